@@ -1,0 +1,5 @@
+"""`python -m services` is the command `envmatte`, where that is not on the path."""
+
+from services.cli import run
+
+run()

@@ -1,0 +1,36 @@
+"""The HTTP API: `build_app`, and one file a resource."""
+
+import hmac
+
+from fastapi import Depends, FastAPI, Request
+from sqlalchemy import Engine
+
+from services.api import captures, errors, jobs, mattes, system
+from services.api.context import PROBLEM, Context
+from services.settings import Settings
+from storage.objects import Objects
+
+
+def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
+    """Build the app: it holds no state of its own, so any number of them may serve one database and store."""
+    app = FastAPI(
+        title="envmatte",
+        version="1",
+        description="Environment mattes of transparent objects, by compressive sensing.",
+        responses=PROBLEM,
+    )
+    app.state.context = Context(settings, engine, objects)
+    errors.register(app)
+
+    def authorize(request: Request) -> None:
+        if not settings.keys:
+            return
+        scheme, _, key = request.headers.get("authorization", "").partition(" ")
+        known = [hmac.compare_digest(key.encode(), one.encode()) for one in settings.keys]
+        if scheme.lower() != "bearer" or not any(known):
+            raise errors.Unauthorized("send a key of this service: `Authorization: Bearer KEY`")
+
+    for router in (captures.router, jobs.router, mattes.router):
+        app.include_router(router, prefix="/v1", dependencies=[Depends(authorize)])
+    app.include_router(system.router)
+    return app

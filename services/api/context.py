@@ -1,0 +1,52 @@
+"""What every request handler needs: the settings, the database and the store."""
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from fastapi import Depends, Query, Request
+from sqlalchemy import Engine
+
+from services.settings import Settings
+from storage.objects import Objects
+
+
+@dataclass(frozen=True)
+class Context:
+    """Built once with the app."""
+
+    settings: Settings
+    engine: Engine
+    objects: Objects
+
+
+def _context(request: Request) -> Context:
+    context: Context = request.app.state.context
+    return context
+
+
+Needs = Annotated[Context, Depends(_context)]
+Limit = Annotated[int, Query(ge=1, le=1000, description="The most items to list.")]
+After = Annotated[str | None, Query(description="The id of the last item of the page before.")]
+
+PROBLEM: dict[int | str, dict[str, Any]] = {
+    "default": {
+        "description": "A problem (RFC 9457)",
+        "content": {
+            "application/problem+json": {
+                "schema": {
+                    "type": "object",
+                    "required": ["type", "title", "status", "detail"],
+                    "properties": {
+                        "type": {"type": "string", "format": "uri"},
+                        "title": {"type": "string"},
+                        "status": {"type": "integer"},
+                        "detail": {"type": "string"},
+                        "entry": {"type": "string"},
+                        "field": {"type": "string"},
+                        "limit": {"type": "number"},
+                    },
+                }
+            }
+        },
+    }
+}

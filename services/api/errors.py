@@ -1,0 +1,110 @@
+"""From errors to HTTP: the only table, and the only shape (RFC 9457)."""
+
+import logging
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+from storage.errors import (
+    CaptureError,
+    Conflict,
+    Corrupt,
+    EnvmatteError,
+    ImageError,
+    InvalidInput,
+    NotFound,
+    OptionError,
+)
+
+MEDIA_TYPE = "application/problem+json"
+logger = logging.getLogger(__name__)
+
+
+class TooLarge(InvalidInput):
+    """A body of more bytes than are taken."""
+
+
+class WrongMediaType(InvalidInput):
+    """A body of another media type than is taken, or an answer asked for in one that can't be given."""
+
+
+class Unauthorized(EnvmatteError):
+    """No key, or one that is not known."""
+
+
+PROBLEMS: dict[type[Exception], tuple[HTTPStatus, str, str]] = {
+    CaptureError: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-capture", "The capture can't be used"),
+    ImageError: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-image", "The image can't be used"),
+    OptionError: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-option", "The options can't be used"),
+    TooLarge: (HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too-large", "Too large"),
+    WrongMediaType: (HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "wrong-media-type", "Wrong media type"),
+    InvalidInput: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-request", "The request can't be used"),
+    Unauthorized: (HTTPStatus.UNAUTHORIZED, "unauthorized", "A key is needed"),
+    NotFound: (HTTPStatus.NOT_FOUND, "not-found", "Not found"),
+    Conflict: (HTTPStatus.CONFLICT, "conflict", "Not in this state"),
+    Corrupt: (HTTPStatus.INTERNAL_SERVER_ERROR, "corrupt", "Stored data is missing or damaged"),
+    Exception: (HTTPStatus.INTERNAL_SERVER_ERROR, "internal", "Something went wrong here"),
+}
+
+
+def problem_of(error: Exception) -> dict[str, Any]:
+    """The problem detail of an error: ``type``, ``title``, ``status``, ``detail``, and what locates the fault."""
+    kind = next(kind for kind in type(error).__mro__ if kind in PROBLEMS)
+    status, slug, title = PROBLEMS[kind]
+    if isinstance(error, EnvmatteError):
+        return _problem(status, slug, title, error.detail, **error.fields)
+    # What an unforeseen error says is for the log: it may name what is no caller's business.
+    return _problem(status, slug, title, f"an unforeseen {type(error).__name__}; the service's log has more")
+
+
+def _problem(status: int, slug: str, title: str, detail: str, **fields: Any) -> dict[str, Any]:
+    return {
+        "type": f"urn:envmatte:problem:{slug}",
+        "title": title,
+        "status": int(status),
+        "detail": detail,
+        **fields,
+    }
+
+
+def answer(problem: dict[str, Any], headers: dict[str, str] | None = None) -> JSONResponse:
+    """A problem detail as a response."""
+    return JSONResponse(problem, problem["status"], headers, media_type=MEDIA_TYPE)
+
+
+def register(app: FastAPI) -> None:
+    """Give every error of an app this shape, those of the framework included."""
+
+    @app.exception_handler(EnvmatteError)
+    async def _ours(request: Request, error: EnvmatteError) -> JSONResponse:
+        headers = {"WWW-Authenticate": "Bearer"} if isinstance(error, Unauthorized) else None
+        return answer(problem_of(error), headers)
+
+    @app.exception_handler(HTTPException)
+    async def _framework(request: Request, error: HTTPException) -> JSONResponse:
+        status = HTTPStatus(error.status_code)
+        slug = status.phrase.lower().replace(" ", "-")
+        detail = f"{request.method} {request.url.path}: {str(error.detail).lower()}; see GET /openapi.json"
+        return answer(_problem(status, slug, status.phrase, detail), dict(error.headers or {}))
+
+    @app.exception_handler(RequestValidationError)
+    async def _validation(request: Request, error: RequestValidationError) -> JSONResponse:
+        first = error.errors()[0]
+        field = ".".join(str(part) for part in first["loc"][1:])
+        problem = _problem(
+            HTTPStatus.UNPROCESSABLE_ENTITY,
+            "bad-request",
+            "The request can't be used",
+            f"{field or first['loc'][0]}: {first['msg']}",
+            field=field,
+        )
+        return answer(problem)
+
+    @app.exception_handler(Exception)
+    async def _unforeseen(request: Request, error: Exception) -> JSONResponse:
+        logger.error("%s %s", request.method, request.url.path, exc_info=error)
+        return answer(problem_of(error))

@@ -1,0 +1,217 @@
+"""Jobs over HTTP."""
+
+import time
+from datetime import UTC, datetime
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Header, Query, Response
+from pydantic import BaseModel, ConfigDict, Field
+from sqlalchemy import Row
+
+from services.api.context import After, Limit, Needs
+from storage import captures, jobs, mattes
+from storage.database import jobs as table
+from storage.database import writing
+from storage.errors import Conflict
+from workflows.options import describe_options, parse_options
+
+router = APIRouter(tags=["jobs"])
+CALL = "POST /v1/jobs"
+State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
+
+
+class JobRequest(BaseModel):
+    """What to recover, and how."""
+
+    model_config = ConfigDict(extra="forbid")
+    capture: str
+    options: dict[str, Any] = Field(default_factory=dict, description="GET /v1/options lists them.")
+
+
+class Tiles(BaseModel):
+    """Pieces of a job's work: squares of a matte, or slabs of frames."""
+
+    total: int
+    done: int
+    failed: int
+
+
+class Job(BaseModel):
+    """A job."""
+
+    id: str
+    kind: Literal["ingest", "recover"]
+    state: State
+    stage: str
+    progress: float
+    tiles: Tiles
+    pixels: int
+    eta_seconds: float | None
+    queued_seconds: float
+    run_seconds: float
+    workers: int
+    capture: str
+    matte: str | None
+    options: dict[str, Any]
+    problem: dict[str, Any] | None
+    created_at: datetime
+    started_at: datetime | None
+    finished_at: datetime | None
+
+    @classmethod
+    def of(cls, row: Row[Any], workers: int) -> "Job":
+        now = time.time()
+        ran = ((row.finished_at or now) - row.started_at) if row.started_at else 0.0
+        running = row.state == "running"
+        # The step after the last tile counts as one more: only a job that has succeeded is at 1.
+        progress = 1.0 if row.state == "succeeded" else row.done / (row.total + 1) if row.total else 0.0
+        return cls(
+            **{
+                name: getattr(row, name)
+                for name in ("id", "kind", "state", "stage", "pixels", "capture", "matte")
+            },
+            progress=progress,
+            tiles=Tiles(total=row.total, done=row.done, failed=row.failed),
+            eta_seconds=ran * (row.total - row.done) / row.done if running and row.done else None,
+            queued_seconds=(row.started_at or row.finished_at or now) - row.created_at,
+            run_seconds=ran,
+            workers=workers if running else 0,
+            options=row.options,
+            problem=row.problem,
+            created_at=datetime.fromtimestamp(row.created_at, UTC),
+            started_at=_time(row.started_at),
+            finished_at=_time(row.finished_at),
+        )
+
+
+class Jobs(BaseModel):
+    """A page of jobs, newest first."""
+
+    jobs: list[Job]
+
+
+class Option(BaseModel):
+    """An option of recovery."""
+
+    name: str
+    type: str
+    default: str | int | float | bool | None
+    values: list[str] | None
+    minimum: float | None
+    maximum: float | None
+    description: str
+
+
+class Options(BaseModel):
+    """Every option of recovery."""
+
+    options: list[Option]
+
+
+class Line(BaseModel):
+    """A line of a job's log."""
+
+    line: int
+    at: datetime
+    text: str
+
+
+class Log(BaseModel):
+    """Lines of a job's log, oldest first."""
+
+    lines: list[Line]
+
+
+@router.get("/options")
+def list_options() -> Options:
+    """Every option of recovery."""
+    return Options.model_validate({"options": describe_options()})
+
+
+@router.post("/jobs", status_code=202)
+def post_job(
+    context: Needs,
+    request: JobRequest,
+    response: Response,
+    idempotency_key: Annotated[str | None, Header(alias="Idempotency-Key", max_length=256)] = None,
+) -> Job:
+    """Queue the recovery of a matte; the capture may still be ingesting."""
+    options = parse_options(request.options)
+    with writing(context.engine) as c:
+        job = jobs.made_by(c, idempotency_key, CALL) if idempotency_key else None
+        if job is None:
+            capture = captures.get(c, request.capture)
+            if capture.state == "failed":
+                raise Conflict(f"capture {capture.id} failed: {capture.problem['detail']}")
+            matte = jobs.new_id()
+            chosen = options.model_dump(mode="json")
+            job = jobs.add(c, "recover", capture.id, chosen, matte)
+            mattes.add(c, matte, capture.id, job, chosen)
+            if idempotency_key:
+                jobs.remember(c, idempotency_key, CALL, job)
+        row = jobs.get(c, job)
+        workers = _workers(c)
+    response.headers["Location"] = f"/v1/jobs/{job}"
+    return Job.of(row, workers)
+
+
+@router.get("/jobs")
+def list_jobs(context: Needs, limit: Limit = 100, after: After = None, state: State | None = None) -> Jobs:
+    """Jobs, newest first."""
+    with context.engine.connect() as c:
+        workers = _workers(c)
+        return Jobs(jobs=[Job.of(row, workers) for row in jobs.page(c, table, limit, after, state=state)])
+
+
+@router.get("/jobs/{id}")
+def get_job(context: Needs, id: str) -> Job:
+    """A job."""
+    with context.engine.connect() as c:
+        return Job.of(jobs.get(c, id), _workers(c))
+
+
+@router.get("/jobs/{id}/log")
+def get_log(context: Needs, id: str, limit: Limit = 1000, after: Annotated[int, Query(ge=0)] = 0) -> Log:
+    """What happened to a job, line by line."""
+    with context.engine.connect() as c:
+        jobs.get(c, id)
+        rows = jobs.notes(c, id, after, limit)
+    return Log(lines=[Line(line=r.line, at=datetime.fromtimestamp(r.at, UTC), text=r.text) for r in rows])
+
+
+@router.post("/jobs/{id}/cancel")
+def cancel_job(context: Needs, id: str) -> Job:
+    """Cancel a job; what it wrote is removed as soon as its running tasks have ended."""
+    with writing(context.engine) as c:
+        jobs.cancel(c, id)
+        return Job.of(jobs.get(c, id), _workers(c))
+
+
+@router.post("/jobs/{id}/retry", status_code=202)
+def retry_job(context: Needs, id: str) -> Job:
+    """Queue a failed job again; the tiles that are done are kept."""
+    with writing(context.engine) as c:
+        row = jobs.get(c, id)
+        capture = captures.get(c, row.capture)
+        if capture.state == "failed":
+            raise Conflict(f"capture {capture.id} failed, and nothing of it was kept; upload it again")
+        jobs.retry(c, id)
+        if row.matte:
+            mattes.change(c, row.matte, state="recovering")
+        return Job.of(jobs.get(c, id), _workers(c))
+
+
+@router.delete("/jobs/{id}", status_code=204)
+def delete_job(context: Needs, id: str) -> None:
+    """Delete a job that has ended, and its log; its matte stays."""
+    with writing(context.engine) as c:
+        jobs.forget(c, id)
+
+
+def _workers(connection: Any) -> int:
+    beat = jobs.last_beat(connection)
+    return beat.workers if beat else 0
+
+
+def _time(seconds: float | None) -> datetime | None:
+    return None if seconds is None else datetime.fromtimestamp(seconds, UTC)

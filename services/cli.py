@@ -1,0 +1,188 @@
+"""The command `envmatte`.
+
+Exit codes: 0 done; 1 the service refused or the job failed; 2 the command line was wrong; 130 interrupted.
+"""
+
+import json
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from services.client import Client, ServiceError
+from services.progress import Progress
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def _remote(command: F) -> F:
+    """Options of every command that talks to a service."""
+    url = click.option(
+        "--url",
+        envvar="ENVMATTE_URL",
+        default="http://127.0.0.1:8000",
+        show_default=True,
+        help="Of the service.",
+    )
+    key = click.option("--key", envvar="ENVMATTE_KEY", help="API key, if the service asks for one.")
+    as_json = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
+    return url(key(as_json(command)))
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="envmatte")
+def main() -> None:
+    """Environment mattes: film glass before a monitor, put it in front of anything.
+
+    Exit codes: 0 done; 1 the service refused or a job failed; 2 wrong command line; 130 interrupted.
+    """
+
+
+@main.command()
+@click.option("--data", type=click.Path(path_type=Path), help="Folder of the database and everything stored.")
+@click.option("--host", help="Address to listen on.")
+@click.option("--port", type=int, help="Port to listen on; 0 takes a free one.")
+@click.option("--workers", type=int, help="Worker processes.")
+def serve(**given: Any) -> None:
+    """Run the service: API, database, store and a cluster of this machine.
+
+    Every setting is an environment variable ENVMATTE_… too, and a line in .env; an option here wins.
+    """
+    from pydantic import ValidationError
+
+    from services.server import serve as run
+    from services.settings import Settings
+    from storage.errors import EnvmatteError
+
+    try:
+        run(Settings(**{name: value for name, value in given.items() if value is not None}))
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise click.UsageError(f"{'.'.join(map(str, first['loc']))} {first['msg']}".strip()) from error
+    except EnvmatteError as error:
+        raise click.ClickException(error.detail) from error
+
+
+@main.command()
+@click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.option("--name", default="", help="A name for people.")
+@_remote
+def upload(file: Path, name: str, url: str, key: str | None, as_json: bool) -> None:
+    """Upload a capture and wait until it is ingested."""
+    with Client(url, key) as client:
+        with Progress("upload") as bar:
+            capture = client.upload(file, name=name, progress=lambda sent, size: bar.show(sent / size))
+        with Progress("ingest") as bar:
+            client.wait(capture["job"], progress=bar.job)
+        _say(client.capture(capture["id"]), as_json, "id")
+
+
+@main.command()
+@click.argument("capture")
+@click.option("--method", help="pyramid or nn-dgsr.")
+@click.option(
+    "--option", "options", multiple=True, metavar="NAME=VALUE", help="Any option of GET /v1/options."
+)
+@click.option("--detach", is_flag=True, help="Print the job and do not wait for it.")
+@_remote
+def recover(
+    capture: str,
+    method: str | None,
+    options: tuple[str, ...],
+    detach: bool,
+    url: str,
+    key: str | None,
+    as_json: bool,
+) -> None:
+    """Recover the matte of a capture, and wait for it."""
+    chosen = dict(_pair(option) for option in options) | ({"method": method} if method else {})
+    with Client(url, key) as client:
+        job = client.recover(capture, **chosen)
+        if not detach:
+            with Progress("recovery") as bar:
+                job = client.wait(job["id"], progress=bar.job)
+    _say(job, as_json, "id" if detach else "matte")
+
+
+@main.command()
+@click.argument("job")
+@_remote
+def status(job: str, url: str, key: str | None, as_json: bool) -> None:
+    """Show a job."""
+    with Client(url, key) as client:
+        found = client.job(job)
+    _say(found, as_json, "state", "stage", "progress")
+
+
+@main.command()
+@click.argument("matte")
+@click.argument("backdrop", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.option(
+    "-o", "--output", type=click.Path(dir_okay=False, path_type=Path), required=True, help="PNG to write."
+)
+@click.option("--transfer", type=click.Choice(["srgb", "linear"]), default="srgb", show_default=True)
+@_remote
+def composite(
+    matte: str, backdrop: Path, output: Path, transfer: str, url: str, key: str | None, as_json: bool
+) -> None:
+    """Put a matte in front of a backdrop."""
+    with Client(url, key) as client:
+        _write(output, client.composite(matte, backdrop.read_bytes(), transfer=transfer))
+    _say({"output": str(output)}, as_json, "output")
+
+
+@main.command()
+@click.option(
+    "-o", "--output", type=click.Path(dir_okay=False, path_type=Path), default=Path("envmatte-demo.png")
+)
+@click.option("--workers", type=int, help="Worker processes of the demo's service.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
+def demo(output: Path, workers: int | None, as_json: bool) -> None:
+    """Trace a glass ball, film it, serve, upload, recover, composite: all of it, in a picture."""
+    from services.demo import run
+
+    picture, figures = run(workers)
+    _write(output, picture)
+    if not as_json:
+        for name, value in figures.items():
+            click.echo(f"{name}: {value}")
+    _say({"output": str(output), **figures}, as_json, "output")
+
+
+def _pair(option: str) -> tuple[str, Any]:
+    name, equals, value = option.partition("=")
+    if not equals:
+        raise click.UsageError(f"--option {option}: give it as NAME=VALUE")
+    try:
+        return name, json.loads(value)
+    except json.JSONDecodeError:
+        return name, value
+
+
+def _write(path: Path, data: bytes) -> None:
+    """Write a file whole or not at all, so that an interrupt leaves nothing half done."""
+    part = path.with_name(path.name + ".part")
+    part.write_bytes(data)
+    os.replace(part, path)
+
+
+def _say(found: dict[str, Any], as_json: bool, *names: str) -> None:
+    click.echo(json.dumps(found, indent=2) if as_json else " ".join(str(found[name]) for name in names))
+
+
+def run() -> None:
+    """The entry point: what the service refuses becomes a message and an exit code."""
+    try:
+        main(standalone_mode=False)
+    except ServiceError as error:
+        click.echo(f"Error: {error}", err=True)
+        sys.exit(1)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("Interrupted.", err=True)
+        sys.exit(130)

@@ -1,0 +1,123 @@
+"""`envmatte demo`: the whole way of a capture, from a glass ball to a composite, on this machine."""
+
+import io
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from services.client import Client
+from services.progress import Progress
+from workflows import images, simulate
+from workflows.program import area_mean
+from workflows.tone import from_light, to_light
+
+WIDTH, HEIGHT = 240, 180
+PANEL = 480, 360
+ERROR_GAIN = 8
+
+
+def run(workers: int | None) -> tuple[bytes, dict[str, Any]]:
+    """Trace, film, serve, upload, recover, composite.
+
+    Parameters
+    ----------
+    workers : int, optional
+        Worker processes; one a core if left out.
+
+    Returns
+    -------
+    picture : bytes
+        A PNG: backdrop, composite, truth and error side by side.
+    figures : dict
+        ``psnr_db`` over the ball's pixels, in linear light, and the seconds that each step took.
+    """
+    times: dict[str, float] = {}
+
+    @contextmanager
+    def step(name: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        times[f"{name}_seconds"] = round(time.perf_counter() - start, 1)
+
+    with tempfile.TemporaryDirectory(prefix="envmatte-demo-") as folder, Progress("demo") as bar:
+        with step("tracing"):
+            bar.show(0, f"tracing a glass ball, {WIDTH} x {HEIGHT} pixels, 64 rays each")
+            scene = simulate.glass_ball(WIDTH, HEIGHT, rays=64)
+            capture = Path(folder, "glass-ball.zip")
+            simulate.write_capture(scene, simulate.nested_program(), capture, name="glass ball")
+        bar.show(0.1, "starting the service")
+        start = time.perf_counter()
+        with _service(Path(folder, "data"), workers) as url, Client(url) as client:
+            times["starting_seconds"] = round(time.perf_counter() - start, 1)
+            with step("ingest"):
+                bar.show(0.2, "uploading the capture")
+                uploaded = client.upload(capture)
+                client.wait(uploaded["job"])
+            with step("recovery"):
+                job = client.recover(uploaded["id"])
+                found = client.wait(
+                    job["id"],
+                    progress=lambda job: bar.show(0.25 + 0.7 * job["progress"], f"recovery: {job['stage']}"),
+                )
+            with step("composite"):
+                backdrop = simulate.backdrop()
+                encoded = images.to_integers(from_light(backdrop, "srgb"), np.dtype(np.uint16))
+                answer = client.composite(found["matte"], images.encode_png(encoded))
+            bar.show(1, "done")
+
+    truth = scene.truth(backdrop)
+    composite = images.to_unit(images.decode(answer, memory=1 << 28))
+    shown = from_light(np.clip(truth, 0, 1), "srgb")
+    error = np.mean((to_light(composite, "srgb") - np.clip(truth, 0, 1))[scene.object_mask] ** 2)
+    psnr = round(float(-10 * np.log10(error)), 2)
+    panels = {
+        "backdrop": from_light(area_mean(backdrop, *PANEL), "srgb"),
+        f"composite, PSNR {psnr} dB": composite,
+        "truth": shown,
+        f"error x {ERROR_GAIN}": np.abs(composite - shown) * ERROR_GAIN,
+    }
+    return _side_by_side(panels), {"psnr_db": psnr, "object_pixels": int(scene.object_mask.sum()), **times}
+
+
+@contextmanager
+def _service(data: Path, workers: int | None) -> Iterator[str]:
+    """A service of its own on a free port; yields its URL."""
+    command = [sys.executable, "-m", "services", "serve", "--data", str(data), "--port", "0"]
+    if workers:
+        command += ["--workers", str(workers)]
+    with (data.parent / "service.log").open("wb") as log:
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            if " at http" not in line:
+                raise RuntimeError(f"the service did not start: {(data.parent / 'service.log').read_text()}")
+            yield line.rsplit(" at ", 1)[1].strip()
+        finally:
+            process.terminate()
+            process.wait(30)
+
+
+def _side_by_side(panels: dict[str, NDArray[np.float32]]) -> bytes:
+    """A PNG of pictures, each with a caption under it."""
+    gap, caption = 8, 28
+    width = len(panels) * (PANEL[0] + gap) + gap
+    sheet = Image.new("RGB", (width, PANEL[1] + 2 * gap + caption), "white")
+    draw = ImageDraw.Draw(sheet)
+    for n, (title, values) in enumerate(panels.items()):
+        left = gap + n * (PANEL[0] + gap)
+        pixels = images.to_integers(values, np.dtype(np.uint8))
+        sheet.paste(Image.fromarray(pixels).resize(PANEL, Image.Resampling.NEAREST), (left, gap))
+        draw.text((left, PANEL[1] + 2 * gap), title, "black", ImageFont.load_default(16))
+    file = io.BytesIO()
+    sheet.save(file, "PNG", optimize=True)
+    return file.getvalue()

@@ -1,0 +1,52 @@
+"""Progress for people: a bar on a terminal, plain lines elsewhere."""
+
+import sys
+from types import TracebackType
+from typing import Any, Self
+
+import click
+
+STEP = 0.25
+"""How far it goes between two plain lines."""
+
+
+class Progress:
+    """Shows how far something is, on standard error."""
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+        self._bar: Any = None
+        self._said = -1.0
+
+    def __enter__(self) -> Self:
+        if sys.stderr.isatty():
+            self._bar = click.progressbar(
+                length=1000,
+                label=self._what,
+                file=sys.stderr,
+                show_eta=False,
+                item_show_func=lambda text: text,
+            )
+            self._bar.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.__exit__(kind, error, trace)
+
+    def show(self, share: float, text: str = "") -> None:
+        """Show a share of 0 to 1, and what is going on."""
+        if self._bar is not None:
+            self._bar.update(round(share * 1000) - self._bar.pos, text)
+        elif share >= self._said + STEP or (share == 1 and self._said < 1):
+            self._said = share
+            click.echo(f"{self._what}: {share:.0%} {text}".rstrip(), err=True)
+
+    def job(self, job: dict[str, Any]) -> None:
+        """Show a job of the API."""
+        eta = job["eta_seconds"]
+        left = f", {eta:.0f} s left" if eta else ""
+        tiles = job["tiles"]
+        self.show(job["progress"], f"{job['stage']}, {tiles['done']} of {tiles['total']} tiles{left}")

@@ -1,0 +1,59 @@
+"""`envmatte serve`: the API, the coordinator and the cluster in one process tree."""
+
+import fcntl
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import uvicorn
+
+from services.api import build_app
+from services.cluster import open_cluster
+from services.coordinator import Coordinator
+from services.settings import Settings
+from storage.database import open_engine
+from storage.errors import Conflict
+from storage.objects import Objects
+
+
+def serve(settings: Settings) -> None:
+    """Serve until interrupted; jobs under way go on at the next start.
+
+    Raises
+    ------
+    Conflict
+        If another service has the data folder.
+    """
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s %(message)s")
+    with _sole_user(settings):
+        engine = open_engine(settings.database_url)
+        objects = Objects(settings.store_url)
+        # The port is taken before workers start, so that one in use is told at once.
+        config = uvicorn.Config(
+            build_app(settings, engine, objects),
+            settings.host,
+            settings.port,
+            log_level="warning",
+            lifespan="off",
+        )
+        socket = config.bind_socket()
+        with socket, open_cluster(settings) as client, Coordinator(settings, engine, objects, client):
+            socket.listen()  # from here on whoever connects is answered, if not yet at once
+            host, port = socket.getsockname()[:2]
+            print(f"envmatte serves {settings.data} at http://{host}:{port}", flush=True)
+            uvicorn.Server(config).run(sockets=[socket])
+        engine.dispose()
+
+
+@contextmanager
+def _sole_user(settings: Settings) -> Iterator[None]:
+    """Hold the data folder's lock: two services on one folder would drive the same jobs."""
+    settings.data.mkdir(parents=True, exist_ok=True)
+    with (settings.data / "lock").open("a") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise Conflict(
+                f"another envmatte serves {settings.data} already; use it, stop it, or name another folder with --data"
+            ) from error
+        yield

@@ -1,0 +1,193 @@
+"""A capture: the frame stack, and its record.
+
+In the store, under ``captures/ID``, a zarr group: ``frames`` (frame, y, x, channel), the optional ``mask`` (y, x) and
+``images/N`` (row, column, channel), the patterns that came as images. Its attributes hold the manifest. The archive
+that was uploaded lies in ``uploads/ID.zip`` until its frames are in the stack.
+"""
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+from sqlalchemy import Connection, Row, delete, insert, select, update
+
+from storage.database import captures
+from storage.errors import Corrupt, NotFound
+from storage.grid import block_edge
+from storage.objects import EVERY_CHUNK, Objects
+
+CHUNK = 1 << 20
+"""Bytes of a chunk of the stack, about: small enough that a tile reads little more than its own."""
+
+
+def upload_path(capture: str) -> str:
+    """Where a capture's archive lies until it is ingested."""
+    return f"uploads/{capture}.zip"
+
+
+def path(capture: str) -> str:
+    """Where a capture lies in the store."""
+    return f"captures/{capture}"
+
+
+def create_stack(
+    objects: Objects,
+    capture: str,
+    shape: tuple[int, int, int, int],
+    dtype: np.dtype[np.generic],
+    *,
+    memory: int,
+    attributes: dict[str, Any],
+    mask: NDArray[np.bool_] | None,
+    images: Sequence[NDArray[np.float32]],
+) -> int:
+    """Make the empty stack of a capture, in place of an earlier one.
+
+    Parameters
+    ----------
+    shape : (frames, height, width, channels)
+    memory : int
+        Bytes that whoever writes it may hold at once: a slab of whole frames, and the chunk of it that is
+        being compressed.
+    attributes : dict
+        The manifest, as JSON.
+    mask : (height, width) bool, optional
+    images : sequence of (rows, columns, 1 or 3) float32
+
+    Returns
+    -------
+    int
+        Frames of a slab: what is written at once, and the length of a chunk. A slab is all that one writer
+        touches, so that slabs can be written in any order, by anyone, and again.
+
+    Notes
+    -----
+    A slab holds as many frames as the memory allows. A chunk is a slab's frames over a square of pixels; the
+    square doubles from the block's edge (`block_edge`) until the chunk has about `CHUNK` bytes, so that a
+    tile reads few chunks and few bytes that it does not need.
+    """
+    frames, height, width, channels = shape
+    pixel = channels * dtype.itemsize
+    slab = int(min(frames, max(1, memory // (2 * height * width * pixel))))
+    edge = block_edge(height, width)
+    while edge < max(height, width) and 2 * slab * edge * edge * pixel <= CHUNK:
+        edge *= 2
+    group = zarr.create_group(objects.zarr, path=path(capture), overwrite=True, attributes=attributes)
+    group.create_array(
+        "frames",
+        shape=shape,
+        dtype=dtype,
+        chunks=(slab, min(edge, height), min(edge, width), channels),
+        config=EVERY_CHUNK,
+        dimension_names=("frame", "y", "x", "channel"),
+    )
+    if mask is not None:
+        group.create_array("mask", data=mask, config=EVERY_CHUNK, dimension_names=("y", "x"))
+    for n, image in enumerate(images):
+        group.create_array(
+            f"images/{n}", data=image, config=EVERY_CHUNK, dimension_names=("row", "column", "channel")
+        )
+    return slab
+
+
+def write_slab(objects: Objects, capture: str, first: int, frames: NDArray[np.generic]) -> None:
+    """Write a slab of whole frames, from frame ``first`` on."""
+    stack = objects.array(f"{path(capture)}/frames")
+    stack[first : first + len(frames)] = frames
+
+
+class Stack:
+    """An ingested capture, open for reading.
+
+    Attributes
+    ----------
+    attributes : dict
+        The manifest, as JSON.
+    frames, height, width : int
+    dtype : numpy.dtype
+        Of the values: uint8 or uint16.
+    """
+
+    def __init__(self, objects: Objects, capture: str) -> None:
+        try:
+            self._group = objects.group(path(capture))
+        except FileNotFoundError as error:
+            raise Corrupt(f"capture {capture} is not in the store; upload it again") from error
+        self._frames = self._array("frames")
+        self.attributes: dict[str, Any] = dict(self._group.attrs)
+        self.frames, self.height, self.width, self.channels = self._frames.shape
+        self.dtype = self._frames.dtype
+
+    def read(
+        self, rows: slice = slice(None), columns: slice = slice(None), frames: slice = slice(None)
+    ) -> NDArray[Any]:
+        """(frame, y, x, channel) values of a rectangle of pixels."""
+        return np.asarray(self._frames[frames, rows, columns])
+
+    def mask(self, rows: slice = slice(None), columns: slice = slice(None)) -> NDArray[np.bool_] | None:
+        """(y, x) bool: the pixels to recover; None for all."""
+        return np.asarray(self._array("mask")[rows, columns], bool) if "mask" in self._group else None
+
+    def images(self) -> list[NDArray[np.float32]]:
+        """The patterns that came as images, each (rows, columns, 1 or 3) float32."""
+        if "images" not in self._group:
+            return []
+        return [
+            np.asarray(self._array(f"images/{n}")[:], np.float32)
+            for n in sorted(int(name) for name in self._group["images"])  # type: ignore[union-attr]
+        ]
+
+    def check(self) -> None:
+        """See that every chunk is there: zarr reads a missing one as zeros, without a word.
+
+        Raises
+        ------
+        Corrupt
+        """
+        missing = self._frames.nchunks - self._frames.nchunks_initialized
+        if missing:
+            raise Corrupt(f"{missing} of {self._frames.nchunks} chunks of the frame stack are missing")
+
+    def annotate(self, **attributes: Any) -> None:
+        """Add to the manifest what was measured from the frames."""
+        self._group.update_attributes(attributes)
+        self.attributes |= attributes
+
+    def _array(self, name: str) -> zarr.Array[Any]:
+        array = self._group[name]
+        if not isinstance(array, zarr.Array):
+            raise Corrupt(f"{name} is no array")
+        return array
+
+
+def add(connection: Connection, capture: str, job: str, **record: Any) -> None:
+    """Write down a new capture, whose ingest job is queued."""
+    row = {"id": capture, "state": "ingesting", "job": job, "created_at": time.time(), **record}
+    connection.execute(insert(captures).values(row))
+
+
+def get(connection: Connection, capture: str) -> Row[Any]:
+    """A capture's row.
+
+    Raises
+    ------
+    NotFound
+        If there is none.
+    """
+    row = connection.execute(select(captures).where(captures.c.id == capture)).one_or_none()
+    if row is None:
+        raise NotFound(f"there is no capture {capture!r}; GET /v1/captures lists those there are")
+    return row
+
+
+def change(connection: Connection, capture: str, **values: Any) -> None:
+    """Change a capture's row."""
+    connection.execute(update(captures).where(captures.c.id == capture).values(values))
+
+
+def forget(connection: Connection, capture: str) -> None:
+    """Delete a capture's row."""
+    connection.execute(delete(captures).where(captures.c.id == capture))

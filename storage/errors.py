@@ -1,0 +1,68 @@
+"""What can go wrong, as one tree.
+
+::
+
+    EnvmatteError
+    ├── InvalidInput            what was sent can't be used
+    │   ├── CaptureError        a capture's archive or capture.json
+    │   ├── ImageError          bytes that should be an image
+    │   └── OptionError         an option of recovery
+    ├── NotFound                no such capture, job, matte or frame
+    ├── Conflict                it exists, but not in a state that allows this
+    └── Corrupt                 something stored is missing or damaged
+
+Every error says in ``detail`` what is wrong and what to do; ``fields`` locate the fault (``entry``, ``field``,
+``limit``). They cross process borders, so they are made of plain values only.
+"""
+
+
+class EnvmatteError(Exception):
+    """Base of every error that a caller can act on.
+
+    Parameters
+    ----------
+    detail : str
+        What is wrong and what to do about it, for people.
+    **fields : str or int or float
+        What locates the fault.
+    """
+
+    def __init__(self, detail: str, **fields: str | int | float) -> None:
+        super().__init__(detail)
+        self.detail = detail
+        self.fields = fields
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return _rebuild, (type(self), self.detail, self.fields)
+
+
+def _rebuild(kind: type[EnvmatteError], detail: str, fields: dict[str, str | int | float]) -> EnvmatteError:
+    return kind(detail, **fields)
+
+
+class InvalidInput(EnvmatteError):
+    """What was sent can't be used."""
+
+
+class CaptureError(InvalidInput):
+    """A capture's archive, its capture.json or one of its frames."""
+
+
+class ImageError(InvalidInput):
+    """Bytes that should be an image."""
+
+
+class OptionError(InvalidInput):
+    """An option of recovery that does not exist, is out of range, or does not go with the capture."""
+
+
+class NotFound(EnvmatteError):
+    """No such capture, job, matte or frame."""
+
+
+class Conflict(EnvmatteError):
+    """It exists, but is not in a state that allows this."""
+
+
+class Corrupt(EnvmatteError):
+    """Something that the store should hold is missing or damaged."""

@@ -1,0 +1,246 @@
+"""A matte: S, rho and T, laid out in zarr so that any zarr reader can read it.
+
+In the store, under ``mattes/ID``, a zarr group with the attributes ``width``, ``height``, ``columns``, ``rows`` (the
+grid of T's cells), ``block`` and what the matte was made from; and in it
+
+- ``S``, ``rho`` (y, x, channel) float32;
+- ``count`` (y, x, channel) uint32: how many cells the row T of a pixel and channel has;
+- ``recovered`` (y, x) bool: false where the capture's mask left a pixel out;
+- ``T/R.C/cell`` and ``T/R.C/weight``, one-dimensional, for the block in block row R and block column C: the
+  cells (``row * columns + column``, row 0 at the top) and weights of its rows T one after another, in the order
+  (y, x, channel).
+
+A block is a square of ``block`` pixels, and a chunk of the frame-shaped arrays. Whoever recovers a block writes all of
+it and nothing else, so blocks can be written in any order, by anyone, and again.
+"""
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+from sqlalchemy import Connection, Row, delete, insert, select, update
+
+from storage.database import mattes
+from storage.errors import Corrupt, NotFound
+from storage.grid import block_edge
+from storage.objects import EVERY_CHUNK, Objects
+
+FORMAT = "envmatte-matte/1"
+FRAMES = ("S", "rho", "recovered", "count")
+"""The frame-shaped arrays, in the order in which a block is written."""
+UNWRITTEN = 0xFFFFFFFF
+"""Fills ``count`` and ``cell``: no row has that many cells and no grid has that one, so a chunk that is missing
+does not read as an empty one."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """One block of a matte, h x w pixels.
+
+    Attributes
+    ----------
+    S, rho : (h, w, 3) float32
+    recovered : (h, w) bool
+    count : (h, w, 3) uint32
+    cell : (count.sum(),) uint32
+    weight : (count.sum(),) float32
+    """
+
+    S: NDArray[np.float32]
+    rho: NDArray[np.float32]
+    recovered: NDArray[np.bool_]
+    count: NDArray[np.uint32]
+    cell: NDArray[np.uint32]
+    weight: NDArray[np.float32]
+
+
+def path(matte: str) -> str:
+    """Where a matte lies in the store."""
+    return f"mattes/{matte}"
+
+
+class Matte:
+    """A matte in the store.
+
+    Attributes
+    ----------
+    attributes : dict
+    height, width : int
+        Of the frame, in pixels.
+    columns, rows : int
+        The grid of T's cells.
+    block : int
+        Edge of a block, in pixels.
+    """
+
+    def __init__(self, objects: Objects, matte: str) -> None:
+        try:
+            self._group = objects.group(path(matte))
+        except FileNotFoundError as error:
+            raise Corrupt(f"matte {matte} is not in the store; recover it again") from error
+        self._objects = objects
+        self._path = path(matte)
+        self._frames = {name: objects.array(f"{path(matte)}/{name}") for name in FRAMES}
+        self.attributes: dict[str, Any] = dict(self._group.attrs)
+        self.height, self.width, self.columns, self.rows, self.block = (
+            int(self.attributes[name]) for name in ("height", "width", "columns", "rows", "block")
+        )
+
+    @property
+    def block_rows(self) -> int:
+        """Blocks from top to bottom."""
+        return -(-self.height // self.block)
+
+    @property
+    def block_columns(self) -> int:
+        """Blocks from left to right."""
+        return -(-self.width // self.block)
+
+    def span(self, row: int, column: int) -> tuple[slice, slice]:
+        """The pixels of a block: rows and columns of the frame."""
+        y, x = row * self.block, column * self.block
+        return slice(y, min(y + self.block, self.height)), slice(x, min(x + self.block, self.width))
+
+    def write(self, row: int, column: int, block: Block) -> None:
+        """Write a block, in place of an earlier one."""
+        span = self.span(row, column)
+        for name, values, missing in (("cell", block.cell, UNWRITTEN), ("weight", block.weight, np.nan)):
+            zarr.create_array(
+                self._objects.zarr,
+                name=f"{self._path}/T/{row}.{column}/{name}",
+                data=values,
+                chunks=(max(len(values), 1),),
+                fill_value=missing,
+                overwrite=True,
+                config=EVERY_CHUNK,
+            )
+        # ``count`` comes last: a block is written once its counts are there.
+        for name, array in self._frames.items():
+            array[span] = getattr(block, name)
+
+    def read(self, row: int, column: int) -> Block:
+        """Read a block.
+
+        Raises
+        ------
+        Corrupt
+            If some of it is missing.
+        """
+        span = self.span(row, column)
+        S, rho, recovered, count = (np.asarray(array[span]) for array in self._frames.values())
+        try:
+            cell, weight = (
+                np.asarray(self._objects.array(f"{self._path}/T/{row}.{column}/{name}")[:])
+                for name in ("cell", "weight")
+            )
+        except FileNotFoundError as error:
+            raise self._corrupt(row, column) from error
+        whole = (
+            not any(UNWRITTEN in values for values in (count, cell))
+            and len(cell) == len(weight) == count.sum()
+        )
+        if not whole or np.isnan(S).any() or np.isnan(rho).any() or np.isnan(weight).any():
+            raise self._corrupt(row, column)
+        return Block(S, rho, recovered, count, cell, weight)
+
+    def check(self) -> None:
+        """See that every block is there.
+
+        Raises
+        ------
+        Corrupt
+        """
+        for name, array in self._frames.items():
+            if array.nchunks_initialized != array.nchunks:
+                raise Corrupt(f"{array.nchunks - array.nchunks_initialized} chunks of {name} are missing")
+        stored = self._objects.below(f"{self._path}/T")
+        for row in range(self.block_rows):
+            for column in range(self.block_columns):
+                arrays = [f"{self._path}/T/{row}.{column}/{name}" for name in ("cell", "weight")]
+                # A block whose rows are all empty has no chunk in either.
+                chunks = {f"{array}/c/0" in stored for array in arrays}
+                if len(chunks) == 2 or not all(f"{array}/zarr.json" in stored for array in arrays):
+                    raise self._corrupt(row, column)
+
+    def _corrupt(self, row: int, column: int) -> Corrupt:
+        return Corrupt(f"block {row}.{column} of the matte is missing or damaged; recover it again")
+
+
+def create(
+    objects: Objects, matte: str, *, height: int, width: int, columns: int, rows: int, **attributes: Any
+) -> Matte:
+    """Make an empty matte, in place of an earlier one.
+
+    Parameters
+    ----------
+    height, width : int
+        Of the frame, in pixels.
+    columns, rows : int
+        The grid of T's cells.
+    **attributes
+        What it is made from, as JSON. No times and no ids: the same input makes the same bytes.
+    """
+    edge = block_edge(height, width)
+    layout = {
+        "format": FORMAT,
+        "height": height,
+        "width": width,
+        "columns": columns,
+        "rows": rows,
+        "block": edge,
+    }
+    group = zarr.create_group(objects.zarr, path=path(matte), overwrite=True, attributes=layout | attributes)
+    frame, chunk = (height, width), (min(edge, height), min(edge, width))
+    dims = ("y", "x", "channel")
+    for name in ("S", "rho"):
+        group.create_array(
+            name,
+            shape=(*frame, 3),
+            chunks=(*chunk, 3),
+            dtype="float32",
+            fill_value=np.nan,
+            dimension_names=dims,
+        )
+    group.create_array(
+        "count",
+        shape=(*frame, 3),
+        chunks=(*chunk, 3),
+        dtype="uint32",
+        fill_value=UNWRITTEN,
+        dimension_names=dims,
+    )
+    group.create_array("recovered", shape=frame, chunks=chunk, dtype="bool", dimension_names=dims[:2])
+    return Matte(objects, matte)
+
+
+def add(connection: Connection, matte: str, capture: str, job: str, options: dict[str, Any]) -> None:
+    """Write down a matte that a job is to recover."""
+    row = {"id": matte, "capture": capture, "job": job, "state": "recovering", "options": options}
+    connection.execute(insert(mattes).values(row | {"created_at": time.time()}))
+
+
+def get(connection: Connection, matte: str) -> Row[Any]:
+    """A matte's row.
+
+    Raises
+    ------
+    NotFound
+        If there is none.
+    """
+    row = connection.execute(select(mattes).where(mattes.c.id == matte)).one_or_none()
+    if row is None:
+        raise NotFound(f"there is no matte {matte!r}; GET /v1/mattes lists those there are")
+    return row
+
+
+def change(connection: Connection, matte: str, **values: Any) -> None:
+    """Change a matte's row."""
+    connection.execute(update(mattes).where(mattes.c.id == matte).values(values))
+
+
+def forget(connection: Connection, matte: str) -> None:
+    """Delete a matte's row."""
+    connection.execute(delete(mattes).where(mattes.c.id == matte))

@@ -1,0 +1,128 @@
+"""A real service in a process of its own, and captures to send it."""
+
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx2
+import numpy as np
+import pytest
+
+from services.client import Client
+from workflows import images, simulate
+from workflows.program import Program
+from workflows.tone import from_light
+
+BANDS = ((8, 6, 16), (16, 12, 16), (32, 24, 20))
+
+
+@dataclass
+class Service:
+    """A running `envmatte serve`."""
+
+    process: subprocess.Popen[str]
+    data: Path
+    url: str
+    client: Client
+    http: httpx2.Client
+
+    def kill(self) -> None:
+        """End the server as a crash would: at once, with its whole process tree."""
+        os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait(10)
+
+    def stored(self) -> set[str]:
+        """Every file of the store that belongs to an upload, a capture or a matte."""
+        store = self.data / "store"
+        # os.walk passes over a folder that is deleted meanwhile.
+        files = [
+            Path(folder, name).relative_to(store) for folder, _, names in os.walk(store) for name in names
+        ]
+        return {str(path) for path in files if len(path.parts) > 2 or path.parts[0] == "uploads"}
+
+
+@contextmanager
+def serving(data: Path, *options: str, **environment: str) -> Iterator[Service]:
+    """Serve a folder on a free port, until the block ends."""
+    command = [sys.executable, "-m", "services", "serve", "--data", str(data), "--port", "0", *options]
+    data.parent.mkdir(parents=True, exist_ok=True)
+    with (data.parent / f"{data.name}.log").open("ab") as log:
+        process = subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+            start_new_session=True,
+            env=os.environ | environment,
+        )
+    assert process.stdout is not None
+    try:
+        line = process.stdout.readline()
+        assert " at http" in line, (data.parent / f"{data.name}.log").read_text()
+        url = line.rsplit(" at ", 1)[1].strip()
+        key = environment.get("ENVMATTE_KEYS", "").partition(",")[0] or None
+        with Client(url, key) as client, httpx2.Client(base_url=url, timeout=60) as http:
+            yield Service(process, data, url, client, http)
+    finally:
+        process.terminate()
+        process.wait(30)
+        process.stdout.close()
+
+
+def png(light: np.ndarray, transfer: str, dtype: type) -> bytes:
+    """A backdrop of linear light as it is sent."""
+    return images.encode_png(images.to_integers(from_light(light, transfer), np.dtype(dtype)))
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """A digest of every file below a folder, by its relative name."""
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+@pytest.fixture(scope="session")
+def program() -> Program:
+    return simulate.nested_program(bands=BANDS, levels=5)
+
+
+@pytest.fixture(scope="session")
+def scene() -> simulate.Scene:
+    return simulate.glass_ball(96, 72, rays=16)
+
+
+@pytest.fixture(scope="session")
+def bundle(scene: simulate.Scene, program: Program, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A capture of the scene."""
+    path = tmp_path_factory.mktemp("bundle") / "ball.zip"
+    simulate.write_capture(scene, program, path, name="ball")
+    return path
+
+
+@pytest.fixture(scope="session")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    """A service that tests share: each adds to it, none depends on what others did."""
+    with serving(tmp_path_factory.mktemp("service") / "data") as running:
+        yield running
+
+
+@pytest.fixture(scope="session")
+def capture(service: Service, bundle: Path) -> str:
+    """The scene's capture, ingested."""
+    uploaded = service.client.upload(bundle)
+    service.client.wait(uploaded["job"])
+    return str(uploaded["id"])
+
+
+@pytest.fixture(scope="session")
+def matte(service: Service, capture: str) -> str:
+    """The scene's matte, recovered."""
+    return str(service.client.wait(service.client.recover(capture)["id"])["matte"])

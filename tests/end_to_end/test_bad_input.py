@@ -1,0 +1,235 @@
+"""Bad input over HTTP: a clear problem each, nothing left behind, and the service lives on."""
+
+import io
+import json
+import socket
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+
+from tests.end_to_end.conftest import Service
+from workflows import images
+
+ZIP = {"Content-Type": "application/zip"}
+
+
+def remade(bundle: Path, change: Callable[[dict, dict[str, bytes]], None]) -> bytes:
+    """A bundle with its capture.json and its files changed."""
+    with zipfile.ZipFile(bundle) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    manifest = json.loads(files["capture.json"])
+    change(manifest, files)
+    if "capture.json" in files:
+        files["capture.json"] = json.dumps(manifest).encode()
+    target = io.BytesIO()
+    with zipfile.ZipFile(target, "w") as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    return target.getvalue()
+
+
+def check_problem(answer, status: int, slug: str) -> dict:
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    problem = answer.json()
+    assert problem["status"] == status
+    assert problem["type"] == f"urn:envmatte:problem:{slug}"
+    assert problem["title"]
+    assert len(problem["detail"]) > 15
+    return problem
+
+
+def no_manifest(manifest: dict, files: dict[str, bytes]) -> None:
+    del files["capture.json"]
+
+
+def other_format(manifest: dict, files: dict[str, bytes]) -> None:
+    manifest["format"] = "envmatte-capture/9"
+
+
+def frame_not_there(manifest: dict, files: dict[str, bytes]) -> None:
+    manifest["frames"][3]["file"] = "frames/nowhere.png"
+
+
+def pattern_without_frame(manifest: dict, files: dict[str, bytes]) -> None:
+    del manifest["frames"][7]
+
+
+def pattern_out_of_range(manifest: dict, files: dict[str, bytes]) -> None:
+    manifest["frames"][7]["pattern"] = 5000
+
+
+def one_level(manifest: dict, files: dict[str, bytes]) -> None:
+    manifest["program"]["parts"][0]["levels"] = [0.5] * 5
+
+
+def leaves(manifest: dict, files: dict[str, bytes]) -> None:
+    files["../evil.png"] = b"x"
+
+
+def monitor_of_nothing(manifest: dict, files: dict[str, bytes]) -> None:
+    manifest["program"]["monitor"]["width"] = 0
+
+
+def program_too_large(manifest: dict, files: dict[str, bytes]) -> None:
+    manifest["program"]["parts"][1] |= {"columns": 1280, "rows": 960, "count": 100_000}
+
+
+def a_video(manifest: dict, files: dict[str, bytes]) -> None:
+    manifest["video"] = {"file": "clip.mp4", "patterns_per_second": 2.0}
+
+
+@pytest.mark.parametrize(
+    ("change", "entry", "field"),
+    [
+        (no_manifest, "capture.json", None),
+        (other_format, "capture.json", "format"),
+        (frame_not_there, "frames/nowhere.png", "frames.3.file"),
+        (pattern_without_frame, "capture.json", "frames"),
+        (pattern_out_of_range, "frames/00007.png", "frames.7.pattern"),
+        (one_level, "capture.json", "program"),
+        (leaves, "../evil.png", None),
+        (monitor_of_nothing, "capture.json", "program.monitor.width"),
+        (program_too_large, "capture.json", "program"),
+        (a_video, "capture.json", "video"),
+    ],
+)
+def test_a_bundle_that_is_refused_at_once(
+    service: Service, bundle: Path, change, entry: str, field: str | None
+) -> None:
+    before = service.stored()
+    answer = service.http.post("/v1/captures", content=remade(bundle, change), headers=ZIP)
+    problem = check_problem(answer, 422, "bad-capture")
+    assert problem["entry"] == entry
+    assert problem.get("field") == field
+    assert service.stored() == before
+
+
+@pytest.mark.parametrize("share", [0, 0.3, 0.99])
+def test_a_zip_that_is_cut_off(service: Service, bundle: Path, share: float) -> None:
+    before = service.stored()
+    data = bundle.read_bytes()
+    answer = service.http.post("/v1/captures", content=data[: int(len(data) * share)], headers=ZIP)
+    check_problem(answer, 422, "bad-capture")
+    assert service.stored() == before
+
+
+def test_an_upload_that_breaks_off(service: Service, bundle: Path) -> None:
+    before, captures = service.stored(), service.http.get("/v1/captures").json()
+    where = urlsplit(service.url)
+    with socket.create_connection((where.hostname, where.port)) as raw:
+        head = "POST /v1/captures HTTP/1.1\r\nHost: x\r\nContent-Type: application/zip\r\nContent-Length: 99999999\r\n\r\n"
+        raw.sendall(head.encode() + bundle.read_bytes()[:100_000])
+    check_problem(service.http.get("/v1/captures/nothing"), 404, "not-found")
+    assert service.stored() == before
+    assert service.http.get("/v1/captures").json() == captures
+
+
+def of_another_size(manifest: dict, files: dict[str, bytes]) -> None:
+    files["frames/00009.png"] = images.encode_png(np.zeros((72, 95, 3), np.uint8))
+
+
+def of_another_kind(manifest: dict, files: dict[str, bytes]) -> None:
+    files["frames/00009.png"] = images.encode_png(np.zeros((72, 96, 3), np.uint16))
+
+
+def no_image(manifest: dict, files: dict[str, bytes]) -> None:
+    files["frames/00009.png"] = b"this is no image"
+
+
+def cut_off(manifest: dict, files: dict[str, bytes]) -> None:
+    files["frames/00009.png"] = files["frames/00009.png"][:1000]
+
+
+def bomb(manifest: dict, files: dict[str, bytes]) -> None:
+    # A real PNG whose header claims 60,000 x 60,000 pixels.
+    data = bytearray(files["frames/00009.png"])
+    data[16:24] = (60_000).to_bytes(4, "big") * 2
+    data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")
+    files["frames/00009.png"] = bytes(data)
+
+
+@pytest.mark.parametrize("change", [of_another_size, of_another_kind, no_image, cut_off, bomb])
+def test_a_frame_that_is_refused_by_the_ingest(service: Service, bundle: Path, change) -> None:
+    before = service.stored()
+    answer = service.http.post("/v1/captures", content=remade(bundle, change), headers=ZIP)
+    assert answer.status_code == 201
+    made = answer.json()
+    waiting = service.client.recover(made["id"])
+    while (found := service.client.capture(made["id"]))["state"] == "ingesting":
+        pass
+    assert found["state"] == "failed"
+    assert found["problem"]["type"] == "urn:envmatte:problem:bad-capture"
+    assert found["problem"]["entry"] == "frames/00009.png"
+    assert service.client.job(made["job"])["problem"] == found["problem"]
+    while (job := service.client.job(waiting["id"]))["state"] in ("queued", "running"):
+        pass
+    assert job["state"] == "failed"
+    assert "frames/00009.png" in job["problem"]["detail"]
+    check_problem(service.http.post("/v1/jobs", json={"capture": made["id"]}), 409, "conflict")
+    assert service.stored() == before
+
+
+def test_a_body_of_another_type(service: Service, bundle: Path) -> None:
+    answer = service.http.post(
+        "/v1/captures", content=bundle.read_bytes(), headers={"Content-Type": "text/plain"}
+    )
+    check_problem(answer, 415, "wrong-media-type")
+
+
+def test_an_unknown_option(service: Service, capture: str) -> None:
+    before = service.http.get("/v1/mattes").json()
+    for options, field in (({"speed": 11}, "speed"), ({"method": "magic"}, "method"), ({"tile": 1}, "tile")):
+        answer = service.http.post("/v1/jobs", json={"capture": capture, "options": options})
+        assert check_problem(answer, 422, "bad-option")["field"] == field
+    assert service.http.get("/v1/mattes").json() == before
+
+
+@pytest.mark.parametrize("body", [b"", b"{", b'{"capture": 3}', b'{"capture": "x", "more": 1}', b"[1]"])
+def test_a_job_that_is_no_job(service: Service, body: bytes) -> None:
+    answer = service.http.post("/v1/jobs", content=body, headers={"Content-Type": "application/json"})
+    check_problem(answer, 422, "bad-request")
+
+
+@pytest.mark.parametrize("body", [b"", b"no image at all", b"\x89PNG\r\n\x1a\n" + b"\0" * 50])
+def test_a_backdrop_that_is_no_image(service: Service, matte: str, body: bytes) -> None:
+    check_problem(service.http.post(f"/v1/mattes/{matte}/composite", content=body), 422, "bad-image")
+
+
+def test_an_answer_that_cannot_be_given(service: Service, matte: str) -> None:
+    answer = service.http.post(f"/v1/mattes/{matte}/composite", headers={"Accept": "image/x-exr"})
+    check_problem(answer, 415, "wrong-media-type")
+
+
+def test_every_call_answers_an_unknown_id_with_a_problem(service: Service) -> None:
+    called = 0
+    for path, calls in service.http.get("/openapi.json").json()["paths"].items():
+        if "{id}" not in path:
+            continue
+        for method in calls:
+            url = path.replace("{id}", "no-such-id").replace("{n}", "0")
+            check_problem(service.http.request(method, url), 404, "not-found")
+            called += 1
+    assert called >= 11
+    check_problem(service.http.post("/v1/jobs", json={"capture": "no-such-id"}), 404, "not-found")
+    check_problem(service.http.get("/v1/captures?after=no-such-id"), 404, "not-found")
+    check_problem(service.http.get("/v2/nothing"), 404, "not-found")
+    check_problem(service.http.put("/v1/jobs"), 405, "method-not-allowed")
+    check_problem(service.http.get("/v1/jobs?limit=many"), 422, "bad-request")
+
+
+def test_calls_out_of_turn(service: Service, capture: str, matte: str) -> None:
+    job = service.http.get(f"/v1/mattes/{matte}").json()["job"]
+    check_problem(service.http.post(f"/v1/jobs/{job}/cancel"), 409, "conflict")
+    check_problem(service.http.post(f"/v1/jobs/{job}/retry"), 409, "conflict")
+    check_problem(service.http.get(f"/v1/captures/{capture}/frames/57.png"), 404, "not-found")
+
+
+def test_the_service_lives_on(service: Service, bundle: Path) -> None:
+    assert service.client.wait(service.client.upload(bundle)["job"])["state"] == "succeeded"
+    assert service.process.poll() is None

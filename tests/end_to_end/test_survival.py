@@ -1,0 +1,163 @@
+"""What a service survives: kills, cancels, a second service; and that the bytes stay the same."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from services.client import ServiceError
+from tests.end_to_end.conftest import Service, digests, png, serving
+
+
+def files_of(service: Service, matte: str) -> dict[str, str]:
+    return digests(service.data / "store" / "mattes" / matte)
+
+
+def recovered(service: Service, bundle: Path, **options: object) -> dict[str, str]:
+    uploaded = service.client.upload(bundle)
+    job = service.client.wait(service.client.recover(uploaded["id"], **options)["id"])
+    return files_of(service, job["matte"])
+
+
+def test_a_killed_server_goes_on_where_it_stood(
+    service: Service, matte: str, bundle: Path, tmp_path: Path
+) -> None:
+    data = tmp_path / "data"
+    with serving(data, "--workers", "1") as first:
+        job = first.client.recover(first.client.upload(bundle)["id"])
+        while first.client.job(job["id"])["tiles"]["done"] < 5:
+            time.sleep(0.01)
+        first.kill()
+    with serving(data, "--workers", "1") as second:
+        found = second.client.job(job["id"])
+        assert 5 <= found["tiles"]["done"] < 30
+        ended = second.client.wait(job["id"])
+        assert ended["tiles"] == {"total": 30, "done": 30, "failed": 0}
+        log = [line["text"] for line in second.http.get(f"/v1/jobs/{job['id']}/log").json()["lines"]]
+        assert log.count("preparing") == 1
+        assert files_of(second, ended["matte"]) == files_of(service, matte)
+
+
+def test_a_server_killed_during_ingest_goes_on(
+    service: Service, matte: str, bundle: Path, tmp_path: Path
+) -> None:
+    data = tmp_path / "data"
+    # A frame takes 20 kB: a budget of 1 MiB makes slabs of a few frames, and many tiles.
+    with serving(data, "--workers", "1", ENVMATTE_INGEST_MEMORY=str(1 << 20)) as first:
+        uploaded = first.client.upload(bundle)
+        while first.client.job(uploaded["job"])["stage"] == "waiting":
+            time.sleep(0.01)
+        first.kill()
+    with serving(data, "--workers", "2", ENVMATTE_INGEST_MEMORY=str(1 << 20)) as second:
+        assert second.client.wait(uploaded["job"])["state"] == "succeeded"
+        job = second.client.wait(second.client.recover(uploaded["id"])["id"])
+        assert files_of(second, job["matte"]) == files_of(service, matte)
+
+
+def test_the_bytes_do_not_depend_on_tiles_or_workers(
+    service: Service, matte: str, bundle: Path, tmp_path: Path
+) -> None:
+    expected = files_of(service, matte)
+    assert len(expected) > 200
+    assert recovered(service, bundle, tile=48) == expected
+    assert recovered(service, bundle, tile=1024) == expected
+    with serving(tmp_path / "data", "--workers", "3") as other:
+        assert recovered(other, bundle, tile=32) == expected
+
+
+def test_a_cancelled_job_leaves_nothing(service: Service, capture: str) -> None:
+    job = service.client.recover(capture)
+    while service.client.job(job["id"])["tiles"]["done"] < 2:
+        time.sleep(0.01)
+    assert service.client.cancel(job["id"])["state"] == "cancelled"
+    with pytest.raises(ServiceError, match="cancelled"):
+        service.client.wait(job["id"])
+    deadline = time.monotonic() + 20
+    while any(job["matte"] in name for name in service.stored()):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    assert service.http.get(f"/v1/mattes/{job['matte']}").status_code == 404
+    assert service.client.cancel(job["id"])["state"] == "cancelled"
+
+
+def test_a_job_cancelled_before_a_kill_leaves_nothing(bundle: Path, tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    with serving(data, "--workers", "1") as first:
+        job = first.client.recover(first.client.upload(bundle)["id"])
+        while first.client.job(job["id"])["tiles"]["done"] < 2:
+            time.sleep(0.01)
+        first.client.cancel(job["id"])
+        first.kill()
+    (data / "store" / "uploads").mkdir(exist_ok=True)
+    (data / "store" / "uploads" / "orphan.zip").write_bytes(b"an upload that was cut off by the kill")
+    with serving(data, "--workers", "1") as second:
+        assert not [name for name in second.stored() if job["matte"] in name or "orphan" in name]
+        assert second.client.job(job["id"])["state"] == "cancelled"
+        assert second.client.wait(second.client.recover(job["capture"])["id"])["state"] == "succeeded"
+
+
+def test_a_worker_that_is_killed_costs_nothing(service: Service, matte: str, capture: str) -> None:
+    job = service.client.recover(capture)
+    while service.client.job(job["id"])["tiles"]["done"] < 3:
+        time.sleep(0.01)
+    tree = psutil.Process(service.process.pid).children(recursive=True)
+    workers = [p for p in tree if "spawn_main" in " ".join(p.cmdline())]
+    assert workers
+    workers[-1].kill()
+    ended = service.client.wait(job["id"])
+    assert files_of(service, ended["matte"]) == files_of(service, matte)
+
+
+def test_a_damaged_matte_is_said_to_be_damaged(service: Service, capture: str) -> None:
+    job = service.client.wait(service.client.recover(capture, tile=48)["id"])
+    folder = service.data / "store" / "mattes" / job["matte"]
+    for name in ("S/c/0/0/0", "count/c/1/1/0", "T/2.2/weight/c/0"):
+        data = (folder / name).read_bytes()
+        (folder / name).unlink()
+        white = png(np.ones((2, 2, 3), np.float32), "srgb", np.uint8)
+        answer = service.http.post(f"/v1/mattes/{job['matte']}/composite", content=white)
+        assert (answer.status_code, answer.json()["type"]) == (500, "urn:envmatte:problem:corrupt")
+        (folder / name).write_bytes(data)
+
+
+def test_a_second_service_on_one_folder_says_so_and_stops(service: Service) -> None:
+    command = [sys.executable, "-m", "services", "serve", "--data", str(service.data), "--port", "0"]
+    second = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert second.returncode == 1
+    assert "serves" in second.stderr
+    assert "already" in second.stderr
+    assert service.http.get("/healthz").status_code == 200
+
+
+def test_an_open_door_is_refused(tmp_path: Path) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        "services",
+        "serve",
+        "--data",
+        str(tmp_path / "data"),
+        "--host",
+        "0.0.0.0",
+    ]
+    environment = {name: value for name, value in os.environ.items() if name != "ENVMATTE_KEYS"}
+    refused = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
+    assert refused.returncode == 2
+    assert "ENVMATTE_KEYS" in refused.stderr
+    assert not (tmp_path / "data").exists()
+
+
+def test_keys_are_asked_for(tmp_path: Path) -> None:
+    with serving(tmp_path / "data", "--workers", "1", ENVMATTE_KEYS="first-key, second-key") as service:
+        assert service.http.get("/healthz").status_code == 200
+        for headers in ({}, {"Authorization": "Bearer wrong"}, {"Authorization": "Basic first-key"}):
+            answer = service.http.get("/v1/captures", headers=headers)
+            assert (answer.status_code, answer.headers["www-authenticate"]) == (401, "Bearer")
+        for key in ("first-key", "second-key"):
+            answer = service.http.get("/v1/captures", headers={"Authorization": f"Bearer {key}"})
+            assert answer.json() == {"captures": []}

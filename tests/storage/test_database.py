@@ -1,0 +1,82 @@
+"""The database: SQLite as it is set up, and writers that come at the same time."""
+
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from sqlalchemy import Engine, inspect, text
+from sqlalchemy.exc import IntegrityError
+
+from storage import jobs
+from storage.database import metadata, open_engine, writing
+
+
+def test_sqlite_is_set_up(engine: Engine) -> None:
+    with engine.connect() as connection:
+        assert connection.scalar(text("PRAGMA journal_mode")) == "wal"
+        assert connection.scalar(text("PRAGMA foreign_keys")) == 1
+        assert connection.scalar(text("PRAGMA busy_timeout")) == 10000
+    assert set(inspect(engine).get_table_names()) == set(metadata.tables)
+
+
+def test_what_was_written_is_there_when_opened_again(engine: Engine, tmp_path: Path) -> None:
+    with writing(engine) as connection:
+        job = jobs.add(connection, "ingest", "c", {})
+    engine.dispose()
+    with open_engine(f"sqlite:///{tmp_path}/ledger.db").connect() as connection:
+        assert jobs.get(connection, job).state == "queued"
+
+
+def test_an_exception_rolls_back(engine: Engine) -> None:
+    with pytest.raises(ZeroDivisionError), writing(engine) as connection:  # noqa: PT012
+        jobs.add(connection, "ingest", "c", {})
+        raise ZeroDivisionError
+    with engine.connect() as connection:
+        assert jobs.active(connection) == []
+
+
+def test_a_tile_needs_its_job(engine: Engine) -> None:
+    with pytest.raises(IntegrityError), writing(engine) as connection:
+        jobs.note(connection, "none", "a line")
+
+
+def test_writers_that_read_first_wait_for_each_other(engine: Engine) -> None:
+    with writing(engine) as connection:
+        job = jobs.add(connection, "ingest", "c", {})
+        jobs.lay_down(connection, job, {"tiles": 40})
+    failed: list[BaseException] = []
+    inside = threading.Barrier(2)
+
+    def work(own: range) -> None:
+        try:
+            inside.wait()
+            for tile in own:
+                with writing(engine) as connection:
+                    jobs.get(connection, job)  # without the lock from the start, the write below is refused
+                    time.sleep(0.002)
+                    jobs.finish_tiles(connection, job, [(tile, 0.1, 10)])
+        except BaseException as error:
+            failed.append(error)
+
+    threads = [threading.Thread(target=work, args=(range(at, 40, 2),)) for at in (0, 1)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert failed == []
+    with engine.connect() as connection:
+        row = jobs.get(connection, job)
+        assert (row.done, row.pixels) == (40, 400)
+        assert jobs.to_do(connection, job) == []
+
+
+def test_a_reader_does_not_wait_for_a_writer(engine: Engine) -> None:
+    with writing(engine) as writer:
+        job = jobs.add(writer, "ingest", "c", {})
+        start = time.monotonic()
+        with engine.connect() as reader:
+            assert jobs.active(reader) == []
+        assert time.monotonic() - start < 5
+    with engine.connect() as reader:
+        assert [row.id for row in jobs.active(reader)] == [job]

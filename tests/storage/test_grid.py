@@ -1,0 +1,32 @@
+"""Edges of blocks: powers of two that keep the number of objects bounded."""
+
+import pytest
+
+from storage.grid import BLOCKS, block_edge
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "edge"),
+    [
+        (1, 1, 16),
+        (480, 640, 16),
+        (512, 1024, 16),  # 32 x 64 blocks of 16 are just 2048
+        (513, 1024, 32),
+        (1080, 1920, 32),
+        (1500, 2000, 64),
+        (4000, 6000, 128),
+        (16384, 16384, 128),
+    ],
+)
+def test_edges_of_known_frames(height: int, width: int, edge: int) -> None:
+    assert block_edge(height, width) == block_edge(width, height) == edge
+
+
+def test_an_edge_is_the_smallest_that_bounds_the_blocks() -> None:
+    for height in range(1, 5000, 331):
+        for width in range(1, 5000, 297):
+            edge = block_edge(height, width)
+            blocks = [-(-height // e) * -(-width // e) for e in (edge // 2, edge)]
+            assert edge in (16, 32, 64, 128)
+            assert blocks[1] <= BLOCKS or edge == 128
+            assert blocks[0] > BLOCKS or edge == 16

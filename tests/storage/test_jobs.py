@@ -1,0 +1,228 @@
+"""The ledger: what a job may become, what its tiles count for, and its log."""
+
+from itertools import pairwise
+
+import pytest
+from sqlalchemy import Connection, Engine, func, select
+
+from storage import database, jobs
+from storage.database import writing
+from storage.errors import Conflict, NotFound
+
+
+@pytest.fixture
+def connection(engine: Engine):  # type: ignore[no-untyped-def]
+    with writing(engine) as connection:
+        yield connection
+
+
+def laid(connection: Connection, tiles: int = 3) -> str:
+    job = jobs.add(connection, "recover", "cap", {"method": "pyramid"}, matte="mat")
+    jobs.lay_down(connection, job, {"tiles": tiles, "slab": 9})
+    return job
+
+
+def lines(connection: Connection, job: str) -> list[str]:
+    return [row.text for row in jobs.notes(connection, job, 0, 100)]
+
+
+def test_a_job_from_queue_to_success(connection: Connection) -> None:
+    job = jobs.add(connection, "recover", "cap", {"tile": 64}, matte="mat")
+    row = jobs.get(connection, job)
+    assert (row.state, row.stage, row.kind, row.capture, row.matte) == (
+        "queued",
+        "waiting",
+        "recover",
+        "cap",
+        "mat",
+    )
+    assert row.options == {"tile": 64}
+    assert (row.plan, row.started_at, row.finished_at, row.total) == (None, None, None, 0)
+    jobs.enter(connection, job, "preparing")
+    started = jobs.get(connection, job).started_at
+    jobs.lay_down(connection, job, {"tiles": 2, "slab": 5})
+    jobs.enter(connection, job, "recovering")
+    row = jobs.get(connection, job)
+    assert (row.state, row.stage, row.total, row.plan) == (
+        "running",
+        "recovering",
+        2,
+        {"tiles": 2, "slab": 5},
+    )
+    assert row.started_at == started is not None
+    jobs.finish_tiles(connection, job, [(0, 0.5, 100), (1, 0.25, 60)])
+    assert jobs.end(connection, job, "succeeded")
+    row = jobs.get(connection, job)
+    assert (row.state, row.done, row.pixels, row.problem) == ("succeeded", 2, 160, None)
+    assert row.created_at <= row.started_at <= row.finished_at
+    assert lines(connection, job) == ["queued", "preparing", "recovering", "succeeded"]
+
+
+def test_ids_are_opaque_and_differ() -> None:
+    ids = {jobs.new_id() for _ in range(1000)}
+    assert len(ids) == 1000
+    assert all(name.isalnum() and len(name) == 20 for name in ids)
+
+
+def test_what_is_not_there(connection: Connection) -> None:
+    for call in (jobs.get, jobs.cancel, jobs.retry, jobs.forget):
+        with pytest.raises(NotFound, match="no job 'none'"):
+            call(connection, "none")
+
+
+def test_a_plan_is_laid_down_once(connection: Connection) -> None:
+    job = laid(connection)
+    jobs.finish_tiles(connection, job, [(1, 0.1, 5)])
+    jobs.lay_down(connection, job, {"tiles": 7})
+    assert jobs.get(connection, job).total == 3
+    assert jobs.to_do(connection, job) == [0, 2]
+
+
+def test_a_tile_done_twice_counts_once(connection: Connection) -> None:
+    job, other = laid(connection), laid(connection)
+    jobs.finish_tiles(connection, job, [(1, 0.1, 50), (1, 0.1, 50)])
+    jobs.finish_tiles(connection, job, [(1, 9.0, 50), (2, 0.1, 30)])
+    row = jobs.get(connection, job)
+    assert (row.done, row.pixels) == (2, 80)
+    assert jobs.to_do(connection, job) == [0]
+    assert jobs.to_do(connection, other) == [0, 1, 2]
+    assert jobs.get(connection, other).done == 0
+
+
+def test_a_tile_is_tried_as_often_as_allowed(connection: Connection) -> None:
+    job = laid(connection)
+    assert [jobs.miss_tile(connection, job, 1, "out of memory", 3) for _ in range(3)] == [True, True, False]
+    assert jobs.get(connection, job).failed == 1
+    assert jobs.to_do(connection, job) == [0, 2]
+    assert lines(connection, job)[1:] == [f"tile 1, attempt {n} of 3: out of memory" for n in (1, 2, 3)]
+    jobs.finish_tiles(connection, job, [(1, 0.1, 10)])
+    assert jobs.get(connection, job).done == 0
+
+
+@pytest.mark.parametrize("state", ["succeeded", "failed", "cancelled"])
+def test_a_job_ends_once(connection: Connection, state: str) -> None:
+    job = laid(connection)
+    problem = {"title": "Corrupt", "detail": "a chunk is gone"} if state == "failed" else None
+    assert jobs.end(connection, job, state, problem)
+    before = jobs.get(connection, job)
+    for again in ("succeeded", "failed", "cancelled"):
+        assert not jobs.end(connection, job, again, {"detail": "late"})
+    jobs.enter(connection, job, "recovering")
+    assert jobs.get(connection, job) == before
+    assert before.problem == problem
+    assert lines(connection, job)[-1] == ("failed: a chunk is gone" if problem else state)
+
+
+def test_an_end_of_no_job(connection: Connection) -> None:
+    assert not jobs.end(connection, "none", "failed")
+
+
+def test_cancelling(connection: Connection) -> None:
+    job = laid(connection)
+    jobs.cancel(connection, job)
+    jobs.cancel(connection, job)
+    assert jobs.get(connection, job).state == "cancelled"
+    assert lines(connection, job).count("cancelled") == 1
+    for state in ("succeeded", "failed"):
+        ended = laid(connection)
+        jobs.end(connection, ended, state)
+        with pytest.raises(Conflict, match=state):
+            jobs.cancel(connection, ended)
+
+
+def test_a_retry_keeps_what_is_done(connection: Connection) -> None:
+    job = laid(connection)
+    jobs.enter(connection, job, "recovering")
+    jobs.finish_tiles(connection, job, [(0, 0.1, 10)])
+    jobs.miss_tile(connection, job, 1, "why", 1)
+    jobs.end(connection, job, "failed", {"detail": "a tile failed"})
+    jobs.retry(connection, job)
+    row = jobs.get(connection, job)
+    assert (row.state, row.stage, row.done, row.failed, row.pixels) == ("queued", "waiting", 1, 0, 10)
+    assert (row.problem, row.finished_at) == (None, None)
+    assert jobs.to_do(connection, job) == [1, 2]
+    assert jobs.miss_tile(connection, job, 1, "again", 2)
+
+
+def test_only_a_failed_job_is_tried_again(connection: Connection) -> None:
+    for state in (None, "succeeded", "cancelled"):
+        job = laid(connection)
+        if state:
+            jobs.end(connection, job, state)
+        with pytest.raises(Conflict, match=state or "queued"):
+            jobs.retry(connection, job)
+
+
+def test_forgetting_takes_tiles_and_log_along(connection: Connection) -> None:
+    job, other = laid(connection), laid(connection)
+    with pytest.raises(Conflict, match="cancel it first"):
+        jobs.forget(connection, job)
+    jobs.cancel(connection, job)
+    jobs.forget(connection, job)
+    with pytest.raises(NotFound):
+        jobs.get(connection, job)
+    for table in (database.tiles, database.log):
+        count = select(func.count()).select_from(table)
+        assert connection.scalar(count.where(table.c.job == job)) == 0
+        assert connection.scalar(count.where(table.c.job == other))
+
+
+def test_active_jobs_are_oldest_first(connection: Connection) -> None:
+    made = [laid(connection) for _ in range(4)]
+    jobs.enter(connection, made[2], "recovering")
+    jobs.end(connection, made[1], "failed")
+    assert [row.id for row in jobs.active(connection)] == [made[0], made[2], made[3]]
+
+
+def test_a_page_is_newest_first(connection: Connection) -> None:
+    made = [laid(connection) for _ in range(5)]
+    for job in (made[1], made[3]):
+        jobs.end(connection, job, "failed")
+
+    def ids(limit: int, after: str | None, **equal: str | None) -> list[str]:
+        return [row.id for row in jobs.page(connection, database.jobs, limit, after, **equal)]
+
+    assert ids(10, None) == made[::-1]
+    assert ids(2, None) == [made[4], made[3]]
+    assert ids(2, made[3]) == [made[2], made[1]]
+    assert ids(2, made[0]) == []
+    assert ids(10, None, state="failed", kind=None) == [made[3], made[1]]
+    assert ids(10, made[2], state="failed") == [made[1]]
+    assert ids(10, made[2], state="queued", kind="recover") == [made[0]]
+    assert ids(10, None, kind="ingest") == []
+    with pytest.raises(NotFound) as caught:
+        ids(10, "none")
+    assert caught.value.fields == {"field": "after"}
+
+
+def test_log_lines_after_a_line(connection: Connection) -> None:
+    job, other = laid(connection), laid(connection)
+    for n in range(5):
+        jobs.note(connection, job, f"line {n}")
+        jobs.note(connection, other, "of another job")
+    read = jobs.notes(connection, job, 0, 3)
+    assert [row.text for row in read] == ["queued", "line 0", "line 1"]
+    rest = jobs.notes(connection, job, read[-1].line, 100)
+    assert [row.text for row in rest] == ["line 2", "line 3", "line 4"]
+    assert jobs.notes(connection, job, rest[-1].line, 100) == []
+    assert all(a.at <= b.at for a, b in pairwise(read))
+
+
+def test_what_a_key_made(connection: Connection) -> None:
+    assert jobs.made_by(connection, "key", "POST /v1/jobs") is None
+    jobs.remember(connection, "key", "POST /v1/jobs", "abc")
+    assert jobs.made_by(connection, "key", "POST /v1/jobs") == "abc"
+    assert jobs.made_by(connection, "key", "POST /v1/captures") is None
+    assert jobs.made_by(connection, "other", "POST /v1/jobs") is None
+
+
+def test_a_sign_of_life(connection: Connection) -> None:
+    assert jobs.last_beat(connection) is None
+    jobs.beat(connection, workers=2, threads=8)
+    first = jobs.last_beat(connection)
+    jobs.beat(connection, workers=3, threads=12)
+    last = jobs.last_beat(connection)
+    assert first is not None
+    assert last is not None
+    assert (last.workers, last.threads) == (3, 12)
+    assert last.beat_at >= first.beat_at

@@ -1,0 +1,101 @@
+"""The object store over a real folder: streaming in, reading, listing, deleting, and chunks that are missing."""
+
+import asyncio
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+
+from storage.errors import Corrupt
+from storage.objects import PART, Objects
+
+
+def put(objects: Objects, path: str, data: bytes, piece: int = 1 << 20) -> None:
+    async def stream() -> None:
+        async with objects.write(path) as writer:
+            for at in range(0, len(data), piece):
+                await writer.write(data[at : at + piece])
+
+    asyncio.run(stream())
+
+
+def test_what_is_streamed_in_is_read_back(objects: Objects, folder: Path) -> None:
+    data = np.random.default_rng(0).bytes(2 * PART + 12345)
+    put(objects, "uploads/a.zip", data)
+    assert (folder / "uploads/a.zip").read_bytes() == data
+    with objects.read("uploads/a.zip") as file:
+        assert file.seekable()
+        assert file.read() == data
+        assert file.seek(PART - 5) == PART - 5
+        assert file.read(10) == data[PART - 5 : PART + 5]
+        assert file.tell() == PART + 5
+        assert file.seek(-4, io.SEEK_END) == len(data) - 4
+        assert file.read(100) == data[-4:]
+        assert file.read(1) == b""
+
+
+def test_zipfile_reads_through_it(objects: Objects) -> None:
+    target = io.BytesIO()
+    with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("one.txt", b"first" * 1000)
+        archive.writestr("two.txt", b"second")
+    put(objects, "uploads/a.zip", target.getvalue())
+    with objects.read("uploads/a.zip") as file, zipfile.ZipFile(file) as archive:
+        assert archive.testzip() is None
+        assert archive.read("one.txt") == b"first" * 1000
+
+
+def test_a_writer_left_by_an_error_leaves_no_object(objects: Objects, folder: Path) -> None:
+    async def broken() -> None:
+        async with objects.write("uploads/a.zip") as writer:
+            await writer.write(bytes(PART + 1))
+            raise ConnectionError("the client went away")
+
+    with pytest.raises(ConnectionError):
+        asyncio.run(broken())
+    assert not [path for path in folder.rglob("*") if path.is_file()]
+    with pytest.raises(FileNotFoundError):
+        objects.read("uploads/a.zip")
+
+
+def test_listing_and_deleting(objects: Objects, folder: Path) -> None:
+    for path in ("c/1/x", "c/1/deep/y", "c/2/x", "c/10/x", "c/file"):
+        put(objects, path, b"data")
+    assert objects.names("c") == ["1", "10", "2", "file"]
+    assert objects.names("none") == []
+    assert objects.below("c/1") == {"c/1/x", "c/1/deep/y"}
+    objects.delete("c/1")
+    assert objects.names("c") == ["10", "2", "file"]
+    assert not (folder / "c/1").exists()
+    objects.delete("c/file")
+    objects.delete("c/1")
+    objects.delete("never/there")
+    assert objects.names("c") == ["10", "2"]
+
+
+def test_a_folder_is_made_and_can_be_opened_again(objects: Objects, folder: Path) -> None:
+    assert folder.is_dir()
+    put(objects, "a", b"1")
+    again = Objects(folder.as_uri())
+    again.check()
+    assert again.read("a").read() == b"1"
+
+
+def test_a_group_that_is_not_there(objects: Objects) -> None:
+    with pytest.raises(FileNotFoundError):
+        objects.group("captures/none")
+
+
+def test_a_missing_chunk_is_an_error_and_not_a_zero(objects: Objects, folder: Path) -> None:
+    array = zarr.create_array(objects.zarr, name="a", shape=(4, 6), chunks=(2, 3), dtype="uint8")
+    array[:2] = 1
+    assert np.asarray(array[:2, 1:5]).min() == 1
+    with pytest.raises(Corrupt, match=r"a/c/1/[01] is missing"):
+        array[1:3]
+    (folder / "a/c/0/1").unlink()
+    assert np.asarray(array[:2, :3]).min() == 1
+    with pytest.raises(Corrupt, match="a/c/0/1 is missing"):
+        array[:2]

@@ -1,0 +1,97 @@
+"""A store in a folder, and captures ingested into it, for the tests of workflows."""
+
+import asyncio
+import hashlib
+import io
+import json
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from storage.captures import Stack, upload_path
+from storage.objects import Objects
+from workflows.ingest import frames
+from workflows.ingest.bundle import Limits
+
+Zip = Callable[..., bytes]
+Ingest = Callable[..., Stack]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tmp_path / "store"
+
+
+@pytest.fixture
+def objects(folder: Path) -> Objects:
+    return Objects(folder.as_uri())
+
+
+@pytest.fixture(scope="session")
+def make_zip() -> Zip:
+    """Makes a bundle of a capture.json and files."""
+
+    def make(
+        record: dict[str, Any] | bytes | None, files: dict[str, bytes], pack: int = zipfile.ZIP_STORED
+    ) -> bytes:
+        target = io.BytesIO()
+        with zipfile.ZipFile(target, "w", pack) as archive:
+            if record is not None:
+                text = record if isinstance(record, bytes) else json.dumps(record).encode()
+                archive.writestr("capture.json", text)
+            for name, data in files.items():
+                archive.writestr(zipfile.ZipInfo(name), data, pack)
+        return target.getvalue()
+
+    return make
+
+
+@pytest.fixture
+def put(objects: Objects) -> Callable[[str, bytes], None]:
+    """Stores a capture's archive where ingest finds it."""
+
+    def store(capture: str, data: bytes) -> None:
+        async def stream() -> None:
+            async with objects.write(upload_path(capture)) as writer:
+                await writer.write(data)
+
+        asyncio.run(stream())
+
+    return store
+
+
+@pytest.fixture
+def ingest(objects: Objects, put: Callable[[str, bytes], None]) -> Ingest:
+    """Ingests an archive, its slabs in the order that is asked for."""
+
+    def run(
+        capture: str,
+        data: bytes,
+        memory: int = 1 << 26,
+        order: Callable[[range], Iterator[int]] = iter,  # type: ignore[assignment]
+    ) -> Stack:
+        put(capture, data)
+        limits = Limits(unpacked=1 << 30, memory=memory)
+        plan = frames.prepare(objects, capture, limits)
+        for index in order(range(plan["tiles"])):
+            frames.read_slab(objects, capture, limits, plan["slab"], index)
+        frames.measure(objects, capture)
+        return Stack(objects, capture)
+
+    return run
+
+
+@pytest.fixture
+def digests(folder: Path) -> Callable[[str], dict[str, str]]:
+    """The files below a folder of the store, each with the hash of its bytes."""
+
+    def of(below: str) -> dict[str, str]:
+        root = folder / below
+        files = [path for path in sorted(root.rglob("*")) if path.is_file()]
+        assert files
+        return {str(f.relative_to(root)): hashlib.sha256(f.read_bytes()).hexdigest() for f in files}
+
+    return of

@@ -1,0 +1,315 @@
+import io
+import json
+import zipfile
+from itertools import pairwise
+from pathlib import Path
+
+import imagecodecs
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from storage.errors import OptionError
+from workflows.program import Bernoulli, Constant, Images, Monitor, Program
+from workflows.simulate import (
+    CAMERA,
+    MONITOR,
+    Scene,
+    backdrop,
+    fresnel,
+    glass_ball,
+    nested_program,
+    write_capture,
+)
+from workflows.tone import to_light
+
+
+def centroids(scene: Scene, channel: int = 0) -> NDArray[np.float64]:
+    """(height, width, 2): where each camera pixel's light comes from, in monitor pixels from the centre."""
+    transport = scene.transport[channel].astype(np.float64)
+    width, height = scene.monitor
+    weight = np.maximum(np.asarray(transport.sum(axis=1)), 1e-9)
+    rows = np.repeat(np.arange(transport.shape[0]), np.diff(transport.indptr))
+    x = transport.indices % width + 0.5 - width / 2
+    y = transport.indices // width + 0.5 - height / 2
+    sums = [np.bincount(rows, transport.data * at, transport.shape[0]) for at in (x, y)]
+    places: NDArray[np.float64] = np.stack(sums, axis=1) / weight[:, None]
+    return places.reshape(scene.height, scene.width, 2)
+
+
+@pytest.fixture(scope="module")
+def ball() -> Scene:
+    return glass_ball(48, 36, monitor=(96, 72), rays=16, index=(1.49, 1.5, 1.52), absorption=(0.1, 0.0, 0.3))
+
+
+@pytest.fixture(scope="module")
+def program() -> Program:
+    return Program(
+        monitor=Monitor(width=96, height=72),
+        parts=(
+            Constant(kind="constant", levels=(0.0, 0.4, 1.0)),
+            Bernoulli(kind="bernoulli", columns=8, rows=6, count=70, seed=3),
+            Bernoulli(kind="bernoulli", columns=13, rows=11, count=4, seed=4, colour="rgb"),
+        ),
+    )
+
+
+def test_fresnel_has_the_textbook_values() -> None:
+    reflectance, refracted = fresnel(np.array([1.0]), 1.5)
+    assert reflectance == pytest.approx(0.04)
+    assert refracted == pytest.approx(1.0)
+    # At Brewster's angle, tan i = n, the parallel half is not reflected; the refracted ray
+    # and the reflected one would be at right angles.
+    cosine = 1 / np.hypot(1, 1.5)
+    reflectance, refracted = fresnel(np.array([cosine]), 1.5)
+    assert refracted == pytest.approx(np.sqrt(1 - cosine**2))
+    assert reflectance == pytest.approx(0.5 * ((1 - 1.5**2) / (1 + 1.5**2)) ** 2)
+
+
+def test_a_surface_reflects_alike_from_both_sides() -> None:
+    cosine = np.linspace(0.01, 1, 50)
+    reflectance, refracted = fresnel(cosine, 1.5)
+    back, through = fresnel(refracted, 1 / 1.5)
+    np.testing.assert_allclose(back, reflectance, rtol=1e-9)
+    np.testing.assert_allclose(through, cosine, rtol=1e-9)
+
+
+def test_total_reflection_keeps_all_the_light() -> None:
+    critical = np.sqrt(1 - (1 / 1.5) ** 2)
+    reflectance, refracted = fresnel(np.linspace(0.001, critical - 1e-9, 50), 1 / 1.5)
+    np.testing.assert_array_equal(reflectance, 1)
+    np.testing.assert_array_equal(refracted, 0)
+
+
+def test_a_bubble_reflects_all_beyond_the_critical_angle() -> None:
+    scene = glass_ball(61, 61, monitor=(96, 96), rays=4, index=0.75)
+    offset = np.abs(np.arange(61) - 30) * 2 / 61 / 0.85 / np.sqrt(CAMERA**2 - 1)
+    sine = CAMERA * offset / np.hypot(1, offset)
+    total = (sine > 0.75 + 0.04) & (sine < 1 - 0.04)
+    assert np.count_nonzero(total) >= 6
+    np.testing.assert_array_equal(scene.rho[30][total], 0)
+    assert np.all(scene.rho[30][sine < 0.3] > 0.9)
+
+
+def test_a_ball_of_no_refraction_is_not_seen() -> None:
+    clear = glass_ball(48, 36, monitor=(960, 720), rays=16, index=1.0)
+    np.testing.assert_allclose(clear.rho, 1, atol=1e-6)
+    assert clear.coverage.max() == 1
+    x = (np.arange(48) + 0.5 - 24) * (960 / 48 / 1.5)
+    seen = centroids(clear)
+    np.testing.assert_allclose(seen[..., 0], np.broadcast_to(x, (36, 48)), atol=1.5)
+    np.testing.assert_allclose(seen[..., 1], np.broadcast_to(x[6:42, None], (36, 48)), atol=1.5)
+
+
+def test_no_light_is_made(ball: Scene) -> None:
+    assert ball.rho.shape == (36, 48, 3)
+    assert ball.rho.dtype == np.float32
+    assert ball.rho.max() <= 1 + 1e-6
+    np.testing.assert_allclose(ball.rho[ball.coverage == 0], 1, atol=1e-6)
+    assert ball.rho[ball.coverage == 1].max() < 0.93
+    assert ball.coverage[18, 24] == 1
+    assert 0.5 < np.count_nonzero(ball.object_mask) / np.count_nonzero(ball.coverage > 0.5) <= 1
+    assert not np.any(ball.object_mask & (ball.coverage <= 0.5))
+
+
+@pytest.mark.parametrize("bounces", [0, 8])
+def test_the_middle_transmits_what_fresnel_says(bounces: int) -> None:
+    scene = glass_ball(61, 61, monitor=(96, 96), rays=4, index=1.6, bounces=bounces)
+    reflectance = (0.6 / 2.6) ** 2
+    # Light passes two surfaces; of every two inner reflections the remainder leaves forward again:
+    # (1 - R)^2 (1 + R^2 + R^4 + ...) = (1 - R) / (1 + R).
+    forward = (1 - reflectance) / (1 + reflectance) if bounces else (1 - reflectance) ** 2
+    np.testing.assert_allclose(scene.rho[30, 30], forward, rtol=1e-5)
+
+
+def test_a_tint_follows_beer_and_lambert() -> None:
+    clear = glass_ball(61, 61, monitor=(96, 96), rays=4, bounces=0)
+    tinted = glass_ball(61, 61, monitor=(96, 96), rays=4, bounces=0, absorption=(0.0, 0.2, 0.5))
+    left = tinted.rho[30, 30] / clear.rho[30, 30]
+    np.testing.assert_allclose(left, np.exp([0.0, -0.4, -1.0]), rtol=1e-3)
+    assert clear.transport[0] is clear.transport[2]
+    assert tinted.transport[0] is not tinted.transport[2]
+
+
+def test_a_ball_inverts_what_is_behind_it() -> None:
+    scene = glass_ball(61, 61, monitor=(480, 480), rays=16)
+    seen = centroids(scene)
+    np.testing.assert_allclose(seen[30, 30], 0, atol=2)
+    assert seen[30, 24, 0] > 5
+    assert seen[30, 36, 0] < -5
+    assert seen[24, 30, 1] > 5
+    assert seen[36, 30, 1] < -5
+    assert seen[30, 1, 0] < -100
+    assert seen[1, 30, 1] < -100
+
+
+def test_near_the_axis_a_ball_is_the_ball_lens() -> None:
+    size = {"width": 161, "height": 121, "monitor": (6400, 4800), "rays": 64, "bounces": 0}
+    index = (1.45, 1.5, 1.55)
+    scene, bare = glass_ball(index=index, **size), glass_ball(index=1.0, **size)  # type: ignore[arg-type]
+    direct = centroids(bare)[60, 83, 0]
+    for channel, n in enumerate(index):
+        # A thin lens of focal length n / (2 (n - 1)) radii at the ball's centre.
+        focal = n / (2 * (n - 1))
+        magnified = (CAMERA + MONITOR * (1 - CAMERA / focal)) / (CAMERA + MONITOR)
+        seen = centroids(scene, channel)[60, 83, 0]
+        assert seen / direct == pytest.approx(magnified, rel=0.02)
+
+
+def test_off_the_axis_a_ray_is_turned_twice() -> None:
+    scene = glass_ball(101, 101, monitor=(3000, 3000), rays=64, bounces=0)
+    slope = (np.arange(51, 101) - 50) * 2 / 101 / 0.85 / np.sqrt(CAMERA**2 - 1)
+    angle = np.arctan(slope)
+    distance = CAMERA * np.sin(angle)
+    inner = distance < 0.8
+    angle, distance = angle[inner], distance[inner]
+    # The ray leaves at its old distance from the ball's centre, turned by twice the difference of its angles.
+    turned = angle - 2 * (np.arcsin(distance) - np.arcsin(distance / 1.5))
+    landing = (distance + MONITOR * np.sin(turned)) / np.cos(turned)
+    radius = 1500 / (1.5 * (CAMERA + MONITOR) / 0.85 / np.sqrt(CAMERA**2 - 1))
+    np.testing.assert_allclose(centroids(scene)[50, 51:, 0][inner], landing * radius, atol=1)
+
+
+def test_a_constant_backdrop_arrives_by_rho(ball: Scene) -> None:
+    for shape in ((1, 1, 3), (5, 7, 1), (72, 96, 3), (90, 200, 3)):
+        arriving = ball.composite(np.full(shape, 0.7, np.float32))
+        assert arriving.dtype == np.float32
+        np.testing.assert_allclose(arriving, 0.7 * ball.rho, atol=1e-6)
+
+
+def test_a_composite_is_the_transport_of_the_backdrop(ball: Scene) -> None:
+    light = backdrop(96, 72)
+    plain = np.stack([ball.transport[c].toarray() @ light[..., c].ravel() for c in range(3)], axis=1)
+    np.testing.assert_allclose(ball.composite(light).reshape(-1, 3), plain, atol=1e-5)
+    truth = ball.truth(light, offset=0.1, gain=0.5)
+    assert truth.dtype == np.float32
+    np.testing.assert_allclose(truth.reshape(-1, 3), 0.1 + 0.5 * plain, atol=1e-5)
+
+
+def test_a_frame_without_noise_is_the_transport_of_the_pattern(ball: Scene, program: Program) -> None:
+    frames = list(ball.film(program, offset=0.05, gain=0.8, noise=0, depth=16))
+    assert len(frames) == program.count
+    x, y = np.arange(96), np.arange(72)[:, None]
+    for n, frame in enumerate(frames):
+        assert frame.shape == (36, 48, 3)
+        assert frame.dtype == np.uint16
+        (shown,) = program.values(n, n + 1)
+        rows, columns, channels = shown.shape
+        on = np.broadcast_to(shown[y * rows // 72, x * columns // 96], (72, 96, channels))
+        light = [ball.transport[c] @ on[..., min(c, channels - 1)].ravel() for c in range(3)]
+        value = 0.05 + 0.8 * np.stack(light, axis=1).reshape(36, 48, 3)
+        np.testing.assert_allclose(frame / 65535, value, atol=0.51 / 65535)
+
+
+def test_curves_of_monitor_and_camera_are_followed(ball: Scene) -> None:
+    def one(response: str) -> Program:
+        part = {"kind": "constant", "levels": [0, 0.5]}
+        image = {"kind": "images", "files": ["a.png"]}
+        monitor = {"width": 96, "height": 72, "response": response}
+        return Program.model_validate({"monitor": monitor, "parts": [part, image]})
+
+    picture = np.linspace(0, 1, 7 * 9, dtype=np.float32).reshape(7, 9, 1)
+    frames = list(ball.film(one("srgb"), noise=0, depth=16, response="srgb", images=[picture]))
+    values = [to_light((f / 65535).astype(np.float32), "srgb") for f in frames]
+    np.testing.assert_allclose(values[1], 0.02 + 0.9 * 0.21404 * ball.rho, atol=3e-5)
+    np.testing.assert_allclose(values[2], ball.truth(to_light(picture, "srgb")), atol=3e-5)
+    unknown = list(ball.film(one("unknown"), noise=0, depth=16, response="srgb", images=[picture]))
+    np.testing.assert_array_equal(unknown, frames)
+
+
+def test_noise_is_the_sensors() -> None:
+    scene = glass_ball(8, 6, monitor=(8, 6), rays=1, index=1.0)
+    levels = (0.0,) * 1000 + (0.5,) * 1000
+    parts = (
+        Constant(kind="constant", levels=levels),
+        Bernoulli(kind="bernoulli", columns=2, rows=2, count=1, seed=0),
+    )
+    program = Program(monitor=Monitor(width=8, height=6), parts=parts)
+    frames = np.array(list(scene.film(program, noise=2.0, depth=16)), np.float64)[:2000] / 65535
+    for level, some in ((0.0, frames[:1000]), (0.5, frames[1000:])):
+        value = 0.02 + 0.9 * level
+        deviation = 2 * (0.002 + 0.006 * np.sqrt(value))
+        assert some.mean() == pytest.approx(value, abs=5 * deviation / np.sqrt(some.size))
+        assert some.std() == pytest.approx(deviation, rel=0.02)
+        assert abs(np.corrcoef(some[:-1].ravel(), some[1:].ravel())[0, 1]) < 0.02
+
+
+def test_the_seed_decides_everything(program: Program) -> None:
+    def capture(seed: int) -> bytes:
+        scene = glass_ball(24, 18, monitor=(96, 72), rays=4, seed=seed)
+        target = io.BytesIO()
+        write_capture(scene, program, target, mask=True, seed=seed)
+        return target.getvalue()
+
+    assert capture(1) == capture(1)
+    assert capture(1) != capture(2)
+
+
+@pytest.mark.parametrize(("depth", "dtype"), [(8, np.uint8), (16, np.uint16)])
+def test_a_capture_holds_what_its_format_says(
+    ball: Scene, program: Program, tmp_path: Path, depth: int, dtype: type
+) -> None:
+    image = np.linspace(0, 1, 24, dtype=np.float32).reshape(2, 4, 3)
+    parts = (*program.parts, Images(kind="images", files=("shown/one.png", "two.png")))
+    program = Program(monitor=program.monitor, parts=parts)
+    options = {"depth": depth, "response": "srgb", "noise": 0.5, "images": (image, image[:, :, :1])}
+    path = tmp_path / "ball.zip"
+    count = write_capture(ball, program, path, mask=True, name="ball", **options)  # type: ignore[arg-type]
+    filmed = list(ball.film(program, **options))  # type: ignore[arg-type]
+    assert count == program.count == len(filmed)
+    with zipfile.ZipFile(path) as archive:
+        record = json.loads(archive.read("capture.json"))
+        assert record["format"] == "envmatte-capture/1"
+        assert record["name"] == "ball"
+        assert record["response"] == "srgb"
+        assert Program.model_validate(record["program"]) == program
+        assert [frame["pattern"] for frame in record["frames"]] == list(range(count))
+        names = [frame["file"] for frame in record["frames"]]
+        assert names[:2] == ["frames/00000.png", "frames/00001.png"]
+        others = {"capture.json", "mask.png", "shown/one.png", "two.png"}
+        assert set(archive.namelist()) == {*names, *others}
+        assert all(entry.compress_type == zipfile.ZIP_STORED for entry in archive.infolist())
+        for name, frame in zip(names, filmed, strict=True):
+            stored = imagecodecs.png_decode(archive.read(name))
+            assert stored.dtype == dtype
+            np.testing.assert_array_equal(stored, frame)
+        mask = imagecodecs.png_decode(archive.read("mask.png"))
+        np.testing.assert_array_equal(mask, np.where(ball.object_mask, 255, 0))
+        one, two = (
+            imagecodecs.png_decode(archive.read(name)) / 65535 for name in ("shown/one.png", "two.png")
+        )
+        np.testing.assert_allclose(one, image, atol=1e-5)
+        np.testing.assert_allclose(two, image[:, :, 0], atol=1e-5)
+
+
+def test_what_does_not_fit_is_refused_and_nothing_written(
+    ball: Scene, program: Program, tmp_path: Path
+) -> None:
+    path = tmp_path / "ball.zip"
+    with pytest.raises(OptionError, match="monitor of another size"):
+        write_capture(ball, nested_program((64, 48), ((8, 6, 2),)), path)
+    with pytest.raises(OptionError, match="shows 0 images, 1 are given"):
+        write_capture(ball, program, path, images=(np.ones((2, 2, 1), np.float32),))
+    assert not path.exists()
+    with pytest.raises(OptionError, match="no square grid"):
+        glass_ball(rays=50)
+
+
+def test_the_demos_program_nests() -> None:
+    program = nested_program()
+    assert program.count == 8 + 24 + 24 + 24 + 26 + 26
+    grids = [(part.columns, part.rows) for part in program.parts if isinstance(part, Bernoulli)]
+    assert all(fine[i] % coarse[i] == 0 for coarse, fine in pairwise(grids) for i in (0, 1))
+    assert program.constants[1][0, 0] == 0
+    assert program.constants[1][-1, 0] == 1
+
+
+def test_the_backdrop_is_light_of_many_colours() -> None:
+    light = backdrop(320, 240, seed=1)
+    assert light.shape == (240, 320, 3)
+    assert light.dtype == np.float32
+    assert light.min() >= 0
+    assert light.max() <= 1
+    assert light.std(axis=(0, 1)).min() > 0.15
+    np.testing.assert_array_equal(light, backdrop(320, 240, seed=1))
+    assert np.any(light != backdrop(320, 240, seed=2))

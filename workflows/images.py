@@ -1,0 +1,138 @@
+"""Image files to arrays and back: PNG, TIFF and JPEG, whoever made them."""
+
+import io
+import warnings
+
+import imagecodecs
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+from PIL import Image
+
+from storage.errors import ImageError
+
+Codes = NDArray[np.unsignedinteger]
+"""Values as a file stores them: uint8 or uint16."""
+READ = ("PNG", "TIFF", "JPEG")
+LOSSLESS = {
+    tifffile.COMPRESSION.NONE,
+    tifffile.COMPRESSION.LZW,
+    tifffile.COMPRESSION.ADOBE_DEFLATE,
+    tifffile.COMPRESSION.DEFLATE,
+    tifffile.COMPRESSION.PACKBITS,
+    tifffile.COMPRESSION.LZMA,
+    tifffile.COMPRESSION.ZSTD,
+}
+"""Compressions of TIFF that tifffile undoes within the size that the header gives."""
+PLAIN = {tifffile.PHOTOMETRIC.MINISWHITE, tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB}
+"""What the values of a TIFF mean, where they can be taken as they are."""
+
+
+def decode(data: bytes, *, memory: int, formats: tuple[str, ...] = READ) -> Codes:
+    """Decode an image.
+
+    Parameters
+    ----------
+    data : bytes
+    memory : int
+        Bytes that the decoded image may take; checked in the header, before anything is decoded.
+    formats : tuple of str
+        What is taken, out of `READ`.
+
+    Returns
+    -------
+    (height, width, 1 or 3) uint8 or uint16
+        Grey or RGB; an alpha channel is dropped, a palette looked up.
+
+    Raises
+    ------
+    ImageError
+        If it is none of the formats, is damaged, too large, or has values of another type or another number
+        of channels.
+    """
+    try:
+        with warnings.catch_warnings():
+            # Pillow warns of sizes that it finds suspicious; ours is the limit that counts, below.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            picture = Image.open(io.BytesIO(data), formats=formats)
+    except Image.DecompressionBombError as error:
+        raise ImageError(f"the image is too large: {error}", limit=memory) from error
+    except Exception as error:  # what a decoder raises on damaged bytes is not a closed set
+        raise ImageError(f"this is no {' or '.join(formats)} image that can be read") from error
+    if picture.format == "PNG" and getattr(picture, "is_animated", False):
+        raise ImageError("this PNG is animated: one picture a file")
+    try:
+        pixels = _pixels(data, picture, memory)
+    except ImageError:
+        raise
+    except Exception as error:
+        raise ImageError(f"the {picture.format} image is cut off or damaged: {error}") from error
+    if pixels.dtype not in (np.uint8, np.uint16) or pixels.ndim != 3 or pixels.shape[2] not in (1, 2, 3, 4):
+        raise ImageError(
+            f"{picture.format} images are read as grey or RGB with 8 or 16 bits a channel; "
+            f"this one has {pixels.dtype} values in the shape {pixels.shape}"
+        )
+    channels = 3 if pixels.shape[2] > 2 else 1
+    return np.ascontiguousarray(pixels[:, :, :channels])
+
+
+def _pixels(data: bytes, picture: Image.Image, memory: int) -> NDArray[np.generic]:
+    if picture.format == "TIFF":
+        array = _tiff(data, picture, memory)
+    elif picture.format == "PNG" and data[24] == 16:  # the bit depth in IHDR (PNG, sect. 11.2.1)
+        _see_that_it_fits(picture, 2 * len(picture.getbands()), memory)
+        array = imagecodecs.png_decode(data)  # Pillow would halve the bits
+    else:
+        array = _by_pillow(picture, memory)
+    return array if array.ndim == 3 else array[..., np.newaxis]
+
+
+def _tiff(data: bytes, picture: Image.Image, memory: int) -> NDArray[np.generic]:
+    with tifffile.TiffFile(io.BytesIO(data)) as file:
+        page = file.pages[0]
+        if page.compression not in LOSSLESS or page.photometric not in PLAIN or page.bitspersample == 1:
+            return _by_pillow(picture, memory)  # knows them all, but halves the 16 bits of the plain ones
+        if page.bitspersample not in (8, 16) or page.axes not in ("YX", "YXS", "SYX"):
+            raise ImageError(
+                "TIFF images are read as grey or RGB with 8 or 16 bits a channel; "
+                f"this one has {page.bitspersample} bits and the axes {page.axes}"
+            )
+        _see_that_it_fits(picture, -(-page.nbytes // (picture.width * picture.height)), memory)
+        array = np.asarray(page.asarray())
+        if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
+            array = np.invert(array)
+        return np.moveaxis(array, 0, -1) if page.axes == "SYX" else array
+
+
+def _by_pillow(picture: Image.Image, memory: int) -> NDArray[np.uint8]:
+    if picture.mode not in ("1", "P", "L", "LA", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr"):
+        raise ImageError(f"{picture.format} images are not read with values of the kind {picture.mode!r}")
+    as_it_is = picture.mode in ("L", "LA", "RGB", "RGBA")
+    _see_that_it_fits(picture, len(picture.getbands()) if as_it_is else 3, memory)
+    picture.info.pop("transparency", None)  # of a palette: dropped like an alpha channel
+    return np.asarray(picture if as_it_is else picture.convert("RGB"))
+
+
+def _see_that_it_fits(picture: Image.Image, pixel: int, memory: int) -> None:
+    if picture.width * picture.height * pixel > memory:
+        raise ImageError(
+            f"an image of {picture.width} x {picture.height} pixels takes more than the {memory} bytes "
+            "allowed for one",
+            limit=memory,
+        )
+
+
+def encode_png(pixels: Codes) -> bytes:
+    """A PNG of (height, width, 1 to 4) uint8 or uint16 values."""
+    return bytes(imagecodecs.png_encode(np.ascontiguousarray(pixels)))
+
+
+def to_unit(pixels: Codes) -> NDArray[np.float32]:
+    """Unsigned integers as float32, 0 to 1."""
+    return pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
+
+
+def to_integers(values: NDArray[np.float32], dtype: np.dtype[np.unsignedinteger]) -> Codes:
+    """Values as unsigned integers of a type: clipped to 0 to 1, rounded."""
+    scaled: Codes = np.rint(np.clip(values, 0, 1) * np.float32(np.iinfo(dtype).max)).astype(dtype)
+    return scaled

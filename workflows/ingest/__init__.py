@@ -1,0 +1,1 @@
+"""From a bundle, the archive that a user uploads, to a frame stack."""

@@ -1,0 +1,210 @@
+"""A bundle: the ZIP of a capture and its capture.json, format envmatte-capture/1, checked as hostile."""
+
+import stat
+import struct
+import zipfile
+import zlib
+from dataclasses import dataclass
+from typing import BinaryIO, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from storage.errors import CaptureError
+from workflows.program import Images, Program
+from workflows.tone import Response
+
+MANIFEST = "capture.json"
+MANIFEST_BYTES = 32 << 20
+ENTRIES = 250_000
+
+
+class Frame(BaseModel):
+    """One frame: its image file in the bundle, and the pattern it saw."""
+
+    model_config = ConfigDict(frozen=True)
+    file: str
+    pattern: int = Field(ge=0)
+
+
+class Manifest(BaseModel):
+    """capture.json."""
+
+    model_config = ConfigDict(frozen=True)
+    format: Literal["envmatte-capture/1"]
+    name: str = Field(default="", max_length=200)
+    program: Program
+    response: Response = "unknown"
+    frames: tuple[Frame, ...] = ()
+    video: dict[str, object] | None = None
+    mask: str | None = None
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a bundle may cost whoever reads it.
+
+    Attributes
+    ----------
+    unpacked : int
+        Bytes of all its entries together.
+    memory : int
+        Bytes that one reader may hold; an entry, or an image decoded, may take a quarter of it.
+    """
+
+    unpacked: int
+    memory: int
+
+    @property
+    def image(self) -> int:
+        """Bytes that one entry, and one decoded image, may take."""
+        return self.memory // 4
+
+
+class Bundle:
+    """An opened bundle.
+
+    Parameters
+    ----------
+    file : BinaryIO
+        Seekable.
+    limits : Limits
+
+    Raises
+    ------
+    CaptureError
+        Naming the entry, and the field of capture.json, that is wrong and why.
+    """
+
+    def __init__(self, file: BinaryIO, limits: Limits) -> None:
+        self._limits = limits
+        try:
+            self._archive = zipfile.ZipFile(file)
+        except (zipfile.BadZipFile, struct.error, ValueError, OSError, NotImplementedError) as error:
+            raise CaptureError(
+                "this is no ZIP archive, or it is cut off: its directory can't be read. Make it again, and "
+                "see that all of it is sent"
+            ) from error
+        self._entries: dict[str, zipfile.ZipInfo] = {}
+        self._check_directory()
+        self.manifest = self._read_manifest()
+        self._check_manifest()
+
+    def read(self, entry: str) -> bytes:
+        """The bytes of an entry.
+
+        Raises
+        ------
+        CaptureError
+            If it is not there, too large, or damaged.
+        """
+        info = self._entries.get(entry)
+        if info is None:
+            raise CaptureError(f"{entry} is not in the archive", entry=entry)
+        if info.file_size > self._limits.image:
+            raise CaptureError(
+                f"{entry} unpacks to {info.file_size} bytes, more than the {self._limits.image} allowed for one",
+                entry=entry,
+                limit=self._limits.image,
+            )
+        try:
+            # Not ZipFile.read, which unpacks all there is before it looks at the size that the directory gives.
+            with self._archive.open(info) as file:
+                return file.read(info.file_size)
+        except (
+            zipfile.BadZipFile,
+            zlib.error,
+            struct.error,
+            EOFError,
+            OSError,
+            ArithmeticError,
+            ValueError,
+            RuntimeError,
+        ) as error:
+            raise CaptureError(f"{entry} is damaged in the archive: {error}", entry=entry) from error
+
+    def _check_directory(self) -> None:
+        infos = self._archive.infolist()
+        if len(infos) > ENTRIES:
+            raise CaptureError(f"the archive has {len(infos)} entries, more than {ENTRIES}", limit=ENTRIES)
+        total = 0
+        for info in infos:
+            name = info.filename
+            if name.startswith(("/", "\\")) or ":" in name or ".." in name.replace("\\", "/").split("/"):
+                raise CaptureError(f"{name!r} leaves the archive: use plain relative names", entry=name)
+            if stat.S_ISLNK(info.external_attr >> 16):
+                raise CaptureError(f"{name!r} is a link: put the file itself in the archive", entry=name)
+            if info.flag_bits & 1:
+                raise CaptureError(f"{name!r} is encrypted", entry=name)
+            if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                # bzip2 and LZMA unpack in zipfile without bounds.
+                raise CaptureError(
+                    f"{name!r} is packed by a method other than deflate: store or deflate the entries",
+                    entry=name,
+                )
+            if name in self._entries:
+                raise CaptureError(f"{name!r} is in the archive twice", entry=name)
+            self._entries[name] = info
+            total += info.file_size
+        if total > self._limits.unpacked:
+            raise CaptureError(
+                f"the archive unpacks to {total} bytes, more than the {self._limits.unpacked} allowed",
+                limit=self._limits.unpacked,
+            )
+
+    def _read_manifest(self) -> Manifest:
+        info = self._entries.get(MANIFEST)
+        if info is None:
+            raise CaptureError(f"there is no {MANIFEST} at the root of the archive", entry=MANIFEST)
+        if info.file_size > MANIFEST_BYTES:
+            raise CaptureError(
+                f"{MANIFEST} is larger than {MANIFEST_BYTES} bytes", entry=MANIFEST, limit=MANIFEST_BYTES
+            )
+        try:
+            return Manifest.model_validate_json(self.read(MANIFEST))
+        except ValidationError as error:
+            first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+            field = ".".join(str(part) for part in first["loc"])
+            what = first["msg"].removeprefix("Value error, ")
+            raise CaptureError(
+                f"{MANIFEST}: {field + ': ' if field else ''}{what}", entry=MANIFEST, field=field
+            ) from error
+
+    def _check_manifest(self) -> None:
+        manifest = self.manifest
+        if manifest.video is not None:
+            raise CaptureError(
+                "this version reads image frames, not video: give `frames`, one image a pattern",
+                entry=MANIFEST,
+                field="video",
+            )
+        if not manifest.frames:
+            raise CaptureError(f"{MANIFEST} names no frames", entry=MANIFEST, field="frames")
+        count = manifest.program.count
+        files = [(f"frames.{n}.file", frame.file) for n, frame in enumerate(manifest.frames)]
+        if manifest.mask is not None:
+            files.append(("mask", manifest.mask))
+        for at, part in enumerate(manifest.program.parts):
+            if isinstance(part, Images):
+                files += [(f"program.parts.{at}.files.{n}", name) for n, name in enumerate(part.files)]
+        for field, name in files:
+            if name not in self._entries or self._entries[name].is_dir():
+                raise CaptureError(
+                    f"{MANIFEST} names {name!r}, which is not in the archive", entry=name, field=field
+                )
+        for n, frame in enumerate(manifest.frames):
+            if frame.pattern >= count:
+                raise CaptureError(
+                    f"{frame.file} saw pattern {frame.pattern}, but the program's patterns are 0 to {count - 1}",
+                    entry=frame.file,
+                    field=f"frames.{n}.pattern",
+                )
+        seen = np.zeros(count, bool)
+        seen[[frame.pattern for frame in manifest.frames]] = True
+        if not seen.all():
+            missing = np.flatnonzero(~seen)
+            raise CaptureError(
+                f"{len(missing)} of {count} patterns have no frame, the first of them pattern {missing[0]}",
+                entry=MANIFEST,
+                field="frames",
+            )

@@ -1,0 +1,166 @@
+"""The ingest of a capture: frames are read one at a time and written, a slab of them at once, into the stack."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import TypeAdapter
+
+from storage.captures import Stack, create_stack, upload_path, write_slab
+from storage.errors import CaptureError, ImageError
+from storage.objects import Objects
+from workflows import images
+from workflows.ingest.bundle import Bundle, Limits
+from workflows.program import Images, Program, smallest_grid
+from workflows.recovery.photometry import estimate_noise
+from workflows.tone import Curve, Response, estimate, table, to_light
+
+FORMATS = ("PNG", "TIFF")
+SAMPLES = 20_000
+"""Pixels, about, from which the noise and unknown curves are measured."""
+
+
+def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, int]:
+    """Look into the bundle of a capture and make its empty stack.
+
+    Returns
+    -------
+    dict
+        ``tiles``: the number of slabs; ``width``, ``height``.
+
+    Raises
+    ------
+    CaptureError
+    """
+    with objects.read(upload_path(capture)) as file:
+        bundle = Bundle(file, limits)
+        manifest = bundle.manifest
+        first = _decode(bundle, manifest.frames[0].file, limits)
+        mask = None
+        if manifest.mask is not None:
+            mask = np.any(_decode(bundle, manifest.mask, limits), axis=2)
+            if mask.shape != first.shape[:2]:
+                raise CaptureError(
+                    f"{manifest.mask} is {_size(mask)}, the frames are {_size(first)}", entry=manifest.mask
+                )
+        names = [n for part in manifest.program.parts if isinstance(part, Images) for n in part.files]
+        patterns: list[NDArray[np.float32]] = []
+        for name in names:
+            patterns.append(images.to_unit(smallest_grid(_decode(bundle, name, limits))))
+            if sum(pattern.nbytes for pattern in patterns) > limits.memory // 2:
+                raise CaptureError(
+                    f"the patterns that come as images take more than {limits.memory // 2} bytes together, from "
+                    f"{name} on: use fewer, smaller or coarser ones",
+                    entry=name,
+                    limit=limits.memory // 2,
+                )
+    height, width, channels = first.shape
+    slab = create_stack(
+        objects,
+        capture,
+        (len(manifest.frames), height, width, channels),
+        first.dtype,
+        memory=limits.memory,
+        attributes={
+            "program": manifest.program.model_dump(mode="json"),
+            "response": TypeAdapter(Response).dump_python(manifest.response, mode="json"),
+            "patterns": [frame.pattern for frame in manifest.frames],
+        },
+        mask=mask,
+        images=patterns,
+    )
+    return {"tiles": -(-len(manifest.frames) // slab), "slab": slab, "width": width, "height": height}
+
+
+def read_slab(objects: Objects, capture: str, limits: Limits, slab: int, index: int) -> int:
+    """Decode the frames of slab ``index``, of ``slab`` frames, into the stack; returns their pixels.
+
+    Raises
+    ------
+    CaptureError
+        Naming the frame that can't be decoded, or is of another size or kind than the first.
+    """
+    stack = Stack(objects, capture)
+    with objects.read(upload_path(capture)) as file:
+        bundle = Bundle(file, limits)
+        of_slab = bundle.manifest.frames[index * slab : (index + 1) * slab]
+        shape = (stack.height, stack.width, stack.channels)
+        frames = np.empty((len(of_slab), *shape), stack.dtype)
+        for n, frame in enumerate(of_slab):
+            pixels = _decode(bundle, frame.file, limits)
+            if pixels.shape != shape or pixels.dtype != stack.dtype:
+                raise CaptureError(
+                    f"{frame.file} is {_size(pixels)} with {pixels.shape[2]} channels of {pixels.dtype}, the first "
+                    f"frame {stack.width} x {stack.height} with {stack.channels} of {stack.dtype}: all frames must "
+                    "be of one size and kind",
+                    entry=frame.file,
+                )
+            frames[n] = pixels
+    write_slab(objects, capture, index * slab, frames)
+    return int(frames.shape[0] * frames.shape[1] * frames.shape[2])
+
+
+def measure(objects: Objects, capture: str) -> None:
+    """Measure the noise, and the curves that the capture calls unknown, from frames of constant levels.
+
+    Raises
+    ------
+    Corrupt
+        If part of the stack is missing.
+    """
+    stack = Stack(objects, capture)
+    stack.check()
+    program = Program.model_validate(stack.attributes["program"])
+    patterns = np.array(stack.attributes["patterns"])
+    numbers, sent = program.constants
+    codes = np.stack([_sample(stack, int(np.flatnonzero(patterns == n)[0])) for n in numbers], axis=1)
+    top = np.iinfo(stack.dtype).max
+    usable = (codes > 0) & (codes < top)
+
+    whole = usable.all(axis=(1, 2))
+    values = codes[whole].astype(np.float32) / np.float32(top)
+    grey = np.ptp(sent, axis=1) == 0
+    monitor, camera = estimate(
+        sent[grey, 0],
+        values[:, grey].transpose(1, 0, 2).reshape(int(grey.sum()), -1),
+        program.monitor.response,
+        TypeAdapter(Response).validate_python(stack.attributes["response"]),
+    )
+    look_up = table(camera, stack.dtype)
+    noise = estimate_noise(look_up[codes], to_light(sent, monitor), usable, 1 / top)
+    stack.annotate(
+        monitor_curve=_plain(monitor),
+        camera_curve=_plain(camera),
+        noise={"read": noise.read, "shot": noise.shot},
+    )
+
+
+def _sample(stack: Stack, frame: int) -> NDArray[Any]:
+    """(n, 3) values of a frame at pixels spread over it: whole chunks, so that few are read."""
+    rows, columns = (_spread(n) for n in (stack.height, stack.width))
+    parts = [
+        stack.read(y, x, slice(frame, frame + 1)).reshape(-1, stack.channels) for y in rows for x in columns
+    ]
+    pixels = np.concatenate(parts)
+    return np.broadcast_to(pixels, (len(pixels), 3))
+
+
+def _spread(n: int) -> list[slice]:
+    """At most four short runs of pixels, spread over n."""
+    length = max(1, min(n // 4, int(SAMPLES**0.5) // 4))
+    return [slice(start, start + length) for start in sorted({n * k // 4 for k in range(4)})]
+
+
+def _decode(bundle: Bundle, entry: str, limits: Limits) -> images.Codes:
+    try:
+        return images.decode(bundle.read(entry), memory=limits.image, formats=FORMATS)
+    except ImageError as error:
+        raise CaptureError(f"{entry}: {error.detail}", entry=entry, **error.fields) from error
+
+
+def _size(pixels: NDArray[np.generic]) -> str:
+    return f"{pixels.shape[1]} x {pixels.shape[0]}"
+
+
+def _plain(curve: Curve) -> Any:
+    return TypeAdapter(Curve).dump_python(curve, mode="json")

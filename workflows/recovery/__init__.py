@@ -1,0 +1,1 @@
+"""Pixel recovery: arrays in, arrays out."""

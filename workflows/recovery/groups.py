@@ -1,0 +1,189 @@
+"""Sparse rows of cells on a grid: their neighbours, and the step from a grid to the next finer one."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from workflows.recovery.sensing import Level
+from workflows.recovery.transport import Transport, ragged_entries
+
+# What a neighbour counts in a cell's group, beside the cell's own 1.
+NEIGHBOUR_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Sparse rows while they are being solved for, one for each problem.
+
+    Attributes
+    ----------
+    begin : (n + 1,) int64
+        Row p has the entries ``begin[p]`` to ``begin[p + 1] - 1``.
+    cell : (begin[n],) int32
+        Cells ``row * columns + column``, ascending within a row.
+    weight : (begin[n],) float32
+        Weights, zero or more; solvers write here.
+    """
+
+    begin: NDArray[np.int64]
+    cell: NDArray[np.int32]
+    weight: NDArray[np.float32]
+
+    @classmethod
+    def whole(cls, n: int, level: Level) -> Self:
+        """Rows that hold every cell of a level, all of weight 0."""
+        cells = level.columns * level.rows
+        return cls(
+            np.arange(n + 1) * cells,
+            np.tile(np.arange(cells, dtype=np.int32), n),
+            np.zeros(n * cells, np.float32),
+        )
+
+    def take(self, index: NDArray[np.integer]) -> Self:
+        """Copies of the given rows, in the given order."""
+        sizes = np.diff(self.begin)[index]
+        entries = ragged_entries(self.begin[:-1][index], sizes)
+        return type(self)(
+            np.concatenate([np.zeros(1, np.int64), np.cumsum(sizes)]),
+            self.cell[entries],
+            self.weight[entries],
+        )
+
+    def split(self, parent: Level, child: Level, least_group: float, reach: int) -> Self:
+        """Prune, widen by the neighbours, and split every cell into its children.
+
+        Parameters
+        ----------
+        parent, child : Level
+            The level of these rows, and the next finer one.
+        least_group : float
+            A cell is kept if its weight plus half of its eight neighbours' is more than this.
+        reach : int
+            Cells at up to this distance of a kept one, diagonals too, are added with their own weight.
+
+        Returns
+        -------
+        Rows
+            On the finer grid; a child has an equal share of its parent's weight.
+        """
+        return type(self)(
+            *split_cells(
+                self.begin,
+                self.cell,
+                self.weight,
+                parent.columns,
+                parent.rows,
+                child.columns // parent.columns,
+                child.rows // parent.rows,
+                least_group,
+                reach,
+            )
+        )
+
+    def transport(self, level: Level, index: NDArray[np.integer]) -> Transport:
+        """Transport of n pixels from ``index (n, 3)``, the row of each channel; -1 gives an empty one."""
+        wanted = index.ravel()
+        found = self.take(wanted[wanted >= 0])
+        count = np.zeros(wanted.size, np.int64)
+        count[wanted >= 0] = np.diff(found.begin)
+        return Transport.from_rows(
+            level.columns, level.rows, count.reshape(index.shape), found.cell, found.weight
+        )
+
+
+@njit(nogil=True, cache=True)
+def group_sums(
+    cell: NDArray[np.int32],
+    value: NDArray[np.float32],
+    columns: int,
+    field: NDArray[np.float32],
+    out: NDArray[np.float32],
+) -> None:
+    """Write each cell's value plus half of its eight neighbours'.
+
+    Parameters
+    ----------
+    cell : (s,) int32
+        Cells ``row * columns + column``.
+    value : (s,) float32
+        Their values; a cell that is not listed has 0.
+    columns : int
+        Columns of the grid.
+    field : (rows + 2, columns + 2) float32
+        Working space, all zero before and after.
+    out : (s,) float32
+        Written.
+    """
+    share = np.float32(NEIGHBOUR_SHARE)
+    for e in range(cell.size):
+        r, c = divmod(cell[e], columns)
+        field[r + 1, c + 1] = value[e]
+    for e in range(cell.size):
+        r, c = divmod(cell[e], columns)
+        around = np.float32(0)
+        for v in range(r, r + 3):
+            around += field[v, c] + field[v, c + 1] + field[v, c + 2]
+        out[e] = value[e] + share * (around - value[e])
+    for e in range(cell.size):
+        r, c = divmod(cell[e], columns)
+        field[r + 1, c + 1] = 0
+
+
+@njit(nogil=True, cache=True)
+def split_cells(
+    begin: NDArray[np.int64],
+    cell: NDArray[np.int32],
+    weight: NDArray[np.float32],
+    columns: int,
+    rows: int,
+    across: int,
+    down: int,
+    least_group: float,
+    reach: int,
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
+    """Kernel of :meth:`Rows.split`; a cell of the ``columns`` by ``rows`` grid has ``across * down`` children."""
+    n = begin.size - 1
+    given = np.zeros((rows + 2, columns + 2), np.float32)
+    kept = np.zeros((rows, columns), np.bool_)
+    children = across * down
+    new_begin = np.zeros(n + 1, np.int64)
+    new_cell = np.empty(1024, np.int32)
+    new_weight = np.empty(1024, np.float32)
+    end = 0
+    for p in range(n):
+        own, mine = cell[begin[p] : begin[p + 1]], weight[begin[p] : begin[p + 1]]
+        group = np.empty(own.size, np.float32)
+        group_sums(own, mine, columns, given, group)
+        top, bottom, left, right = rows, -1, columns, -1
+        marked = 0
+        for e in range(own.size):
+            r, c = divmod(own[e], columns)
+            given[r + 1, c + 1] = mine[e]
+            if group[e] > least_group:
+                r0, r1 = max(r - reach, 0), min(r + reach, rows - 1)
+                c0, c1 = max(c - reach, 0), min(c + reach, columns - 1)
+                top, bottom, left, right = min(top, r0), max(bottom, r1), min(left, c0), max(right, c1)
+                for v in range(r0, r1 + 1):
+                    for u in range(c0, c1 + 1):
+                        marked += not kept[v, u]
+                        kept[v, u] = True
+        while end + marked * children > new_cell.size:
+            new_cell = np.concatenate((new_cell, np.empty_like(new_cell)))
+            new_weight = np.concatenate((new_weight, np.empty_like(new_weight)))
+        for v in range(top * down, (bottom + 1) * down):
+            for u in range(left, right + 1):
+                if kept[v // down, u]:
+                    for i in range(across):
+                        new_cell[end] = (v * columns + u) * across + i
+                        new_weight[end] = given[v // down + 1, u + 1] / np.float32(children)
+                        end += 1
+        for v in range(top, bottom + 1):
+            kept[v, left : right + 1] = False
+        for e in range(own.size):
+            r, c = divmod(own[e], columns)
+            given[r + 1, c + 1] = 0
+        new_begin[p + 1] = end
+    return new_begin, new_cell[:end].copy(), new_weight[:end].copy()

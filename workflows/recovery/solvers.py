@@ -1,0 +1,112 @@
+"""Non-negative least squares on the few cells of one pixel: kernels that more than one method uses.
+
+A matrix here has one row a cell, as long as the measurements: every inner loop runs over contiguous memory.
+"""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+
+# "reassoc" lets the sum run in vector lanes. Its order depends on the length and the machine's vector width
+# only, never on where the data lie or what else is in the batch.
+@njit(nogil=True, cache=True, fastmath={"reassoc"})
+def inner(a: NDArray[np.float32], b: NDArray[np.float32]) -> np.float32:
+    """Inner product of two float32 vectors of one length."""
+    total = np.float32(0)
+    for k in range(a.size):
+        total += a[k] * b[k]
+    return total
+
+
+@njit(nogil=True, cache=True)
+def subtract(residual: NDArray[np.float32], factor: np.float32, row: NDArray[np.float32]) -> None:
+    """Take ``factor * row`` from `residual`, in place."""
+    for k in range(residual.size):
+        residual[k] -= factor * row[k]
+
+
+@njit(nogil=True, cache=True)
+def descend(
+    matrix: NDArray[np.float32],
+    target: NDArray[np.float32],
+    x: NDArray[np.float32],
+    sweeps: int,
+    tolerance: float,
+) -> NDArray[np.float32]:
+    """Minimise ``|target - x matrix|^2`` over x >= 0 by cyclic coordinate descent, from the given x.
+
+    Parameters
+    ----------
+    matrix : (s, m) float32
+        One row a cell.
+    target : (m,) float32
+        What the rows are to add up to.
+    x : (s,) float32
+        The start, zero or more; overwritten with the result.
+    sweeps : int
+        Most rounds over the cells. Every fourth takes in the cells at zero.
+    tolerance : float
+        The rounds end when none changes an entry by more than this.
+
+    Returns
+    -------
+    (m,) float32
+        The residual ``target - x matrix``.
+
+    Notes
+    -----
+    ``x_j <- max(0, x_j + a_j . r / a_j . a_j)``, with the residual r kept up to date.
+    """
+    s = x.size
+    residual = target.copy()
+    energy = np.empty(s, np.float32)
+    for j in range(s):
+        energy[j] = inner(matrix[j], matrix[j])
+        if x[j] > 0:
+            subtract(residual, x[j], matrix[j])
+    check = False
+    for sweep in range(sweeps):
+        everything = check or sweep % 4 == 0
+        largest = np.float32(0)
+        for j in range(s):
+            if energy[j] > 0 and (everything or x[j] > 0):
+                new = max(x[j] + inner(matrix[j], residual) / energy[j], np.float32(0))
+                change = new - x[j]
+                if change != 0:
+                    subtract(residual, change, matrix[j])
+                    x[j] = new
+                    largest = max(largest, abs(change))
+        if largest <= tolerance and everything:
+            break
+        check = largest <= tolerance
+    return residual
+
+
+@njit(nogil=True, cache=True)
+def signed_rows(
+    light: NDArray[np.float32],
+    cell: NDArray[np.int32],
+    scale: NDArray[np.float32],
+    first: int,
+    out: NDArray[np.float32],
+) -> None:
+    """Write the +-1 form of the light of a pixel's cells, each measurement scaled.
+
+    Parameters
+    ----------
+    light : (cells, m) float32
+        Light of one channel, 0 (black) to 1 (white), as in :class:`~workflows.recovery.sensing.Level`.
+    cell : (s,) int32
+        Cells.
+    scale : (m,) float32
+        Factor of each measurement.
+    first : int
+        Column of `out` that the first measurement goes to.
+    out : (s, first + m or more) float32
+        Written there: ``scale * (2 light[cell] - 1)``.
+    """
+    for i in range(cell.size):
+        row, written = light[cell[i]], out[i, first : first + scale.size]
+        for k in range(scale.size):
+            written[k] = scale[k] * (2 * row[k] - 1)

@@ -1,0 +1,171 @@
+"""The value that holds a T: for each pixel and channel, the monitor's cells its light comes from."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Transport:
+    """Sparse non-negative rows T of eq. 5, for n pixels and their three channels.
+
+    Attributes
+    ----------
+    columns, rows : int
+        The grid of the cells.
+    count : (n, 3) uint32
+        Number of cells of each row; 0 where nothing could be recovered.
+    cell : (count.sum(),) uint32
+        Cell indices ``row * columns + column``, ascending within a row; rows in the order (pixel, channel).
+    weight : (count.sum(),) float32
+        Share of the light, positive; each row sums to 1.
+    """
+
+    columns: int
+    rows: int
+    count: NDArray[np.uint32]
+    cell: NDArray[np.uint32]
+    weight: NDArray[np.float32]
+
+    @classmethod
+    def from_rows(
+        cls,
+        columns: int,
+        rows: int,
+        count: NDArray[np.integer],
+        cell: NDArray[np.integer],
+        weight: NDArray[np.floating],
+        least_weight: float = 1e-4,
+    ) -> Self:
+        """Clean the rows of a solver: drop tiny entries, make each row sum to 1.
+
+        Parameters
+        ----------
+        columns, rows : int
+            The grid of the cells.
+        count : (n, 3) integer
+            Number of entries of each row.
+        cell : (count.sum(),) integer
+            Cells, ascending within a row.
+        weight : (count.sum(),) float
+            Weights, zero or more, of any positive sum; a row that sums to zero ends up empty.
+        least_weight : float
+            Entries below this share of their row are dropped.
+
+        Returns
+        -------
+        Transport
+
+        Raises
+        ------
+        ValueError
+            If the arrays do not fit together, a weight is negative or not finite, or cells do not ascend.
+        """
+        sizes = count.ravel().astype(np.int64)
+        if count.ndim != 2 or count.shape[1] != 3 or not cell.shape == weight.shape == (int(sizes.sum()),):
+            raise ValueError("count must be (n, 3), cell and weight (count.sum(),)")
+        if not (np.isfinite(weight).all() and (weight >= 0).all()):
+            raise ValueError("weights must be finite and not negative")
+        row = np.repeat(np.arange(sizes.size), sizes)
+        ascending = np.diff(cell.astype(np.int64)) > 0
+        if not (ascending | (np.diff(row) > 0)).all():
+            raise ValueError("cells must ascend within a row")
+        exact = weight.astype(np.float64)
+        total = np.bincount(row, exact, sizes.size)
+        keep = (exact >= least_weight * total[row]) & (exact > 0)
+        row, exact = row[keep], exact[keep]
+        exact /= np.bincount(row, exact, sizes.size)[row]
+        kept = np.bincount(row, minlength=sizes.size).reshape(count.shape)
+        return cls(
+            columns, rows, kept.astype(np.uint32), cell[keep].astype(np.uint32), exact.astype(np.float32)
+        )
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Self]) -> Self:
+        """Join the pixels of several transports of one grid, in order.
+
+        Raises
+        ------
+        ValueError
+            If there are no parts, or their grids differ.
+        """
+        if len({(part.columns, part.rows) for part in parts}) != 1:
+            raise ValueError("transports to concatenate must be at least one, all of one grid")
+        return cls(
+            parts[0].columns,
+            parts[0].rows,
+            np.concatenate([part.count for part in parts]),
+            np.concatenate([part.cell for part in parts]),
+            np.concatenate([part.weight for part in parts]),
+        )
+
+    def take(self, pixels: NDArray[np.integer]) -> Self:
+        """Transport of the given pixels, in the given order.
+
+        Parameters
+        ----------
+        pixels : (k,) integer
+            Indices along the first axis of `count`, 0 to n - 1; repeats are allowed.
+
+        Raises
+        ------
+        IndexError
+            If an index is out of range.
+        """
+        sizes = self.count.sum(axis=1, dtype=np.int64)
+        begin = np.cumsum(sizes) - sizes
+        entries = ragged_entries(begin[pixels], sizes[pixels])
+        return type(self)(
+            self.columns, self.rows, self.count[pixels], self.cell[entries], self.weight[entries]
+        )
+
+    def apply(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Light that arrives through the rows: T L of eq. 5.
+
+        Parameters
+        ----------
+        light : (rows * columns, 3) float32
+            L, the monitor's light by cell and channel.
+
+        Returns
+        -------
+        (n, 3) float32
+            0 for an empty row.
+
+        Raises
+        ------
+        ValueError
+            If `light` does not have one row for each cell.
+        """
+        if light.shape != (self.rows * self.columns, 3):
+            raise ValueError(f"light must be ({self.rows * self.columns}, 3), not {light.shape}")
+        sizes = self.count.ravel().astype(np.int64)
+        row = np.repeat(np.arange(sizes.size), sizes)
+        share = self.weight.astype(np.float64) * light[self.cell, row % 3]
+        return np.bincount(row, share, sizes.size).reshape(self.count.shape).astype(np.float32)
+
+
+def ragged_entries(begin: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Indices of the entries of several runs, run after run.
+
+    Parameters
+    ----------
+    begin, sizes : (k,) int64
+        First entry of each run, and its length.
+
+    Returns
+    -------
+    (sizes.sum(),) int64
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> ragged_entries(np.array([4, 0]), np.array([3, 2]))
+    array([4, 5, 6, 0, 1])
+    """
+    shift = begin - (np.cumsum(sizes) - sizes)
+    entries: NDArray[np.int64] = np.arange(sizes.sum()) + np.repeat(shift, sizes)
+    return entries
