@@ -138,13 +138,18 @@ def composite(
 @click.option(
     "-o", "--output", type=click.Path(dir_okay=False, path_type=Path), default=Path("envmatte-demo.png")
 )
+@click.option(
+    "--keep",
+    type=click.Path(file_okay=False, path_type=Path),
+    help="Folder to leave the capture and backdrop in.",
+)
 @click.option("--workers", type=int, help="Worker processes of the demo's service.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
-def demo(output: Path, workers: int | None, as_json: bool) -> None:
+def demo(output: Path, keep: Path | None, workers: int | None, as_json: bool) -> None:
     """Trace a glass ball, film it, serve, upload, recover, composite: all of it, in a picture."""
     from services.demo import run
 
-    picture, figures = run(workers)
+    picture, figures = run(workers, keep)
     _write(output, picture)
     if not as_json:
         for name, value in figures.items():

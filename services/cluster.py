@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import dask
 from distributed import Client, LocalCluster
 
 from services.settings import Settings
@@ -19,13 +18,7 @@ def open_cluster(settings: Settings) -> Iterator[Client]:
         Synchronous; may be used from any thread.
     """
     scratch = settings.data.resolve() / "scratch"
-    options = {
-        # A worker whose scheduler was killed ends by itself, and soon.
-        "distributed.comm.timeouts.connect": "5s",
-        "distributed.scheduler.allowed-failures": 3,
-    }
     with (
-        dask.config.set(options),
         LocalCluster(
             n_workers=settings.workers,
             threads_per_worker=1,
@@ -34,7 +27,9 @@ def open_cluster(settings: Settings) -> Iterator[Client]:
             dashboard_address=None,
             local_directory=str(scratch),
             silence_logs=30,
-            death_timeout="10s",
+            death_timeout="60s",  # what a worker may take to start on a busy machine
+            # Importing the kernels takes seconds: not out of the first job's time.
+            preload="workflows.jobs",
         ) as cluster,
         Client(cluster) as client,
     ):

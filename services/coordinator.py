@@ -19,7 +19,7 @@ from services.api.errors import problem_of
 from services.settings import Settings
 from storage import captures, database, jobs, mattes
 from storage.database import writing
-from storage.errors import Conflict, InvalidInput
+from storage.errors import Conflict, EnvmatteError, GaveUp, InvalidInput
 from storage.objects import Objects
 from workflows.jobs import KINDS, Task, run_finish, run_prepare, run_tile
 
@@ -29,6 +29,8 @@ POLL = 0.1
 """Seconds between two looks at the ledger and the cluster."""
 BEAT = 2.0
 """Seconds between two signs of life."""
+LOST = ("cancelled", "lost")
+"""States of a future whose task the cluster has forgotten: it is to be done again."""
 DEPTH = 2
 """Tasks in flight for each thread of the cluster: one that runs, and one that waits so that no thread does."""
 
@@ -45,6 +47,8 @@ class Drive:
     tiles: dict[Future, int] = field(default_factory=dict)
     step: Future | None = None
     """The task of the stage, where that is a single one."""
+    misses: int = 0
+    """How often that one has failed."""
 
 
 class Coordinator:
@@ -110,10 +114,11 @@ class Coordinator:
         """Whether the capture of a job is there; a job whose capture never will be is ended."""
         if row.kind == "ingest":
             return True
-        with writing(self._engine) as c:
+        with self._engine.connect() as c:
             capture = captures.get(c, row.capture)
-            if capture.state == "failed":
-                error = Conflict(f"capture {row.capture} could not be ingested: {capture.problem['detail']}")
+        if capture.state == "failed":
+            error = Conflict(f"capture {row.capture} could not be ingested: {capture.problem['detail']}")
+            with writing(self._engine) as c:
                 jobs.end(c, row.id, "failed", problem_of(error))
                 mattes.change(c, row.matte, state="failed")
         return bool(capture.state == "ready")
@@ -160,12 +165,22 @@ class Coordinator:
         function: Callable[[str, Task], dict[str, Any]],
         then: Callable[[Drive, dict[str, Any]], None],
     ) -> None:
-        if drive.step is None or drive.step.status in ("cancelled", "lost"):
+        if drive.step is None or drive.step.status in LOST:
             drive.step = self._client.submit(function, drive.kind, drive.task, pure=False)
         elif drive.step.done():
-            result = drive.step.result()
-            drive.step = None
-            then(drive, result)
+            error = drive.step.exception()
+            if error is None:
+                result = drive.step.result()
+                drive.step = None
+                drive.misses = 0
+                then(drive, result)
+            else:
+                drive.step = None
+                drive.misses += 1
+                if isinstance(error, EnvmatteError):
+                    raise error
+                if drive.misses >= self._settings.attempts:
+                    raise GaveUp(f"{drive.stage} failed {drive.misses} times, last with {error!r}") from error
 
     def _prepared(self, drive: Drive, plan: dict[str, Any]) -> None:
         drive.task = replace(drive.task, plan=plan)
@@ -190,33 +205,32 @@ class Coordinator:
             self._objects.delete(captures.upload_path(drive.task.capture))
 
     def _collect(self, drive: Drive) -> None:
-        """Write down the tiles that have finished since the last look, all in one transaction."""
-        finished = []
-        for future, tile in [(f, t) for f, t in drive.tiles.items() if f.done()]:
+        """Write down the tiles that have ended since the last look, all in one transaction."""
+        ended = {future: tile for future, tile in drive.tiles.items() if future.done()}
+        if not ended:
+            return
+        errors: list[tuple[int, BaseException]] = []
+        finished: list[tuple[int, float, int]] = []
+        for future, tile in ended.items():
             del drive.tiles[future]
-            if future.status in ("cancelled", "lost"):
+            if future.status in LOST:
                 drive.to_do.append(tile)
-                continue
-            error = future.exception()
-            if error is None:
-                finished.append((tile, *future.result()))
-            elif isinstance(error, InvalidInput):
-                raise error
+            elif (error := future.exception()) is not None:
+                errors.append((tile, error))
             else:
-                self._missed(drive, tile, error)
-        if finished:
-            with writing(self._engine) as c:
-                jobs.finish_tiles(c, drive.job, finished)
-
-    def _missed(self, drive: Drive, tile: int, error: BaseException) -> None:
-        logger.warning("job %s, tile %d: %r", drive.job, tile, error)
+                finished.append((tile, *future.result()))
         with writing(self._engine) as c:
-            again = jobs.miss_tile(c, drive.job, tile, repr(error), self._settings.attempts)
-        if not again:
-            raise RuntimeError(
-                f"tile {tile} failed {self._settings.attempts} times, last with {error!r}"
-            ) from error
-        drive.to_do.append(tile)
+            jobs.finish_tiles(c, drive.job, finished)
+            for tile, error in errors:
+                if jobs.miss_tile(c, drive.job, tile, repr(error), self._settings.attempts):
+                    drive.to_do.append(tile)
+        for tile, error in errors:
+            if isinstance(error, EnvmatteError):  # it would be the same the next time
+                raise error
+            if tile not in drive.to_do:
+                raise GaveUp(
+                    f"tile {tile} failed {self._settings.attempts} times, last with {error!r}"
+                ) from error
 
     def _submit(self) -> None:
         """Fill the cluster from all jobs in turn, so that a small one is not kept waiting by a large one."""
@@ -232,40 +246,40 @@ class Coordinator:
                 waiting.append(drive)
 
     def _wind_up(self, drive: Drive) -> None:
-        """Let the running tasks of a cancelled job end, for they can't be stopped; then remove what they wrote."""
+        """Let the running tasks of a job that has ended early end too, for they can't be stopped.
+
+        Only then is what they wrote removed, or they would go on to write it.
+        """
         drive.to_do.clear()
-        running = [*drive.tiles, *([drive.step] if drive.step else [])]
-        if all(future.done() for future in running):
+        if all(future.done() for future in (*drive.tiles, *filter(None, [drive.step]))):
             del self._drives[drive.job]
             self._discard(drive.kind, drive.task.capture, drive.task.matte)
 
     def _fail(self, drive: Drive, error: Exception) -> None:
-        if not isinstance(error, InvalidInput):
-            logger.error("job %s failed", drive.job, exc_info=error)
+        logger.error("job %s failed", drive.job, exc_info=error)
         problem = problem_of(error)
-        self._client.cancel([*drive.tiles, *([drive.step] if drive.step else [])])
-        del self._drives[drive.job]
+        unusable = drive.kind == "ingest" and isinstance(error, InvalidInput)
+        if not unusable:  # what is done is kept for a retry
+            self._client.cancel([*drive.tiles, *filter(None, [drive.step])])
+            del self._drives[drive.job]
         with writing(self._engine) as c:
             jobs.end(c, drive.job, "failed", problem)
-            if drive.kind == "recover":
-                mattes.change(c, drive.task.matte, state="failed")
-            elif isinstance(error, InvalidInput):
+            if unusable:
                 captures.change(c, drive.task.capture, state="failed", problem=problem)
-        if drive.kind == "ingest" and isinstance(error, InvalidInput):
-            self._discard_capture(drive.task.capture)
+            elif drive.kind == "recover":
+                mattes.change(c, drive.task.matte, state="failed")
 
     def _discard(self, kind: str, capture: str, matte: str) -> None:
+        """Remove what an ended job wrote: a matte whole, of a capture all but the row that says what was wrong."""
         if kind == "recover":
             with writing(self._engine) as c:
                 mattes.forget(c, matte)
             self._objects.delete(mattes.path(matte))
-        else:
-            problem = problem_of(Conflict("the ingest was cancelled; upload the capture again"))
-            with writing(self._engine) as c:
+            return
+        with writing(self._engine) as c:
+            if captures.get(c, capture).state != "failed":
+                problem = problem_of(Conflict("the ingest was cancelled; upload the capture again"))
                 captures.change(c, capture, state="failed", problem=problem)
-            self._discard_capture(capture)
-
-    def _discard_capture(self, capture: str) -> None:
         self._objects.delete(captures.path(capture))
         self._objects.delete(captures.upload_path(capture))
 

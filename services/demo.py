@@ -1,6 +1,7 @@
 """`envmatte demo`: the whole way of a capture, from a glass ball to a composite, on this machine."""
 
 import io
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -25,13 +26,15 @@ PANEL = 480, 360
 ERROR_GAIN = 8
 
 
-def run(workers: int | None) -> tuple[bytes, dict[str, Any]]:
+def run(workers: int | None, keep: Path | None = None) -> tuple[bytes, dict[str, Any]]:
     """Trace, film, serve, upload, recover, composite.
 
     Parameters
     ----------
     workers : int, optional
         Worker processes; one a core if left out.
+    keep : Path, optional
+        Folder to leave the capture and the backdrop in, as `glass-ball.zip` and `backdrop.png`.
 
     Returns
     -------
@@ -56,7 +59,7 @@ def run(workers: int | None) -> tuple[bytes, dict[str, Any]]:
             simulate.write_capture(scene, simulate.nested_program(), capture, name="glass ball")
         bar.show(0.1, "starting the service")
         start = time.perf_counter()
-        with _service(Path(folder, "data"), workers) as url, Client(url) as client:
+        with service(Path(folder, "data"), workers) as url, Client(url) as client:
             times["starting_seconds"] = round(time.perf_counter() - start, 1)
             with step("ingest"):
                 bar.show(0.2, "uploading the capture")
@@ -70,9 +73,15 @@ def run(workers: int | None) -> tuple[bytes, dict[str, Any]]:
                 )
             with step("composite"):
                 backdrop = simulate.backdrop()
-                encoded = images.to_integers(from_light(backdrop, "srgb"), np.dtype(np.uint16))
-                answer = client.composite(found["matte"], images.encode_png(encoded))
+                encoded = images.encode_png(
+                    images.to_integers(from_light(backdrop, "srgb"), np.dtype(np.uint16))
+                )
+                answer = client.composite(found["matte"], encoded)
             bar.show(1, "done")
+        if keep:
+            keep.mkdir(parents=True, exist_ok=True)
+            shutil.copy(capture, keep)
+            (keep / "backdrop.png").write_bytes(encoded)
 
     truth = scene.truth(backdrop)
     composite = images.to_unit(images.decode(answer, memory=1 << 28))
@@ -89,7 +98,7 @@ def run(workers: int | None) -> tuple[bytes, dict[str, Any]]:
 
 
 @contextmanager
-def _service(data: Path, workers: int | None) -> Iterator[str]:
+def service(data: Path, workers: int | None) -> Iterator[str]:
     """A service of its own on a free port; yields its URL."""
     command = [sys.executable, "-m", "services", "serve", "--data", str(data), "--port", "0"]
     if workers:

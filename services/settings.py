@@ -32,8 +32,8 @@ class Settings(BaseSettings):
     ingest_memory: int = Field(
         512 << 20,
         ge=1 << 20,
-        description="Bytes that one worker may hold while it ingests frames, whatever the size of the stack; a single "
-        "frame may take a quarter of it.",
+        description="Bytes of frames that one worker may hold while it ingests, whatever the size of the stack, "
+        "besides some 50 MB that compressing takes; a single frame may take a quarter of them.",
     )
     backdrop_bytes: int = Field(
         128 << 20, ge=1, description="Bytes that a backdrop may have, as it is sent and again decoded."

@@ -124,7 +124,13 @@ class Stack:
     def read(
         self, rows: slice = slice(None), columns: slice = slice(None), frames: slice = slice(None)
     ) -> NDArray[Any]:
-        """(frame, y, x, channel) values of a rectangle of pixels."""
+        """(frame, y, x, channel) values of a rectangle of pixels.
+
+        Raises
+        ------
+        Corrupt
+            If a chunk of it is missing.
+        """
         return np.asarray(self._frames[frames, rows, columns])
 
     def mask(self, rows: slice = slice(None), columns: slice = slice(None)) -> NDArray[np.bool_] | None:
@@ -141,7 +147,7 @@ class Stack:
         ]
 
     def check(self) -> None:
-        """See that every chunk is there: zarr reads a missing one as zeros, without a word.
+        """See that every chunk is there, without reading them.
 
         Raises
         ------

@@ -9,7 +9,8 @@
     │   └── OptionError         an option of recovery
     ├── NotFound                no such capture, job, matte or frame
     ├── Conflict                it exists, but not in a state that allows this
-    └── Corrupt                 something stored is missing or damaged
+    ├── Corrupt                 something stored is missing or damaged
+    └── GaveUp                  work that failed as often as it may
 
 Every error says in ``detail`` what is wrong and what to do; ``fields`` locate the fault (``entry``, ``field``,
 ``limit``). They cross process borders, so they are made of plain values only.
@@ -66,3 +67,7 @@ class Conflict(EnvmatteError):
 
 class Corrupt(EnvmatteError):
     """Something that the store should hold is missing or damaged."""
+
+
+class GaveUp(EnvmatteError):
+    """Work that failed as often as it may, for a reason nobody foresaw."""

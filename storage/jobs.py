@@ -137,9 +137,10 @@ def finish_tiles(connection: Connection, job: str, finished: Iterable[tuple[int,
 
 
 def miss_tile(connection: Connection, job: str, tile: int, reason: str, allowed: int) -> bool:
-    """Write down a failed attempt at a tile; true if it may be tried again."""
-    here = (tiles.c.job == job, tiles.c.tile == tile)
-    connection.execute(update(tiles).where(*here).values(attempts=tiles.c.attempts + 1))
+    """Write down a failed attempt at a tile; true if it may be tried again, which one that is done need not be."""
+    here = (tiles.c.job == job, tiles.c.tile == tile, tiles.c.state == "queued")
+    if not connection.execute(update(tiles).where(*here).values(attempts=tiles.c.attempts + 1)).rowcount:
+        return False
     attempts = connection.scalar(select(tiles.c.attempts).where(*here)) or 0
     note(connection, job, f"tile {tile}, attempt {attempts} of {allowed}: {reason}")
     if attempts < allowed:

@@ -31,9 +31,6 @@ from storage.objects import EVERY_CHUNK, Objects
 FORMAT = "envmatte-matte/1"
 FRAMES = ("S", "rho", "recovered", "count")
 """The frame-shaped arrays, in the order in which a block is written."""
-UNWRITTEN = 0xFFFFFFFF
-"""Fills ``count`` and ``cell``: no row has that many cells and no grid has that one, so a chunk that is missing
-does not read as an empty one."""
 
 
 @dataclass(frozen=True)
@@ -107,13 +104,12 @@ class Matte:
     def write(self, row: int, column: int, block: Block) -> None:
         """Write a block, in place of an earlier one."""
         span = self.span(row, column)
-        for name, values, missing in (("cell", block.cell, UNWRITTEN), ("weight", block.weight, np.nan)):
+        for name, values in (("cell", block.cell), ("weight", block.weight)):
             zarr.create_array(
                 self._objects.zarr,
                 name=f"{self._path}/T/{row}.{column}/{name}",
                 data=values,
                 chunks=(max(len(values), 1),),
-                fill_value=missing,
                 overwrite=True,
                 config=EVERY_CHUNK,
             )
@@ -138,11 +134,7 @@ class Matte:
             )
         except FileNotFoundError as error:
             raise self._corrupt(row, column) from error
-        whole = (
-            not any(UNWRITTEN in values for values in (count, cell))
-            and len(cell) == len(weight) == count.sum()
-        )
-        if not whole or np.isnan(S).any() or np.isnan(rho).any() or np.isnan(weight).any():
+        if not len(cell) == len(weight) == count.sum():
             raise self._corrupt(row, column)
         return Block(S, rho, recovered, count, cell, weight)
 
@@ -201,7 +193,6 @@ def create(
             shape=(*frame, 3),
             chunks=(*chunk, 3),
             dtype="float32",
-            fill_value=np.nan,
             dimension_names=dims,
         )
     group.create_array(
@@ -209,7 +200,6 @@ def create(
         shape=(*frame, 3),
         chunks=(*chunk, 3),
         dtype="uint32",
-        fill_value=UNWRITTEN,
         dimension_names=dims,
     )
     group.create_array("recovered", shape=frame, chunks=chunk, dtype="bool", dimension_names=dims[:2])

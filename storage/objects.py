@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import obstore
 import zarr
 from obstore.store import LocalStore, ObjectStore, from_url
-from zarr.abc.store import ByteRequest
-from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import ObjectStore as ZarrStore
 from zarr.storage import WrapperStore
 
@@ -18,10 +16,14 @@ from storage.errors import Corrupt
 
 if TYPE_CHECKING:
     from obstore import AsyncWritableFile, ReadableFile
+    from zarr.abc.store import ByteRequest
     from zarr.core.array_spec import ArrayConfigParams
+    from zarr.core.buffer import Buffer, BufferPrototype
 
 EVERY_CHUNK: ArrayConfigParams = {"write_empty_chunks": True}
 """For whoever makes an array: a chunk of zeros is stored like any other, so that one that is missing is damage."""
+METADATA = ("zarr.json", ".zarray", ".zgroup", ".zattrs", ".zmetadata")
+"""Objects that zarr looks for to see whether there is an array or a group: they may be missing."""
 PART = 8 << 20
 """Bytes of one part of a large object: S3 takes parts of 5 MiB and more."""
 
@@ -112,7 +114,7 @@ class _Whole(WrapperStore[ZarrStore[ObjectStore]]):
         self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
     ) -> Buffer | None:
         value = await self._store.get(key, prototype, byte_range)
-        if value is None and not key.endswith(("zarr.json", ".zarray", ".zgroup", ".zattrs", ".zmetadata")):
+        if value is None and not key.endswith(METADATA):
             raise Corrupt(f"{key} is missing in the store: what it belongs to is damaged, make it again")
         return value
 

@@ -124,7 +124,8 @@ def _see_that_it_fits(picture: Image.Image, pixel: int, memory: int) -> None:
 
 def encode_png(pixels: Codes) -> bytes:
     """A PNG of (height, width, 1 to 4) uint8 or uint16 values."""
-    return bytes(imagecodecs.png_encode(np.ascontiguousarray(pixels)))
+    plane = pixels[:, :, 0] if pixels.shape[2] == 1 else pixels
+    return bytes(imagecodecs.png_encode(np.ascontiguousarray(plane)))
 
 
 def to_unit(pixels: Codes) -> NDArray[np.float32]:

@@ -121,8 +121,10 @@ def _recover(
         frames[:, numbers], to_light(sent, monitor), usable[:, numbers], noise, repeats[numbers]
     )
     measurements = np.ascontiguousarray(frames[:, program.measured])
-    method = {"pyramid": pyramid.recover, "nn-dgsr": dgsr.recover}[options.method]
-    transport = method(measurements, photometry, sensing, noise)
+    if options.method == "pyramid":
+        transport = pyramid.recover(measurements, photometry, sensing, noise)
+    else:
+        transport = dgsr.recover(measurements, photometry, sensing, noise)
     return photometry.S, photometry.rho, transport
 
 

@@ -76,12 +76,12 @@ def estimate(
     -------
     monitor, camera : Curve
         Known curves as they are. One unknown curve is the gamma under which the light at the camera is
-        closest to a line in the light of the monitor (eq. 6). With both unknown, or fewer than three
-        levels, the levels can't tell them apart, and an unknown curve is taken for sRGB, which is what
+        closest to a line in the light of the monitor (eq. 6). With both unknown, fewer than three levels,
+        or a camera that saw no difference, the levels can't tell, and an unknown curve is taken for sRGB, which is what
         nearly every monitor and camera is built to.
     """
     both = monitor == "unknown" and camera == "unknown"
-    if both or len(np.unique(levels)) < 3 or values.size == 0:
+    if both or len(np.unique(levels)) < 3 or values.size == 0 or not np.ptp(values, axis=0).any():
         return (
             "srgb" if monitor == "unknown" else monitor,
             "srgb" if camera == "unknown" else camera,

@@ -14,6 +14,7 @@ from storage.errors import (
     Conflict,
     Corrupt,
     EnvmatteError,
+    GaveUp,
     ImageError,
     InvalidInput,
     NotFound,
@@ -47,6 +48,7 @@ PROBLEMS: dict[type[Exception], tuple[HTTPStatus, str, str]] = {
     NotFound: (HTTPStatus.NOT_FOUND, "not-found", "Not found"),
     Conflict: (HTTPStatus.CONFLICT, "conflict", "Not in this state"),
     Corrupt: (HTTPStatus.INTERNAL_SERVER_ERROR, "corrupt", "Stored data is missing or damaged"),
+    GaveUp: (HTTPStatus.INTERNAL_SERVER_ERROR, "gave-up", "The work failed again and again"),
     Exception: (HTTPStatus.INTERNAL_SERVER_ERROR, "internal", "Something went wrong here"),
 }
 

@@ -123,8 +123,13 @@ def test_an_upload_that_breaks_off(service: Service, bundle: Path) -> None:
     before, captures = service.stored(), service.http.get("/v1/captures").json()
     where = urlsplit(service.url)
     with socket.create_connection((where.hostname, where.port)) as raw:
-        head = "POST /v1/captures HTTP/1.1\r\nHost: x\r\nContent-Type: application/zip\r\nContent-Length: 99999999\r\n\r\n"
-        raw.sendall(head.encode() + bundle.read_bytes()[:100_000])
+        head = [
+            "POST /v1/captures HTTP/1.1",
+            "Host: x",
+            "Content-Type: application/zip",
+            "Content-Length: 99999999",
+        ]
+        raw.sendall("\r\n".join([*head, "", ""]).encode() + bundle.read_bytes()[:100_000])
     check_problem(service.http.get("/v1/captures/nothing"), 404, "not-found")
     assert service.stored() == before
     assert service.http.get("/v1/captures").json() == captures

@@ -125,6 +125,26 @@ def test_a_damaged_matte_is_said_to_be_damaged(service: Service, capture: str) -
         (folder / name).write_bytes(data)
 
 
+def test_a_tile_that_always_fails_fails_its_job_and_retry_goes_on(
+    service: Service, matte: str, bundle: Path
+) -> None:
+    uploaded = service.client.upload(bundle)
+    service.client.wait(uploaded["job"])
+    chunk = service.data / "store" / "captures" / uploaded["id"] / "frames" / "c" / "0" / "0" / "1" / "0"
+    data = chunk.read_bytes()
+    chunk.unlink()
+    job = service.client.recover(uploaded["id"])
+    with pytest.raises(ServiceError, match="is missing"):
+        service.client.wait(job["id"])
+    failed = service.client.job(job["id"])
+    assert failed["state"] == "failed"
+    assert failed["tiles"]["done"] < 30
+    chunk.write_bytes(data)
+    assert service.http.post(f"/v1/jobs/{job['id']}/retry").status_code == 202
+    assert service.client.wait(job["id"])["tiles"] == {"total": 30, "done": 30, "failed": 0}
+    assert files_of(service, job["matte"]) == files_of(service, matte)
+
+
 def test_a_second_service_on_one_folder_says_so_and_stops(service: Service) -> None:
     command = [sys.executable, "-m", "services", "serve", "--data", str(service.data), "--port", "0"]
     second = subprocess.run(command, capture_output=True, text=True, timeout=60)

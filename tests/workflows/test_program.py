@@ -163,6 +163,18 @@ def test_a_photograph_is_averaged_over_the_finest_cells() -> None:
     np.testing.assert_allclose(fine.light[:, :, 3], means, rtol=1e-5)
 
 
+@pytest.mark.parametrize(("columns", "rows"), [(4, 2), (2, 3), (4, 3), (1, 2), (8, 6), (3, 3)])
+def test_an_image_is_sensed_from_the_first_grid_that_holds_it(columns: int, rows: int) -> None:
+    made = program(grid(4, 3), {"kind": "images", "files": ["a.png"]}, grid(8, 6))
+    image = np.random.default_rng(0).random((rows, columns, 1), np.float32)
+    coarse, fine = made.sensing("linear", [image]).levels
+    assert (3 in coarse.patterns) == (4 % columns == 0 and 3 % rows == 0)
+    assert 3 in fine.patterns
+    if 3 in coarse.patterns:
+        expected = image.repeat(3 // rows, axis=0).repeat(4 // columns, axis=1)
+        np.testing.assert_array_equal(coarse.light[0, :, 3], expected.ravel())
+
+
 @pytest.mark.parametrize("other", [(8, 9), (12, 12), (6, 12), (13, 11)])
 def test_grids_that_do_not_nest_are_refused(other: tuple[int, int]) -> None:
     made = program(grid(8, 6), grid(*other))

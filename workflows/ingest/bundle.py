@@ -1,7 +1,6 @@
 """A bundle: the ZIP of a capture and its capture.json, format envmatte-capture/1, checked as hostile."""
 
 import stat
-import struct
 import zipfile
 import zlib
 from dataclasses import dataclass
@@ -80,7 +79,7 @@ class Bundle:
         self._limits = limits
         try:
             self._archive = zipfile.ZipFile(file)
-        except (zipfile.BadZipFile, struct.error, ValueError, OSError, NotImplementedError) as error:
+        except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError) as error:
             raise CaptureError(
                 "this is no ZIP archive, or it is cut off: its directory can't be read. Make it again, and "
                 "see that all of it is sent"
@@ -114,7 +113,6 @@ class Bundle:
         except (
             zipfile.BadZipFile,
             zlib.error,
-            struct.error,
             EOFError,
             OSError,
             ArithmeticError,

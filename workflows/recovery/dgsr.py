@@ -27,10 +27,9 @@ def recover(
     noise: Noise,
     *,
     sparsity: float = 0.2,
-    coarse_sparsity: float = 0.5,
-    growth: float = 1.5,
+    growth: float = 1.25,
     sum_tolerance: float = 0.02,
-    least_group: float = 0.01,
+    least_group: float = 0.02,
     least_contrast: float = 3.0,
 ) -> Transport:
     """Recover T by NN-DGSR, level by level: only the children of a level's cells are unknowns at the next.
@@ -46,9 +45,8 @@ def recover(
     noise : Noise
         Noise of a measurement; it tells which channels are too dark.
     sparsity : float
-        Most cells of a row, as a share of the measurements.
-    coarse_sparsity : float
-        The same at all levels but the finest. They only have to find the cells, and one missed there is lost.
+        Most cells of a row at the finest level, as a share of the measurements. Coarser levels may have as many
+        as measurements: they only have to find the cells, and one missed there is lost.
     growth : float
         Factor by which the sparsity grows, from one cell, until more cells explain no more.
     sum_tolerance : float
@@ -75,15 +73,15 @@ def recover(
     neighbours' is largest, solves a non-negative least squares on them and the cells so far, and prunes the
     result in the same way (Huang, Huang and Metaxas, "Learning with dynamic group sparsity", ICCV 2009).
 
-    Of s cells that explain nothing the best one still lowers ``m ln |r|^2`` by about ``2 ln s``. Growth ends
-    when it gains less than that a cell, and cells of a group that is worth less are dropped at the end.
+    Of s cells that explain nothing the best one still lowers ``m ln |r|^2`` by about ``2 ln s``. Growth at the
+    finest level ends when it gains less than that a cell, and cells of a group worth less are dropped.
     """
     value, precision = normalise(measurements, photometry, noise, least_contrast)
     parts = []
     for first in range(0, max(len(value), 1), _BLOCK):
         block = value[first : first + _BLOCK]
         alive = precision[first : first + _BLOCK].max(axis=2, initial=0) > 0
-        pixel, channel = np.nonzero(alive)
+        pixel, channel = map(np.ascontiguousarray, np.nonzero(alive))
         rows = Rows.whole(pixel.size, sensing.levels[0])
         for i, level in enumerate(sensing.levels):
             if i > 0:
@@ -97,9 +95,10 @@ def recover(
                 rows.weight,
                 level.columns,
                 level.rows,
-                sparsity if level is sensing.levels[-1] else coarse_sparsity,
+                level is sensing.levels[-1],
+                sparsity,
                 growth,
-                sum_tolerance if level is sensing.levels[-1] else -1.0,
+                sum_tolerance,
             )
         index = np.full(alive.shape, -1)
         index[alive] = np.arange(pixel.size)
@@ -117,6 +116,7 @@ def grow_rows(
     weight: NDArray[np.float32],
     columns: int,
     rows: int,
+    finest: bool,
     sparsity: float,
     growth: float,
     sum_tolerance: float,
@@ -135,13 +135,15 @@ def grow_rows(
         Candidates as in :class:`~workflows.recovery.groups.Rows`; weights are overwritten.
     columns, rows : int
         The level's grid.
+    finest : bool
+        Whether to stop growing, and to drop cells, where more cells explain nothing.
     sparsity, growth, sum_tolerance
         As in :func:`recover`.
     """
     n, m = value.shape
     field = np.zeros((rows + 2, columns + 2), np.float32)
     ones = np.ones(m, np.float32)
-    most = max(int(sparsity * m), 1)
+    most = max(int(sparsity * m), 1) if finest else m
     for p in range(n):
         own, best = cell[begin[p] : begin[p + 1]], weight[begin[p] : begin[p + 1]]
         s = own.size
@@ -162,27 +164,30 @@ def grow_rows(
                 for j in range(s):
                     proxy[j] = max(best[j] + inner(matrix[j], residual) / m, 0)
                 choose_groups(own, proxy, k, columns, field, chosen)
-                chosen |= best > 0
-                x[:] = best
+                for j in range(s):
+                    chosen[j] = chosen[j] or best[j] > 0
+                    x[j] = best[j]
                 solve_chosen(matrix, value[p], chosen, x)
                 choose_groups(own, x, k, columns, field, chosen)
                 pruned = solve_chosen(matrix, value[p], chosen, x)
                 now = inner(pruned, pruned)
                 stalled = now >= (1 - _STALL) * left
                 if now < left:
-                    best[:], residual, left = x, pruned, now
+                    residual, left = pruned, now
+                    for j in range(s):
+                        best[j] = x[j]
                 if stalled:
                     break
             gain = m * np.log(before / max(left, 1e-30))
-            settled = (
-                gain <= price * (np.count_nonzero(best) - cells) and abs(best.sum() - 1) <= sum_tolerance
-            )
+            enough = gain <= price * (np.count_nonzero(best) - cells)
+            settled = finest and enough and abs(best.sum() - 1) <= sum_tolerance
             if settled or k == min(most, s):
                 break
             k = min(max(k + 1, int(k * growth)), most, s)
-        group_sums(own, best, columns, field, proxy)
-        chosen[:] = (best > 0) & (proxy > np.sqrt(price * left) / m)
-        if sum_tolerance >= 0:
+        if finest:
+            group_sums(own, best, columns, field, proxy)
+            for j in range(s):
+                chosen[j] = best[j] > 0 and proxy[j] > np.sqrt(price * left) / m
             solve_chosen(matrix, value[p], chosen, best)
 
 
@@ -210,16 +215,20 @@ def choose_groups(
     """
     energy = np.empty_like(value)
     group_sums(cell, value * value, columns, field, energy)
-    for j in range(energy.size):
-        if value[j] <= 0:
-            energy[j] = 0
-    bar = np.partition(energy, energy.size - k)[energy.size - k]
-    chosen[:] = energy > bar
-    left = k - np.count_nonzero(chosen)
-    for j in range(energy.size):
-        if left > 0 and energy[j] == bar and bar > 0:
-            chosen[j] = True
-            left -= 1
+    best = np.empty(k, np.int64)  # the most energetic cells so far, falling
+    found = 0
+    for j in range(value.size):
+        chosen[j] = False
+        if value[j] <= 0 or (found == k and energy[j] <= energy[best[k - 1]]):
+            continue
+        place = min(found, k - 1)
+        found = place + 1
+        while place > 0 and energy[best[place - 1]] < energy[j]:
+            best[place] = best[place - 1]
+            place -= 1
+        best[place] = j
+    for i in range(found):
+        chosen[best[i]] = True
 
 
 @njit(nogil=True, cache=True)
@@ -251,5 +260,6 @@ def solve_chosen(
     part, y = matrix[index], x[index]
     residual: NDArray[np.float32] = descend(part, target, y, _SWEEPS, _TOLERANCE)
     x[:] = 0
-    x[index] = y
+    for i in range(index.size):
+        x[index[i]] = y[i]
     return residual

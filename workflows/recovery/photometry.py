@@ -34,7 +34,7 @@ class Noise:
 
     def variance(self, values: NDArray[np.floating]) -> NDArray[np.float32]:
         """Variance of linear camera values of any shape."""
-        lit = np.maximum(values, 0).astype(np.float32)
+        lit: NDArray[np.float32] = np.maximum(values, 0).astype(np.float32)
         return np.float32(self.read) + np.float32(self.shot) * lit
 
 

@@ -106,7 +106,8 @@ class _Block:
             own, weight = value[pixel], precision[pixel]
             total = weight.sum(axis=1, keepdims=True)
             mean = (weight * own).sum(axis=1, keepdims=True) / total
-            misfit = (weight * (own - mean) ** 2).sum(axis=(1, 2))
+            # one axis at a time over contiguous memory: the order of the sum is the same in any batch
+            misfit = np.ascontiguousarray(weight * (own - mean) ** 2).sum(axis=2).sum(axis=1)
             freedom = (self.alive[pixel].sum(axis=1) - 1) * level.patterns.size
             self._solve(level, joint, np.zeros(joint.size, np.int64), mean, total, options)
         else:
@@ -212,8 +213,9 @@ def fit_rows(
         total = np.float32(0)
         for c in range(channels):
             scale = np.sqrt(precision[p, c])
-            total += precision[p, c].sum()
-            target[c * m : (c + 1) * m] = scale * value[p, c]
+            for k in range(m):
+                total += precision[p, c, k]
+                target[c * m + k] = scale[k] * value[p, c, k]
             signed_rows(light[source[p] + c], own, scale, c * m, matrix)
         target[-1] = np.sqrt(np.float32(sum_strength) * total)
         matrix[:, -1] = target[-1]

@@ -65,9 +65,9 @@ def descend(
         energy[j] = inner(matrix[j], matrix[j])
         if x[j] > 0:
             subtract(residual, x[j], matrix[j])
-    check = False
+    settled = False
     for sweep in range(sweeps):
-        everything = check or sweep % 4 == 0
+        everything = settled or sweep % 4 == 0
         largest = np.float32(0)
         for j in range(s):
             if energy[j] > 0 and (everything or x[j] > 0):
@@ -77,9 +77,9 @@ def descend(
                     subtract(residual, change, matrix[j])
                     x[j] = new
                     largest = max(largest, abs(change))
-        if largest <= tolerance and everything:
+        settled = bool(largest <= tolerance)
+        if settled and everything:
             break
-        check = largest <= tolerance
     return residual
 
 

@@ -1,0 +1,55 @@
+"""What an upload costs the server."""
+
+import threading
+import zipfile
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.end_to_end.conftest import serving
+
+GIB = 1 << 30
+
+
+@pytest.mark.full
+def test_an_upload_of_a_gigabyte_is_streamed(bundle: Path, tmp_path: Path) -> None:
+    large = tmp_path / "large.zip"
+    large.write_bytes(bundle.read_bytes())
+    with zipfile.ZipFile(large, "a") as archive, archive.open("film.raw", "w", force_zip64=True) as entry:
+        for _ in range(GIB >> 20):
+            entry.write(bytes(1 << 20))
+    with serving(tmp_path / "data", "--workers", "1") as service:
+        server = psutil.Process(service.process.pid)
+        idle = peak = server.memory_info().rss
+        done = threading.Event()
+
+        def watch() -> None:
+            nonlocal peak
+            while not done.wait(0.005):
+                peak = max(peak, server.memory_info().rss)
+
+        watcher = threading.Thread(target=watch)
+        watcher.start()
+        uploaded = service.client.upload(large)
+        done.set()
+        watcher.join()
+        assert uploaded["bytes"] == large.stat().st_size > GIB
+        print(f"\n{(peak - idle) / 1e6:.0f} MB above {idle / 1e6:.0f} MB idle")
+        assert peak - idle < 200e6
+        assert service.client.wait(uploaded["job"])["state"] == "succeeded"
+
+
+@pytest.mark.full
+def test_an_upload_over_the_limit_is_refused_without_being_read(bundle: Path, tmp_path: Path) -> None:
+    limit = bundle.stat().st_size - 1
+    with serving(tmp_path / "data", "--workers", "1", ENVMATTE_UPLOAD_BYTES=str(limit)) as service:
+        headers = {"Content-Type": "application/zip"}
+        for content in (
+            bundle.read_bytes(),
+            iter([bundle.read_bytes()]),
+        ):  # the second without Content-Length
+            answer = service.http.post("/v1/captures", content=content, headers=headers)
+            assert answer.status_code == 413
+            assert answer.json()["limit"] == limit
+        assert service.stored() == set()

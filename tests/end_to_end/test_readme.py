@@ -1,0 +1,32 @@
+"""The README, as a new user would paste it."""
+
+import re
+import subprocess
+from pathlib import Path
+
+import numpy as np
+
+from services.settings import Settings
+from tests.end_to_end.conftest import Service
+from workflows import images, simulate
+
+README = (Path(__file__).parents[2] / "README.md").read_text()
+
+
+def test_the_five_lines_of_curl(service: Service, bundle: Path, tmp_path: Path) -> None:
+    (lines,) = (block for block in re.findall(r"```sh\n(.*?)```", README, re.S) if "curl" in block)
+    assert len(lines.splitlines()) == 5
+    (tmp_path / "demo").mkdir()
+    (tmp_path / "demo" / "glass-ball.zip").write_bytes(bundle.read_bytes())
+    backdrop = images.to_integers(simulate.backdrop(160, 120), np.dtype(np.uint8))
+    (tmp_path / "demo" / "backdrop.png").write_bytes(images.encode_png(backdrop))
+    script = lines.replace("http://127.0.0.1:8000", service.url)
+    subprocess.run(["bash", "-euc", script], cwd=tmp_path, check=True, timeout=120)
+    (newest,) = service.http.get("/v1/mattes?limit=1").json()["mattes"]
+    expected = service.client.composite(newest["id"], (tmp_path / "demo" / "backdrop.png").read_bytes())
+    assert (tmp_path / "composite.png").read_bytes() == expected
+
+
+def test_every_setting_is_documented() -> None:
+    documented = set(re.findall(r"`ENVMATTE_(\w+)`", README))
+    assert documented == {name.upper() for name in Settings.model_fields}

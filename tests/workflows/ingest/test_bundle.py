@@ -1,0 +1,330 @@
+"""Bundles: every refusal names its entry or field, and no archive does anything but be read or refused."""
+
+import copy
+import io
+import stat
+import struct
+import time
+import tracemalloc
+import zipfile
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from storage.errors import CaptureError
+from storage.objects import Objects
+from workflows.ingest.bundle import Bundle, Limits
+
+Zip = Callable[..., bytes]
+LIMITS = Limits(unpacked=1 << 20, memory=1 << 20)
+
+RECORD: dict[str, Any] = {
+    "format": "envmatte-capture/1",
+    "name": "ball",
+    "program": {
+        "monitor": {"width": 64, "height": 48},
+        "parts": [
+            {"kind": "constant", "levels": [0, 1]},
+            {"kind": "bernoulli", "columns": 4, "rows": 3, "count": 2, "seed": 1},
+            {"kind": "images", "files": ["shown/a.png"]},
+        ],
+    },
+    "response": "linear",
+    "frames": [{"file": f"frames/{n}.png", "pattern": n} for n in (2, 0, 1, 4, 3, 3)],
+    "mask": "mask.png",
+}
+FILES = {
+    name: name.encode() * 20 for name in ("shown/a.png", "mask.png", *(f"frames/{n}.png" for n in range(5)))
+}
+
+
+def changed(change: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
+    record = copy.deepcopy(RECORD)
+    change(record)
+    return record
+
+
+def open_bundle(data: bytes, limits: Limits = LIMITS) -> Bundle:
+    return Bundle(io.BytesIO(data), limits)
+
+
+def refused(data: bytes, limits: Limits = LIMITS) -> CaptureError:
+    with pytest.raises(CaptureError) as caught:
+        open_bundle(data, limits)
+    assert caught.value.detail
+    return caught.value
+
+
+@pytest.mark.parametrize("pack", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+def test_a_bundle_is_read(make_zip: Zip, pack: int) -> None:
+    bundle = open_bundle(make_zip(RECORD, FILES, pack))
+    assert bundle.manifest.name == "ball"
+    assert bundle.manifest.program.count == 5
+    assert next((f.file, f.pattern) for f in bundle.manifest.frames) == ("frames/2.png", 2)
+    for name, data in FILES.items():
+        assert bundle.read(name) == data
+
+
+def test_unknown_fields_and_files_are_accepted(make_zip: Zip) -> None:
+    def extend(record: dict[str, Any]) -> None:
+        record["made_by"] = {"tool": "x", "at": [1, 2]}
+        record["frames"][0]["exposure"] = 0.1
+        record["program"]["note"] = "text"
+        record["program"]["monitor"]["serial"] = "7"
+        record["program"]["parts"][1]["shuffled"] = False
+
+    files = FILES | {"README.txt": b"hello", "empty/": b"", "ünï.png": b""}
+    bundle = open_bundle(make_zip(changed(extend), files))
+    assert bundle.manifest == open_bundle(make_zip(RECORD, FILES)).manifest
+
+
+def test_a_record_is_needed(make_zip: Zip) -> None:
+    assert refused(make_zip(None, FILES)).fields == {"entry": "capture.json"}
+    deeper = make_zip(None, {"ball/capture.json": b"{}"})
+    assert refused(deeper).fields == {"entry": "capture.json"}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"",
+        b"{",
+        b"[]",
+        b"null",
+        b"\xff\xfe",
+        b"[" * 100_000,
+        b'{"format": "envmatte-capture/1",}',
+        b"\0" * 50,
+    ],
+)
+def test_a_malformed_record_is_refused(make_zip: Zip, text: bytes) -> None:
+    error = refused(make_zip(text, FILES))
+    assert error.fields["entry"] == "capture.json"
+
+
+@pytest.mark.parametrize(
+    ("change", "field", "why"),
+    [
+        (lambda r: r.pop("format"), "format", "required"),
+        (lambda r: r.update(format="envmatte-capture/2"), "format", "envmatte-capture/1"),
+        (lambda r: r.pop("program"), "program", "required"),
+        (lambda r: r.update(response={"gamma": 99}), "response", ""),
+        (lambda r: r.update(response="kodak"), "response", "linear"),
+        (lambda r: r.update(name="x" * 201), "name", "200"),
+        (lambda r: r["program"]["monitor"].update(width=0), "program.monitor.width", "greater than"),
+        (
+            lambda r: r["program"]["parts"][0].update(levels=[0.5, 0.5]),
+            "program",
+            "no two different constant",
+        ),
+        (lambda r: r["program"]["parts"].pop(0), "program", "no two different constant"),
+        (lambda r: r["program"]["parts"][1].update(columns=65), "program", "finer than the monitor"),
+        (lambda r: r["program"]["parts"][1].pop("seed"), "program.parts.1.bernoulli.seed", "required"),
+        (lambda r: r["program"]["parts"][1].update(kind="hadamard"), "program.parts.1", "kind"),
+        (lambda r: r["frames"][3].update(pattern=-1), "frames.3.pattern", "greater than or equal to 0"),
+        (lambda r: r["frames"][3].update(pattern=5), "frames.3.pattern", "0 to 4"),
+        (lambda r: r["frames"][3].update(pattern=10**30), "frames.3.pattern", ""),
+        (lambda r: r["frames"][3].pop("file"), "frames.3.file", "required"),
+        (lambda r: r["frames"][3].update(file="frames/9.png"), "frames.3.file", "frames/9.png"),
+        (
+            lambda r: r["frames"].pop(0),
+            "frames",
+            "1 of 5 patterns have no frame, the first of them pattern 2",
+        ),
+        (lambda r: r.update(frames=[]), "frames", "no frames"),
+        (lambda r: r.update(mask="masks.png"), "mask", "masks.png"),
+        (lambda r: r["program"]["parts"][2].update(files=["b.png"]), "program.parts.2.files.0", "b.png"),
+        (lambda r: r.update(video={"file": "clip.mp4"}), "video", "not video"),
+    ],
+)
+def test_a_record_that_does_not_hold_together_is_refused(
+    make_zip: Zip, change: Callable[[dict[str, Any]], object], field: str, why: str
+) -> None:
+    error = refused(make_zip(changed(change), FILES))
+    assert str(error.fields["field"]).startswith(field)
+    assert error.fields["entry"]
+    assert why in error.detail
+
+
+def test_a_folder_is_no_frame(make_zip: Zip) -> None:
+    record = changed(lambda r: r["frames"][0].update(file="frames/x/"))
+    error = refused(make_zip(record, FILES | {"frames/x/": b""}))
+    assert error.fields == {"entry": "frames/x/", "field": "frames.0.file"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../x.png",
+        "frames/../../x.png",
+        "..",
+        "/etc/x.png",
+        "\\x.png",
+        "..\\x.png",
+        "a\\..\\..\\x",
+        "C:\\x.png",
+        "c:x",
+    ],
+)
+def test_entries_that_leave_the_archive_are_refused(make_zip: Zip, name: str) -> None:
+    error = refused(make_zip(RECORD, FILES | {name: b"data"}))
+    assert error.fields == {"entry": name}
+    assert "leaves the archive" in error.detail
+
+
+def test_links_are_refused(make_zip: Zip) -> None:
+    target = io.BytesIO(make_zip(RECORD, FILES))
+    with zipfile.ZipFile(target, "a") as archive:
+        link = zipfile.ZipInfo("frames/link.png")
+        link.external_attr = (stat.S_IFLNK | 0o777) << 16
+        archive.writestr(link, "/etc/passwd")
+    error = refused(target.getvalue())
+    assert error.fields == {"entry": "frames/link.png"}
+    assert "link" in error.detail
+
+
+def test_encrypted_entries_are_refused(make_zip: Zip) -> None:
+    data = bytearray(make_zip(RECORD, FILES))
+    at = data.rindex(b"PK\x01\x02")
+    data[at + 8] |= 1
+    assert "encrypted" in refused(bytes(data)).detail
+    assert refused(bytes(data)).fields == {"entry": "frames/4.png"}
+
+
+@pytest.mark.parametrize("pack", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_other_packing_is_refused(make_zip: Zip, pack: int) -> None:
+    assert "deflate" in refused(make_zip(RECORD, FILES, pack)).detail
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+@pytest.mark.parametrize("name", ["frames/1.png", "capture.json"])
+def test_names_given_twice_are_refused(make_zip: Zip, name: str) -> None:
+    target = io.BytesIO(make_zip(RECORD, FILES))
+    with zipfile.ZipFile(target, "a") as archive:
+        archive.writestr(name, b"another")
+    error = refused(target.getvalue())
+    assert error.fields == {"entry": name}
+    assert "twice" in error.detail
+
+
+def test_a_zip_bomb_is_refused_by_its_directory(make_zip: Zip) -> None:
+    bomb = make_zip(RECORD, FILES | {"frames/zeros.png": bytes(50 << 20)}, zipfile.ZIP_DEFLATED)
+    assert len(bomb) < 100_000
+    start = time.monotonic()
+    error = refused(bomb)
+    assert error.fields == {"limit": 1 << 20}
+    assert time.monotonic() - start < 1
+    many = {f"frames/{n}.dat": bytes(1 << 17) for n in range(8)}
+    assert refused(make_zip(RECORD, FILES | many, zipfile.ZIP_DEFLATED)).fields == {"limit": 1 << 20}
+
+
+def test_an_entry_takes_a_quarter_of_the_memory_at_most(make_zip: Zip) -> None:
+    files = FILES | {"fits": bytes(1 << 18), "large": bytes((1 << 18) + 1)}
+    bundle = open_bundle(make_zip(RECORD, files))
+    assert len(bundle.read("fits")) == 1 << 18
+    with pytest.raises(CaptureError, match="more than the 262144") as caught:
+        bundle.read("large")
+    assert caught.value.fields == {"entry": "large", "limit": 1 << 18}
+
+
+def test_a_directory_that_lies_about_sizes_costs_no_memory(make_zip: Zip) -> None:
+    size = 100 << 20
+    data = bytearray(make_zip(RECORD, FILES | {"z": bytes(size)}, zipfile.ZIP_DEFLATED))
+    at = data.rindex(b"PK\x01\x02")
+    assert struct.unpack_from("<I", data, at + 24) == (size,)
+    struct.pack_into("<I", data, at + 24, 1000)
+    bundle = open_bundle(bytes(data))
+    tracemalloc.start()
+    try:
+        with pytest.raises(CaptureError, match="z is damaged"):
+            bundle.read("z")
+        assert tracemalloc.get_traced_memory()[1] < 4 << 20
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(("field", "value"), [(20, 0), (20, 5), (24, 99), (42, 0xFFFFFFFE), (42, 7)])
+@pytest.mark.parametrize("pack", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+def test_a_directory_that_lies_is_refused_when_it_is_read(
+    make_zip: Zip, pack: int, field: int, value: int
+) -> None:
+    data = bytearray(make_zip(RECORD, FILES, pack))
+    struct.pack_into("<I", data, data.rindex(b"PK\x01\x02") + field, value)
+    bundle = open_bundle(bytes(data))
+    with pytest.raises(CaptureError) as caught:
+        bundle.read("frames/4.png")
+    assert caught.value.fields == {"entry": "frames/4.png"}
+    assert bundle.read("frames/3.png") == FILES["frames/3.png"]
+
+
+def test_an_offset_beyond_all_is_refused(make_zip: Zip) -> None:
+    data = make_zip(RECORD, FILES)
+    at, end = data.rindex(b"PK\x01\x02"), data.rindex(b"PK\x05\x06")
+    entry, extra = bytearray(data[at:end]), struct.pack("<HHQ", 1, 8, 2**64 - 1)
+    struct.pack_into("<H", entry, 30, len(extra))
+    struct.pack_into("<I", entry, 42, 0xFFFFFFFF)  # the offset stands in the ZIP64 field
+    tail = bytearray(data[end:])
+    struct.pack_into("<I", tail, 12, struct.unpack_from("<I", tail, 12)[0] + len(extra))
+    bundle = open_bundle(data[:at] + bytes(entry) + extra + bytes(tail))
+    with pytest.raises(CaptureError) as caught:
+        bundle.read("frames/4.png")
+    assert caught.value.fields == {"entry": "frames/4.png"}
+
+
+def test_a_name_that_is_not_there(make_zip: Zip) -> None:
+    with pytest.raises(CaptureError) as caught:
+        open_bundle(make_zip(RECORD, FILES)).read("none")
+    assert caught.value.fields == {"entry": "none"}
+
+
+def through(data: bytes, open_file: Callable[[bytes], Any]) -> int:
+    """Reads all of a bundle; 1 if some of it was refused. Any error but CaptureError fails the test."""
+    try:
+        with open_file(data) as file:
+            bundle = Bundle(file, LIMITS)
+            for name in FILES:
+                bundle.read(name)
+    except CaptureError:
+        return 1
+    return 0
+
+
+def test_an_archive_that_is_cut_off_is_refused(
+    make_zip: Zip, objects: Objects, put: Callable[[str, bytes], None]
+) -> None:
+    data = make_zip(RECORD, FILES, zipfile.ZIP_DEFLATED)
+    lengths = {*range(0, len(data), 37), *range(len(data) - 120, len(data), 3)}
+    for length in lengths:
+        assert through(data[:length], io.BytesIO), length
+    for length in (0, 1, 21, 22, 500, len(data) - 30, len(data) - 1):
+        put("cut", data[:length])
+        assert through(b"", lambda _: objects.read("uploads/cut.zip")), length
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+@pytest.mark.parametrize("pack", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+def test_a_damaged_archive_is_a_capture_error_or_read(
+    make_zip: Zip, objects: Objects, put: Callable[[str, bytes], None], pack: int
+) -> None:
+    whole = make_zip(RECORD, FILES, pack)
+    assert through(whole, io.BytesIO) == 0
+    directory = whole.index(b"PK\x01\x02")
+    rng = np.random.default_rng(pack)
+    refusals = 0
+    for case in range(400):
+        data = bytearray(whole)
+        lowest = directory if case % 2 else 0
+        for at in rng.integers(lowest, len(data), rng.integers(1, 6)):
+            data[at] = rng.choice([0, 1, 255, rng.integers(256)])
+        if case % 7 == 0:
+            at = int(rng.integers(len(data)))
+            data[at:at] = rng.bytes(9)
+        start = time.monotonic()
+        refusals += through(bytes(data), io.BytesIO)
+        if case % 20 == 0:
+            put("damaged", bytes(data))
+            through(b"", lambda _: objects.read("uploads/damaged.zip"))
+        assert time.monotonic() - start < 2
+    assert refusals > 200

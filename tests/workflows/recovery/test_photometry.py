@@ -1,0 +1,122 @@
+import numpy as np
+import pytest
+
+from workflows.recovery.photometry import Noise, Photometry, estimate_noise, fit_photometry, normalise
+
+NOISE = Noise(4e-6, 5e-5)
+
+
+def constants(n, k=8, noise=NOISE, seed=0, frames=1):
+    rng = np.random.default_rng(seed)
+    levels = np.repeat(np.linspace(0, 1, k)[:, None], 3, axis=1).astype(np.float32)
+    S, rho = rng.uniform(0.01, 0.05, (n, 3)), rng.uniform(0.1, 0.9, (n, 3))
+    clean = S[:, None] + rho[:, None] * levels
+    error = np.sqrt(noise.variance(clean) / frames) * rng.standard_normal(clean.shape)
+    return (clean + error).astype(np.float32), levels, S, rho
+
+
+def test_fit_is_weighted_least_squares():
+    values, levels, S, rho = constants(5)
+    frames = np.array([1, 2, 1, 4, 1, 1, 3, 1])
+    fit = fit_photometry(values, levels, np.ones(values.shape, bool), NOISE, frames)
+    for p in range(5):
+        for c in range(3):
+            root = np.sqrt(frames / NOISE.variance(values[p, :, c]))
+            design = np.stack([np.ones(8), levels[:, c]], axis=1) * root[:, None]
+            expected = np.linalg.lstsq(design, values[p, :, c] * root, rcond=None)[0]
+            np.testing.assert_allclose([fit.S[p, c], fit.rho[p, c]], expected, atol=2e-6)
+    np.testing.assert_allclose(fit.S, S, atol=0.01)
+    np.testing.assert_allclose(fit.rho, rho, atol=0.03)
+    assert fit.S.dtype == fit.rho.dtype == np.float32
+
+
+def test_clipped_levels_are_left_out():
+    values, levels, _, _ = constants(4)
+    usable = np.ones(values.shape, bool)
+    usable[:, 6:, 1] = False
+    clipped = values.copy()
+    clipped[:, 6:, 1] = 0.1
+    frames = np.ones(8, int)
+    expected = fit_photometry(values[:, :6], levels[:6], usable[:, :6], NOISE, frames[:6])
+    fit = fit_photometry(clipped, levels, usable, NOISE, frames)
+    np.testing.assert_allclose(fit.rho[:, 1], expected.rho[:, 1], rtol=1e-6)
+
+
+def test_all_levels_serve_where_fewer_than_two_usable_ones_differ():
+    values, levels, _, _ = constants(1)
+    usable = np.zeros(values.shape, bool)
+    usable[:, 3] = True
+    frames = np.ones(8, int)
+    fit = fit_photometry(values, levels, usable, NOISE, frames)
+    whole = fit_photometry(values, levels, np.ones_like(usable), NOISE, frames)
+    np.testing.assert_array_equal(fit.rho, whole.rho)
+
+
+def test_a_dead_channel_has_rho_zero_and_the_mean_as_s():
+    values, levels, _, _ = constants(1)
+    values[0, :, 2] = np.linspace(0.04, 0.02, 8)
+    fit = fit_photometry(values, levels, np.ones(values.shape, bool), Noise(1e-6, 0), np.ones(8, int))
+    assert fit.rho[0, 2] == 0
+    assert fit.S[0, 2] == pytest.approx(0.03)
+
+
+def test_one_level_is_refused():
+    with pytest.raises(ValueError, match="two different"):
+        fit_photometry(
+            np.ones((1, 2, 3), np.float32),
+            np.ones((2, 3), np.float32),
+            np.ones((1, 2, 3), bool),
+            NOISE,
+            np.ones(2, int),
+        )
+
+
+def test_shapes_that_do_not_fit_are_refused():
+    values, levels, _, _ = constants(2)
+    with pytest.raises(ValueError, match="do not fit"):
+        estimate_noise(values, levels[:4], np.ones(values.shape, bool), 1 / 255)
+    with pytest.raises(ValueError, match="measurements"):
+        normalise(values, Photometry(np.zeros((3, 3)), np.ones((3, 3))), NOISE, 3.0)
+
+
+@pytest.mark.parametrize("frames", [1, 4])
+def test_noise_is_recovered(frames):
+    values, levels, _, _ = constants(3000, frames=frames, seed=3)
+    usable = np.ones(values.shape, bool)
+    usable[:, 0, 0] = False
+    values[:, 0, 0] = 0
+    found = estimate_noise(values, levels, usable, 0.0, np.full(8, frames))
+    for v in (0.02, 0.3, 0.8):
+        assert found.variance(np.float32(v)) == pytest.approx(NOISE.variance(np.float32(v)), rel=0.12)
+
+
+def test_noise_withstands_a_few_wild_pixels():
+    values, levels, _, _ = constants(3000, seed=4)
+    values[::50] += np.random.default_rng(0).normal(0, 0.2, values[::50].shape).astype(np.float32)
+    found = estimate_noise(values, levels, np.ones(values.shape, bool), 0.0)
+    assert found.variance(np.float32(0.4)) == pytest.approx(NOISE.variance(np.float32(0.4)), rel=0.15)
+
+
+def test_noise_of_few_levels_is_that_of_a_typical_sensor():
+    values, levels, _, _ = constants(500, k=3)
+    found = estimate_noise(values, levels, np.ones(values.shape, bool), 1 / 255)
+    assert found.shot == 1 / 20_000
+    assert found.read == pytest.approx(0.0015**2 + (1 / 255) ** 2 / 12)
+
+
+def test_noise_is_never_below_the_quantisation():
+    values, levels, _, _ = constants(500, noise=Noise(0, 0))
+    found = estimate_noise(values, levels, np.ones(values.shape, bool), 1 / 255)
+    assert found.read >= (1 / 255) ** 2 / 12
+    assert found.variance(np.zeros(1)).dtype == np.float32
+
+
+def test_normalise_gives_the_signed_form_and_its_precision():
+    photometry = Photometry(np.full((1, 3), 0.1, np.float32), np.array([[0.5, 0.8, 0.001]], np.float32))
+    measurements = np.array([[[0.1, 0.9, 0.1], [0.6, 0.5, 0.1]]], np.float32)
+    value, precision = normalise(measurements, photometry, NOISE, 3.0)
+    np.testing.assert_allclose(value, [[[-1, 1], [1, 0], [0, 0]]], atol=1e-6)
+    np.testing.assert_allclose(
+        precision[0, 0], 0.5**2 / (4 * NOISE.variance(np.float32([0.1, 0.6]))), rtol=1e-6
+    )
+    assert (precision[0, 2] == 0).all()

@@ -1,0 +1,194 @@
+"""Tiles: every block in exactly one, and the same matte to the byte however frames and work were cut."""
+
+import io
+import json
+import random
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from storage import mattes
+from storage.errors import Corrupt
+from storage.objects import Objects
+from workflows.images import decode, encode_png
+from workflows.ingest.bundle import Limits
+from workflows.jobs import Task, run_finish, run_prepare, run_tile
+from workflows.simulate import Scene, glass_ball, nested_program, write_capture
+from workflows.tiles import cut
+
+Ingest = Callable[..., object]
+Digests = Callable[[str], dict[str, str]]
+
+
+@pytest.mark.parametrize(
+    ("height", "width"), [(1, 1), (16, 16), (17, 33), (40, 100), (128, 16), (600, 1100), (2000, 30)]
+)
+@pytest.mark.parametrize("tile", [16, 17, 32, 50, 100, 1024])
+def test_every_block_is_in_one_tile(objects: Objects, height: int, width: int, tile: int) -> None:
+    matte = mattes.create(objects, "m", height=height, width=width, columns=1, rows=1)
+    tiles = cut(matte, tile)
+    covered = np.zeros((matte.block_rows, matte.block_columns), int)
+    for rows, columns in tiles:
+        assert len(rows) > 0
+        assert len(columns) > 0
+        assert max(len(rows), len(columns)) * matte.block < tile + matte.block
+        covered[rows.start : rows.stop, columns.start : columns.stop] += 1
+    assert covered.min() == covered.max() == 1
+    edge = -(-tile // matte.block) * matte.block
+    assert len(tiles) == -(-height // edge) * -(-width // edge)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return glass_ball(44, 36, monitor=(64, 48), rays=4)
+
+
+@pytest.fixture(scope="module")
+def bundles(scene: Scene) -> dict[bool, bytes]:
+    """The ball's capture, without a mask and with one."""
+    program = nested_program((64, 48), ((4, 3, 14), (8, 6, 10)), levels=5)
+    made = {}
+    for mask in (False, True):
+        target = io.BytesIO()
+        write_capture(scene, program, target, mask=mask, noise=0.5)
+        made[mask] = target.getvalue()
+    return made
+
+
+@pytest.fixture
+def recover(objects: Objects, ingest: Ingest) -> Callable[..., tuple[mattes.Matte, int]]:
+    def run(
+        data: bytes,
+        tile: int | None = None,
+        *,
+        memory: int = 1 << 26,
+        order: Callable[[range], object] = iter,
+        method: str = "pyramid",
+    ) -> tuple[mattes.Matte, int]:
+        ingest("c", data, memory=memory)
+        options = {"method": method, "tile": tile}
+        task = Task(objects.url, "c", "m", options, Limits(1 << 30, memory), {})
+        plan = run_prepare("recover", task)
+        tiles = list(order(range(plan["tiles"])))  # type: ignore[call-overload]
+        pixels = sum(run_tile("recover", task, index)[1] for index in tiles)
+        assert run_finish("recover", task)["columns"] == 8
+        return mattes.Matte(objects, "m"), pixels
+
+    return run
+
+
+def test_the_matte_is_the_same_to_the_byte(
+    recover: Callable[..., tuple[mattes.Matte, int]], digests: Digests, bundles: dict[bool, bytes]
+) -> None:
+    matte, pixels = recover(bundles[True])
+    assert matte.block == 16
+    plain = digests("mattes/m")
+    frame = 44 * 36 * 3
+    for variant in (
+        {"tile": 16},
+        {"tile": 17},
+        {"tile": 1024},
+        {"tile": 32, "order": reversed},
+        {"memory": 8 * frame},  # slabs of four frames
+        {"memory": 10 * frame, "tile": 1024},
+        {"order": lambda tiles: [*tiles, 0, 3]},  # and some tiles again
+    ):
+        _, again = recover(bundles[True], **variant)
+        assert digests("mattes/m") == plain, variant
+        assert again == pixels or "order" in variant
+
+
+def test_pixels_outside_the_mask_are_empty(
+    recover: Callable[..., tuple[mattes.Matte, int]], scene: Scene, bundles: dict[bool, bytes]
+) -> None:
+    masked, pixels = recover(bundles[True])
+    blocks = {(r, c): masked.read(r, c) for r in range(3) for c in range(3)}
+    mask = scene.object_mask
+    assert pixels == mask.sum()
+    assert 0 < pixels < mask.size
+    whole, every = recover(bundles[False])
+    assert every == mask.size
+    for place, block in blocks.items():
+        inside = mask[whole.span(*place)]
+        np.testing.assert_array_equal(block.recovered, inside)
+        for values in (block.S, block.rho, block.count):
+            assert not values[~inside].any()
+        unmasked = whole.read(*place)
+        assert unmasked.recovered.all()
+        assert unmasked.rho[~inside].min() > 0
+        # What is inside does not depend on what is left out.
+        np.testing.assert_array_equal(block.S[inside], unmasked.S[inside])
+        np.testing.assert_array_equal(block.count[inside], unmasked.count[inside])
+        kept = np.repeat(np.repeat(inside.ravel(), 3), unmasked.count.ravel())
+        np.testing.assert_array_equal(block.cell, unmasked.cell[kept])
+        np.testing.assert_array_equal(block.weight, unmasked.weight[kept])
+
+
+def test_the_photometry_is_the_scenes(
+    recover: Callable[..., tuple[mattes.Matte, int]], scene: Scene, bundles: dict[bool, bytes]
+) -> None:
+    matte, _ = recover(bundles[False], tile=1024)
+    S, rho = np.zeros((2, 36, 44, 3), np.float32)
+    for row in range(matte.block_rows):
+        for column in range(matte.block_columns):
+            block, at = matte.read(row, column), matte.span(row, column)
+            S[at], rho[at] = block.S, block.rho
+    # The simulated camera adds 0.02 of its own and keeps 0.9 of the light.
+    np.testing.assert_allclose(S, 0.02, atol=0.01)
+    np.testing.assert_allclose(rho, 0.9 * scene.rho, atol=0.02)
+
+
+def test_frames_of_one_pattern_are_averaged(
+    recover: Callable[..., tuple[mattes.Matte, int]], bundles: dict[bool, bytes]
+) -> None:
+    # Each frame is split into a darker and a lighter one; their mean is the frame.
+    split = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(bundles[False])) as archive, zipfile.ZipFile(split, "w") as out:
+        record = json.loads(archive.read("capture.json"))
+        frames = record["frames"]
+        record["frames"] = []
+        for n, frame in enumerate(frames):
+            pixels = decode(archive.read(frame["file"]), memory=1 << 20)
+            apart = np.minimum(np.minimum(pixels - 1, 254 - pixels.astype(int)).clip(0), 1 + n % 4)
+            for name, shifted in (("a", pixels - apart), ("b", pixels + apart)):
+                out.writestr(f"{n}{name}.png", encode_png(shifted.astype(np.uint8)))
+                record["frames"].append({"file": f"{n}{name}.png", "pattern": frame["pattern"]})
+        random.Random(0).shuffle(record["frames"])
+        out.writestr("capture.json", json.dumps(record))
+    plain = recover(bundles[False], tile=1024)[0].read(1, 1)
+    doubled = recover(split.getvalue(), tile=1024)[0].read(1, 1)
+    np.testing.assert_allclose(doubled.S, plain.S, atol=2e-3)
+    np.testing.assert_allclose(doubled.rho, plain.rho, atol=4e-3)
+
+
+def test_a_damaged_stack_is_corrupt(
+    recover: Callable[..., tuple[mattes.Matte, int]],
+    objects: Objects,
+    folder: Path,
+    bundles: dict[bool, bytes],
+) -> None:
+    recover(bundles[False])
+    chunk = next(path for path in (folder / "captures/c/frames/c").rglob("*") if path.is_file())
+    chunk.unlink()
+    task = Task(objects.url, "c", "m", {}, Limits(1 << 30, 1 << 26), {})
+    plan = run_prepare("recover", task)
+    with pytest.raises(Corrupt, match="frames"):
+        sum(run_tile("recover", task, index)[1] for index in range(plan["tiles"]))
+    with pytest.raises(Corrupt):
+        run_finish("recover", task)
+
+
+@pytest.mark.parametrize(("capture", "matte"), [("c", "none"), ("none", "m")])
+def test_what_the_store_lacks_is_corrupt(
+    recover: Callable[..., tuple[mattes.Matte, int]],
+    objects: Objects,
+    bundles: dict[bool, bytes],
+    capture: str,
+    matte: str,
+) -> None:
+    recover(bundles[False], tile=1024)
+    with pytest.raises(Corrupt, match="none is not in the store"):
+        run_tile("recover", Task(objects.url, capture, matte, {}, Limits(1, 1), {}), 0)
