@@ -17,6 +17,7 @@ import pytest
 from services.client import Client
 from workflows import images, simulate
 from workflows.program import Program
+from workflows.scene import Scene, nested_program, write_capture
 from workflows.tone import from_light
 
 BANDS = ((8, 6, 16), (16, 12, 16), (32, 24, 20))
@@ -91,19 +92,19 @@ def digests(folder: Path) -> dict[str, str]:
 
 @pytest.fixture(scope="session")
 def program() -> Program:
-    return simulate.nested_program(bands=BANDS, levels=5)
+    return nested_program(bands=BANDS, levels=5)
 
 
 @pytest.fixture(scope="session")
-def scene() -> simulate.Scene:
+def scene() -> Scene:
     return simulate.glass_ball(96, 72, rays=16)
 
 
 @pytest.fixture(scope="session")
-def bundle(scene: simulate.Scene, program: Program, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bundle(scene: Scene, program: Program, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A capture of the scene."""
     path = tmp_path_factory.mktemp("bundle") / "ball.zip"
-    simulate.write_capture(scene, program, path, name="ball")
+    write_capture(scene, program, path, name="ball")
     return path
 
 

@@ -9,11 +9,12 @@ import pytest
 from PIL import Image
 
 from tests.end_to_end.conftest import Service, png
-from workflows import images, simulate
+from workflows import images
+from workflows.scene import Scene, write_capture
 from workflows.tone import to_light
 
 
-def test_an_upload_is_ingested(service: Service, bundle: Path, scene: simulate.Scene) -> None:
+def test_an_upload_is_ingested(service: Service, bundle: Path, scene: Scene) -> None:
     headers = {"Content-Type": "application/zip"}
     answer = service.http.post("/v1/captures?name=mine", content=bundle.read_bytes(), headers=headers)
     assert answer.status_code == 201
@@ -28,9 +29,7 @@ def test_an_upload_is_ingested(service: Service, bundle: Path, scene: simulate.S
     assert not (service.data / "store" / "uploads" / f"{made['id']}.zip").exists()
 
 
-def test_frames_are_kept_as_they_were_filmed(
-    service: Service, capture: str, scene: simulate.Scene, program
-) -> None:
+def test_frames_are_kept_as_they_were_filmed(service: Service, capture: str, scene: Scene, program) -> None:
     filmed = list(scene.film(program))
     for n in (0, 30, 56):
         answer = service.http.get(f"/v1/captures/{capture}/frames/{n}.png")
@@ -66,7 +65,7 @@ def test_a_job_may_be_posted_while_its_capture_is_ingesting(service: Service, bu
 @pytest.mark.parametrize("transfer", ["srgb", "linear"])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_a_composite_is_close_to_the_truth(
-    service: Service, matte: str, scene: simulate.Scene, transfer: str, dtype: type
+    service: Service, matte: str, scene: Scene, transfer: str, dtype: type
 ) -> None:
     # Soft enough for the 32 x 24 cells of the program; what the grid can't show is measured elsewhere.
     y, x = np.mgrid[:96, :128] / 128
@@ -88,10 +87,10 @@ def test_a_composite_says_where_its_time_went(service: Service, matte: str) -> N
 
 
 def test_what_the_mask_left_out_is_transparent(
-    service: Service, scene: simulate.Scene, program, tmp_path: Path
+    service: Service, scene: Scene, program, tmp_path: Path
 ) -> None:
     masked = tmp_path / "masked.zip"
-    simulate.write_capture(scene, program, masked, mask=True)
+    write_capture(scene, program, masked, mask=True)
     uploaded = service.client.upload(masked)
     job = service.client.wait(service.client.recover(uploaded["id"])["id"])
     assert job["pixels"] == scene.object_mask.sum()

@@ -16,7 +16,8 @@ from storage.objects import Objects
 from workflows.images import decode, encode_png
 from workflows.ingest.bundle import Limits
 from workflows.jobs import Task, run_finish, run_prepare, run_tile
-from workflows.simulate import Scene, glass_ball, nested_program, write_capture
+from workflows.scene import Scene, nested_program, write_capture
+from workflows.simulate import glass_ball
 from workflows.tiles import cut
 
 Ingest = Callable[..., object]

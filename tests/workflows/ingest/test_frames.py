@@ -20,7 +20,8 @@ from storage.objects import Objects
 from workflows.images import encode_png
 from workflows.ingest import frames
 from workflows.recovery.photometry import Noise
-from workflows.simulate import glass_ball, nested_program, write_capture
+from workflows.scene import nested_program, write_capture
+from workflows.simulate import glass_ball
 
 Zip = Callable[..., bytes]
 Ingest = Callable[..., Stack]
