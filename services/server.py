@@ -2,6 +2,8 @@
 
 import fcntl
 import logging
+import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -24,6 +26,8 @@ def serve(settings: Settings) -> None:
     Conflict
         If another service has the data folder.
     """
+    # uvicorn raises the signal that stopped it once more at its end: what is open here must close before we go.
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s %(message)s")
     with _sole_user(settings):
         engine = open_engine(settings.database_url)

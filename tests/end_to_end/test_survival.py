@@ -1,6 +1,7 @@
 """What a service survives: kills, cancels, a second service; and that the bytes stay the same."""
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -143,6 +144,20 @@ def test_a_tile_that_always_fails_fails_its_job_and_retry_goes_on(
     assert service.http.post(f"/v1/jobs/{job['id']}/retry").status_code == 202
     assert service.client.wait(job["id"])["tiles"] == {"total": 30, "done": 30, "failed": 0}
     assert files_of(service, job["matte"]) == files_of(service, matte)
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_a_server_that_is_asked_to_stop_leaves_no_process(
+    bundle: Path, tmp_path: Path, number: int, code: int
+) -> None:
+    with serving(tmp_path / "data", "--workers", "2") as service:
+        service.client.recover(service.client.upload(bundle)["id"])
+        family = psutil.Process(service.process.pid).children(recursive=True)
+        assert len(family) >= 2
+        service.process.send_signal(number)
+        assert service.process.wait(20) == code
+        _, alive = psutil.wait_procs(family, timeout=10)
+        assert alive == []
 
 
 def test_a_second_service_on_one_folder_says_so_and_stops(service: Service) -> None:

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from workflows.program import Bernoulli, Constant, Monitor, Program
 from workflows.scene import Scene
 from workflows.simulate import CAMERA, MONITOR, backdrop, fresnel, glass_ball
 
@@ -25,18 +24,6 @@ def centroids(scene: Scene, channel: int = 0) -> NDArray[np.float64]:
 @pytest.fixture(scope="module")
 def ball() -> Scene:
     return glass_ball(48, 36, monitor=(96, 72), rays=16, index=(1.49, 1.5, 1.52), absorption=(0.1, 0.0, 0.3))
-
-
-@pytest.fixture(scope="module")
-def program() -> Program:
-    return Program(
-        monitor=Monitor(width=96, height=72),
-        parts=(
-            Constant(kind="constant", levels=(0.0, 0.4, 1.0)),
-            Bernoulli(kind="bernoulli", columns=8, rows=6, count=70, seed=3),
-            Bernoulli(kind="bernoulli", columns=13, rows=11, count=4, seed=4, colour="rgb"),
-        ),
-    )
 
 
 def test_fresnel_has_the_textbook_values() -> None:
