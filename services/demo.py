@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw, ImageFont
 from services.client import Client
 from services.progress import Progress
 from workflows import images, simulate
-from workflows.program import area_mean
+from workflows.grids import area_mean
 from workflows.scene import nested_program, write_capture
 from workflows.tone import from_light, to_light
 

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from storage.mattes import Matte
-from workflows.program import area_mean
+from workflows.grids import area_mean
 
 
 def composite(matte: Matte, backdrop: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -3,20 +3,20 @@
 from collections.abc import Sequence
 from functools import cached_property
 from itertools import pairwise
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from storage.errors import OptionError
+from workflows.grids import on_grid
 from workflows.recovery.sensing import Level, Sensing
 from workflows.tone import Curve, Response, to_light
 
 SENSING_BYTES = 1 << 30
 """The largest sensing matrix that a worker is asked to hold."""
 
-Value = TypeVar("Value", bound=np.generic)
 Unit = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -174,6 +174,16 @@ class Program(_Model):
                 shown += [bits[i].astype(np.float32) for i in inside]
         return shown
 
+    def bands(self) -> list[tuple[int, int]]:
+        """The columns and rows of the Bernoulli parts' grids, from coarse to fine.
+
+        Raises
+        ------
+        OptionError
+            If two of them do not nest.
+        """
+        return _nested({(part.columns, part.rows) for part in self.parts if isinstance(part, Bernoulli)})
+
     def sensing(
         self,
         monitor_curve: Curve,
@@ -206,18 +216,7 @@ class Program(_Model):
                 shapes += [(part.rows, part.columns, part.channels)] * part.count
             elif isinstance(part, Images):
                 shapes += [next(pictures).shape for _ in part.files]
-        bands = {(p.columns, p.rows) for p in self.parts if isinstance(p, Bernoulli)}
-        grids = sorted(
-            bands or {(columns, rows) for rows, columns, _ in shapes}, key=lambda g: (g[0] * g[1], g)
-        )
-        for coarse, fine in pairwise(grids):
-            if fine[0] % coarse[0] or fine[1] % coarse[1]:
-                raise OptionError(
-                    f"the program's grids {coarse[0]} x {coarse[1]} and {fine[0]} x {fine[1]} do not nest: "
-                    "recovery goes from coarse to fine by splitting cells, so each grid must be a whole "
-                    "multiple of the one before",
-                    field="program",
-                )
+        grids = self.bands() or _nested({(columns, rows) for rows, columns, _ in shapes})
         channels = max(shape[2] for shape in shapes)
         size = sum(4 * channels * columns * rows * len(shapes) for columns, rows in grids)
         if size > SENSING_BYTES:
@@ -239,7 +238,7 @@ class Program(_Model):
             usable = [i for i, level in enumerate(first) if level <= at]
             matrix = np.empty((channels, rows * columns, len(usable)), np.float32)
             for m, i in enumerate(usable):
-                cells = _on_grid(light[i], columns, rows)
+                cells = on_grid(light[i], columns, rows)
                 matrix[:, :, m] = np.broadcast_to(
                     cells.reshape(rows * columns, -1).T, (channels, rows * columns)
                 )
@@ -252,64 +251,21 @@ class Program(_Model):
         return np.setdiff1d(np.arange(self.count), self.constants[0])
 
 
-def smallest_grid(image: NDArray[Value]) -> NDArray[Value]:
-    """An image on the coarsest even grid on which it loses nothing.
-
-    Parameters
-    ----------
-    image : (height, width, channels)
-
-    Returns
-    -------
-    (rows, columns, channels)
-        ``height`` is a whole multiple of ``rows``, ``width`` of ``columns``.
-    """
-    for axis in (0, 1):
-        other = tuple(a for a in range(3) if a != axis)
-        edges = np.flatnonzero(np.any(np.diff(image, axis=axis) != 0, axis=other)) + 1
-        step = int(np.gcd.reduce(np.append(edges, image.shape[axis])))
-        image = image[::step] if axis == 0 else image[:, ::step]
-    return image
+def _nested(grids: set[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Grids from coarse to fine, each a whole multiple of the one before."""
+    ordered = sorted(grids, key=lambda grid: (grid[0] * grid[1], grid))
+    for coarse, fine in pairwise(ordered):
+        if fine[0] % coarse[0] or fine[1] % coarse[1]:
+            raise OptionError(
+                f"the program's grids {coarse[0]} x {coarse[1]} and {fine[0]} x {fine[1]} do not nest: "
+                "recovery goes from coarse to fine by splitting cells, so each grid must be a whole "
+                "multiple of the one before",
+                field="program",
+            )
+    return ordered
 
 
 def _first_level(columns: int, rows: int, grids: list[tuple[int, int]]) -> int:
     """The coarsest grid on which a pattern of this grid is exact, or else the finest."""
     exact = (at for at, (c, r) in enumerate(grids) if c % columns == 0 and r % rows == 0)
     return next(exact, len(grids) - 1)
-
-
-def _on_grid(light: NDArray[np.float32], columns: int, rows: int) -> NDArray[np.float32]:
-    """The mean light over each cell of a grid."""
-    if columns % light.shape[1] == 0 and rows % light.shape[0] == 0:
-        return light.repeat(rows // light.shape[0], axis=0).repeat(columns // light.shape[1], axis=1)
-    return area_mean(light, columns, rows)
-
-
-def area_mean(image: NDArray[np.float32], columns: int, rows: int) -> NDArray[np.float32]:
-    """The mean of an image, stretched over a grid, in each of its cells.
-
-    Parameters
-    ----------
-    image : (height, width, channels) float32
-
-    Returns
-    -------
-    (rows, columns, channels) float32
-
-    Notes
-    -----
-    The integral of the image (constant over each of its pixels) is sampled at the cells' edges; differences
-    of it are exact means for any ratio of sizes, enlarging included.
-    """
-    for axis, cells in ((0, rows), (1, columns)):
-        n = image.shape[axis]
-        if n == cells:
-            continue
-        moved = np.moveaxis(image, axis, 0).astype(np.float64)
-        whole = np.concatenate([np.zeros((1, *moved.shape[1:])), np.cumsum(moved, axis=0)])
-        at = np.arange(cells + 1) * (n / cells)
-        below = np.minimum(at.astype(np.intp), n - 1)
-        part = (at - below).reshape(-1, 1, 1)
-        integral = whole[below] + part * moved[below]
-        image = np.moveaxis(np.diff(integral, axis=0) * (cells / n), 0, axis).astype(np.float32)
-    return np.ascontiguousarray(image)

@@ -14,7 +14,8 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from storage.errors import OptionError
-from workflows.program import Bernoulli, Constant, Monitor, Program, area_mean
+from workflows.grids import area_mean
+from workflows.program import Bernoulli, Constant, Monitor, Program
 from workflows.tone import from_light, to_light
 
 BATCH_PATTERNS = 16

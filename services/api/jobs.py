@@ -14,6 +14,7 @@ from storage.database import jobs as table
 from storage.database import writing
 from storage.errors import Conflict
 from workflows.options import describe_options, parse_options
+from workflows.program import Program
 
 router = APIRouter(tags=["jobs"])
 CALL = "POST /v1/jobs"
@@ -143,6 +144,9 @@ def post_job(
             capture = captures.get(c, request.capture)
             if capture.state == "failed":
                 raise Conflict(f"capture {capture.id} failed: {capture.problem['detail']}")
+            Program.model_validate(
+                capture.program
+            ).bands()  # grids that do not nest are refused now, not later
             matte = jobs.new_id()
             chosen = options.model_dump(mode="json")
             job = jobs.add(c, "recover", capture.id, chosen, matte)

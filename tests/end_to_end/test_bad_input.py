@@ -201,6 +201,16 @@ def test_a_job_that_is_no_job(service: Service, body: bytes) -> None:
     check_problem(answer, 422, "bad-request")
 
 
+def test_a_program_whose_grids_do_not_nest(service: Service, bundle: Path) -> None:
+    def not_nested(manifest: dict, files: dict[str, bytes]) -> None:
+        manifest["program"]["parts"][2] |= {"columns": 20, "rows": 15}
+
+    made = service.http.post("/v1/captures", content=remade(bundle, not_nested), headers=ZIP).json()
+    service.client.wait(made["job"])
+    problem = check_problem(service.http.post("/v1/jobs", json={"capture": made["id"]}), 422, "bad-option")
+    assert "20 x 15" in problem["detail"]
+
+
 @pytest.mark.parametrize("body", [b"", b"no image at all", b"\x89PNG\r\n\x1a\n" + b"\0" * 50])
 def test_a_backdrop_that_is_no_image(service: Service, matte: str, body: bytes) -> None:
     check_problem(service.http.post(f"/v1/mattes/{matte}/composite", content=body), 422, "bad-image")

@@ -1,7 +1,7 @@
 """A store in a folder and a SQLite database, both real, for the tests of storage."""
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -22,8 +22,10 @@ def objects(folder: Path) -> Objects:
 
 
 @pytest.fixture
-def engine(tmp_path: Path) -> Engine:
-    return open_engine(f"sqlite:///{tmp_path}/ledger.db")
+def engine(tmp_path: Path) -> Iterator[Engine]:
+    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
+    yield engine
+    engine.dispose()
 
 
 @pytest.fixture

@@ -24,8 +24,10 @@ def test_what_was_written_is_there_when_opened_again(engine: Engine, tmp_path: P
     with writing(engine) as connection:
         job = jobs.add(connection, "ingest", "c", {})
     engine.dispose()
-    with open_engine(f"sqlite:///{tmp_path}/ledger.db").connect() as connection:
+    again = open_engine(f"sqlite:///{tmp_path}/ledger.db")
+    with again.connect() as connection:
         assert jobs.get(connection, job).state == "queued"
+    again.dispose()
 
 
 def test_an_exception_rolls_back(engine: Engine) -> None:

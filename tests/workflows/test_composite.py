@@ -11,7 +11,7 @@ from storage.errors import Corrupt
 from storage.mattes import Block, Matte
 from storage.objects import Objects
 from workflows.composite import composite
-from workflows.program import area_mean
+from workflows.grids import area_mean
 
 HEIGHT, WIDTH, COLUMNS, ROWS = 20, 35, 6, 4
 

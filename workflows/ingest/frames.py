@@ -10,8 +10,9 @@ from storage.captures import Stack, create_stack, upload_path, write_slab
 from storage.errors import CaptureError, ImageError
 from storage.objects import Objects
 from workflows import images
+from workflows.grids import smallest_grid
 from workflows.ingest.bundle import Bundle, Limits
-from workflows.program import Images, Program, smallest_grid
+from workflows.program import Images, Program
 from workflows.recovery.photometry import estimate_noise
 from workflows.tone import Curve, Response, estimate, table, to_light
 

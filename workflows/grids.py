@@ -1,0 +1,65 @@
+"""Images on grids of cells laid over them."""
+
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+Value = TypeVar("Value", bound=np.generic)
+
+
+def smallest_grid(image: NDArray[Value]) -> NDArray[Value]:
+    """An image on the coarsest even grid on which it loses nothing.
+
+    Parameters
+    ----------
+    image : (height, width, channels)
+
+    Returns
+    -------
+    (rows, columns, channels)
+        ``height`` is a whole multiple of ``rows``, ``width`` of ``columns``.
+    """
+    for axis in (0, 1):
+        other = tuple(a for a in range(3) if a != axis)
+        edges = np.flatnonzero(np.any(np.diff(image, axis=axis) != 0, axis=other)) + 1
+        step = int(np.gcd.reduce(np.append(edges, image.shape[axis])))
+        image = image[::step] if axis == 0 else image[:, ::step]
+    return image
+
+
+def on_grid(light: NDArray[np.float32], columns: int, rows: int) -> NDArray[np.float32]:
+    """The mean light over each cell of a grid."""
+    if columns % light.shape[1] == 0 and rows % light.shape[0] == 0:
+        return light.repeat(rows // light.shape[0], axis=0).repeat(columns // light.shape[1], axis=1)
+    return area_mean(light, columns, rows)
+
+
+def area_mean(image: NDArray[np.float32], columns: int, rows: int) -> NDArray[np.float32]:
+    """The mean of an image, stretched over a grid, in each of its cells.
+
+    Parameters
+    ----------
+    image : (height, width, channels) float32
+
+    Returns
+    -------
+    (rows, columns, channels) float32
+
+    Notes
+    -----
+    The integral of the image (constant over each of its pixels) is sampled at the cells' edges; differences
+    of it are exact means for any ratio of sizes, enlarging included.
+    """
+    for axis, cells in ((0, rows), (1, columns)):
+        n = image.shape[axis]
+        if n == cells:
+            continue
+        moved = np.moveaxis(image, axis, 0).astype(np.float64)
+        whole = np.concatenate([np.zeros((1, *moved.shape[1:])), np.cumsum(moved, axis=0)])
+        at = np.arange(cells + 1) * (n / cells)
+        below = np.minimum(at.astype(np.intp), n - 1)
+        part = (at - below).reshape(-1, 1, 1)
+        integral = whole[below] + part * moved[below]
+        image = np.moveaxis(np.diff(integral, axis=0) * (cells / n), 0, axis).astype(np.float32)
+    return np.ascontiguousarray(image)
