@@ -20,7 +20,7 @@ from workflows.tone import from_light, to_light
 
 BATCH_PATTERNS = 16
 """Patterns filmed at once."""
-DEMO_BANDS = ((16, 12, 24), (32, 24, 24), (64, 48, 24), (128, 96, 26), (256, 192, 26))
+DEMO_BANDS = ((16, 12, 24), (32, 24, 20), (64, 48, 20), (128, 96, 20), (256, 192, 20), (512, 384, 20))
 """Columns, rows and number of patterns of grids that nest, for a monitor of 1280 x 960 pixels."""
 
 Floats = NDArray[np.float32]

@@ -53,11 +53,11 @@ def measure(kit: ModuleType, scene: Path, method: str, client: Client, data: Pat
     truth = kit.Scene.load(scene)
     scores = {}
     for name, backdrop in kit.backdrops().items():
-        sent = images.to_integers(backdrop, np.dtype(np.uint8))
+        # 16 bits, so that the matte is scored and not the answer's rounding.
+        sent = images.to_integers(backdrop, np.dtype(np.uint16))
         answer = client.composite(job["matte"], images.encode_png(sent), transfer="linear")
-        path = data.parent / "composite.png"
-        path.write_bytes(answer)
-        scores[name] = kit.score(truth, images.to_unit(sent), kit.read_image(path))
+        pixels = images.to_unit(images.decode(answer, memory=1 << 28))
+        scores[name] = kit.score(truth, images.to_unit(sent), pixels[..., :3])
     return {
         "scene": scene.stem,
         "method": method,
