@@ -9,6 +9,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import CancelledError
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -19,7 +20,7 @@ from services.api.errors import problem_of
 from services.settings import Settings
 from storage import captures, database, jobs, mattes
 from storage.database import writing
-from storage.errors import Conflict, EnvmatteError, GaveUp, InvalidInput
+from storage.errors import Conflict, EnvmatteError, GaveUp
 from storage.objects import Objects
 from workflows.jobs import KINDS, Task, run_finish, run_prepare, run_tile
 
@@ -29,8 +30,8 @@ POLL = 0.1
 """Seconds between two looks at the ledger and the cluster."""
 BEAT = 2.0
 """Seconds between two signs of life."""
-LOST = ("cancelled", "lost")
-"""States of a future whose task the cluster has forgotten: it is to be done again."""
+FETCH = 5.0
+"""Seconds to wait for the small result of a task that is done, before it counts as gone with its worker."""
 DEPTH = 2
 """Tasks in flight for each thread of the cluster: one that runs, and one that waits so that no thread does."""
 
@@ -100,14 +101,22 @@ class Coordinator:
             self._beat_at = time.monotonic()
         with self._engine.connect() as c:
             rows = {row.id: row for row in jobs.active(c)}
+            cancelled = jobs.not_wound_up(c)
         for row in rows.values():
             if row.id not in self._drives and self._may_start(row):
                 self._take_up(row)
+        for row in cancelled:
+            if row.id not in self._drives:
+                self._discard(row.kind, row.capture, row.matte)
         for drive in list(self._drives.values()):
             try:
                 self._advance(drive, row=rows.get(drive.job))
-            except Exception as error:
+            except EnvmatteError as error:
                 self._fail(drive, error)
+            except Exception:
+                # Whatever it was, and whatever it left half done here: the ledger knows where the job stands.
+                del self._drives[drive.job]
+                raise
         self._submit()
 
     def _may_start(self, row: Row[Any]) -> bool:
@@ -165,22 +174,24 @@ class Coordinator:
         function: Callable[[str, Task], dict[str, Any]],
         then: Callable[[Drive, dict[str, Any]], None],
     ) -> None:
-        if drive.step is None or drive.step.status in LOST:
+        if drive.step is None:
             drive.step = self._client.submit(function, drive.kind, drive.task, pure=False)
-        elif drive.step.done():
-            error = drive.step.exception()
-            if error is None:
-                result = drive.step.result()
-                drive.step = None
-                drive.misses = 0
-                then(drive, result)
-            else:
-                drive.step = None
-                drive.misses += 1
-                if isinstance(error, EnvmatteError):
-                    raise error
-                if drive.misses >= self._settings.attempts:
-                    raise GaveUp(f"{drive.stage} failed {drive.misses} times, last with {error!r}") from error
+        if not drive.step.done():
+            return
+        step, drive.step = drive.step, None
+        try:
+            result = step.result(timeout=FETCH)
+        except EnvmatteError:  # it would be the same the next time
+            raise
+        except (TimeoutError, CancelledError):
+            return
+        except Exception as error:
+            drive.misses += 1
+            if drive.misses >= self._settings.attempts:
+                raise GaveUp(f"{drive.stage} failed {drive.misses} times, last with {error!r}") from error
+        else:
+            drive.misses = 0
+            then(drive, result)
 
     def _prepared(self, drive: Drive, plan: dict[str, Any]) -> None:
         drive.task = replace(drive.task, plan=plan)
@@ -193,14 +204,14 @@ class Coordinator:
             jobs.enter(c, drive.job, drive.stage)
 
     def _finished(self, drive: Drive, figures: dict[str, Any]) -> None:
-        del self._drives[drive.job]
         with writing(self._engine) as c:
             if not jobs.end(c, drive.job, "succeeded"):
-                return
+                return  # it was cancelled at the last moment, and is wound up next
             if drive.kind == "ingest":
                 captures.change(c, drive.task.capture, state="ready")
             else:
                 mattes.change(c, drive.task.matte, state="ready", figures=figures)
+        del self._drives[drive.job]
         if drive.kind == "ingest":
             self._objects.delete(captures.upload_path(drive.task.capture))
 
@@ -209,16 +220,16 @@ class Coordinator:
         ended = {future: tile for future, tile in drive.tiles.items() if future.done()}
         if not ended:
             return
-        errors: list[tuple[int, BaseException]] = []
+        errors: list[tuple[int, Exception]] = []
         finished: list[tuple[int, float, int]] = []
         for future, tile in ended.items():
             del drive.tiles[future]
-            if future.status in LOST:
+            try:
+                finished.append((tile, *future.result(timeout=FETCH)))
+            except (TimeoutError, CancelledError):  # gone with its worker, or forgotten by the scheduler
                 drive.to_do.append(tile)
-            elif (error := future.exception()) is not None:
-                errors.append((tile, error))
-            else:
-                finished.append((tile, *future.result()))
+            except Exception as failure:
+                errors.append((tile, failure))
         with writing(self._engine) as c:
             jobs.finish_tiles(c, drive.job, finished)
             for tile, error in errors:
@@ -255,19 +266,18 @@ class Coordinator:
             del self._drives[drive.job]
             self._discard(drive.kind, drive.task.capture, drive.task.matte)
 
-    def _fail(self, drive: Drive, error: Exception) -> None:
+    def _fail(self, drive: Drive, error: EnvmatteError) -> None:
         logger.error("job %s failed", drive.job, exc_info=error)
         problem = problem_of(error)
-        unusable = drive.kind == "ingest" and isinstance(error, InvalidInput)
-        if not unusable:  # what is done is kept for a retry
-            self._client.cancel([*drive.tiles, *filter(None, [drive.step])])
-            del self._drives[drive.job]
         with writing(self._engine) as c:
             jobs.end(c, drive.job, "failed", problem)
-            if unusable:
+            if drive.kind == "ingest":
                 captures.change(c, drive.task.capture, state="failed", problem=problem)
-            elif drive.kind == "recover":
+            else:
                 mattes.change(c, drive.task.matte, state="failed")
+        if drive.kind == "recover" or captures.may_be_retried(problem):  # what is done is kept
+            self._client.cancel([*drive.tiles, *filter(None, [drive.step])])
+            del self._drives[drive.job]
 
     def _discard(self, kind: str, capture: str, matte: str) -> None:
         """Remove what an ended job wrote: a matte whole, of a capture all but the row that says what was wrong."""
@@ -284,25 +294,16 @@ class Coordinator:
         self._objects.delete(captures.upload_path(capture))
 
     def _reconcile(self) -> None:
-        """Remove what a killed process left: the work of cancelled jobs, and what has no row in the ledger."""
+        """Remove what has no row in the ledger: what a killed process left."""
         with self._engine.connect() as c:
-            cancelled = c.execute(select(database.jobs).where(database.jobs.c.state == "cancelled")).all()
-            unready = set(
-                c.scalars(select(database.mattes.c.id).where(database.mattes.c.state == "recovering"))
-            )
-            ingesting = set(
-                c.scalars(select(database.captures.c.id).where(database.captures.c.state == "ingesting"))
-            )
-        for row in cancelled:
-            if row.matte in unready if row.kind == "recover" else row.capture in ingesting:
-                self._discard(row.kind, row.capture, row.matte)
-        with self._engine.connect() as c:
-            rows = c.execute(select(database.captures.c.id, database.captures.c.state)).all()
+            rows = c.execute(select(database.captures)).all()
+            kept = [row for row in rows if row.state != "failed" or captures.may_be_retried(row.problem)]
             known = {
-                "captures": {row.id for row in rows if row.state != "failed"},
-                "uploads": {f"{row.id}.zip" for row in rows if row.state == "ingesting"},
+                "captures": {row.id for row in kept},
+                "uploads": {f"{row.id}.zip" for row in kept if row.state != "ready"},
                 "mattes": set(c.scalars(select(database.mattes.c.id))),
             }
+        self._objects.sweep("uploads")
         for folder, names in known.items():
             for name in self._objects.names(folder):
                 if name not in names and name != "zarr.json":

@@ -5,6 +5,7 @@ from contextlib import contextmanager
 
 from sqlalchemy import (
     JSON,
+    BigInteger,
     Column,
     Connection,
     Engine,
@@ -30,7 +31,7 @@ captures = Table(
     Column("name", Text, nullable=False),
     Column("state", String(16), nullable=False),
     Column("job", String(32), nullable=False),
-    Column("bytes", Integer, nullable=False),
+    Column("bytes", BigInteger, nullable=False),
     Column("width", Integer),
     Column("height", Integer),
     Column("frames", Integer, nullable=False),
@@ -67,7 +68,7 @@ jobs = Table(
     Column("total", Integer, nullable=False, default=0),
     Column("done", Integer, nullable=False, default=0),
     Column("failed", Integer, nullable=False, default=0),
-    Column("pixels", Integer, nullable=False, default=0),
+    Column("pixels", BigInteger, nullable=False, default=0),
     Column("problem", JSON(none_as_null=True)),
     Column("created_at", Float, nullable=False),
     Column("started_at", Float),

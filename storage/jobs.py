@@ -10,9 +10,9 @@ import time
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from sqlalchemy import Connection, Row, Table, delete, insert, select, update
+from sqlalchemy import Connection, Row, Table, delete, insert, or_, select, update
 
-from storage.database import coordinator, jobs, log, made, tiles
+from storage.database import captures, coordinator, jobs, log, made, mattes, tiles
 from storage.errors import Conflict, NotFound
 
 ACTIVE = ("queued", "running")
@@ -91,6 +91,19 @@ def get(connection: Connection, job: str) -> Row[Any]:
 def active(connection: Connection) -> Sequence[Row[Any]]:
     """Jobs that are queued or running, oldest first."""
     query = select(jobs).where(jobs.c.state.in_(ACTIVE)).order_by(jobs.c.number)
+    return connection.execute(query).all()
+
+
+def not_wound_up(connection: Connection) -> Sequence[Row[Any]]:
+    """Jobs that were cancelled, and that have left something: a matte, or a capture, in the making."""
+    query = (
+        select(jobs)
+        .outerjoin(mattes, mattes.c.id == jobs.c.matte)
+        .outerjoin(captures, captures.c.job == jobs.c.id)
+        .where(
+            jobs.c.state == "cancelled", or_(mattes.c.state == "recovering", captures.c.state == "ingesting")
+        )
+    )
     return connection.execute(query).all()
 
 

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import io
-from contextlib import AbstractAsyncContextManager, suppress
+import shutil
+from contextlib import AbstractAsyncContextManager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 import obstore
 import zarr
@@ -40,8 +44,10 @@ class Objects:
     def __init__(self, url: str) -> None:
         self.url = url
         self._store: ObjectStore
+        self._folder: Path | None = None
         if url.startswith("file:"):
-            # Deleting the last object of a folder takes the folder with it: a deleted capture leaves nothing.
+            self._folder = Path(url2pathname(urlsplit(url).path))
+            # Whoever deletes the last object of a folder, zarr too, takes the folder with it.
             self._store = LocalStore.from_url(url, mkdir=True, automatic_cleanup=True)
         else:
             self._store = from_url(url)
@@ -97,10 +103,22 @@ class Objects:
 
     def delete(self, path: str) -> None:
         """Remove an object, or everything below a folder; nothing there is no error."""
+        if self._folder is not None:  # with its folders, and with what was never finished, see `sweep`
+            target = self._folder / path
+            shutil.rmtree(target) if target.is_dir() else target.unlink(missing_ok=True)
+            return
         for batch in obstore.list(self._store, path, chunk_size=500):
             obstore.delete(self._store, [meta["path"] for meta in batch])
-        with suppress(FileNotFoundError):  # a folder, gone with its objects, or never there
-            obstore.delete(self._store, path)
+
+    def sweep(self, path: str) -> None:
+        """Remove what writers that were killed have left below a folder that nobody writes to.
+
+        In a folder of this machine an object is written beside its place, under a name with a ``#``, and
+        then moved. A bucket has nothing of the kind.
+        """
+        if self._folder is not None:
+            for part in (self._folder / path).rglob("*#*"):
+                part.unlink()
 
     def check(self) -> None:
         """Reach the store once; raises whatever it raises when it can't be reached."""

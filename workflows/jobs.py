@@ -12,7 +12,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from storage import mattes
+from storage import captures, mattes
 from storage.captures import Stack
 from storage.objects import Objects
 from workflows import tiles
@@ -82,6 +82,7 @@ def _ingest_work(task: Task, tile: int) -> int:
 
 
 def _ingest_finish(task: Task) -> dict[str, Any]:
+    _objects(task.store).sweep(captures.path(task.capture))
     frames.measure(_objects(task.store), task.capture)
     return {}
 
@@ -113,6 +114,7 @@ def _recover_work(task: Task, tile: int) -> int:
 
 
 def _recover_finish(task: Task) -> dict[str, Any]:
+    _objects(task.store).sweep(mattes.path(task.matte))
     matte = mattes.Matte(_objects(task.store), task.matte)
     matte.check()
     return {

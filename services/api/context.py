@@ -6,6 +6,7 @@ from typing import Annotated, Any
 from fastapi import Depends, Query, Request
 from sqlalchemy import Engine
 
+from services.api.errors import TooLarge
 from services.settings import Settings
 from storage.objects import Objects
 
@@ -27,6 +28,25 @@ def _context(request: Request) -> Context:
 Needs = Annotated[Context, Depends(_context)]
 Limit = Annotated[int, Query(ge=1, le=1000, description="The most items to list.")]
 After = Annotated[str | None, Query(description="The id of the last item of the page before.")]
+
+
+async def read_body(request: Request, limit: int) -> bytes:
+    """The body of a request, read whole.
+
+    Raises
+    ------
+    TooLarge
+        As soon as more than ``limit`` bytes have come.
+    """
+    body = bytearray()
+    async for part in request.stream():
+        body += part
+        if len(body) > limit:
+            raise TooLarge(
+                f"the body of this request may have {limit} bytes; send a smaller one", limit=limit
+            )
+    return bytes(body)
+
 
 PROBLEM: dict[int | str, dict[str, Any]] = {
     "default": {

@@ -30,7 +30,11 @@ class TooLarge(InvalidInput):
 
 
 class WrongMediaType(InvalidInput):
-    """A body of another media type than is taken, or an answer asked for in one that can't be given."""
+    """A body of another media type than is taken."""
+
+
+class NotAcceptable(InvalidInput):
+    """An answer asked for in a media type that can't be given."""
 
 
 class Unauthorized(EnvmatteError):
@@ -43,6 +47,7 @@ PROBLEMS: dict[type[Exception], tuple[HTTPStatus, str, str]] = {
     OptionError: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-option", "The options can't be used"),
     TooLarge: (HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too-large", "Too large"),
     WrongMediaType: (HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "wrong-media-type", "Wrong media type"),
+    NotAcceptable: (HTTPStatus.NOT_ACCEPTABLE, "not-acceptable", "Not acceptable"),
     InvalidInput: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-request", "The request can't be used"),
     Unauthorized: (HTTPStatus.UNAUTHORIZED, "unauthorized", "A key is needed"),
     NotFound: (HTTPStatus.NOT_FOUND, "not-found", "Not found"),

@@ -4,11 +4,12 @@ import time
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Header, Query, Response
-from pydantic import BaseModel, ConfigDict, Field
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from sqlalchemy import Row
 
-from services.api.context import After, Limit, Needs
+from services.api.context import After, Limit, Needs, read_body
 from storage import captures, jobs, mattes
 from storage.database import jobs as table
 from storage.database import writing
@@ -18,6 +19,7 @@ from workflows.program import Program
 
 router = APIRouter(tags=["jobs"])
 CALL = "POST /v1/jobs"
+REQUEST_BYTES = 1 << 20
 State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 
 
@@ -27,6 +29,15 @@ class JobRequest(BaseModel):
     model_config = ConfigDict(extra="forbid")
     capture: str
     options: dict[str, Any] = Field(default_factory=dict, description="GET /v1/options lists them.")
+
+
+async def _job_request(request: Request) -> JobRequest:
+    """The JSON of a job, not read whole before its size is known, as a framework would."""
+    try:
+        return JobRequest.model_validate_json(await read_body(request, REQUEST_BYTES))
+    except ValidationError as error:
+        found = [detail | {"loc": ("body", *detail["loc"])} for detail in error.errors(include_url=False)]
+        raise RequestValidationError(found) from error
 
 
 class Tiles(BaseModel):
@@ -129,10 +140,16 @@ def list_options() -> Options:
     return Options.model_validate({"options": describe_options()})
 
 
-@router.post("/jobs", status_code=202)
+@router.post(
+    "/jobs",
+    status_code=202,
+    openapi_extra={
+        "requestBody": {"content": {"application/json": {"schema": JobRequest.model_json_schema()}}}
+    },
+)
 def post_job(
     context: Needs,
-    request: JobRequest,
+    request: Annotated[JobRequest, Depends(_job_request)],
     response: Response,
     idempotency_key: Annotated[str | None, Header(alias="Idempotency-Key", max_length=256)] = None,
 ) -> Job:
@@ -197,11 +214,15 @@ def retry_job(context: Needs, id: str) -> Job:
     with writing(context.engine) as c:
         row = jobs.get(c, id)
         capture = captures.get(c, row.capture)
-        if capture.state == "failed":
-            raise Conflict(f"capture {capture.id} failed, and nothing of it was kept; upload it again")
         jobs.retry(c, id)
-        if row.matte:
+        if row.kind == "recover":
+            if capture.state == "failed":
+                raise Conflict(f"capture {capture.id} failed: {capture.problem['detail']}")
             mattes.change(c, row.matte, state="recovering")
+        elif captures.may_be_retried(capture.problem):
+            captures.change(c, capture.id, state="ingesting", problem=None)
+        else:
+            raise Conflict(f"capture {capture.id} can't be used, and nothing of it was kept; upload it again")
         return Job.of(jobs.get(c, id), _workers(c))
 
 

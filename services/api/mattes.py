@@ -11,8 +11,8 @@ from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel
 from sqlalchemy import Row
 
-from services.api.context import After, Context, Limit, Needs
-from services.api.errors import TooLarge, WrongMediaType
+from services.api.context import After, Context, Limit, Needs, read_body
+from services.api.errors import NotAcceptable
 from storage import jobs, mattes
 from storage.database import mattes as table
 from storage.database import writing
@@ -112,15 +112,10 @@ async def post_composite(
     """
     accept = request.headers.get("accept", "*/*")
     if not any(kind in accept for kind in ("*/*", "image/*", "image/png")):
-        raise WrongMediaType(f"composites are answered as image/png, not as {accept}")
+        raise NotAcceptable(f"composites are answered as image/png, not as {accept}")
     row = await anyio.to_thread.run_sync(_ready, context, id)
-    limit = context.settings.backdrop_bytes
-    body = bytearray()
-    async for part in request.stream():
-        body += part
-        if len(body) > limit:
-            raise TooLarge(f"a backdrop may have {limit} bytes; send a smaller one", limit=limit)
-    picture, timing = await anyio.to_thread.run_sync(_composite, context, row.id, bytes(body), transfer)
+    body = await read_body(request, context.settings.backdrop_bytes)
+    picture, timing = await anyio.to_thread.run_sync(_composite, context, row.id, body, transfer)
     return Response(picture, media_type="image/png", headers={"Server-Timing": timing})
 
 

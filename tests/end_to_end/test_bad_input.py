@@ -201,6 +201,16 @@ def test_a_job_that_is_no_job(service: Service, body: bytes) -> None:
     check_problem(answer, 422, "bad-request")
 
 
+def test_bodies_that_are_too_large(service: Service, matte: str) -> None:
+    def endless(size: int):
+        yield from (bytes(1 << 20) for _ in range(size >> 20))
+
+    answer = service.http.post("/v1/jobs", content=endless(20 << 20))
+    assert check_problem(answer, 413, "too-large")["limit"] == 1 << 20
+    answer = service.http.post(f"/v1/mattes/{matte}/composite", content=endless(160 << 20))
+    assert check_problem(answer, 413, "too-large")["limit"] == 128 << 20
+
+
 def test_a_program_whose_grids_do_not_nest(service: Service, bundle: Path) -> None:
     def not_nested(manifest: dict, files: dict[str, bytes]) -> None:
         manifest["program"]["parts"][2] |= {"columns": 20, "rows": 15}
@@ -218,7 +228,7 @@ def test_a_backdrop_that_is_no_image(service: Service, matte: str, body: bytes) 
 
 def test_an_answer_that_cannot_be_given(service: Service, matte: str) -> None:
     answer = service.http.post(f"/v1/mattes/{matte}/composite", headers={"Accept": "image/x-exr"})
-    check_problem(answer, 415, "wrong-media-type")
+    check_problem(answer, 406, "not-acceptable")
 
 
 def test_every_call_answers_an_unknown_id_with_a_problem(service: Service) -> None:

@@ -19,6 +19,16 @@ def files_of(service: Service, matte: str) -> dict[str, str]:
     return digests(service.data / "store" / "mattes" / matte)
 
 
+def gone(service: Service, matte: str) -> None:
+    """Wait until a matte has left nothing."""
+    deadline = time.monotonic() + 20
+    while service.http.get(f"/v1/mattes/{matte}").status_code != 404 or any(
+        matte in n for n in service.stored()
+    ):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
 def recovered(service: Service, bundle: Path, **options: object) -> dict[str, str]:
     uploaded = service.client.upload(bundle)
     job = service.client.wait(service.client.recover(uploaded["id"], **options)["id"])
@@ -78,12 +88,54 @@ def test_a_cancelled_job_leaves_nothing(service: Service, capture: str) -> None:
     assert service.client.cancel(job["id"])["state"] == "cancelled"
     with pytest.raises(ServiceError, match="cancelled"):
         service.client.wait(job["id"])
+    gone(service, job["matte"])
+    assert service.client.cancel(job["id"])["state"] == "cancelled"
+
+
+def test_a_job_cancelled_while_it_waits_leaves_nothing(service: Service, bundle: Path) -> None:
+    uploaded = service.client.upload(bundle)
+    job = service.client.recover(uploaded["id"])
+    assert service.client.cancel(job["id"])["state"] == "cancelled"
+    service.client.wait(uploaded["job"])
+    gone(service, job["matte"])
+
+
+def test_a_cancelled_ingest_leaves_nothing(service: Service, capture: str, bundle: Path) -> None:
+    service.client.recover(capture, tile=1024)  # keeps a worker busy
+    before = service.stored()
+    uploaded = service.client.upload(bundle)
+    service.client.cancel(uploaded["job"])
     deadline = time.monotonic() + 20
-    while any(job["matte"] in name for name in service.stored()):
+    while service.client.capture(uploaded["id"])["state"] == "ingesting":
         assert time.monotonic() < deadline
         time.sleep(0.05)
-    assert service.http.get(f"/v1/mattes/{job['matte']}").status_code == 404
-    assert service.client.cancel(job["id"])["state"] == "cancelled"
+    assert service.client.capture(uploaded["id"])["problem"]["detail"].startswith("the ingest was cancelled")
+    while any(uploaded["id"] in name for name in service.stored() - before):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def test_an_ingest_that_failed_for_no_fault_of_the_capture_can_be_retried(
+    bundle: Path, tmp_path: Path
+) -> None:
+    with serving(tmp_path / "data", "--workers", "1") as service:
+        first = service.client.upload(bundle)
+        service.client.wait(first["job"])
+        busy = service.client.recover(first["id"], tile=1024)
+        while service.client.job(busy["id"])["stage"] != "recovering":
+            time.sleep(0.01)
+        time.sleep(0.3)
+        second = service.client.upload(bundle)
+        archive = service.data / "store" / "uploads" / f"{second['id']}.zip"
+        data = archive.read_bytes()
+        archive.unlink()
+        with pytest.raises(ServiceError, match="failed 3 times"):
+            service.client.wait(second["job"])
+        assert service.client.capture(second["id"])["state"] == "failed"
+        archive.write_bytes(data)
+        assert service.http.post(f"/v1/jobs/{second['job']}/retry").status_code == 202
+        service.client.wait(second["job"])
+        assert service.client.capture(second["id"])["state"] == "ready"
 
 
 def test_a_job_cancelled_before_a_kill_leaves_nothing(bundle: Path, tmp_path: Path) -> None:
@@ -96,6 +148,7 @@ def test_a_job_cancelled_before_a_kill_leaves_nothing(bundle: Path, tmp_path: Pa
         first.kill()
     (data / "store" / "uploads").mkdir(exist_ok=True)
     (data / "store" / "uploads" / "orphan.zip").write_bytes(b"an upload that was cut off by the kill")
+    (data / "store" / "uploads" / "orphan.zip#1").write_bytes(b"and one that was being written")
     with serving(data, "--workers", "1") as second:
         assert not [name for name in second.stored() if job["matte"] in name or "orphan" in name]
         assert second.client.job(job["id"])["state"] == "cancelled"

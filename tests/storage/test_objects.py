@@ -99,3 +99,24 @@ def test_a_missing_chunk_is_an_error_and_not_a_zero(objects: Objects, folder: Pa
     assert np.asarray(array[:2, :3]).min() == 1
     with pytest.raises(Corrupt, match="a/c/0/1 is missing"):
         array[:2]
+
+
+def test_what_a_killed_writer_left_is_swept(objects: Objects, folder: Path) -> None:
+    (folder / "a" / "b").mkdir(parents=True)
+    (folder / "a" / "b" / "whole").write_bytes(b"1")
+    (folder / "a" / "b" / "half#1").write_bytes(b"1")
+    objects.sweep("a")
+    assert [path.name for path in folder.rglob("*") if path.is_file()] == ["whole"]
+    (folder / "a" / "b" / "half#2").write_bytes(b"1")
+    objects.delete("a")
+    assert not (folder / "a").exists()
+
+
+def test_a_folder_with_an_odd_name_is_itself(tmp_path: Path) -> None:
+    odd = tmp_path / "a folder, 100 % ä"
+    Objects(odd.as_uri()).sweep("nothing")
+    store = Objects(odd.as_uri())
+    (odd / "x").write_bytes(b"1")
+    assert store.names("") == ["x"]
+    store.delete("x")
+    assert list(odd.iterdir()) == []
