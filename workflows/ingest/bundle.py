@@ -81,13 +81,15 @@ class Bundle:
 
     def __init__(self, file: BinaryIO, limits: Limits) -> None:
         self._limits = limits
+        bounded = _Bounded(file)
         try:
-            self._archive = zipfile.ZipFile(_Bounded(file))
+            self._archive = zipfile.ZipFile(bounded)
         except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError) as error:
             raise CaptureError(
                 "this is no ZIP archive, or it is cut off: its directory can't be read. Make it again, and "
                 "see that all of it is sent"
             ) from error
+        bounded.most = None
         self._entries: dict[str, zipfile.ZipInfo] = {}
         self._check_directory()
         self.manifest = self._read_manifest()
@@ -215,18 +217,20 @@ class Bundle:
 
 
 class _Bounded:
-    """A file that zipfile may not read at once as much of as a hostile directory says."""
+    """A file of which zipfile, while it opens it, may not read as much at once as a hostile directory says."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
+        self.most: int | None = DIRECTORY_BYTES
         self.seek = file.seek
         self.tell = file.tell
         self.seekable = file.seekable
         self.close = file.close
 
     def read(self, size: int = -1) -> bytes:
-        most = DIRECTORY_BYTES + 1
-        data = self._file.read(min(size, most) if size >= 0 else most)
-        if len(data) == most:
-            raise zipfile.BadZipFile(f"a directory of more than {DIRECTORY_BYTES} bytes")
+        if self.most is None:
+            return self._file.read(size)
+        data = self._file.read(min(size, self.most + 1) if size >= 0 else self.most + 1)
+        if len(data) > self.most:
+            raise zipfile.BadZipFile(f"a directory of more than {self.most} bytes")
         return data

@@ -353,3 +353,9 @@ def test_of_a_curve_out_of_range_the_range_is_told(make_zip: Zip) -> None:
     with pytest.raises(CaptureError, match="less than or equal to 5") as caught:
         open_bundle(make_zip(RECORD | {"response": {"gamma": 99}}, FILES))
     assert caught.value.fields == {"entry": "capture.json", "field": "response.gamma"}
+
+
+def test_an_entry_larger_than_a_directory_may_be_is_read(make_zip: Zip) -> None:
+    large = bytes(range(256)) * (9 << 12)
+    bundle = Bundle(io.BytesIO(make_zip(RECORD, FILES | {"large": large})), Limits(1 << 30, 1 << 30))
+    assert bundle.read("large") == large
