@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import zarr
 from numpy.typing import NDArray
-from sqlalchemy import Connection, Row, delete, insert, select, update
+from sqlalchemy import Connection, Row, delete, insert, update
 
-from storage.database import captures
-from storage.errors import Corrupt, NotFound
+from storage.database import captures, find
+from storage.errors import Corrupt
 from storage.grid import block_edge
 from storage.objects import EVERY_CHUNK, Objects
 
@@ -176,17 +176,8 @@ def add(connection: Connection, capture: str, job: str, **record: Any) -> None:
 
 
 def get(connection: Connection, capture: str) -> Row[Any]:
-    """A capture's row.
-
-    Raises
-    ------
-    NotFound
-        If there is none.
-    """
-    row = connection.execute(select(captures).where(captures.c.id == capture)).one_or_none()
-    if row is None:
-        raise NotFound(f"there is no capture {capture!r}; GET /v1/captures lists those there are")
-    return row
+    """A capture's row; `NotFound` if there is none."""
+    return find(connection, captures, capture)
 
 
 def may_be_retried(problem: dict[str, Any]) -> bool:

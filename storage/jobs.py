@@ -5,53 +5,16 @@ tiles (frames of a capture by slabs, pixels of a matte by rectangles), each ``qu
 is done when what it writes is stored and its row here says so.
 """
 
-import secrets
 import time
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from sqlalchemy import Connection, Row, Table, delete, insert, or_, select, update
+from sqlalchemy import Connection, Row, delete, insert, or_, select, update
 
-from storage.database import captures, coordinator, jobs, log, made, mattes, tiles
-from storage.errors import Conflict, NotFound
+from storage.database import captures, coordinator, find, jobs, log, made, mattes, new_id, tiles
+from storage.errors import Conflict
 
 ACTIVE = ("queued", "running")
-
-
-def new_id() -> str:
-    """An opaque, URL-safe id that can't be guessed."""
-    return secrets.token_hex(10)
-
-
-def page(
-    connection: Connection, table: Table, limit: int, after: str | None, **equal: str | None
-) -> Sequence[Row[Any]]:
-    """Rows of a table with ids and numbers, newest first.
-
-    Parameters
-    ----------
-    after : str, optional
-        The id of the last row of the page before.
-    **equal : str or None
-        Columns that must have a value; None asks for any.
-
-    Raises
-    ------
-    NotFound
-        If there is no row ``after``.
-    """
-    query = select(table).order_by(table.c.number.desc()).limit(limit)
-    for column, value in equal.items():
-        if value is not None:
-            query = query.where(table.c[column] == value)
-    if after is not None:
-        number = connection.scalar(select(table.c.number).where(table.c.id == after))
-        if number is None:
-            raise NotFound(
-                f"there is no {after!r} to go on after; leave `after` out to start again", field="after"
-            )
-        query = query.where(table.c.number < number)
-    return connection.execute(query).all()
 
 
 def add(
@@ -75,17 +38,8 @@ def add(
 
 
 def get(connection: Connection, job: str) -> Row[Any]:
-    """A job's row.
-
-    Raises
-    ------
-    NotFound
-        If there is none.
-    """
-    row = connection.execute(select(jobs).where(jobs.c.id == job)).one_or_none()
-    if row is None:
-        raise NotFound(f"there is no job {job!r}; GET /v1/jobs lists those there are")
-    return row
+    """A job's row; `NotFound` if there is none."""
+    return find(connection, jobs, job)
 
 
 def active(connection: Connection) -> Sequence[Row[Any]]:

@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 import zarr
 from numpy.typing import NDArray
-from sqlalchemy import Connection, Row, delete, insert, select, update
+from sqlalchemy import Connection, Row, delete, insert, update
 
-from storage.database import mattes
-from storage.errors import Corrupt, NotFound
+from storage.database import find, mattes
+from storage.errors import Corrupt
 from storage.grid import block_edge
 from storage.objects import EVERY_CHUNK, Objects
 
@@ -213,17 +213,8 @@ def add(connection: Connection, matte: str, capture: str, job: str, options: dic
 
 
 def get(connection: Connection, matte: str) -> Row[Any]:
-    """A matte's row.
-
-    Raises
-    ------
-    NotFound
-        If there is none.
-    """
-    row = connection.execute(select(mattes).where(mattes.c.id == matte)).one_or_none()
-    if row is None:
-        raise NotFound(f"there is no matte {matte!r}; GET /v1/mattes lists those there are")
-    return row
+    """A matte's row; `NotFound` if there is none."""
+    return find(connection, mattes, matte)
 
 
 def change(connection: Connection, matte: str, **values: Any) -> None:

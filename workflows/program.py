@@ -14,7 +14,7 @@ from workflows.grids import on_grid
 from workflows.recovery.sensing import Level, Sensing
 from workflows.tone import Curve, Response, to_light
 
-SENSING_BYTES = 1 << 30
+SENSING_BYTES = 512 << 20
 """The largest sensing matrix that a worker is asked to hold."""
 
 Unit = Annotated[float, Field(ge=0, le=1)]

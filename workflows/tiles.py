@@ -1,6 +1,8 @@
 """How a frame is cut into tiles, and the work of one: what a dask task runs."""
 
 from functools import lru_cache
+from itertools import product
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +17,9 @@ from workflows.program import Program
 from workflows.recovery import dgsr, pyramid
 from workflows.recovery.photometry import Noise, fit_photometry
 from workflows.recovery.sensing import Sensing
-from workflows.recovery.transport import Transport
 from workflows.tone import Curve, table, to_light
+
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 def cut(matte: Matte, tile: int) -> list[tuple[range, range]]:
@@ -44,7 +47,9 @@ def cut(matte: Matte, tile: int) -> list[tuple[range, range]]:
 
 
 def recover_tile(objects: Objects, capture: str, matte: str, options: RecoveryOptions, index: int) -> int:
-    """Recover the pixels of a tile, and write the blocks of the matte that it consists of.
+    """Recover the blocks of a matte that a tile consists of, one after another.
+
+    What is held in memory is a block's, and what comes out is the same however blocks make up tiles.
 
     Returns
     -------
@@ -56,76 +61,55 @@ def recover_tile(objects: Objects, capture: str, matte: str, options: RecoveryOp
     Corrupt
         If the store lacks the capture or the matte.
     """
-    target = Matte(objects, matte)
-    block_rows, block_columns = cut(target, options.tile or target.block)[index]
-    (top, _), (left, _) = ((s.start, s.stop) for s in target.span(block_rows[0], block_columns[0]))
-    (_, bottom), (_, right) = ((s.start, s.stop) for s in target.span(block_rows[-1], block_columns[-1]))
-    stack = Stack(objects, capture)
-    rows, columns = slice(top, bottom), slice(left, right)
-    height, width = bottom - top, right - left
-
-    mask = stack.mask(rows, columns)
-    recovered = np.ones((height, width), bool) if mask is None else mask
-    S, rho, transport = _recover(objects, capture, stack, stack.read(rows, columns)[:, recovered], options)
-
-    # The rows of T in the order of the tile's pixels, those left out being empty.
-    count = np.zeros((height, width, 3), np.uint32)
-    count[recovered] = transport.count
-    start = np.concatenate([[0], np.cumsum(count, dtype=np.int64)])
-    frames = {"S": S, "rho": rho}
-    full = {name: np.zeros((height, width, 3), np.float32) for name in frames}
-    for name, values in frames.items():
-        full[name][recovered] = values
-    for row in block_rows:
-        for column in block_columns:
-            y, x = target.span(row, column)
-            at = slice(y.start - top, y.stop - top), slice(x.start - left, x.stop - left)
-            entries = _entries(start, height, width, at)
-            target.write(
-                row,
-                column,
-                Block(
-                    full["S"][at],
-                    full["rho"][at],
-                    recovered[at],
-                    count[at],
-                    transport.cell[entries],
-                    transport.weight[entries],
-                ),
-            )
-    return int(recovered.sum())
+    target, stack = Matte(objects, matte), Stack(objects, capture)
+    rows, columns = cut(target, options.tile or target.block)[index]
+    pixels = 0
+    for row, column in product(rows, columns):
+        block = _recover_block(stack, target.span(row, column), _program(objects.url, capture), options)
+        target.write(row, column, block)
+        pixels += int(block.recovered.sum())
+    return pixels
 
 
-def _entries(start: NDArray[np.int64], height: int, width: int, at: tuple[slice, slice]) -> NDArray[np.int64]:
-    """Indices of the entries of T of a rectangle of a tile's pixels, in the rectangle's own order."""
-    ends = start[:-1].reshape(height, width * 3), start[1:].reshape(height, width * 3)
-    runs = [
-        np.arange(ends[0][y, 3 * at[1].start], ends[1][y, 3 * at[1].stop - 1])
-        for y in range(at[0].start, at[0].stop)
-    ]
-    return np.concatenate(runs)
-
-
-def _recover(
-    objects: Objects, capture: str, stack: Stack, codes: Codes, options: RecoveryOptions
-) -> tuple[NDArray[np.float32], NDArray[np.float32], Transport]:
-    """S, rho (n, 3) float32 and T of n pixels, from their stored values (frame, n, channel)."""
+def _recover_block(
+    stack: Stack,
+    span: tuple[slice, slice],
+    shown: tuple[Program, Sensing, Curve],
+    options: RecoveryOptions,
+) -> Block:
+    program, sensing, monitor = shown
     attributes = stack.attributes
-    program, sensing, monitor = _program(objects.url, capture)
     camera = TypeAdapter[Curve](Curve).validate_python(attributes["camera_curve"])
     noise = Noise(**attributes["noise"])
-    frames, usable, repeats = _merge(codes, np.array(attributes["patterns"]), program.count, camera)
-
+    codes, mask = stack.read(*span), stack.mask(*span)
+    recovered = np.ones(codes.shape[1:3], bool) if mask is None else mask
+    light, usable, repeats = _merge(
+        codes[:, recovered], np.array(attributes["patterns"]), program.count, camera
+    )
     numbers, sent = program.constants
     photometry = fit_photometry(
-        frames[:, numbers], to_light(sent, monitor), usable[:, numbers], noise, repeats[numbers]
+        light[:, numbers], to_light(sent, monitor), usable[:, numbers], noise, repeats[numbers]
     )
-    measurements = np.ascontiguousarray(frames[:, program.measured])
+    measurements = np.ascontiguousarray(light[:, program.measured])
     if options.method == "pyramid":
         transport = pyramid.recover(measurements, photometry, sensing, noise)
     else:
         transport = dgsr.recover(measurements, photometry, sensing, noise)
-    return photometry.S, photometry.rho, transport
+
+    def spread(values: NDArray[Scalar]) -> NDArray[Scalar]:
+        """Values of the recovered pixels, and zeros for the others."""
+        block = np.zeros((*recovered.shape, 3), values.dtype)
+        block[recovered] = values
+        return block
+
+    return Block(
+        spread(photometry.S),
+        spread(photometry.rho),
+        recovered,
+        spread(transport.count),
+        transport.cell,
+        transport.weight,
+    )
 
 
 def _merge(

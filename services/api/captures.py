@@ -15,7 +15,7 @@ from services.api.errors import TooLarge, WrongMediaType
 from storage import captures, jobs
 from storage.captures import Stack
 from storage.database import captures as table
-from storage.database import writing
+from storage.database import new_id, page, writing
 from storage.errors import CaptureError, Conflict, NotFound
 from workflows.images import encode_png
 from workflows.ingest.bundle import Bundle, Manifest
@@ -87,7 +87,7 @@ async def upload(
         raise _too_large(limit)
     row = await anyio.to_thread.run_sync(_made, context, idempotency_key)
     if row is None:
-        capture = jobs.new_id()
+        capture = new_id()
         size = await _receive(context, capture, request.stream(), limit)
         row = await anyio.to_thread.run_sync(_register, context, capture, size, name, idempotency_key)
     response.headers["Location"] = f"/v1/captures/{row.id}"
@@ -103,7 +103,7 @@ def list_captures(
 ) -> Captures:
     """Captures, newest first."""
     with context.engine.connect() as c:
-        return Captures(captures=[Capture.of(row) for row in jobs.page(c, table, limit, after, state=state)])
+        return Captures(captures=[Capture.of(row) for row in page(c, table, limit, after, state=state)])
 
 
 @router.get("/captures/{id}")

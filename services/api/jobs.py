@@ -12,7 +12,7 @@ from sqlalchemy import Row
 from services.api.context import After, Limit, Needs, read_body
 from storage import captures, jobs, mattes
 from storage.database import jobs as table
-from storage.database import writing
+from storage.database import new_id, page, writing
 from storage.errors import Conflict
 from workflows.options import describe_options, parse_options
 from workflows.program import Program
@@ -164,7 +164,7 @@ def post_job(
             Program.model_validate(
                 capture.program
             ).bands()  # grids that do not nest are refused now, not later
-            matte = jobs.new_id()
+            matte = new_id()
             chosen = options.model_dump(mode="json")
             job = jobs.add(c, "recover", capture.id, chosen, matte)
             mattes.add(c, matte, capture.id, job, chosen)
@@ -181,7 +181,7 @@ def list_jobs(context: Needs, limit: Limit = 100, after: After = None, state: St
     """Jobs, newest first."""
     with context.engine.connect() as c:
         workers = _workers(c)
-        return Jobs(jobs=[Job.of(row, workers) for row in jobs.page(c, table, limit, after, state=state)])
+        return Jobs(jobs=[Job.of(row, workers) for row in page(c, table, limit, after, state=state)])
 
 
 @router.get("/jobs/{id}")

@@ -15,7 +15,7 @@ from services.api.context import After, Context, Limit, Needs, read_body
 from services.api.errors import NotAcceptable
 from storage import jobs, mattes
 from storage.database import mattes as table
-from storage.database import writing
+from storage.database import page, writing
 from storage.errors import Conflict
 from workflows import images
 from workflows.composite import composite
@@ -66,7 +66,7 @@ def list_mattes(
 ) -> Mattes:
     """Mattes, newest first."""
     with context.engine.connect() as c:
-        return Mattes(mattes=[Matte.of(row) for row in jobs.page(c, table, limit, after, state=state)])
+        return Mattes(mattes=[Matte.of(row) for row in page(c, table, limit, after, state=state)])
 
 
 @router.get("/mattes/{id}")

@@ -59,7 +59,7 @@ def test_a_job_from_queue_to_success(connection: Connection) -> None:
 
 
 def test_ids_are_opaque_and_differ() -> None:
-    ids = {jobs.new_id() for _ in range(1000)}
+    ids = {database.new_id() for _ in range(1000)}
     assert len(ids) == 1000
     assert all(name.isalnum() and len(name) == 20 for name in ids)
 
@@ -180,7 +180,7 @@ def test_a_page_is_newest_first(connection: Connection) -> None:
         jobs.end(connection, job, "failed")
 
     def ids(limit: int, after: str | None, **equal: str | None) -> list[str]:
-        return [row.id for row in jobs.page(connection, database.jobs, limit, after, **equal)]
+        return [row.id for row in database.page(connection, database.jobs, limit, after, **equal)]
 
     assert ids(10, None) == made[::-1]
     assert ids(2, None) == [made[4], made[3]]
