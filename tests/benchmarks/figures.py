@@ -14,6 +14,7 @@ import json
 import sqlite3
 import sys
 import tempfile
+from contextlib import redirect_stdout
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -45,7 +46,8 @@ def measure(kit: ModuleType, scene: Path, method: str, client: Client, data: Pat
     """Film, upload, recover, composite, score."""
     bundle = data.parent / "capture.zip"
     bands = BANDS[method]
-    kit.main(["capture", str(scene), str(bundle), "--bands", bands, "--noise", "1.0", "--mask"])
+    with redirect_stdout(None):
+        kit.main(["capture", str(scene), str(bundle), "--bands", bands, "--noise", "1.0", "--mask"])
     uploaded = client.upload(bundle, name=scene.stem)
     job = client.wait(client.recover(uploaded["id"], method=method)["id"])
     with sqlite3.connect(data / "envmatte.db") as ledger:

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.end_to_end.conftest import Service, png
+from tests.end_to_end.conftest import Service, digests, png
 from workflows import images
+from workflows.program import Images, Program
 from workflows.scene import Scene, write_capture
 from workflows.tone import to_light
 
@@ -150,3 +151,18 @@ def test_options_are_described(service: Service) -> None:
     assert options["method"]["default"] == "pyramid"
     assert (options["tile"]["minimum"], options["tile"]["maximum"]) == (16, 1024)
     assert all(option["description"] for option in options.values())
+
+
+def test_patterns_may_come_as_images(
+    service: Service, matte: str, scene: Scene, program: Program, tmp_path: Path
+) -> None:
+    constant, *bands = program.parts
+    shown = [pattern.astype(np.float32) for band in bands for pattern in band.bits]
+    files = tuple(f"patterns/{n}.png" for n in range(len(shown)))
+    same = Program(monitor=program.monitor, parts=(constant, Images(kind="images", files=files)))
+    bundle = tmp_path / "images.zip"
+    write_capture(scene, same, bundle, images=shown)
+    uploaded = service.client.upload(bundle)
+    job = service.client.wait(service.client.recover(uploaded["id"])["id"])
+    mattes = service.data / "store" / "mattes"
+    assert digests(mattes / job["matte"]) == digests(mattes / matte)

@@ -43,7 +43,10 @@ def test_a_killed_server_goes_on_where_it_stood(
         job = first.client.recover(first.client.upload(bundle)["id"])
         while first.client.job(job["id"])["tiles"]["done"] < 5:
             time.sleep(0.01)
+        family = psutil.Process(first.process.pid).children(recursive=True)
         first.kill()
+        _, alive = psutil.wait_procs(family, timeout=10)
+        assert alive == []
     with serving(data, "--workers", "1") as second:
         found = second.client.job(job["id"])
         assert 5 <= found["tiles"]["done"] < 30
