@@ -40,6 +40,7 @@ class Progress:
         """Show a share of 0 to 1, and what is going on."""
         if self._bar is not None:
             self._bar.update(round(share * 1000) - self._bar.pos, text)
+            self._bar.render_progress()  # update alone shows no new text where the share stands still
         elif share >= self._said + STEP or (share == 1 and self._said < 1):
             self._said = share
             click.echo(f"{self._what}: {share:.0%} {text}".rstrip(), err=True)
