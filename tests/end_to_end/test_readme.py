@@ -15,7 +15,9 @@ from workflows import images, simulate
 README = (Path(__file__).parents[2] / "README.md").read_text()
 
 
-@pytest.mark.skipif(shutil.which("curl") is None, reason="the README's lines need curl, which is not installed")
+@pytest.mark.skipif(
+    shutil.which("curl") is None, reason="the README's lines need curl, which is not installed"
+)
 def test_the_five_lines_of_curl(service: Service, bundle: Path, tmp_path: Path) -> None:
     (lines,) = (block for block in re.findall(r"```sh\n(.*?)```", README, re.S) if "curl" in block)
     assert len(lines.splitlines()) == 5
