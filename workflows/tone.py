@@ -77,15 +77,9 @@ def estimate(
     monitor, camera : Curve
         Known curves as they are. One unknown curve is the gamma under which the light at the camera is
         closest to a line in the light of the monitor (eq. 6). With both unknown, fewer than three levels,
-        or a camera that saw no difference, the levels can't tell, and an unknown curve is taken for sRGB, which is what
-        nearly every monitor and camera is built to.
+        or a camera that saw no difference, the levels can't tell, and an unknown curve is taken for sRGB,
+        which is what nearly every monitor and camera is built to.
     """
-    both = monitor == "unknown" and camera == "unknown"
-    if both or len(np.unique(levels)) < 3 or values.size == 0 or not np.ptp(values, axis=0).any():
-        return (
-            "srgb" if monitor == "unknown" else monitor,
-            "srgb" if camera == "unknown" else camera,
-        )
 
     def off_line(gamma: float) -> float:
         curve = Gamma(gamma=gamma)
@@ -95,16 +89,9 @@ def estimate(
         residual = c - design @ np.linalg.lstsq(design, c, rcond=None)[0]
         return float(np.sum(residual**2) / np.sum((c - c.mean(axis=0)) ** 2))
 
-    found: Curve | None = None
-    if "unknown" in (monitor, camera):
-        found = Gamma(gamma=round(float(minimize_scalar(off_line, bounds=(0.4, 4.0), method="bounded").x), 4))
-    return (
-        found if monitor == "unknown" and found is not None else _known(monitor),
-        found if camera == "unknown" and found is not None else _known(camera),
-    )
-
-
-def _known(response: Response) -> Curve:
-    if response == "unknown":
-        raise ValueError("an unknown curve has no light")
-    return response
+    found: Curve = "srgb"
+    one = (monitor == "unknown") != (camera == "unknown")
+    if one and len(np.unique(levels)) >= 3 and values.size > 0 and np.ptp(values, axis=0).any():
+        best = minimize_scalar(off_line, bounds=(0.4, 4.0), method="bounded")
+        found = Gamma(gamma=round(float(best.x), 4))
+    return (found if monitor == "unknown" else monitor, found if camera == "unknown" else camera)

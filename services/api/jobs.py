@@ -161,9 +161,8 @@ def post_job(
             capture = captures.get(c, request.capture)
             if capture.state == "failed":
                 raise Conflict(f"capture {capture.id} failed: {capture.problem['detail']}")
-            Program.model_validate(
-                capture.program
-            ).bands()  # grids that do not nest are refused now, not later
+            # Grids that do not nest are refused now, and not by the job.
+            Program.model_validate(capture.program).bands()
             matte = new_id()
             chosen = options.model_dump(mode="json")
             job = jobs.add(c, "recover", capture.id, chosen, matte)
