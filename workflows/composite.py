@@ -2,10 +2,10 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from storage.mattes import Matte
 from workflows.grids import area_mean
+from workflows.recovery.transport import Transport
 
 
 def composite(matte: Matte, backdrop: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -31,21 +31,14 @@ def composite(matte: Matte, backdrop: NDArray[np.float32]) -> NDArray[np.float32
     -----
     T's cells see the mean of the backdrop over them, which is what the patterns' blocks were to them.
     """
-    cells = np.broadcast_to(
-        area_mean(backdrop, matte.columns, matte.rows), (matte.rows, matte.columns, 3)
-    ).reshape(-1)
+    light = area_mean(backdrop, matte.columns, matte.rows).reshape(matte.columns * matte.rows, -1)
+    light = np.broadcast_to(light, (len(light), 3))
     picture = np.zeros((matte.height, matte.width, 4), np.float32)
     for row in range(matte.block_rows):
         for column in range(matte.block_columns):
             block = matte.read(row, column)
-            # One product for the three channels: each channel's cells are columns of their own.
-            channel = np.repeat(np.tile(np.arange(3), block.count.size // 3), block.count.ravel())
-            ends = np.concatenate([[0], np.cumsum(block.count, dtype=np.int64)])
-            T = csr_array(
-                (block.weight, block.cell.astype(np.int64) * 3 + channel, ends),
-                shape=(block.count.size, len(cells)),
-            )
+            T = Transport(matte.columns, matte.rows, block.count.reshape(-1, 3), block.cell, block.weight)
             y, x = matte.span(row, column)
-            picture[y, x, :3] = block.S + block.rho * (T @ cells).reshape(block.S.shape)
+            picture[y, x, :3] = block.S + block.rho * T.apply(light).reshape(block.S.shape)
             picture[y, x, 3] = block.recovered
     return picture

@@ -102,26 +102,6 @@ class Transport:
             np.concatenate([part.weight for part in parts]),
         )
 
-    def take(self, pixels: NDArray[np.integer]) -> Self:
-        """Transport of the given pixels, in the given order.
-
-        Parameters
-        ----------
-        pixels : (k,) integer
-            Indices along the first axis of `count`, 0 to n - 1; repeats are allowed.
-
-        Raises
-        ------
-        IndexError
-            If an index is out of range.
-        """
-        sizes = self.count.sum(axis=1, dtype=np.int64)
-        begin = np.cumsum(sizes) - sizes
-        entries = ragged_entries(begin[pixels], sizes[pixels])
-        return type(self)(
-            self.columns, self.rows, self.count[pixels], self.cell[entries], self.weight[entries]
-        )
-
     def apply(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
         """Light that arrives through the rows: T L of eq. 5.
 
