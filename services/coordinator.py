@@ -51,6 +51,11 @@ class Drive:
     misses: int = 0
     """How often that one has failed."""
 
+    @property
+    def in_flight(self) -> list[Future]:
+        """All that the cluster has of it."""
+        return [*self.tiles, *([self.step] if self.step else [])]
+
 
 class Coordinator:
     """Drives jobs until it is stopped. There is one for a database.
@@ -262,7 +267,7 @@ class Coordinator:
         Only then is what they wrote removed, or they would go on to write it.
         """
         drive.to_do.clear()
-        if all(future.done() for future in (*drive.tiles, *filter(None, [drive.step]))):
+        if all(future.done() for future in drive.in_flight):
             del self._drives[drive.job]
             self._discard(drive.kind, drive.task.capture, drive.task.matte)
 
@@ -276,7 +281,7 @@ class Coordinator:
             else:
                 mattes.change(c, drive.task.matte, state="failed")
         if drive.kind == "recover" or captures.may_be_retried(problem):  # what is done is kept
-            self._client.cancel([*drive.tiles, *filter(None, [drive.step])])
+            self._client.cancel(drive.in_flight)
             del self._drives[drive.job]
 
     def _discard(self, kind: str, capture: str, matte: str) -> None:

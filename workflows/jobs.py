@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-from pydantic import TypeAdapter
-
 from storage import captures, mattes
 from storage.captures import Stack
 from storage.objects import Objects
@@ -19,8 +17,6 @@ from workflows import tiles
 from workflows.ingest import frames
 from workflows.ingest.bundle import Limits
 from workflows.options import RecoveryOptions
-from workflows.program import Program
-from workflows.tone import Curve
 
 
 @dataclass(frozen=True)
@@ -90,9 +86,8 @@ def _ingest_finish(task: Task) -> dict[str, Any]:
 def _recover_prepare(task: Task) -> dict[str, int]:
     objects = _objects(task.store)
     stack = Stack(objects, task.capture)
-    program = Program.model_validate(stack.attributes["program"])
-    curve = TypeAdapter[Curve](Curve).validate_python(stack.attributes["monitor_curve"])
-    finest = program.sensing(curve, stack.images()).levels[-1]
+    program, sensing, _ = tiles.program_of(task.store, task.capture)
+    finest = sensing.levels[-1]
     options = RecoveryOptions.model_validate(task.options)
     matte = mattes.create(
         objects,

@@ -65,7 +65,7 @@ def recover_tile(objects: Objects, capture: str, matte: str, options: RecoveryOp
     rows, columns = cut(target, options.tile or target.block)[index]
     pixels = 0
     for row, column in product(rows, columns):
-        block = _recover_block(stack, target.span(row, column), _program(objects.url, capture), options)
+        block = _recover_block(stack, target.span(row, column), program_of(objects.url, capture), options)
         target.write(row, column, block)
         pixels += int(block.recovered.sum())
     return pixels
@@ -139,7 +139,7 @@ def _merge(
 
 
 @lru_cache(maxsize=2)
-def _program(url: str, capture: str) -> tuple[Program, Sensing, Curve]:
+def program_of(url: str, capture: str) -> tuple[Program, Sensing, Curve]:
     """A capture's program, sensing matrices and monitor curve, kept from tile to tile: a capture never changes."""
     stack = Stack(Objects(url), capture)
     program = Program.model_validate(stack.attributes["program"])

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from sqlalchemy import Row
+from sqlalchemy import Connection, Row
 
 from services.api.context import After, Limit, Needs, read_body
 from storage import captures, jobs, mattes
@@ -232,7 +232,7 @@ def delete_job(context: Needs, id: str) -> None:
         jobs.forget(c, id)
 
 
-def _workers(connection: Any) -> int:
+def _workers(connection: Connection) -> int:
     beat = jobs.last_beat(connection)
     return beat.workers if beat else 0
 
