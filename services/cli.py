@@ -5,17 +5,30 @@ Exit codes: 0 done; 1 the service refused or the job failed; 2 the command line 
 
 import json
 import os
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from services.client import Client, ServiceError
 from services.progress import Progress
 
+if TYPE_CHECKING:
+    from pydantic import ValidationError
+
 F = TypeVar("F", bound=Callable[..., Any])
+
+PRESETS = {
+    "default": "132 frames, black and white: the best mattes, whatever the glass.",
+    "quick": "56 frames in colour: for clear glass, and for who can't wait.",
+    "sketch": "32 frames in colour: a first look at the set-up.",
+    "paper-250": "282 frames: the program of the paper, to compare with it.",
+    "paper-400": "432 frames: the same at its longest.",
+}
+"""Named here once more than in `workflows.presets`, which is too heavy to import for a list of names."""
 
 
 def _remote(command: F) -> F:
@@ -60,8 +73,7 @@ def serve(**given: Any) -> None:
     try:
         run(Settings(**{name: value for name, value in given.items() if value is not None}))
     except ValidationError as error:
-        first = error.errors()[0]
-        raise click.UsageError(f"{'.'.join(map(str, first['loc']))} {first['msg']}".strip()) from error
+        raise click.UsageError(_first(error)) from error
     except EnvmatteError as error:
         raise click.ClickException(error.detail) from error
 
@@ -82,7 +94,7 @@ def upload(file: Path, name: str, url: str, key: str | None, as_json: bool) -> N
 
 @main.command()
 @click.argument("capture")
-@click.option("--method", help="pyramid or nn-dgsr.")
+@click.option("--method", help="lobes or nn-dgsr.")
 @click.option(
     "--option", "options", multiple=True, metavar="NAME=VALUE", help="Any option of GET /v1/options."
 )
@@ -157,6 +169,47 @@ def demo(output: Path, keep: Path | None, workers: int | None, as_json: bool) ->
     _say({"output": str(output), **figures}, as_json, "output")
 
 
+def _size(context: click.Context, parameter: click.Parameter, text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
+    if not found:
+        raise click.BadParameter("give it as WIDTHxHEIGHT in pixels, 1280x960 say")
+    return int(found[1]), int(found[2])
+
+
+@main.command(epilog="\b\nPresets:\n" + "\n".join(f"  {name:<11}{text}" for name, text in PRESETS.items()))
+@click.argument("preset", type=click.Choice(list(PRESETS)), metavar="PRESET")
+@click.argument("folder", type=click.Path(file_okay=False, path_type=Path))
+@click.option(
+    "--monitor",
+    default="1280x960",
+    show_default=True,
+    metavar="WIDTHxHEIGHT",
+    callback=_size,
+    help="The monitor's pixels: each of them must show one of the picture's.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
+def patterns(preset: str, folder: Path, monitor: tuple[int, int], as_json: bool) -> None:
+    """Write the patterns of a preset into a new folder, a PNG each, and program.json for the capture."""
+    from pydantic import ValidationError
+
+    from services.patterns import write
+    from storage.errors import EnvmatteError
+    from workflows.presets import preset as program_of
+
+    try:
+        program = program_of(preset, *monitor)
+        with Progress("patterns") as bar:
+            write(program, folder, lambda n: bar.show(n / program.count, f"{n} of {program.count}"))
+    except ValidationError as error:
+        raise click.UsageError(_first(error)) from error
+    except EnvmatteError as error:
+        raise click.UsageError(error.detail) from error
+    except OSError as error:
+        raise click.ClickException(f"{folder} can't be written: {error.strerror}") from error
+    made = {"folder": str(folder), "preset": preset, "monitor": list(monitor), "patterns": program.count}
+    _say(made, as_json, "folder")
+
+
 def _pair(option: str) -> tuple[str, Any]:
     name, equals, value = option.partition("=")
     if not equals:
@@ -165,6 +218,11 @@ def _pair(option: str) -> tuple[str, Any]:
         return name, json.loads(value)
     except json.JSONDecodeError:
         return name, value
+
+
+def _first(error: "ValidationError") -> str:
+    first = error.errors()[0]
+    return f"{'.'.join(map(str, first['loc']))} {first['msg']}".strip()
 
 
 def _write(path: Path, data: bytes) -> None:

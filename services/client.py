@@ -115,6 +115,10 @@ class Client:
         )
         return answer.content
 
+    def layer(self, matte: str, name: str) -> bytes:
+        """A layer of a matte, as `confidence.png`."""
+        return self._send("GET", f"/v1/mattes/{matte}/layers/{name}").content
+
     def _json(self, method: str, path: str, **request: Any) -> dict[str, Any]:
         found: dict[str, Any] = self._send(method, path, **request).json()
         return found

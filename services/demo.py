@@ -19,7 +19,8 @@ from services.client import Client
 from services.progress import Progress
 from workflows import images, simulate
 from workflows.grids import area_mean
-from workflows.scene import nested_program, write_capture
+from workflows.presets import preset
+from workflows.scene import write_capture
 from workflows.tone import from_light, to_light
 
 WIDTH, HEIGHT = 240, 180
@@ -57,7 +58,7 @@ def run(workers: int | None, keep: Path | None = None) -> tuple[bytes, dict[str,
             bar.show(0, f"tracing a glass ball, {WIDTH} x {HEIGHT} pixels, 64 rays each")
             scene = simulate.glass_ball(WIDTH, HEIGHT, rays=64)
             capture = Path(folder, "glass-ball.zip")
-            write_capture(scene, nested_program(), capture, name="glass ball")
+            write_capture(scene, preset("default"), capture, name="glass ball")
         bar.show(0.1, "starting the service")
         start = time.perf_counter()
         with service(Path(folder, "data"), workers) as url, Client(url) as client:

@@ -1,14 +1,22 @@
 """A matte: S, rho and T, laid out in zarr so that any zarr reader can read it.
 
 In the store, under ``mattes/ID``, a zarr group with the attributes ``width``, ``height``, ``columns``, ``rows`` (the
-grid of T's cells), ``block`` and what the matte was made from; and in it
+first grid of T's cells), ``block``, ``crosstalk`` (X of ``C = S + X (rho T L)``: row the camera's channel, column the
+monitor's) and what the matte was made from; and in it
 
 - ``S``, ``rho`` (y, x, channel) float32;
 - ``count`` (y, x, channel) uint32: how many cells the row T of a pixel and channel has;
+- ``shared`` (y, x) bool: whether a pixel's first row is the T of all its channels; the others are empty then;
+- ``error`` (y, x) float32: root of the mean squared error to expect of a composite there, in camera units; infinite
+  where nothing could be recovered;
 - ``recovered`` (y, x) bool: false where the capture's mask left a pixel out;
 - ``T/R.C/cell`` and ``T/R.C/weight``, one-dimensional, for the block in block row R and block column C: the
-  cells (``row * columns + column``, row 0 at the top) and weights of its rows T one after another, in the order
-  (y, x, channel).
+  cells and weights of its rows T one after another, in the order (y, x, channel).
+
+Cells are numbered ``row * columns + column``, row 0 at the top, through a first grid laid over the monitor, then
+through one of half as many columns and rows (rounded up), and so on. A cell of the first grid sees the mean light over
+it; one of a further grid sees sixteen of the grid before, 2 column - 1 to 2 column + 2 and the same in rows, with the
+weights [1, 3, 3, 1] / 8 along each axis, beyond the edge the cells at the edge.
 
 A block is a square of ``block`` pixels, and a chunk of the frame-shaped arrays. Whoever recovers a block writes all of
 it and nothing else, so blocks can be written in any order, by anyone, and again.
@@ -29,7 +37,7 @@ from storage.grid import block_edge
 from storage.objects import EVERY_CHUNK, Objects
 
 FORMAT = "envmatte-matte/1"
-FRAMES = ("S", "rho", "recovered", "count")
+FRAMES = ("S", "rho", "error", "recovered", "shared", "count")
 """The frame-shaped arrays, in the order in which a block is written."""
 
 
@@ -40,7 +48,8 @@ class Block:
     Attributes
     ----------
     S, rho : (h, w, 3) float32
-    recovered : (h, w) bool
+    error : (h, w) float32
+    recovered, shared : (h, w) bool
     count : (h, w, 3) uint32
     cell : (count.sum(),) uint32
     weight : (count.sum(),) float32
@@ -48,7 +57,9 @@ class Block:
 
     S: NDArray[np.float32]
     rho: NDArray[np.float32]
+    error: NDArray[np.float32]
     recovered: NDArray[np.bool_]
+    shared: NDArray[np.bool_]
     count: NDArray[np.uint32]
     cell: NDArray[np.uint32]
     weight: NDArray[np.float32]
@@ -68,7 +79,7 @@ class Matte:
     height, width : int
         Of the frame, in pixels.
     columns, rows : int
-        The grid of T's cells.
+        The first grid of T's cells.
     block : int
         Edge of a block, in pixels.
     """
@@ -126,7 +137,7 @@ class Matte:
             If some of it is missing.
         """
         span = self.span(row, column)
-        S, rho, recovered, count = (np.asarray(array[span]) for array in self._frames.values())
+        frames = {name: np.asarray(array[span]) for name, array in self._frames.items()}
         try:
             cell, weight = (
                 np.asarray(self._objects.array(f"{self._path}/T/{row}.{column}/{name}")[:])
@@ -134,9 +145,19 @@ class Matte:
             )
         except FileNotFoundError as error:
             raise self._corrupt(row, column) from error
-        if not len(cell) == len(weight) == count.sum():
+        if not len(cell) == len(weight) == frames["count"].sum():
             raise self._corrupt(row, column)
-        return Block(S, rho, recovered, count, cell, weight)
+        return Block(**frames, cell=cell, weight=weight)
+
+    def layer(self, name: str) -> NDArray[Any]:
+        """A frame-shaped array, whole.
+
+        Raises
+        ------
+        Corrupt
+            If some of it is missing.
+        """
+        return np.asarray(self._frames[name][:])
 
     def check(self) -> None:
         """See that every block is there.
@@ -171,7 +192,7 @@ def create(
     height, width : int
         Of the frame, in pixels.
     columns, rows : int
-        The grid of T's cells.
+        The first grid of T's cells.
     **attributes
         What it is made from, as JSON. No times and no ids: the same input makes the same bytes.
     """
@@ -202,7 +223,8 @@ def create(
         dtype="uint32",
         dimension_names=dims,
     )
-    group.create_array("recovered", shape=frame, chunks=chunk, dtype="bool", dimension_names=dims[:2])
+    for name, kind in (("error", "float32"), ("recovered", "bool"), ("shared", "bool")):
+        group.create_array(name, shape=frame, chunks=chunk, dtype=kind, dimension_names=dims[:2])
     return Matte(objects, matte)
 
 

@@ -28,6 +28,26 @@ def smallest_grid(image: NDArray[Value]) -> NDArray[Value]:
     return image
 
 
+def stretch(values: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
+    """Values of a grid, stretched over a monitor as the capture format says.
+
+    Parameters
+    ----------
+    values : (rows, columns, channels) float32
+
+    Returns
+    -------
+    (height, width, channels) float32
+        Pixel (y, x) has the value of row ``y * rows // height`` and column ``x * columns // width``.
+    """
+    rows, columns, _ = values.shape
+    if (rows, columns) == (height, width):
+        return values
+    x, y = np.arange(width) * columns // width, np.arange(height) * rows // height
+    picture: NDArray[np.float32] = values.take(x, axis=1).take(y, axis=0)
+    return picture
+
+
 def on_grid(light: NDArray[np.float32], columns: int, rows: int) -> NDArray[np.float32]:
     """The mean light over each cell of a grid."""
     if columns % light.shape[1] == 0 and rows % light.shape[0] == 0:

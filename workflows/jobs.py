@@ -16,7 +16,7 @@ from storage.objects import Objects
 from workflows import tiles
 from workflows.ingest import frames
 from workflows.ingest.bundle import Limits
-from workflows.options import RecoveryOptions
+from workflows.options import parse_options
 
 
 @dataclass(frozen=True)
@@ -86,17 +86,18 @@ def _ingest_finish(task: Task) -> dict[str, Any]:
 def _recover_prepare(task: Task) -> dict[str, int]:
     objects = _objects(task.store)
     stack = Stack(objects, task.capture)
-    program, sensing, _ = tiles.program_of(task.store, task.capture)
-    finest = sensing.levels[-1]
-    options = RecoveryOptions.model_validate(task.options)
+    program, _ = tiles.program_of(task.store, task.capture)
+    options = parse_options(task.options)
+    columns, rows = tiles.grid_of(task.store, task.capture, options)
     matte = mattes.create(
         objects,
         task.matte,
         height=stack.height,
         width=stack.width,
-        columns=finest.columns,
-        rows=finest.rows,
+        columns=columns,
+        rows=rows,
         monitor=[program.monitor.width, program.monitor.height],
+        crosstalk=stack.attributes["crosstalk"],
         # The tile is left out: the same matte comes out whatever it was.
         options=options.model_dump(mode="json", exclude={"tile"}),
     )
@@ -104,7 +105,7 @@ def _recover_prepare(task: Task) -> dict[str, int]:
 
 
 def _recover_work(task: Task, tile: int) -> int:
-    options = RecoveryOptions.model_validate(task.options)
+    options = parse_options(task.options)
     return tiles.recover_tile(_objects(task.store), task.capture, task.matte, options, tile)
 
 

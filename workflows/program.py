@@ -1,105 +1,26 @@
-"""A pattern program: what the monitor shows, as bits, as images, and as rows of the sensing matrix."""
+"""A pattern program: what the monitor shows, as bits, as pictures, and as rows of the sensing matrix."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
-from itertools import pairwise
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from storage.errors import OptionError
-from workflows.grids import on_grid
-from workflows.recovery.sensing import Level, Sensing
-from workflows.tone import Curve, Response, to_light
+from workflows.grids import stretch
+from workflows.levels import Shape, chain, fitting, nested, sense
+from workflows.parts import Bernoulli, Constant, Images, Monitor, Part, Record, Stripes
+from workflows.recovery.sensing import Sensing
+from workflows.tone import Curve, to_light
+
+__all__ = ["Bernoulli", "Constant", "Images", "Monitor", "Program", "Stripes"]
 
 SENSING_BYTES = 512 << 20
 """The largest sensing matrix that a worker is asked to hold."""
 
-Unit = Annotated[float, Field(ge=0, le=1)]
 
-
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
-
-
-class Monitor(_Model):
-    """The monitor that the program was shown on."""
-
-    width: Annotated[int, Field(ge=1, le=16384)]
-    height: Annotated[int, Field(ge=1, le=16384)]
-    response: Response = "linear"
-
-
-class Constant(_Model):
-    """The whole monitor at one level or colour after another (Sect. 4.1)."""
-
-    kind: Literal["constant"]
-    levels: tuple[Unit, ...] = ()
-    colours: tuple[tuple[Unit, Unit, Unit], ...] = ()
-
-    @model_validator(mode="after")
-    def _one_of_them(self) -> "Constant":
-        if bool(self.levels) == bool(self.colours):
-            raise ValueError("give either levels or colours, and at least one")
-        return self
-
-    @property
-    def count(self) -> int:
-        return len(self.levels) + len(self.colours)
-
-    @property
-    def values(self) -> NDArray[np.float32]:
-        """(count, 3) float32: what is sent to the monitor."""
-        rows = self.colours or tuple((level, level, level) for level in self.levels)
-        return np.array(rows, np.float32).reshape(-1, 3)
-
-
-class Bernoulli(_Model):
-    """Random grids of black and white blocks (Sect. 4.2.1)."""
-
-    kind: Literal["bernoulli"]
-    columns: Annotated[int, Field(ge=1, le=4096)]
-    rows: Annotated[int, Field(ge=1, le=4096)]
-    count: Annotated[int, Field(ge=1, le=100_000)]
-    seed: Annotated[int, Field(ge=0, le=2**64 - 1)]
-    colour: Literal["grey", "rgb"] = "grey"
-
-    @property
-    def channels(self) -> int:
-        return 3 if self.colour == "rgb" else 1
-
-    @property
-    def bits(self) -> NDArray[np.uint8]:
-        """(count, rows, columns, 1 or 3) uint8, 1 is lit.
-
-        Notes
-        -----
-        The raw 64-bit words of PCG64, little-endian, least significant bit first, in the order
-        (pattern, row, column, channel). `random_raw` is a stable stream; Generator's distributions are not.
-        """
-        shape = (self.count, self.rows, self.columns, self.channels)
-        n = int(np.prod(shape))
-        words = np.random.PCG64(self.seed).random_raw(-(-n // 64)).astype("<u8")
-        return np.unpackbits(words.view(np.uint8), bitorder="little", count=n).reshape(shape)
-
-
-class Images(_Model):
-    """Patterns from any tool, each an image stretched over the monitor."""
-
-    kind: Literal["images"]
-    files: Annotated[tuple[str, ...], Field(min_length=1)]
-
-    @property
-    def count(self) -> int:
-        return len(self.files)
-
-
-Part = Annotated[Constant | Bernoulli | Images, Field(discriminator="kind")]
-
-
-class Program(_Model):
+class Program(Record):
     """The patterns that a monitor shows, numbered from 0 through the parts, in order."""
 
     monitor: Monitor
@@ -112,6 +33,14 @@ class Program(_Model):
                 part.columns > self.monitor.width or part.rows > self.monitor.height
             ):
                 raise ValueError(f"a grid of {part.columns} x {part.rows} is finer than the monitor's pixels")
+            if isinstance(part, Stripes):
+                size = self.monitor.width if part.axis == "x" else self.monitor.height
+                most = size.bit_length() - 1
+                if part.first + part.count > most:
+                    raise ValueError(
+                        f"{2 ** (part.first + part.count)} stripes are finer than the monitor's {size} pixels along "
+                        f"{part.axis}: first and count may add up to {most}"
+                    )
         constants = [part.values for part in self.parts if isinstance(part, Constant)]
         if not constants or np.any(np.ptp(np.concatenate(constants), axis=0) == 0):
             raise ValueError(
@@ -158,31 +87,67 @@ class Program(_Model):
         Returns
         -------
         list of (rows, columns, 1 or 3) float32
-            0 to 1, each on its own grid.
+            0 to 1, each on its own grid; patterns with an offset on the monitor's pixels.
         """
-        shown: list[NDArray[np.float32]] = []
-        pictures = iter(images)
+        return list(self._values(first, last, images))
+
+    def pictures(
+        self, first: int, last: int, images: Sequence[NDArray[np.float32]] = ()
+    ) -> Iterator[NDArray[np.float32]]:
+        """The pictures sent to the monitor for the patterns from ``first`` up to ``last``, one after another.
+
+        Parameters
+        ----------
+        first, last : int
+        images : sequence of (rows, columns, 1 or 3) float32
+            The images of the `Images` parts, in order, at any size.
+
+        Returns
+        -------
+        iterator of (height, width, 1 or 3) float32
+            0 to 1, at the monitor's resolution.
+        """
+        for values in self._values(first, last, images):
+            yield stretch(values, self.monitor.width, self.monitor.height)
+
+    def _values(
+        self, first: int, last: int, images: Sequence[NDArray[np.float32]]
+    ) -> Iterator[NDArray[np.float32]]:
+        """As `values`, one after another: at the monitor's resolution, all of them may be too much to hold."""
+        given = iter(images)
         for start, part in zip(self.starts, self.parts, strict=False):
             inside = range(max(first - start, 0), min(last - start, part.count))
             if isinstance(part, Images):
-                of_part = [next(pictures) for _ in part.files]
-                shown += [of_part[i] for i in inside]
+                of_part = [next(given) for _ in part.files]
+                yield from (of_part[i] for i in inside)
             elif isinstance(part, Constant):
-                shown += [part.values[i].reshape(1, 1, 3) for i in inside]
+                yield from (part.values[i].reshape(1, 1, 3) for i in inside)
+            elif isinstance(part, Stripes):
+                yield from (part.values(i) for i in inside)
             elif inside:
-                bits = part.bits
-                shown += [bits[i].astype(np.float32) for i in inside]
-        return shown
+                bits, offsets = part.bits, part.offsets(self.monitor)
+                for i in inside:
+                    values = bits[i].astype(np.float32)
+                    if part.offset:
+                        dx, dy = offsets[i]
+                        picture = stretch(values, self.monitor.width, self.monitor.height)
+                        values = np.roll(picture, (-dy, -dx), axis=(0, 1))
+                    yield values
 
     def bands(self) -> list[tuple[int, int]]:
-        """The columns and rows of the Bernoulli parts' grids, from coarse to fine.
+        """The columns and rows of the Bernoulli parts' grids that nest, from coarse to fine.
+
+        Those of the parts without an offset; if there are none, the longest chain of the others' that ends with
+        their finest.
 
         Raises
         ------
         OptionError
-            If two of them do not nest.
+            If two grids without an offset do not nest.
         """
-        return _nested({(part.columns, part.rows) for part in self.parts if isinstance(part, Bernoulli)})
+        parts = [part for part in self.parts if isinstance(part, Bernoulli)]
+        fixed = {(part.columns, part.rows) for part in parts if not part.offset}
+        return nested(fixed) if fixed else chain({(part.columns, part.rows) for part in parts})
 
     def sensing(
         self,
@@ -202,70 +167,62 @@ class Program(_Model):
         Raises
         ------
         OptionError
-            If the grids of two bands do not nest, or the matrices would be too large.
+            If the grids of two bands without an offset do not nest, or the matrices would be too large with the
+            coarsest level alone.
 
         Notes
         -----
-        A pattern is exact on its own grid and on every finer one. An image whose grid nests in none of the
-        bands' (a photograph, say) is averaged over the cells of the finest.
+        The levels are the `bands`; without any, grids of the images and stripes that nest. The finest levels are
+        left out if the matrices would be too large with them. A pattern is exact on its own grid and on every
+        finer one, and is listed from the first of them on. One with an offset is averaged over the cells, and
+        listed from the first level on whose cells are no larger than its blocks. What is left (a photograph,
+        say) is averaged over the cells of the finest.
         """
-        pictures = iter(images)
-        shapes: list[tuple[int, int, int]] = []  # rows, columns, channels of each pattern
+        shapes, channels = self._shapes(images), self.channels(images)
+        grids = fitting(
+            self.bands() or self._grids_of_others(images), 4 * channels * len(shapes), SENSING_BYTES
+        )
+        return sense(self._light(monitor_curve, images, grids[-1]), shapes, grids)
+
+    def channels(self, images: Sequence[NDArray[np.float32]] = ()) -> int:
+        """1 if every pattern that is not constant is grey, else 3."""
+        return max(shape.channels for shape in self._shapes(images))
+
+    def _light(
+        self, curve: Curve, images: Sequence[NDArray[np.float32]], finest: tuple[int, int]
+    ) -> Iterator[NDArray[np.float32]]:
+        """The light of the patterns that are not constant: on their own grids, with an offset on the finest."""
+        for start, part in zip(self.starts, self.parts, strict=False):
+            if isinstance(part, Bernoulli) and part.offset:
+                yield from part.means(self.monitor, *finest)  # no curve changes black and white
+            elif not isinstance(part, Constant):
+                yield from (to_light(v, curve) for v in self._values(start, start + part.count, images))
+
+    def _grids_of_others(self, images: Sequence[NDArray[np.float32]]) -> list[tuple[int, int]]:
+        """A chain of the grids of the images, and of those that hold the stripes along both axes."""
+        grids = {(image.shape[1], image.shape[0]) for image in images}
+        stripes = [part for part in self.parts if isinstance(part, Stripes)]
+        if stripes:
+            x, y = np.max([part.grid(part.count - 1) for part in stripes], axis=0).tolist()
+            widest = min(part.first for part in stripes) + 1
+            grids |= {(min(2**i, x), min(2**i, y)) for i in range(widest, max(x, y).bit_length())}
+        return chain(grids)
+
+    def _shapes(self, images: Sequence[NDArray[np.float32]]) -> list[Shape]:
+        """The shapes of the patterns that are not constant."""
+        given = iter(images)
+        shapes: list[Shape] = []
         for part in self.parts:
             if isinstance(part, Bernoulli):
-                shapes += [(part.rows, part.columns, part.channels)] * part.count
+                shapes += [Shape(part.columns, part.rows, part.channels, part.offset)] * part.count
+            elif isinstance(part, Stripes):
+                shapes += [Shape(*part.grid(i), 1) for i in range(part.count)]
             elif isinstance(part, Images):
-                shapes += [next(pictures).shape for _ in part.files]
-        grids = self.bands() or _nested({(columns, rows) for rows, columns, _ in shapes})
-        channels = max(shape[2] for shape in shapes)
-        size = sum(4 * channels * columns * rows * len(shapes) for columns, rows in grids)
-        if size > SENSING_BYTES:
-            raise OptionError(
-                f"the program's sensing matrices would take {size} bytes, more than {SENSING_BYTES}: "
-                "use coarser grids or fewer patterns",
-                field="program",
-                limit=SENSING_BYTES,
-            )
-        light = [
-            to_light(v, monitor_curve)
-            for start, part in zip(self.starts, self.parts, strict=False)
-            if not isinstance(part, Constant)
-            for v in self.values(start, start + part.count, images)
-        ]
-        first = [_first_level(columns, rows, grids) for rows, columns, _ in shapes]
-        levels = []
-        for at, (columns, rows) in enumerate(grids):
-            usable = [i for i, level in enumerate(first) if level <= at]
-            matrix = np.empty((channels, rows * columns, len(usable)), np.float32)
-            for m, i in enumerate(usable):
-                cells = on_grid(light[i], columns, rows)
-                matrix[:, :, m] = np.broadcast_to(
-                    cells.reshape(rows * columns, -1).T, (channels, rows * columns)
-                )
-            levels.append(Level(columns, rows, np.array(usable, np.intp), matrix))
-        return Sensing(tuple(levels))
+                sizes = [next(given).shape for _ in part.files]
+                shapes += [Shape(columns, rows, channels) for rows, columns, channels in sizes]
+        return shapes
 
     @cached_property
     def measured(self) -> NDArray[np.intp]:
         """The numbers of the patterns that are not constant, in order: axis 1 of the measurements."""
         return np.setdiff1d(np.arange(self.count), self.constants[0])
-
-
-def _nested(grids: set[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Grids from coarse to fine, each a whole multiple of the one before."""
-    ordered = sorted(grids, key=lambda grid: (grid[0] * grid[1], grid))
-    for coarse, fine in pairwise(ordered):
-        if fine[0] % coarse[0] or fine[1] % coarse[1]:
-            raise OptionError(
-                f"the program's grids {coarse[0]} x {coarse[1]} and {fine[0]} x {fine[1]} do not nest: "
-                "recovery goes from coarse to fine by splitting cells, so each grid must be a whole "
-                "multiple of the one before",
-                field="program",
-            )
-    return ordered
-
-
-def _first_level(columns: int, rows: int, grids: list[tuple[int, int]]) -> int:
-    """The coarsest grid on which a pattern of this grid is exact, or else the finest."""
-    exact = (at for at, (c, r) in enumerate(grids) if c % columns == 0 and r % rows == 0)
-    return next(exact, len(grids) - 1)

@@ -18,8 +18,6 @@ from workflows.grids import area_mean
 from workflows.program import Bernoulli, Constant, Monitor, Program
 from workflows.tone import from_light, to_light
 
-BATCH_PATTERNS = 16
-"""Patterns filmed at once."""
 DEMO_BANDS = ((16, 12, 24), (32, 24, 20), (64, 48, 20), (128, 96, 20), (256, 192, 20), (512, 384, 20))
 """Columns, rows and number of patterns of grids that nest, for a monitor of 1280 x 960 pixels."""
 
@@ -87,8 +85,14 @@ class Scene:
         (height, width, 3) float32
             Linear light.
         """
-        shown = area_mean(backdrop, *self.monitor)
-        arriving = self._arriving(self.transport, shown.reshape(1, -1, shown.shape[2]))
+        channels = backdrop.shape[2]
+        shown = area_mean(backdrop, *self.monitor).reshape(-1, channels)
+        arriving = np.empty((self.height * self.width, 3), np.float32)
+        for c in range(3):
+            if c and channels == 1 and self.transport[c] is self.transport[c - 1]:
+                arriving[:, c] = arriving[:, c - 1]
+            else:
+                arriving[:, c] = self.transport[c] @ shown[:, min(c, channels - 1)]
         return arriving.reshape(self.height, self.width, 3)
 
     def truth(self, backdrop: Floats, *, offset: float = 0.02, gain: float = 0.9) -> Floats:
@@ -172,53 +176,9 @@ class Scene:
                 return np.round(stored * 255).astype(np.uint8)
             return np.round(stored * 65535).astype(np.uint16)
 
-        return (frame(light) for light in self._patterns(program, images))
-
-    def _patterns(self, program: Program, images: Sequence[Floats]) -> Iterator[Floats]:
-        """The light arriving of each pattern in order, (height, width, 3) float32."""
         curve = "srgb" if program.monitor.response == "unknown" else program.monitor.response
-        for start, part in zip(program.starts, program.parts, strict=False):
-            # A monitor pixel belongs to one block: the sums over blocks are exact, and made once a band.
-            blocks = self._blocks(part.columns, part.rows) if isinstance(part, Bernoulli) else None
-            for first in range(start, start + part.count, BATCH_PATTERNS):
-                last = min(first + BATCH_PATTERNS, start + part.count)
-                shown = [to_light(v, curve) for v in program.values(first, last, images)]
-                if blocks is not None:
-                    light = np.stack(shown)
-                    yield from self._arriving(blocks, light.reshape(len(light), -1, light.shape[3]))
-                elif isinstance(part, Constant):
-                    yield from (self.rho * level for level in shown)
-                else:
-                    yield from (self.composite(image) for image in shown)
-
-    def _blocks(self, columns: int, rows: int) -> Transports:
-        """The transport summed over the blocks of a pattern grid, (height * width, rows * columns)."""
-        width, height = self.monitor
-        row = np.arange(height) * rows // height
-        cell = (row[:, None] * columns + np.arange(width) * columns // width).astype(np.int32).ravel()
-
-        made: dict[int, Transport] = {}
-        for whole in self.transport:
-            if id(whole) not in made:
-                entries = (whole.data, cell[whole.indices], whole.indptr)
-                blocks = sp.csr_array(
-                    entries, shape=(whole.shape[0], rows * columns), dtype=np.float32, copy=True
-                )
-                blocks.sum_duplicates()
-                made[id(whole)] = blocks
-        red, green, blue = (made[id(whole)] for whole in self.transport)
-        return red, green, blue
-
-    def _arriving(self, transport: Transports, light: Floats) -> Floats:
-        """Light (patterns, cells, 1 or 3) through the transport: (patterns, height, width, 3) float32."""
-        patterns, _, channels = light.shape
-        arriving = np.empty((patterns, self.height * self.width, 3), np.float32)
-        for c in range(3):
-            if c and channels == 1 and transport[c] is transport[c - 1]:
-                arriving[:, :, c] = arriving[:, :, c - 1]
-            else:
-                arriving[:, :, c] = (transport[c] @ light[:, :, min(c, channels - 1)].T).T
-        return arriving.reshape(patterns, self.height, self.width, 3)
+        pictures = program.pictures(0, program.count, images)
+        return (frame(self.composite(to_light(picture, curve))) for picture in pictures)
 
 
 def nested_program(

@@ -13,10 +13,11 @@ from storage.mattes import Block, Matte
 from storage.objects import Objects
 from workflows.images import Codes
 from workflows.options import RecoveryOptions
+from workflows.patterns import lay_out, pyramid_of
 from workflows.program import Program
-from workflows.recovery import dgsr, pyramid
-from workflows.recovery.photometry import Noise, fit_photometry
-from workflows.recovery.sensing import Sensing
+from workflows.recovery import dgsr, lobes
+from workflows.recovery.photometry import Noise, fit_photometry, normalise
+from workflows.recovery.sensing import Patterns, Sensing
 from workflows.tone import Curve, table, to_light
 
 Scalar = TypeVar("Scalar", bound=np.generic)
@@ -65,19 +66,16 @@ def recover_tile(objects: Objects, capture: str, matte: str, options: RecoveryOp
     rows, columns = cut(target, options.tile or target.block)[index]
     pixels = 0
     for row, column in product(rows, columns):
-        block = _recover_block(stack, target.span(row, column), program_of(objects.url, capture), options)
+        block = _recover_block(stack, objects.url, capture, target.span(row, column), options)
         target.write(row, column, block)
         pixels += int(block.recovered.sum())
     return pixels
 
 
 def _recover_block(
-    stack: Stack,
-    span: tuple[slice, slice],
-    shown: tuple[Program, Sensing, Curve],
-    options: RecoveryOptions,
+    stack: Stack, url: str, capture: str, span: tuple[slice, slice], options: RecoveryOptions
 ) -> Block:
-    program, sensing, monitor = shown
+    program, monitor = program_of(url, capture)
     attributes = stack.attributes
     camera = TypeAdapter[Curve](Curve).validate_python(attributes["camera_curve"])
     noise = Noise(**attributes["noise"])
@@ -86,27 +84,40 @@ def _recover_block(
     light, usable, repeats = _merge(
         codes[:, recovered], np.array(attributes["patterns"]), program.count, camera
     )
+    crosstalk = np.array(attributes["crosstalk"])
+    if np.any(crosstalk != np.eye(3)):
+        light = (light @ np.linalg.inv(crosstalk).T).astype(np.float32)
+        usable &= usable.all(axis=2, keepdims=True)
     numbers, sent = program.constants
     photometry = fit_photometry(
         light[:, numbers], to_light(sent, monitor), usable[:, numbers], noise, repeats[numbers]
     )
-    measurements = np.ascontiguousarray(light[:, program.measured])
-    if options.method == "pyramid":
-        transport = pyramid.recover(measurements, photometry, sensing, noise)
+    shown = program.measured
+    measurements = np.ascontiguousarray(light[:, shown])
+    given = (noise, usable[:, shown], repeats[shown])
+    if options.method == "nn-dgsr":
+        sensing = sensing_of(url, capture)
+        transport = dgsr.recover(measurements, photometry, sensing, *given, **options.constants)
+        measured = normalise(measurements, photometry, noise, options.constants["least_contrast"], *given[1:])
+        error = dgsr.error_of(transport, photometry, measured, sensing)
     else:
-        transport = dgsr.recover(measurements, photometry, sensing, noise)
+        transport, photometry, error = lobes.recover(
+            measurements, photometry, patterns_of(url, capture), *given, **options.constants
+        )
 
-    def spread(values: NDArray[Scalar]) -> NDArray[Scalar]:
+    def spread(values: NDArray[Scalar], *channels: int) -> NDArray[Scalar]:
         """Values of the recovered pixels, and zeros for the others."""
-        block = np.zeros((*recovered.shape, 3), values.dtype)
+        block = np.zeros((*recovered.shape, *channels), values.dtype)
         block[recovered] = values
         return block
 
     return Block(
-        spread(photometry.S),
-        spread(photometry.rho),
+        spread((photometry.S @ crosstalk.T).astype(np.float32), 3),
+        spread(photometry.rho, 3),
+        spread(error),
         recovered,
-        spread(transport.count),
+        spread(transport.shared),
+        spread(transport.count, 3),
         transport.cell,
         transport.weight,
     )
@@ -138,10 +149,36 @@ def _merge(
     return light, usable, repeats
 
 
+def grid_of(url: str, capture: str, options: RecoveryOptions) -> tuple[int, int]:
+    """Columns and rows of the first grid of the T that a method recovers from a capture."""
+    if options.method == "nn-dgsr":
+        finest = sensing_of(url, capture).levels[-1]
+        return finest.columns, finest.rows
+    program, _ = program_of(url, capture)
+    return pyramid_of(program, program.channels(_images_of(url, capture))).grids[0]
+
+
 @lru_cache(maxsize=2)
-def program_of(url: str, capture: str) -> tuple[Program, Sensing, Curve]:
-    """A capture's program, sensing matrices and monitor curve, kept from tile to tile: a capture never changes."""
-    stack = Stack(Objects(url), capture)
-    program = Program.model_validate(stack.attributes["program"])
-    monitor = TypeAdapter[Curve](Curve).validate_python(stack.attributes["monitor_curve"])
-    return program, program.sensing(monitor, stack.images()), monitor
+def program_of(url: str, capture: str) -> tuple[Program, Curve]:
+    """A capture's program and monitor curve, kept from tile to tile: a capture never changes."""
+    attributes = Stack(Objects(url), capture).attributes
+    monitor = TypeAdapter[Curve](Curve).validate_python(attributes["monitor_curve"])
+    return Program.model_validate(attributes["program"]), monitor
+
+
+@lru_cache(maxsize=1)
+def sensing_of(url: str, capture: str) -> Sensing:
+    """A capture's sensing matrices."""
+    program, monitor = program_of(url, capture)
+    return program.sensing(monitor, _images_of(url, capture))
+
+
+@lru_cache(maxsize=1)
+def patterns_of(url: str, capture: str) -> Patterns:
+    """A capture's patterns on a pyramid."""
+    program, monitor = program_of(url, capture)
+    return lay_out(program, monitor, _images_of(url, capture))
+
+
+def _images_of(url: str, capture: str) -> list[NDArray[np.float32]]:
+    return Stack(Objects(url), capture).images()

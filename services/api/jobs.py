@@ -103,9 +103,10 @@ class Jobs(BaseModel):
 
 
 class Option(BaseModel):
-    """An option of recovery."""
+    """An option of recovery; `method` is null if it is one of every method's."""
 
     name: str
+    method: str | None
     type: str
     default: str | int | float | bool | None
     values: list[str] | None

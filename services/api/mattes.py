@@ -18,7 +18,7 @@ from storage.database import mattes as table
 from storage.database import page, writing
 from storage.errors import Conflict
 from workflows import images
-from workflows.composite import composite
+from workflows.composite import composite, confidence
 from workflows.tone import from_light, to_light
 
 router = APIRouter(tags=["mattes"])
@@ -117,6 +117,21 @@ async def post_composite(
     body = await read_body(request, context.settings.backdrop_bytes)
     picture, timing = await anyio.to_thread.run_sync(_composite, context, row.id, body, transfer)
     return Response(picture, media_type="image/png", headers={"Server-Timing": timing})
+
+
+@router.get(
+    "/mattes/{id}/layers/confidence.png",
+    response_class=Response,
+    responses={200: {"content": {"image/png": {}}, "description": "The layer"}},
+)
+def get_confidence(context: Needs, id: str) -> Response:
+    """How far to trust the matte, pixel by pixel: 0, not at all or not recovered, to 1, in 16 bits.
+
+    It is 1 / (1 + e / 0.01), e the error to expect of a composite there, as a share of the camera's full scale.
+    """
+    layer = confidence(mattes.Matte(context.objects, _ready(context, id).id))
+    answer = images.to_integers(layer[..., np.newaxis], np.dtype(np.uint16))
+    return Response(images.encode_png(answer), media_type="image/png")
 
 
 def _ready(context: Context, id: str) -> Row[Any]:

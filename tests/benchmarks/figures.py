@@ -1,33 +1,52 @@
 """Recovers captures of traced scenes through the service, and scores the composites against the truth.
 
-    python tests/benchmarks/figures.py KIT SCENES [--method pyramid] [--json FILE]
+    python tests/benchmarks/figures.py KIT SCENES [--case default] [--film="--noise 4"] [--workers 1] [--json FILE]
 
 KIT is the path of a `kit.py` that makes captures of scenes and scores composites, SCENES a folder of its scenes
-(`*.npz`). For each scene it films the method's program with a mask, uploads the capture, recovers its matte,
-requests composites over the kit's backdrops, and prints the PSNR over the object's pixels and the seconds of work
-for 1,000 of them.
+(`*.npz`). For each case and scene it films the case's program with a mask, uploads the capture, recovers its matte,
+requests composites over the kit's backdrops, and prints the PSNR over the object's pixels, the share of the squared
+error in the 5 % of least confidence (and in the worst 5 %, the most there can be), the rank correlation of confidence
+and error, and the seconds of work for 1,000 pixels. Options in `--film` go to the kit's `capture`.
 """
 
 import argparse
 import importlib.util
 import json
+import shlex
 import sqlite3
 import sys
 import tempfile
 from contextlib import redirect_stdout
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import spearmanr
 
 from services.client import Client
 from services.demo import service
+from services.patterns import write
 from workflows import images
+from workflows.presets import preset
 
-BANDS = {
-    "nn-dgsr": "16x12:24,128x96:250",
-    "pyramid": "16x12:24,32x24:24,64x48:24,128x96:26,256x192:26",
+
+class Case(NamedTuple):
+    """A program, a preset's or the kit's bands, and the options of recovery."""
+
+    program: str
+    options: dict[str, Any]
+
+
+NESTED = "16x12:24,32x24:20,64x48:20,128x96:20,256x192:20,512x384:20"
+CASES = {
+    "default": Case("default", {}),
+    "fast": Case("default", {"quality": "fast"}),
+    "quick": Case("quick", {}),
+    "sketch": Case("sketch", {}),
+    "nested": Case(NESTED, {}),
+    "nn-dgsr": Case("16x12:24,128x96:250", {"method": "nn-dgsr"}),
 }
 
 
@@ -42,34 +61,58 @@ def load(kit: Path) -> ModuleType:
     return module
 
 
-def measure(kit: ModuleType, scene: Path, method: str, client: Client, data: Path) -> dict[str, Any]:
+def measure(
+    kit: ModuleType, scene: Path, case: Case, film: list[str], client: Client, folder: Path
+) -> dict[str, Any]:
     """Film, upload, recover, composite, score."""
-    bundle = data.parent / "capture.zip"
-    bands = BANDS[method]
+    bundle = folder / "capture.zip"
+    if ":" in case.program:
+        program = ["--bands", case.program]
+    else:
+        patterns = folder / case.program
+        if not patterns.exists():
+            write(preset(case.program), patterns, lambda _: None)
+        program = ["--program", str(patterns)]
     with redirect_stdout(None):
-        kit.main(["capture", str(scene), str(bundle), "--bands", bands, "--noise", "1.0", "--mask"])
+        kit.main(["capture", str(scene), str(bundle), *program, "--mask", *film])
     uploaded = client.upload(bundle, name=scene.stem)
-    job = client.wait(client.recover(uploaded["id"], method=method)["id"])
-    with sqlite3.connect(data / "envmatte.db") as ledger:
+    job = client.wait(client.recover(uploaded["id"], **case.options)["id"])
+    with sqlite3.connect(folder / "data" / "envmatte.db") as ledger:
         (seconds,) = ledger.execute("select sum(seconds) from tiles where job = ?", (job["id"],)).fetchone()
     truth = kit.Scene.load(scene)
-    scores = {}
+    crosstalk = float(film[film.index("--crosstalk") + 1]) if "--crosstalk" in film else 0.0
+    scores, squares = {}, []
     for name, backdrop in kit.backdrops().items():
         # 16 bits, so that the matte is scored and not the answer's rounding.
         sent = images.to_integers(backdrop, np.dtype(np.uint16))
         answer = client.composite(job["matte"], images.encode_png(sent), transfer="linear")
         pixels = images.to_unit(images.decode(answer, memory=1 << 28))
-        scores[name] = kit.score(truth, images.to_unit(sent), pixels[..., :3])
+        scores[name] = kit.score(truth, images.to_unit(sent), pixels[..., :3], crosstalk=crosstalk)
+        mix = (1 - 3 * crosstalk) * np.eye(3) + crosstalk
+        true = 0.02 + 0.9 * truth.composite(images.to_unit(sent)) @ mix
+        squares.append(((pixels[..., :3] - true)[truth.object_pixels] ** 2).mean(axis=1))
+    error = np.mean(squares, axis=0)
+    doubt = -images.to_unit(images.decode(client.layer(job["matte"], "confidence.png"), memory=1 << 28))[
+        truth.object_pixels, 0
+    ]
+    worst = -(len(error) // -20)
     return {
         "scene": scene.stem,
-        "method": method,
         "frames": uploaded["frames"],
         "pixels": job["pixels"],
         **{name: round(score, 2) for name, score in scores.items()},
         "mean": round(sum(scores.values()) / len(scores), 2),
+        "worst_5_hold": share(error, doubt, worst),
+        "at_best": share(error, error, worst),
+        "rank": round(float(spearmanr(doubt, error).statistic), 2),
         "seconds_per_1000_pixels": round(seconds / job["pixels"] * 1000, 2),
         "run_seconds": round(job["run_seconds"], 1),
     }
+
+
+def share(error: NDArray[np.floating], doubt: NDArray[np.floating], worst: int) -> float:
+    """The share of the squared error that the most doubtful pixels hold."""
+    return round(float(error[np.argsort(-doubt, kind="stable")[:worst]].sum() / error.sum()), 2)
 
 
 def main() -> None:
@@ -78,27 +121,38 @@ def main() -> None:
     )
     parser.add_argument("kit", type=Path)
     parser.add_argument("scenes", type=Path)
-    parser.add_argument("--method", choices=BANDS, action="append")
+    parser.add_argument("--case", choices=CASES, action="append")
+    parser.add_argument("--film", default="", help="Options of the kit's capture.")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     kit = load(given.kit)
-    rows = []
-    with tempfile.TemporaryDirectory() as folder:
-        data = Path(folder, "data")
-        with service(data, given.workers) as url, Client(url) as client:
-            for method in given.method or BANDS:
-                for scene in sorted(given.scenes.glob("*.npz")):
-                    row = measure(kit, scene, method, client, data)
-                    if not rows:
-                        print("  ".join(f"{name:>8}" for name in row))
-                    print(
-                        "  ".join(f"{value!s:>{max(8, len(name))}}" for name, value in row.items()),
-                        flush=True,
-                    )
-                    rows.append(row)
+    rows: list[dict[str, Any]] = []
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        service(Path(folder, "data"), given.workers) as url,
+        Client(url) as client,
+    ):
+        for case in given.case or CASES:
+            found = []
+            for scene in sorted(given.scenes.glob("*.npz")):
+                row = measure(kit, scene, CASES[case], shlex.split(given.film), client, Path(folder))
+                found.append({"case": case, **row})
+                if not rows and len(found) == 1:
+                    print("  ".join(f"{name:>8}" for name in found[0]))
+                show(found[-1])
+            rows += found
+            means = {
+                name: round(float(np.mean([row[name] for row in found])), 2) for name in list(found[0])[4:]
+            }
+            show({"case": case, "scene": "mean", "frames": "", "pixels": "", **means})
     if given.json:
         given.json.write_text(json.dumps(rows, indent=2))
+
+
+def show(row: dict[str, Any]) -> None:
+    """Print a row under the heads of its columns."""
+    print("  ".join(f"{value!s:>{max(8, len(name))}}" for name, value in row.items()), flush=True)
 
 
 if __name__ == "__main__":

@@ -9,9 +9,13 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pytest
+from PIL import Image
 
+from services.cli import PRESETS
 from tests.end_to_end.conftest import Service, png
-from workflows import images
+from workflows import images, presets
+from workflows.program import Program
 
 
 def envmatte(service: Service, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -77,3 +81,87 @@ def test_an_interrupt_stops_the_waiting_and_not_the_job(service: Service, captur
     assert waiting.returncode == 130
     assert "Interrupted" in said
     assert service.client.wait(job["id"])["state"] == "succeeded"
+
+
+def patterns(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "services", "patterns", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_the_patterns_of_a_preset_are_written_as_they_are(preset: str, tmp_path: Path) -> None:
+    folder = tmp_path / "new" / "patterns"
+    done = patterns(preset, str(folder), "--monitor", "160x120", "--json")
+    assert done.returncode == 0, done.stderr
+    assert "patterns: 100%" in done.stderr
+    program = presets.preset(preset, 160, 120)
+    assert json.loads(done.stdout) == {
+        "folder": str(folder),
+        "preset": preset,
+        "monitor": [160, 120],
+        "patterns": program.count,
+    }
+    assert Program.model_validate_json((folder / "program.json").read_text()) == program
+    names = [f"{n:05d}.png" for n in range(program.count)]
+    assert sorted(path.name for path in folder.iterdir()) == [*names, "program.json"]
+    assert [path.name for path in folder.parent.iterdir()] == ["patterns"]
+    for name, picture in zip(names, program.pictures(0, program.count), strict=True):
+        with Image.open(folder / name) as image:
+            pixels = np.asarray(image)
+        values = pixels.astype(np.float32) / np.float32(1 if pixels.dtype == bool else 255)
+        if pixels.ndim == 2:
+            values = np.broadcast_to(values[..., None], picture.shape)
+            # As small as can be: 1 bit where black and white is all there is.
+            assert (pixels.dtype == bool) == set(np.unique(picture)).issubset({0.0, 1.0})
+        else:
+            assert np.any(picture != picture[..., :1])
+        np.testing.assert_array_equal(values, picture)
+
+
+def test_every_preset_is_described_in_the_help() -> None:
+    assert set(PRESETS) == set(presets.PRESETS)
+    said = patterns("--help").stdout
+    for name, text in PRESETS.items():
+        assert text.startswith(f"{presets.preset(name).count} frames")
+        assert any(line.split(maxsplit=1) == [name, text] for line in said.splitlines())
+
+
+def test_patterns_go_into_a_new_or_empty_folder_alone(tmp_path: Path) -> None:
+    done = patterns("sketch", str(tmp_path), "--monitor", "16x12")
+    assert (done.returncode, done.stdout) == (0, f"{tmp_path}\n")
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert len(before) == 33
+    again = patterns("default", str(tmp_path), "--monitor", "16x12")
+    assert (again.returncode, again.stdout) == (2, "")
+    assert "is not empty" in again.stderr
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["best", "x"], "is not one of 'default'"),
+        (["quick"], "FOLDER"),
+        (["quick", "x", "--monitor", "1280"], "WIDTHxHEIGHT"),
+        (["quick", "x", "--monitor", "2x2"], "too small"),
+        (["quick", "x", "--monitor", "99999x960"], "less than or equal to 16384"),
+    ],
+)
+def test_patterns_that_can_not_be_made_are_refused(arguments: list[str], said: str, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "services", "patterns", *arguments]
+    refused = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert (refused.returncode, refused.stdout) == (2, "")
+    assert said in refused.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_interrupted_patterns_leave_nothing(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "services", "patterns", "paper-400", str(tmp_path / "patterns")]
+    writing = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    assert writing.stderr is not None
+    assert "1 of 432" in writing.stderr.readline()
+    os.kill(writing.pid, signal.SIGINT)
+    _, said = writing.communicate(timeout=20)
+    assert writing.returncode == 130
+    assert "Interrupted" in said
+    assert not list(tmp_path.iterdir())

@@ -40,7 +40,7 @@ def test_frames_are_kept_as_they_were_filmed(service: Service, capture: str, sce
 
 def test_a_recovery_goes_from_queued_to_succeeded(service: Service, capture: str) -> None:
     answer = service.http.post(
-        "/v1/jobs", json={"capture": capture, "options": {"method": "pyramid", "tile": 32}}
+        "/v1/jobs", json={"capture": capture, "options": {"method": "lobes", "tile": 32}}
     )
     assert answer.status_code == 202
     posted = answer.json()
@@ -147,8 +147,8 @@ def test_the_service_says_that_it_is_well(service: Service) -> None:
 
 def test_options_are_described(service: Service) -> None:
     options = {option["name"]: option for option in service.http.get("/v1/options").json()["options"]}
-    assert options["method"]["values"] == ["pyramid", "nn-dgsr"]
-    assert options["method"]["default"] == "pyramid"
+    assert options["method"]["values"] == ["lobes", "nn-dgsr"]
+    assert options["method"]["default"] == "lobes"
     assert (options["tile"]["minimum"], options["tile"]["maximum"]) == (16, 1024)
     assert all(option["description"] for option in options.values())
 

@@ -17,7 +17,7 @@ def connection(engine: Engine):  # type: ignore[no-untyped-def]
 
 
 def laid(connection: Connection, tiles: int = 3) -> str:
-    job = jobs.add(connection, "recover", "cap", {"method": "pyramid"}, matte="mat")
+    job = jobs.add(connection, "recover", "cap", {"method": "lobes"}, matte="mat")
     jobs.lay_down(connection, job, {"tiles": tiles, "slab": 9})
     return job
 

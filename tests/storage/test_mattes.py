@@ -1,6 +1,7 @@
 """A matte in the store: blocks whatever the order of writing, damage that is found, and its record."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,9 @@ def block(height: int, width: int, seed: int) -> Block:
     return Block(
         rng.random((height, width, 3), np.float32),
         rng.random((height, width, 3), np.float32),
+        rng.random((height, width), np.float32),
         recovered,
+        rng.random((height, width)) < 0.5,
         count.astype(np.uint32),
         rng.integers(0, CELLS, entries, np.uint32),
         rng.random(entries, np.float32),
@@ -39,7 +42,8 @@ def zeros(height: int, width: int, entries: int) -> Block:
     count = np.zeros((height, width, 3), np.uint32)
     count[0, 0, 0] = entries
     cell, weight = np.zeros(entries, np.uint32), np.zeros(entries, np.float32)
-    return Block(light, light, np.zeros((height, width), bool), count, cell, weight)
+    nowhere = np.zeros((height, width), bool)
+    return Block(light, light, light[..., 0], nowhere, nowhere, count, cell, weight)
 
 
 def create(objects: Objects) -> Matte:
@@ -61,7 +65,7 @@ def fill(matte: Matte, order: list[tuple[int, int]]) -> None:
 
 
 def same(a: Block, b: Block) -> None:
-    for name in ("S", "rho", "recovered", "count", "cell", "weight"):
+    for name in ("S", "rho", "error", "recovered", "shared", "count", "cell", "weight"):
         left, right = getattr(a, name), getattr(b, name)
         assert left.dtype == right.dtype
         np.testing.assert_array_equal(left, right)
@@ -91,6 +95,7 @@ def test_any_zarr_reader_can_read_it(matte: Matte, folder: Path) -> None:
     expected = block(5, 8, seed=12)
     np.testing.assert_array_equal(group["S"][16:, 32:], expected.S)
     np.testing.assert_array_equal(group["recovered"][16:, 32:], expected.recovered)
+    np.testing.assert_array_equal(group["shared"][16:, 32:], expected.shared)
     np.testing.assert_array_equal(group["T/1.2/cell"][:], expected.cell)
     np.testing.assert_array_equal(group["T/1.2/weight"][:], expected.weight)
     assert group["S"].metadata.dimension_names == ("y", "x", "channel")
@@ -120,7 +125,7 @@ def test_zeros_are_stored_like_anything_else(objects: Objects) -> None:
 @pytest.mark.parametrize(
     "file",
     [
-        *("S/c/1/2/0", "rho/c/1/2/0", "count/c/1/2/0", "recovered/c/1/2"),
+        *("S/c/1/2/0", "rho/c/1/2/0", "count/c/1/2/0", "error/c/1/2", "recovered/c/1/2", "shared/c/1/2"),
         *("T/1.2/cell/c/0", "T/1.2/weight/c/0", "T/1.2/cell/zarr.json", "T/1.2/weight/zarr.json"),
     ],
 )
@@ -150,7 +155,7 @@ def test_a_block_that_was_never_written_is_corrupt(objects: Objects) -> None:
 
 def test_counts_that_do_not_fit_are_corrupt(matte: Matte) -> None:
     good = block(16, 16, seed=5)
-    cut = Block(good.S, good.rho, good.recovered, good.count, good.cell[:-1], good.weight[:-1])
+    cut = replace(good, cell=good.cell[:-1], weight=good.weight[:-1])
     matte.write(0, 1, cut)
     with pytest.raises(Corrupt, match=r"block 0\.1"):
         matte.read(0, 1)
@@ -170,14 +175,14 @@ def test_a_matte_that_is_not_there(objects: Objects) -> None:
 
 def test_the_record(engine: Engine) -> None:
     with writing(engine) as connection:
-        mattes.add(connection, "m1", "c1", "j1", {"method": "pyramid"})
+        mattes.add(connection, "m1", "c1", "j1", {"method": "lobes"})
         mattes.add(connection, "m2", "c1", "j2", {})
         row = mattes.get(connection, "m1")
         assert (row.state, row.capture, row.job, row.options) == (
             "recovering",
             "c1",
             "j1",
-            {"method": "pyramid"},
+            {"method": "lobes"},
         )
         mattes.change(connection, "m1", state="ready", figures={"block": 16})
     with writing(engine) as connection:

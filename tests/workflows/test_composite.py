@@ -1,5 +1,6 @@
-"""Composites against the dense formula, C = S + rho T L."""
+"""Composites against the dense formula, C = S + X (rho T L)."""
 
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -10,33 +11,57 @@ from storage import mattes
 from storage.errors import Corrupt
 from storage.mattes import Block, Matte
 from storage.objects import Objects
-from workflows.composite import composite
+from workflows.composite import composite, confidence
 from workflows.grids import area_mean
 
-HEIGHT, WIDTH, COLUMNS, ROWS = 20, 35, 6, 4
+HEIGHT, WIDTH, COLUMNS, ROWS = 20, 35, 36, 5
+CROSSTALK = [[0.9, 0.1, 0], [0.05, 0.8, 0.15], [0.02, 0.18, 0.8]]
+ERROR = np.linspace(0, 0.1, HEIGHT * WIDTH, dtype=np.float32).reshape(HEIGHT, WIDTH)
+ERROR[0, :4] = np.inf
+# Of a second grid, 18 x 3.
+NODES = COLUMNS * ROWS + 18 * 3
 
 Dense = tuple[Matte, NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]
 
 
 @pytest.fixture
 def dense(objects: Objects) -> Dense:
-    """A random matte, and its S, rho, T (y, x, channel, cell) and recovered as whole arrays."""
+    """A random matte, and its S, rho, T (y, x, channel, cell) and recovered as whole arrays.
+
+    In some pixels the first row is the T of all channels.
+    """
     rng = np.random.default_rng(0)
     S, rho = rng.random((2, HEIGHT, WIDTH, 3), np.float32)
-    T = rng.random((HEIGHT, WIDTH, 3, ROWS * COLUMNS), np.float32)
-    T *= rng.random(T.shape) < 0.2
+    T = rng.random((HEIGHT, WIDTH, 3, NODES), np.float32)
+    T *= rng.random(T.shape) < 0.05
     recovered = rng.random((HEIGHT, WIDTH)) < 0.8
     for whole in (S, rho, T):
         whole[~recovered] = 0
-    matte = mattes.create(objects, "m", height=HEIGHT, width=WIDTH, columns=COLUMNS, rows=ROWS)
+    shared = recovered & (rng.random((HEIGHT, WIDTH)) < 0.5)
+    stored = T.copy()
+    stored[shared, 1:] = 0
+    T[shared] = T[shared][:, :1]
+    matte = mattes.create(
+        objects, "m", height=HEIGHT, width=WIDTH, columns=COLUMNS, rows=ROWS, crosstalk=CROSSTALK
+    )
     for row in range(matte.block_rows):
         for column in range(matte.block_columns):
             at = matte.span(row, column)
-            count = np.count_nonzero(T[at], axis=3).astype(np.uint32)
-            cell = np.nonzero(T[at])[3].astype(np.uint32)
-            weight = T[at][np.nonzero(T[at])]
-            matte.write(row, column, Block(S[at], rho[at], recovered[at], count, cell, weight))
+            count = np.count_nonzero(stored[at], axis=3).astype(np.uint32)
+            cell = np.nonzero(stored[at])[3].astype(np.uint32)
+            weight = stored[at][np.nonzero(stored[at])]
+            block = Block(S[at], rho[at], ERROR[at], recovered[at], shared[at], count, cell, weight)
+            matte.write(row, column, block)
     return matte, S, rho, T, recovered
+
+
+def nodes(cells: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The light of the nodes of both grids, as the layout in storage/mattes.py says."""
+    coarse = np.zeros((3, 18, cells.shape[2]), np.float32)
+    for y, x, i, j in product(range(3), range(18), range(4), range(4)):
+        row, column = np.clip([2 * y - 1 + i, 2 * x - 1 + j], 0, [ROWS - 1, COLUMNS - 1])
+        coarse[y, x] += cells[row, column] * (1, 3, 3, 1)[i] * (1, 3, 3, 1)[j] / 64
+    return np.concatenate([cells.reshape(-1, cells.shape[2]), coarse.reshape(-1, cells.shape[2])])
 
 
 @pytest.mark.parametrize("size", [(ROWS, COLUMNS), (9, 7), (2, 3), (1, 1), (40, 60)])
@@ -44,9 +69,8 @@ def dense(objects: Objects) -> Dense:
 def test_a_composite_is_the_formula(dense: Dense, size: tuple[int, int], channels: int) -> None:
     matte, S, rho, T, recovered = dense
     backdrop = np.random.default_rng(1).random((*size, channels), np.float32)
-    cells = area_mean(backdrop, COLUMNS, ROWS).reshape(-1, channels)
-    light = np.broadcast_to(cells, (len(cells), 3))
-    expected = S + rho * np.einsum("yxcl,lc->yxc", T.astype(np.float64), light)
+    light = np.broadcast_to(nodes(area_mean(backdrop, COLUMNS, ROWS)), (NODES, 3))
+    expected = S + (rho * np.einsum("yxcl,lc->yxc", T.astype(np.float64), light)) @ np.transpose(CROSSTALK)
     got = composite(matte, backdrop)
     assert got.dtype == np.float32
     assert got.shape == (HEIGHT, WIDTH, 4)
@@ -63,8 +87,13 @@ def test_cells_are_taken_from_the_top_left(dense: Dense) -> None:
     matte, S, rho, T, _ = dense
     backdrop = np.zeros((ROWS, COLUMNS, 3), np.float32)
     backdrop[1, 4, 2] = 1
-    expected = S.copy()
-    expected[..., 2] += rho[..., 2] * T[..., 2, 1 * COLUMNS + 4]
+    # column 4 of row 1 is in the bumps of columns 1 and 2 and of rows 0 and 1
+    share = np.zeros(NODES)
+    share[1 * COLUMNS + 4] = 1
+    for row, column, weight in ((0, 1, 3), (0, 2, 9), (1, 1, 1), (1, 2, 3)):
+        share[COLUMNS * ROWS + row * 18 + column] = weight / 64
+    arrived = rho[..., 2] * (T[..., 2, :] @ share)
+    expected = S + arrived[..., np.newaxis] * np.array(CROSSTALK)[:, 2]
     np.testing.assert_allclose(composite(matte, backdrop)[..., :3], expected, atol=1e-6)
 
 
@@ -73,3 +102,13 @@ def test_a_missing_block_is_corrupt(dense: Dense, folder: Path, objects: Objects
     (folder / "mattes/m" / file).unlink()
     with pytest.raises(Corrupt):
         composite(Matte(objects, "m"), np.ones((4, 6, 3), np.float32))
+
+
+def test_confidence_is_a_half_where_an_error_of_a_hundredth_is_expected(dense: Dense) -> None:
+    matte, *_, recovered = dense
+    trusted = confidence(matte)
+    assert trusted.dtype == np.float32
+    assert (trusted[0, :4] == 0).all()
+    assert (trusted[~recovered] == 0).all()
+    seen = recovered & np.isfinite(ERROR)
+    np.testing.assert_allclose(trusted[seen], 0.01 / (0.01 + ERROR[seen]), rtol=1e-5)

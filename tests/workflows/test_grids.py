@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from workflows.grids import area_mean, smallest_grid
+from workflows.grids import area_mean, smallest_grid, stretch
 
 
 def test_the_smallest_grid_loses_nothing() -> None:
@@ -58,3 +58,13 @@ def test_area_mean_keeps_a_constant() -> None:
     for size in ((1, 1), (640, 480), (999, 1)):
         got = area_mean(np.full((37, 41, 3), 0.3, np.float32), *size)
         np.testing.assert_allclose(got, 0.3, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(1, 1), (3, 2), (8, 6), (5, 5), (11, 9)])
+def test_stretching_gives_each_pixel_its_block(columns: int, rows: int) -> None:
+    values = np.random.default_rng(0).random((rows, columns, 3), np.float32)
+    picture = stretch(values, 8, 6)
+    assert picture.shape == (6, 8, 3)
+    for y in range(6):
+        for x in range(8):
+            np.testing.assert_array_equal(picture[y, x], values[y * rows // 6, x * columns // 8])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from storage.errors import OptionError
-from workflows.program import Bernoulli, Constant, Images, Monitor, Program
+from workflows.program import Bernoulli, Constant, Images, Monitor, Program, Stripes
 from workflows.scene import Scene, nested_program, write_capture
 from workflows.simulate import backdrop, glass_ball
 from workflows.tone import to_light
@@ -30,6 +30,10 @@ def program() -> Program:
             Constant(kind="constant", levels=(0.0, 0.4, 1.0)),
             Bernoulli(kind="bernoulli", columns=8, rows=6, count=70, seed=3),
             Bernoulli(kind="bernoulli", columns=13, rows=11, count=4, seed=4, colour="rgb"),
+            Bernoulli(kind="bernoulli", columns=13, rows=11, count=3, seed=5, colour="rgb", offset=True),
+            Bernoulli(kind="bernoulli", columns=8, rows=6, count=3, seed=6, offset=True),
+            Stripes(kind="stripes", axis="x", count=6),
+            Stripes(kind="stripes", axis="y", count=2, first=3),
         ),
     )
 
@@ -53,14 +57,11 @@ def test_a_composite_is_the_transport_of_the_backdrop(ball: Scene) -> None:
 def test_a_frame_without_noise_is_the_transport_of_the_pattern(ball: Scene, program: Program) -> None:
     frames = list(ball.film(program, offset=0.05, gain=0.8, noise=0, depth=16))
     assert len(frames) == program.count
-    x, y = np.arange(96), np.arange(72)[:, None]
     for n, frame in enumerate(frames):
         assert frame.shape == (36, 48, 3)
         assert frame.dtype == np.uint16
-        (shown,) = program.values(n, n + 1)
-        rows, columns, channels = shown.shape
-        on = np.broadcast_to(shown[y * rows // 72, x * columns // 96], (72, 96, channels))
-        light = [ball.transport[c] @ on[..., min(c, channels - 1)].ravel() for c in range(3)]
+        (shown,) = program.pictures(n, n + 1)
+        light = [ball.transport[c] @ shown[..., min(c, shown.shape[2] - 1)].ravel() for c in range(3)]
         value = 0.05 + 0.8 * np.stack(light, axis=1).reshape(36, 48, 3)
         np.testing.assert_allclose(frame / 65535, value, atol=0.51 / 65535)
 
@@ -76,7 +77,8 @@ def test_curves_of_monitor_and_camera_are_followed(ball: Scene) -> None:
     frames = list(ball.film(one("srgb"), noise=0, depth=16, response="srgb", images=[picture]))
     values = [to_light((f / 65535).astype(np.float32), "srgb") for f in frames]
     np.testing.assert_allclose(values[1], 0.02 + 0.9 * 0.21404 * ball.rho, atol=3e-5)
-    np.testing.assert_allclose(values[2], ball.truth(to_light(picture, "srgb")), atol=3e-5)
+    stretched = picture[np.arange(72)[:, None] * 7 // 72, np.arange(96) * 9 // 96]
+    np.testing.assert_allclose(values[2], ball.truth(to_light(stretched, "srgb")), atol=3e-5)
     unknown = list(ball.film(one("unknown"), noise=0, depth=16, response="srgb", images=[picture]))
     np.testing.assert_array_equal(unknown, frames)
 

@@ -5,6 +5,7 @@ import json
 import random
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -67,7 +68,7 @@ def recover(objects: Objects, ingest: Ingest) -> Callable[..., tuple[mattes.Matt
         *,
         memory: int = 1 << 26,
         order: Callable[[range], object] = iter,
-        method: str = "pyramid",
+        method: str = "lobes",
     ) -> tuple[mattes.Matte, int]:
         ingest("c", data, memory=memory)
         options = {"method": method, "tile": tile}
@@ -75,16 +76,21 @@ def recover(objects: Objects, ingest: Ingest) -> Callable[..., tuple[mattes.Matt
         plan = run_prepare("recover", task)
         tiles = list(order(range(plan["tiles"])))  # type: ignore[call-overload]
         pixels = sum(run_tile("recover", task, index)[1] for index in tiles)
-        assert run_finish("recover", task)["columns"] == 8
+        # of the monitor's pixels, or of the program's finest grid
+        assert run_finish("recover", task)["columns"] == {"lobes": 64, "nn-dgsr": 8}[method]
         return mattes.Matte(objects, "m"), pixels
 
     return run
 
 
+@pytest.mark.parametrize("method", ["lobes", "nn-dgsr"])
 def test_the_matte_is_the_same_to_the_byte(
-    recover: Callable[..., tuple[mattes.Matte, int]], digests: Digests, bundles: dict[bool, bytes]
+    recover: Callable[..., tuple[mattes.Matte, int]],
+    digests: Digests,
+    bundles: dict[bool, bytes],
+    method: str,
 ) -> None:
-    matte, pixels = recover(bundles[True])
+    matte, pixels = recover(bundles[True], method=method)
     assert matte.block == 16
     plain = digests("mattes/m")
     frame = 44 * 36 * 3
@@ -97,7 +103,7 @@ def test_the_matte_is_the_same_to_the_byte(
         {"memory": 10 * frame, "tile": 1024},
         {"order": lambda tiles: [*tiles, 0, 3]},  # and some tiles again
     ):
-        _, again = recover(bundles[True], **variant)
+        _, again = recover(bundles[True], method=method, **variant)
         assert digests("mattes/m") == plain, variant
         assert again == pixels or "order" in variant
 
@@ -115,8 +121,9 @@ def test_pixels_outside_the_mask_are_empty(
     for place, block in blocks.items():
         inside = mask[whole.span(*place)]
         np.testing.assert_array_equal(block.recovered, inside)
-        for values in (block.S, block.rho, block.count):
+        for values in (block.S, block.rho, block.count, block.shared):
             assert not values[~inside].any()
+        assert np.isfinite(block.error[inside]).any() or not inside.any()
         unmasked = whole.read(*place)
         assert unmasked.recovered.all()
         assert unmasked.rho[~inside].min() > 0
@@ -126,6 +133,24 @@ def test_pixels_outside_the_mask_are_empty(
         kept = np.repeat(np.repeat(inside.ravel(), 3), unmasked.count.ravel())
         np.testing.assert_array_equal(block.cell, unmasked.cell[kept])
         np.testing.assert_array_equal(block.weight, unmasked.weight[kept])
+
+
+@pytest.mark.parametrize("colours", ["grey", "rgb"])
+def test_a_block_that_the_mask_leaves_out_is_empty(
+    recover: Callable[..., tuple[mattes.Matte, int]], scene: Scene, colours: str
+) -> None:
+    program = nested_program((64, 48), ((4, 3, 14), (8, 6, 10)), levels=5)
+    parts = (program.parts[0], *(part.model_copy(update={"colour": colours}) for part in program.parts[1:]))
+    corner = np.zeros_like(scene.coverage)
+    corner[17:30, 17:30] = 1
+    target = io.BytesIO()
+    alone = replace(scene, coverage=corner)
+    write_capture(alone, program.model_copy(update={"parts": parts}), target, mask=True)
+    matte, pixels = recover(target.getvalue())
+    assert pixels == alone.object_mask.sum() > 0
+    assert not matte.read(0, 0).recovered.any()
+    assert matte.read(0, 0).cell.size == 0
+    assert matte.read(1, 1).cell.size > 0
 
 
 def test_the_photometry_is_the_scenes(
@@ -161,8 +186,9 @@ def test_frames_of_one_pattern_are_averaged(
         out.writestr("capture.json", json.dumps(record))
     plain = recover(bundles[False], tile=1024)[0].read(1, 1)
     doubled = recover(split.getvalue(), tile=1024)[0].read(1, 1)
-    np.testing.assert_allclose(doubled.S, plain.S, atol=2e-3)
-    np.testing.assert_allclose(doubled.rho, plain.rho, atol=4e-3)
+    # split frames have another noise, and so S and rho other bounds
+    np.testing.assert_allclose(doubled.S, plain.S, atol=4e-3)
+    np.testing.assert_allclose(doubled.rho, plain.rho, atol=8e-3)
 
 
 def test_a_damaged_stack_is_corrupt(

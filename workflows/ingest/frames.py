@@ -13,7 +13,7 @@ from workflows import images
 from workflows.grids import smallest_grid
 from workflows.ingest.bundle import Bundle, Limits
 from workflows.program import Images, Program
-from workflows.recovery.photometry import estimate_noise
+from workflows.recovery.photometry import estimate_crosstalk, estimate_noise
 from workflows.tone import Curve, Response, estimate, table, to_light
 
 FORMATS = ("PNG", "TIFF")
@@ -102,7 +102,7 @@ def read_slab(objects: Objects, capture: str, limits: Limits, slab: int, index: 
 
 
 def measure(objects: Objects, capture: str) -> None:
-    """Measure the noise, and the curves that the capture calls unknown, from frames of constant levels.
+    """Measure the noise, the crosstalk, and the curves that the capture calls unknown, from frames of constant levels.
 
     Raises
     ------
@@ -128,11 +128,15 @@ def measure(objects: Objects, capture: str) -> None:
         TypeAdapter(Response).validate_python(stack.attributes["response"]),
     )
     look_up = table(camera, stack.dtype)
-    noise = estimate_noise(look_up[codes], to_light(sent, monitor), usable, 1 / top)
+    light, shown = look_up[codes], to_light(sent, monitor)
+    # what the channels see of each other's colours is no noise
+    some = grey if np.count_nonzero(grey) >= 4 else np.ones_like(grey)
+    noise = estimate_noise(light[:, some], shown[some], usable[:, some], 1 / top)
     stack.annotate(
         monitor_curve=_plain(monitor),
         camera_curve=_plain(camera),
         noise={"read": noise.read, "shot": noise.shot},
+        crosstalk=estimate_crosstalk(light, shown, usable).tolist(),
     )
 
 

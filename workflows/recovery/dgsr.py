@@ -1,23 +1,23 @@
-"""The paper's recovery: hierarchical non-negative dynamic group sparsity (NN-DGSR), each channel on its own."""
+"""The paper's recovery: non-negative dynamic group sparsity (NN-DGSR), with and without its Gaussian prior."""
+
+from typing import Literal
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from workflows.recovery.groups import Rows, group_sums
-from workflows.recovery.photometry import Noise, Photometry, normalise
+from workflows.recovery.gaussian import filter_rows
+from workflows.recovery.groups import Rows
+from workflows.recovery.photometry import Measured, Noise, Photometry, expected_error, normalise
+from workflows.recovery.pursuit import grow_rows
 from workflows.recovery.sensing import Sensing
-from workflows.recovery.solvers import descend, inner, signed_rows
 from workflows.recovery.transport import Transport
 
 # Pixels at a time, so that the working arrays stay small whatever a caller passes.
 _BLOCK = 256
-# Rounds of pruning at one sparsity; they end earlier when one takes less than this share off the residual.
-_ROUNDS = 10
-_STALL = 0.01
-# Precision of the least squares in each round.
-_SWEEPS = 30
-_TOLERANCE = 1e-4
+# A measurement so many standard deviations from zero, or with one so much larger than the range, says nothing:
+# squares of the others fit float32.
+_FARTHEST = 1e6
+_WIDEST = 1e3
 
 
 def recover(
@@ -25,41 +25,84 @@ def recover(
     photometry: Photometry,
     sensing: Sensing,
     noise: Noise,
+    usable: NDArray[np.bool_] | None = None,
+    frames: NDArray[np.integer] | None = None,
     *,
+    prior: Literal["gaussian", "none"] = "gaussian",
+    levels: Literal["hierarchical", "direct"] = "hierarchical",
+    channels: Literal["apart", "joint"] = "apart",
     sparsity: float = 0.2,
     growth: float = 1.25,
     sum_tolerance: float = 0.02,
     least_group: float = 0.02,
+    rounds: int = 10,
+    stall: float = 0.01,
+    sweeps: int = 30,
+    tolerance: float = 1e-4,
+    clusters: int = 3,
+    reach: float = 3.0,
+    fits: int = 8,
+    steps: int = 30,
+    precision: float = 0.03,
     least_contrast: float = 3.0,
 ) -> Transport:
-    """Recover T by NN-DGSR, level by level: only the children of a level's cells are unknowns at the next.
+    """Recover T by NN-DGSR (Duan, Cai and Zheng, "Compressive environment matting", 2015, Sect. 4.2 and 5.1).
 
     Parameters
     ----------
     measurements : (n, m, 3) float32
-        Linear camera values of n pixels under the m patterns.
+        Linear camera values of n pixels under the m patterns. One that is not finite is left out.
     photometry : Photometry
         S and rho of the pixels.
     sensing : Sensing
         The program's levels, coarse to fine.
     noise : Noise
-        Noise of a measurement; it tells which channels are too dark.
+        Noise of a frame.
+    usable : (n, m, 3) bool, optional
+        False where a measurement says nothing, as where the camera clipped it; all say something if left out.
+    frames : (m,) integer, optional
+        Frames averaged into each measurement; one each if left out.
+    prior : {"gaussian", "none"}
+        Whether T is filtered by oriented Gaussians fitted to its clusters (Sect. 4.2.2).
+    levels : {"hierarchical", "direct"}
+        Level by level, with only the children of a level's cells as unknowns of the next (Sect. 4.2.3); or the
+        finest level at once, with all of its cells.
+    channels : {"apart", "joint"}
+        A T for each channel, as in the paper, or one for the three.
     sparsity : float
-        Most cells of a row at the finest level, as a share of the measurements. Coarser levels may have as many
-        as measurements: they only have to find the cells, and one missed there is lost.
+        Most cells that the search lights at the finest level, as a share of the measurements. Coarser levels may
+        have as many as measurements: they only have to find the cells, and one missed there is lost.
     growth : float
         Factor by which the sparsity grows, from one cell, until more cells explain no more.
     sum_tolerance : float
         The sparsity grows on while the L1 norm of T is further than this from one.
     least_group : float
         A cell is refined if its weight plus half of its eight neighbours' is more than this.
+    rounds : int
+        Most rounds of lighting and pruning cells at one sparsity.
+    stall : float
+        Rounds, and fits of the Gaussians, end when one takes less than this share off the squared residual.
+    sweeps : int
+        Most sweeps of coordinate descent in a least squares.
+    tolerance : float
+        They end when one changes no entry of T by more than this.
+    clusters : int
+        Most clusters of a T that a Gaussian is fitted to.
+    reach : float
+        What is further than this many standard deviations from all Gaussians is taken out.
+    fits : int
+        Most times that Gaussians are fitted to T and T is filtered by them.
+    steps : int
+        Most conjugate gradients in filtering T.
+    precision : float
+        They end when this share of the right-hand side is left.
     least_contrast : float
         A channel whose rho is below this many standard deviations of a mid-grey value gets an empty row.
 
     Returns
     -------
     Transport
-        On the finest grid.
+        On the finest grid; empty rows where the measurements say nothing.
 
     Raises
     ------
@@ -68,198 +111,191 @@ def recover(
 
     Notes
     -----
-    Eq. 9 without its Gaussian prior, in the +-1 form of eq. 8: ``f = 2 (C - S) / rho - 1 = A t``, t >= 0. Each
-    round takes the proxy ``t + A'(f - A t) / m``, keeps the cells whose squared proxy plus half of their
-    neighbours' is largest, solves a non-negative least squares on them and the cells so far, and prunes the
-    result in the same way (Huang, Huang and Metaxas, "Learning with dynamic group sparsity", ICCV 2009).
+    Solves eq. 9 in the +-1 form of eq. 8: ``f = 2 (C - S) / rho - 1 = A t``, t >= 0. Each round takes the proxy
+    ``t + A'(f - A t) / m``, lights the cells whose squared proxy plus half of their neighbours' is largest, solves
+    a non-negative least squares on them and the cells so far, and prunes the result in the same way (Huang, Huang
+    and Metaxas, "Learning with dynamic group sparsity", ICCV 2009).
 
     Of s cells that explain nothing the best one still lowers ``m ln |r|^2`` by about ``2 ln s``. Growth at the
     finest level ends when it gains less than that a cell, and cells of a group worth less are dropped.
+
+    From there on, with the Gaussian prior, iterations at the finest level fit Gaussians to T and solve for T under
+    them (:func:`~workflows.recovery.gaussian.filter_row`). A T of few cells that explains the measurements
+    better than any Gaussians, at the same price of ``2 ln s`` a cell, stays as it is.
+
+    All measurements of a channel weigh the same: the variance of one is known from its own noisy value only, and
+    weights by it would favour those that came out dark. Joint channels weigh by their mean inverse variance; seen
+    under grey patterns they become one measurement, else their rows are stacked.
     """
-    value, precision = normalise(measurements, photometry, noise, least_contrast)
+    measured = normalise(measurements, photometry, noise, least_contrast, usable, frames)
+    value, weight = _weigh(measured.value[..., :-2], measured.variance[..., :-2])
+    used = sensing.levels if levels == "hierarchical" else sensing.levels[-1:]
     parts = []
     for first in range(0, max(len(value), 1), _BLOCK):
-        block = value[first : first + _BLOCK]
-        alive = precision[first : first + _BLOCK].max(axis=2, initial=0) > 0
-        pixel, channel = map(np.ascontiguousarray, np.nonzero(alive))
-        rows = Rows.whole(pixel.size, sensing.levels[0])
-        for i, level in enumerate(sensing.levels):
+        block = slice(first, first + _BLOCK)
+        alive = weight[block].max(axis=2, initial=0) > 0
+        index = np.full(alive.shape, -1)
+        if channels == "joint":
+            pixel = np.flatnonzero(alive.any(axis=1))
+            channel = np.zeros_like(pixel)
+            index[pixel] = np.arange(pixel.size)[:, np.newaxis]
+        else:
+            pixel, channel = map(np.ascontiguousarray, np.nonzero(alive))
+            index[pixel, channel] = np.arange(pixel.size)
+        rows = Rows.whole(pixel.size, used[0])
+        for i, level in enumerate(used):
             if i > 0:
-                rows = rows.split(sensing.levels[i - 1], level, least_group, reach=0)
+                rows = rows.split(used[i - 1], level, least_group, reach=0)
+            finest = level is used[-1]
+            light = np.ascontiguousarray(level.light)
+            source = np.zeros_like(channel) if len(light) == 1 else channel
+            target, scale, variance = _rows_of(
+                value[block][..., level.patterns],
+                weight[block][..., level.patterns],
+                pixel,
+                None if channels == "joint" else channel,
+                grey=len(light) == 1,
+            )
             grow_rows(
-                np.ascontiguousarray(level.light),
-                np.zeros_like(channel) if level.light.shape[0] == 1 else channel,
-                np.ascontiguousarray(block[..., level.patterns][pixel, channel]),
+                light,
+                source,
+                scale,
+                target,
                 rows.begin,
                 rows.cell,
                 rows.weight,
                 level.columns,
                 level.rows,
-                level is sensing.levels[-1],
+                finest,
                 sparsity,
                 growth,
                 sum_tolerance,
+                rounds,
+                stall,
+                sweeps,
+                tolerance,
             )
-        index = np.full(alive.shape, -1)
-        index[alive] = np.arange(pixel.size)
-        parts.append(rows.transport(sensing.levels[-1], index))
+            if finest and prior == "gaussian":
+                rows = Rows(
+                    *filter_rows(
+                        light,
+                        source,
+                        scale,
+                        target,
+                        variance,
+                        rows.begin,
+                        rows.cell,
+                        rows.weight,
+                        level.columns,
+                        level.rows,
+                        clusters,
+                        reach,
+                        fits,
+                        stall,
+                        steps,
+                        precision,
+                    )
+                )
+        parts.append(rows.transport(used[-1], np.where(alive, index, -1)))
     return Transport.concatenate(parts)
 
 
-@njit(nogil=True, cache=True)
-def grow_rows(
-    light: NDArray[np.float32],
-    source: NDArray[np.int64],
-    value: NDArray[np.float32],
-    begin: NDArray[np.int64],
-    cell: NDArray[np.int32],
-    weight: NDArray[np.float32],
-    columns: int,
-    rows: int,
-    finest: bool,
-    sparsity: float,
-    growth: float,
-    sum_tolerance: float,
-) -> None:
-    """Fit the weights of sparse rows to measurements by NN-DGSR, from zero.
-
-    Parameters
-    ----------
-    light : (channels, cells, m) float32
-        Light of the level, 0 to 1.
-    source : (n,) int64
-        Channel of `light` that a row's measurements belong to.
-    value : (n, m) float32
-        Measurements in +-1 form.
-    begin, cell, weight
-        Candidates as in :class:`~workflows.recovery.groups.Rows`; weights are overwritten.
-    columns, rows : int
-        The level's grid.
-    finest : bool
-        Whether to stop growing, and to drop cells, where more cells explain nothing.
-    sparsity, growth, sum_tolerance
-        As in :func:`recover`.
-    """
-    n, m = value.shape
-    field = np.zeros((rows + 2, columns + 2), np.float32)
-    ones = np.ones(m, np.float32)
-    most = max(int(sparsity * m), 1) if finest else m
-    for p in range(n):
-        own, best = cell[begin[p] : begin[p + 1]], weight[begin[p] : begin[p + 1]]
-        s = own.size
-        best[:] = 0
-        if s == 0:
-            continue
-        matrix = np.empty((s, m), np.float32)
-        signed_rows(light[source[p]], own, ones, 0, matrix)
-        residual = value[p].copy()
-        left = inner(residual, residual)
-        price = 2 * np.log(max(s, 2))
-        proxy, x = np.empty(s, np.float32), np.empty(s, np.float32)
-        chosen = np.empty(s, np.bool_)
-        k = 1
-        while True:
-            before, cells = left, np.count_nonzero(best)
-            for _ in range(_ROUNDS):
-                for j in range(s):
-                    proxy[j] = max(best[j] + inner(matrix[j], residual) / m, 0)
-                choose_groups(own, proxy, k, columns, field, chosen)
-                for j in range(s):
-                    chosen[j] = chosen[j] or best[j] > 0
-                    x[j] = best[j]
-                solve_chosen(matrix, value[p], chosen, x)
-                choose_groups(own, x, k, columns, field, chosen)
-                pruned = solve_chosen(matrix, value[p], chosen, x)
-                now = inner(pruned, pruned)
-                stalled = now >= (1 - _STALL) * left
-                if now < left:
-                    residual, left = pruned, now
-                    for j in range(s):
-                        best[j] = x[j]
-                if stalled:
-                    break
-            gain = m * np.log(before / max(left, 1e-30))
-            enough = gain <= price * (np.count_nonzero(best) - cells)
-            settled = finest and enough and abs(best.sum() - 1) <= sum_tolerance
-            if settled or k == min(most, s):
-                break
-            k = min(max(k + 1, int(k * growth)), most, s)
-        if finest:
-            group_sums(own, best, columns, field, proxy)
-            for j in range(s):
-                chosen[j] = best[j] > 0 and proxy[j] > np.sqrt(price * left) / m
-            solve_chosen(matrix, value[p], chosen, best)
-
-
-@njit(nogil=True, cache=True)
-def choose_groups(
-    cell: NDArray[np.int32],
-    value: NDArray[np.float32],
-    k: int,
-    columns: int,
-    field: NDArray[np.float32],
-    chosen: NDArray[np.bool_],
-) -> None:
-    """Mark the k cells of positive value whose group has the most energy; of equal ones the first.
-
-    Parameters
-    ----------
-    cell, columns, field
-        As in :func:`~workflows.recovery.groups.group_sums`.
-    value : (s,) float32
-        Zero or more; a group's energy is the cell's squared value plus half of its neighbours'.
-    k : int
-        1 or more.
-    chosen : (s,) bool
-        Written.
-    """
-    energy = np.empty_like(value)
-    group_sums(cell, value * value, columns, field, energy)
-    best = np.empty(k, np.int64)  # the most energetic cells so far, falling
-    found = 0
-    for j in range(value.size):
-        chosen[j] = False
-        if value[j] <= 0 or (found == k and energy[j] <= energy[best[k - 1]]):
-            continue
-        place = min(found, k - 1)
-        found = place + 1
-        while place > 0 and energy[best[place - 1]] < energy[j]:
-            best[place] = best[place - 1]
-            place -= 1
-        best[place] = j
-    for i in range(found):
-        chosen[best[i]] = True
-
-
-@njit(nogil=True, cache=True)
-def solve_chosen(
-    matrix: NDArray[np.float32],
-    target: NDArray[np.float32],
-    chosen: NDArray[np.bool_],
-    x: NDArray[np.float32],
+def error_of(
+    transport: Transport,
+    photometry: Photometry,
+    measured: Measured,
+    sensing: Sensing,
 ) -> NDArray[np.float32]:
-    """Non-negative least squares on some of the cells, from x.
+    """The error to expect of composites with a T of the finest level; see :func:`expected_error`.
 
     Parameters
     ----------
-    matrix : (s, m) float32
-        One row a cell.
-    target : (m,) float32
-        What the rows are to add up to.
-    chosen : (s,) bool
-        Cells that may be above zero.
-    x : (s,) float32
-        The start; overwritten with the result.
+    transport : Transport
+        Of n pixels.
+    photometry : Photometry
+    measured : Measured
+    sensing : Sensing
 
     Returns
     -------
-    (m,) float32
-        The residual ``target - x matrix``.
+    (n,) float32
     """
-    index = np.flatnonzero(chosen)
-    part, y = matrix[index], x[index]
-    residual: NDArray[np.float32] = descend(part, target, y, _SWEEPS, _TOLERANCE)
-    x[:] = 0
-    for i in range(index.size):
-        x[index[i]] = y[i]
-    return residual
+    level, sizes = sensing.levels[-1], transport.count.ravel().astype(np.int64)
+    row = np.repeat(np.arange(sizes.size), sizes)
+    channel = np.minimum(row % 3, len(level.light) - 1)
+    seen = level.light[channel, transport.cell] * transport.weight[:, np.newaxis]
+    response = np.zeros((sizes.size, level.patterns.size), np.float32)
+    begin = (np.cumsum(sizes) - sizes)[sizes > 0]
+    if begin.size:
+        response[sizes > 0] = 2 * np.add.reduceat(seen, begin) - 1
+    value, variance = (array[..., level.patterns] for array in measured)
+    used = np.isfinite(variance)
+    square = (value - response.reshape(value.shape)) ** 2 - np.where(used, variance, 0)
+    misfit = np.where(used, square, 0).sum(axis=2) / np.maximum(used.sum(axis=2), 1)
+    return expected_error(photometry, measured, misfit)
+
+
+def _weigh(
+    value: NDArray[np.float32], variance: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Measurements with the inverse of their channel's mean variance; both 0 for one that says nothing.
+
+    Parameters
+    ----------
+    value, variance : (n, 3, m) float32
+        Measurements in +-1 form and their variances, infinite where nothing was measured.
+
+    Returns
+    -------
+    value, weight : (n, 3, m) float32
+    """
+    usable = np.isfinite(value) & (variance < _WIDEST**2)
+    usable &= np.abs(np.where(usable, value, 0)) < _FARTHEST * np.sqrt(np.where(usable, variance, 1))
+    # one axis at a time over contiguous memory: the order of the sum is the same in any batch
+    total = np.ascontiguousarray(np.where(usable, variance, 0)).sum(axis=2, keepdims=True)
+    count = usable.sum(axis=2, keepdims=True)
+    weight = np.where(usable, count / np.where(total > 0, total, 1), 0)
+    return np.where(usable, value, 0).astype(np.float32), weight.astype(np.float32)
+
+
+def _rows_of(
+    value: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    pixel: NDArray[np.intp],
+    channel: NDArray[np.intp] | None,
+    *,
+    grey: bool,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float64]]:
+    """The measurements of each row to solve for, scaled to one variance.
+
+    Parameters
+    ----------
+    value, weight : (n, 3, m) float32
+        Measurements in +-1 form and their inverse variances.
+    pixel, channel : (k,) intp
+        Whose measurements a row has; those of all channels if `channel` is None.
+    grey : bool
+        Whether the channels saw the same patterns.
+
+    Returns
+    -------
+    target, scale : (k, m or 3 m) float32
+        Scaled measurements, and the scales; a row's squared scales add up to its usable measurements.
+    variance : (k,) float64
+        Of a scaled measurement.
+    """
+    if channel is not None:
+        value, weight = value[pixel, channel], weight[pixel, channel]
+    elif grey:
+        total = weight[pixel].sum(axis=1)
+        value = (weight * value)[pixel].sum(axis=1) / np.where(total > 0, total, 1)
+        weight = total
+    else:
+        value, weight = value[pixel].reshape(pixel.size, -1), weight[pixel].reshape(pixel.size, -1)
+    # one axis at a time over contiguous memory: the order of the sum is the same in any batch
+    value, weight = np.ascontiguousarray(value), np.ascontiguousarray(weight)
+    count = np.maximum((weight > 0).sum(axis=1), 1)
+    mean = weight.sum(axis=1, dtype=np.float64) / count
+    mean = np.where(mean > 0, mean, 1)
+    scale = np.sqrt(weight / mean[:, np.newaxis]).astype(np.float32)
+    return scale * value, scale, 1 / mean

@@ -1,6 +1,7 @@
 """S and rho of each pixel from constant monitors, the camera's noise, and measurements in units of T."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,11 @@ LEAST_READ = 2e-11
 
 _SAMPLE = 4096
 _BINS = 12
-_MEDIAN_OF_CHI_SQUARE = 0.454936
+# A chi-square variable's mean without its largest tenth: P(chi-square of 3 <= its 90th percentile) / 0.9.
+_TRIM, _TRIMMED_CHI_SQUARE = 0.9, 0.623011
+_MOST_CROSSTALK = 0.9
+# Standard deviations that S and S + rho may move when they are fitted once more.
+_TRUST = 2.0
 
 
 @dataclass(frozen=True)
@@ -48,10 +53,14 @@ class Photometry:
         Light that is not the monitor's, in camera units (full scale is 1).
     rho : (n, 3) float32
         Camera value a unit of the monitor's light, 0 or more.
+    black, white : (n, 3) float32
+        Variances of S and of S + rho, the camera's values before a black and a white monitor.
     """
 
     S: NDArray[np.float32]
     rho: NDArray[np.float32]
+    black: NDArray[np.float32]
+    white: NDArray[np.float32]
 
 
 def fit_photometry(
@@ -99,10 +108,11 @@ def fit_photometry(
     mean_level = (weight * levels).sum(axis=1) / total
     mean_value = (weight * values).sum(axis=1) / total
     offset = levels - mean_level[:, None]
-    rho = (weight * offset * values).sum(axis=1) / (weight * offset**2).sum(axis=1)
-    rho = np.maximum(rho, 0)
+    spread = (weight * offset**2).sum(axis=1)
+    rho = np.maximum((weight * offset * values).sum(axis=1) / spread, 0)
     S = mean_value - rho * mean_level
-    return Photometry(S.astype(np.float32), rho.astype(np.float32))
+    black, white = (1 / total + (level - mean_level) ** 2 / spread for level in (0, 1))
+    return Photometry(*(array.astype(np.float32) for array in (S, rho, black, white)))
 
 
 def estimate_noise(
@@ -130,7 +140,7 @@ def estimate_noise(
     Returns
     -------
     Noise
-        With fewer than four different levels, or none usable, that of a typical sensor (a full well of 20,000
+        With fewer than four frames, or none usable, that of a typical sensor (a full well of 20,000
         electrons, read noise of 0.15 % of full scale) plus the quantisation's.
 
     Raises
@@ -142,14 +152,15 @@ def estimate_noise(
     -----
     The residuals of an unweighted line are ``R e``, R the projector that takes lines out. If the error e_j of
     frame j has the variance ``(read + shot v_j) / frames_j``, a residual has
-    ``read a + shot b``, ``a = sum_j R_ij^2 / frames_j``, ``b = sum_j R_ij^2 v_j / frames_j``. The median of
-    ``r^2 / a`` over residuals of similar b / a, in units of the median of a chi-square variable, is one robust
-    sample of the line ``read + shot (b / a)``, which is fitted with both terms >= 0.
+    ``read a + shot b``, ``a = sum_j R_ij^2 / frames_j``, ``b = sum_j R_ij^2 v_j / frames_j``. The mean of
+    ``r^2 / a`` over residuals of similar b / a, without the largest tenth and in units of the same of a chi-square
+    variable, is one robust sample of the line ``read + shot (b / a)``, which is fitted with both terms >= 0. (A
+    median would fail where rounding leaves only a few different values.)
     """
     _check(values, levels, usable)
     floor = max(quantum**2 / 12, LEAST_READ)
     typical = Noise(TYPICAL_READ + floor, TYPICAL_SHOT)
-    channels = [c for c in range(3) if np.unique(levels[:, c]).size >= 4]
+    channels = range(3) if len(levels) >= 4 else ()
     step = max(1, -(-values.shape[0] // _SAMPLE))
     share = 1 / (np.ones(len(levels)) if frames is None else frames)
     pairs = [_residuals(values[::step, :, c], levels[:, c], usable[::step, :, c], share) for c in channels]
@@ -160,7 +171,8 @@ def estimate_noise(
     order = np.argsort(level, kind="stable")
     bins = np.array_split(order, _BINS)
     middle = np.array([level[b].mean() for b in bins])
-    variance = np.array([np.median(square[b]) for b in bins]) / _MEDIAN_OF_CHI_SQUARE
+    lowest = [np.sort(square[b])[: int(_TRIM * len(b))] for b in bins]
+    variance = np.array([least.mean() for least in lowest]) / _TRIMMED_CHI_SQUARE
     variance = np.maximum(variance, floor)
     # the error of a sample variance is in proportion to it
     design = np.stack([np.ones(_BINS), np.maximum(middle, 0)], axis=1) / variance[:, None]
@@ -168,28 +180,94 @@ def estimate_noise(
     return Noise(max(float(read), floor), float(shot))
 
 
+class Measured(NamedTuple):
+    """Measurements in the +-1 form of eq. 8, where T is all there is between patterns and camera.
+
+    Attributes
+    ----------
+    value : (n, 3, m + 2) float32
+        ``2 (C - S) / rho - 1``: T times patterns of -1 (black) and 1 (white). The last two are a black and a white
+        monitor, -1 and 1. 0 where nothing was measured.
+    variance : (n, 3, m + 2) float32
+        Of `value`; infinite where nothing was measured.
+    """
+
+    value: NDArray[np.float32]
+    variance: NDArray[np.float32]
+
+
+def estimate_crosstalk(
+    values: NDArray[np.float32], levels: NDArray[np.float32], usable: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Estimate how much of each of the monitor's colours the camera's other channels see.
+
+    Parameters
+    ----------
+    values : (n, k, 3) float32
+        Linear camera values of n pixels before k constant monitors.
+    levels : (k, 3) float32
+        Light of each monitor by channel, 0 to 1.
+    usable : (n, k, 3) bool
+        False where a value says nothing.
+
+    Returns
+    -------
+    (3, 3) float64
+        X of ``C = S + X (rho T L)``: row the camera's channel, column the monitor's, 1 on the diagonal. The identity if
+        the monitors do not tell the colours apart, or the camera does not.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit.
+
+    Notes
+    -----
+    Each pixel's values are fitted by ``s + G b``; X_cd is the slope of G_cd over G_dd through zero.
+    """
+    _check(values, levels, usable)
+    design = np.concatenate([np.ones((len(levels), 1)), levels], axis=1)
+    whole = usable.all(axis=(1, 2))
+    if np.linalg.matrix_rank(design) < 4 or not whole.any():
+        return np.eye(3)
+    gain = np.einsum("dk,nkc->ncd", np.linalg.pinv(design)[1:], values[whole].astype(np.float64))
+    own = gain[:, [0, 1, 2], [0, 1, 2]]
+    energy = (own**2).sum(axis=0)
+    if not energy.all():
+        return np.eye(3)
+    mixed: NDArray[np.float64] = np.einsum("ncd,nd->cd", gain, own) / energy
+    # a camera without colours sees all of them alike
+    return mixed if np.abs(mixed - np.eye(3)).sum(axis=1).max() < _MOST_CROSSTALK else np.eye(3)
+
+
 def normalise(
-    measurements: NDArray[np.float32], photometry: Photometry, noise: Noise, least_contrast: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Bring measurements to the +-1 form of eq. 8, with their precision.
+    measurements: NDArray[np.float32],
+    photometry: Photometry,
+    noise: Noise,
+    least_contrast: float,
+    usable: NDArray[np.bool_] | None = None,
+    frames: NDArray[np.integer] | None = None,
+) -> Measured:
+    """Bring measurements to the +-1 form of eq. 8.
 
     Parameters
     ----------
     measurements : (n, m, 3) float32
-        Linear camera values C.
+        Linear camera values C. One that is not finite was not measured.
     photometry : Photometry
         S and rho of the n pixels.
     noise : Noise
-        Noise of a value.
+        Noise of a frame.
     least_contrast : float
         A channel whose rho is below this many standard deviations of a mid-grey value says nothing of T.
+    usable : (n, m, 3) bool, optional
+        False where a value says nothing, as where the camera clipped it; all say something if left out.
+    frames : (m,) integer, optional
+        Frames averaged into each value; one each if left out.
 
     Returns
     -------
-    value : (n, 3, m) float32
-        ``2 (C - S) / rho - 1``: T times patterns of -1 (black) and 1 (white); 0 where rho is too small.
-    precision : (n, 3, m) float32
-        Inverse variance of `value`; 0 where rho is too small.
+    Measured
 
     Raises
     ------
@@ -203,9 +281,106 @@ def normalise(
     alive = (rho > 0) & (rho**2 >= least_contrast**2 * noise.variance(S + rho / 2))
     scale = np.where(alive, rho, 1)
     light = np.ascontiguousarray(measurements.transpose(0, 2, 1), dtype=np.float32)
-    value = np.where(alive, 2 * (light - S) / scale - 1, 0)
-    precision = np.where(alive, scale**2 / (4 * noise.variance(light)), 0)
-    return value.astype(np.float32), precision.astype(np.float32)
+    there = alive & np.isfinite(light)
+    if usable is not None:
+        there &= usable.transpose(0, 2, 1)
+    light = np.where(there, light, 0)
+    variance = noise.variance(light) / (1 if frames is None else frames)
+    ends = np.stack([photometry.black, photometry.white], axis=2)
+    value = np.where(there, 2 * (light - S) / scale - 1, 0)
+    known = np.where(alive, np.array([-1, 1], np.float32), 0)
+    spread = np.where(there, 4 * variance / scale**2, np.inf)
+    return Measured(
+        np.concatenate([value, known], axis=2).astype(np.float32),
+        np.concatenate([spread, np.where(alive, 4 * ends / scale**2, np.inf)], axis=2).astype(np.float32),
+    )
+
+
+def refit(
+    photometry: Photometry,
+    measured: Measured,
+    response: NDArray[np.float32],
+    kappa: NDArray[np.floating],
+) -> Photometry:
+    """Fit S and rho once more, now that T says what each pattern was: all frames know of them, not the constant ones.
+
+    Parameters
+    ----------
+    photometry : Photometry
+        With which the measurements were brought to their form.
+    measured : Measured
+    response : (n, 3, m + 2) float32
+        What T makes of the patterns, in the same form.
+    kappa : (n, 3) float
+        Variance of a pattern of full contrast that T does not account for.
+
+    Returns
+    -------
+    Photometry
+        The old one where T says nothing, and everywhere within two standard deviations of it: of a T that is wrong,
+        slopes come out too low.
+
+    Notes
+    -----
+    With ``value = a + g response``, ``S + rho (value + 1) / 2`` is ``S' + rho' (response + 1) / 2`` of
+    ``rho' = g rho`` and ``S' = S + rho (1 + a - g) / 2``.
+    """
+    m = response.shape[2] - 2
+    unknown = np.zeros(response.shape)
+    unknown[:, :, :m] = kappa[..., None] * np.maximum(1 - response[:, :, :m] ** 2, 0)
+    weight = 1 / (measured.variance + unknown)
+    total = weight.sum(axis=2, keepdims=True)
+    known = total[..., 0] > 0
+    total[~known] = 1
+    mean = (weight * response).sum(axis=2, keepdims=True) / total
+    mean_value = (weight * measured.value).sum(axis=2, keepdims=True) / total
+    offset = response - mean
+    spread = (weight * offset**2).sum(axis=2)
+    known &= spread > 0
+    g = (weight * offset * (measured.value - mean_value)).sum(axis=2) / np.where(known, spread, 1)
+    g = np.where(known, np.maximum(g, 0), 1)
+    a = np.where(known, (mean_value - g[..., None] * mean)[..., 0], 0)
+    S, white = photometry.S, photometry.S + photometry.rho
+    black_range, white_range = _TRUST * np.sqrt(photometry.black), _TRUST * np.sqrt(photometry.white)
+    new_S = np.clip(S + photometry.rho * (1 + a - g) / 2, S - black_range, S + black_range)
+    new_white = np.clip(S + photometry.rho * (1 + a + g) / 2, white - white_range, white + white_range)
+    S, white = np.where(known, new_S, S), np.where(known, np.maximum(new_white, new_S), white)
+    return Photometry(
+        S.astype(np.float32),
+        np.where(known, white - S, photometry.rho).astype(np.float32),
+        photometry.black,
+        photometry.white,
+    )
+
+
+def expected_error(
+    photometry: Photometry, measured: Measured, misfit: NDArray[np.floating]
+) -> NDArray[np.float32]:
+    """The error to expect of composites, from how far T was from explaining the measurements.
+
+    Parameters
+    ----------
+    photometry : Photometry
+    measured : Measured
+    misfit : (n, 3) float
+        Squared residuals of the measurements less their variances, in the mean.
+
+    Returns
+    -------
+    (n,) float32
+        Root of the mean square over the channels, in camera units; infinite where no channel was measured.
+
+    Notes
+    -----
+    A pattern is a backdrop like any other: what T misses of the patterns it misses of composites, times rho / 2, for
+    patterns are +-1. Where the residuals are no larger than noise, the error is at least that of a mean of them.
+    """
+    there = np.isfinite(measured.variance)
+    used = there.sum(axis=2)
+    noise = np.where(there, measured.variance, 0).sum(axis=2) / np.maximum(used, 1) ** 2
+    square = (photometry.rho**2 / 4 * np.maximum(misfit, noise)).mean(axis=1)
+    error: NDArray[np.float32] = np.where(used.any(axis=1), np.sqrt(square), np.inf).astype(np.float32)
+    return error
 
 
 def _check(values: NDArray[np.float32], levels: NDArray[np.float32], usable: NDArray[np.bool_]) -> None:

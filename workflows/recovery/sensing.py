@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from workflows.recovery.pyramid import Pyramid
+
 
 @dataclass(frozen=True)
 class Level:
@@ -35,3 +37,27 @@ class Sensing:
     """The levels of a program from coarse to fine; each grid is a whole multiple of the one before it."""
 
     levels: tuple[Level, ...]
+
+
+@dataclass(frozen=True)
+class Patterns:
+    """The light of every pattern on the nodes of a pyramid over the monitor.
+
+    Attributes
+    ----------
+    pyramid : Pyramid
+    channels : int
+        1 if every pattern is grey, else 3.
+    code : (pyramid.nodes, channels * m) uint8
+        Light, 0 (black) to 255 (white), of the m patterns channel after channel. A byte is enough: a lobe sees many
+        nodes, and a camera's noise is larger.
+    """
+
+    pyramid: Pyramid
+    channels: int
+    code: NDArray[np.uint8]
+
+    @property
+    def count(self) -> int:
+        """m."""
+        return int(self.code.shape[1]) // self.channels

@@ -1,4 +1,4 @@
-"""Non-negative least squares on the few cells of one pixel: kernels that more than one method uses.
+"""Least squares on the few cells of one pixel: kernels that more than one method uses.
 
 A matrix here has one row a cell, as long as the measurements: every inner loop runs over contiguous memory.
 """
@@ -84,6 +84,73 @@ def descend(
 
 
 @njit(nogil=True, cache=True)
+def posterior_mean(
+    matrix: NDArray[np.float32],
+    residual: NDArray[np.float32],
+    mean: NDArray[np.float32],
+    variance: float,
+    looseness: float,
+    steps: int,
+    precision: float,
+) -> NDArray[np.float32]:
+    """Mean of ``t ~ N(mean, looseness * diag(mean))`` given measurements, cut off at zero.
+
+    Parameters
+    ----------
+    matrix : (s, n) float32
+        One row a cell.
+    residual : (n,) float32
+        Measurements less ``mean matrix``.
+    mean : (s,) float32
+        Zero or more.
+    variance, looseness : float
+        Of the measurements, and of the prior; zero or more.
+    steps : int
+        Most conjugate gradients.
+    precision : float
+        They end when this share of the right-hand side is left.
+
+    Returns
+    -------
+    (s,) float32
+
+    Notes
+    -----
+    Conjugate gradients on ``(A M A' + variance / looseness) y = residual``, ``t = mean + M A' y``.
+    """
+    s, n = matrix.shape
+    t = mean.copy()
+    if looseness <= 0:
+        return t
+    ridge = np.float32(variance / looseness)
+    y = np.zeros(n, np.float32)
+    rest, direction, image = residual.copy(), residual.copy(), np.empty(n, np.float32)
+    energy = inner(rest, rest)
+    enough = np.float32(precision * precision) * energy
+    for _ in range(steps):
+        if energy <= enough:
+            break
+        for k in range(n):
+            image[k] = ridge * direction[k]
+        for j in range(s):
+            subtract(image, -mean[j] * inner(matrix[j], direction), matrix[j])
+        curvature = inner(direction, image)
+        if curvature <= 0:
+            break
+        step = energy / curvature
+        for k in range(n):
+            y[k] += step * direction[k]
+            rest[k] -= step * image[k]
+        now = inner(rest, rest)
+        for k in range(n):
+            direction[k] = rest[k] + now / energy * direction[k]
+        energy = now
+    for j in range(s):
+        t[j] = max(t[j] + mean[j] * inner(matrix[j], y), np.float32(0))
+    return t
+
+
+@njit(nogil=True, cache=True)
 def signed_rows(
     light: NDArray[np.float32],
     cell: NDArray[np.int32],
@@ -110,3 +177,28 @@ def signed_rows(
         row, written = light[cell[i]], out[i, first : first + scale.size]
         for k in range(scale.size):
             written[k] = scale[k] * (2 * row[k] - 1)
+
+
+@njit(nogil=True, cache=True)
+def stack_rows(
+    light: NDArray[np.float32],
+    cell: NDArray[np.int32],
+    scale: NDArray[np.float32],
+    out: NDArray[np.float32],
+) -> None:
+    """Write :func:`signed_rows` of several channels, one after another.
+
+    Parameters
+    ----------
+    light : (channels, cells, m) float32
+        Light of the channels, 0 to 1.
+    cell : (s,) int32
+        Cells.
+    scale : (channels * m,) float32
+        Factor of each measurement.
+    out : (s, channels * m) float32
+        Written.
+    """
+    m = light.shape[2]
+    for c in range(light.shape[0]):
+        signed_rows(light[c], cell, scale[c * m : (c + 1) * m], c * m, out)

@@ -15,13 +15,16 @@ class Transport:
     Attributes
     ----------
     columns, rows : int
-        The grid of the cells.
+        The first grid of the pyramid that the cells are nodes of; a method that knows one grid has no others.
     count : (n, 3) uint32
         Number of cells of each row; 0 where nothing could be recovered.
     cell : (count.sum(),) uint32
-        Cell indices ``row * columns + column``, ascending within a row; rows in the order (pixel, channel).
+        Nodes of :class:`~workflows.recovery.pyramid.Pyramid` over the grid, ``row * columns + column`` on the grid
+        itself; ascending within a row; rows in the order (pixel, channel).
     weight : (count.sum(),) float32
         Share of the light, positive; each row sums to 1.
+    shared : (n,) bool
+        Whether a pixel's first row serves all channels; its others are empty.
     """
 
     columns: int
@@ -29,6 +32,7 @@ class Transport:
     count: NDArray[np.uint32]
     cell: NDArray[np.uint32]
     weight: NDArray[np.float32]
+    shared: NDArray[np.bool_]
 
     @classmethod
     def from_rows(
@@ -38,6 +42,7 @@ class Transport:
         count: NDArray[np.integer],
         cell: NDArray[np.integer],
         weight: NDArray[np.floating],
+        shared: NDArray[np.bool_] | None = None,
         least_weight: float = 1e-4,
     ) -> Self:
         """Clean the rows of a solver: drop tiny entries, make each row sum to 1.
@@ -52,6 +57,8 @@ class Transport:
             Cells, ascending within a row.
         weight : (count.sum(),) float
             Weights, zero or more, of any positive sum; a row that sums to zero ends up empty.
+        shared : (n,) bool, optional
+            False for every pixel if left out.
         least_weight : float
             Entries below this share of their row are dropped.
 
@@ -80,7 +87,12 @@ class Transport:
         exact /= np.bincount(row, exact, sizes.size)[row]
         kept = np.bincount(row, minlength=sizes.size).reshape(count.shape)
         return cls(
-            columns, rows, kept.astype(np.uint32), cell[keep].astype(np.uint32), exact.astype(np.float32)
+            columns,
+            rows,
+            kept.astype(np.uint32),
+            cell[keep].astype(np.uint32),
+            exact.astype(np.float32),
+            np.zeros(len(count), bool) if shared is None else shared,
         )
 
     @classmethod
@@ -100,6 +112,7 @@ class Transport:
             np.concatenate([part.count for part in parts]),
             np.concatenate([part.cell for part in parts]),
             np.concatenate([part.weight for part in parts]),
+            np.concatenate([part.shared for part in parts]),
         )
 
     def apply(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -107,8 +120,9 @@ class Transport:
 
         Parameters
         ----------
-        light : (rows * columns, 3) float32
-            L, the monitor's light by cell and channel.
+        light : (nodes, 3) float32
+            L, the monitor's light by node of the pyramid and channel; of the first grid alone, if no cell is on
+            another.
 
         Returns
         -------
@@ -118,14 +132,19 @@ class Transport:
         Raises
         ------
         ValueError
-            If `light` does not have one row for each cell.
+            If `light` is not that of the pyramid's nodes.
         """
-        if light.shape != (self.rows * self.columns, 3):
-            raise ValueError(f"light must be ({self.rows * self.columns}, 3), not {light.shape}")
         sizes = self.count.ravel().astype(np.int64)
+        if light.ndim != 2 or light.shape[1] != 3 or len(light) <= int(self.cell.max(initial=0)):
+            raise ValueError(f"light must be (nodes, 3), with a row for every cell, not {light.shape}")
         row = np.repeat(np.arange(sizes.size), sizes)
-        share = self.weight.astype(np.float64) * light[self.cell, row % 3]
-        return np.bincount(row, share, sizes.size).reshape(self.count.shape).astype(np.float32)
+        exact = self.weight.astype(np.float64)
+        arrived = np.stack(
+            [np.bincount(row, exact * light[self.cell, c], sizes.size) for c in range(3)], axis=1
+        )
+        arrived = arrived.reshape(-1, 3, 3)
+        own = arrived[:, [0, 1, 2], [0, 1, 2]]
+        return np.where(self.shared[:, np.newaxis], arrived[:, 0], own).astype(np.float32)
 
 
 def ragged_entries(begin: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.int64]:

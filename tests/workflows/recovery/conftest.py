@@ -7,10 +7,13 @@ import pytest
 from numpy.typing import NDArray
 
 from workflows.recovery.photometry import Noise, Photometry
-from workflows.recovery.sensing import Level, Sensing
+from workflows.recovery.pyramid import Pyramid
+from workflows.recovery.sensing import Level, Patterns, Sensing
 
 Bands = list[tuple[int, int, int]]
 SensingOf = Callable[..., Sensing]
+PatternsOf = Callable[..., Patterns]
+Gaussian = Callable[..., NDArray[np.float64]]
 Scene = tuple[NDArray[np.float32], Photometry, Noise]
 Observe = Callable[..., Scene]
 
@@ -30,17 +33,43 @@ def _sensing_of(bands: Bands, seed: int, channels: int = 1) -> Sensing:
     return Sensing(tuple(levels))
 
 
+def _patterns_of(bands: Bands, seed: int, channels: int = 1) -> Patterns:
+    """The patterns of a finest level, on the pyramid over it."""
+    level = _sensing_of(bands, seed, channels).levels[-1]
+    pyramid = Pyramid.over(level.columns, level.rows)
+    light = level.light.reshape(channels, level.rows, level.columns, -1)
+    code = np.concatenate([pyramid.light(of_channel) for of_channel in light], axis=1)
+    return Patterns(pyramid, channels, np.rint(255 * code).astype(np.uint8))
+
+
+def _gaussian(
+    columns: int, rows: int, x: float, y: float, major: float, minor: float, angle: float = 0.0
+) -> NDArray[np.float64]:
+    """(1, 3, cells) the share of an oriented Gaussian on each cell of a grid, whose centre of cell 0 is at 0.5."""
+    fine = 4
+    v, u = (np.mgrid[: rows * fine, : columns * fine] + 0.5) / fine
+    along = (u - x) * np.cos(angle) + (v - y) * np.sin(angle)
+    across = (v - y) * np.cos(angle) - (u - x) * np.sin(angle)
+    density = np.exp(-((along / major) ** 2 + (across / minor) ** 2) / 2)
+    share = density.reshape(rows, fine, columns, fine).sum((1, 3)).reshape(1, 1, -1)
+    return np.repeat(share / share.sum(), 3, axis=1)
+
+
 def _observe(
-    sensing: Sensing, truth: NDArray[np.float64], rho: float | list[float] = 0.7, seed: int = 1
+    shown: Sensing | Patterns, truth: NDArray[np.float64], rho: float | list[float] = 0.7, seed: int = 1
 ) -> Scene:
     """Noisy measurements of true rows (n, 3, cells) on the finest grid."""
     rng = np.random.default_rng(seed)
     noise = Noise(4e-6, 5e-5)
-    photometry = Photometry(
-        np.full(truth.shape[:2], 0.02, np.float32),
-        np.broadcast_to(np.asarray(rho, np.float32), truth.shape[:2]).copy(),
-    )
-    light = np.broadcast_to(sensing.levels[-1].light, (3, truth.shape[2], sensing.levels[-1].patterns.size))
+    S = np.full(truth.shape[:2], 0.02, np.float32)
+    factor = np.broadcast_to(np.asarray(rho, np.float32), truth.shape[:2]).copy()
+    photometry = Photometry(S, factor, noise.variance(S) / 4, noise.variance(S + factor) / 4)
+    if isinstance(shown, Sensing):
+        light = shown.levels[-1].light
+    else:
+        cells = shown.code[: truth.shape[2]].reshape(truth.shape[2], shown.channels, -1)
+        light = cells.transpose(1, 0, 2) / 255
+    light = np.broadcast_to(light, (3, *light.shape[1:]))
     arrived = np.einsum("nci,cim->nmc", truth, light)
     clean = photometry.S[:, None] + photometry.rho[:, None] * arrived
     noisy = clean + np.sqrt(noise.variance(clean)) * rng.standard_normal(clean.shape)
@@ -55,3 +84,13 @@ def sensing_of() -> SensingOf:
 @pytest.fixture
 def observe() -> Observe:
     return _observe
+
+
+@pytest.fixture(scope="session")
+def patterns_of() -> PatternsOf:
+    return _patterns_of
+
+
+@pytest.fixture(scope="session")
+def gaussian() -> Gaussian:
+    return _gaussian

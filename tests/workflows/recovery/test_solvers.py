@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from workflows.recovery.solvers import descend, inner, signed_rows
+from workflows.recovery.solvers import descend, inner, posterior_mean, signed_rows, stack_rows
 
 
 @pytest.mark.parametrize(("s", "m"), [(6, 20), (30, 40), (40, 30)])
@@ -50,3 +50,33 @@ def test_signed_rows_scale_each_measurement():
     signed_rows(light, cell, scale, 1, out)
     np.testing.assert_allclose(out[:, 1:5], scale * (2 * light[cell] - 1), rtol=1e-6)
     assert (out[:, [0, 5]] == 0).all()
+
+
+def test_stacked_rows_are_the_channels_one_after_another():
+    rng = np.random.default_rng(0)
+    light = rng.random((3, 5, 4)).astype(np.float32)
+    cell, scale = np.array([3, 1], np.int32), rng.random(12).astype(np.float32)
+    out = np.empty((2, 12), np.float32)
+    stack_rows(light, cell, scale, out)
+    expected = (2 * light[:, cell] - 1).transpose(1, 0, 2).reshape(2, 12)
+    np.testing.assert_allclose(out, scale * expected, rtol=1e-6)
+
+
+def test_posterior_mean_is_the_closed_form():
+    rng = np.random.default_rng(0)
+    matrix = np.sign(rng.standard_normal((40, 25))).astype(np.float32)
+    mean = rng.dirichlet(np.full(40, 5.0)).astype(np.float32)
+    target = rng.dirichlet(np.full(40, 5.0)) @ matrix
+    variance, looseness = 1e-3, 0.02
+    gram = looseness * (matrix.T * mean) @ matrix + variance * np.eye(25)
+    gain = looseness * mean * (matrix @ np.linalg.solve(gram, target - mean @ matrix))
+    residual = (target - mean @ matrix).astype(np.float32)
+    found = posterior_mean(matrix, residual, mean, variance, looseness, 200, 1e-6)
+    np.testing.assert_allclose(found, np.maximum(mean + gain, 0), atol=2e-5)
+    assert (posterior_mean(matrix, residual, mean, variance, 0.0, 200, 1e-6) == mean).all()
+
+
+def test_posterior_mean_of_patterns_that_see_nothing():
+    mean = np.full(3, 1 / 3, np.float32)
+    found = posterior_mean(np.zeros((3, 4), np.float32), np.ones(4, np.float32), mean, 0.0, 1.0, 10, 0.0)
+    np.testing.assert_array_equal(found, mean)

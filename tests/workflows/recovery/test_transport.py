@@ -55,7 +55,7 @@ def test_concatenate_joins_pixels_in_order(transport):
 
 
 def test_concatenate_refuses_different_grids(transport):
-    other = Transport(2, 3, transport.count, transport.cell, transport.weight)
+    other = Transport(2, 3, transport.count, transport.cell, transport.weight, transport.shared)
     with pytest.raises(ValueError, match="one grid"):
         Transport.concatenate([transport, other])
     with pytest.raises(ValueError, match="one grid"):
@@ -68,6 +68,29 @@ def test_apply_is_the_matrix_product(transport):
     np.testing.assert_allclose(transport.apply(light), expected, rtol=1e-6)
     with pytest.raises(ValueError, match="light"):
         transport.apply(light[:5])
+
+
+def test_a_shared_row_serves_all_channels():
+    count = np.array([[2, 0, 0], [1, 1, 1], [0, 0, 0]])
+    cell, weight = np.array([0, 7, 1, 2, 3]), np.array([0.5, 0.5, 1, 1, 1])
+    made = Transport.from_rows(3, 2, count, cell, weight, np.array([True, False, True]))
+    # nodes beyond the first grid's six are allowed for
+    light = np.random.default_rng(0).random((8, 3)).astype(np.float32)
+    expected = [(light[0] + light[7]) / 2, [light[1, 0], light[2, 1], light[3, 2]], [0, 0, 0]]
+    np.testing.assert_allclose(made.apply(light), expected, rtol=1e-6)
+    with pytest.raises(ValueError, match="light"):
+        made.apply(light[:7])
+    joined = Transport.concatenate([made, made])
+    np.testing.assert_array_equal(joined.shared, [True, False, True] * 2)
+    np.testing.assert_allclose(joined.apply(light), expected * 2, rtol=1e-6)
+
+
+def test_an_entry_is_dropped_by_its_share_of_the_row():
+    count, cell, weight = np.array([[3, 0, 0]]), np.array([0, 1, 2]), np.array([1.0, 1.0, 0.02])
+    kept = Transport.from_rows(3, 1, count, cell, weight, least_weight=0.009)
+    assert kept.count[0, 0] == 3
+    dropped = Transport.from_rows(3, 1, count, cell, weight, least_weight=0.011)
+    np.testing.assert_array_equal(dropped.weight, [0.5, 0.5])
 
 
 def test_ragged_entries_of_nothing():

@@ -1,0 +1,198 @@
+"""An oriented Gaussian lobe on the nodes of a pyramid, and what every pattern says of it.
+
+A lobe has the parameters (weight, x, y, l00, l10, l11): its centre in cells of the pyramid's first grid, from the top
+left corner, and the Cholesky factor L of its covariance, L = [[l00, 0], [l10, l11]], less that of the bumps it is
+sampled on. It lies on the coarsest grid that resolves it.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+PARAMETERS = 6
+NODES = 1024
+"""Nodes that a lobe is sampled on, at most: an even longer one is blurred across."""
+
+# A lobe is cut off at this squared Mahalanobis distance: 0.7 % of it are beyond.
+_REACH = 10.0
+# The least standard deviation of a sampled Gaussian, in spacings of its grid: a narrower one falls between nodes.
+_SHARPEST = 0.6
+
+
+@njit(nogil=True, cache=True)
+def bump_variance(level: int) -> float:
+    """Variance of the bumps of a level along an axis, in squared cells of the first grid."""
+    return 1 / 12 + (4.0**level - 1) / 4
+
+
+@njit(nogil=True, cache=True)
+def fit_level(lobe: NDArray[np.float64], level: int, columns: NDArray[np.int64], resolution: float) -> int:
+    """Move a lobe to the level that resolves it.
+
+    Parameters
+    ----------
+    lobe : (6,) float64
+        Its L is changed so that the lobe with its bumps stays as wide as it is.
+    level : int
+        The level it lies on.
+    columns : (levels,) int64
+        Of the pyramid's grids.
+    resolution : float
+        Spacings that the lobe's smaller standard deviation must have, at least.
+
+    Returns
+    -------
+    int
+        The level it now lies on.
+    """
+    blur = bump_variance(level)
+    xx = lobe[3] ** 2 + blur
+    xy = lobe[3] * lobe[4]
+    yy = lobe[4] ** 2 + lobe[5] ** 2 + blur
+    mean, half = (xx + yy) / 2, math.hypot((xx - yy) / 2, xy)
+    minor, major = math.sqrt(max(mean - half, 1e-3)), math.sqrt(mean + half)
+    level = 0
+    while level < columns.size - 1:
+        spacing = 2.0**level
+        crowded = math.pi * _REACH * minor * major > NODES * 0.9 * spacing**2
+        if minor < 2 * resolution * spacing and not crowded:
+            break
+        level += 1
+    blur, least = bump_variance(level), (_SHARPEST * 2.0**level) ** 2
+    low, high = max(mean - half - blur, least), max(mean + half - blur, least)
+    cosine, sine = ((xx - yy) / 2 / half, xy / half) if half > 1e-9 else (1.0, 0.0)
+    xx, xy = (low + high + (high - low) * cosine) / 2, (high - low) * sine / 2
+    yy = low + high - xx
+    lobe[3] = math.sqrt(xx)
+    lobe[4] = xy / lobe[3]
+    lobe[5] = math.sqrt(max(yy - lobe[4] ** 2, 1e-3))
+    return level
+
+
+@njit(nogil=True, cache=True)
+def sample(
+    lobe: NDArray[np.float64],
+    level: int,
+    columns: NDArray[np.int64],
+    rows: NDArray[np.int64],
+    starts: NDArray[np.int64],
+    node: NDArray[np.int64],
+    terms: NDArray[np.float32],
+) -> int:
+    """The nodes under a lobe, and its share on each.
+
+    Parameters
+    ----------
+    lobe : (6,) float64
+    level : int
+    columns, rows, starts : int64
+        Of the pyramid.
+    node : (NODES,) int64
+        Written.
+    terms : (1 or 6, NODES) float32
+        Written: shares that sum to 1, and their derivatives by x, y, l00, l10 and l11, which sum to 0.
+
+    Returns
+    -------
+    int
+        The number of nodes; one at least.
+
+    Notes
+    -----
+    With z = L^-1 (node - centre), ln share = -z'z / 2 + const, and d ln share = z' L^-1 (d centre + dL z).
+    """
+    spacing = 2.0**level
+    x, y, l00, l10, l11 = lobe[1], lobe[2], lobe[3], lobe[4], lobe[5]
+    yy = l10**2 + l11**2
+    slope, across = l00 * l10 / yy, l00 * l11 / math.sqrt(yy)
+    tall = math.sqrt(_REACH * yy)
+    top = max(0, math.ceil((y - tall) / spacing - 0.5))
+    bottom = min(rows[level] - 1, math.floor((y + tall) / spacing - 0.5))
+    n, total = 0, 0.0
+    for row in range(top, bottom + 1):
+        dy = (row + 0.5) * spacing - y
+        wide = across * math.sqrt(max(_REACH - dy * dy / yy, 0.0))
+        left = max(0, math.ceil((x + slope * dy - wide) / spacing - 0.5))
+        right = min(columns[level] - 1, math.floor((x + slope * dy + wide) / spacing - 0.5))
+        for column in range(left, min(right + 1, left + NODES - n)):
+            dx = (column + 0.5) * spacing - x
+            z0 = dx / l00
+            z1 = (dy - l10 * z0) / l11
+            share = math.exp(-(z0 * z0 + z1 * z1) / 2)
+            node[n] = starts[level] + row * columns[level] + column
+            terms[0, n] = share
+            if terms.shape[0] > 1:
+                g1 = z1 / l11
+                g0 = (z0 - l10 * g1) / l00
+                terms[1, n], terms[2, n] = g0, g1
+                terms[3, n], terms[4, n], terms[5, n] = g0 * z0, g1 * z0, g1 * z1
+            total += share
+            n += 1
+    if n == 0:
+        column = min(max(math.floor(x / spacing), 0), columns[level] - 1)
+        row = min(max(math.floor(y / spacing), 0), rows[level] - 1)
+        node[0] = starts[level] + row * columns[level] + column
+        for k in range(terms.shape[0]):
+            terms[k, 0] = 1.0 if k == 0 else 0.0
+        return 1
+    for i in range(n):
+        terms[0, i] /= total
+    for k in range(1, terms.shape[0]):
+        mean = 0.0
+        for i in range(n):
+            mean += terms[0, i] * terms[k, i]
+        for i in range(n):
+            terms[k, i] = terms[0, i] * (terms[k, i] - mean)
+    return n
+
+
+@njit(nogil=True, cache=True)
+def load(
+    code: NDArray[np.uint8], first: int, m: int, node: NDArray[np.int64], n: int, out: NDArray[np.float32]
+) -> None:
+    """Write what the patterns send from some nodes, -1 (black) to 1 (white), one row a node.
+
+    Parameters
+    ----------
+    code : (nodes, m or more) uint8
+        Light, 0 to 255.
+    first, m : int
+        The columns of `code` to take.
+    node : (n or more,) int64
+    n : int
+    out : (n or more, m) float32
+    """
+    for i in range(n):
+        row, written = code[node[i], first : first + m], out[i]
+        for k in range(m):
+            written[k] = np.float32(row[k]) * np.float32(2 / 255) - np.float32(1)
+
+
+# "contract" lets a product and a sum be one operation: fewer roundings, and the same ones on every machine that has it.
+@njit(nogil=True, cache=True, fastmath={"contract"})
+def combine(terms: NDArray[np.float32], rows: NDArray[np.float32], n: int, out: NDArray[np.float32]) -> None:
+    """Write ``terms[:, :n] @ rows[:n]``.
+
+    Parameters
+    ----------
+    terms : (t, n or more) float32
+    rows : (n or more, m) float32
+    n : int
+    out : (t, m or more) float32
+    """
+    m = rows.shape[1]
+    for t in range(terms.shape[0]):
+        written = out[t]
+        for k in range(m):
+            written[k] = 0
+        for i in range(0, n - 3, 4):
+            a, b, c, d = terms[t, i], terms[t, i + 1], terms[t, i + 2], terms[t, i + 3]
+            r0, r1, r2, r3 = rows[i], rows[i + 1], rows[i + 2], rows[i + 3]
+            for k in range(m):
+                written[k] += a * r0[k] + b * r1[k] + c * r2[k] + d * r3[k]
+        for i in range(n - n % 4, n):
+            a, r0 = terms[t, i], rows[i]
+            for k in range(m):
+                written[k] += a * r0[k]

@@ -1,0 +1,362 @@
+"""The default recovery: a few oriented Gaussian lobes, and about them the posterior mean of T."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from workflows.recovery.footprint import NODES, PARAMETERS
+from workflows.recovery.mixture import fit
+from workflows.recovery.photometry import Measured, Noise, Photometry, expected_error, normalise, refit
+from workflows.recovery.posterior import rows_of, spread_lobes, update
+from workflows.recovery.sensing import Patterns
+from workflows.recovery.solvers import subtract
+from workflows.recovery.transport import Transport
+
+# Pixels at a time, so that the working arrays stay small whatever a caller passes.
+_BLOCK = 256
+# Nodes that the rows of a block are first given room for.
+_ROOM = 1 << 16
+
+
+class Effort(NamedTuple):
+    """The constants of :func:`recover` that its kernels need."""
+
+    most_lobes: int
+    fit_resolution: float
+    resolution: float
+    rounds: int
+    steps: int
+    tolerance: float
+    beam: int
+    passes: int
+    gradients: int
+    least_weight: float
+
+
+class Recovery(NamedTuple):
+    """What was recovered of n pixels.
+
+    Attributes
+    ----------
+    transport : Transport
+    photometry : Photometry
+        S and rho, fitted once more with T.
+    error : (n,) float32
+        Root of the mean squared error to expect of a composite's channels, in camera units; infinite where nothing
+        could be recovered.
+    """
+
+    transport: Transport
+    photometry: Photometry
+    error: NDArray[np.float32]
+
+
+def recover(
+    measurements: NDArray[np.float32],
+    photometry: Photometry,
+    patterns: Patterns,
+    noise: Noise,
+    usable: NDArray[np.bool_] | None = None,
+    frames: NDArray[np.integer] | None = None,
+    *,
+    most_lobes: int = 4,
+    fit_resolution: float = 0.65,
+    resolution: float = 1.3,
+    rounds: int = 1,
+    steps: int = 6,
+    tolerance: float = 2.0,
+    beam: int = 6,
+    passes: int = 3,
+    gradients: int = 10,
+    disagreement: float = 1.5,
+    least_weight: float = 1e-4,
+    least_contrast: float = 3.0,
+) -> Recovery:
+    """Recover T as a few oriented Gaussian lobes, and then as what the measurements say about these.
+
+    Parameters
+    ----------
+    measurements : (n, m, 3) float32
+        Linear camera values of n pixels under the m patterns. One that is not finite is left out.
+    photometry : Photometry
+        S and rho of the pixels, from constant monitors.
+    patterns : Patterns
+        The patterns' light on a pyramid over the monitor.
+    noise : Noise
+        Noise of a frame.
+    usable : (n, m, 3) bool, optional
+        False where a value says nothing, as where the camera clipped it.
+    frames : (m,) integer, optional
+        Frames averaged into each value; one each if left out.
+    most_lobes : int
+        Most lobes of a T.
+    fit_resolution, resolution : float
+        Standard deviations of a lobe across, in spacings of the nodes that it lies on, at least: while it is
+        fitted, and in the end. They may be up to twice as many.
+    rounds, steps : int
+        Most rounds of a fit, after each of which the measurements are weighed again, and most steps in one.
+    tolerance : float
+        A round ends when a step takes less than this off chi-square.
+    beam : int
+        Nodes of a grid that are looked into for another lobe.
+    passes : int
+        How often T is replaced by its posterior mean.
+    gradients : int
+        Most conjugate gradients in each of them.
+    disagreement : float
+        One T serves all channels until their chi-square a degree of freedom exceeds this.
+    least_weight : float
+        Entries of T below this are dropped.
+    least_contrast : float
+        A channel whose rho is below this many standard deviations of a mid-grey value gets an empty row.
+
+    Returns
+    -------
+    Recovery
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit.
+
+    Notes
+    -----
+    The model is eq. 5 with T a sum of the pyramid's bumps. Lobes are added where they explain most
+    (:func:`~workflows.recovery.mixture.search`), all of them fitted (:func:`~workflows.recovery.mixture.refine`), and
+    kept if they pay for themselves. What they leave out, a sharp edge or a bend, is what
+    :func:`~workflows.recovery.posterior.update` finds.
+
+    Channels that saw the same patterns are weighed into one measurement, the others stacked. Where they disagree,
+    each gets its own T, fitted from the common lobes.
+    """
+    n, m = len(measurements), patterns.count
+    if measurements.shape != (n, m, 3):
+        raise ValueError(f"measurements must be (n, {m}, 3), not {measurements.shape}")
+    effort = Effort(
+        most_lobes,
+        fit_resolution,
+        resolution,
+        rounds,
+        steps,
+        tolerance,
+        beam,
+        passes,
+        gradients,
+        least_weight,
+    )
+    measured = normalise(measurements, photometry, noise, least_contrast, usable, frames)
+    response, kappa, misfit = np.zeros_like(measured.value), np.zeros((n, 3)), np.zeros((n, 3))
+    parts = []
+    for first in range(0, max(n, 1), _BLOCK):
+        block = slice(first, first + _BLOCK)
+        of_block = Measured(measured.value[block], measured.variance[block])
+        parts.append(
+            _recover_block(
+                patterns, of_block, effort, disagreement, response[block], kappa[block], misfit[block]
+            )
+        )
+    better = refit(photometry, measured, response, kappa)
+    return Recovery(Transport.concatenate(parts), better, expected_error(better, measured, misfit))
+
+
+def _recover_block(
+    patterns: Patterns,
+    measured: Measured,
+    effort: Effort,
+    disagreement: float,
+    response: NDArray[np.float32],
+    kappa: NDArray[np.float64],
+    misfit: NDArray[np.float64],
+) -> Transport:
+    """Recover some pixels; `response`, `kappa` and `misfit` are written."""
+    columns, rows = patterns.pyramid.grids[0]
+    alive = np.isfinite(measured.variance).any(axis=(1, 2))
+    own, own_variance = measured.value[alive], measured.variance[alive]
+    if patterns.channels == 1:
+        joint, joint_variance = _mean(own, own_variance)
+        apart = _disagree(own, own_variance, joint, disagreement)
+    else:
+        flat = len(own), own.shape[1] * own.shape[2]
+        joint, joint_variance = own.reshape(flat), own_variance.reshape(flat)
+        apart = np.zeros(len(own), bool)
+    counts = np.zeros((len(own), 3), np.int64)
+    seen, left_out, missed = np.zeros_like(own), np.zeros((len(own), 3)), np.zeros((len(own), 3))
+    node, weight = recover_pixels(
+        patterns.code,
+        patterns.count,
+        *(np.array(size) for size in zip(*patterns.pyramid.grids, strict=True)),
+        patterns.pyramid.starts,
+        joint,
+        joint_variance,
+        own,
+        own_variance,
+        apart,
+        effort,
+        seen,
+        left_out,
+        missed,
+        counts,
+    )
+    response[alive], kappa[alive], misfit[alive] = seen, left_out, missed
+    count, shared = np.zeros((alive.size, 3), np.int64), np.zeros(alive.size, bool)
+    count[alive], shared[alive] = counts, ~apart
+    row = np.repeat(np.arange(count.size), count.ravel())
+    order = np.lexsort((node, row))
+    row, node, weight = row[order], node[order], weight[order]
+    # a node under two lobes is there twice
+    new = np.append(True, (np.diff(row) > 0) | (np.diff(node) > 0))[: row.size]
+    begin = np.flatnonzero(new)
+    merged = np.add.reduceat(weight, begin) if begin.size else weight
+    count = np.bincount(row[begin], minlength=count.size).reshape(count.shape)
+    return Transport.from_rows(columns, rows, count, node[begin], merged, shared, effort.least_weight)
+
+
+def _mean(
+    value: NDArray[np.float32], variance: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The mean of the channels, (n, m + 2), each weighed by its precision, and its variance."""
+    precision = 1 / variance
+    total = precision.sum(axis=1)
+    with np.errstate(divide="ignore"):
+        joint_variance = 1 / total
+    joint = (value * precision).sum(axis=1) * np.where(total > 0, joint_variance, 0)
+    return joint, joint_variance
+
+
+def _disagree(
+    value: NDArray[np.float32],
+    variance: NDArray[np.float32],
+    joint: NDArray[np.float32],
+    disagreement: float,
+) -> NDArray[np.bool_]:
+    """(n,) bool: whether the channels differ by more than noise, and S and rho that are not quite known."""
+    precision, x = 1 / variance, joint[:, np.newaxis]
+    total = np.maximum(precision.sum(axis=2, keepdims=True), 1e-12)
+    dx = x - (precision * x).sum(axis=2, keepdims=True) / total
+    dy = value - (precision * value).sum(axis=2, keepdims=True) / total
+    gain = (precision * dx * dy).sum(axis=2) / np.maximum((precision * dx**2).sum(axis=2), 1e-12)
+    chi = (precision * (dy - gain[..., np.newaxis] * dx) ** 2).sum(axis=(1, 2))
+    used = np.isfinite(variance).sum(axis=2)
+    # the mean and, of each channel, an offset and a gain are fitted
+    freedom = used.sum(axis=1) - used.max(axis=1) - 2 * (np.count_nonzero(used, axis=1) - 1)
+    disagrees: NDArray[np.bool_] = chi > disagreement * np.maximum(freedom, 1)
+    return disagrees
+
+
+@njit(nogil=True, cache=True)
+def recover_pixels(
+    code: NDArray[np.uint8],
+    m: int,
+    columns: NDArray[np.int64],
+    rows: NDArray[np.int64],
+    starts: NDArray[np.int64],
+    joint: NDArray[np.float32],
+    joint_variance: NDArray[np.float32],
+    own: NDArray[np.float32],
+    own_variance: NDArray[np.float32],
+    apart: NDArray[np.bool_],
+    effort: Effort,
+    response: NDArray[np.float32],
+    kappa: NDArray[np.float64],
+    misfit: NDArray[np.float64],
+    count: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Recover T of some pixels, one for all channels or one for each.
+
+    Parameters
+    ----------
+    code : (nodes, channels m) uint8
+        Light of the m patterns on the nodes of the pyramid; 1 or 3 channels.
+    m : int
+    columns, rows, starts
+        Of the pyramid.
+    joint, joint_variance : (n, channels (m + 2)) float32
+        Measurements of all channels together, and their variances.
+    own, own_variance : (n, 3, m + 2) float32
+        Those of each channel.
+    apart : (n,) bool
+        Whether each channel gets its own T; under patterns of three colours found out here, and written.
+    effort : Effort
+    response : (n, 3, m + 2) float32
+        Written: what the measurements would be before T.
+    kappa, misfit : (n, 3) float64
+        Written, as from :func:`~workflows.recovery.posterior.update`.
+    count : (n, 3) int64
+        Written: nodes of each row; those of a row for all channels stand first.
+
+    Returns
+    -------
+    node : (count.sum(),) int64
+    weight : (count.sum(),) float32
+    """
+    groups, most = code.shape[1] // m, effort.most_lobes
+    lobes, level, k = np.empty((4, most, PARAMETERS)), np.empty((4, most), np.int64), np.zeros(4, np.int64)
+    offset, worth = np.zeros((4, 3)), np.zeros(4)
+    node, weight = np.empty(most * NODES, np.int64), np.empty(most * NODES, np.float32)
+    all_nodes, all_weights, written = np.empty(_ROOM, np.int64), np.empty(_ROOM, np.float32), 0
+    for p in range(joint.shape[0]):
+        offset[:] = 0
+        # 0 to 2: a channel; 3: all of them
+        for c in (3, 0, 1, 2):
+            if c < 3 and (np.isinf(own_variance[p, c]).all() or not (apart[p] or groups == 3)):
+                k[c], worth[c] = 0, 0
+                continue
+            if c < 3:
+                lobes[c], level[c], k[c] = lobes[3], level[3], k[3]
+            k[c], _, worth[c] = fit(
+                code,
+                c * m if c < 3 and groups == 3 else 0,
+                groups if c == 3 else 1,
+                columns,
+                rows,
+                starts,
+                joint[p] if c == 3 else own[p, c],
+                joint_variance[p] if c == 3 else own_variance[p, c],
+                lobes[c],
+                level[c],
+                k[c] if c < 3 else 0,
+                offset[c],
+                most,
+                effort.fit_resolution,
+                effort.rounds,
+                effort.steps,
+                effort.tolerance,
+                effort.beam,
+            )
+        if groups == 3:
+            # Bayes' information criterion, with a kappa each; the channels' lobes are near the common ones
+            each = math.log(joint.shape[1])
+            fewer = worth[3] + each * (PARAMETERS * k[3] + 1)
+            apart[p] = (worth[:3] + each * (PARAMETERS * k[:3] + 1)).sum() < fewer
+        count[p] = 0
+        for c in range(0 if apart[p] else 3, 3 if apart[p] else 4):
+            if k[c] == 0:
+                continue
+            first, my_groups = (c * m if groups == 3 else 0, 1) if c < 3 else (0, groups)
+            y, variance = (own[p, c], own_variance[p, c]) if c < 3 else (joint[p], joint_variance[p])
+            n = spread_lobes(columns, rows, starts, lobes[c], level[c], k[c], effort.resolution, node, weight)
+            A = rows_of(code, first, my_groups, m, node, n)
+            left_out, missed = update(
+                A, weight[:n], y, variance, my_groups, offset[c], effort.passes, effort.gradients
+            )
+            f = np.zeros(my_groups * (m + 2), np.float32)
+            for i in range(n):
+                subtract(f, -weight[i], A[i])
+            for d in range(3):
+                if c == 3 or c == d:
+                    kappa[p, d], misfit[p, d] = left_out, missed
+                    to = d * (m + 2) if my_groups == 3 else 0
+                    for j in range(m + 2):
+                        response[p, d, j] = f[to + j]
+            while written + n > all_nodes.size:
+                all_nodes = np.concatenate((all_nodes, np.empty_like(all_nodes)))
+                all_weights = np.concatenate((all_weights, np.empty_like(all_weights)))
+            for i in range(n):
+                if weight[i] >= effort.least_weight:
+                    all_nodes[written], all_weights[written] = node[i], weight[i]
+                    count[p, c % 3] += 1
+                    written += 1
+    return all_nodes[:written], all_weights[:written]
