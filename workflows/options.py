@@ -37,7 +37,7 @@ def _least_contrast() -> Any:
     )
 
 
-FAST = {"most_lobes": 2, "resolution": 0.8, "steps": 4, "beam": 3, "passes": 2, "gradients": 5}
+FAST = {"most_lobes": 2, "resolution": 0.8, "steps": 4, "beam": 3, "passes": 1, "gradients": 8}
 """What `quality` fast stands for."""
 
 
@@ -51,7 +51,7 @@ class LobesOptions(RecoveryOptions):
         + ", ".join(f"`{name}` {value}" for name, value in FAST.items())
         + " where these are left out.",
     )
-    most_lobes: int = Field(4, ge=1, le=16, description="Most lobes of a T.")
+    most_lobes: int = Field(3, ge=1, le=16, description="Most lobes of a T.")
     fit_resolution: float = Field(
         0.65,
         ge=0.5,
@@ -59,7 +59,7 @@ class LobesOptions(RecoveryOptions):
         description="Standard deviations of a lobe across, in spacings of the nodes that it lies on, at least, while "
         "it is fitted. It may be up to twice as many.",
     )
-    resolution: float = Field(1.3, ge=0.5, le=4, description="The same of the T that is recovered.")
+    resolution: float = Field(1.1, ge=0.5, le=4, description="The same of the T that is recovered.")
     rounds: int = Field(
         1,
         ge=1,
@@ -71,10 +71,10 @@ class LobesOptions(RecoveryOptions):
         2.0, ge=0, le=100, description="A round ends when a step takes less than this off chi-square."
     )
     beam: int = Field(
-        6, ge=1, le=64, description="Nodes of a grid that are looked into when another lobe is searched for."
+        4, ge=1, le=64, description="Nodes of a grid that are looked into when another lobe is searched for."
     )
     passes: int = Field(
-        3, ge=1, le=20, description="How often T is replaced by its posterior mean, each time about the last."
+        2, ge=1, le=20, description="How often T is replaced by its posterior mean, each time about the last."
     )
     gradients: int = Field(10, ge=1, le=1000, description="Most conjugate gradients in each of them.")
     disagreement: float = Field(

@@ -38,11 +38,13 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import Lasso, orthogonal_mp
 
 from workflows.grids import area_mean
+from workflows.patterns import lay_out
 from workflows.program import Program
-from workflows.recovery import dgsr
+from workflows.recovery import dgsr, lobes
 from workflows.recovery.groups import Rows
 from workflows.recovery.photometry import Noise, Photometry, estimate_noise, fit_photometry, normalise
-from workflows.recovery.sensing import Sensing
+from workflows.recovery.pyramid import Pyramid
+from workflows.recovery.sensing import Patterns, Sensing
 from workflows.recovery.transport import Transport
 
 LEVELS, SEED, NOISE, DEPTH = 8, 7, 1.0, 8
@@ -63,6 +65,7 @@ class Take:
     photometry: Photometry
     sensing: Sensing
     noise: Noise
+    program: Program
 
 
 def sample(kit: ModuleType, path: Path, count: int) -> Any:
@@ -88,7 +91,7 @@ def film(kit: ModuleType, scene: Any, bands: list[tuple[int, int, int]]) -> Take
     once = np.ones(len(numbers), int)
     photometry = fit_photometry(values[:, numbers], levels, usable[:, numbers], noise, once)
     measurements = np.ascontiguousarray(values[:, program.measured])
-    return Take(scene, measurements, photometry, program.sensing("linear"), noise)
+    return Take(scene, measurements, photometry, program.sensing("linear"), noise, program)
 
 
 def measure(kit: ModuleType, take: Take, recover: Recover) -> dict[str, float]:
@@ -112,7 +115,10 @@ def grid_errors(kit: ModuleType, scene: Any) -> dict[str, float]:
     return _errors(
         kit,
         scene,
-        lambda light: 0.02 + 0.9 * np.stack([blocks[c] @ light[:, c] for c in range(3)], axis=-1),
+        lambda light: (
+            0.02
+            + 0.9 * np.stack([block @ light[: block.shape[1], c] for c, block in enumerate(blocks)], axis=-1)
+        ),
         *FINE,
     )
 
@@ -127,7 +133,7 @@ def _errors(
     """Mean squared error and mean PSNR over the backdrops."""
     scores = []
     for backdrop in _backdrops(kit):
-        light = area_mean(backdrop, columns, rows).reshape(columns * rows, 3)
+        light = Pyramid.over(columns, rows).light(area_mean(backdrop, columns, rows))
         scores.append(kit.score(scene, backdrop, composite(light)[np.newaxis]))
     return {"mse": float(np.mean(10 ** (-np.array(scores) / 10))), "psnr": float(np.mean(scores))}
 
@@ -250,6 +256,16 @@ def table_2(kit: ModuleType, scenes: dict[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
+def _lobes(
+    patterns: Patterns,
+    measurements: NDArray[np.float32],
+    photometry: Photometry,
+    sensing: Sensing,
+    noise: Noise,
+) -> Transport:
+    return lobes.recover(measurements, photometry, patterns, noise).transport
+
+
 def methods(kit: ModuleType, scenes: dict[str, Any]) -> list[dict[str, Any]]:
     """All methods on the same frames."""
     runs: dict[str, tuple[str, Recover]] = {
@@ -266,7 +282,9 @@ def methods(kit: ModuleType, scenes: dict[str, Any]) -> list[dict[str, Any]]:
     for frames in FRAMES:
         bands = [COARSE, (*FINE, frames - LEVELS - COARSE[2])]
         takes = {name: film(kit, scene, bands) for name, scene in scenes.items()}
-        for name, (levels, recover) in runs.items():
+        patterns = lay_out(next(iter(takes.values())).program, "linear")
+        own = partial(_lobes, patterns)
+        for name, (levels, recover) in ({"lobes": ("the monitor's pixels", own)} | runs).items():
             found = {scene: measure(kit, take, recover) for scene, take in takes.items()}
             row: dict[str, Any] = {"frames": frames, "method": name.strip(), "levels": levels}
             row |= {f"{scene} psnr": figures["psnr"] for scene, figures in found.items()}
@@ -311,6 +329,7 @@ def main() -> None:
     # Compile before the clock starts.
     take = film(kit, next(iter(few.values())), [COARSE, (*FINE, 20)])
     dgsr.recover(take.measurements, take.photometry, take.sensing, take.noise)
+    measure(kit, take, partial(_lobes, lay_out(take.program, "linear")))
     tables = {}
     for name, title, run, of in (
         ("figures 4 and 5", "Fig. 4 and 5: the Gaussian prior, channels apart", figures_4_and_5, scenes),

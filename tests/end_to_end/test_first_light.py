@@ -99,6 +99,10 @@ def test_what_the_mask_left_out_is_transparent(
     with Image.open(io.BytesIO(answer)) as picture:
         alpha = np.asarray(picture)[..., 3]
     np.testing.assert_array_equal(alpha > 0, scene.object_mask)
+    confidence = images.decode(service.client.layer(job["matte"], "confidence.png"), memory=1 << 24)[..., 0]
+    assert confidence.dtype == np.uint16
+    np.testing.assert_array_equal(confidence > 0, scene.object_mask)
+    assert np.unique(confidence).size > 100
 
 
 def test_lists_are_newest_first_and_go_on_after(service: Service, bundle: Path) -> None:

@@ -62,14 +62,14 @@ def recover(
     usable: NDArray[np.bool_] | None = None,
     frames: NDArray[np.integer] | None = None,
     *,
-    most_lobes: int = 4,
+    most_lobes: int = 3,
     fit_resolution: float = 0.65,
-    resolution: float = 1.3,
+    resolution: float = 1.1,
     rounds: int = 1,
     steps: int = 6,
     tolerance: float = 2.0,
-    beam: int = 6,
-    passes: int = 3,
+    beam: int = 4,
+    passes: int = 2,
     gradients: int = 10,
     disagreement: float = 1.5,
     least_weight: float = 1e-4,
@@ -305,7 +305,11 @@ def recover_pixels(
                 k[c], worth[c] = 0, 0
                 continue
             if c < 3:
-                lobes[c], level[c], k[c] = lobes[3], level[3], k[3]
+                k[c] = k[3]
+                for i in range(k[3]):
+                    level[c, i] = level[3, i]
+                    for t in range(PARAMETERS):
+                        lobes[c, i, t] = lobes[3, i, t]
             k[c], _, worth[c] = fit(
                 code,
                 c * m if c < 3 and groups == 3 else 0,
