@@ -76,7 +76,7 @@ class LobesOptions(RecoveryOptions):
     passes: int = Field(
         2, ge=1, le=20, description="How often T is replaced by its posterior mean, each time about the last."
     )
-    gradients: int = Field(10, ge=1, le=1000, description="Most conjugate gradients in each of them.")
+    gradients: int = Field(9, ge=1, le=1000, description="Most conjugate gradients in each of them.")
     disagreement: float = Field(
         1.5,
         ge=0,

@@ -70,7 +70,7 @@ def recover(
     tolerance: float = 2.0,
     beam: int = 4,
     passes: int = 2,
-    gradients: int = 10,
+    gradients: int = 9,
     disagreement: float = 1.5,
     least_weight: float = 1e-4,
     least_contrast: float = 3.0,

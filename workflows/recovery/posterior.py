@@ -70,59 +70,108 @@ def rows_of(
     return A
 
 
-@njit(nogil=True, cache=True)
-def unresolved(
+@njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})
+def add_moments(
     A: NDArray[np.float32],
     weight: NDArray[np.float32],
+    mean: NDArray[np.float32],
+    square: NDArray[np.float32],
+) -> None:
+    """Add the weighted sums of the rows of A, and of their squares, to `mean` and `square`."""
+    n = A.shape[0]
+    # two rows at a time: the sums are read and written half as often
+    for i in range(0, n - 1, 2):
+        a, b, v, w = A[i], A[i + 1], weight[i], weight[i + 1]
+        for j in range(mean.size):
+            mean[j] += v * a[j] + w * b[j]
+            square[j] += v * a[j] * a[j] + w * b[j] * b[j]
+    if n % 2:
+        a, v = A[n - 1], weight[n - 1]
+        for j in range(mean.size):
+            mean[j] += v * a[j]
+            square[j] += v * a[j] * a[j]
+
+
+@njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})
+def add_products(
+    A: NDArray[np.float32],
+    scale: np.float32,
+    weight: NDArray[np.float32],
+    p: NDArray[np.float32],
+    out: NDArray[np.float32],
+) -> None:
+    """Add ``scale A' diag(weight) A p`` to `out`."""
+    n = A.shape[0]
+    # four rows at a time, while they are in the cache
+    for i in range(0, n - 3, 4):
+        a, b, c, d = A[i], A[i + 1], A[i + 2], A[i + 3]
+        s, t, u, v = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+        for j in range(p.size):
+            s += a[j] * p[j]
+            t += b[j] * p[j]
+            u += c[j] * p[j]
+            v += d[j] * p[j]
+        s *= scale * weight[i]
+        t *= scale * weight[i + 1]
+        u *= scale * weight[i + 2]
+        v *= scale * weight[i + 3]
+        for j in range(p.size):
+            out[j] += s * a[j] + t * b[j] + u * c[j] + v * d[j]
+    for i in range(n - n % 4, n):
+        subtract(out, -scale * weight[i] * inner(A[i], p), A[i])
+
+
+@njit(nogil=True, cache=True)
+def unresolved(
     y: NDArray[np.float32],
     f: NDArray[np.float32],
+    mean: NDArray[np.float32],
+    square: NDArray[np.float32],
     variance: NDArray[np.float32],
     groups: int,
     total: NDArray[np.float32],
-) -> float:
-    """kappa about a T of the given weights, and the variance of measurements for what is finer than its nodes.
+) -> tuple[float, float]:
+    """kappa about a T, and the variance of measurements for what is finer than its nodes.
 
     Parameters
     ----------
-    A : (n, groups (m + 2)) float32
-        As from :func:`rows_of`.
-    weight : (n,) float32
-    y, f, variance : (groups (m + 2),) float32
-        Measurements, prediction with the offsets, the camera's variance.
+    y, f : (groups (m + 2),) float32
+        Measurements, and their prediction with the offsets.
+    mean, square : like y
+        What the nodes of T make of the measurements, and of their squares, in the mean.
+    variance : like y
+        The camera's variance.
     groups : int
     total : like y
         Written: the variance, and kappa times the share of the contrast that is within nodes.
 
     Returns
     -------
-    float
+    kappa : float
         As from :func:`~workflows.recovery.mixture.weigh`, but of no parameters.
+    misfit : float
+        By how much the squared residuals of the patterns are larger than their variances, in the mean.
     """
     m = y.size // groups - 2
-    mean, square = np.zeros_like(y), np.zeros_like(y)
-    for i in range(A.shape[0]):
-        row, w = A[i], weight[i]
-        for j in range(y.size):
-            mean[j] += w * row[j]
-            square[j] += w * row[j] * row[j]
-    excess, contrast = 0.0, 1e-9
-    for j in range(y.size):
-        if j % (m + 2) < m and variance[j] < np.inf:
-            excess += (y[j] - f[j]) ** 2 - variance[j]
-            contrast += max(1 - mean[j] ** 2, 0.02)
-    kappa = min(max(excess / contrast, 1e-5), 1.0)
-    for _ in range(4):
-        excess, contrast = 0.0, 1e-9
-        for j in range(y.size):
-            if j % (m + 2) < m and variance[j] < np.inf:
-                share = max(1 - mean[j] ** 2, 0.02)
-                w = share / (variance[j] + kappa * share) ** 2
-                excess += w * ((y[j] - f[j]) ** 2 - variance[j])
-                contrast += w * share
+    kappa, misfit = 0.0, 0.0
+    for step in range(5):
+        excess, contrast, used = 0.0, 1e-9, 0
+        for g in range(groups):
+            for j in range(g * (m + 2), g * (m + 2) + m):
+                if variance[j] < np.inf:
+                    share = max(1 - mean[j] ** 2, 0.02)
+                    w = share / (variance[j] + kappa * share) ** 2 if step > 0 else 1.0
+                    excess += w * ((y[j] - f[j]) ** 2 - variance[j])
+                    contrast += w * share
+                    used += 1
         kappa = min(max(excess / contrast, 1e-5), 1.0)
-    for j in range(y.size):
-        total[j] = variance[j] + (kappa * max(1 - square[j], 0.0) if j % (m + 2) < m else 0.0)
-    return kappa
+        if step == 0:
+            misfit = excess / max(used, 1)
+    for g in range(groups):
+        for j in range(g * (m + 2), (g + 1) * (m + 2)):
+            within = kappa * max(1 - square[j], 0.0) if j < g * (m + 2) + m else 0.0
+            total[j] = variance[j] + within
+    return kappa, misfit
 
 
 @njit(nogil=True, cache=True)
@@ -155,11 +204,9 @@ def update(
 
     Returns
     -------
-    kappa : float
-        As from :func:`unresolved`, before the last pass.
-    misfit : float
-        By how much the squared residuals of the patterns were larger than their variances then, in the mean. It is
-        an estimate of the squared error of T times a pattern that it was not fitted to.
+    kappa, misfit : float
+        As from :func:`unresolved`, before the last pass. The misfit is an estimate of the squared error of T times a
+        pattern that it was not fitted to.
 
     Notes
     -----
@@ -171,25 +218,18 @@ def update(
     m = M // groups - 2
     f, total, diagonal = np.empty_like(y), np.empty_like(y), np.empty_like(y)
     r, x, p, z, Kp = np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y)
+    mean, square = np.empty_like(y), np.empty_like(y)
     kappa, misfit = 0.0, 0.0
     for _ in range(passes):
         for j in range(M):
-            f[j] = offset[j // (m + 2)]
-        for i in range(n):
-            subtract(f, -weight[i], A[i])
-        kappa = unresolved(A, weight, y, f, variance, groups, total)
-        misfit, used = 0.0, 0
+            mean[j] = square[j] = 0
+        add_moments(A, weight, mean, square)
+        for g in range(groups):
+            for j in range(g * (m + 2), (g + 1) * (m + 2)):
+                f[j] = offset[g] + mean[j]
+        kappa, misfit = unresolved(y, f, mean, square, variance, groups, total)
         for j in range(M):
-            if j % (m + 2) < m and variance[j] < np.inf:
-                misfit += (y[j] - f[j]) ** 2 - variance[j]
-                used += 1
-        misfit /= max(used, 1)
-        for j in range(M):
-            diagonal[j] = total[j] + np.float32(_OFFSET**2)
-        for i in range(n):
-            row, s = A[i], np.float32(kappa) * weight[i]
-            for j in range(M):
-                diagonal[j] += s * row[j] * row[j]
+            diagonal[j] = total[j] + np.float32(_OFFSET**2) + np.float32(kappa) * square[j]
         for j in range(M):
             # what was not measured stays as predicted
             r[j] = y[j] - f[j] if variance[j] < np.inf else 0.0
@@ -209,8 +249,7 @@ def update(
                     lean += p[j]
                 for j in range(g * (m + 2), (g + 1) * (m + 2)):
                     Kp[j] += np.float32(_OFFSET**2) * lean
-            for i in range(n):
-                subtract(Kp, -np.float32(kappa) * weight[i] * inner(A[i], p), A[i])
+            add_products(A, np.float32(kappa), weight, p, Kp)
             for j in range(M):
                 Kp[j] = Kp[j] if variance[j] < np.inf else 0.0
             length = left / inner(p, Kp)

@@ -113,7 +113,9 @@ def test_unresolved_finds_the_variance_about_a_first_estimate():
     spread = variance + kappa * np.maximum(1 - f**2, 0)
     y = (f + np.sqrt(spread) * rng.standard_normal(m + 2)).astype(np.float32)
     total = np.empty_like(y)
-    assert unresolved(A, weight, y, f, variance, 1, total) == pytest.approx(kappa, rel=0.05)
+    found, misfit = unresolved(y, f, f, weight @ A**2, variance, 1, total)
+    assert found == pytest.approx(kappa, rel=0.05)
+    assert misfit == pytest.approx(np.mean((y - f)[:m] ** 2 - variance[:m]), rel=1e-4)
     # black and white nodes leave nothing to what is finer than them
     np.testing.assert_allclose(total, variance, atol=1e-7)
 
