@@ -8,7 +8,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from workflows.recovery.footprint import NODES, PARAMETERS
-from workflows.recovery.mixture import fit
+from workflows.recovery.mixture import copy_lobes, fit
 from workflows.recovery.photometry import Measured, Noise, Photometry, expected_error, normalise, refit
 from workflows.recovery.posterior import rows_of, spread_lobes, update
 from workflows.recovery.sensing import Patterns
@@ -306,10 +306,7 @@ def recover_pixels(
                 continue
             if c < 3:
                 k[c] = k[3]
-                for i in range(k[3]):
-                    level[c, i] = level[3, i]
-                    for t in range(PARAMETERS):
-                        lobes[c, i, t] = lobes[3, i, t]
+                copy_lobes(k[3], lobes[3], level[3], lobes[c], level[c])
             k[c], _, worth[c] = fit(
                 code,
                 c * m if c < 3 and groups == 3 else 0,

@@ -86,6 +86,75 @@ def predict(
 
 
 @njit(nogil=True, cache=True)
+def copy_lobes(
+    k: int,
+    lobes: NDArray[np.float64],
+    level: NDArray[np.int64],
+    to: NDArray[np.float64],
+    to_level: NDArray[np.int64],
+) -> None:
+    """Copy the first k lobes and their levels; loops compile sooner than slices."""
+    for i in range(k):
+        to_level[i] = level[i]
+        for t in range(PARAMETERS):
+            to[i, t] = lobes[i, t]
+
+
+@njit(nogil=True, cache=True)
+def scatter(
+    y: NDArray[np.float32],
+    f: NDArray[np.float32],
+    mean: NDArray[np.float32],
+    variance: NDArray[np.float32],
+    groups: int,
+    parameters: int,
+    least: float,
+) -> tuple[float, float]:
+    """How far T is from what predicts the measurements.
+
+    Parameters
+    ----------
+    y, f, variance : (groups (m + 2),) float32
+        Measurements, prediction, and the camera's share of their variances; infinite for no measurement.
+    mean : like y
+        What the prediction makes of the patterns, without offsets.
+    groups, parameters : int
+        Parameters that were fitted.
+    least : float
+        The least kappa.
+
+    Returns
+    -------
+    kappa : float
+        Variance that a pattern of full contrast has because T is not the prediction's; 1 if T is a single ray.
+    misfit : float
+        By how much the squared residuals of the patterns are larger than their variances, in the mean.
+
+    Notes
+    -----
+    A T of mean t and covariance kappa diag(t) adds the variance kappa (1 - mean^2) to a pattern of +-1. kappa is
+    found by a few scoring steps from its moment estimate.
+    """
+    m = y.size // groups - 2
+    kappa, misfit, freedom = 0.0, 0.0, 1.0
+    for scoring in range(5):
+        excess, contrast, used = 0.0, 1e-9, 0
+        for g in range(groups):
+            for j in range(g * (m + 2), g * (m + 2) + m):
+                if variance[j] < np.inf:
+                    share = max(1 - mean[j] * mean[j], _LEAST_CONTRAST)
+                    weight = share / (variance[j] + kappa * share) ** 2 if scoring > 0 else 1.0
+                    excess += weight * (freedom * (y[j] - f[j]) ** 2 - variance[j])
+                    contrast += weight * share
+                    used += 1
+        kappa = min(max(excess / contrast, least), 1.0)
+        if scoring == 0:
+            misfit = excess / max(used, 1)
+            freedom = used / max(used - parameters, used / 4, 1)
+    return kappa, misfit
+
+
+@njit(nogil=True, cache=True)
 def weigh(
     y: NDArray[np.float32],
     f: NDArray[np.float32],
@@ -108,35 +177,12 @@ def weigh(
     Returns
     -------
     kappa : float
-        Variance that a pattern of full contrast has because T is not the prediction's; 1 if T is a single ray.
+        As from :func:`scatter`.
     objective : float
         -2 ln likelihood, up to a constant.
-
-    Notes
-    -----
-    A T of mean t and covariance kappa diag(t) adds the variance kappa (1 - f^2) to a pattern of +-1. kappa is found
-    by a few scoring steps from its moment estimate.
     """
     m = y.size // groups - 2
-    excess, contrast, used = 0.0, 0.0, 0
-    for g in range(groups):
-        for j in range(g * (m + 2), g * (m + 2) + m):
-            if variance[j] < np.inf:
-                excess += (y[j] - f[j]) ** 2 - variance[j]
-                contrast += max(1 - f[j] * f[j], _LEAST_CONTRAST)
-                used += 1
-    freedom = used / max(used - parameters, used / 4, 1)
-    kappa = min(max(excess / max(contrast, 1e-9), 0.0), 1.0)
-    for _ in range(4):
-        excess, contrast = 0.0, 1e-9
-        for g in range(groups):
-            for j in range(g * (m + 2), g * (m + 2) + m):
-                if variance[j] < np.inf:
-                    share = max(1 - f[j] * f[j], _LEAST_CONTRAST)
-                    weight = share / (variance[j] + kappa * share) ** 2
-                    excess += weight * (freedom * (y[j] - f[j]) ** 2 - variance[j])
-                    contrast += weight * share
-        kappa = min(max(excess / contrast, 0.0), 1.0)
+    kappa, _ = scatter(y, f, f, variance, groups, parameters, 0.0)
     objective = 0.0
     for g in range(groups):
         for j in range(g * (m + 2), (g + 1) * (m + 2)):
@@ -324,10 +370,7 @@ def refine(
                         damped[i, j] = A[i, j]
                     damped[i, i] += damping * A[i, i] + 1e-6
                 if solve(damped, change):
-                    for i in range(k):
-                        new_level[i] = level[i]
-                        for t in range(PARAMETERS):
-                            new_lobes[i, t] = lobes[i, t]
+                    copy_lobes(k, lobes, level, new_lobes, new_level)
                     for g in range(groups):
                         new_offset[g] = offset[g] + change[g]
                     step(new_lobes, new_level, change[groups:], columns, rows, resolution)
@@ -347,10 +390,7 @@ def refine(
                 )  # fmt: skip
                 break
             damping = max(damping * _EASIER, 1e-5)
-            for i in range(k):
-                level[i] = new_level[i]
-                for t in range(PARAMETERS):
-                    lobes[i, t] = new_lobes[i, t]
+            copy_lobes(k, new_lobes, new_level, lobes, level)
             for g in range(groups):
                 offset[g] = new_offset[g]
             if chi - now < tolerance:
@@ -547,10 +587,7 @@ def fit(
             break
         if at < 0:  # nothing says anything: light from everywhere
             at, column, row = columns.size - 1, columns[-1] // 2, rows[-1] // 2
-        for i in range(k):
-            tried_level[i] = level[i]
-            for t in range(PARAMETERS):
-                tried[i, t] = lobes[i, t]
+        copy_lobes(k, lobes, level, tried, tried_level)
         for g in range(groups):
             tried_offset[g] = offset[g]
         spacing = 2.0**at
@@ -569,10 +606,7 @@ def fit(
             break
         k += 1
         kappa, objective, f, precision = new_kappa, new, new_f, new_precision
-        for i in range(k):
-            level[i] = tried_level[i]
-            for t in range(PARAMETERS):
-                lobes[i, t] = tried[i, t]
+        copy_lobes(k, tried, tried_level, lobes, level)
         for g in range(groups):
             offset[g] = tried_offset[g]
     return k, kappa, objective - price(columns, rows, level, k)

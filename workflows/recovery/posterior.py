@@ -5,12 +5,15 @@ from numba import njit
 from numpy.typing import NDArray
 
 from workflows.recovery.footprint import NODES, fit_level, load, sample
+from workflows.recovery.mixture import scatter
 from workflows.recovery.solvers import inner, subtract
 
 # Standard deviation of the offset of a group, in units of T: S is known better than that.
 _OFFSET = 0.03
 # Conjugate gradients end when this share of the squared right-hand side is left.
 _ENOUGH = 1e-5
+# T is never known to be the first estimate.
+_LEAST_KAPPA = 1e-5
 
 
 @njit(nogil=True, cache=True)
@@ -147,26 +150,11 @@ def unresolved(
 
     Returns
     -------
-    kappa : float
-        As from :func:`~workflows.recovery.mixture.weigh`, but of no parameters.
-    misfit : float
-        By how much the squared residuals of the patterns are larger than their variances, in the mean.
+    kappa, misfit : float
+        As from :func:`~workflows.recovery.mixture.scatter`.
     """
     m = y.size // groups - 2
-    kappa, misfit = 0.0, 0.0
-    for step in range(5):
-        excess, contrast, used = 0.0, 1e-9, 0
-        for g in range(groups):
-            for j in range(g * (m + 2), g * (m + 2) + m):
-                if variance[j] < np.inf:
-                    share = max(1 - mean[j] ** 2, 0.02)
-                    w = share / (variance[j] + kappa * share) ** 2 if step > 0 else 1.0
-                    excess += w * ((y[j] - f[j]) ** 2 - variance[j])
-                    contrast += w * share
-                    used += 1
-        kappa = min(max(excess / contrast, 1e-5), 1.0)
-        if step == 0:
-            misfit = excess / max(used, 1)
+    kappa, misfit = scatter(y, f, mean, variance, groups, 0, _LEAST_KAPPA)
     for g in range(groups):
         for j in range(g * (m + 2), (g + 1) * (m + 2)):
             within = kappa * max(1 - square[j], 0.0) if j < g * (m + 2) + m else 0.0
