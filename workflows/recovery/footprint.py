@@ -150,7 +150,13 @@ def sample(
 
 @njit(nogil=True, cache=True)
 def load(
-    code: NDArray[np.uint8], first: int, m: int, node: NDArray[np.int64], n: int, out: NDArray[np.float32]
+    code: NDArray[np.uint8],
+    first: int,
+    m: int,
+    node: NDArray[np.int64],
+    n: int,
+    out: NDArray[np.float32],
+    to: int,
 ) -> None:
     """Write what the patterns send from some nodes, -1 (black) to 1 (white), one row a node.
 
@@ -162,10 +168,12 @@ def load(
         The columns of `code` to take.
     node : (n or more,) int64
     n : int
-    out : (n or more, m) float32
+    out : (n or more, to + m or more) float32
+    to : int
+        The first column of `out` to write.
     """
     for i in range(n):
-        row, written = code[node[i], first : first + m], out[i]
+        row, written = code[node[i]][first : first + m], out[i][to : to + m]
         for k in range(m):
             written[k] = np.float32(row[k]) * np.float32(2 / 255) - np.float32(1)
 

@@ -296,6 +296,7 @@ def recover_pixels(
     lobes, level, k = np.empty((4, most, PARAMETERS)), np.empty((4, most), np.int64), np.zeros(4, np.int64)
     offset, worth = np.zeros((4, 3)), np.zeros(4)
     node, weight = np.empty(most * NODES, np.int64), np.empty(most * NODES, np.float32)
+    room = np.empty(node.size * joint.shape[1], np.float32)
     all_nodes, all_weights, written = np.empty(_ROOM, np.int64), np.empty(_ROOM, np.float32), 0
     for p in range(joint.shape[0]):
         offset[:] = 0
@@ -339,7 +340,8 @@ def recover_pixels(
             first, my_groups = (c * m if groups == 3 else 0, 1) if c < 3 else (0, groups)
             y, variance = (own[p, c], own_variance[p, c]) if c < 3 else (joint[p], joint_variance[p])
             n = spread_lobes(columns, rows, starts, lobes[c], level[c], k[c], effort.resolution, node, weight)
-            A = rows_of(code, first, my_groups, m, node, n)
+            A = room[: n * y.size].reshape(n, y.size)
+            rows_of(code, first, my_groups, m, node, n, A)
             left_out, missed = update(
                 A, weight[:n], y, variance, my_groups, offset[c], effort.passes, effort.gradients
             )

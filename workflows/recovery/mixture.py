@@ -70,7 +70,7 @@ def predict(
             f[j] = offset[g]
     for i in range(k):
         n = sample(lobes[i], level[i], columns, rows, starts, node, terms)
-        load(code, first, light.shape[1], node, n, light)
+        load(code, first, light.shape[1], node, n, light, 0)
         combine(terms, light, n, sums)
         for t in range(terms.shape[0]):
             of_lobe = response[i, t]
@@ -408,7 +408,6 @@ def score(
     f: NDArray[np.float32],
     residual: NDArray[np.float32],
     precision: NDArray[np.float32],
-    m: int,
 ) -> tuple[float, float]:
     """What moving light from the prediction to a node would gain.
 
@@ -416,9 +415,9 @@ def score(
     ----------
     row : (groups m,) uint8
         Codes of the node.
-    f, residual, precision : (groups (m + 2),) float32
-        Prediction, what is left over times its precision, precision.
-    m : int
+    f, residual, precision : (groups m,) float32
+        Of the patterns: the prediction as a code, what is left over times its precision, and precision, both for a
+        code's unit.
 
     Returns
     -------
@@ -432,12 +431,10 @@ def score(
     ``z = sum d r / v / sqrt(sum d^2 / v)``, d the node's row less the prediction.
     """
     along, across = np.float32(0), np.float32(1e-9)
-    for g in range(row.size // m):
-        for j in range(m):
-            to = g * (m + 2) + j
-            d = np.float32(row[g * m + j]) * np.float32(2 / 255) - np.float32(1) - f[to]
-            along += d * residual[to]
-            across += d * d * precision[to]
+    for j in range(row.size):
+        d = np.float32(row[j]) - f[j]
+        along += d * residual[j]
+        across += d * d * precision[j]
     return float(along / math.sqrt(across)), float(along / across)
 
 
@@ -474,9 +471,19 @@ def search(
         Of light.
     """
     m = y.size // groups - 2
-    residual = np.empty_like(y)
-    for j in range(y.size):
-        residual[j] = (y[j] - f[j]) * precision[j]
+    size = groups * m
+    codes_of_f, residual, weight = (
+        np.empty(size, np.float32),
+        np.empty(size, np.float32),
+        np.empty(size, np.float32),
+    )
+    unit = np.float32(2 / 255)
+    for g in range(groups):
+        for j in range(m):
+            at = g * (m + 2) + j
+            codes_of_f[g * m + j] = (f[at] + 1) / unit
+            residual[g * m + j] = unit * (y[at] - f[at]) * precision[at]
+            weight[g * m + j] = unit**2 * precision[at]
     best_level, best_column, best_row, gain, amount, best_z = -1, 0, 0, -_NEVER, 0.0, 0.0
     parents, z_of = np.empty((beam, 2), np.int64), np.empty(beam)
     children = np.empty((beam, 2), np.int64)
@@ -493,8 +500,8 @@ def search(
                 column, row = 2 * parents[p // 4, 0] + p % 2, 2 * parents[p // 4, 1] + p % 4 // 2
             if column >= wide or row >= high:
                 continue
-            codes = code[starts[level] + row * wide + column, first : first + groups * m]
-            z, much = score(codes, f, residual, precision, m)
+            codes = code[starts[level] + row * wide + column, first : first + size]
+            z, much = score(codes, codes_of_f, residual, weight)
             z_found = max(z_found, z)
             if z > 0 and z * z - place > gain:
                 best_level, best_column, best_row, gain, amount, best_z = (

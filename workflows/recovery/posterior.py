@@ -61,16 +61,31 @@ def spread_lobes(
 
 @njit(nogil=True, cache=True)
 def rows_of(
-    code: NDArray[np.uint8], first: int, groups: int, m: int, node: NDArray[np.int64], n: int
-) -> NDArray[np.float32]:
-    """(n, groups (m + 2)) float32: what the measurements of a pixel would be if all light came from a node."""
-    A = np.empty((n, groups * (m + 2)), np.float32)
+    code: NDArray[np.uint8],
+    first: int,
+    groups: int,
+    m: int,
+    node: NDArray[np.int64],
+    n: int,
+    A: NDArray[np.float32],
+) -> None:
+    """Write what the measurements of a pixel would be if all light came from a node.
+
+    Parameters
+    ----------
+    code, first, groups
+        As in :func:`~workflows.recovery.mixture.predict`.
+    m : int
+    node : (n or more,) int64
+    n : int
+    A : (n or more, groups (m + 2)) float32
+        Written.
+    """
     for g in range(groups):
         to = g * (m + 2)
-        load(code, first + g * m, m, node, n, A[:, to : to + m])
+        load(code, first + g * m, m, node, n, A, to)
         for i in range(n):
             A[i, to + m], A[i, to + m + 1] = -1.0, 1.0
-    return A
 
 
 @njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})

@@ -16,7 +16,8 @@ def problem(groups, n=40, seed=0, sigma=0.02):
     """The rows of n nodes, the weights of a first estimate, and measurements of others."""
     rng = np.random.default_rng(seed)
     code = rng.integers(0, 256, (n, groups * M), np.uint8)
-    A = rows_of(code, 0, groups, M, np.arange(n), n)
+    A = np.empty((n, groups * (M + 2)), np.float32)
+    rows_of(code, 0, groups, M, np.arange(n), n, A)
     weight, truth = rng.dirichlet(np.full(n, 5.0), 2)
     variance = np.full(groups * (M + 2), sigma**2, np.float32)
     y = truth @ A + sigma * rng.standard_normal(variance.size)
@@ -27,8 +28,10 @@ def problem(groups, n=40, seed=0, sigma=0.02):
 def test_rows_are_the_signed_codes_between_black_and_white(groups):
     code = np.random.default_rng(0).integers(0, 256, (9, 2 + groups * M), np.uint8)
     node = np.array([7, 0, 3, 3])
-    A = rows_of(code, 2, groups, M, node, 3)
-    assert A.shape == (3, groups * (M + 2))
+    A = np.full((4, groups * (M + 2)), np.nan, np.float32)
+    rows_of(code, 2, groups, M, node, 3, A)
+    assert np.isnan(A[3]).all()
+    A = A[:3]
     for g in range(groups):
         of_group = A[:, g * (M + 2) : (g + 1) * (M + 2)]
         np.testing.assert_allclose(of_group[:, :M], code[node[:3], 2 + g * M :][:, :M] / 127.5 - 1, atol=1e-6)
@@ -107,7 +110,8 @@ def test_unresolved_finds_the_variance_about_a_first_estimate():
     rng = np.random.default_rng(0)
     m, kappa = 20_000, 0.05
     code = 255 * rng.integers(0, 2, (6, m)).astype(np.uint8)
-    A = rows_of(code, 0, 1, m, np.arange(6), 6)
+    A = np.empty((6, m + 2), np.float32)
+    rows_of(code, 0, 1, m, np.arange(6), 6, A)
     weight = rng.dirichlet(np.full(6, 5.0)).astype(np.float32)
     f, variance = weight @ A, rng.uniform(1e-4, 2e-3, m + 2).astype(np.float32)
     spread = variance + kappa * np.maximum(1 - f**2, 0)
