@@ -17,7 +17,7 @@ from sqlalchemy import Connection, Row, delete, insert, update
 from storage.database import captures, find
 from storage.errors import Corrupt
 from storage.grid import block_edge
-from storage.objects import EVERY_CHUNK, Objects
+from storage.objects import EVERY_CHUNK, Objects, together
 
 CHUNK = 1 << 20
 """Bytes of a chunk of the stack, about: small enough that a tile reads little more than its own."""
@@ -95,7 +95,7 @@ def create_stack(
 
 def write_slab(objects: Objects, capture: str, first: int, frames: NDArray[np.generic]) -> None:
     """Write a slab of whole frames, from frame ``first`` on."""
-    stack = objects.array(f"{path(capture)}/frames")
+    (stack,) = together(objects.array(f"{path(capture)}/frames"))
     stack[first : first + len(frames)] = frames
 
 
@@ -112,11 +112,23 @@ class Stack:
     """
 
     def __init__(self, objects: Objects, capture: str) -> None:
+        at = path(capture)
+
+        async def mask() -> zarr.Array[Any] | None:
+            try:
+                return await objects.array(f"{at}/mask")
+            except FileNotFoundError:
+                return None
+
+        self._group: zarr.Group
+        self._frames: zarr.Array[Any]
+        self._mask: zarr.Array[Any] | None
         try:
-            self._group = objects.group(path(capture))
+            self._group, self._frames, self._mask = together(
+                objects.group(at), objects.array(f"{at}/frames"), mask()
+            )
         except FileNotFoundError as error:
             raise Corrupt(f"capture {capture} is not in the store; upload it again") from error
-        self._frames = self._array("frames")
         self.attributes: dict[str, Any] = dict(self._group.attrs)
         self.frames, self.height, self.width, self.channels = self._frames.shape
         self.dtype = self._frames.dtype
@@ -133,9 +145,18 @@ class Stack:
         """
         return np.asarray(self._frames[frames, rows, columns])
 
-    def mask(self, rows: slice = slice(None), columns: slice = slice(None)) -> NDArray[np.bool_] | None:
-        """(y, x) bool: the pixels to recover; None for all."""
-        return np.asarray(self._array("mask")[rows, columns], bool) if "mask" in self._group else None
+    def read_masked(
+        self, rows: slice = slice(None), columns: slice = slice(None)
+    ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+        """As `read`, and (y, x) bool: the pixels to recover."""
+        if self._mask is None:
+            values = self.read(rows, columns)
+            return values, np.ones(values.shape[1:3], bool)
+        values, mask = together(
+            self._frames.async_array.getitem((slice(None), rows, columns)),
+            self._mask.async_array.getitem((rows, columns)),
+        )
+        return values, mask
 
     def images(self) -> list[NDArray[np.float32]]:
         """The patterns that came as images, each (rows, columns, 1 or 3) float32."""

@@ -34,11 +34,11 @@ from sqlalchemy import Connection, Row, delete, insert, update
 from storage.database import find, mattes
 from storage.errors import Corrupt
 from storage.grid import block_edge
-from storage.objects import EVERY_CHUNK, Objects
+from storage.objects import Objects, together
 
 FORMAT = "envmatte-matte/1"
 FRAMES = ("S", "rho", "error", "recovered", "shared", "count")
-"""The frame-shaped arrays, in the order in which a block is written."""
+"""The frame-shaped arrays."""
 
 
 @dataclass(frozen=True)
@@ -85,14 +85,15 @@ class Matte:
     """
 
     def __init__(self, objects: Objects, matte: str) -> None:
+        at = path(matte)
         try:
-            self._group = objects.group(path(matte))
+            group, *frames = together(objects.group(at), *(objects.array(f"{at}/{name}") for name in FRAMES))
         except FileNotFoundError as error:
             raise Corrupt(f"matte {matte} is not in the store; recover it again") from error
         self._objects = objects
-        self._path = path(matte)
-        self._frames = {name: objects.array(f"{path(matte)}/{name}") for name in FRAMES}
-        self.attributes: dict[str, Any] = dict(self._group.attrs)
+        self._path = at
+        self._frames: dict[str, zarr.Array[Any]] = dict(zip(FRAMES, frames, strict=True))
+        self.attributes: dict[str, Any] = dict(group.attrs)
         self.height, self.width, self.columns, self.rows, self.block = (
             int(self.attributes[name]) for name in ("height", "width", "columns", "rows", "block")
         )
@@ -114,19 +115,19 @@ class Matte:
 
     def write(self, row: int, column: int, block: Block) -> None:
         """Write a block, in place of an earlier one."""
-        span = self.span(row, column)
-        for name, values in (("cell", block.cell), ("weight", block.weight)):
-            zarr.create_array(
-                self._objects.zarr,
-                name=f"{self._path}/T/{row}.{column}/{name}",
-                data=values,
-                chunks=(max(len(values), 1),),
-                overwrite=True,
-                config=EVERY_CHUNK,
-            )
+        span, rows = self.span(row, column), f"{self._path}/T/{row}.{column}"
+
+        async def write(name: str) -> None:
+            await self._frames[name].async_array.setitem(span, getattr(block, name))
+
+        together(
+            self._objects.put_group(rows),
+            self._objects.put_array(f"{rows}/cell", block.cell),
+            self._objects.put_array(f"{rows}/weight", block.weight),
+            *(write(name) for name in FRAMES if name != "count"),
+        )
         # ``count`` comes last: a block is written once its counts are there.
-        for name, array in self._frames.items():
-            array[span] = getattr(block, name)
+        together(write("count"))
 
     def read(self, row: int, column: int) -> Block:
         """Read a block.
@@ -137,14 +138,20 @@ class Matte:
             If some of it is missing.
         """
         span = self.span(row, column)
-        frames = {name: np.asarray(array[span]) for name, array in self._frames.items()}
+
+        async def of_rows(name: str) -> Any:
+            array = await self._objects.array(f"{self._path}/T/{row}.{column}/{name}")
+            return await array.async_array.getitem(slice(None))
+
         try:
-            cell, weight = (
-                np.asarray(self._objects.array(f"{self._path}/T/{row}.{column}/{name}")[:])
-                for name in ("cell", "weight")
+            cell, weight, *values = together(
+                of_rows("cell"),
+                of_rows("weight"),
+                *(array.async_array.getitem(span) for array in self._frames.values()),
             )
         except FileNotFoundError as error:
             raise self._corrupt(row, column) from error
+        frames = dict(zip(self._frames, values, strict=True))
         if not len(cell) == len(weight) == frames["count"].sum():
             raise self._corrupt(row, column)
         return Block(**frames, cell=cell, weight=weight)
@@ -225,6 +232,7 @@ def create(
     )
     for name, kind in (("error", "float32"), ("recovered", "bool"), ("shared", "bool")):
         group.create_array(name, shape=frame, chunks=chunk, dtype=kind, dimension_names=dims[:2])
+    group.create_group("T")
     return Matte(objects, matte)
 
 

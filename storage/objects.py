@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
+import json
 import shutil
+import threading
 from contextlib import AbstractAsyncContextManager
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
+import numpy as np
 import obstore
 import zarr
+from numpy.typing import NDArray
 from obstore.store import LocalStore, ObjectStore, from_url
+from zarr.buffer import default_buffer_prototype
+from zarr.storage import MemoryStore, StorePath, WrapperStore
 from zarr.storage import ObjectStore as ZarrStore
-from zarr.storage import WrapperStore
 
 from storage.errors import Corrupt
 
 if TYPE_CHECKING:
+    from collections.abc import Coroutine
+
     from obstore import AsyncWritableFile, ReadableFile
     from zarr.abc.store import ByteRequest
     from zarr.core.array_spec import ArrayConfigParams
@@ -30,6 +39,34 @@ METADATA = ("zarr.json", ".zarray", ".zgroup", ".zattrs", ".zmetadata")
 """Objects that zarr looks for to see whether there is an array or a group: they may be missing."""
 PART = 8 << 20
 """Bytes of one part of a large object: S3 takes parts of 5 MiB and more."""
+
+
+def together(*work: Coroutine[Any, Any, Any]) -> list[Any]:
+    """Do what does not wait for one another at once, and return what came of each.
+
+    A bucket takes tens of milliseconds to answer, and zarr about one to go over to its thread and back. All of
+    it has ended when this returns, or raises the first error.
+    """
+    return asyncio.run_coroutine_threadsafe(_all_of(*work), _loop()).result()
+
+
+async def _all_of(*work: Coroutine[Any, Any, Any]) -> list[Any]:
+    ended = await asyncio.gather(*work, return_exceptions=True)
+    for result in ended:
+        if isinstance(result, BaseException):
+            raise result
+    return ended
+
+
+@cache
+def _loop() -> asyncio.AbstractEventLoop:
+    """The loop that `together` runs on, in a thread of its own: a caller may have a loop that must not wait.
+
+    It is kept because the threads in which zarr compresses are the loop's.
+    """
+    loop = asyncio.new_event_loop()
+    threading.Thread(target=loop.run_forever, name="objects", daemon=True).start()
+    return loop
 
 
 class Objects:
@@ -52,27 +89,58 @@ class Objects:
         else:
             self._store = from_url(url)
         self.zarr = _Whole(ZarrStore(self._store))
+        # Every tile opens the same ten arrays anew, to see that they are there; to parse them takes longer.
+        self._array = lru_cache(maxsize=64)(partial(_array, self.zarr))
 
-    def group(self, path: str) -> zarr.Group:
-        """The zarr group at a path.
-
-        Raises
-        ------
-        FileNotFoundError
-            If there is none.
-        """
-        return zarr.open_group(self.zarr, path=path, mode="r+")
-
-    def array(self, path: str) -> zarr.Array[Any]:
-        """The zarr array at a path, to read and to write.
+    async def group(self, path: str) -> zarr.Group:
+        """The zarr group at a path, for `together`.
 
         Raises
         ------
         FileNotFoundError
             If there is none.
         """
-        # `open_array` takes a config too, and ignores it where the array is there already.
-        return zarr.open_array(self.zarr, path=path, mode="r+").with_config(EVERY_CHUNK)
+        return zarr.Group(await zarr.AsyncGroup.open(StorePath(self.zarr, path), zarr_format=3))
+
+    async def array(self, path: str) -> zarr.Array[Any]:
+        """The zarr array at a path, to read and to write, for `together`.
+
+        Raises
+        ------
+        FileNotFoundError
+            If there is none.
+        """
+        document = await self.zarr.get(f"{path}/zarr.json", default_buffer_prototype())
+        if document is None:
+            raise FileNotFoundError(path)
+        return self._array(path, document.to_bytes())
+
+    async def put_group(self, path: str) -> None:
+        """Make a zarr group without attributes at a path, for `together`; what is in it already stays."""
+        plain = {"zarr_format": 3, "node_type": "group"}
+        group = zarr.AsyncGroup.from_dict(StorePath(self.zarr, path), plain)
+        await self._put_metadata(path, group)
+
+    async def put_array(self, path: str, values: NDArray[Any]) -> None:
+        """Make a zarr array of one dimension and one chunk at a path, in place of an earlier one, for `together`.
+
+        It is what ``zarr.create_array(…, overwrite=True)`` makes there, except for the groups above it, which zarr
+        would look at and make: three objects to write, and no moment in which an earlier array is gone.
+        """
+        n = len(values)
+        shape = {
+            "shape": (n,),
+            "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": (max(n, 1),)}},
+        }
+        array = zarr.AsyncArray.from_dict(StorePath(self.zarr, path), _metadata(values.dtype) | shape)
+        array = array.with_config(EVERY_CHUNK)
+        # Without values there is no chunk.
+        chunk = array.setitem(slice(None), values) if n else self.zarr.delete(f"{path}/c/0")
+        await _all_of(self._put_metadata(path, array), chunk)
+
+    async def _put_metadata(self, path: str, node: zarr.AsyncGroup | zarr.AsyncArray[Any]) -> None:
+        for name, document in node.metadata.to_buffer_dict(default_buffer_prototype()).items():
+            await self.zarr.set(f"{path}/{name}", document)
 
     def write(self, path: str) -> AbstractAsyncContextManager[AsyncWritableFile]:
         """A writer that streams into an object; left by an exception it leaves no object."""
@@ -123,6 +191,19 @@ class Objects:
     def check(self) -> None:
         """Reach the store once; raises whatever it raises when it can't be reached."""
         obstore.list_with_delimiter(self._store, None)
+
+
+def _array(store: _Whole, path: str, document: bytes) -> zarr.Array[Any]:
+    """The array that a ``zarr.json`` describes."""
+    array = zarr.AsyncArray.from_dict(StorePath(store, path), json.loads(document))
+    return zarr.Array(array).with_config(EVERY_CHUNK)
+
+
+@cache
+def _metadata(dtype: np.dtype[Any]) -> dict[str, Any]:
+    """What zarr writes down about an array of a type, for arrays of any length."""
+    array = zarr.create_array(MemoryStore(), shape=(1,), chunks=(1,), dtype=dtype)
+    return array.metadata.to_dict()
 
 
 class _Whole(WrapperStore[ZarrStore[ObjectStore]]):

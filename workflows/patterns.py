@@ -1,6 +1,6 @@
 """The light of a program's patterns on a pyramid over the monitor."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import compress, islice
 
 import numpy as np
@@ -16,7 +16,7 @@ PATTERNS_BYTES = 256 << 20
 """What a worker may hold of a program; with more patterns or pixels, the pyramid starts at cells of several pixels."""
 
 # Patterns written at a time: a node's are neighbours in memory.
-_BATCH = 16
+_BATCH = 24
 
 
 def pyramid_of(program: Program, channels: int) -> Pyramid:
@@ -48,18 +48,35 @@ def lay_out(program: Program, curve: Curve, images: Sequence[NDArray[np.float32]
     columns, rows = pyramid.grids[0]
     m = program.measured.size
     code = np.empty((pyramid.nodes, channels * m), np.uint8)
-    shown = program.pictures(0, program.count, images)
-    measured = compress(shown, np.isin(np.arange(program.count), program.measured))
+    measured = compress(
+        _codes(program, curve, images, columns, rows), np.isin(np.arange(program.count), program.measured)
+    )
+    planes = np.empty((channels, min(_BATCH, m), rows, columns), np.uint8)
     for first in range(0, m, _BATCH):
-        batch = np.empty((rows, columns, channels, min(_BATCH, m - first)), np.uint8)
-        for i, picture in enumerate(islice(measured, batch.shape[3])):
-            light = area_mean(to_light(picture, curve), columns, rows)
-            batch[..., i] = np.rint(light * np.float32(255))
+        batch = planes[:, : m - first]
+        for i, picture in enumerate(islice(measured, batch.shape[1])):
+            batch[:, i] = np.moveaxis(picture, 2, 0)
         for c in range(channels):
             at = c * m + first
-            code[: columns * rows, at : at + batch.shape[3]] = batch[:, :, c].reshape(columns * rows, -1)
+            code[: columns * rows, at : at + batch.shape[1]] = batch[c].reshape(-1, columns * rows).T
     sums = np.empty(channels * m, np.uint16)
     for level in range(len(pyramid.grids) - 1):
         fine, coarse = (code[slice(*pyramid.starts[at : at + 2])] for at in (level, level + 1))
         halve_codes(fine, *pyramid.grids[level], coarse, sums)
     return Patterns(pyramid, channels, code)
+
+
+def _codes(
+    program: Program, curve: Curve, images: Sequence[NDArray[np.float32]], columns: int, rows: int
+) -> Iterator[NDArray[np.uint8]]:
+    """The light of a program's pictures on a grid, (rows, columns, 1 or 3) uint8 each."""
+    if (columns, rows) == (program.monitor.width, program.monitor.height):
+        return program.mapped(lambda values: _rounded(to_light(values, curve)), 0, program.count, images)
+    # A cell's light is the mean of its pixels': rounding comes after it, the curve before.
+    lights = program.mapped(lambda values: to_light(values, curve), 0, program.count, images)
+    return (_rounded(area_mean(light, columns, rows)) for light in lights)
+
+
+def _rounded(light: NDArray[np.float32]) -> NDArray[np.uint8]:
+    code: NDArray[np.uint8] = np.rint(light * np.float32(255)).astype(np.uint8)
+    return code

@@ -1,8 +1,8 @@
 """A pattern program: what the monitor shows, as bits, as pictures, and as rows of the sensing matrix."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,8 @@ from workflows.recovery.sensing import Sensing
 from workflows.tone import Curve, to_light
 
 __all__ = ["Bernoulli", "Constant", "Images", "Monitor", "Program", "Stripes"]
+
+Value = TypeVar("Value", bound=np.generic)
 
 SENSING_BYTES = 512 << 20
 """The largest sensing matrix that a worker is asked to hold."""
@@ -107,32 +109,57 @@ class Program(Record):
         iterator of (height, width, 1 or 3) float32
             0 to 1, at the monitor's resolution.
         """
-        for values in self._values(first, last, images):
-            yield stretch(values, self.monitor.width, self.monitor.height)
+        return self.mapped(lambda values: values, first, last, images)
+
+    def mapped(
+        self,
+        point: Callable[[NDArray[np.float32]], NDArray[Value]],
+        first: int,
+        last: int,
+        images: Sequence[NDArray[np.float32]] = (),
+    ) -> Iterator[NDArray[Value]]:
+        """As `pictures`, put through a function of each value alone: a tone curve, say.
+
+        A pattern has few blocks and the monitor many pixels, so the function is given whichever are fewer.
+        """
+        pixels = self.monitor.width * self.monitor.height
+        for values, offset in self._drawn(first, last, images):
+            if values.shape[0] * values.shape[1] <= pixels:
+                yield self._placed(point(values), offset)
+            else:
+                yield point(self._placed(values, offset))
 
     def _values(
         self, first: int, last: int, images: Sequence[NDArray[np.float32]]
     ) -> Iterator[NDArray[np.float32]]:
         """As `values`, one after another: at the monitor's resolution, all of them may be too much to hold."""
+        for values, offset in self._drawn(first, last, images):
+            yield values if offset is None else self._placed(values, offset)
+
+    def _placed(self, values: NDArray[Value], offset: tuple[int, int] | None) -> NDArray[Value]:
+        """Values of a pattern's grid on the monitor's pixels."""
+        picture = stretch(values, self.monitor.width, self.monitor.height)
+        return picture if offset is None else np.roll(picture, (-offset[1], -offset[0]), axis=(0, 1))
+
+    def _drawn(
+        self, first: int, last: int, images: Sequence[NDArray[np.float32]]
+    ) -> Iterator[tuple[NDArray[np.float32], tuple[int, int] | None]]:
+        """The patterns on their own grids, and the offsets dx and dy of those that have one."""
         given = iter(images)
         for start, part in zip(self.starts, self.parts, strict=False):
             inside = range(max(first - start, 0), min(last - start, part.count))
             if isinstance(part, Images):
                 of_part = [next(given) for _ in part.files]
-                yield from (of_part[i] for i in inside)
+                yield from ((of_part[i], None) for i in inside)
             elif isinstance(part, Constant):
-                yield from (part.values[i].reshape(1, 1, 3) for i in inside)
+                yield from ((part.values[i].reshape(1, 1, 3), None) for i in inside)
             elif isinstance(part, Stripes):
-                yield from (part.values(i) for i in inside)
+                yield from ((part.values(i), None) for i in inside)
             elif inside:
                 bits, offsets = part.bits, part.offsets(self.monitor)
                 for i in inside:
-                    values = bits[i].astype(np.float32)
-                    if part.offset:
-                        dx, dy = offsets[i]
-                        picture = stretch(values, self.monitor.width, self.monitor.height)
-                        values = np.roll(picture, (-dy, -dx), axis=(0, 1))
-                    yield values
+                    dx, dy = offsets[i].tolist()
+                    yield bits[i].astype(np.float32), (dx, dy) if part.offset else None
 
     def bands(self) -> list[tuple[int, int]]:
         """The columns and rows of the Bernoulli parts' grids that nest, from coarse to fine.

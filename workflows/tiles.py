@@ -79,8 +79,7 @@ def _recover_block(
     attributes = stack.attributes
     camera = TypeAdapter[Curve](Curve).validate_python(attributes["camera_curve"])
     noise = Noise(**attributes["noise"])
-    codes, mask = stack.read(*span), stack.mask(*span)
-    recovered = np.ones(codes.shape[1:3], bool) if mask is None else mask
+    codes, recovered = stack.read_masked(*span)
     light, usable, repeats = _merge(
         codes[:, recovered], np.array(attributes["patterns"]), program.count, camera
     )

@@ -54,7 +54,10 @@ def test_what_is_written_is_read(objects: Objects, values: NDArray[np.uint16]) -
     np.testing.assert_array_equal(stack.read(), values)
     part = stack.read(slice(5, 33), slice(15, 18), slice(3, 9))
     np.testing.assert_array_equal(part, values[3:9, 5:33, 15:18])
-    assert stack.mask() is None
+    of_part, mask = stack.read_masked(slice(5, 33), slice(15, 18))
+    np.testing.assert_array_equal(of_part, values[:, 5:33, 15:18])
+    assert mask.shape == (28, 3)
+    assert mask.all()
     assert stack.images() == []
 
 
@@ -80,9 +83,15 @@ def test_masks_and_images_come_back(objects: Objects) -> None:
     mask = rng.random((37, 50)) < 0.5
     images = [rng.random((n, 3, 1 + 2 * (n % 2)), np.float32) for n in range(1, 12)]
     create(objects, mask=mask, images=images)
+    frames = rng.integers(0, 65536, SHAPE, np.uint16)
+    for slab in (0, 4, 8):
+        write_slab(objects, "c", slab, frames[slab : slab + 4])
     stack = Stack(objects, "c")
-    np.testing.assert_array_equal(stack.mask(), mask)
-    np.testing.assert_array_equal(stack.mask(slice(3, 9), slice(40, 50)), mask[3:9, 40:])
+    np.testing.assert_array_equal(stack.read_masked()[1], mask)
+    of_part, part = stack.read_masked(slice(3, 9), slice(40, 50))
+    np.testing.assert_array_equal(of_part, frames[:, 3:9, 40:])
+    np.testing.assert_array_equal(part, mask[3:9, 40:])
+    assert part.dtype == bool
     for read, image in zip(stack.images(), images, strict=True):
         np.testing.assert_array_equal(read, image)
 
@@ -135,15 +144,15 @@ def test_a_removed_chunk_is_corrupt(objects: Objects, folder: Path, values: NDAr
 @pytest.mark.parametrize("name", ["mask", "images/0"])
 def test_a_removed_chunk_of_a_mask_or_an_image_is_corrupt(objects: Objects, folder: Path, name: str) -> None:
     create(objects, mask=np.zeros(SHAPE[1:3], bool), images=[np.zeros((4, 4, 1), np.float32)])
+    for slab in (0, 4, 8):
+        write_slab(objects, "c", slab, np.zeros((min(4, 11 - slab), *SHAPE[1:]), np.uint16))
     stack = Stack(objects, "c")
-    mask = stack.mask()
-    assert mask is not None
-    assert not mask.any()
+    assert not stack.read_masked()[1].any()
     assert not stack.images()[0].any()
     chunk = next(path for path in (folder / "captures/c" / name / "c").rglob("*") if path.is_file())
     chunk.unlink()
     with pytest.raises(Corrupt):
-        stack.mask() if name == "mask" else stack.images()
+        stack.read_masked() if name == "mask" else stack.images()
 
 
 def test_slabs_that_were_never_written_are_corrupt(objects: Objects, values: NDArray[np.uint16]) -> None:
@@ -157,6 +166,13 @@ def test_slabs_that_were_never_written_are_corrupt(objects: Objects, values: NDA
 def test_a_capture_that_is_not_there(objects: Objects) -> None:
     with pytest.raises(Corrupt, match="capture none"):
         Stack(objects, "none")
+
+
+def test_a_capture_without_its_frames_is_corrupt(objects: Objects, folder: Path) -> None:
+    create(objects)
+    (folder / "captures/c/frames/zarr.json").unlink()
+    with pytest.raises(Corrupt, match="capture c"):
+        Stack(objects, "c")
 
 
 def test_the_record(engine: Engine) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
+from obstore.exceptions import GenericError
 from sqlalchemy import Engine
 
 from storage import mattes
@@ -98,6 +99,8 @@ def test_any_zarr_reader_can_read_it(matte: Matte, folder: Path) -> None:
     np.testing.assert_array_equal(group["shared"][16:, 32:], expected.shared)
     np.testing.assert_array_equal(group["T/1.2/cell"][:], expected.cell)
     np.testing.assert_array_equal(group["T/1.2/weight"][:], expected.weight)
+    assert sorted(group["T"].group_keys()) == ["0.0", "0.1", "0.2", "1.0", "1.1", "1.2"]
+    assert sorted(group["T/0.1"].array_keys()) == ["cell", "weight"]
     assert group["S"].metadata.dimension_names == ("y", "x", "channel")
 
 
@@ -163,9 +166,44 @@ def test_counts_that_do_not_fit_are_corrupt(matte: Matte) -> None:
 
 def test_a_matte_takes_the_place_of_an_earlier_one(objects: Objects, matte: Matte, folder: Path) -> None:
     create(objects)
-    assert not (folder / "mattes/m/T").exists()
+    assert [path.name for path in (folder / "mattes/m/T").iterdir()] == ["zarr.json"]
     with pytest.raises(Corrupt):
         Matte(objects, "m").read(0, 0)
+
+
+@pytest.mark.parametrize("array", ["S", "count", "shared"])
+def test_a_matte_without_one_of_its_arrays_is_corrupt(
+    objects: Objects, matte: Matte, folder: Path, array: str
+) -> None:
+    (folder / "mattes/m" / array / "zarr.json").unlink()
+    with pytest.raises(Corrupt, match="matte m"):
+        Matte(objects, "m")
+
+
+def test_a_block_is_written_once_its_counts_are_there(objects: Objects, folder: Path) -> None:
+    matte = create(objects)
+    (folder / "mattes/m/rho/c").write_bytes(b"in the way")
+    with pytest.raises(GenericError):
+        matte.write(0, 0, block(16, 16, seed=0))
+    assert (folder / "mattes/m/S/c/0/0/0").exists()
+    assert not (folder / "mattes/m/count/c").exists()
+
+
+def test_a_block_without_rows_takes_the_place_of_one_with_some(
+    objects: Objects, matte: Matte, digests: Callable[[str], dict[str, str]]
+) -> None:
+    matte.write(0, 1, zeros(16, 16, entries=0))
+    matte.check()
+    same(matte.read(0, 1), zeros(16, 16, entries=0))
+    again = digests("mattes/m")
+    fresh = create(objects)
+    for place in places(fresh):
+        empty = place == (0, 1)
+        extents = extent(fresh, *place)
+        fresh.write(
+            *place, zeros(*extents, entries=0) if empty else block(*extents, seed=10 * place[0] + place[1])
+        )
+    assert digests("mattes/m") == again
 
 
 def test_a_matte_that_is_not_there(objects: Objects) -> None:

@@ -3,14 +3,17 @@
 import asyncio
 import io
 import zipfile
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 import zarr
+from numpy.typing import NDArray
 
 from storage.errors import Corrupt
-from storage.objects import PART, Objects
+from storage.objects import EVERY_CHUNK, PART, Objects, together
 
 
 def put(objects: Objects, path: str, data: bytes, piece: int = 1 << 20) -> None:
@@ -86,7 +89,65 @@ def test_a_folder_is_made_and_can_be_opened_again(objects: Objects, folder: Path
 
 def test_a_group_that_is_not_there(objects: Objects) -> None:
     with pytest.raises(FileNotFoundError):
-        objects.group("captures/none")
+        together(objects.group("captures/none"))
+    with pytest.raises(FileNotFoundError):
+        together(objects.array("captures/none"))
+
+
+@pytest.mark.parametrize(
+    "values", [np.arange(5, dtype=np.uint32), np.zeros(3, np.float32), np.empty(0, "u2")]
+)
+def test_an_array_put_is_the_one_zarr_makes(
+    objects: Objects, digests: Callable[[str], dict[str, str]], values: NDArray[np.generic]
+) -> None:
+    zarr.create_array(
+        objects.zarr, name="g/a", data=values, chunks=(max(len(values), 1),), config=EVERY_CHUNK
+    )
+    plain = digests("g")
+    objects.delete("g")
+    for earlier in (np.arange(9.0), values):
+        together(objects.put_group("g"), objects.put_array("g/a", earlier))
+    assert digests("g") == plain
+
+
+def test_an_array_that_was_made_anew_is_opened_anew(objects: Objects) -> None:
+    for values in (np.arange(3), np.arange(7.0)):
+        together(objects.put_array("a", values))
+        (array,) = together(objects.array("a"))
+        np.testing.assert_array_equal(array[:], values)
+        assert array.dtype == values.dtype
+    objects.delete("a")
+    with pytest.raises(FileNotFoundError):
+        together(objects.array("a"))
+
+
+def test_together_all_ends_before_the_first_error_is_raised() -> None:
+    ended = []
+
+    async def work(seconds: float, error: Exception | None = None) -> float:
+        await asyncio.sleep(seconds)
+        ended.append(seconds)
+        if error:
+            raise error
+        return seconds
+
+    assert together(work(0.02), work(0.0), work(0.01)) == [0.02, 0.0, 0.01]
+    assert ended == [0.0, 0.01, 0.02]
+    with pytest.raises(KeyError):
+        together(work(0.03), work(0.02, KeyError()), work(0.01, ValueError()))
+    assert ended[3:] == [0.01, 0.02, 0.03]
+
+
+def test_together_from_threads_and_from_a_running_loop() -> None:
+    async def double(n: int) -> int:
+        return 2 * n
+
+    async def inside() -> list[int]:
+        return together(double(1), double(2))
+
+    assert asyncio.run(inside()) == [2, 4]
+    with ThreadPoolExecutor(4) as threads:
+        assert list(threads.map(lambda n: together(double(n)), range(50))) == [[2 * n] for n in range(50)]
 
 
 def test_a_missing_chunk_is_an_error_and_not_a_zero(objects: Objects, folder: Path) -> None:

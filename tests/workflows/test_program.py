@@ -142,6 +142,26 @@ def test_stripes_may_start_from_a_finer_one() -> None:
     assert Stripes.model_validate(stripes("y", 2, first=3)).values(1).shape == (32, 1, 1)
 
 
+def test_a_function_of_each_value_alone_may_come_before_the_pixels() -> None:
+    rng = np.random.default_rng(0)
+    rolled = grid(5, 4, 3, colour="rgb", offset=True)
+    files = {"kind": "images", "files": ["small.png", "large.png"]}
+    made = program(rolled, files, stripes("x", 2), width=13, height=11)
+    images = [rng.random((4, 6, 1), np.float32), rng.random((30, 17, 3), np.float32)]
+    sizes = []
+
+    def to_bytes(values: NDArray[np.float32]) -> NDArray[np.uint8]:
+        sizes.append(values.shape[0] * values.shape[1])
+        return np.rint(255 * values**2).astype(np.uint8)
+
+    pictures = made.pictures(0, made.count, images)
+    for got, picture in zip(made.mapped(to_bytes, 0, made.count, images), pictures, strict=True):
+        assert got.dtype == np.uint8
+        np.testing.assert_array_equal(got, np.rint(255 * picture**2))
+    # the large image is put on the pixels first
+    assert sizes == [1, 1, 20, 20, 20, 24, 11 * 13, 2, 4]
+
+
 def test_pictures_are_the_patterns_on_the_monitors_pixels() -> None:
     images = [np.random.default_rng(0).random((5, 7, 3), np.float32), np.ones((1, 1, 1), np.float32)]
     made = program(

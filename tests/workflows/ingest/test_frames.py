@@ -85,7 +85,7 @@ def test_the_stack_holds_the_very_values(
     )
     assert stack.dtype == dtype
     np.testing.assert_array_equal(stack.read(), values)
-    np.testing.assert_array_equal(stack.mask(), mask)
+    np.testing.assert_array_equal(stack.read_masked()[1], mask)
     assert stack.attributes["patterns"] == PATTERNS
     assert stack.attributes["camera_curve"] == stack.attributes["monitor_curve"] == "linear"
     assert set(stack.attributes["noise"]) == {"read", "shot"}
