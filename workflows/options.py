@@ -37,7 +37,7 @@ def _least_contrast() -> Any:
     )
 
 
-FAST = {"most_lobes": 2, "resolution": 0.8, "steps": 4, "beam": 3, "passes": 1, "gradients": 8}
+FAST = {"most_lobes": 2, "resolution": 0.8, "steps": 4, "beam": 3, "doubt": 0.03, "passes": 1, "gradients": 8}
 """What `quality` fast stands for."""
 
 
@@ -66,12 +66,20 @@ class LobesOptions(RecoveryOptions):
         le=100,
         description="Most rounds of a fit, after each of which the measurements are weighed again.",
     )
-    steps: int = Field(6, ge=1, le=1000, description="Most steps of Levenberg and Marquardt's in a round.")
+    steps: int = Field(9, ge=1, le=1000, description="Most steps of Levenberg and Marquardt's in a round.")
     tolerance: float = Field(
         2.0, ge=0, le=100, description="A round ends when a step takes less than this off chi-square."
     )
     beam: int = Field(
         4, ge=1, le=64, description="Nodes of a grid that are looked into when another lobe is searched for."
+    )
+    doubt: float = Field(
+        0.01,
+        ge=0,
+        le=1,
+        description="Lobes are fitted once more, from what the measurements say about them, where they leave out "
+        "more than this: the variance of a black-and-white pattern (-1 to 1) beside them; 1 is a single ray, "
+        "unseen.",
     )
     passes: int = Field(
         2, ge=1, le=20, description="How often T is replaced by its posterior mean, each time about the last."

@@ -1,39 +1,17 @@
 """The default recovery: a few oriented Gaussian lobes, and about them the posterior mean of T."""
 
-import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from workflows.recovery.footprint import NODES, PARAMETERS
-from workflows.recovery.mixture import copy_lobes, fit
 from workflows.recovery.photometry import Measured, Noise, Photometry, expected_error, normalise, refit
-from workflows.recovery.posterior import rows_of, spread_lobes, update
+from workflows.recovery.pixels import Effort, recover_pixels
 from workflows.recovery.sensing import Patterns
-from workflows.recovery.solvers import subtract
 from workflows.recovery.transport import Transport
 
 # Pixels at a time, so that the working arrays stay small whatever a caller passes.
 _BLOCK = 256
-# Nodes that the rows of a block are first given room for.
-_ROOM = 1 << 16
-
-
-class Effort(NamedTuple):
-    """The constants of :func:`recover` that its kernels need."""
-
-    most_lobes: int
-    fit_resolution: float
-    resolution: float
-    rounds: int
-    steps: int
-    tolerance: float
-    beam: int
-    passes: int
-    gradients: int
-    least_weight: float
 
 
 class Recovery(NamedTuple):
@@ -66,9 +44,10 @@ def recover(
     fit_resolution: float = 0.65,
     resolution: float = 1.1,
     rounds: int = 1,
-    steps: int = 6,
+    steps: int = 9,
     tolerance: float = 2.0,
     beam: int = 4,
+    doubt: float = 0.01,
     passes: int = 2,
     gradients: int = 9,
     disagreement: float = 1.5,
@@ -102,6 +81,9 @@ def recover(
         A round ends when a step takes less than this off chi-square.
     beam : int
         Nodes of a grid that are looked into for another lobe.
+    doubt : float
+        Lobes are fitted once more where they leave out more than this: the variance that a pattern of full contrast
+        has beside them, 1 if T is a single ray.
     passes : int
         How often T is replaced by its posterior mean.
     gradients : int
@@ -143,6 +125,7 @@ def recover(
         steps,
         tolerance,
         beam,
+        doubt,
         passes,
         gradients,
         least_weight,
@@ -244,122 +227,3 @@ def _disagree(
     freedom = used.sum(axis=1) - used.max(axis=1) - 2 * (np.count_nonzero(used, axis=1) - 1)
     disagrees: NDArray[np.bool_] = chi > disagreement * np.maximum(freedom, 1)
     return disagrees
-
-
-@njit(nogil=True, cache=True)
-def recover_pixels(
-    code: NDArray[np.uint8],
-    m: int,
-    columns: NDArray[np.int64],
-    rows: NDArray[np.int64],
-    starts: NDArray[np.int64],
-    joint: NDArray[np.float32],
-    joint_variance: NDArray[np.float32],
-    own: NDArray[np.float32],
-    own_variance: NDArray[np.float32],
-    apart: NDArray[np.bool_],
-    effort: Effort,
-    response: NDArray[np.float32],
-    kappa: NDArray[np.float64],
-    misfit: NDArray[np.float64],
-    count: NDArray[np.int64],
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Recover T of some pixels, one for all channels or one for each.
-
-    Parameters
-    ----------
-    code : (nodes, channels m) uint8
-        Light of the m patterns on the nodes of the pyramid; 1 or 3 channels.
-    m : int
-    columns, rows, starts
-        Of the pyramid.
-    joint, joint_variance : (n, channels (m + 2)) float32
-        Measurements of all channels together, and their variances.
-    own, own_variance : (n, 3, m + 2) float32
-        Those of each channel.
-    apart : (n,) bool
-        Whether each channel gets its own T; under patterns of three colours found out here, and written.
-    effort : Effort
-    response : (n, 3, m + 2) float32
-        Written: what the measurements would be before T.
-    kappa, misfit : (n, 3) float64
-        Written, as from :func:`~workflows.recovery.posterior.update`.
-    count : (n, 3) int64
-        Written: nodes of each row; those of a row for all channels stand first.
-
-    Returns
-    -------
-    node : (count.sum(),) int64
-    weight : (count.sum(),) float32
-    """
-    groups, most = code.shape[1] // m, effort.most_lobes
-    lobes, level, k = np.empty((4, most, PARAMETERS)), np.empty((4, most), np.int64), np.zeros(4, np.int64)
-    offset, worth = np.zeros((4, 3)), np.zeros(4)
-    node, weight = np.empty(most * NODES, np.int64), np.empty(most * NODES, np.float32)
-    room = np.empty(node.size * joint.shape[1], np.float32)
-    all_nodes, all_weights, written = np.empty(_ROOM, np.int64), np.empty(_ROOM, np.float32), 0
-    for p in range(joint.shape[0]):
-        offset[:] = 0
-        # 0 to 2: a channel; 3: all of them
-        for c in (3, 0, 1, 2):
-            if c < 3 and (np.isinf(own_variance[p, c]).all() or not (apart[p] or groups == 3)):
-                k[c], worth[c] = 0, 0
-                continue
-            if c < 3:
-                k[c] = k[3]
-                copy_lobes(k[3], lobes[3], level[3], lobes[c], level[c])
-            k[c], _, worth[c] = fit(
-                code,
-                c * m if c < 3 and groups == 3 else 0,
-                groups if c == 3 else 1,
-                columns,
-                rows,
-                starts,
-                joint[p] if c == 3 else own[p, c],
-                joint_variance[p] if c == 3 else own_variance[p, c],
-                lobes[c],
-                level[c],
-                k[c] if c < 3 else 0,
-                offset[c],
-                most,
-                effort.fit_resolution,
-                effort.rounds,
-                effort.steps,
-                effort.tolerance,
-                effort.beam,
-            )
-        if groups == 3:
-            # Bayes' information criterion, with a kappa each; the channels' lobes are near the common ones
-            each = math.log(joint.shape[1])
-            fewer = worth[3] + each * (PARAMETERS * k[3] + 1)
-            apart[p] = (worth[:3] + each * (PARAMETERS * k[:3] + 1)).sum() < fewer
-        count[p] = 0
-        for c in range(0 if apart[p] else 3, 3 if apart[p] else 4):
-            if k[c] == 0:
-                continue
-            first, my_groups = (c * m if groups == 3 else 0, 1) if c < 3 else (0, groups)
-            y, variance = (own[p, c], own_variance[p, c]) if c < 3 else (joint[p], joint_variance[p])
-            n = spread_lobes(columns, rows, starts, lobes[c], level[c], k[c], effort.resolution, node, weight)
-            A = room[: n * y.size].reshape(n, y.size)
-            rows_of(code, first, my_groups, m, node, n, A)
-            left_out, missed = update(
-                A, weight[:n], y, variance, my_groups, offset[c], effort.passes, effort.gradients
-            )
-            f = np.zeros(my_groups * (m + 2), np.float32)
-            for i in range(n):
-                subtract(f, -weight[i], A[i])
-            for d in range(3):
-                if c == 3 or c == d:
-                    kappa[p, d], misfit[p, d] = left_out, missed
-                    to = d * (m + 2) if my_groups == 3 else 0
-                    for j in range(m + 2):
-                        response[p, d, j] = f[to + j]
-            while written + n > all_nodes.size:
-                all_nodes = np.concatenate((all_nodes, np.empty_like(all_nodes)))
-                all_weights = np.concatenate((all_weights, np.empty_like(all_weights)))
-            for i in range(n):
-                if weight[i] >= effort.least_weight:
-                    all_nodes[written], all_weights[written] = node[i], weight[i]
-                    count[p, c % 3] += 1
-                    written += 1
-    return all_nodes[:written], all_weights[:written]

@@ -1,5 +1,7 @@
 """The posterior mean of T about a first estimate: what the lobes of a pixel do not say, its measurements still may."""
 
+import math
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -27,6 +29,7 @@ def spread_lobes(
     resolution: float,
     node: NDArray[np.int64],
     weight: NDArray[np.float32],
+    end: NDArray[np.int64],
 ) -> int:
     """Write the nodes under k lobes and their weights, which sum to 1.
 
@@ -40,7 +43,9 @@ def spread_lobes(
     resolution : float
         As in :func:`~workflows.recovery.footprint.fit_level`.
     node, weight : (k NODES,)
-        Written; a node under two lobes is there twice.
+        Written, lobe after lobe; a node under two lobes is there twice.
+    end : (k or more,) int64
+        Written: where the nodes of each lobe end.
 
     Returns
     -------
@@ -56,7 +61,57 @@ def spread_lobes(
         for j in range(found):
             weight[n + j] = terms[0, j] * lobes[i, 0] / total
         n += found
+        end[i] = n
     return n
+
+
+@njit(nogil=True, cache=True)
+def gather_lobes(
+    columns: NDArray[np.int64],
+    starts: NDArray[np.int64],
+    node: NDArray[np.int64],
+    weight: NDArray[np.float32],
+    end: NDArray[np.int64],
+    lobes: NDArray[np.float64],
+    level: NDArray[np.int64],
+    k: int,
+    resolution: float,
+) -> None:
+    """Give k lobes the moments of the weights under them: what :func:`spread_lobes` did, the other way round.
+
+    Parameters
+    ----------
+    columns, starts
+        Of the pyramid.
+    node, weight, end
+        As from :func:`spread_lobes`, with any weights.
+    lobes, level
+        Changed; a lobe with no weight left stays as it is, but for its own.
+    k : int
+    resolution : float
+        As in :func:`~workflows.recovery.footprint.fit_level`.
+    """
+    begin = 0
+    for i in range(k):
+        spacing, lobe = 2.0 ** level[i], lobes[i]
+        total, sx, sy, sxx, sxy, syy = 1e-30, 0.0, 0.0, 0.0, 0.0, 0.0
+        for j in range(begin, end[i]):
+            row, column = divmod(node[j] - starts[level[i]], columns[level[i]])
+            # about the lobe's centre, for the squares of small numbers lose nothing
+            w, x, y = weight[j], (column + 0.5) * spacing - lobe[1], (row + 0.5) * spacing - lobe[2]
+            total += w
+            sx, sy = sx + w * x, sy + w * y
+            sxx, sxy, syy = sxx + w * x * x, sxy + w * x * y, syy + w * y * y
+        begin = end[i]
+        lobe[0] = total
+        if total > 1e-6:
+            x, y = sx / total, sy / total
+            least = (0.3 * spacing) ** 2
+            lobe[1], lobe[2] = lobe[1] + x, lobe[2] + y
+            lobe[3] = math.sqrt(max(sxx / total - x * x, least))
+            lobe[4] = (sxy / total - x * y) / lobe[3]
+            lobe[5] = math.sqrt(max(syy / total - y * y - lobe[4] ** 2, least))
+            level[i] = fit_level(lobe, level[i], columns, resolution)
 
 
 @njit(nogil=True, cache=True)

@@ -126,6 +126,20 @@ def test_what_lobes_do_not_say_the_posterior_mean_does(patterns, observe):
     assert error(3) < 0.4 * error(0)
 
 
+def test_lobes_that_miss_are_fitted_again(patterns, truth, observe):
+    # a streak: a lobe that is turned a little is better wide than narrow, and small steps leave it so
+    rng = np.random.default_rng(0)
+    low, high = (20, 14, 5, 0.8, 0), (44, 34, 9, 1.2, 3)
+    T = np.concatenate([truth(tuple(rng.uniform(low, high))) for _ in range(60)])
+    scene = observe(patterns, T)
+
+    def error(doubt):
+        found = recovered(patterns, scene, doubt=doubt, steps=4).transport
+        return np.mean((dense(patterns, found) - T) ** 2)
+
+    assert error(0.01) < 0.8 * error(1.0)
+
+
 @pytest.mark.parametrize("colours", ["patterns", "coloured"])
 def test_channels_that_differ_get_their_own_t(request, colours, truth, observe):
     shown = request.getfixturevalue(colours)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from workflows.recovery.footprint import NODES, PARAMETERS
-from workflows.recovery.posterior import rows_of, spread_lobes, unresolved, update
+from workflows.recovery.posterior import gather_lobes, rows_of, spread_lobes, unresolved, update
 from workflows.recovery.pyramid import Pyramid
 
 # Standard deviation of an offset.
@@ -131,10 +131,33 @@ def test_lobes_are_spread_by_their_weights():
     level = np.zeros(3, np.int64)
     node, weight = np.empty(3 * NODES, np.int64), np.empty(3 * NODES, np.float32)
     assert lobes.shape[1] == PARAMETERS
-    n = spread_lobes(*grids, lobes, level, 2, 0.8, node, weight)
+    end = np.zeros(3, np.int64)
+    n = spread_lobes(*grids, lobes, level, 2, 0.8, node, weight, end)
+    assert n == end[1]
     assert weight[:n].sum() == pytest.approx(1, abs=1e-5)
     y, x = np.mgrid[:48, :64] + 0.5
     light = pyramid.light(np.stack([x, y], axis=2))[node[:n]]
-    first = np.flatnonzero(np.cumsum(weight[:n]) > 0.6 / 0.9 - 1e-4)[0] + 1
-    for part, centre in ((slice(first), (20, 15)), (slice(first, n), (21, 16))):
+    assert weight[: end[0]].sum() == pytest.approx(0.6 / 0.9, abs=1e-5)
+    for part, centre in ((slice(end[0]), (20, 15)), (slice(end[0], n), (21, 16))):
         np.testing.assert_allclose(weight[part] @ light[part] / weight[part].sum(), centre, atol=0.02)
+
+
+def test_gathered_lobes_are_those_that_were_spread():
+    pyramid = Pyramid.over(64, 48)
+    grids = (*(np.array(size) for size in zip(*pyramid.grids, strict=True)), pyramid.starts)
+    lobes = np.array([[0.7, 20, 15, 2.5, 1, 1.8], [0.3, 41, 30, 3, -2, 2.2]])
+    level, end = np.zeros(2, np.int64), np.zeros(2, np.int64)
+    node, weight = np.empty(2 * NODES, np.int64), np.empty(2 * NODES, np.float32)
+    n = spread_lobes(*grids, lobes, level, 2, 1.1, node, weight, end)
+    found, found_level = lobes + 1.0, level.copy()
+    gather_lobes(grids[0], grids[2], node, weight, end, found, found_level, 2, 1.1)
+    np.testing.assert_array_equal(found_level, level)
+    # what is beyond the reach of a lobe is a few per cent of its covariance
+    np.testing.assert_allclose(found, lobes, rtol=0.05, atol=0.02)
+
+    weight[:n] *= np.where(node[:n] % 64 < 20, 1, 0)
+    gather_lobes(grids[0], grids[2], node, weight, end, found, found_level, 2, 1.1)
+    assert found[0, 1] < 20
+    # nothing is left of the second: it stays where it is
+    assert found[1, 0] < 1e-6
+    np.testing.assert_allclose(found[1, 1:], lobes[1, 1:], rtol=0.05, atol=0.02)
