@@ -1,7 +1,7 @@
 """How a frame is laid out in blocks: the pieces that captures and mattes are stored in."""
 
-BLOCKS = 1024
-"""The most blocks that a frame is cut into, while a block is smaller than `LARGEST`."""
+EDGES = {16: 64, 32: 1024}
+"""Edges of blocks, and the most blocks of each that a frame is cut into."""
 LARGEST = 64
 """Edge of the largest block: its 4,096 pixels take a worker some seconds."""
 
@@ -11,9 +11,10 @@ def block_edge(height: int, width: int) -> int:
 
     It depends on the frame's size alone, so what is stored is the same however work was cut into tiles. It
     grows with the frame: a block is a handful of objects in the store, and a task of its own unless a job
-    asks for larger tiles.
+    asks for larger tiles. Blocks of 16 are for frames so small that there would be too few tasks; their 256 pixels
+    take hardly longer than their reading and writing.
     """
-    edge = 16
-    while edge < LARGEST and -(-height // edge) * -(-width // edge) > BLOCKS:
-        edge *= 2
-    return edge
+    for edge, most in EDGES.items():
+        if -(-height // edge) * -(-width // edge) <= most:
+            return edge
+    return LARGEST

@@ -2,17 +2,18 @@
 
 import pytest
 
-from storage.grid import BLOCKS, LARGEST, block_edge
+from storage.grid import EDGES, LARGEST, block_edge
 
 
 @pytest.mark.parametrize(
     ("height", "width", "edge"),
     [
         (1, 1, 16),
-        (120, 160, 16),
-        (512, 512, 16),  # 32 x 32 blocks of 16 are just 1024
-        (513, 512, 32),
+        (128, 128, 16),  # 8 x 8 blocks of 16 are just 64
+        (129, 128, 32),
+        (120, 160, 32),
         (480, 640, 32),
+        (1024, 1024, 32),
         (1080, 1920, 64),
         (16384, 16384, 64),
     ],
@@ -25,7 +26,5 @@ def test_an_edge_is_the_smallest_that_bounds_the_blocks() -> None:
     for height in range(1, 5000, 331):
         for width in range(1, 5000, 297):
             edge = block_edge(height, width)
-            blocks = [-(-height // e) * -(-width // e) for e in (edge // 2, edge)]
-            assert edge in (16, 32, LARGEST)
-            assert blocks[1] <= BLOCKS or edge == LARGEST
-            assert blocks[0] > BLOCKS or edge == 16
+            fits = [e for e, most in EDGES.items() if -(-height // e) * -(-width // e) <= most]
+            assert edge == min(fits, default=LARGEST)
