@@ -107,7 +107,7 @@ def recover(
     Notes
     -----
     The model is eq. 5 with T a sum of the pyramid's bumps. Lobes are added where they explain most
-    (:func:`~workflows.recovery.mixture.search`), all of them fitted (:func:`~workflows.recovery.mixture.refine`), and
+    (:func:`~workflows.recovery.search.search`), all of them fitted (:func:`~workflows.recovery.mixture.refine`), and
     kept if they pay for themselves. What they leave out, a sharp edge or a bend, is what
     :func:`~workflows.recovery.posterior.update` finds.
 

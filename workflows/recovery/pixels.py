@@ -8,8 +8,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from workflows.recovery.footprint import NODES, PARAMETERS
-from workflows.recovery.mixture import copy_lobes, fit, price
+from workflows.recovery.mixture import copy_lobes, price
 from workflows.recovery.posterior import gather_lobes, rows_of, spread_lobes, update
+from workflows.recovery.search import fit
 from workflows.recovery.solvers import subtract
 
 # Nodes that the rows of a block are first given room for.
