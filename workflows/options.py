@@ -47,7 +47,7 @@ class LobesOptions(RecoveryOptions):
     method: Literal["lobes"] = "lobes"
     quality: Literal["fine", "fast"] = Field(
         "fine",
-        description="`fast` takes half of the time for two decibels: it is "
+        description="`fast` takes half of the time for two and a half decibels: it is "
         + ", ".join(f"`{name}` {value}" for name, value in FAST.items())
         + " where these are left out.",
     )
