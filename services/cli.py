@@ -169,7 +169,9 @@ def demo(output: Path, keep: Path | None, workers: int | None, as_json: bool) ->
     _say({"output": str(output), **figures}, as_json, "output")
 
 
-def _size(context: click.Context, parameter: click.Parameter, text: str) -> tuple[int, int]:
+def _size(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
     found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
     if not found:
         raise click.BadParameter("give it as WIDTHxHEIGHT in pixels, 1280x960 say")
@@ -177,37 +179,58 @@ def _size(context: click.Context, parameter: click.Parameter, text: str) -> tupl
 
 
 @main.command(epilog="\b\nPresets:\n" + "\n".join(f"  {name:<11}{text}" for name, text in PRESETS.items()))
-@click.argument("preset", type=click.Choice(list(PRESETS)), metavar="PRESET")
-@click.argument("folder", type=click.Path(file_okay=False, path_type=Path))
+@click.argument("program", metavar="PROGRAM")
+@click.argument("out", type=click.Path(path_type=Path), metavar="OUT")
 @click.option(
     "--monitor",
-    default="1280x960",
-    show_default=True,
     metavar="WIDTHxHEIGHT",
     callback=_size,
-    help="The monitor's pixels: each of them must show one of the picture's.",
+    help="The monitor's pixels: each of them must show one of the picture's. Left out: 1280x960 "
+    "for a preset, and for a file the program's own.",
+)
+@click.option(
+    "--rate",
+    type=click.FloatRange(0.1, 30),
+    default=2.0,
+    show_default=True,
+    help="Of a video: patterns a second.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
-def patterns(preset: str, folder: Path, monitor: tuple[int, int], as_json: bool) -> None:
-    """Write the patterns of a preset into a new folder, a PNG each, and program.json for the capture."""
+def patterns(program: str, out: Path, monitor: tuple[int, int] | None, rate: float, as_json: bool) -> None:
+    """Write the patterns of PROGRAM, a preset or a JSON file with a program.
+
+    \b
+    OUT ending in .mp4 or .mkv: a video of them, with a border and a lead-in that make a film of it certain to
+    read, and beside it the capture.json for the film. Needs a player that decodes in software, VLC or mpv say.
+    Anything else: a new folder, with a PNG of each pattern, and program.json for the capture.
+    """
     from pydantic import ValidationError
 
-    from services.patterns import write
+    from services import film
+    from services import patterns as files
     from storage.errors import EnvmatteError
-    from workflows.presets import preset as program_of
 
+    video = out.suffix.lower() in film.FORMATS
     try:
-        program = program_of(preset, *monitor)
+        shown = files.fitted(files.given(program), monitor, bordered=video)
         with Progress("patterns") as bar:
-            write(program, folder, lambda n: bar.show(n / program.count, f"{n} of {program.count}"))
+
+            def progress(done: int, of: int) -> None:
+                bar.show(done / of, f"{done} of {of}")
+
+            if video:
+                film.write(shown, out, rate, progress)
+            else:
+                files.write(shown, out, progress)
     except ValidationError as error:
         raise click.UsageError(_first(error)) from error
     except EnvmatteError as error:
         raise click.UsageError(error.detail) from error
     except OSError as error:
-        raise click.ClickException(f"{folder} can't be written: {error.strerror}") from error
-    made = {"folder": str(folder), "preset": preset, "monitor": list(monitor), "patterns": program.count}
-    _say(made, as_json, "folder")
+        raise click.ClickException(f"{out} can't be written: {error.strerror}") from error
+    kind, source = "video" if video else "folder", "preset" if program in PRESETS else "program"
+    size = [shown.monitor.width, shown.monitor.height]
+    _say({kind: str(out), source: program, "monitor": size, "patterns": shown.count}, as_json, kind)
 
 
 def _pair(option: str) -> tuple[str, Any]:

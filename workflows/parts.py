@@ -83,6 +83,15 @@ class Bernoulli(Record):
         bits = np.unpackbits(words.view(np.uint8), bitorder="little", count=int(np.prod(shape)))
         return bits.reshape(shape)
 
+    def pattern(self, index: int) -> NDArray[np.uint8]:
+        """(rows, columns, 1 or 3) uint8: the bits of one pattern, in the memory of one."""
+        shape = (self.rows, self.columns, self.channels)
+        size = self.rows * self.columns * self.channels
+        first, within = divmod(index * size, 64)
+        words = np.random.PCG64(self.seed).advance(first).random_raw(-(-(within + size) // 64)).astype("<u8")
+        bits = np.unpackbits(words.view(np.uint8), bitorder="little", count=within + size)
+        return bits[within:].reshape(shape)
+
     def offsets(self, monitor: Monitor) -> NDArray[np.int64]:
         """(count, 2) int64: dx and dy of each pattern in pixels of the monitor, zeros without ``offset``.
 

@@ -156,10 +156,10 @@ class Program(Record):
             elif isinstance(part, Stripes):
                 yield from ((part.values(i), None) for i in inside)
             elif inside:
-                bits, offsets = part.bits, part.offsets(self.monitor)
+                offsets = part.offsets(self.monitor)
                 for i in inside:
                     dx, dy = offsets[i].tolist()
-                    yield bits[i].astype(np.float32), (dx, dy) if part.offset else None
+                    yield part.pattern(i).astype(np.float32), (dx, dy) if part.offset else None
 
     def bands(self) -> list[tuple[int, int]]:
         """The columns and rows of the Bernoulli parts' grids that nest, from coarse to fine.

@@ -141,7 +141,7 @@ def test_patterns_go_into_a_new_or_empty_folder_alone(tmp_path: Path) -> None:
     ("arguments", "said"),
     [
         (["best", "x"], "is not one of 'default'"),
-        (["quick"], "FOLDER"),
+        (["quick"], "OUT"),
         (["quick", "x", "--monitor", "1280"], "WIDTHxHEIGHT"),
         (["quick", "x", "--monitor", "2x2"], "too small"),
         (["quick", "x", "--monitor", "99999x960"], "less than or equal to 16384"),
@@ -155,11 +155,32 @@ def test_patterns_that_can_not_be_made_are_refused(arguments: list[str], said: s
     assert not list(tmp_path.iterdir())
 
 
-def test_interrupted_patterns_leave_nothing(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "services", "patterns", "paper-400", str(tmp_path / "patterns")]
+def test_a_film_is_made_of_a_preset_and_of_its_record(tmp_path: Path) -> None:
+    film = tmp_path / "new" / "sketch.mp4"
+    done = patterns("sketch", str(film), "--monitor", "320x240", "--rate", "10", "--json")
+    assert done.returncode == 0, done.stderr
+    assert "patterns: 100% 42 of 42" in done.stderr
+    assert json.loads(done.stdout) == {
+        "video": str(film),
+        "preset": "sketch",
+        "monitor": [296, 216],
+        "patterns": 32,
+    }
+    assert sorted(path.name for path in film.parent.iterdir()) == ["sketch.json", "sketch.mp4"]
+    again = patterns(str(film.with_suffix(".json")), str(tmp_path / "again.mp4"), "--rate", "10")
+    assert again.returncode == 0, again.stderr
+    assert (tmp_path / "again.mp4").read_bytes() == film.read_bytes()
+    refused = patterns("sketch", str(film))
+    assert (refused.returncode, refused.stdout) == (2, "")
+    assert "is there already" in refused.stderr
+
+
+@pytest.mark.parametrize(("out", "first"), [("patterns", "1 of 432"), ("patterns.mkv", "1 of 442")])
+def test_interrupted_patterns_leave_nothing(out: str, first: str, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "services", "patterns", "paper-400", str(tmp_path / out)]
     writing = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     assert writing.stderr is not None
-    assert "1 of 432" in writing.stderr.readline()
+    assert first in writing.stderr.readline()
     os.kill(writing.pid, signal.SIGINT)
     _, said = writing.communicate(timeout=20)
     assert writing.returncode == 130

@@ -64,6 +64,12 @@ def test_bits_are_the_raw_words_of_pcg64() -> None:
     assert bits.ravel().tolist() == expected[: bits.size]
 
 
+@pytest.mark.parametrize(("columns", "rows", "colour"), [(16, 12, "grey"), (7, 5, "rgb"), (3, 3, "grey")])
+def test_one_pattern_is_the_one_among_all(columns: int, rows: int, colour: str) -> None:
+    part = Bernoulli.model_validate(grid(columns, rows, count=40, colour=colour))
+    np.testing.assert_array_equal([part.pattern(i) for i in range(40)], part.bits)
+
+
 def test_bits_never_change() -> None:
     bits = Bernoulli.model_validate(grid(16, 12, count=24, seed=7)).bits
     assert "".join(map(str, bits[0, 0, :, 0])) == "1101000101010010"
