@@ -14,21 +14,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from services.client import Client, ServiceError
+from services.presets import PRESETS
 from services.progress import Progress
 
 if TYPE_CHECKING:
     from pydantic import ValidationError
 
 F = TypeVar("F", bound=Callable[..., Any])
-
-PRESETS = {
-    "default": "132 frames, black and white: the best mattes, whatever the glass.",
-    "quick": "56 frames in colour: for clear glass, and for who can't wait.",
-    "sketch": "32 frames in colour: a first look at the set-up.",
-    "paper-250": "282 frames: the program of the paper, to compare with it.",
-    "paper-400": "432 frames: the same at its longest.",
-}
-"""Named here once more than in `workflows.presets`, which is too heavy to import for a list of names."""
 
 
 def _remote(command: F) -> F:

@@ -108,9 +108,8 @@ def encode(
     steps = schedule(program.count, rate)
     frame_rate = Fraction(rate).limit_denominator(1000) * math.ceil(FRAMES_PER_SECOND / rate)
     shown = pictures(program)
-    options = {"movflags": "+faststart"} if container == "mp4" else {}
     at = 0
-    with av.open(target, "w", format=container, options=options) as video:
+    with av.open(target, "w", format=container) as video:
         stream = video.add_stream("libx264", rate=frame_rate, options={"qp": "0", "preset": "ultrafast"})
         stream.width, stream.height, stream.pix_fmt = border.width, border.height, "yuv444p"
         codec = stream.codec_context

@@ -72,7 +72,8 @@ def fitted(given: str | Program, screen: Size | None, *, bordered: bool) -> Prog
     Raises
     ------
     OptionError
-        If there is no such preset, it has no room on the screen, or shows images, which are files already.
+        If there is no such preset, it has no room on the screen, its grids do not nest, or it shows images, which are
+        files already.
     """
     if isinstance(given, Program) and screen is None:
         program = given
@@ -85,6 +86,7 @@ def fitted(given: str | Program, screen: Size | None, *, bordered: bool) -> Prog
         raise OptionError(
             "this program has a part of images, which are pictures already: leave it out", field="program"
         )
+    program.bands()  # a capture of grids that do not nest would be refused
     return program
 
 

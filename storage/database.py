@@ -59,6 +59,15 @@ mattes = Table(
     Column("created_at", Float, nullable=False),
 )
 
+programs = Table(
+    "programs",
+    metadata,
+    Column("number", Integer, primary_key=True, autoincrement=True),
+    Column("id", String(32), nullable=False, unique=True),
+    Column("program", JSON, nullable=False),
+    Column("created_at", Float, nullable=False),
+)
+
 jobs = Table(
     "jobs",
     metadata,

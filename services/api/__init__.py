@@ -3,10 +3,11 @@
 import hmac
 
 from fastapi import Depends, FastAPI, Request
+from fastapi.staticfiles import StaticFiles
 from sqlalchemy import Engine
 
-from services.api import captures, errors, jobs, mattes, system
-from services.api.context import PROBLEM, Context
+from services.api import captures, errors, jobs, mattes, programs, system
+from services.api.context import PROBLEM, WEB, Context
 from services.settings import Settings
 from storage.objects import Objects
 
@@ -30,7 +31,9 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
         if scheme.lower() != "bearer" or not any(known):
             raise errors.Unauthorized("send a key of this service: `Authorization: Bearer KEY`")
 
-    for router in (captures.router, jobs.router, mattes.router):
+    for router in (captures.router, jobs.router, mattes.router, programs.router):
         app.include_router(router, prefix="/v1", dependencies=[Depends(authorize)])
+    app.include_router(programs.page, prefix="/v1")
     app.include_router(system.router)
+    app.mount("/web", StaticFiles(directory=WEB))
     return app

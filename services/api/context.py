@@ -1,14 +1,22 @@
 """What every request handler needs: the settings, the database and the store."""
 
-from dataclasses import dataclass
-from typing import Annotated, Any
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
 
+from anyio import CapacityLimiter
 from fastapi import Depends, Query, Request
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, ValidationError
 from sqlalchemy import Engine
 
 from services.api.errors import TooLarge
 from services.settings import Settings
 from storage.objects import Objects
+
+WEB = Path(__file__).parents[1] / "web"
+"""The browser's files."""
+Model = TypeVar("Model", bound=BaseModel)
 
 
 @dataclass(frozen=True)
@@ -18,6 +26,10 @@ class Context:
     settings: Settings
     engine: Engine
     objects: Objects
+    pictures: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(4))
+    """Pictures of programs that are drawn at once, which bounds what they take."""
+    films: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(1))
+    """Videos of programs that are encoded at once."""
 
 
 def _context(request: Request) -> Context:
@@ -46,6 +58,15 @@ async def read_body(request: Request, limit: int) -> bytes:
                 f"the body of this request may have {limit} bytes; send a smaller one", limit=limit
             )
     return bytes(body)
+
+
+async def read_json(request: Request, model: type[Model], limit: int) -> Model:
+    """The JSON of a request, not read whole before its size is known, as a framework would."""
+    try:
+        return model.model_validate_json(await read_body(request, limit))
+    except ValidationError as error:
+        found = [detail | {"loc": ("body", *detail["loc"])} for detail in error.errors(include_url=False)]
+        raise RequestValidationError(found) from error
 
 
 PROBLEM: dict[int | str, dict[str, Any]] = {

@@ -5,11 +5,10 @@ from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
-from fastapi.exceptions import RequestValidationError
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection, Row
 
-from services.api.context import After, Limit, Needs, read_body
+from services.api.context import After, Limit, Needs, read_json
 from storage import captures, jobs, mattes
 from storage.database import jobs as table
 from storage.database import new_id, page, writing
@@ -32,12 +31,7 @@ class JobRequest(BaseModel):
 
 
 async def _job_request(request: Request) -> JobRequest:
-    """The JSON of a job, not read whole before its size is known, as a framework would."""
-    try:
-        return JobRequest.model_validate_json(await read_body(request, REQUEST_BYTES))
-    except ValidationError as error:
-        found = [detail | {"loc": ("body", *detail["loc"])} for detail in error.errors(include_url=False)]
-        raise RequestValidationError(found) from error
+    return await read_json(request, JobRequest, REQUEST_BYTES)
 
 
 class Tiles(BaseModel):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from services.cli import PRESETS
+from services.presets import PRESETS
 from tests.end_to_end.conftest import Service, png
 from workflows import images, presets
 from workflows.program import Program

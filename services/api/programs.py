@@ -1,0 +1,259 @@
+"""Programs over HTTP: a record each, and pictures and videos that are made of it when they are asked for."""
+
+import os
+import tempfile
+from collections.abc import AsyncIterator, Iterator
+from contextlib import ExitStack
+from datetime import UTC, datetime
+from typing import IO, Annotated, Any
+
+import anyio.to_thread
+from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi.responses import FileResponse, StreamingResponse
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from sqlalchemy import Row
+
+from services import film
+from services.api.context import WEB, After, Limit, Needs, read_json
+from services.patterns import archive, fitted, pictures, png, record
+from services.presets import PRESETS
+from storage import programs
+from storage.database import page as page_of
+from storage.database import programs as table
+from storage.database import writing
+from storage.errors import NotFound, OptionError
+from workflows.clock import MOST, Border
+from workflows.parts import Monitor
+from workflows.program import Program as Shown
+
+router = APIRouter(tags=["programs"])
+page = APIRouter(tags=["programs"])
+REQUEST_BYTES = 64 << 10
+MOST_PIXELS = 1 << 24
+"""Of a monitor: one picture in colour takes 48 MiB, a few times that while it is made."""
+MOST_WORK = 1 << 31
+"""Pixels of all patterns of a program: a core encodes some 30 million of them a second."""
+BLOCK = 1 << 20
+
+
+class Preset(BaseModel):
+    """A program by name, for a monitor of any size."""
+
+    name: str
+    description: str
+
+
+class Presets(BaseModel):
+    """Every preset."""
+
+    presets: list[Preset]
+
+
+class Size(BaseModel):
+    """In pixels."""
+
+    model_config = ConfigDict(extra="forbid")
+    width: int = Field(ge=1, le=16384)
+    height: int = Field(ge=1, le=16384)
+
+
+class ProgramRequest(BaseModel):
+    """A preset or a program, and the screen to show it on."""
+
+    model_config = ConfigDict(extra="forbid")
+    preset: str | None = Field(None, description="GET /v1/presets lists them.")
+    program: Shown | None = Field(None, description="As in capture.json.")
+    monitor: Size | None = Field(
+        None, description="The screen's pixels; left out, 1280 x 960 for a preset and the program's own."
+    )
+    border: bool = Field(
+        False, description="Whether `monitor` is to have room for the border that videos and the page draw."
+    )
+
+    @model_validator(mode="after")
+    def _one_of_them(self) -> "ProgramRequest":
+        if (self.preset is None) == (self.program is None):
+            raise ValueError("give either a preset or a program")
+        return self
+
+
+class Program(BaseModel):
+    """A program; `display` is the screen that its video is made for, if it can have a border."""
+
+    id: str
+    patterns: int
+    monitor: Size
+    display: Size | None
+    program: dict[str, Any]
+    created_at: datetime
+
+    @classmethod
+    def of(cls, row: Row[Any]) -> "Program":
+        shown = Shown.model_validate(row.program)
+        return cls(
+            id=row.id,
+            patterns=shown.count,
+            monitor=Size(width=shown.monitor.width, height=shown.monitor.height),
+            display=_display(shown.monitor),
+            program=row.program,
+            created_at=datetime.fromtimestamp(row.created_at, UTC),
+        )
+
+
+class Programs(BaseModel):
+    """A page of programs, newest first."""
+
+    programs: list[Program]
+
+
+def _display(monitor: Monitor) -> Size | None:
+    try:
+        border = Border.around(monitor.width, monitor.height)
+    except OptionError:
+        return None
+    return Size(width=border.width, height=border.height)
+
+
+async def _request(request: Request) -> ProgramRequest:
+    return await read_json(request, ProgramRequest, REQUEST_BYTES)
+
+
+@router.get("/presets")
+def list_presets() -> Presets:
+    """Every preset."""
+    return Presets(presets=[Preset(name=name, description=text) for name, text in PRESETS.items()])
+
+
+@router.post(
+    "/programs",
+    status_code=201,
+    openapi_extra={
+        "requestBody": {"content": {"application/json": {"schema": ProgramRequest.model_json_schema()}}}
+    },
+)
+def post_program(
+    context: Needs, request: Annotated[ProgramRequest, Depends(_request)], response: Response
+) -> Program:
+    """Keep a program. Its id follows from what it shows: a repeat makes nothing, with an Idempotency-Key or without."""
+    screen = (request.monitor.width, request.monitor.height) if request.monitor else None
+    shown = fitted(request.program or request.preset or "", screen, bordered=request.border)
+    _see_that_it_is_small(shown)
+    with writing(context.engine) as c:
+        id = programs.add(c, record(shown))
+        row = programs.get(c, id)
+    response.headers["Location"] = f"/v1/programs/{id}"
+    return Program.of(row)
+
+
+@router.get("/programs")
+def list_programs(context: Needs, limit: Limit = 100, after: After = None) -> Programs:
+    """Programs, newest first."""
+    with context.engine.connect() as c:
+        return Programs(programs=[Program.of(row) for row in page_of(c, table, limit, after)])
+
+
+@router.get("/programs/{id}")
+def get_program(context: Needs, id: str) -> Program:
+    """A program."""
+    with context.engine.connect() as c:
+        return Program.of(programs.get(c, id))
+
+
+@router.delete("/programs/{id}", status_code=204)
+def delete_program(context: Needs, id: str) -> None:
+    """Delete a program; captures of it keep their own."""
+    with writing(context.engine) as c:
+        programs.get(c, id)
+        programs.forget(c, id)
+
+
+def _shown(context: Needs, id: str) -> Shown:
+    with context.engine.connect() as c:
+        return Shown.model_validate(programs.get(c, id).program)
+
+
+Asked = Annotated[Shown, Depends(_shown)]
+
+
+@router.get("/programs/{id}/program.json")
+def get_record(context: Needs, id: str) -> dict[str, Any]:
+    """A program as capture.json has it."""
+    with context.engine.connect() as c:
+        found: dict[str, Any] = programs.get(c, id).program
+    return found
+
+
+@router.get("/programs/{id}/patterns/{n}.png", response_class=Response)
+async def get_pattern(context: Needs, shown: Asked, n: int) -> Response:
+    """What the monitor shows for a pattern."""
+    if not 0 <= n < shown.count:
+        raise NotFound(f"this program has the patterns 0 to {shown.count - 1}", field="n")
+
+    def draw() -> bytes:
+        return png(next(pictures(shown, n, n + 1)))
+
+    return Response(await anyio.to_thread.run_sync(draw, limiter=context.pictures), media_type="image/png")
+
+
+@router.get("/programs/{id}/patterns.zip", response_class=StreamingResponse)
+async def get_patterns(context: Needs, shown: Asked) -> StreamingResponse:
+    """`program.json` and a numbered PNG of each pattern, drawn while they are sent."""
+    parts = archive(shown)
+
+    async def stream() -> AsyncIterator[bytes]:
+        while part := await anyio.to_thread.run_sync(next, parts, b"", limiter=context.pictures):
+            yield part
+
+    return StreamingResponse(stream(), media_type="application/zip")
+
+
+@router.get("/programs/{id}/patterns.mp4", response_class=StreamingResponse)
+async def get_film(
+    context: Needs,
+    shown: Asked,
+    rate: Annotated[float, Query(ge=film.SLOWEST, le=film.FASTEST, description="Patterns a second.")] = 2.0,
+) -> StreamingResponse:
+    """A video of the lead-in, the patterns in a border, and the lead-out; encoded whole before the answer begins."""
+
+    def encode() -> tuple[IO[bytes], int]:
+        with ExitStack() as stack:
+            file = stack.enter_context(
+                tempfile.TemporaryFile()
+            )  # of no name: it is gone with whoever holds it
+            film.encode(shown, file, rate)
+            size = file.seek(0, os.SEEK_END)
+            file.seek(0)
+            stack.pop_all()  # now it is the answer's to close
+        return file, size
+
+    file, size = await anyio.to_thread.run_sync(encode, limiter=context.films)
+    return StreamingResponse(_blocks(file), media_type="video/mp4", headers={"Content-Length": str(size)})
+
+
+@page.get("/programs/{id}/play", response_class=FileResponse)
+def get_page(context: Needs, id: str) -> FileResponse:
+    """A page that shows the program full screen. It holds nothing of it: asked for without a key, it asks for one."""
+    with context.engine.connect() as c:
+        programs.get(c, id)
+    return FileResponse(WEB / "play.html", media_type="text/html")
+
+
+def _blocks(file: IO[bytes]) -> Iterator[bytes]:
+    with file:
+        while block := file.read(BLOCK):
+            yield block
+
+
+def _see_that_it_is_small(shown: Shown) -> None:
+    pixels = shown.monitor.width * shown.monitor.height
+    for much, what, limit in (
+        (shown.count, "patterns", MOST),
+        (pixels, "pixels of the monitor", MOST_PIXELS),
+        (pixels * shown.count, "pixels of all patterns together", MOST_WORK),
+    ):
+        if much > limit:
+            raise OptionError(
+                f"{much} {what}: the service makes pictures of up to {limit}; ask for fewer, or make them with "
+                "`envmatte patterns`",
+                limit=limit,
+            )

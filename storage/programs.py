@@ -1,0 +1,36 @@
+"""Programs: their records in the database. All else of a program, its pictures too, follows from its record."""
+
+import hashlib
+import json
+import time
+from typing import Any
+
+from sqlalchemy import Connection, Row, delete, insert, select
+
+from storage.database import find
+from storage.database import programs as table
+
+
+def add(connection: Connection, program: dict[str, Any]) -> str:
+    """Write down a program and return its id; the same program has the same id, and is written down once."""
+    text = json.dumps(program, sort_keys=True)
+    id = hashlib.sha256(text.encode()).hexdigest()[:20]
+    if connection.scalar(select(table.c.id).where(table.c.id == id)) is None:
+        connection.execute(insert(table).values(id=id, program=program, created_at=time.time()))
+    return id
+
+
+def get(connection: Connection, program: str) -> Row[Any]:
+    """A program's row.
+
+    Raises
+    ------
+    NotFound
+        If there is none.
+    """
+    return find(connection, table, program)
+
+
+def forget(connection: Connection, program: str) -> None:
+    """Remove a program's row."""
+    connection.execute(delete(table).where(table.c.id == program))
