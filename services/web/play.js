@@ -1,0 +1,281 @@
+// Shows a program full screen. Where cells lie, what they show, and what is shown when: as workflows/clock.py has it.
+
+const BITS = 12;
+const TICKS = 8;
+const LEAD = -1;
+const LEAD_SECONDS = [1, 0.5, 0.5, 0.5, 0.5];
+const LEAST_CELL = 4;
+const COUNTDOWN = 5; // seconds
+const AHEAD = 8; // pictures decoded before they are shown: all of them would fill the memory
+const AT_ONCE = 4; // requests
+
+export function borderOn(width, height) {
+  const thickness = Math.floor(height / 20);
+  const along = (length, pairs) => {
+    const size = Math.floor((length - 2 * thickness) / (2 * pairs));
+    const start = Math.floor((length - 2 * pairs * size) / 2);
+    return Array.from({ length: 2 * pairs }, (_, i) => [start + i * size, size]);
+  };
+  const top = along(width, BITS + 1).map(([x, size]) => [x, 0, size, thickness]);
+  const left = along(height, TICKS).map(([y, size]) => [0, y, thickness, size]);
+  return {
+    width,
+    height,
+    inner: [thickness, thickness, width - 2 * thickness, height - 2 * thickness],
+    top,
+    bottom: top.map(([x, , w, h]) => [x, height - thickness, w, h]).reverse(),
+    left,
+    right: left.map(([, y, w, h]) => [width - thickness, y, w, h]),
+    fits: Math.min(top[0][2], left[0][3]) >= LEAST_CELL,
+  };
+}
+
+const pairs = (bits) => bits.flatMap((bit) => (bit ? [true, false] : [false, true]));
+
+export function code(number) {
+  const gray = (number + 1) ^ ((number + 1) >> 1);
+  const bits = Array.from({ length: BITS }, (_, i) => (gray >> (BITS - 1 - i)) & 1);
+  return pairs([...bits, bits.reduce((sum, bit) => sum ^ bit, 0)]);
+}
+
+export const tick = (number) => pairs(Array(TICKS).fill((number + 1) & 1));
+
+export function schedule(count, rate) {
+  const lead = LEAD_SECONDS.map((seconds, i) => ({ seconds, number: LEAD, white: i % 2 === 1 }));
+  const patterns = Array.from({ length: count }, (_, number) => ({ seconds: 1 / rate, number, white: false }));
+  return [...lead, ...patterns, ...lead];
+}
+
+// Draws a picture, or the lead's black or white where there is none, in the border.
+export function draw(context, border, step, picture) {
+  context.fillStyle = "#000";
+  context.fillRect(0, 0, border.width, border.height);
+  context.fillStyle = "#fff";
+  if (picture) {
+    context.imageSmoothingEnabled = false;
+    context.drawImage(picture, ...border.inner);
+  } else if (step.white) {
+    context.fillRect(...border.inner);
+  }
+  const number = code(step.number);
+  const ticks = tick(step.number);
+  for (const [boxes, lit] of [[border.top, number], [border.bottom, number], [border.left, ticks], [border.right, ticks]]) {
+    boxes.forEach((box, i) => lit[i] && context.fillRect(...box));
+  }
+}
+
+// The pictures of a program: all fetched before it starts, the next few of them decoded.
+class Pictures {
+  #blobs = [];
+  #decoded = new Map();
+
+  async load(count, fetched, progress) {
+    let next = 0;
+    let done = 0;
+    const work = async () => {
+      while (next < count) {
+        const n = next++;
+        this.#blobs[n] = await (await fetched(`patterns/${n}.png`)).blob();
+        progress(++done / count);
+      }
+    };
+    await Promise.all(Array.from({ length: AT_ONCE }, work));
+  }
+
+  // Decodes from a number on, and lets go of what is before it.
+  async prepare(first) {
+    for (const [n, entry] of this.#decoded) {
+      if (n < first) {
+        this.#decoded.delete(n);
+        entry.then((picture) => picture.close(), () => {});
+      }
+    }
+    for (let n = first; n < Math.min(first + AHEAD, this.#blobs.length); n++) {
+      if (!this.#decoded.has(n)) {
+        const entry = createImageBitmap(this.#blobs[n], { colorSpaceConversion: "none" });
+        entry.then((picture) => (entry.picture = picture), () => {});
+        this.#decoded.set(n, entry);
+      }
+    }
+    await Promise.all(this.#decoded.values());
+  }
+
+  // The picture of a number if it is decoded.
+  at(n) {
+    return this.#decoded.get(n)?.picture;
+  }
+}
+
+const nextFrame = () => new Promise(requestAnimationFrame);
+
+// Shows the steps, each for a whole number of the display's refreshes, and none before its picture is there. A step that
+// came late is followed by one as long as any: no step is ever left out. Returns when each of them was first shown.
+async function show(context, border, steps, pictures, refresh, stopped) {
+  const shown = [];
+  let due = -Infinity;
+  for (const [i, step] of steps.entries()) {
+    let now;
+    let picture;
+    do {
+      now = await nextFrame();
+      stopped.throwIfAborted();
+      picture = pictures.at(step.number);
+    } while (now < due - refresh / 2 || (step.number !== LEAD && !picture));
+    draw(context, border, step, picture);
+    shown.push({ number: step.number, white: step.white, at: now });
+    // On time, the next is due by the steady beat; too late, by a new one.
+    const start = now < due + refresh ? due : now;
+    due = start + Math.max(1, Math.round((step.seconds * 1000) / refresh)) * refresh;
+    if (i + 1 < steps.length && steps[i + 1].number !== LEAD) {
+      pictures.prepare(steps[i + 1].number).catch(() => {}); // a picture that fails is waited for, until Escape
+    }
+  }
+  while ((await nextFrame()) < due - refresh / 2) stopped.throwIfAborted();
+  return shown;
+}
+
+// Counts down, and measures the refresh of the display meanwhile: the median of its frames' distances, in milliseconds.
+async function countDown(element, stopped) {
+  const begin = await nextFrame();
+  const times = [begin];
+  while (times.at(-1) < begin + COUNTDOWN * 1000) {
+    const left = String(Math.ceil(COUNTDOWN - (times.at(-1) - begin) / 1000));
+    if (element.textContent !== left) element.textContent = left;
+    times.push(await nextFrame());
+    stopped.throwIfAborted();
+  }
+  element.textContent = "";
+  const distances = times.slice(1).map((time, i) => time - times[i]).sort((a, b) => a - b);
+  return distances[Math.floor(distances.length / 2)];
+}
+
+// Gives a canvas as many pixels as the display has under it.
+async function fill(canvas) {
+  const [width, height] = await new Promise((resolve) => {
+    const observer = new ResizeObserver(([entry]) => {
+      observer.disconnect();
+      const exact = entry.devicePixelContentBoxSize?.[0];
+      const rounded = (length) => Math.round(length * devicePixelRatio);
+      resolve(
+        exact
+          ? [exact.inlineSize, exact.blockSize]
+          : [rounded(entry.contentRect.width), rounded(entry.contentRect.height)],
+      );
+    });
+    try {
+      observer.observe(canvas, { box: "device-pixel-content-box" });
+    } catch {
+      observer.observe(canvas); // Safari knows CSS pixels alone
+    }
+  });
+  [canvas.width, canvas.height] = [width, height];
+}
+
+const $ = (id) => document.getElementById(id);
+const say = (text) => ($("status").textContent = text);
+const here = new URL(".", location.href);
+const screenSize = () => ({
+  width: Math.round(screen.width * devicePixelRatio),
+  height: Math.round(screen.height * devicePixelRatio),
+});
+
+async function ask(path, options = {}) {
+  const key = sessionStorage.getItem("envmatte-key");
+  const headers = { ...options.headers, ...(key ? { Authorization: `Bearer ${key}` } : {}) };
+  const answer = await fetch(new URL(path, here), { ...options, headers });
+  if (answer.status === 401) $("unlock").hidden = false;
+  if (!answer.ok) throw new Error((await answer.json()).detail);
+  return answer;
+}
+
+async function open() {
+  const id = here.pathname.split("/").at(-2);
+  const program = await (await ask(`../${id}`)).json();
+  const { display, patterns, monitor } = program;
+  $("about").textContent = `${patterns} patterns of ${monitor.width} x ${monitor.height} pixels.`;
+  const size = screenSize();
+  if (display?.width !== size.width || display?.height !== size.height) {
+    const made = display ? `It is made for a screen of ${display.width} x ${display.height} pixels` : "It has no room";
+    $("misfit").textContent = `${made}; this one has ${size.width} x ${size.height}, so it is stretched and less sharp.`;
+    $("fit").hidden = false;
+    $("refit").onclick = () => refit(program.program, size).catch((error) => say(error.message));
+  }
+  const pictures = new Pictures();
+  say("Loading the patterns.");
+  await pictures.load(patterns, ask, (share) => ($("loaded").value = share));
+  say("Ready.");
+  $("start").disabled = false;
+  $("settings").onsubmit = (event) => {
+    event.preventDefault();
+    play(program, pictures, Number($("rate").value));
+  };
+}
+
+async function refit(program, monitor) {
+  const body = JSON.stringify({ program, monitor, border: true });
+  const answer = await ask("../../programs", { method: "POST", body, headers: { "Content-Type": "application/json" } });
+  location.assign(new URL(`../${(await answer.json()).id}/play`, here));
+}
+
+async function play(program, pictures, rate) {
+  const [stage, canvas] = [$("stage"), $("canvas")];
+  const stop = new AbortController();
+  const { signal } = stop;
+  const listen = (target, event, listener) => target.addEventListener(event, listener, { signal });
+  const end = (why) => stop.abort(new Error(why));
+  let lock;
+  $("record").hidden = true;
+  $("start").disabled = true;
+  try {
+    stage.hidden = false;
+    // Where there is no full screen for elements, the stage fills the window.
+    const full = await stage.requestFullscreen?.({ navigationUI: "hide" }).then(() => true, () => false);
+    lock = await navigator.wakeLock?.request("screen").catch(() => undefined);
+    listen(document, "keydown", (event) => event.key === "Escape" && end("Stopped."));
+    listen(document, "fullscreenchange", () => full && !document.fullscreenElement && end("Stopped."));
+    listen(document, "visibilitychange", () => document.hidden && end("Stopped: the page was hidden."));
+    await pictures.prepare(0);
+    const refresh = await countDown($("countdown"), signal);
+    await fill(canvas);
+    listen(window, "resize", () => end("Stopped: the window changed its size."));
+    const border = borderOn(canvas.width, canvas.height);
+    if (!border.fits) throw new Error("The window is too small for the border: make it larger.");
+    const context = canvas.getContext("2d", { alpha: false });
+    const shown = await show(context, border, schedule(program.patterns, rate), pictures, refresh, signal);
+    finish(program, border, shown, refresh);
+  } catch (error) {
+    say(error.message);
+  } finally {
+    stop.abort();
+    lock?.release();
+    if (document.fullscreenElement) await document.exitFullscreen();
+    canvas.width = canvas.height = 0;
+    $("countdown").textContent = "";
+    stage.hidden = true;
+    $("start").disabled = false;
+    $("start").focus();
+  }
+}
+
+function finish(program, { width, height }, shown, refresh) {
+  const patterns = shown.filter((step) => step.number !== LEAD);
+  const seconds = (patterns.at(-1).at - patterns[0].at) / 1000;
+  const rate = Number(((patterns.length - 1) / seconds).toFixed(4));
+  const video = { file: "film.mp4", patterns_per_second: rate, border: { width, height } };
+  const record = { format: "envmatte-capture/1", program: program.program, video };
+  URL.revokeObjectURL($("capture").href);
+  $("capture").href = URL.createObjectURL(new Blob([JSON.stringify(record, null, 1)], { type: "application/json" }));
+  $("record").hidden = false;
+  say(`All ${patterns.length} patterns were shown, ${rate} a second. Stop the film.`);
+  document.dispatchEvent(new CustomEvent("played", { detail: { shown, refresh, record } }));
+}
+
+$("unlock").onsubmit = (event) => {
+  event.preventDefault();
+  sessionStorage.setItem("envmatte-key", $("key").value);
+  $("unlock").hidden = true;
+  start();
+};
+
+const start = () => open().catch((error) => say(error.message));
+start();

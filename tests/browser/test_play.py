@@ -1,0 +1,211 @@
+"""The page that shows a program, in a real browser: its rules are those of `workflows.clock`, and it keeps time."""
+
+import base64
+import io
+import json
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+from playwright.sync_api import Page, expect
+
+from services.patterns import pictures
+from tests.end_to_end.conftest import Service, serving
+from workflows import clock
+from workflows.program import Program
+
+SCREEN = {"width": 640, "height": 360}
+DISPLAYS = [(640, 360), (1920, 1080), (1080, 1920), (3440, 1440), (161, 121), (90, 60), (200, 5000)]
+NUMBERS = [clock.LEAD, 0, 1, 62, 63, 64, 1023, clock.MOST - 1]
+
+
+def posted(service: Service, **asked: Any) -> dict[str, Any]:
+    answer = service.http.post(
+        "/v1/programs", json={"preset": "sketch", "monitor": SCREEN, "border": True} | asked
+    )
+    assert answer.status_code == 201, answer.text
+    found: dict[str, Any] = answer.json()
+    return found
+
+
+def go(tab: Page, service: Service, program: dict[str, Any]) -> str:
+    url = f"{service.url}/v1/programs/{program['id']}/play"
+    tab.goto(url)
+    expect(tab.get_by_role("status")).to_have_text("Ready.", timeout=60_000)
+    return url
+
+
+def drawn(tab: Page, program: dict[str, Any], number: int, white: bool) -> NDArray[np.uint8]:
+    """The display's frame as the page draws it, (360, 640, 3)."""
+    url = tab.evaluate(
+        """async ([number, white]) => {
+            const page = await import(new URL("/web/play.js", location.href));
+            const canvas = Object.assign(document.createElement("canvas"), { width: 640, height: 360 });
+            const blob = number < 0 ? null : await (await fetch(`patterns/${number}.png`)).blob();
+            const picture = blob && (await createImageBitmap(blob, { colorSpaceConversion: "none" }));
+            page.draw(canvas.getContext("2d", { alpha: false }), page.borderOn(640, 360), { number, white }, picture);
+            return canvas.toDataURL("image/png");
+        }""",
+        [number, white],
+    )
+    image = Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2])))
+    return np.asarray(image.convert("RGB"))
+
+
+def test_the_page_has_the_rules_of_the_clock(tab: Page, service: Service) -> None:
+    go(tab, service, posted(service))
+    rules = tab.evaluate(
+        """async ([displays, numbers]) => {
+            const page = await import(new URL("/web/play.js", location.href));
+            return {
+                borders: displays.map(([width, height]) => page.borderOn(width, height)),
+                codes: numbers.map(page.code),
+                ticks: numbers.map(page.tick),
+                schedule: page.schedule(7, 4),
+            };
+        }""",
+        [DISPLAYS, NUMBERS],
+    )
+    for (width, height), found in zip(DISPLAYS, rules["borders"], strict=True):
+        try:
+            border = clock.Border(width=width, height=height)
+        except ValueError:
+            assert not found["fits"]
+            continue
+        assert found["fits"]
+        for name in ("inner", "top", "bottom", "left", "right"):
+            assert np.array_equal(found[name], getattr(border, name))
+    assert np.array_equal(rules["codes"], [clock.code(number) for number in NUMBERS])
+    assert np.array_equal(rules["ticks"], [clock.tick(number) for number in NUMBERS])
+    expected = [(step.seconds, step.number, step.white) for step in clock.schedule(7, 4)]
+    assert [(step["seconds"], step["number"], step["white"]) for step in rules["schedule"]] == expected
+
+
+def test_the_page_draws_what_the_clock_draws(tab: Page, service: Service) -> None:
+    program = posted(service)
+    go(tab, service, program)
+    shown = Program.model_validate(program["program"])
+    border = clock.Border(**SCREEN)
+    for white in (False, True):
+        level = np.full((1, 1, 3), 255 * white, np.uint8)
+        np.testing.assert_array_equal(drawn(tab, program, -1, white), clock.draw(level, -1, border))
+    every = list(pictures(shown))
+    for number in (0, 6, 20, 31):
+        picture = np.broadcast_to(every[number], (*every[number].shape[:2], 3))
+        np.testing.assert_array_equal(drawn(tab, program, number, False), clock.draw(picture, number, border))
+
+
+def test_every_pattern_is_shown_in_order_for_its_time(tab: Page, service: Service) -> None:
+    program = posted(service)
+    go(tab, service, program)
+    # What is on the canvas at each of the display's frames, seen by a loop of its own.
+    tab.evaluate(
+        """(boxes) => {
+            window.seen = [];
+            window.played = new Promise((resolve) => document.addEventListener("played", (e) => resolve(e.detail)));
+            const canvas = document.getElementById("canvas");
+            const look = (now) => {
+                if (canvas.width === 640) {
+                    const y = Math.floor(boxes[0][3] / 2);
+                    const row = canvas.getContext("2d").getImageData(0, y, 640, 1).data;
+                    const middle = canvas.getContext("2d").getImageData(320, 180, 1, 1).data[0];
+                    window.seen.push([now, middle, boxes.map(([x, , w]) => row[4 * Math.floor(x + w / 2)])]);
+                }
+                requestAnimationFrame(look);
+            };
+            requestAnimationFrame(look);
+        }""",
+        clock.Border(**SCREEN).top,
+    )
+    tab.get_by_label("Patterns a second").fill("10")
+    tab.get_by_role("button", name="full screen").press("Enter")
+    played = tab.evaluate("window.played")
+    seen = tab.evaluate("window.seen")
+    refresh = played["refresh"]
+    steps = clock.schedule(32, 10)
+    assert [(s["number"], s["white"]) for s in played["shown"]] == [(s.number, s.white) for s in steps]
+
+    # The numbers as a reader sees them, and black and white of the lead.
+    numbers, certain = clock.read(np.array([cells for *_, cells in seen], float))
+    at = np.array([now for now, *_ in seen])
+    states = [
+        (int(number), middle > 127 if number == clock.LEAD else None)
+        for number, (_, middle, _), sure in zip(numbers, seen, certain, strict=True)
+        if sure
+    ]
+    times = at[certain]
+    expected = [(s.number, s.white if s.number == clock.LEAD else None) for s in steps]
+    runs = [(state, [i for i, _ in group]) for state, group in groupby(enumerate(states), key=lambda e: e[1])]
+    assert [state for state, _ in runs] == expected
+    # Each is there for its number of refreshes, to one; frames that this machine had no time for are made up for.
+    lost = np.concatenate([[0], np.cumsum(np.rint(np.diff(times) / refresh) - 1)])
+    before = 0
+    for (_, now), (_, after), step in zip(runs[:-1], runs[1:], steps, strict=False):
+        first, last = now[0], after[0]
+        refreshes = (times[last] - times[first]) / refresh
+        missed = lost[last] - lost[before]
+        assert abs(refreshes - step.seconds * 1000 / refresh) < 1.5 + missed, step
+        before = first
+    expect(tab.get_by_role("status")).to_contain_text("All 32 patterns were shown")
+    link = tab.get_by_role("link", name="capture.json")
+    expect(link).to_be_visible()
+    with tab.expect_download() as download:
+        link.click()
+    record = json.loads(download.value.path().read_text())
+    assert record["video"]["border"] == SCREEN
+    assert record["video"]["patterns_per_second"] == pytest.approx(10, rel=0.1)
+    assert record["program"] == program["program"]
+
+
+def test_escape_stops_it_and_it_can_be_shown_again(tab: Page, service: Service) -> None:
+    go(tab, service, posted(service))
+    start = tab.get_by_role("button", name="full screen")
+    for _ in range(2):
+        start.click()
+        expect(tab.locator("#stage")).to_be_visible()
+        expect(tab.locator("#countdown")).to_have_text("4")
+        tab.keyboard.press("Escape")
+        expect(tab.locator("#stage")).to_be_hidden()
+        expect(tab.get_by_role("status")).to_have_text("Stopped.")
+        expect(start).to_be_focused()
+
+
+def test_a_program_of_another_size_is_made_for_this_screen(tab: Page, service: Service) -> None:
+    first = go(tab, service, posted(service, monitor={"width": 800, "height": 600}))
+    expect(tab.get_by_text("made for a screen of 800 x 600 pixels; this one has 640 x 360")).to_be_visible()
+    with tab.expect_navigation():
+        tab.get_by_role("button", name="Make it for this screen").click()
+    expect(tab.get_by_role("status")).to_have_text("Ready.")
+    assert tab.url != first
+    expect(tab.get_by_text("32 patterns of 604 x 324 pixels")).to_be_visible()
+    expect(tab.locator("#fit")).to_be_hidden()
+
+
+def test_a_key_is_asked_for_where_the_service_wants_one(
+    tab: Page, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.mktemp("locked") / "data"
+    with serving(folder, "--workers", "1", ENVMATTE_KEYS="secret") as locked:
+        locked.http.headers["Authorization"] = "Bearer secret"
+        program = posted(locked)
+        tab.goto(f"{locked.url}/v1/programs/{program['id']}/play")
+        key = tab.get_by_label("Key of the service")
+        for text, said in (("wrong", "send a key"), ("secret", "Ready.")):
+            expect(key).to_be_visible()
+            key.fill(text)
+            key.press("Enter")
+            expect(tab.get_by_role("status")).to_contain_text(said)
+        expect(key).to_be_hidden()
+
+
+def test_all_controls_have_names(tab: Page, service: Service) -> None:
+    go(tab, service, posted(service))
+    unnamed = tab.evaluate(
+        """() => [...document.querySelectorAll("input, button, progress, canvas, a")].filter(
+            (e) => !(e.labels?.length || e.ariaLabel || e.textContent.trim())).map((e) => e.outerHTML)"""
+    )
+    assert unnamed == []
+    assert tab.evaluate("document.documentElement.lang") == "en"
