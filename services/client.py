@@ -1,7 +1,10 @@
 """A small synchronous client of the HTTP API."""
 
+import base64
+import hashlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from http import HTTPStatus
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -9,7 +12,13 @@ from typing import Any, Self
 import httpx2
 
 Job = dict[str, Any]
-PART = 1 << 20
+TUS = {"Tus-Resumable": "1.0.0"}
+LARGEST, SMALLEST = 8 << 20, 64 << 10
+"""Bytes of a file that are sent at once: half as many after a fault, twice as many after a success."""
+PATIENCE = 60.0
+"""Seconds without progress after which an upload is given up: a service may be started again meanwhile."""
+PASSING = (408, 409, 423, 429, 460, 500, 502, 503, 504)
+"""Statuses after which an upload is tried again, from where the service says it stands."""
 
 
 class ServiceError(Exception):
@@ -50,20 +59,73 @@ class Client:
     def upload(
         self, file: Path, *, name: str = "", progress: Callable[[int, int], None] | None = None
     ) -> dict[str, Any]:
-        """Upload a capture, streamed; returns it. ``progress`` is told the bytes sent and those there are."""
-        size = file.stat().st_size
+        """Upload a capture; returns it.
 
-        def parts() -> Iterator[bytes]:
-            sent = 0
-            with file.open("rb") as source:
-                while part := source.read(PART):
-                    yield part
-                    sent += len(part)
-                    if progress:
-                        progress(sent, size)
+        Connections that break and services that are started again are outlived. An upload that was given up is
+        gone on with by calling this again for the same file, until the service has forgotten it.
 
-        headers = {"Content-Type": "application/zip", "Content-Length": str(size)}
-        return self._json("POST", "/v1/captures", params={"name": name}, content=parts(), headers=headers)
+        Parameters
+        ----------
+        progress : callable, optional
+            Told the bytes that the service has, and those there are.
+
+        Notes
+        -----
+        By tus 1.0. The Idempotency-Key is made of the file's path, size and time of change, so that nothing
+        about the upload has to be remembered here.
+        """
+        state = file.stat()
+        size = state.st_size
+        mark = f"{file.resolve()} {size} {state.st_mtime_ns}"
+        key = hashlib.sha256(mark.encode(errors="surrogateescape")).hexdigest()
+        create = TUS | {"Upload-Length": str(size), "Idempotency-Key": key}
+        where, offset, step, pause = "", -1, LARGEST, 0.1
+        give_up = time.monotonic() + PATIENCE
+
+        def reached(answer: httpx2.Response) -> int:
+            found = int(answer.headers["Upload-Offset"])
+            if progress and size and found != offset:
+                progress(found, size)
+            return found
+
+        with file.open("rb") as source:
+            while True:
+                try:
+                    if not where:
+                        where = self._send("POST", "/v1/uploads", headers=create).headers["Location"]
+                    if offset < size:
+                        offset = reached(self._send("HEAD", where, headers=TUS))
+                    while offset < size:
+                        source.seek(offset)
+                        offset = reached(self._patch(where, offset, source.read(step)))
+                        step, pause = min(2 * step, LARGEST), 0.1
+                        give_up = time.monotonic() + PATIENCE
+                    body = {"upload": where.rsplit("/", 1)[-1], "name": name}
+                    return self._json("POST", "/v1/captures", json=body)
+                except ServiceError as error:
+                    status = error.problem["status"]
+                    if status == HTTPStatus.NOT_FOUND and offset < size and where:
+                        offset = (
+                            size  # another who sends this file may have finished it: then there is a capture
+                        )
+                        continue
+                    nobody = isinstance(error.__cause__, httpx2.ConnectError) and not where
+                    if nobody or status not in PASSING or time.monotonic() > give_up:
+                        raise
+                    time.sleep(pause)
+                    step, pause = max(step // 2, SMALLEST), min(2 * pause, 5)
+
+    def _patch(self, where: str, offset: int, data: bytes) -> httpx2.Response:
+        if not data:
+            detail = "the file has become shorter while it was sent; upload it again"
+            raise ServiceError({"title": "The file has changed", "status": 400, "detail": detail})
+        digest = base64.b64encode(hashlib.sha256(data).digest()).decode()
+        headers = TUS | {
+            "Content-Type": "application/offset+octet-stream",
+            "Upload-Offset": str(offset),
+            "Upload-Checksum": f"sha256 {digest}",
+        }
+        return self._send("PATCH", where, headers=headers, content=data)
 
     def recover(self, capture: str, **options: Any) -> Job:
         """Queue the recovery of a matte; returns its job."""
@@ -137,4 +199,13 @@ class Client:
             ) from error
         if answer.is_success:
             return answer
+        if answer.headers.get("content-type") != "application/problem+json" or not answer.content:
+            # Of a proxy between, or to HEAD.
+            raise ServiceError(
+                {
+                    "title": answer.reason_phrase,
+                    "status": answer.status_code,
+                    "detail": f"{method} {answer.url} was answered with {answer.status_code} {answer.reason_phrase}",
+                }
+            )
         raise ServiceError(answer.json())

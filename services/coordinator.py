@@ -18,7 +18,7 @@ from sqlalchemy import Engine, Row, select
 
 from services.api.errors import problem_of
 from services.settings import Settings
-from storage import captures, database, jobs, mattes
+from storage import captures, database, jobs, mattes, uploads
 from storage.database import writing
 from storage.errors import Conflict, EnvmatteError, GaveUp
 from storage.objects import Objects
@@ -103,6 +103,9 @@ class Coordinator:
             self._threads = sum(threads.values())
             with writing(self._engine) as c:
                 jobs.beat(c, len(threads), self._threads)
+                expired = uploads.forget_expired(c)
+            for upload in expired:
+                uploads.remove(self._objects, upload)
             self._beat_at = time.monotonic()
         with self._engine.connect() as c:
             rows = {row.id: row for row in jobs.active(c)}
@@ -218,7 +221,7 @@ class Coordinator:
                 mattes.change(c, drive.task.matte, state="ready", figures=figures)
         del self._drives[drive.job]
         if drive.kind == "ingest":
-            self._objects.delete(captures.upload_path(drive.task.capture))
+            self._objects.delete(uploads.path(drive.task.capture))
 
     def _collect(self, drive: Drive) -> None:
         """Write down the tiles that have ended since the last look, all in one transaction."""
@@ -296,16 +299,17 @@ class Coordinator:
                 problem = problem_of(Conflict("the ingest was cancelled; upload the capture again"))
                 captures.change(c, capture, state="failed", problem=problem)
         self._objects.delete(captures.path(capture))
-        self._objects.delete(captures.upload_path(capture))
+        self._objects.delete(uploads.path(capture))
 
     def _reconcile(self) -> None:
         """Remove what has no row in the ledger: what a killed process left."""
         with self._engine.connect() as c:
             rows = c.execute(select(database.captures)).all()
             kept = [row for row in rows if row.state != "failed" or captures.may_be_retried(row.problem)]
+            under_way = {id: uploads.parts_of(c, id) for id in c.scalars(select(database.uploads.c.id))}
             known = {
                 "captures": {row.id for row in kept},
-                "uploads": {f"{row.id}.zip" for row in kept if row.state != "ready"},
+                "uploads": {row.id for row in kept if row.state != "ready"} | under_way.keys(),
                 "mattes": set(c.scalars(select(database.mattes.c.id))),
             }
         self._objects.sweep("uploads")
@@ -314,3 +318,5 @@ class Coordinator:
                 if name not in names and name != "zarr.json":
                     logger.info("removing %s/%s, which nothing refers to", folder, name)
                     self._objects.delete(f"{folder}/{name}")
+        for upload, parts in under_way.items():
+            uploads.sweep(self._objects, upload, parts)

@@ -28,6 +28,9 @@ class Settings(BaseSettings):
         description="Worker processes of the embedded cluster, one thread each. Default: one a core.",
     )
     upload_bytes: int = Field(8 << 30, ge=1, description="Bytes of the largest archive that is taken.")
+    upload_seconds: int = Field(
+        86_400, ge=1, description="How long a resumable upload is kept after the last byte of it came."
+    )
     unpacked_bytes: int = Field(64 << 30, ge=1, description="Bytes that an archive may unpack to.")
     ingest_memory: int = Field(
         512 << 20,

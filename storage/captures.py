@@ -2,7 +2,7 @@
 
 In the store, under ``captures/ID``, a zarr group: ``frames`` (frame, y, x, channel), the optional ``mask`` (y, x) and
 ``images/N`` (row, column, channel), the patterns that came as images. Its attributes hold the manifest. The archive
-that was uploaded lies in ``uploads/ID.zip`` until its frames are in the stack.
+that was uploaded lies where `storage.uploads` puts it until its frames are in the stack.
 """
 
 import time
@@ -21,11 +21,6 @@ from storage.objects import EVERY_CHUNK, Objects, together
 
 CHUNK = 1 << 20
 """Bytes of a chunk of the stack, about: small enough that a tile reads little more than its own."""
-
-
-def upload_path(capture: str) -> str:
-    """Where a capture's archive lies until it is ingested."""
-    return f"uploads/{capture}.zip"
 
 
 def path(capture: str) -> str:

@@ -120,6 +120,28 @@ coordinator = Table(
 )
 """One row: the coordinator's last sign of life, and the cluster as it saw it."""
 
+uploads = Table(
+    "uploads",
+    metadata,
+    Column("id", String(32), primary_key=True),
+    Column("key", String(256), unique=True),
+    Column("offset", BigInteger, nullable=False),
+    Column("length", BigInteger, nullable=False),
+    Column("parts", Integer, nullable=False),
+    Column("metadata", Text, nullable=False),
+    Column("created_at", Float, nullable=False),
+    Column("expires_at", Float, nullable=False, index=True),
+)
+
+upload_parts = Table(
+    "upload_parts",
+    metadata,
+    Column("upload", ForeignKey("uploads.id", ondelete="CASCADE"), primary_key=True),
+    Column("offset", BigInteger, primary_key=True),
+    Column("name", String(32), nullable=False),
+    Column("size", BigInteger, nullable=False),
+)
+
 made = Table(
     "made",
     metadata,

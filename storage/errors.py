@@ -9,6 +9,7 @@
     │   └── OptionError         an option of recovery
     ├── NotFound                no such capture, job, matte or frame
     ├── Conflict                it exists, but not in a state that allows this
+    ├── NoRoom                  the store has no space for it
     ├── Corrupt                 something stored is missing or damaged
     └── GaveUp                  work that failed as often as it may
 
@@ -63,6 +64,10 @@ class NotFound(EnvmatteError):
 
 class Conflict(EnvmatteError):
     """It exists, but is not in a state that allows this."""
+
+
+class NoRoom(EnvmatteError):
+    """The store has no space for it."""
 
 
 class Corrupt(EnvmatteError):

@@ -159,6 +159,10 @@ class Objects:
             _Reader(obstore.open_reader(self._store, path, buffer_size=1 << 20)), 1 << 16
         )
 
+    def put(self, path: str, data: bytes) -> None:
+        """Write a small object, whole."""
+        obstore.put(self._store, path, data)
+
     def names(self, folder: str) -> list[str]:
         """What lies directly in a folder, folders and objects, by name."""
         found = obstore.list_with_delimiter(self._store, folder)
@@ -187,6 +191,10 @@ class Objects:
         if self._folder is not None:
             for part in (self._folder / path).rglob("*#*"):
                 part.unlink()
+
+    def free(self) -> int | None:
+        """Bytes that the disk of a folder has left; None for a bucket, which has no end."""
+        return shutil.disk_usage(self._folder).free if self._folder is not None else None
 
     def check(self) -> None:
         """Reach the store once; raises whatever it raises when it can't be reached."""

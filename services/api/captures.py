@@ -6,22 +6,28 @@ from typing import Annotated, Any, Literal
 
 import anyio.to_thread
 from fastapi import APIRouter, Header, Query, Request, Response
-from pydantic import BaseModel
-from sqlalchemy import Row
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from sqlalchemy import Row, select
 from sqlalchemy.exc import IntegrityError
 
-from services.api.context import After, Context, Limit, Needs
-from services.api.errors import TooLarge, WrongMediaType
-from storage import captures, jobs
+from services.api.context import After, Context, Limit, Needs, read_body
+from services.api.errors import WrongMediaType
+from services.api.uploads import too_large
+from storage import captures, jobs, uploads
 from storage.captures import Stack
 from storage.database import captures as table
 from storage.database import new_id, page, writing
 from storage.errors import CaptureError, Conflict, NotFound
+from storage.uploads import Part
 from workflows.images import encode_png
-from workflows.ingest.bundle import Bundle, Manifest
+from workflows.ingest.bundle import Bundle
 
 router = APIRouter(tags=["captures"])
 CALL = "POST /v1/captures"
+FROM_UPLOAD_BYTES = 1 << 16
+ONLY = "all"
+"""The one part of an archive that is sent as one body."""
 
 
 class Capture(BaseModel):
@@ -59,6 +65,14 @@ class Captures(BaseModel):
     captures: list[Capture]
 
 
+class FromUpload(BaseModel):
+    """A finished resumable upload to make a capture from."""
+
+    model_config = ConfigDict(extra="forbid")
+    upload: str
+    name: str = Field("", max_length=200)
+
+
 Key = Annotated[str | None, Header(alias="Idempotency-Key", max_length=256)]
 
 
@@ -66,7 +80,12 @@ Key = Annotated[str | None, Header(alias="Idempotency-Key", max_length=256)]
     "/captures",
     status_code=201,
     openapi_extra={
-        "requestBody": {"content": {"application/zip": {"schema": {"type": "string", "format": "binary"}}}}
+        "requestBody": {
+            "content": {
+                "application/zip": {"schema": {"type": "string", "format": "binary"}},
+                "application/json": {"schema": FromUpload.model_json_schema()},
+            }
+        }
     },
 )
 async def upload(
@@ -76,20 +95,18 @@ async def upload(
     name: Annotated[str, Query(max_length=200, description="A name for people.")] = "",
     idempotency_key: Key = None,
 ) -> Capture:
-    """Upload a capture: the body is its ZIP, format envmatte-capture/1."""
+    """Make a capture: the body is its ZIP, format envmatte-capture/1, or names the upload that has brought it."""
     media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    if media_type != "application/zip":
+    if media_type == "application/json":
+        wanted = _parse(await read_body(request, FROM_UPLOAD_BYTES))
+        row = await anyio.to_thread.run_sync(_from_upload, context, wanted, idempotency_key)
+    elif media_type == "application/zip":
+        row = await _from_body(context, request, name, idempotency_key)
+    else:
         raise WrongMediaType(
-            f"send the ZIP of a capture as application/zip, not as {media_type or 'nothing'}"
+            f"send the ZIP of a capture as application/zip, not as {media_type or 'nothing'}, or the id of a finished "
+            "upload as application/json"
         )
-    limit = context.settings.upload_bytes
-    if int(request.headers.get("content-length", 0)) > limit:
-        raise _too_large(limit)
-    row = await anyio.to_thread.run_sync(_made, context, idempotency_key)
-    if row is None:
-        capture = new_id()
-        size = await _receive(context, capture, request.stream(), limit)
-        row = await anyio.to_thread.run_sync(_register, context, capture, size, name, idempotency_key)
     response.headers["Location"] = f"/v1/captures/{row.id}"
     return Capture.of(row)
 
@@ -123,7 +140,7 @@ def delete_capture(context: Needs, id: str) -> None:
             raise Conflict(f"job {busy[0]} works on capture {id}; cancel it first, or wait for it")
         captures.forget(c, id)
     context.objects.delete(captures.path(id))
-    context.objects.delete(captures.upload_path(id))
+    context.objects.delete(uploads.path(id))
 
 
 @router.get("/captures/{id}/frames/{n}.png", response_class=Response)
@@ -139,16 +156,79 @@ def get_frame(context: Needs, id: str, n: int) -> Response:
     return Response(encode_png(frame), media_type="image/png")
 
 
+async def _from_body(context: Context, request: Request, name: str, key: str | None) -> Row[Any]:
+    """Stream the archive into the store; what is cut off, too large or refused leaves nothing."""
+    limit = context.settings.upload_bytes
+    length = int(request.headers.get("content-length", 0))
+    if length > limit:
+        raise too_large(limit)
+    row = await anyio.to_thread.run_sync(_made, context, key)
+    if row is not None:
+        return row
+    await anyio.to_thread.run_sync(_check_room, context, length)
+    capture = new_id()
+    try:
+        size = await _receive(context, capture, request.stream(), limit)
+        part = Part(ONLY, size)
+        row = await anyio.to_thread.run_sync(_register, context, capture, [part], name, key, False)
+    except BaseException:
+        context.objects.delete(uploads.path(capture))
+        raise
+    if row.id != capture:  # a repeat with the same key was quicker
+        context.objects.delete(uploads.path(capture))
+    return row
+
+
 async def _receive(context: Context, capture: str, body: AsyncIterator[bytes], limit: int) -> int:
-    """Stream a body into the store; what is cut off or too large leaves nothing."""
     size = 0
-    async with context.objects.write(captures.upload_path(capture)) as file:
+    async with context.objects.write(uploads.part_path(capture, ONLY)) as file:
         async for part in body:
             size += len(part)
             if size > limit:
-                raise _too_large(limit)
+                raise too_large(limit)
             await file.write(part)
     return size
+
+
+def _parse(body: bytes) -> FromUpload:
+    try:
+        return FromUpload.model_validate_json(body)
+    except ValidationError as error:
+        raise RequestValidationError([{**e, "loc": ("body", *e["loc"])} for e in error.errors()]) from error
+
+
+def _from_upload(context: Context, wanted: FromUpload, key: str | None) -> Row[Any]:
+    """Make a capture from a finished upload, under the same id; a repeat answers with it."""
+    upload = wanted.upload
+    made = _made(context, key) or _find(context, upload)
+    if made is not None:
+        return made
+    with context.engine.connect() as c:
+        row = uploads.get(c, upload)
+        parts = uploads.parts_of(c, upload)
+    if row.offset < row.length:
+        raise Conflict(
+            f"{row.offset} of the {row.length} bytes of upload {upload} have come; send the rest first",
+            offset=row.offset,
+        )
+    try:
+        return _register(context, upload, parts, wanted.name, key, True)
+    except CaptureError:  # it would be refused again
+        with writing(context.engine) as c:
+            refused = uploads.forget(c, upload)
+        if refused:
+            uploads.remove(context.objects, upload)
+        raise
+    except NotFound:  # a repeat was quicker, or it was deleted
+        made = _find(context, upload)
+        if made is None:
+            raise
+        return made
+
+
+def _find(context: Context, capture: str) -> Row[Any] | None:
+    with context.engine.connect() as c:
+        return c.execute(select(table).where(table.c.id == capture)).one_or_none()
 
 
 def _made(context: Context, key: str | None) -> Row[Any] | None:
@@ -157,19 +237,29 @@ def _made(context: Context, key: str | None) -> Row[Any] | None:
         return captures.get(c, made) if made else None
 
 
-def _register(context: Context, capture: str, size: int, name: str, key: str | None) -> Row[Any]:
-    """Check an uploaded archive, and write it down with its ingest job; what is refused is deleted."""
-    path = captures.upload_path(capture)
+def _check_room(context: Context, length: int) -> None:
+    with context.engine.connect() as c:
+        uploads.check_room(c, context.objects, length)
+
+
+def _register(
+    context: Context, capture: str, parts: list[Part], name: str, key: str | None, resumable: bool
+) -> Row[Any]:
+    """Check an archive that is complete, and write it down as a capture with its ingest job."""
+    uploads.seal(context.objects, capture, parts)
+    with uploads.read(context.objects, capture) as file:
+        manifest = Bundle(file, context.settings.limits).manifest
     try:
-        manifest = _manifest(context, path)
         with writing(context.engine) as c:
+            if resumable and not uploads.forget(c, capture):
+                raise NotFound(f"upload {capture} is gone")
             job = jobs.add(c, "ingest", capture, {})
             captures.add(
                 c,
                 capture,
                 job,
                 name=name or manifest.name,
-                bytes=size,
+                bytes=sum(part.size for part in parts),
                 frames=len(manifest.frames),
                 program=manifest.program.model_dump(mode="json"),
             )
@@ -177,25 +267,7 @@ def _register(context: Context, capture: str, size: int, name: str, key: str | N
                 jobs.remember(c, key, CALL, capture)
             return captures.get(c, capture)
     except IntegrityError:  # a repeat with the same key was quicker
-        context.objects.delete(path)
         row = _made(context, key)
         if row is None:
             raise
         return row
-    except BaseException:
-        context.objects.delete(path)
-        raise
-
-
-def _manifest(context: Context, path: str) -> Manifest:
-    try:
-        with context.objects.read(path) as file:
-            return Bundle(file, context.settings.limits).manifest
-    except FileNotFoundError as error:
-        raise CaptureError("the body is empty: send the ZIP of a capture") from error
-
-
-def _too_large(limit: int) -> TooLarge:
-    return TooLarge(
-        f"an archive may have {limit} bytes; split the capture or raise ENVMATTE_UPLOAD_BYTES", limit=limit
-    )

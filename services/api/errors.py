@@ -6,8 +6,9 @@ from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse
+from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from storage.errors import (
     CaptureError,
@@ -17,6 +18,7 @@ from storage.errors import (
     GaveUp,
     ImageError,
     InvalidInput,
+    NoRoom,
     NotFound,
     OptionError,
 )
@@ -37,21 +39,37 @@ class NotAcceptable(InvalidInput):
     """An answer asked for in a media type that can't be given."""
 
 
+class BadHeader(InvalidInput):
+    """A header that is missing, or does not say what it should."""
+
+
+class WrongVersion(InvalidInput):
+    """A version of the protocol of uploads that is not spoken."""
+
+
+class ChecksumMismatch(InvalidInput):
+    """A body that is not what its checksum was made of."""
+
+
 class Unauthorized(EnvmatteError):
     """No key, or one that is not known."""
 
 
-PROBLEMS: dict[type[Exception], tuple[HTTPStatus, str, str]] = {
+PROBLEMS: dict[type[Exception], tuple[int, str, str]] = {
     CaptureError: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-capture", "The capture can't be used"),
     ImageError: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-image", "The image can't be used"),
     OptionError: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-option", "The options can't be used"),
     TooLarge: (HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too-large", "Too large"),
     WrongMediaType: (HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "wrong-media-type", "Wrong media type"),
     NotAcceptable: (HTTPStatus.NOT_ACCEPTABLE, "not-acceptable", "Not acceptable"),
+    BadHeader: (HTTPStatus.BAD_REQUEST, "bad-header", "A header can't be used"),
+    WrongVersion: (HTTPStatus.PRECONDITION_FAILED, "wrong-version", "Another version is spoken here"),
+    ChecksumMismatch: (460, "checksum-mismatch", "Not what the checksum was made of"),  # of tus
     InvalidInput: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-request", "The request can't be used"),
     Unauthorized: (HTTPStatus.UNAUTHORIZED, "unauthorized", "A key is needed"),
     NotFound: (HTTPStatus.NOT_FOUND, "not-found", "Not found"),
     Conflict: (HTTPStatus.CONFLICT, "conflict", "Not in this state"),
+    NoRoom: (HTTPStatus.INSUFFICIENT_STORAGE, "no-room", "The store is full"),
     Corrupt: (HTTPStatus.INTERNAL_SERVER_ERROR, "corrupt", "Stored data is missing or damaged"),
     GaveUp: (HTTPStatus.INTERNAL_SERVER_ERROR, "gave-up", "The work failed again and again"),
     Exception: (HTTPStatus.INTERNAL_SERVER_ERROR, "internal", "Something went wrong here"),
@@ -110,6 +128,10 @@ def register(app: FastAPI) -> None:
             field=field,
         )
         return answer(problem)
+
+    @app.exception_handler(ClientDisconnect)
+    async def _nobody_there(request: Request, error: ClientDisconnect) -> Response:
+        return Response(status_code=HTTPStatus.REQUEST_TIMEOUT)  # which nobody reads
 
     @app.exception_handler(Exception)
     async def _unforeseen(request: Request, error: Exception) -> JSONResponse:

@@ -238,7 +238,11 @@ def test_every_call_answers_an_unknown_id_with_a_problem(service: Service) -> No
             continue
         for method in calls:
             url = path.replace("{id}", "no-such-id").replace("{n}", "0")
-            check_problem(service.http.request(method, url), 404, "not-found")
+            answer = service.http.request(method, url, headers={"Tus-Resumable": "1.0.0"})
+            if method == "head":  # which has no body
+                assert answer.status_code == 404
+            else:
+                check_problem(answer, 404, "not-found")
             called += 1
     assert called >= 11
     check_problem(service.http.post("/v1/jobs", json={"capture": "no-such-id"}), 404, "not-found")

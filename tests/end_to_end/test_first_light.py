@@ -27,7 +27,7 @@ def test_an_upload_is_ingested(service: Service, bundle: Path, scene: Scene) -> 
     found = service.client.capture(made["id"])
     assert (found["state"], found["width"], found["height"], found["frames"]) == ("ready", 96, 72, 57)
     assert datetime.fromisoformat(found["created_at"]).utcoffset() is not None
-    assert not (service.data / "store" / "uploads" / f"{made['id']}.zip").exists()
+    assert not (service.data / "store" / "uploads" / made["id"]).exists()
 
 
 def test_frames_are_kept_as_they_were_filmed(service: Service, capture: str, scene: Scene, program) -> None:

@@ -129,7 +129,7 @@ def test_an_ingest_that_failed_for_no_fault_of_the_capture_can_be_retried(
             time.sleep(0.01)
         time.sleep(0.3)
         second = service.client.upload(bundle)
-        archive = service.data / "store" / "uploads" / f"{second['id']}.zip"
+        (archive,) = (service.data / "store" / "uploads" / second["id"]).glob("*.part")
         data = archive.read_bytes()
         archive.unlink()
         with pytest.raises(ServiceError, match="failed 3 times"):

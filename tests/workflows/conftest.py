@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 
-from storage.captures import Stack, upload_path
+from storage import uploads
+from storage.captures import Stack
 from storage.objects import Objects
 from workflows.ingest import frames
 from workflows.ingest.bundle import Limits
@@ -55,10 +56,11 @@ def put(objects: Objects) -> Callable[[str, bytes], None]:
 
     def store(capture: str, data: bytes) -> None:
         async def stream() -> None:
-            async with objects.write(upload_path(capture)) as writer:
+            async with objects.write(uploads.part_path(capture, "all")) as writer:
                 await writer.write(data)
 
         asyncio.run(stream())
+        uploads.seal(objects, capture, [uploads.Part("all", len(data))])
 
     return store
 

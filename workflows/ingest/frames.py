@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from storage.captures import Stack, create_stack, upload_path, write_slab
+from storage import uploads
+from storage.captures import Stack, create_stack, write_slab
 from storage.errors import CaptureError, ImageError
 from storage.objects import Objects
 from workflows import images
@@ -33,7 +34,7 @@ def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, int]:
     ------
     CaptureError
     """
-    with objects.read(upload_path(capture)) as file:
+    with uploads.read(objects, capture) as file:
         bundle = Bundle(file, limits)
         manifest = bundle.manifest
         first = _decode(bundle, manifest.frames[0].file, limits)
@@ -82,7 +83,7 @@ def read_slab(objects: Objects, capture: str, limits: Limits, slab: int, index: 
         Naming the frame that can't be decoded, or is of another size or kind than the first.
     """
     stack = Stack(objects, capture)
-    with objects.read(upload_path(capture)) as file:
+    with uploads.read(objects, capture) as file:
         bundle = Bundle(file, limits)
         of_slab = bundle.manifest.frames[index * slab : (index + 1) * slab]
         shape = (stack.height, stack.width, stack.channels)

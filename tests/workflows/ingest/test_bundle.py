@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from storage import uploads
 from storage.errors import CaptureError
 from storage.objects import Objects
 from workflows.ingest.bundle import Bundle, Limits
@@ -302,7 +303,7 @@ def test_an_archive_that_is_cut_off_is_refused(
         assert through(data[:length], io.BytesIO), length
     for length in (0, 1, 21, 22, 500, len(data) - 30, len(data) - 1):
         put("cut", data[:length])
-        assert through(b"", lambda _: objects.read("uploads/cut.zip")), length
+        assert through(b"", lambda _: uploads.read(objects, "cut")), length
 
 
 @pytest.mark.filterwarnings("ignore:Duplicate name")
@@ -327,7 +328,7 @@ def test_a_damaged_archive_is_a_capture_error_or_read(
         refusals += through(bytes(data), io.BytesIO)
         if case % 20 == 0:
             put("damaged", bytes(data))
-            through(b"", lambda _: objects.read("uploads/damaged.zip"))
+            through(b"", lambda _: uploads.read(objects, "damaged"))
         assert time.monotonic() - start < 2
     assert refusals > 200
 

@@ -1,0 +1,327 @@
+"""Resumable uploads over HTTP: tus 1.0 (https://tus.io/protocols/resumable-upload).
+
+Extensions: creation, creation-with-upload, checksum, expiration, termination.
+"""
+
+import base64
+import binascii
+import hashlib
+from collections.abc import AsyncIterator
+from datetime import UTC, datetime
+from email.utils import format_datetime
+from typing import TYPE_CHECKING, Annotated, Any
+
+import anyio
+import anyio.to_thread
+from fastapi import APIRouter, Depends, Header, Request, Response
+from sqlalchemy import Row
+from sqlalchemy.exc import IntegrityError
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import ClientDisconnect
+
+from services.api.context import Context, Needs
+from services.api.errors import BadHeader, ChecksumMismatch, TooLarge, WrongMediaType, WrongVersion
+from storage import uploads
+from storage.database import new_id, writing
+from storage.errors import InvalidInput, NotFound
+from storage.uploads import MOST_PARTS, Part
+
+if TYPE_CHECKING:
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+VERSION = "1.0.0"
+EXTENSIONS = "creation,creation-with-upload,checksum,expiration,termination"
+ALGORITHMS = ("sha1", "sha256")
+CHUNK = "application/offset+octet-stream"
+METADATA_BYTES = 8192
+PART = 64 << 20
+"""Bytes after which what has come is written down: what a killed server loses of one PATCH, at most."""
+SILENCE = 60.0
+"""Seconds without a byte after which a sender counts as gone: a connection may be lost without a word."""
+
+
+class Protocol:
+    """What tus asks of every exchange, an answer with a problem included."""
+
+    def __init__(self, app: "ASGIApp") -> None:
+        self._app = app
+
+    async def __call__(self, scope: "Scope", receive: "Receive", send: "Send") -> None:
+        if scope["type"] != "http" or not scope["path"].startswith("/v1/uploads"):
+            await self._app(scope, receive, send)
+            return
+
+        async def tell(message: "Message") -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                headers["Tus-Resumable"] = headers["Tus-Version"] = VERSION
+            await send(message)
+
+        # For clients whose surroundings let only GET and POST through.
+        method = Headers(scope=scope).get("x-http-method-override", scope["method"])
+        await self._app({**scope, "method": method.upper()}, receive, tell)
+
+
+def _version(
+    tus_resumable: Annotated[str | None, Header(description="The version of tus that is spoken.")] = None,
+) -> None:
+    if tus_resumable != VERSION:
+        raise WrongVersion(f"send `Tus-Resumable: {VERSION}`, the version of tus spoken here")
+
+
+router = APIRouter(prefix="/uploads", tags=["uploads"])
+Spoken = Depends(_version)
+
+
+@router.options("", status_code=204, response_class=Response)
+def get_protocol(context: Needs, response: Response) -> None:
+    """What is spoken here: version, extensions, and the bytes of the largest upload."""
+    response.headers["Tus-Extension"] = EXTENSIONS
+    response.headers["Tus-Checksum-Algorithm"] = ",".join(ALGORITHMS)
+    response.headers["Tus-Max-Size"] = str(context.settings.upload_bytes)
+
+
+@router.post("", status_code=201, dependencies=[Spoken], response_class=Response)
+async def create_upload(
+    context: Needs,
+    request: Request,
+    idempotency_key: Annotated[str | None, Header(max_length=256)] = None,
+) -> Response:
+    """Start an upload of `Upload-Length` bytes; the body may be the first of them."""
+    length = _number(request, "Upload-Length")
+    if length > context.settings.upload_bytes:
+        raise too_large(context.settings.upload_bytes)
+    checksum = Checksum.of(request)
+    with_body = request.headers.get("content-length", "0") != "0" or "transfer-encoding" in request.headers
+    if with_body:
+        _check_media_type(request)
+    metadata = _metadata(request)
+    row, new = await anyio.to_thread.run_sync(_create, context, length, metadata, idempotency_key)
+    if with_body and new:
+        row = await _append(context, request, row, checksum)
+    return Response(status_code=201, headers={"Location": f"/v1/uploads/{row.id}"} | _headers(row))
+
+
+@router.head("/{id}", dependencies=[Spoken], response_class=Response)
+def get_upload(context: Needs, id: str) -> Response:
+    """How far an upload is: `Upload-Offset` of `Upload-Length` bytes."""
+    with context.engine.connect() as c:
+        row = uploads.get(c, id)
+    headers = {"Upload-Length": str(row.length), "Cache-Control": "no-store"} | _headers(row)
+    return Response(headers=headers | ({"Upload-Metadata": row.metadata} if row.metadata else {}))
+
+
+@router.patch("/{id}", status_code=204, dependencies=[Spoken], response_class=Response)
+async def append(context: Needs, request: Request, id: str) -> Response:
+    """Send the bytes of an upload from `Upload-Offset` on.
+
+    What has come of a body that breaks off is kept, unless it has an `Upload-Checksum`: then it is kept
+    whole or not at all.
+    """
+    row = await anyio.to_thread.run_sync(_get, context, id)
+    _check_media_type(request)
+    checksum = Checksum.of(request)
+    uploads.check_offset(row, _number(request, "Upload-Offset"))
+    if row.parts >= MOST_PARTS:
+        raise InvalidInput(
+            f"upload {id} came in {row.parts} pieces, the most there may be; start again with larger ones",
+            limit=MOST_PARTS,
+        )
+    row = await _append(context, request, row, checksum)
+    return Response(status_code=204, headers=_headers(row))
+
+
+@router.delete("/{id}", status_code=204, dependencies=[Spoken], response_class=Response)
+def delete_upload(context: Needs, id: str) -> None:
+    """Give an upload up."""
+    with writing(context.engine) as c:
+        uploads.get(c, id)
+        uploads.forget(c, id)
+    uploads.remove(context.objects, id)
+
+
+class Checksum:
+    """What a body should hash to, as an ``Upload-Checksum`` header says."""
+
+    def __init__(self, algorithm: str, digest: bytes) -> None:
+        self._hash = hashlib.new(algorithm, usedforsecurity=False)
+        self._digest = digest
+        self.update = self._hash.update
+
+    @classmethod
+    def of(cls, request: Request) -> "Checksum | None":
+        """The checksum of a request, if it has one."""
+        header = request.headers.get("upload-checksum")
+        if header is None:
+            return None
+        algorithm, _, text = header.partition(" ")
+        if algorithm not in ALGORITHMS:
+            raise BadHeader(
+                f"Upload-Checksum: {algorithm!r} is not taken; use {' or '.join(ALGORITHMS)}",
+                field="Upload-Checksum",
+            )
+        return cls(algorithm, _base64(text, "Upload-Checksum"))
+
+    def check(self) -> None:
+        """Compare it with what has come."""
+        if self._hash.digest() != self._digest:
+            raise ChecksumMismatch(
+                "the bytes that came are not those that the checksum was made of; none was kept, send them again"
+            )
+
+
+async def _append(context: Context, request: Request, row: Row[Any], checksum: Checksum | None) -> Row[Any]:
+    """Store a body from an upload's offset on; returns the row as it is then."""
+    room = row.length - row.offset
+    if int(request.headers.get("content-length", 0)) > room:
+        raise _too_long(row)
+    body = _heard(request.stream())
+    stored: list[Part] = []
+    offset, more = row.offset, True
+    try:
+        while more:
+            name, size, more = new_id(), 0, False
+            async with context.objects.write(uploads.part_path(row.id, name)) as file:
+                stored.append(Part(name, 0))
+                try:
+                    async for data in body:
+                        size += len(data)
+                        room -= len(data)
+                        if room < 0:
+                            raise _too_long(row)
+                        if checksum:
+                            checksum.update(data)
+                        await file.write(data)
+                        if size >= PART:
+                            more = True
+                            break
+                except ClientDisconnect:
+                    if checksum:
+                        raise
+            stored[-1] = Part(name, size)
+            if not size:
+                context.objects.delete(uploads.part_path(row.id, stored.pop().name))
+            if not checksum:
+                offset = await anyio.to_thread.run_sync(_advance, context, row.id, offset, stored)
+                stored = []
+        if checksum:
+            checksum.check()
+            await anyio.to_thread.run_sync(_advance, context, row.id, offset, stored)
+    except BaseException:
+        with anyio.CancelScope(shield=True):
+            await anyio.to_thread.run_sync(_take_back, context, row.id, stored)
+        raise
+    return await anyio.to_thread.run_sync(_get, context, row.id)
+
+
+async def _heard(body: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
+    """A body, from which a client that falls silent counts as disconnected."""
+    while True:
+        try:
+            with anyio.fail_after(SILENCE):
+                data = await anext(body, None)
+        except TimeoutError as error:
+            raise ClientDisconnect from error
+        if data is None:
+            return
+        yield data
+
+
+def _advance(context: Context, upload: str, offset: int, parts: list[Part]) -> int:
+    with writing(context.engine) as c:
+        return uploads.advance(c, upload, offset, parts, context.settings.upload_seconds)
+
+
+def _take_back(context: Context, upload: str, parts: list[Part]) -> None:
+    """Remove parts that were stored and not written down; all there is, if their upload is gone meanwhile."""
+    try:
+        _get(context, upload)
+    except NotFound:
+        uploads.remove(context.objects, upload)
+        raise
+    for part in parts:
+        context.objects.delete(uploads.part_path(upload, part.name))
+
+
+def _get(context: Context, upload: str) -> Row[Any]:
+    with context.engine.connect() as c:
+        return uploads.get(c, upload)
+
+
+def _create(context: Context, length: int, metadata: str, key: str | None) -> tuple[Row[Any], bool]:
+    """The upload to send to, and whether it is new: a repeat with the same key goes on with the first one's."""
+    with writing(context.engine) as c:
+        expired = uploads.forget_expired(c)
+    for upload in expired:
+        uploads.remove(context.objects, upload)
+    try:
+        with writing(context.engine) as c:
+            row = uploads.by_key(c, key) if key else None
+            if row is not None:
+                return row, False
+            uploads.check_room(c, context.objects, length)
+            upload = new_id()
+            uploads.add(c, upload, length, metadata, context.settings.upload_seconds, key)
+            return uploads.get(c, upload), True
+    except IntegrityError:  # the repeat came at the same time
+        with context.engine.connect() as c:
+            row = uploads.by_key(c, key) if key else None
+        if row is None:
+            raise
+        return row, False
+
+
+def _headers(row: Row[Any]) -> dict[str, str]:
+    expires = format_datetime(datetime.fromtimestamp(row.expires_at, UTC), usegmt=True)
+    return {"Upload-Offset": str(row.offset), "Upload-Expires": expires}
+
+
+def _number(request: Request, name: str) -> int:
+    text = request.headers.get(name, "")
+    if not (text.isascii() and text.isdigit() and len(text) <= 18):
+        raise BadHeader(f"{name}: {text or 'nothing'!r} is no number of bytes; send one", field=name)
+    return int(text)
+
+
+def _metadata(request: Request) -> str:
+    """The ``Upload-Metadata`` of a request: pairs of a key and, in Base64, a value, checked and kept as they are."""
+    text = request.headers.get("upload-metadata", "")
+    if len(text) > METADATA_BYTES:
+        raise BadHeader(
+            f"Upload-Metadata may have {METADATA_BYTES} bytes", field="Upload-Metadata", limit=METADATA_BYTES
+        )
+    pairs = [pair.strip().partition(" ") for pair in text.split(",")] if text else []
+    for key, _, value in pairs:
+        _base64(value, "Upload-Metadata")
+        if not key.isascii():
+            raise BadHeader(f"Upload-Metadata: {key!r} is not ASCII", field="Upload-Metadata")
+    if len({key for key, _, _ in pairs} - {""}) < len(pairs):
+        raise BadHeader("Upload-Metadata: a key is empty, or there twice", field="Upload-Metadata")
+    return text
+
+
+def _base64(text: str, name: str) -> bytes:
+    try:
+        return base64.b64decode(text, validate=True)
+    except (binascii.Error, ValueError) as error:
+        raise BadHeader(f"{name}: {text!r} is not Base64", field=name) from error
+
+
+def _check_media_type(request: Request) -> None:
+    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if media_type != CHUNK:
+        raise WrongMediaType(f"send the bytes of an upload as {CHUNK}, not as {media_type or 'nothing'}")
+
+
+def _too_long(row: Row[Any]) -> TooLarge:
+    return TooLarge(
+        f"upload {row.id} was to have {row.length} bytes, and more have come; send no more than the rest",
+        limit=row.length,
+    )
+
+
+def too_large(limit: int) -> TooLarge:
+    """An archive over the limit of the settings."""
+    return TooLarge(
+        f"an archive may have {limit} bytes; split the capture or raise ENVMATTE_UPLOAD_BYTES", limit=limit
+    )
