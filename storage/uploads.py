@@ -233,7 +233,7 @@ class _Joined(io.RawIOBase):
             return 0
         file = self._part(n)
         file.seek(self._at - self._starts[n])
-        count = file.readinto(buffer[: self._starts[n + 1] - self._at])  # type: ignore[attr-defined]
+        count = file.readinto(memoryview(buffer)[: self._starts[n + 1] - self._at])  # type: ignore[attr-defined]
         self._at += count
         return int(count)
 
