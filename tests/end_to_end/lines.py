@@ -21,17 +21,21 @@ class Line:
         How often it cuts a connection before it holds.
     mean : int
         Bytes from the client between two cuts, in the mean.
+    back : bool
+        Whether half of the cuts come where all was sent, and the answer is on its way back.
     pace : float
         Seconds that 64 KiB from the client take at least.
     """
 
-    def __init__(self, target: str, *, cuts: int = 0, mean: int = 0, seed: int = 0, pace: float = 0) -> None:
+    def __init__(
+        self, target: str, *, cuts: int = 0, mean: int = 0, back: bool = False, seed: int = 0, pace: float = 0
+    ) -> None:
         self.target = target
         self.made = 0
         """Cuts so far."""
         self.carried = 0
         """Bytes from the client that were passed on."""
-        self._cuts, self._mean, self._pace = cuts, mean, pace
+        self._cuts, self._mean, self._back, self._pace = cuts, mean, back, pace
         self._random = random.Random(seed)
         self._lock = threading.Lock()
         self._listener = socket.create_server(("127.0.0.1", 0))
@@ -65,8 +69,7 @@ class Line:
         with self._lock:
             breaks = self.made < self._cuts
             budget = int(self._random.expovariate(1 / self._mean)) if breaks else None
-            # Half of the cuts come where all was sent, and the answer is on its way back.
-            back = self._random.random() < 0.5
+            back = self._back and self._random.random() < 0.5
         cut = threading.Event()
         answers = threading.Thread(target=self._answer, args=(server, client, cut), daemon=True)
         answers.start()
