@@ -16,6 +16,7 @@ from storage.objects import Objects
 from workflows import tiles
 from workflows.ingest import frames
 from workflows.ingest.bundle import Limits
+from workflows.ingest.measure import measure
 from workflows.options import parse_options
 
 
@@ -79,7 +80,7 @@ def _ingest_work(task: Task, tile: int) -> int:
 
 def _ingest_finish(task: Task) -> dict[str, Any]:
     _objects(task.store).sweep(captures.path(task.capture))
-    frames.measure(_objects(task.store), task.capture)
+    measure(_objects(task.store), task.capture)
     return {}
 
 

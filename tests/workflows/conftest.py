@@ -16,6 +16,7 @@ from storage.captures import Stack
 from storage.objects import Objects
 from workflows.ingest import frames
 from workflows.ingest.bundle import Limits
+from workflows.ingest.measure import measure
 
 Zip = Callable[..., bytes]
 Ingest = Callable[..., Stack]
@@ -80,7 +81,7 @@ def ingest(objects: Objects, put: Callable[[str, bytes], None]) -> Ingest:
         plan = frames.prepare(objects, capture, limits)
         for index in order(range(plan["tiles"])):
             frames.read_slab(objects, capture, limits, plan["slab"], index)
-        frames.measure(objects, capture)
+        measure(objects, capture)
         return Stack(objects, capture)
 
     return run

@@ -249,13 +249,14 @@ from pathlib import Path
 from storage.objects import Objects
 from workflows.ingest import frames
 from workflows.ingest.bundle import Limits
+from workflows.ingest.measure import measure
 
 def ingest(capture, memory):
     objects, limits = Objects(sys.argv[1]), Limits(1 << 30, memory)
     plan = frames.prepare(objects, capture, limits)
     for index in range(plan["tiles"]):
         frames.read_slab(objects, capture, limits, plan["slab"], index)
-    frames.measure(objects, capture)
+    measure(objects, capture)
     return plan["tiles"]
 
 def peak():
