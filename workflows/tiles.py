@@ -2,7 +2,7 @@
 
 from functools import lru_cache
 from itertools import product
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,20 +80,18 @@ def _recover_block(
     camera = TypeAdapter[Curve](Curve).validate_python(attributes["camera_curve"])
     noise = Noise(**attributes["noise"])
     codes, recovered = stack.read_masked(*span)
-    light, usable, repeats = _merge(
-        codes[:, recovered], np.array(attributes["patterns"]), program.count, camera
-    )
+    light, usable, worth = _merge(codes[:, recovered], attributes, program.count, camera)
     crosstalk = np.array(attributes["crosstalk"])
     if np.any(crosstalk != np.eye(3)):
         light = (light @ np.linalg.inv(crosstalk).T).astype(np.float32)
         usable &= usable.all(axis=2, keepdims=True)
     numbers, sent = program.constants
     photometry = fit_photometry(
-        light[:, numbers], to_light(sent, monitor), usable[:, numbers], noise, repeats[numbers]
+        light[:, numbers], to_light(sent, monitor), usable[:, numbers], noise, worth[:, numbers]
     )
     shown = program.measured
     measurements = np.ascontiguousarray(light[:, shown])
-    given = (noise, usable[:, shown], repeats[shown])
+    given = (noise, usable[:, shown], worth[:, shown])
     if options.method == "nn-dgsr":
         sensing = sensing_of(url, capture)
         transport = dgsr.recover(measurements, photometry, sensing, *given, **options.constants)
@@ -123,29 +121,52 @@ def _recover_block(
 
 
 def _merge(
-    codes: Codes, patterns: NDArray[np.intp], count: int, camera: Curve
-) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.intp]]:
-    """The mean light of each pattern's frames.
+    codes: Codes, attributes: dict[str, Any], count: int, camera: Curve
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
+    """The light of each pattern, from its frames.
 
     Returns
     -------
     light : (n, count, 3) float32
+        In units of what fills the camera's range in the shortest exposure.
     usable : (n, count, 3) bool
-        False where a frame is clipped, at black or at white.
-    repeats : (count,) intp
-        Frames of each pattern.
+        False where in every exposure some frame is clipped, at black or at white.
+    worth : (n, count, 3) float32
+        Frames of the shortest exposure that say as much.
+
+    Notes
+    -----
+    A frame that was exposed t times as long as the shortest has the value v = t x of the light x, with the variance
+    ``read + shot v``. Where the photons' noise counts most, the likelihood's maximum is ``sum v / sum t``, over the
+    exposures that are not clipped, with the variance ``shot x / sum t``: `worth` is ``sum t``. Read noise, which long
+    exposures have less of, is then rather overstated.
     """
-    look_up = table(camera, codes.dtype)
-    n = codes.shape[1]
-    light = np.zeros((n, count, 3), np.float32)
-    usable = np.ones((n, count, 3), bool)
+    look_up = table(camera, codes.dtype, attributes["storage"]["black"])
     top = np.iinfo(codes.dtype).max
-    for frame, pattern in zip(codes, patterns, strict=True):
-        light[:, pattern] += look_up[frame]
-        usable[:, pattern] &= (frame > 0) & (frame < top)
-    repeats = np.bincount(patterns, minlength=count)
-    light /= repeats[:, np.newaxis].astype(np.float32)
-    return light, usable, repeats
+    exposures = np.array(attributes["exposures"], np.float32)
+    exposures /= exposures.min()
+    shape = (codes.shape[1], count, 3)
+    light, worth = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    every, times = np.zeros(shape, np.float32), np.zeros(count, np.float32)
+    of_exposure: dict[tuple[int, float], list[int]] = {}
+    for frame, key in enumerate(zip(attributes["patterns"], exposures.tolist(), strict=True)):
+        of_exposure.setdefault(key, []).append(frame)
+    for (pattern, exposure), frames in of_exposure.items():
+        total = np.zeros((shape[0], 3), np.float32)
+        whole = np.ones((shape[0], 3), bool)
+        for frame in frames:
+            total += look_up[codes[frame]]
+            whole &= (codes[frame] > 0) & (codes[frame] < top)
+        time = np.float32(len(frames) * exposure)
+        light[:, pattern] += np.where(whole, total, 0)
+        worth[:, pattern] += np.where(whole, time, 0)
+        every[:, pattern] += total
+        times[pattern] += time
+    usable = worth > 0
+    np.copyto(worth, times[:, np.newaxis], where=~usable)
+    np.copyto(light, every, where=~usable)
+    light /= worth
+    return light, usable, worth
 
 
 def grid_of(url: str, capture: str, options: RecoveryOptions) -> tuple[int, int]:

@@ -9,7 +9,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import tifffile
+from numpy.typing import NDArray
 
 from storage import uploads
 from storage.captures import Stack
@@ -85,6 +88,32 @@ def ingest(objects: Objects, put: Callable[[str, bytes], None]) -> Ingest:
         return Stack(objects, capture)
 
     return run
+
+
+@pytest.fixture(scope="session")
+def make_dng() -> Callable[..., bytes]:
+    """Makes a DNG of a sensor's counts, the least that LibRaw takes for one."""
+
+    def make(
+        counts: NDArray[np.uint16], black: int, white: int, pattern: tuple[int, ...] = (0, 1, 1, 2)
+    ) -> bytes:
+        tags = [
+            (271, "s", 0, "Acme", True),
+            (272, "s", 0, "Box", True),
+            (33421, "H", 2, (2, 2), True),  # the colour filter's size, and its colours
+            (33422, "B", 4, bytes(pattern), True),
+            (50706, "B", 4, bytes((1, 4, 0, 0)), True),  # the DNG's version
+            (50708, "s", 0, "Acme Box", True),
+            (50714, "I", 1, black, True),
+            (50717, "I", 1, white, True),
+            (50721, "2i", 9, tuple(v for n in range(9) for v in (int(n % 4 == 0), 1)), True),  # colour matrix
+            (50728, "2I", 3, (1, 1) * 3, True),  # neutral
+        ]
+        target = io.BytesIO()
+        tifffile.imwrite(target, counts, photometric="cfa", extratags=tags)
+        return target.getvalue()
+
+    return make
 
 
 @pytest.fixture

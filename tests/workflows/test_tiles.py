@@ -14,12 +14,13 @@ import pytest
 from storage import mattes
 from storage.errors import Corrupt
 from storage.objects import Objects
+from workflows.composite import composite
 from workflows.images import decode, encode_png
 from workflows.ingest.bundle import Limits
 from workflows.jobs import Task, run_finish, run_prepare, run_tile
 from workflows.scene import Scene, nested_program, write_capture
 from workflows.simulate import glass_ball
-from workflows.tiles import cut
+from workflows.tiles import _merge, cut
 
 Ingest = Callable[..., object]
 Digests = Callable[[str], dict[str, str]]
@@ -219,3 +220,66 @@ def test_what_the_store_lacks_is_corrupt(
     recover(bundles[False], tile=1024)
     with pytest.raises(Corrupt, match="none is not in the store"):
         run_tile("recover", Task(objects.url, capture, matte, {}, Limits(1, 1), {}), 0)
+
+
+def bracketed(data: bytes, exposures: tuple[float, ...]) -> bytes:
+    """A capture of 16 bits as a camera of 8 sees it, several times as long."""
+    rng = np.random.default_rng(1)
+    target = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(data)) as archive, zipfile.ZipFile(target, "w") as out:
+        record = json.loads(archive.read("capture.json"))
+        frames = []
+        for frame in record["frames"]:
+            light = decode(archive.read(frame["file"]), memory=1 << 24) / 65535
+            for exposure in exposures:
+                value = exposure * light + rng.normal(0, 0.004, light.shape)
+                name = f"{frame['pattern']}-{exposure}.png"
+                out.writestr(name, encode_png(np.rint(np.clip(value, 0, 1) * 255).astype(np.uint8)))
+                frames.append({"file": name, "pattern": frame["pattern"], "exposure": exposure / 50})
+        out.writestr("capture.json", json.dumps(record | {"frames": frames}))
+    return target.getvalue()
+
+
+def test_exposures_are_merged_by_what_they_say(objects: Objects, ingest: Ingest) -> None:
+    scene = glass_ball(44, 36, monitor=(64, 48), rays=4)
+    program = nested_program((64, 48), ((4, 3, 14), (8, 6, 10)), levels=5)
+    target = io.BytesIO()
+    write_capture(scene, program, target, noise=0, depth=16, offset=0.003, gain=0.05)
+    backdrop = np.random.default_rng(3).random((3, 4, 3), np.float32)
+    exact = scene.truth(backdrop, offset=0.003, gain=0.05)
+
+    def error(capture: str, data: bytes) -> float:
+        ingest(capture, data)
+        task = Task(objects.url, capture, f"m-{capture}", {}, Limits(1 << 30, 1 << 26), {})
+        task = replace(task, plan=run_prepare("recover", task))
+        for tile in range(task.plan["tiles"]):
+            run_tile("recover", task, tile)
+        got = composite(mattes.Matte(objects, task.matte), backdrop)[..., :3]
+        return float(np.sqrt(np.mean((got - exact) ** 2)))
+
+    one = error("one", bracketed(target.getvalue(), (1,)))
+    # the longest clips the brightest pixels
+    many = error("many", bracketed(target.getvalue(), (1, 4, 20)))
+    assert many < 0.4 * one
+
+
+def test_merged_light_leaves_out_what_is_clipped() -> None:
+    storage = {"black": 0, "full": 1.0}
+    codes = np.array(
+        [[[51, 0, 255]], [[102, 0, 255]], [[204, 4, 255]], [[255, 8, 255]], [[10, 20, 30]]], np.uint8
+    )
+    given = {"patterns": [0, 0, 0, 0, 1], "exposures": [0.5, 1.0, 2.0, 4.0, 1.0], "storage": storage}
+    light, usable, worth = _merge(codes, given, 2, "linear")
+    assert usable[0].tolist() == [[True, True, False], [True, True, True]]
+    np.testing.assert_allclose(worth[0], [[7, 12, 15], [2, 2, 2]])
+    np.testing.assert_allclose(light[0, 0, :2] * 255, [357 / 7, 12 / 12], rtol=1e-6)
+    np.testing.assert_allclose(light[0, 1] * 255, [5, 10, 15], rtol=1e-6)
+
+
+def test_a_clipped_repeat_takes_its_whole_exposure_out() -> None:
+    codes = np.array([[[250, 100, 9]], [[255, 110, 0]]], np.uint8)
+    given = {"patterns": [0, 0], "exposures": [1.0, 1.0], "storage": {"black": 0, "full": 1.0}}
+    light, usable, worth = _merge(codes, given, 1, "linear")
+    assert usable[0, 0].tolist() == [False, True, False]
+    np.testing.assert_allclose(light[0, 0] * 255, [252.5, 105, 4.5])
+    np.testing.assert_array_equal(worth, 2)

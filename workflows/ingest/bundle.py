@@ -4,7 +4,7 @@ import stat
 import zipfile
 import zlib
 from dataclasses import dataclass
-from typing import BinaryIO, Literal
+from typing import Annotated, BinaryIO, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -23,11 +23,12 @@ TAGS = {"constant", "bernoulli", "images", "Gamma"}
 
 
 class Frame(BaseModel):
-    """One frame: its image file in the bundle, and the pattern it saw."""
+    """One frame: its image file in the bundle, the pattern it saw, and for how long, in seconds or any other unit."""
 
     model_config = ConfigDict(frozen=True)
     file: str
     pattern: int = Field(ge=0)
+    exposure: Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)] = 1.0
 
 
 class Manifest(BaseModel):

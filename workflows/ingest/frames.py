@@ -10,11 +10,10 @@ from storage.errors import CaptureError, ImageError
 from storage.objects import Objects
 from workflows import images
 from workflows.grids import smallest_grid
+from workflows.ingest import stills
 from workflows.ingest.bundle import Bundle, Limits
 from workflows.program import Images
 from workflows.tone import Response
-
-FORMATS = ("PNG", "TIFF")
 
 
 def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, int]:
@@ -32,7 +31,8 @@ def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, int]:
     with uploads.read(objects, capture) as file:
         bundle = Bundle(file, limits)
         manifest = bundle.manifest
-        first = _decode(bundle, manifest.frames[0].file, limits)
+        first = stills.read(bundle, manifest.frames[0].file, limits)
+        storage = stills.storage_of(bundle, first, limits)
         mask = None
         if manifest.mask is not None:
             mask = np.any(_decode(bundle, manifest.mask, limits), axis=2)
@@ -56,12 +56,17 @@ def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, int]:
         objects,
         capture,
         (len(manifest.frames), height, width, channels),
-        first.dtype,
+        storage.dtype,
         memory=limits.memory,
         attributes={
             "program": manifest.program.model_dump(mode="json"),
-            "response": TypeAdapter(Response).dump_python(manifest.response, mode="json"),
+            # Float values are linear light, whatever is left unsaid.
+            "response": "linear"
+            if first.dtype == np.float32
+            else TypeAdapter(Response).dump_python(manifest.response, mode="json"),
             "patterns": [frame.pattern for frame in manifest.frames],
+            "exposures": [frame.exposure for frame in manifest.frames],
+            "storage": {"black": storage.black, "full": storage.full},
         },
         mask=mask,
         images=patterns,
@@ -83,23 +88,25 @@ def read_slab(objects: Objects, capture: str, limits: Limits, slab: int, index: 
         of_slab = bundle.manifest.frames[index * slab : (index + 1) * slab]
         shape = (stack.height, stack.width, stack.channels)
         frames = np.empty((len(of_slab), *shape), stack.dtype)
+        storage = stills.Storage(stack.dtype, **stack.attributes["storage"])
+        kind = np.dtype(np.float32) if storage.black else stack.dtype
         for n, frame in enumerate(of_slab):
-            pixels = _decode(bundle, frame.file, limits)
-            if pixels.shape != shape or pixels.dtype != stack.dtype:
+            pixels = stills.read(bundle, frame.file, limits)
+            if pixels.shape != shape or pixels.dtype != kind:
                 raise CaptureError(
                     f"{frame.file} is {_size(pixels)} with {pixels.shape[2]} channels of {pixels.dtype}, the first "
-                    f"frame {stack.width} x {stack.height} with {stack.channels} of {stack.dtype}: all frames must "
+                    f"frame {stack.width} x {stack.height} with {stack.channels} of {kind}: all frames must "
                     "be of one size and kind",
                     entry=frame.file,
                 )
-            frames[n] = pixels
+            frames[n] = storage.encode(pixels)
     write_slab(objects, capture, index * slab, frames)
     return int(frames.shape[0] * frames.shape[1] * frames.shape[2])
 
 
 def _decode(bundle: Bundle, entry: str, limits: Limits) -> images.Codes:
     try:
-        return images.decode(bundle.read(entry), memory=limits.image, formats=FORMATS)
+        return images.decode(bundle.read(entry), memory=limits.image)
     except ImageError as error:
         raise CaptureError(f"{entry}: {error.detail}", entry=entry, **error.fields) from error
 

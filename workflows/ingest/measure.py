@@ -14,6 +14,8 @@ from workflows.tone import Curve, Response, estimate, table, to_light
 
 SAMPLES = 20_000
 """Pixels, about, from which the noise and unknown curves are measured."""
+FRAMES = 64
+"""Frames of constant levels, at most, from which they are."""
 
 
 def measure(objects: Objects, capture: str) -> None:
@@ -27,32 +29,72 @@ def measure(objects: Objects, capture: str) -> None:
     stack = Stack(objects, capture)
     stack.check()
     program = Program.model_validate(stack.attributes["program"])
-    patterns = np.array(stack.attributes["patterns"])
-    numbers, sent = program.constants
-    codes = np.stack([_sample(stack, int(np.flatnonzero(patterns == n)[0])) for n in numbers], axis=1)
-    top = np.iinfo(stack.dtype).max
+    frames, sent, exposures = constant_frames(stack, program)
+    codes = np.stack([_sample(stack, frame) for frame in frames], axis=1)
+    top, black = np.iinfo(stack.dtype).max, stack.attributes["storage"]["black"]
     usable = (codes > 0) & (codes < top)
-
-    whole = usable.all(axis=(1, 2))
-    values = codes[whole].astype(np.float32) / np.float32(top)
     grey = np.ptp(sent, axis=1) == 0
-    monitor, camera = estimate(
+    found = estimate(
         sent[grey, 0],
-        values[:, grey].transpose(1, 0, 2).reshape(int(grey.sum()), -1),
+        exposures[grey],
+        _by_value(table("linear", stack.dtype, black)[codes[:, grey]]),
+        _by_value(usable[:, grey]),
         program.monitor.response,
         TypeAdapter(Response).validate_python(stack.attributes["response"]),
     )
-    look_up = table(camera, stack.dtype)
-    light, shown = look_up[codes], to_light(sent, monitor)
+    # Of one exposure, so that they have one noise.
+    shortest = np.flatnonzero(exposures == exposures.min())
+    codes, usable, sent, grey = codes[:, shortest], usable[:, shortest], sent[shortest], grey[shortest]
+    light, shown = table(found.camera, stack.dtype, black)[codes], to_light(sent, found.monitor)
     # what the channels see of each other's colours is no noise
     some = grey if np.count_nonzero(grey) >= 4 else np.ones_like(grey)
-    noise = estimate_noise(light[:, some], shown[some], usable[:, some], 1 / top)
+    noise = estimate_noise(light[:, some], shown[some], usable[:, some], 1 / (top - black))
     stack.annotate(
-        monitor_curve=_plain(monitor),
-        camera_curve=_plain(camera),
+        monitor_curve=_plain(found.monitor),
+        camera_curve=_plain(found.camera),
+        assumed_curves=found.assumed,
         noise={"read": noise.read, "shot": noise.shot},
         crosstalk=estimate_crosstalk(light, shown, usable).tolist(),
     )
+
+
+def constant_frames(
+    stack: Stack, program: Program
+) -> tuple[list[int], NDArray[np.float32], NDArray[np.float32]]:
+    """Frames of constant levels to measure by: one a pattern and exposure, from dark to bright.
+
+    Returns
+    -------
+    frames : list of int
+        `FRAMES` of them at most.
+    sent : (k, 3) float32
+        What the monitor showed in each.
+    exposures : (k,) float32
+        In units of the stack's shortest.
+    """
+    exposures = np.array(stack.attributes["exposures"], np.float32)
+    exposures /= exposures.min()
+    numbers, sent = program.constants
+    first: dict[tuple[int, float], int] = {}
+    for frame, key in enumerate(zip(stack.attributes["patterns"], exposures.tolist(), strict=True)):
+        first.setdefault(key, frame)
+    place = {int(number): at for at, number in enumerate(numbers)}
+    found = [
+        (place[pattern], exposure, frame) for (pattern, exposure), frame in first.items() if pattern in place
+    ]
+    found.sort(key=lambda f: (f[1], float(sent[f[0]].sum()), f[2]))
+    if len(found) > FRAMES:
+        found = [found[at] for at in np.linspace(0, len(found) - 1, FRAMES).astype(int)]
+    return (
+        [frame for _, _, frame in found],
+        sent[[at for at, _, _ in found]],
+        np.array([exposure for _, exposure, _ in found], np.float32),
+    )
+
+
+def _by_value(values: NDArray[Any]) -> NDArray[Any]:
+    """(k, 3 n) of (n, k, 3)."""
+    return values.transpose(1, 0, 2).reshape(values.shape[1], -1)
 
 
 def _sample(stack: Stack, frame: int) -> NDArray[Any]:

@@ -26,7 +26,7 @@ def recover(
     sensing: Sensing,
     noise: Noise,
     usable: NDArray[np.bool_] | None = None,
-    frames: NDArray[np.integer] | None = None,
+    frames: NDArray[np.number] | None = None,
     *,
     prior: Literal["gaussian", "none"] = "gaussian",
     levels: Literal["hierarchical", "direct"] = "hierarchical",
@@ -60,7 +60,7 @@ def recover(
         Noise of a frame.
     usable : (n, m, 3) bool, optional
         False where a measurement says nothing, as where the camera clipped it; all say something if left out.
-    frames : (m,) integer, optional
+    frames : (m,) or (n, m, 3) number, optional
         Frames averaged into each measurement; one each if left out.
     prior : {"gaussian", "none"}
         Whether T is filtered by oriented Gaussians fitted to its clusters (Sect. 4.2.2).

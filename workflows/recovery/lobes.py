@@ -38,7 +38,7 @@ def recover(
     patterns: Patterns,
     noise: Noise,
     usable: NDArray[np.bool_] | None = None,
-    frames: NDArray[np.integer] | None = None,
+    frames: NDArray[np.number] | None = None,
     *,
     most_lobes: int = 3,
     fit_resolution: float = 0.65,
@@ -68,8 +68,8 @@ def recover(
         Noise of a frame.
     usable : (n, m, 3) bool, optional
         False where a value says nothing, as where the camera clipped it.
-    frames : (m,) integer, optional
-        Frames averaged into each value; one each if left out.
+    frames : (m,) or (n, m, 3) number, optional
+        Frames averaged into each value, above 0; one each if left out.
     most_lobes : int
         Most lobes of a T.
     fit_resolution, resolution : float

@@ -68,7 +68,7 @@ def fit_photometry(
     levels: NDArray[np.float32],
     usable: NDArray[np.bool_],
     noise: Noise,
-    frames: NDArray[np.integer],
+    frames: NDArray[np.number],
 ) -> Photometry:
     """Fit S and rho to the frames of constant monitors.
 
@@ -82,8 +82,8 @@ def fit_photometry(
         False where a value says nothing, as where the camera clipped it.
     noise : Noise
         Noise of one frame.
-    frames : (k,) integer
-        Frames averaged into each value, 1 or more.
+    frames : (k,) or (n, k, 3) number
+        Frames averaged into each value, above 0; longer exposures count as more.
 
     Returns
     -------
@@ -102,7 +102,7 @@ def fit_photometry(
     _check(values, levels, usable)
     if (np.ptp(levels, axis=0) == 0).any():
         raise ValueError("every channel needs at least two different constant levels")
-    weight = frames[:, None] / noise.variance(values).astype(np.float64)
+    weight = (frames[:, None] if frames.ndim == 1 else frames) / noise.variance(values).astype(np.float64)
     weight = np.where(_decisive(levels, usable), weight, 0)
     total = weight.sum(axis=1)
     mean_level = (weight * levels).sum(axis=1) / total
@@ -246,7 +246,7 @@ def normalise(
     noise: Noise,
     least_contrast: float,
     usable: NDArray[np.bool_] | None = None,
-    frames: NDArray[np.integer] | None = None,
+    frames: NDArray[np.number] | None = None,
 ) -> Measured:
     """Bring measurements to the +-1 form of eq. 8.
 
@@ -262,8 +262,8 @@ def normalise(
         A channel whose rho is below this many standard deviations of a mid-grey value says nothing of T.
     usable : (n, m, 3) bool, optional
         False where a value says nothing, as where the camera clipped it; all say something if left out.
-    frames : (m,) integer, optional
-        Frames averaged into each value; one each if left out.
+    frames : (m,) or (n, m, 3) number, optional
+        Frames averaged into each value, above 0; one each if left out.
 
     Returns
     -------
@@ -285,6 +285,8 @@ def normalise(
     if usable is not None:
         there &= usable.transpose(0, 2, 1)
     light = np.where(there, light, 0)
+    if frames is not None and frames.ndim == 3:
+        frames = frames.transpose(0, 2, 1)
     variance = noise.variance(light) / (1 if frames is None else frames)
     ends = np.stack([photometry.black, photometry.white], axis=2)
     value = np.where(there, 2 * (light - S) / scale - 1, 0)

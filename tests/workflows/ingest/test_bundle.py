@@ -71,7 +71,7 @@ def test_a_bundle_is_read(make_zip: Zip, pack: int) -> None:
 def test_unknown_fields_and_files_are_accepted(make_zip: Zip) -> None:
     def extend(record: dict[str, Any]) -> None:
         record["made_by"] = {"tool": "x", "at": [1, 2]}
-        record["frames"][0]["exposure"] = 0.1
+        record["frames"][0]["aperture"] = 5.6
         record["program"]["note"] = "text"
         record["program"]["monitor"]["serial"] = "7"
         record["program"]["parts"][1]["shuffled"] = False

@@ -1,0 +1,136 @@
+"""Frames of float values and camera RAW, and several exposures, from a bundle into the stack."""
+
+import io
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import OpenEXR
+import pytest
+import tifffile
+from numpy.typing import NDArray
+
+from storage.captures import Stack
+from storage.errors import CaptureError
+from workflows.images import encode_png
+from workflows.tone import BLACK, table
+
+Zip = Callable[..., bytes]
+Ingest = Callable[..., Stack]
+Dng = Callable[..., bytes]
+HEIGHT, WIDTH = 20, 36
+LEVELS = [0, 0.5, 1]
+
+
+def record(suffix: str, frames: int = 6, **more: Any) -> dict[str, Any]:
+    return {
+        "format": "envmatte-capture/1",
+        "program": {
+            "monitor": {"width": 64, "height": 48},
+            "parts": [
+                {"kind": "constant", "levels": LEVELS},
+                {"kind": "bernoulli", "columns": 4, "rows": 3, "count": 3, "seed": 1},
+            ],
+        },
+        "frames": [{"file": f"{n}.{suffix}", "pattern": n % 6} for n in range(frames)],
+    } | more
+
+
+def light(peak: float, noise: float = 0.002) -> NDArray[np.float32]:
+    """Six frames: three constants, and what are three patterns."""
+    rng = np.random.default_rng(2)
+    rho = rng.uniform(0.2, 0.8, (HEIGHT, WIDTH, 3))
+    share = [*LEVELS, *rng.uniform(0, 1, 3)]
+    frames = peak * np.stack([s * rho for s in share])
+    return (frames + rng.normal(0, noise * peak, frames.shape)).astype(np.float32)
+
+
+def exr(pixels: NDArray[Any]) -> bytes:
+    target = io.BytesIO()
+    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION}, {"RGB": pixels}).write(target)
+    return target.getvalue()
+
+
+def float_tiff(pixels: NDArray[Any]) -> bytes:
+    target = io.BytesIO()
+    tifffile.imwrite(target, pixels, photometric="rgb")
+    return target.getvalue()
+
+
+def decoded(stack: Stack) -> NDArray[Any]:
+    storage = stack.attributes["storage"]
+    look_up = table(stack.attributes["camera_curve"], stack.dtype, storage["black"])
+    return look_up[stack.read()] * storage["full"]
+
+
+@pytest.mark.parametrize(("suffix", "encode"), [("exr", exr), ("tif", float_tiff)])
+@pytest.mark.parametrize("peak", [0.001, 1.0, 5000.0])
+def test_float_frames_are_stored_in_units_of_the_white_frame(
+    make_zip: Zip, ingest: Ingest, suffix: str, encode: Callable[..., bytes], peak: float
+) -> None:
+    frames = light(peak)
+    stack = ingest("c", make_zip(record(suffix), {f"{n}.{suffix}": encode(f) for n, f in enumerate(frames)}))
+    assert stack.dtype == np.uint16
+    assert stack.attributes["camera_curve"] == "linear"
+    # 1.05 times the largest of white, over 61439 steps; black's noise is on both sides of zero
+    assert stack.attributes["storage"]["full"] == pytest.approx(1.05 * frames[2].max())
+    np.testing.assert_allclose(decoded(stack), frames, atol=0.6 * 1.05 * frames[2].max() / (65535 - BLACK))
+    assert (decoded(stack) < 0).any()
+    assert stack.attributes["assumed_curves"] == []
+
+
+def test_what_is_no_number_or_out_of_range_is_clipped(make_zip: Zip, ingest: Ingest) -> None:
+    frames = light(1.0)
+    frames[2, 5, 5] = 1e6  # a glint does not set the scale
+    frames[4, 0, 0] = np.inf, np.nan, -np.inf
+    frames[4, 0, 1] = 1e6, -1e6, 0
+    stack = ingest("c", make_zip(record("exr"), {f"{n}.exr": exr(f) for n, f in enumerate(frames)}))
+    assert stack.attributes["storage"]["full"] < 5
+    codes = stack.read()[4, 0, :2].tolist()
+    assert codes == [[65535, 0, 0], [65535, 0, BLACK]]
+
+
+def test_raw_frames_are_stored_in_units_of_the_white_level(
+    make_zip: Zip, ingest: Ingest, make_dng: Dng
+) -> None:
+    counts = np.random.default_rng(5).integers(200, 3900, (6, 2 * HEIGHT, 2 * WIDTH), np.uint16)
+    counts[4, 0, 0] = 4095
+    stack = ingest(
+        "c", make_zip(record("DNG"), {f"{n}.DNG": make_dng(c, 256, 4095) for n, c in enumerate(counts)})
+    )
+    assert stack.read().shape == (6, HEIGHT, WIDTH, 3)
+    assert stack.attributes["storage"] == {"black": BLACK, "full": 1.0}
+    assert stack.read()[4, 0, 0, 0] == 65535
+    red = (counts[:, ::2, ::2].astype(np.float32) - 256) / (4095 - 256)
+    got = decoded(stack)[..., 0]
+    got[4, 0, 0] = red[4, 0, 0]
+    np.testing.assert_allclose(got, red, atol=1e-5)
+
+
+def test_floats_have_no_curve(make_zip: Zip, ingest: Ingest) -> None:
+    files = {f"{n}.exr": exr(f) for n, f in enumerate(light(1.0))}
+    with pytest.raises(CaptureError, match="hold linear light") as caught:
+        ingest("c", make_zip(record("exr", response="srgb"), files))
+    assert caught.value.fields == {"entry": "capture.json", "field": "response"}
+
+
+def test_a_white_frame_without_light_is_refused(make_zip: Zip, ingest: Ingest) -> None:
+    files = {f"{n}.exr": exr(f * (n != 2)) for n, f in enumerate(light(1.0))}
+    with pytest.raises(CaptureError, match="holds no light") as caught:
+        ingest("c", make_zip(record("exr"), files))
+    assert caught.value.fields == {"entry": "2.exr"}
+
+
+def test_integers_among_floats_are_refused(make_zip: Zip, ingest: Ingest) -> None:
+    files = {f"{n}.exr": exr(f) for n, f in enumerate(light(1.0))}
+    files["4.exr"] = encode_png(np.ones((HEIGHT, WIDTH, 3), np.uint16))
+    with pytest.raises(CaptureError, match="one size and kind") as caught:
+        ingest("c", make_zip(record("exr"), files))
+    assert caught.value.fields == {"entry": "4.exr"}
+
+
+def test_raw_of_a_camera_that_is_not_known_is_refused(make_zip: Zip, ingest: Ingest) -> None:
+    files = {f"{n}.nef": bytes(9000) for n in range(6)}
+    with pytest.raises(CaptureError, match=r"^0\.nef: this camera's RAW format is not known") as caught:
+        ingest("c", make_zip(record("nef"), files))
+    assert caught.value.fields == {"entry": "0.nef"}
