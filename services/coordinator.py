@@ -208,7 +208,10 @@ class Coordinator:
         with writing(self._engine) as c:
             jobs.lay_down(c, drive.job, plan)
             if drive.kind == "ingest":
-                captures.change(c, drive.task.capture, width=plan["width"], height=plan["height"])
+                found = {name: plan[name] for name in ("width", "height", "frames")}
+                captures.change(c, drive.task.capture, **found)
+            for line in plan.get("notes", ()):
+                jobs.note(c, drive.job, line)
             jobs.enter(c, drive.job, drive.stage)
 
     def _finished(self, drive: Drive, figures: dict[str, Any]) -> None:

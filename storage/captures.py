@@ -1,8 +1,9 @@
 """A capture: the frame stack, and its record.
 
 In the store, under ``captures/ID``, a zarr group: ``frames`` (frame, y, x, channel), the optional ``mask`` (y, x) and
-``images/N`` (row, column, channel), the patterns that came as images. Its attributes hold the manifest. The archive
-that was uploaded lies where `storage.uploads` puts it until its frames are in the stack.
+``images/N`` (row, column, channel), the patterns that came as images; of a video also ``shares`` (share, column),
+which of its frames make up each frame of the stack. Its attributes hold the manifest. The archive that was uploaded
+lies where `storage.uploads` puts it until its frames are in the stack.
 """
 
 import time
@@ -38,6 +39,7 @@ def create_stack(
     attributes: dict[str, Any],
     mask: NDArray[np.bool_] | None,
     images: Sequence[NDArray[np.float32]],
+    shares: NDArray[np.int64] | None = None,
 ) -> int:
     """Make the empty stack of a capture, in place of an earlier one.
 
@@ -51,6 +53,8 @@ def create_stack(
         The manifest, as JSON.
     mask : (height, width) bool, optional
     images : sequence of (rows, columns, 1 or 3) float32
+    shares : (k, 3) int64, optional
+        What a video's frames go into: a frame of the stack, a time in ticks, and a weight, in this order.
 
     Returns
     -------
@@ -81,6 +85,8 @@ def create_stack(
     )
     if mask is not None:
         group.create_array("mask", data=mask, config=EVERY_CHUNK, dimension_names=("y", "x"))
+    if shares is not None:
+        group.create_array("shares", data=shares, config=EVERY_CHUNK, dimension_names=("share", "column"))
     for n, image in enumerate(images):
         group.create_array(
             f"images/{n}", data=image, config=EVERY_CHUNK, dimension_names=("row", "column", "channel")
@@ -161,6 +167,10 @@ class Stack:
             np.asarray(self._array(f"images/{n}")[:], np.float32)
             for n in sorted(int(name) for name in self._group["images"])  # type: ignore[union-attr]
         ]
+
+    def shares(self) -> NDArray[np.int64]:
+        """What the frames of a video go into, as given to `create_stack`."""
+        return np.asarray(self._array("shares")[:], np.int64)
 
     def check(self) -> None:
         """See that every chunk is there, without reading them.

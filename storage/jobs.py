@@ -72,7 +72,7 @@ def enter(connection: Connection, job: str, stage: str) -> None:
     note(connection, job, stage)
 
 
-def lay_down(connection: Connection, job: str, plan: dict[str, int]) -> None:
+def lay_down(connection: Connection, job: str, plan: dict[str, Any]) -> None:
     """Write down a job's plan and its tiles, once: a repeat changes nothing."""
     if get(connection, job).plan is not None:
         return

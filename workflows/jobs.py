@@ -45,7 +45,7 @@ class Task:
     matte: str
     options: dict[str, Any]
     limits: Limits
-    plan: dict[str, int]
+    plan: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,8 @@ class Kind:
     stage : str
         What is going on while its tiles are worked on.
     prepare : callable
-        Returns the plan: ``tiles``, how many there are, and what else the steps and the records need.
+        Returns the plan: ``tiles``, how many there are, and what else the steps and the records need; ``notes``, if it
+        has any, are lines for the job's log.
     work : callable
         Does a tile; returns its pixels.
     finish : callable
@@ -65,12 +66,12 @@ class Kind:
     """
 
     stage: str
-    prepare: Callable[[Task], dict[str, int]]
+    prepare: Callable[[Task], dict[str, Any]]
     work: Callable[[Task, int], int]
     finish: Callable[[Task], dict[str, Any]]
 
 
-def _ingest_prepare(task: Task) -> dict[str, int]:
+def _ingest_prepare(task: Task) -> dict[str, Any]:
     return frames.prepare(_objects(task.store), task.capture, task.limits)
 
 
@@ -125,7 +126,7 @@ KINDS = {
 }
 
 
-def run_prepare(kind: str, task: Task) -> dict[str, int]:
+def run_prepare(kind: str, task: Task) -> dict[str, Any]:
     """The first step of a job; returns its plan."""
     return KINDS[kind].prepare(task)
 

@@ -86,6 +86,8 @@ def _recover_block(
         light = (light @ np.linalg.inv(crosstalk).T).astype(np.float32)
         usable &= usable.all(axis=2, keepdims=True)
     numbers, sent = program.constants
+    filmed = np.isin(numbers, attributes["patterns"])  # a video may lack some
+    numbers, sent = numbers[filmed], sent[filmed]
     photometry = fit_photometry(
         light[:, numbers], to_light(sent, monitor), usable[:, numbers], noise, worth[:, numbers]
     )
@@ -130,7 +132,7 @@ def _merge(
     light : (n, count, 3) float32
         In units of what fills the camera's range in the shortest exposure.
     usable : (n, count, 3) bool
-        False where in every exposure some frame is clipped, at black or at white.
+        False where in every exposure some frame is clipped, at black or at white, and where there is no frame.
     worth : (n, count, 3) float32
         Frames of the shortest exposure that say as much.
 
@@ -163,7 +165,7 @@ def _merge(
         every[:, pattern] += total
         times[pattern] += time
     usable = worth > 0
-    np.copyto(worth, times[:, np.newaxis], where=~usable)
+    np.copyto(worth, np.maximum(times, 1)[:, np.newaxis], where=~usable)
     np.copyto(light, every, where=~usable)
     light /= worth
     return light, usable, worth

@@ -260,7 +260,7 @@ def _register(
                 job,
                 name=name or manifest.name,
                 bytes=sum(part.size for part in parts),
-                frames=len(manifest.frames),
+                frames=len(manifest.frames) or manifest.program.count,
                 program=manifest.program.model_dump(mode="json"),
             )
             if key:

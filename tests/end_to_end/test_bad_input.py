@@ -81,6 +81,7 @@ def program_too_large(manifest: dict, files: dict[str, bytes]) -> None:
 
 
 def a_video(manifest: dict, files: dict[str, bytes]) -> None:
+    manifest["frames"] = []
     manifest["video"] = {"file": "clip.mp4", "patterns_per_second": 2.0}
 
 
@@ -96,7 +97,7 @@ def a_video(manifest: dict, files: dict[str, bytes]) -> None:
         (leaves, "../evil.png", None),
         (monitor_of_nothing, "capture.json", "program.monitor.width"),
         (program_too_large, "capture.json", "program"),
-        (a_video, "capture.json", "video"),
+        (a_video, "clip.mp4", "video.file"),
     ],
 )
 def test_a_bundle_that_is_refused_at_once(

@@ -1,10 +1,14 @@
 """A bundle: the ZIP of a capture and its capture.json, format envmatte-capture/1, checked as hostile."""
 
 import stat
+import struct
+import tempfile
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import Annotated, BinaryIO, Literal
+from typing import Annotated, BinaryIO, Literal, cast
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -18,6 +22,20 @@ MANIFEST_BYTES = 8 << 20
 ENTRIES = 20_000
 DIRECTORY_BYTES = 8 << 20
 """Of the archive's directory, which is read in one piece."""
+NAME_LENGTH = 26
+"""Where an entry's header has the lengths of its name and of the field after it (APPNOTE, sect. 4.3.7)."""
+PIECE = 1 << 20
+"""Bytes that are unpacked at once."""
+UNREADABLE = (
+    zipfile.BadZipFile,
+    zlib.error,
+    EOFError,
+    OSError,
+    ArithmeticError,
+    ValueError,
+    RuntimeError,
+)
+"""What zipfile raises on damaged entries."""
 TAGS = {"constant", "bernoulli", "images", "Gamma"}
 """What pydantic adds to the way to a field: which member of a union it took."""
 
@@ -31,6 +49,14 @@ class Frame(BaseModel):
     exposure: Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)] = 1.0
 
 
+class Video(BaseModel):
+    """A recording of the program from before its start until after its end, in place of frames."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+    file: str
+    patterns_per_second: float = Field(ge=0.01, le=120)
+
+
 class Manifest(BaseModel):
     """capture.json."""
 
@@ -40,7 +66,7 @@ class Manifest(BaseModel):
     program: Program
     response: Response = "unknown"
     frames: tuple[Frame, ...] = ()
-    video: dict[str, object] | None = None
+    video: Video | None = None
     mask: str | None = None
 
 
@@ -82,6 +108,7 @@ class Bundle:
 
     def __init__(self, file: BinaryIO, limits: Limits) -> None:
         self._limits = limits
+        self._file = file
         bounded = _Bounded(file)
         try:
             self._archive = zipfile.ZipFile(bounded)
@@ -117,16 +144,38 @@ class Bundle:
             # Not ZipFile.read, which unpacks all there is before it looks at the size that the directory gives.
             with self._archive.open(info) as file:
                 return file.read(info.file_size)
-        except (
-            zipfile.BadZipFile,
-            zlib.error,
-            EOFError,
-            OSError,
-            ArithmeticError,
-            ValueError,
-            RuntimeError,
-        ) as error:
+        except UNREADABLE as error:
             raise CaptureError(f"{entry} is damaged in the archive: {error}", entry=entry) from error
+
+    @contextmanager
+    def open(self, entry: str) -> Iterator[BinaryIO]:
+        """An entry as a seekable file, for what is too large to be read at once.
+
+        A stored entry is read where it lies; one that is packed is unpacked into a temporary file.
+
+        Raises
+        ------
+        CaptureError
+            If it is damaged.
+        """
+        info = self._entries[entry]
+        with ExitStack() as held:
+            try:
+                with self._archive.open(info) as packed:
+                    if info.compress_type == zipfile.ZIP_STORED:
+                        # What zipfile gives, sent back, reads all that lies before once more.
+                        self._file.seek(info.header_offset + NAME_LENGTH)
+                        name, extra = struct.unpack("<HH", self._file.read(4))
+                        start = info.header_offset + NAME_LENGTH + 4 + name + extra
+                        file = cast(BinaryIO, _Window(self._file, start, info.file_size))
+                    else:
+                        file = cast(BinaryIO, held.enter_context(tempfile.TemporaryFile()))
+                        for done in range(0, info.file_size, PIECE):
+                            file.write(packed.read(min(PIECE, info.file_size - done)))
+                        file.seek(0)
+            except UNREADABLE as error:
+                raise CaptureError(f"{entry} is damaged in the archive: {error}", entry=entry) from error
+            yield file
 
     def _check_directory(self) -> None:
         infos = self._archive.infolist()
@@ -179,16 +228,16 @@ class Bundle:
 
     def _check_manifest(self) -> None:
         manifest = self.manifest
-        if manifest.video is not None:
+        if manifest.video is not None and manifest.frames:
             raise CaptureError(
-                "this version reads image frames, not video: give `frames`, one image a pattern",
-                entry=MANIFEST,
-                field="video",
+                f"{MANIFEST} names both frames and a video: give one of them", entry=MANIFEST, field="video"
             )
-        if not manifest.frames:
+        if manifest.video is None and not manifest.frames:
             raise CaptureError(f"{MANIFEST} names no frames", entry=MANIFEST, field="frames")
         count = manifest.program.count
         files = [(f"frames.{n}.file", frame.file) for n, frame in enumerate(manifest.frames)]
+        if manifest.video is not None:
+            files.append(("video.file", manifest.video.file))
         if manifest.mask is not None:
             files.append(("mask", manifest.mask))
         for at, part in enumerate(manifest.program.parts):
@@ -206,6 +255,8 @@ class Bundle:
                     entry=frame.file,
                     field=f"frames.{n}.pattern",
                 )
+        if manifest.video is not None:
+            return
         seen = np.zeros(count, bool)
         seen[[frame.pattern for frame in manifest.frames]] = True
         if not seen.all():
@@ -234,4 +285,31 @@ class _Bounded:
         data = self._file.read(min(size, self.most + 1) if size >= 0 else self.most + 1)
         if len(data) > self.most:
             raise zipfile.BadZipFile(f"a directory of more than {self.most} bytes")
+        return data
+
+
+class _Window:
+    """A part of a file as a file of its own, to read."""
+
+    def __init__(self, file: BinaryIO, start: int, size: int) -> None:
+        self._file, self._start, self._size, self._at = file, start, size, 0
+
+    def seekable(self) -> bool:
+        return True
+
+    def readable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._at
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        self._at = max(offset + (0, self._at, self._size)[whence], 0)
+        return self._at
+
+    def read(self, size: int = -1) -> bytes:
+        left = max(self._size - self._at, 0)
+        self._file.seek(self._start + self._at)
+        data = self._file.read(left if size < 0 else min(size, left))
+        self._at += len(data)
         return data

@@ -1,5 +1,8 @@
 """The ingest of a capture: frames are read one at a time and written, a slab of them at once, into the stack."""
 
+from collections.abc import Iterator, Sequence
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
@@ -12,17 +15,21 @@ from workflows import images
 from workflows.grids import smallest_grid
 from workflows.ingest import stills
 from workflows.ingest.bundle import Bundle, Limits
+from workflows.ingest.content import lay_out
+from workflows.ingest.sorting import Sorted, sort
+from workflows.ingest.video import Share, opened
 from workflows.program import Images
 from workflows.tone import Response
 
 
-def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, int]:
+def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, Any]:
     """Look into the bundle of a capture and make its empty stack.
 
     Returns
     -------
     dict
-        ``tiles``: the number of slabs; ``width``, ``height``.
+        ``tiles``: the number of slabs; ``slab``: frames of one; ``width``, ``height``, ``frames``; ``notes``: lines
+        for people about what was found in a video.
 
     Raises
     ------
@@ -31,15 +38,6 @@ def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, int]:
     with uploads.read(objects, capture) as file:
         bundle = Bundle(file, limits)
         manifest = bundle.manifest
-        first = stills.read(bundle, manifest.frames[0].file, limits)
-        storage = stills.storage_of(bundle, first, limits)
-        mask = None
-        if manifest.mask is not None:
-            mask = np.any(_decode(bundle, manifest.mask, limits), axis=2)
-            if mask.shape != first.shape[:2]:
-                raise CaptureError(
-                    f"{manifest.mask} is {_size(mask)}, the frames are {_size(first)}", entry=manifest.mask
-                )
         names = [n for part in manifest.program.parts if isinstance(part, Images) for n in part.files]
         patterns: list[NDArray[np.float32]] = []
         for name in names:
@@ -51,27 +49,62 @@ def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, int]:
                     entry=name,
                     limit=limits.memory // 2,
                 )
-    height, width, channels = first.shape
+        shape, storage, filmed = _look(bundle, patterns, limits)
+        mask = None
+        if manifest.mask is not None:
+            mask = np.any(_decode(bundle, manifest.mask, limits), axis=2)
+            if mask.shape != shape[1:3]:
+                raise CaptureError(
+                    f"{manifest.mask} is {_size(mask)}, the frames are {shape[2]} x {shape[1]}",
+                    entry=manifest.mask,
+                )
+    frames, height, width, _ = shape
     slab = create_stack(
         objects,
         capture,
-        (len(manifest.frames), height, width, channels),
+        shape,
         storage.dtype,
         memory=limits.memory,
         attributes={
             "program": manifest.program.model_dump(mode="json"),
             # Float values are linear light, whatever is left unsaid.
             "response": "linear"
-            if first.dtype == np.float32
+            if storage.black
             else TypeAdapter(Response).dump_python(manifest.response, mode="json"),
-            "patterns": [frame.pattern for frame in manifest.frames],
-            "exposures": [frame.exposure for frame in manifest.frames],
             "storage": {"black": storage.black, "full": storage.full},
+            "patterns": [frame.pattern for frame in manifest.frames]
+            if filmed is None
+            else list(filmed.shares),
+            "exposures": [frame.exposure for frame in manifest.frames] or [1.0] * frames,
+            **({} if filmed is None else {"video": filmed.record}),
         },
         mask=mask,
         images=patterns,
+        shares=None if filmed is None else filmed.table,
     )
-    return {"tiles": -(-len(manifest.frames) // slab), "slab": slab, "width": width, "height": height}
+    notes = [] if filmed is None else filmed.notes
+    size = {"width": width, "height": height, "frames": frames}
+    return {"tiles": -(-frames // slab), "slab": slab, **size, "notes": notes}
+
+
+def _look(
+    bundle: Bundle, patterns: Sequence[NDArray[np.float32]], limits: Limits
+) -> tuple[tuple[int, int, int, int], stills.Storage, Sorted | None]:
+    """The shape of the stack and how it is stored, and of a video which of its frames show what."""
+    manifest = bundle.manifest
+    if manifest.video is None:
+        first = stills.read(bundle, manifest.frames[0].file, limits)
+        height, width, channels = first.shape
+        shape = len(manifest.frames), height, width, channels
+        return shape, stills.storage_of(bundle, first, limits), None
+    program, entry = manifest.program, manifest.video.file
+    curve = "srgb" if program.monitor.response == "unknown" else program.monitor.response
+    light = lay_out(program, curve, patterns)
+    with bundle.open(entry) as file, opened(file, entry, limits.image) as clip:
+        signatures, ticks = clip.signatures(limits.memory // 4)
+        filmed = sort(signatures, ticks, clip.tick, program, light, manifest.video.patterns_per_second, entry)
+        shape = len(filmed.shares), clip.height, clip.width, 3
+        return shape, stills.Storage(np.dtype(np.uint16), 0, 1.0), filmed
 
 
 def read_slab(objects: Objects, capture: str, limits: Limits, slab: int, index: int) -> int:
@@ -83,25 +116,38 @@ def read_slab(objects: Objects, capture: str, limits: Limits, slab: int, index: 
         Naming the frame that can't be decoded, or is of another size or kind than the first.
     """
     stack = Stack(objects, capture)
+    first, last = index * slab, min((index + 1) * slab, stack.frames)
+    frames = np.empty((last - first, stack.height, stack.width, stack.channels), stack.dtype)
     with uploads.read(objects, capture) as file:
         bundle = Bundle(file, limits)
-        of_slab = bundle.manifest.frames[index * slab : (index + 1) * slab]
-        shape = (stack.height, stack.width, stack.channels)
-        frames = np.empty((len(of_slab), *shape), stack.dtype)
-        storage = stills.Storage(stack.dtype, **stack.attributes["storage"])
-        kind = np.dtype(np.float32) if storage.black else stack.dtype
-        for n, frame in enumerate(of_slab):
-            pixels = stills.read(bundle, frame.file, limits)
-            if pixels.shape != shape or pixels.dtype != kind:
-                raise CaptureError(
-                    f"{frame.file} is {_size(pixels)} with {pixels.shape[2]} channels of {pixels.dtype}, the first "
-                    f"frame {stack.width} x {stack.height} with {stack.channels} of {kind}: all frames must "
-                    "be of one size and kind",
-                    entry=frame.file,
-                )
-            frames[n] = storage.encode(pixels)
-    write_slab(objects, capture, index * slab, frames)
+        for n, pixels in enumerate(_pixels(bundle, stack, first, last, limits)):
+            frames[n] = pixels
+    write_slab(objects, capture, first, frames)
     return int(frames.shape[0] * frames.shape[1] * frames.shape[2])
+
+
+def _pixels(bundle: Bundle, stack: Stack, first: int, last: int, limits: Limits) -> Iterator[images.Codes]:
+    """The frames of a stack from ``first`` up to ``last``, one after another."""
+    video = bundle.manifest.video
+    if video is not None:
+        shares = stack.shares()
+        plan = [[Share(*row) for row in shares[shares[:, 0] == n, 1:].tolist()] for n in range(first, last)]
+        with bundle.open(video.file) as file, opened(file, video.file, limits.image) as clip:
+            yield from clip.means(plan)
+        return
+    shape = (stack.height, stack.width, stack.channels)
+    storage = stills.Storage(stack.dtype, **stack.attributes["storage"])
+    kind = np.dtype(np.float32) if storage.black else stack.dtype
+    for frame in bundle.manifest.frames[first:last]:
+        pixels = stills.read(bundle, frame.file, limits)
+        if pixels.shape != shape or pixels.dtype != kind:
+            raise CaptureError(
+                f"{frame.file} is {_size(pixels)} with {pixels.shape[2]} channels of {pixels.dtype}, the first "
+                f"frame {stack.width} x {stack.height} with {stack.channels} of {kind}: all frames must "
+                "be of one size and kind",
+                entry=frame.file,
+            )
+        yield storage.encode(pixels)
 
 
 def _decode(bundle: Bundle, entry: str, limits: Limits) -> images.Codes:
@@ -113,3 +159,4 @@ def _decode(bundle: Bundle, entry: str, limits: Limits) -> images.Codes:
 
 def _size(pixels: NDArray[np.generic]) -> str:
     return f"{pixels.shape[1]} x {pixels.shape[0]}"
+

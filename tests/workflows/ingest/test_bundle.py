@@ -41,6 +41,9 @@ FILES = {
 }
 
 
+VIDEO = {"file": "clip.mp4", "patterns_per_second": 2.0}
+
+
 def changed(change: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
     record = copy.deepcopy(RECORD)
     change(record)
@@ -137,7 +140,10 @@ def test_a_malformed_record_is_refused(make_zip: Zip, text: bytes) -> None:
         (lambda r: r.update(frames=[]), "frames", "no frames"),
         (lambda r: r.update(mask="masks.png"), "mask", "masks.png"),
         (lambda r: r["program"]["parts"][2].update(files=["b.png"]), "program.parts.2.files.0", "b.png"),
-        (lambda r: r.update(video={"file": "clip.mp4"}), "video", "not video"),
+        (lambda r: r.update(video=VIDEO), "video", "both frames and a video"),
+        (lambda r: r.update(video=VIDEO, frames=[]), "video.file", "clip.mp4"),
+        (lambda r: r.update(video={"file": "a.mp4"}), "video.patterns_per_second", "required"),
+        (lambda r: r.update(video=VIDEO | {"patterns_per_second": 0}), "video.patterns_per_second", ""),
     ],
 )
 def test_a_record_that_does_not_hold_together_is_refused(

@@ -1,0 +1,195 @@
+"""The frames of a video sorted by the patterns that they show, and what to make of those that are not found."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.errors import CaptureError
+from workflows.ingest import content
+from workflows.ingest.recording import Recording
+from workflows.ingest.timing import Found, find
+from workflows.ingest.video import PARTS, Share, Signatures
+from workflows.program import Program
+
+Doubles = NDArray[np.float64]
+
+LEAST_SHARE = 0.6
+"""Of the patterns that are not constant: with fewer, a recording is refused."""
+LEAST_RESEMBLANCE = 2.5
+"""Standard deviations, see `content.resemblance`."""
+_EVENTS = 4
+_GAMMA = 2.2  # near enough to any camera's curve to compare what it saw
+
+
+@dataclass(frozen=True)
+class Sorted:
+    """A recording, sorted.
+
+    Attributes
+    ----------
+    shares : dict of int to tuple of Share
+        The frames of each pattern that was found.
+    record : dict
+        What was found, as JSON: ``tick`` in seconds, ``frames`` that were decoded, ``kept``, ``first_pattern_seconds``,
+        ``patterns_per_second``, ``resemblance``, and ``missing``: the number of each pattern without frames, and why.
+    notes : list of str
+        The same for people.
+    """
+
+    shares: dict[int, tuple[Share, ...]]
+    record: dict[str, Any]
+    notes: list[str]
+
+    @property
+    def table(self) -> NDArray[np.int64]:
+        """(k, 3) int64: the shares of the patterns in order, each with the pattern's place among those found."""
+        rows = [(n, *share) for n, shares in enumerate(self.shares.values()) for share in shares]
+        return np.array(rows, np.int64)
+
+
+def sort(
+    signatures: Signatures,
+    ticks: NDArray[np.int64],
+    tick: float,
+    program: Program,
+    light: content.Light,
+    rate: float,
+    entry: str,
+) -> Sorted:
+    """Sort the frames of a recording by the patterns of a program.
+
+    Parameters
+    ----------
+    signatures : (frames, rows, columns, 3) uint8
+    ticks : (frames,) int64
+        When each frame is shown.
+    tick : float
+        Seconds of a tick.
+    program : Program
+    light : (patterns, rows, columns, 3) float32
+        Of its patterns, see `content.lay_out`.
+    rate : float
+        Patterns a second, about.
+    entry : str
+        The video's name, for errors.
+
+    Raises
+    ------
+    CaptureError
+        If too little of the program is found.
+    """
+
+    def refused(what: str) -> CaptureError:
+        return CaptureError(f"{entry}: {what}", entry=entry)
+
+    recording = Recording(signatures, (ticks - ticks[0]) * tick, 1 / rate)
+    if not recording.events:
+        raise refused("nothing changes in the video: film the monitor while it shows the program")
+    if len(recording.events) > _EVENTS * program.count + 100:
+        raise refused(
+            f"the picture changes {len(recording.events)} times, but the program has {program.count} patterns: keep "
+            "the camera, the light and the glass at rest, and cut off what does not belong to the program"
+        )
+    found, looks, resemblance = _best(recording, rate, program, light, refused)
+    reasons = dict(found.reasons)
+    for number in content.odd(program, light, looks):
+        reasons[number] = "it looks unlike others of its kind, as if something had been in front"
+        del looks[number]
+    if resemblance is not None and resemblance < LEAST_RESEMBLANCE:
+        raise refused(
+            "what changes in the video does not look like the patterns of the program: see that capture.json has the "
+            "program that was shown, and its patterns_per_second"
+        )
+    _see_that_it_is_enough(program, looks, reasons, rate, refused)
+    kept = sorted(looks)
+    shares = {number: _shares(ticks[found.frames[number]], found.weights[number]) for number in kept}
+    record = {
+        "tick": tick,
+        "frames": len(ticks),
+        "kept": sum(len(share) for share in shares.values()),
+        "first_pattern_seconds": round(found.start, 3),
+        "patterns_per_second": round(found.rate, 4),
+        "resemblance": None if resemblance is None else round(resemblance, 1),
+        "missing": {str(number): reason for number, reason in sorted(reasons.items())},
+    }
+    return Sorted(shares, record, [_summary(record, len(kept), program.count), *_by_reason(reasons)])
+
+
+def _best(
+    recording: Recording, rate: float, program: Program, light: content.Light, refused: Any
+) -> tuple[Found, dict[int, Doubles], float | None]:
+    """The whole program in the recording; or if that can't be, a part of it: its beginning, or its end."""
+    flat = light.reshape(len(light), -1)
+    same = (flat[1:] == flat[:-1]).all(axis=1)
+    tried = []
+    for begun, cut in ((False, False), (False, True), (True, False)):
+        found = find(recording, rate, same, begun=begun, cut=cut)
+        if found is None or found.jump is not None:
+            continue
+        looks = {n: (recording.look(f) / 255) ** _GAMMA for n, f in enumerate(found.frames) if f.size}
+        resemblance = content.resemblance(program, light, looks)
+        tried.append((found, looks, resemblance))
+        if not begun and not cut:
+            break
+    if not tried:
+        raise refused(
+            f"the {len(recording.events)} changes in the video do not fit {program.count} patterns at {rate:g} a "
+            "second: see that capture.json has the program that was shown and its patterns_per_second, and record "
+            "all of it in one go, with everything at rest"
+        )
+    return max(tried, key=lambda each: each[2] or 0.0)
+
+
+def _see_that_it_is_enough(
+    program: Program, looks: Mapping[int, Doubles], reasons: Mapping[int, str], rate: float, refused: Any
+) -> None:
+    numbers, sent = program.constants
+    there = np.isin(numbers, list(looks))
+    why = "; ".join(_by_reason(reasons))
+    if not there.any() or (np.ptp(sent[there], axis=0) < np.ptp(sent, axis=0) / 2).any():
+        raise refused(f"the dark and bright constant patterns are not both found: {why}. Record it again")
+    share = float(np.isin(program.measured, list(looks)).mean())
+    if share < LEAST_SHARE:
+        raise refused(
+            f"only {share:.0%} of the patterns are found: {why}. Record it again, at more frames a second, or show "
+            f"fewer than {rate:g} patterns a second"
+        )
+
+
+def _shares(ticks: NDArray[np.int64], weights: Doubles) -> tuple[Share, ...]:
+    """Weights as whole parts of `PARTS`, by largest remainders."""
+    exact = PARTS * weights / weights.sum()
+    parts = np.floor(exact).astype(int)
+    parts[np.argsort(parts - exact, kind="stable")[: PARTS - parts.sum()]] += 1
+    return tuple(Share(int(tick), int(part)) for tick, part in zip(ticks, parts, strict=True) if part)
+
+
+def _summary(record: Mapping[str, Any], kept: int, count: int) -> str:
+    return (
+        f"{record['frames']} frames: {kept} of {count} patterns found, {record['kept']} frames kept; the first pattern "
+        f"begins at {record['first_pattern_seconds']} s, {record['patterns_per_second']} a second"
+    )
+
+
+def _by_reason(reasons: Mapping[int, str]) -> list[str]:
+    """A line a reason: the patterns that it holds for, as ranges."""
+    ordered = sorted(reasons.items(), key=lambda item: (item[1], item[0]))
+    return [
+        f"no frame of pattern{'s' * (len(numbers) > 1)} {_ranges(numbers)}: {reason}"
+        for reason, items in groupby(ordered, key=lambda item: item[1])
+        for numbers in [[number for number, _ in items]]
+    ]
+
+
+def _ranges(numbers: Iterable[int]) -> str:
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    return ", ".join(str(a) if a == b else f"{a} to {b}" for a, b in runs)
