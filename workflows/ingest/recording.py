@@ -60,7 +60,7 @@ class Recording:
             before = range(self.events[-1].last if self.events else 0, event.first + 1)
             after = range(event.last, (events[n + 1].first if n + 1 < len(events) else len(times) - 1) + 1)
             gap = difference(self.look(before[-5:]), self.look(after[:5])).max()
-            if gap > limit[event.first] / 2:
+            if gap > limit[event.first : event.last].max():
                 self.events.append(event)
 
     def plateau(self, n: int) -> range:
@@ -100,4 +100,6 @@ def _quiet(change: Doubles, times: Doubles, hold: float) -> Doubles:
         np.searchsorted(middle, middle - hold / 2),
         np.searchsorted(middle, middle + hold / 2, "right"),
     )
-    return np.array([np.quantile(change[a:b], _QUIET) for a, b in zip(first, last, strict=True)])
+    noise = np.array([np.quantile(change[a:b], _QUIET) for a, b in zip(first, last, strict=True)])
+    # What a codec leaves as it was has no noise at all for a while.
+    return np.asarray(np.maximum(noise, np.median(noise) / 2 if noise.size else 0))
