@@ -159,4 +159,3 @@ def _decode(bundle: Bundle, entry: str, limits: Limits) -> images.Codes:
 
 def _size(pixels: NDArray[np.generic]) -> str:
     return f"{pixels.shape[1]} x {pixels.shape[0]}"
-

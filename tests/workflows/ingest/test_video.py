@@ -1,15 +1,13 @@
 """A video capture: every pattern from the right frames, whatever the camera, and what can't be used is refused."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from storage.captures import Stack
-from storage.errors import CaptureError
-from tests.workflows.ingest.camera import TICK, Camera, Film, boxes, capture, film, lights, turned
+from tests.workflows.ingest.camera import TICK, Camera, Film, capture, film, lights
 from workflows.program import Program
 from workflows.scene import nested_program
 from workflows.simulate import glass_ball
