@@ -224,7 +224,7 @@ class Coordinator:
                 mattes.change(c, drive.task.matte, state="ready", figures=figures)
         del self._drives[drive.job]
         if drive.kind == "ingest":
-            self._objects.delete(uploads.path(drive.task.capture))
+            uploads.remove(self._objects, drive.task.capture)
 
     def _collect(self, drive: Drive) -> None:
         """Write down the tiles that have ended since the last look, all in one transaction."""
@@ -302,7 +302,7 @@ class Coordinator:
                 problem = problem_of(Conflict("the ingest was cancelled; upload the capture again"))
                 captures.change(c, capture, state="failed", problem=problem)
         self._objects.delete(captures.path(capture))
-        self._objects.delete(uploads.path(capture))
+        uploads.remove(self._objects, capture)
 
     def _reconcile(self) -> None:
         """Remove what has no row in the ledger: what a killed process left."""

@@ -17,6 +17,9 @@ from storage.database import open_engine
 from storage.errors import Conflict
 from storage.objects import Objects
 
+GRACE = 3
+"""Seconds that requests under way have to end when the service is asked to stop: an upload may take hours."""
+
 
 def serve(settings: Settings) -> None:
     """Serve until interrupted; jobs under way go on at the next start.
@@ -39,6 +42,7 @@ def serve(settings: Settings) -> None:
             settings.port,
             log_level="warning",
             lifespan="off",
+            timeout_graceful_shutdown=GRACE,
         )
         socket = config.bind_socket()
         with socket, open_cluster(settings) as client, Coordinator(settings, engine, objects, client):

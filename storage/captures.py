@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import zarr
 from numpy.typing import NDArray
-from sqlalchemy import Connection, Row, delete, insert, update
+from sqlalchemy import Connection, Row, delete, insert, select, update
 
 from storage.database import captures, find
 from storage.errors import Corrupt
@@ -204,6 +204,11 @@ def add(connection: Connection, capture: str, job: str, **record: Any) -> None:
 def get(connection: Connection, capture: str) -> Row[Any]:
     """A capture's row; `NotFound` if there is none."""
     return find(connection, captures, capture)
+
+
+def exists(connection: Connection, capture: str) -> bool:
+    """Whether there is a capture."""
+    return connection.scalar(select(captures.c.id).where(captures.c.id == capture)) is not None
 
 
 def may_be_retried(problem: dict[str, Any]) -> bool:

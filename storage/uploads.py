@@ -146,8 +146,8 @@ def forget_expired(connection: Connection) -> list[str]:
 
 
 def remove(objects: Objects, upload: str) -> None:
-    """Remove the bytes of an upload whose row is deleted."""
-    # Whoever writes to it still, and makes a file here meanwhile, finds the row gone and removes all there is again.
+    """Remove the bytes of an upload whose row is deleted, and of an archive that is ingested."""
+    # Whoever writes to it still, and makes a file here meanwhile, finds the row gone and removes what he wrote.
     with suppress(OSError):
         objects.delete(path(upload))
 

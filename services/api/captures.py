@@ -8,7 +8,7 @@ import anyio.to_thread
 from fastapi import APIRouter, Header, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from sqlalchemy import Row, select
+from sqlalchemy import Row
 from sqlalchemy.exc import IntegrityError
 
 from services.api.context import After, Context, Limit, Needs, read_body
@@ -140,7 +140,7 @@ def delete_capture(context: Needs, id: str) -> None:
             raise Conflict(f"job {busy[0]} works on capture {id}; cancel it first, or wait for it")
         captures.forget(c, id)
     context.objects.delete(captures.path(id))
-    context.objects.delete(uploads.path(id))
+    uploads.remove(context.objects, id)
 
 
 @router.get("/captures/{id}/frames/{n}.png", response_class=Response)
@@ -172,10 +172,10 @@ async def _from_body(context: Context, request: Request, name: str, key: str | N
         part = Part(ONLY, size)
         row = await anyio.to_thread.run_sync(_register, context, capture, [part], name, key, False)
     except BaseException:
-        context.objects.delete(uploads.path(capture))
+        uploads.remove(context.objects, capture)
         raise
     if row.id != capture:  # a repeat with the same key was quicker
-        context.objects.delete(uploads.path(capture))
+        uploads.remove(context.objects, capture)
     return row
 
 
@@ -200,10 +200,12 @@ def _parse(body: bytes) -> FromUpload:
 def _from_upload(context: Context, wanted: FromUpload, key: str | None) -> Row[Any]:
     """Make a capture from a finished upload, under the same id; a repeat answers with it."""
     upload = wanted.upload
-    made = _made(context, key) or _find(context, upload)
+    made = _made(context, key)
     if made is not None:
         return made
     with context.engine.connect() as c:
+        if captures.exists(c, upload):
+            return captures.get(c, upload)
         row = uploads.get(c, upload)
         parts = uploads.parts_of(c, upload)
     if row.offset < row.length:
@@ -213,22 +215,16 @@ def _from_upload(context: Context, wanted: FromUpload, key: str | None) -> Row[A
         )
     try:
         return _register(context, upload, parts, wanted.name, key, True)
-    except CaptureError:  # it would be refused again
+    except (CaptureError, NotFound, FileNotFoundError) as error:
         with writing(context.engine) as c:
-            refused = uploads.forget(c, upload)
-        if refused:
+            if captures.exists(c, upload):  # a repeat was quicker
+                return captures.get(c, upload)
+            uploads.get(c, upload)
+            if isinstance(error, CaptureError):  # it would be refused again
+                uploads.forget(c, upload)
+        if isinstance(error, CaptureError):
             uploads.remove(context.objects, upload)
         raise
-    except NotFound:  # a repeat was quicker, or it was deleted
-        made = _find(context, upload)
-        if made is None:
-            raise
-        return made
-
-
-def _find(context: Context, capture: str) -> Row[Any] | None:
-    with context.engine.connect() as c:
-        return c.execute(select(table).where(table.c.id == capture)).one_or_none()
 
 
 def _made(context: Context, key: str | None) -> Row[Any] | None:

@@ -21,7 +21,7 @@ from starlette.requests import ClientDisconnect
 
 from services.api.context import Context, Needs
 from services.api.errors import BadHeader, ChecksumMismatch, TooLarge, WrongMediaType, WrongVersion
-from storage import uploads
+from storage import captures, uploads
 from storage.database import new_id, writing
 from storage.errors import InvalidInput, NotFound
 from storage.uploads import MOST_PARTS, Part
@@ -203,7 +203,6 @@ async def _append(context: Context, request: Request, row: Row[Any], checksum: C
                 context.objects.delete(uploads.part_path(row.id, stored.pop().name))
             if not checksum:
                 offset = await anyio.to_thread.run_sync(_advance, context, row.id, offset, stored)
-                stored = []
         if checksum:
             checksum.check()
             await anyio.to_thread.run_sync(_advance, context, row.id, offset, stored)
@@ -227,20 +226,25 @@ async def _heard(body: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
         yield data
 
 
-def _advance(context: Context, upload: str, offset: int, parts: list[Part]) -> int:
+def _advance(context: Context, upload: str, offset: int, stored: list[Part]) -> int:
     with writing(context.engine) as c:
-        return uploads.advance(c, upload, offset, parts, context.settings.upload_seconds)
+        offset = uploads.advance(c, upload, offset, stored, context.settings.upload_seconds)
+    stored.clear()  # here, for a request may be cancelled when this is done and before it goes on
+    return offset
 
 
-def _take_back(context: Context, upload: str, parts: list[Part]) -> None:
-    """Remove parts that were stored and not written down; all there is, if their upload is gone meanwhile."""
+def _take_back(context: Context, upload: str, stored: list[Part]) -> None:
+    """Remove parts that were not written down; all there is, if their upload was deleted meanwhile."""
+    for part in stored:
+        context.objects.delete(uploads.part_path(upload, part.name))
     try:
         _get(context, upload)
     except NotFound:
-        uploads.remove(context.objects, upload)
+        with context.engine.connect() as c:
+            is_capture = captures.exists(c, upload)
+        if not is_capture:
+            uploads.remove(context.objects, upload)
         raise
-    for part in parts:
-        context.objects.delete(uploads.part_path(upload, part.name))
 
 
 def _get(context: Context, upload: str) -> Row[Any]:

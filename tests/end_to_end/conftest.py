@@ -11,6 +11,7 @@ from pathlib import Path
 
 import httpx2
 import numpy as np
+import psutil
 import pytest
 
 from services.client import Client
@@ -73,6 +74,21 @@ def serving(data: Path, *options: str, **environment: str) -> Iterator[Service]:
         process.terminate()
         process.wait(30)
         process.stdout.close()
+
+
+@contextmanager
+def paused(service: Service) -> Iterator[None]:
+    """Hold up the workers of a service: what was uploaded stays in the store."""
+    tree = psutil.Process(service.process.pid).children(recursive=True)
+    workers = [process for process in tree if "spawn_main" in " ".join(process.cmdline())]
+    assert workers
+    for worker in workers:
+        worker.suspend()
+    try:
+        yield
+    finally:
+        for worker in workers:
+            worker.resume()
 
 
 def png(light: np.ndarray, transfer: str, dtype: type) -> bytes:

@@ -4,6 +4,7 @@ import base64
 import hashlib
 import socket
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from email.utils import parsedate_to_datetime
 from http.client import HTTPConnection
@@ -14,7 +15,7 @@ import httpx2
 import pytest
 
 from services.client import ServiceError
-from tests.end_to_end.conftest import Service, serving
+from tests.end_to_end.conftest import Service, paused, serving
 from tests.end_to_end.test_bad_input import check_problem
 
 TUS = {"Tus-Resumable": "1.0.0"}
@@ -27,7 +28,9 @@ def create(service: Service, length: int, **headers: str) -> str:
     return str(answer.headers["location"])
 
 
-def patch(service: Service, where: str, offset: int, data: bytes, **headers: str) -> httpx2.Response:
+def patch(
+    service: Service, where: str, offset: int, data: bytes | Iterator[bytes], **headers: str
+) -> httpx2.Response:
     given = CHUNK | {"Upload-Offset": str(offset)} | headers
     return service.http.patch(where, content=data, headers=given)
 
@@ -274,18 +277,43 @@ def test_of_two_at_one_offset_one_wins(service: Service) -> None:
     service.http.delete(where, headers=TUS)
 
 
-def test_two_clients_that_send_one_file_make_one_capture(
+def test_one_who_lags_behind_spoils_nothing(service: Service, bundle: Path) -> None:
+    data = bundle.read_bytes()
+    where = create(service, len(data))
+    late = begin(service, where, 0, len(data), bytes(1000))
+    assert patch(service, where, 0, data).status_code == 204
+    with paused(service):
+        made = service.http.post("/v1/captures", json={"upload": where.rsplit("/", 1)[1]}).json()
+        late.send(bytes(len(data) - 1000))
+        assert late.getresponse().status == 404
+        late.close()
+    assert service.client.wait(made["job"])["state"] == "succeeded"
+
+
+def test_two_clients_that_send_one_file_do_so_together(
     service: Service, bundle: Path, tmp_path: Path
 ) -> None:
     file = tmp_path / "same.zip"
     file.write_bytes(bundle.read_bytes())
     with ThreadPoolExecutor() as pool:
         made = [*pool.map(lambda _: service.client.upload(file), range(2))]
-    # The slower one may come when all is over, and then starts a capture of its own.
+    # One or two captures: the slower may come when all is over. Afterwards the file makes a new one.
     for capture in made:
         assert service.client.wait(capture["job"])["state"] == "succeeded"
         assert not [name for name in uploads_of(service) if capture["id"] in name]
     assert service.client.upload(file)["id"] not in {capture["id"] for capture in made}
+
+
+def test_a_capture_asked_for_many_times_at_once_is_one(service: Service, bundle: Path) -> None:
+    data = bundle.read_bytes()
+    where = create(service, len(data))
+    patch(service, where, 0, data)
+    body = {"upload": where.rsplit("/", 1)[1]}
+    with ThreadPoolExecutor() as pool:
+        answers = [*pool.map(lambda _: service.http.post("/v1/captures", json=body), range(8))]
+    assert {answer.status_code for answer in answers} == {201}
+    assert {answer.json()["job"] for answer in answers} == {answers[0].json()["job"]}
+    assert service.client.wait(answers[0].json()["job"])["state"] == "succeeded"
 
 
 def test_one_that_is_deleted_is_gone(service: Service) -> None:
