@@ -75,7 +75,10 @@ def serve(**given: Any) -> None:
 @click.option("--name", default="", help="A name for people.")
 @_remote
 def upload(file: Path, name: str, url: str, key: str | None, as_json: bool) -> None:
-    """Upload a capture and wait until it is ingested."""
+    """Upload a capture and wait until it is ingested.
+
+    Called again for the same file after an interrupt, it goes on where it stood.
+    """
     with Client(url, key) as client:
         with Progress("upload") as bar:
             capture = client.upload(file, name=name, progress=lambda sent, size: bar.show(sent / size))

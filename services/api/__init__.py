@@ -6,7 +6,7 @@ from fastapi import Depends, FastAPI, Request
 from fastapi.staticfiles import StaticFiles
 from sqlalchemy import Engine
 
-from services.api import captures, errors, jobs, mattes, programs, system, uploads
+from services.api import captures, errors, jobs, mattes, programs, system, tus, uploads
 from services.api.context import PROBLEM, WEB, Context
 from services.settings import Settings
 from storage.objects import Objects
@@ -22,7 +22,7 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
     )
     app.state.context = Context(settings, engine, objects)
     errors.register(app)
-    app.add_middleware(uploads.Protocol)
+    app.add_middleware(tus.Protocol)
 
     def authorize(request: Request) -> None:
         if not settings.keys:

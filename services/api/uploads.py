@@ -1,76 +1,40 @@
-"""Resumable uploads over HTTP: tus 1.0 (https://tus.io/protocols/resumable-upload).
+"""Resumable uploads over HTTP: tus 1.0 (https://tus.io/protocols/resumable-upload)."""
 
-Extensions: creation, creation-with-upload, checksum, expiration, termination.
-"""
-
-import base64
-import binascii
-import hashlib
 from collections.abc import AsyncIterator
 from datetime import UTC, datetime
 from email.utils import format_datetime
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import anyio
 import anyio.to_thread
 from fastapi import APIRouter, Depends, Header, Request, Response
 from sqlalchemy import Row
 from sqlalchemy.exc import IntegrityError
-from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect
 
 from services.api.context import Context, Needs
-from services.api.errors import BadHeader, ChecksumMismatch, TooLarge, WrongMediaType, WrongVersion
+from services.api.errors import TooLarge
+from services.api.tus import (
+    ALGORITHMS,
+    EXTENSIONS,
+    Checksum,
+    check_media_type,
+    metadata_of,
+    number,
+    version_spoken,
+)
 from storage import captures, uploads
 from storage.database import new_id, writing
 from storage.errors import InvalidInput, NotFound
 from storage.uploads import MOST_PARTS, Part
 
-if TYPE_CHECKING:
-    from starlette.types import ASGIApp, Message, Receive, Scope, Send
-
-VERSION = "1.0.0"
-EXTENSIONS = "creation,creation-with-upload,checksum,expiration,termination"
-ALGORITHMS = ("sha1", "sha256")
-CHUNK = "application/offset+octet-stream"
-METADATA_BYTES = 8192
 PART = 64 << 20
 """Bytes after which what has come is written down: what a killed server loses of one PATCH, at most."""
 SILENCE = 60.0
 """Seconds without a byte after which a sender counts as gone: a connection may be lost without a word."""
 
-
-class Protocol:
-    """What tus asks of every exchange, an answer with a problem included."""
-
-    def __init__(self, app: "ASGIApp") -> None:
-        self._app = app
-
-    async def __call__(self, scope: "Scope", receive: "Receive", send: "Send") -> None:
-        if scope["type"] != "http" or not scope["path"].startswith("/v1/uploads"):
-            await self._app(scope, receive, send)
-            return
-
-        async def tell(message: "Message") -> None:
-            if message["type"] == "http.response.start":
-                headers = MutableHeaders(scope=message)
-                headers["Tus-Resumable"] = headers["Tus-Version"] = VERSION
-            await send(message)
-
-        # For clients whose surroundings let only GET and POST through.
-        method = Headers(scope=scope).get("x-http-method-override", scope["method"])
-        await self._app({**scope, "method": method.upper()}, receive, tell)
-
-
-def _version(
-    tus_resumable: Annotated[str | None, Header(description="The version of tus that is spoken.")] = None,
-) -> None:
-    if tus_resumable != VERSION:
-        raise WrongVersion(f"send `Tus-Resumable: {VERSION}`, the version of tus spoken here")
-
-
 router = APIRouter(prefix="/uploads", tags=["uploads"])
-Spoken = Depends(_version)
+Spoken = Depends(version_spoken)
 
 
 @router.options("", status_code=204, response_class=Response)
@@ -88,14 +52,14 @@ async def create_upload(
     idempotency_key: Annotated[str | None, Header(max_length=256)] = None,
 ) -> Response:
     """Start an upload of `Upload-Length` bytes; the body may be the first of them."""
-    length = _number(request, "Upload-Length")
+    length = number(request, "Upload-Length")
     if length > context.settings.upload_bytes:
         raise too_large(context.settings.upload_bytes)
     checksum = Checksum.of(request)
     with_body = request.headers.get("content-length", "0") != "0" or "transfer-encoding" in request.headers
     if with_body:
-        _check_media_type(request)
-    metadata = _metadata(request)
+        check_media_type(request)
+    metadata = metadata_of(request)
     row, new = await anyio.to_thread.run_sync(_create, context, length, metadata, idempotency_key)
     if with_body and new:
         row = await _append(context, request, row, checksum)
@@ -119,9 +83,9 @@ async def append(context: Needs, request: Request, id: str) -> Response:
     whole or not at all.
     """
     row = await anyio.to_thread.run_sync(_get, context, id)
-    _check_media_type(request)
+    check_media_type(request)
     checksum = Checksum.of(request)
-    uploads.check_offset(row, _number(request, "Upload-Offset"))
+    uploads.check_offset(row, number(request, "Upload-Offset"))
     if row.parts >= MOST_PARTS:
         raise InvalidInput(
             f"upload {id} came in {row.parts} pieces, the most there may be; start again with larger ones",
@@ -138,36 +102,6 @@ def delete_upload(context: Needs, id: str) -> None:
         uploads.get(c, id)
         uploads.forget(c, id)
     uploads.remove(context.objects, id)
-
-
-class Checksum:
-    """What a body should hash to, as an ``Upload-Checksum`` header says."""
-
-    def __init__(self, algorithm: str, digest: bytes) -> None:
-        self._hash = hashlib.new(algorithm, usedforsecurity=False)
-        self._digest = digest
-        self.update = self._hash.update
-
-    @classmethod
-    def of(cls, request: Request) -> "Checksum | None":
-        """The checksum of a request, if it has one."""
-        header = request.headers.get("upload-checksum")
-        if header is None:
-            return None
-        algorithm, _, text = header.partition(" ")
-        if algorithm not in ALGORITHMS:
-            raise BadHeader(
-                f"Upload-Checksum: {algorithm!r} is not taken; use {' or '.join(ALGORITHMS)}",
-                field="Upload-Checksum",
-            )
-        return cls(algorithm, _base64(text, "Upload-Checksum"))
-
-    def check(self) -> None:
-        """Compare it with what has come."""
-        if self._hash.digest() != self._digest:
-            raise ChecksumMismatch(
-                "the bytes that came are not those that the checksum was made of; none was kept, send them again"
-            )
 
 
 async def _append(context: Context, request: Request, row: Row[Any], checksum: Checksum | None) -> Row[Any]:
@@ -278,43 +212,6 @@ def _create(context: Context, length: int, metadata: str, key: str | None) -> tu
 def _headers(row: Row[Any]) -> dict[str, str]:
     expires = format_datetime(datetime.fromtimestamp(row.expires_at, UTC), usegmt=True)
     return {"Upload-Offset": str(row.offset), "Upload-Expires": expires}
-
-
-def _number(request: Request, name: str) -> int:
-    text = request.headers.get(name, "")
-    if not (text.isascii() and text.isdigit() and len(text) <= 18):
-        raise BadHeader(f"{name}: {text or 'nothing'!r} is no number of bytes; send one", field=name)
-    return int(text)
-
-
-def _metadata(request: Request) -> str:
-    """The ``Upload-Metadata`` of a request: pairs of a key and, in Base64, a value, checked and kept as they are."""
-    text = request.headers.get("upload-metadata", "")
-    if len(text) > METADATA_BYTES:
-        raise BadHeader(
-            f"Upload-Metadata may have {METADATA_BYTES} bytes", field="Upload-Metadata", limit=METADATA_BYTES
-        )
-    pairs = [pair.strip().partition(" ") for pair in text.split(",")] if text else []
-    for key, _, value in pairs:
-        _base64(value, "Upload-Metadata")
-        if not key.isascii():
-            raise BadHeader(f"Upload-Metadata: {key!r} is not ASCII", field="Upload-Metadata")
-    if len({key for key, _, _ in pairs} - {""}) < len(pairs):
-        raise BadHeader("Upload-Metadata: a key is empty, or there twice", field="Upload-Metadata")
-    return text
-
-
-def _base64(text: str, name: str) -> bytes:
-    try:
-        return base64.b64decode(text, validate=True)
-    except (binascii.Error, ValueError) as error:
-        raise BadHeader(f"{name}: {text!r} is not Base64", field=name) from error
-
-
-def _check_media_type(request: Request) -> None:
-    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    if media_type != CHUNK:
-        raise WrongMediaType(f"send the bytes of an upload as {CHUNK}, not as {media_type or 'nothing'}")
 
 
 def _too_long(row: Row[Any]) -> TooLarge:

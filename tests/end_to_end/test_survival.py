@@ -13,6 +13,7 @@ import pytest
 
 from services.client import ServiceError
 from tests.end_to_end.conftest import Service, digests, png, serving
+from tests.end_to_end.test_uploads import begin, create
 
 
 def files_of(service: Service, matte: str) -> dict[str, str]:
@@ -209,10 +210,12 @@ def test_a_server_that_is_asked_to_stop_leaves_no_process(
 ) -> None:
     with serving(tmp_path / "data", "--workers", "2") as service:
         service.client.recover(service.client.upload(bundle)["id"])
+        sending = begin(service, create(service, 1000), 0, 1000, b"the rest of which never comes")
         family = psutil.Process(service.process.pid).children(recursive=True)
         assert len(family) >= 2
         service.process.send_signal(number)
         assert service.process.wait(20) == code
+        sending.close()
         _, alive = psutil.wait_procs(family, timeout=10)
         assert alive == []
 

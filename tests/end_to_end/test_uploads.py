@@ -13,8 +13,11 @@ from urllib.parse import urlsplit
 
 import httpx2
 import pytest
+from sqlalchemy import update
 
 from services.client import ServiceError
+from storage.database import open_engine, writing
+from storage.database import uploads as table
 from tests.end_to_end.conftest import Service, paused, serving
 from tests.end_to_end.test_bad_input import check_problem
 
@@ -236,6 +239,29 @@ def test_what_came_before_a_line_broke_is_kept(service: Service) -> None:
     store = service.data / "store"
     parts = sorted((store / name).read_bytes() for name in uploads_of(service) - before)
     assert parts == [b"a" * offset, rest]
+    service.http.delete(where, headers=TUS)
+
+
+@pytest.mark.full
+def test_who_falls_silent_counts_as_gone(service: Service) -> None:
+    where = create(service, 1000)
+    silent = begin(service, where, 0, 1000, b"a" * 300)
+    deadline = time.monotonic() + 120
+    while offset_of(service, where) != 300:
+        assert time.monotonic() < deadline
+        time.sleep(1)
+    silent.close()
+    service.http.delete(where, headers=TUS)
+
+
+def test_an_upload_in_crumbs_is_refused(service: Service) -> None:
+    where = create(service, 1000)
+    assert patch(service, where, 0, b"a").status_code == 204
+    engine = open_engine(f"sqlite:///{service.data / 'envmatte.db'}")
+    with writing(engine) as c:
+        c.execute(update(table).where(table.c.id == where.rsplit("/", 1)[1]).values(parts=10_000))
+    engine.dispose()
+    assert check_problem(patch(service, where, 1, b"a"), 422, "bad-request")["limit"] == 10_000
     service.http.delete(where, headers=TUS)
 
 
