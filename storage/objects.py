@@ -179,6 +179,7 @@ class Objects:
             target = self._folder / path
             shutil.rmtree(target) if target.is_dir() else target.unlink(missing_ok=True)
             return
+        obstore.delete(self._store, path)  # which a bucket does not list below itself
         for batch in obstore.list(self._store, path, chunk_size=500):
             obstore.delete(self._store, [meta["path"] for meta in batch])
 

@@ -21,7 +21,7 @@ from sqlalchemy import Connection, Row, delete, func, insert, select, update
 
 from storage.database import upload_parts as table
 from storage.database import uploads
-from storage.errors import Conflict, NoRoom, NotFound
+from storage.errors import Conflict, Corrupt, NoRoom, NotFound
 from storage.objects import Objects
 
 INDEX = "parts.json"
@@ -178,7 +178,7 @@ def seal(objects: Objects, upload: str, parts: Sequence[Part]) -> None:
 
 
 def read(objects: Objects, upload: str) -> BinaryIO:
-    """A seekable file over the parts of a sealed upload.
+    """A seekable file over the parts of a sealed upload; reading it is `Corrupt` where a part is cut short.
 
     Raises
     ------
@@ -234,6 +234,8 @@ class _Joined(io.RawIOBase):
         file = self._part(n)
         file.seek(self._at - self._starts[n])
         count = file.readinto(memoryview(buffer)[: self._starts[n + 1] - self._at])  # type: ignore[attr-defined]
+        if not count:
+            raise Corrupt(f"{self._paths[n]} is shorter than it was; upload the capture again")
         self._at += count
         return int(count)
 

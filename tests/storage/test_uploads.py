@@ -11,7 +11,7 @@ from sqlalchemy.exc import IntegrityError
 
 from storage import uploads
 from storage.database import upload_parts, writing
-from storage.errors import Conflict, NoRoom, NotFound
+from storage.errors import Conflict, Corrupt, NoRoom, NotFound
 from storage.objects import Objects
 from storage.uploads import Part
 
@@ -163,6 +163,13 @@ def test_a_missing_part_is_told_before_anything_is_read(objects: Objects) -> Non
     objects.delete(uploads.part_path("u", "p1"))
     with pytest.raises(FileNotFoundError, match="p1"):
         uploads.read(objects, "u")
+
+
+def test_a_part_that_is_cut_short_is_damage(objects: Objects) -> None:
+    uploads.seal(objects, "u", stored(objects, "u", [b"one", b"two"]))
+    objects.put(uploads.part_path("u", "p0"), b"on")
+    with uploads.read(objects, "u") as file, pytest.raises(Corrupt, match=r"p0\.part is shorter"):
+        file.read()
 
 
 def test_what_killed_writers_left_is_swept(objects: Objects) -> None:
