@@ -146,6 +146,10 @@ class Stack:
         """
         return np.asarray(self._frames[frames, rows, columns])
 
+    def pick(self, frames: list[int], rows: slice, columns: slice) -> NDArray[Any]:
+        """As `read`, of any frames in any order."""
+        return np.asarray(self._frames.oindex[np.array(frames), rows, columns])
+
     def read_masked(
         self, rows: slice = slice(None), columns: slice = slice(None)
     ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
@@ -158,6 +162,12 @@ class Stack:
             self._mask.async_array.getitem((rows, columns)),
         )
         return values, mask
+
+    def recovered(self, rows: slice = slice(None), columns: slice = slice(None)) -> NDArray[np.bool_]:
+        """(y, x) bool: the pixels of a rectangle that are to be recovered."""
+        if self._mask is None:
+            return np.ones((self.height, self.width), bool)[rows, columns]
+        return np.asarray(self._mask[rows, columns])
 
     def images(self) -> list[NDArray[np.float32]]:
         """The patterns that came as images, each (rows, columns, 1 or 3) float32."""

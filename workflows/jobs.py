@@ -17,6 +17,7 @@ from workflows import tiles
 from workflows.ingest import frames
 from workflows.ingest.bundle import Limits
 from workflows.ingest.measure import measure
+from workflows.ingest.survey import survey
 from workflows.options import parse_options
 
 
@@ -82,6 +83,7 @@ def _ingest_work(task: Task, tile: int) -> int:
 def _ingest_finish(task: Task) -> dict[str, Any]:
     _objects(task.store).sweep(captures.path(task.capture))
     measure(_objects(task.store), task.capture)
+    survey(_objects(task.store), task.capture)
     return {}
 
 

@@ -6,7 +6,7 @@ from fastapi import Depends, FastAPI, Request
 from fastapi.staticfiles import StaticFiles
 from sqlalchemy import Engine
 
-from services.api import captures, errors, jobs, mattes, programs, system, tus, uploads
+from services.api import captures, errors, jobs, mattes, programs, reports, system, tus, uploads
 from services.api.context import PROBLEM, WEB, Context
 from services.settings import Settings
 from storage.objects import Objects
@@ -32,7 +32,14 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
         if scheme.lower() != "bearer" or not any(known):
             raise errors.Unauthorized("send a key of this service: `Authorization: Bearer KEY`")
 
-    for router in (captures.router, uploads.router, jobs.router, mattes.router, programs.router):
+    for router in (
+        captures.router,
+        reports.router,
+        uploads.router,
+        jobs.router,
+        mattes.router,
+        programs.router,
+    ):
         app.include_router(router, prefix="/v1", dependencies=[Depends(authorize)])
     app.include_router(programs.page, prefix="/v1")
     app.include_router(system.router)

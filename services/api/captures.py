@@ -42,6 +42,7 @@ class Capture(BaseModel):
     frames: int
     program: dict[str, Any]
     bytes: int
+    report: str | None
     problem: dict[str, Any] | None
     created_at: datetime
     expires_at: datetime | None
@@ -52,8 +53,9 @@ class Capture(BaseModel):
             **{
                 name: getattr(row, name)
                 for name in cls.model_fields
-                if name not in ("created_at", "expires_at")
+                if name not in ("created_at", "expires_at", "report")
             },
+            report=f"/v1/captures/{row.id}/report" if row.state == "ready" else None,
             created_at=datetime.fromtimestamp(row.created_at, UTC),
             expires_at=None,
         )

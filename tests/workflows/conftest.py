@@ -20,6 +20,7 @@ from storage.objects import Objects
 from workflows.ingest import frames
 from workflows.ingest.bundle import Limits
 from workflows.ingest.measure import measure
+from workflows.ingest.survey import survey
 
 Zip = Callable[..., bytes]
 Ingest = Callable[..., Stack]
@@ -85,6 +86,7 @@ def ingest(objects: Objects, put: Callable[[str, bytes], None]) -> Ingest:
         for index in order(range(plan["tiles"])):
             frames.read_slab(objects, capture, limits, plan["slab"], index)
         measure(objects, capture)
+        survey(objects, capture)
         return Stack(objects, capture)
 
     return run

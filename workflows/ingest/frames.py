@@ -71,7 +71,7 @@ def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, Any]:
             "response": "linear"
             if storage.black
             else TypeAdapter(Response).dump_python(manifest.response, mode="json"),
-            "storage": {"black": storage.black, "full": storage.full},
+            "storage": {"black": storage.black, "full": storage.full, "bounded": storage.bounded},
             "patterns": [frame.pattern for frame in manifest.frames]
             if filmed is None
             else list(filmed.shares),
@@ -104,7 +104,7 @@ def _look(
         signatures, ticks = clip.signatures(limits.memory // 4)
         filmed = sort(signatures, ticks, clip.tick, program, light, manifest.video.patterns_per_second, entry)
         shape = len(filmed.shares), clip.height, clip.width, 3
-        return shape, stills.Storage(np.dtype(np.uint16), 0, 1.0), filmed
+        return shape, stills.Storage(np.dtype(np.uint16), 0, 1.0, True), filmed
 
 
 def read_slab(objects: Objects, capture: str, limits: Limits, slab: int, index: int) -> int:

@@ -29,11 +29,14 @@ class Storage(NamedTuple):
         The stored value of no light. Float values may lie below it, by noise.
     full : float
         The light, in the frames' own units, of the largest stored value.
+    bounded : bool
+        Whether the camera ends there, or only what is stored.
     """
 
     dtype: np.dtype[np.unsignedinteger]
     black: int
     full: float
+    bounded: bool
 
     def encode(self, pixels: Codes | Floats) -> Codes:
         """Values of a frame as they are stored.
@@ -89,7 +92,7 @@ def storage_of(bundle: Bundle, first: NDArray[np.generic], limits: Limits) -> St
     that of the brightest constant frame, whose every pixel is at least as bright as before any pattern.
     """
     if first.dtype != np.float32:
-        return Storage(first.dtype, 0, 1.0)  # type: ignore[arg-type]
+        return Storage(first.dtype, 0, 1.0, True)  # type: ignore[arg-type]
     manifest = bundle.manifest
     if manifest.response not in ("linear", "unknown"):
         raise CaptureError(
@@ -101,8 +104,8 @@ def storage_of(bundle: Bundle, first: NDArray[np.generic], limits: Limits) -> St
     white = int(numbers[np.argmax(sent.sum(axis=1))])
     frames = [frame for frame in manifest.frames if frame.pattern == white]
     entry = max(frames, key=lambda frame: frame.exposure).file
-    full = 1.0
-    if not raw.is_raw(entry):
+    full, bounded = 1.0, raw.is_raw(entry)
+    if not bounded:
         values = read(bundle, entry, limits)
         finite = values[np.isfinite(values)]
         full = 0.0
@@ -110,4 +113,4 @@ def storage_of(bundle: Bundle, first: NDArray[np.generic], limits: Limits) -> St
             full = HEADROOM * min(float(finite.max()), HIGHLIGHT * float(np.percentile(finite, 99)))
     if full <= 0:
         raise CaptureError(f"{entry}, the brightest constant frame, holds no light", entry=entry)
-    return Storage(np.dtype(np.uint16), BLACK, full)
+    return Storage(np.dtype(np.uint16), BLACK, full, bounded)

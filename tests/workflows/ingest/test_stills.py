@@ -99,7 +99,7 @@ def test_raw_frames_are_stored_in_units_of_the_white_level(
         "c", make_zip(record("DNG"), {f"{n}.DNG": make_dng(c, 256, 4095) for n, c in enumerate(counts)})
     )
     assert stack.read().shape == (6, HEIGHT, WIDTH, 3)
-    assert stack.attributes["storage"] == {"black": BLACK, "full": 1.0}
+    assert stack.attributes["storage"] == {"black": BLACK, "full": 1.0, "bounded": True}
     assert stack.read()[4, 0, 0, 0] == 65535
     red = (counts[:, ::2, ::2].astype(np.float32) - 256) / (4095 - 256)
     got = decoded(stack)[..., 0]

@@ -1,0 +1,145 @@
+"""What a survey measures of captures whose clipping, drift and flicker are known."""
+
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.ndimage import shift
+
+from storage.captures import Stack
+from workflows.images import decode, encode_png
+from workflows.ingest.report import Finding, Report, report
+from workflows.presets import preset
+from workflows.scene import write_capture
+from workflows.simulate import glass_ball
+
+Ingest = Callable[..., Stack]
+
+
+@pytest.fixture(scope="module")
+def bundle() -> bytes:
+    target = io.BytesIO()
+    scene = glass_ball(120, 90, monitor=(320, 240), rays=16)
+    write_capture(scene, preset("default", 320, 240), target, mask=True)
+    return target.getvalue()
+
+
+def filmed(
+    bundle: bytes, *, drift: float = 0, flicker: float = 0, gain: float = 1, less: int = 0, **more: Any
+) -> bytes:
+    """The capture as a camera that moves to the right, or a light that varies, would have had it."""
+    target = io.BytesIO()
+    rng = np.random.default_rng(2)
+    with zipfile.ZipFile(io.BytesIO(bundle)) as archive, zipfile.ZipFile(target, "w") as out:
+        record = json.loads(archive.read("capture.json"))
+        out.writestr("capture.json", json.dumps(record | more))
+        out.writestr(record["mask"], archive.read(record["mask"]))
+        for n, frame in enumerate(record["frames"]):
+            values = decode(archive.read(frame["file"]), memory=1 << 24).astype(np.float64)
+            if drift:
+                values = shift(values, (0, drift * n / len(record["frames"]), 0), order=1, mode="nearest")
+            values = values * gain * (1 + flicker * rng.standard_normal()) - less
+            out.writestr(frame["file"], encode_png(np.clip(np.rint(values), 0, 255).astype(np.uint8)))
+    return target.getvalue()
+
+
+def reported(ingest: Ingest, data: bytes) -> tuple[Report, dict[str, Finding]]:
+    stack = ingest("c", data)
+    made = report(stack.attributes, stack.frames)
+    return made, {finding.name: finding for finding in made.findings}
+
+
+def test_a_good_capture_is_good(ingest: Ingest, bundle: bytes) -> None:
+    made, found = reported(ingest, bundle)
+    assert made.level == "good"
+    assert {finding.level for finding in made.findings} == {"good"}
+    assert all(finding.message and not finding.remedy for finding in made.findings)
+    assert made.frames.model_dump() == {"kept": 132, "patterns": 132, "exposures": 1, "missing": []}
+    assert made.clipping.white == 0
+    assert made.white_reaches == pytest.approx(0.86, abs=0.03)
+    assert made.drift is not None
+    assert made.drift.pixels < 0.2
+    assert made.flicker is not None
+    assert made.flicker.percent < 0.2
+    assert made.noise.black == pytest.approx(255 * 0.0025, rel=0.4)
+    assert "no difference to black and white" in found["monitor_curve"].message
+
+
+@pytest.mark.parametrize("percent", [1.0, 3.0, 8.0])
+def test_flicker_is_measured(ingest: Ingest, bundle: bytes, percent: float) -> None:
+    made, found = reported(ingest, filmed(bundle, flicker=percent / 100, gain=0.8))
+    assert made.flicker is not None
+    assert made.flicker.percent == pytest.approx(percent, rel=0.2)
+    assert found["flicker"].level == ("warning" if percent < 2 else "bad")
+    assert made.drift is not None
+    assert made.drift.pixels < 0.2
+
+
+@pytest.mark.parametrize("pixels", [0.6, 1.6])
+def test_drift_is_measured(ingest: Ingest, bundle: bytes, pixels: float) -> None:
+    made, found = reported(ingest, filmed(bundle, drift=pixels))
+    assert made.drift is not None
+    # between the middles of the first and the last quarter lie three quarters of it
+    assert made.drift.pixels == pytest.approx(0.75 * pixels, rel=0.25)
+    first, last = made.drift.quarters[0], made.drift.quarters[-1]
+    assert last[0] - first[0] > 0.5 * pixels
+    assert abs(last[1] - first[1]) < 0.15
+    assert found["drift"].level == ("warning" if pixels < 1 else "bad")
+
+
+def test_a_white_that_is_clipped_asks_for_less_exposure(ingest: Ingest, bundle: bytes) -> None:
+    made, found = reported(ingest, filmed(bundle, gain=1.3))
+    assert made.level == found["exposure"].level == "bad"
+    assert made.clipping.white > 0.3
+    assert "expose a stop less" in found["exposure"].remedy
+
+
+@pytest.mark.parametrize(
+    ("gain", "level", "more"), [(0.4, "warning", "a stop more"), (0.1, "bad", "3 stops more")]
+)
+def test_a_dark_white_asks_for_more_exposure(
+    ingest: Ingest, bundle: bytes, gain: float, level: str, more: str
+) -> None:
+    _, found = reported(ingest, filmed(bundle, gain=gain))
+    assert found["exposure"].level == level
+    assert more in found["exposure"].remedy
+
+
+def test_a_clipped_black_is_found(ingest: Ingest, bundle: bytes) -> None:
+    made, found = reported(ingest, filmed(bundle, less=9))
+    assert found["black"].level == "bad"
+    assert made.clipping.black > 0.9
+
+
+def test_more_noise_and_fewer_patterns_promise_less(ingest: Ingest, bundle: bytes) -> None:
+    def promised(data: bytes) -> tuple[float, float]:
+        quality = reported(ingest, data)[0].quality
+        assert quality is not None
+        return quality.low, quality.high
+
+    scene = glass_ball(60, 45, monitor=(320, 240), rays=4)
+    noisy, few = io.BytesIO(), io.BytesIO()
+    write_capture(scene, preset("default", 320, 240), noisy, noise=6)
+    write_capture(scene, preset("sketch", 320, 240), few)
+    best = promised(bundle)
+    for data in (noisy.getvalue(), few.getvalue()):
+        assert all(lesser < b - 2 for lesser, b in zip(promised(data), best, strict=True))
+    assert best[0] < best[1] < 60
+
+
+def test_a_curve_that_is_assumed_is_a_warning(ingest: Ingest, bundle: bytes) -> None:
+    made, found = reported(ingest, filmed(bundle, response="unknown"))
+    assert made.camera.source == "assumed"
+    assert made.level == found["camera_curve"].level == "warning"
+    assert "name it in capture.json" in found["camera_curve"].remedy
+
+
+def test_a_capture_that_saw_nothing_is_bad(ingest: Ingest, bundle: bytes) -> None:
+    made, found = reported(ingest, filmed(bundle, gain=0))
+    assert made.level == "bad"
+    assert made.drift is made.flicker is made.quality is None
+    assert found["noise"].level == "bad"
