@@ -152,10 +152,9 @@ def _batches(
     size = (rows.stop - rows.start) * (columns.stop - columns.start) * stack.channels * stack.dtype.itemsize
     # Values become floats, by then of several kinds.
     step = max(1, BATCH // (16 * size))
-    for first in range(0, stack.frames, step):
-        at = np.flatnonzero((chosen >= first) & (chosen < first + step))
-        if at.size:
-            yield at, stack.read(rows, columns, slice(first, first + step))[chosen[at] - first]
+    for first in range(0, len(chosen), step):
+        at = np.arange(first, min(first + step, len(chosen)))
+        yield at, stack.pick(chosen[at].tolist(), rows, columns)
 
 
 class _Shifts:

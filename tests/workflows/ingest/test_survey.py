@@ -12,7 +12,8 @@ from scipy.ndimage import shift
 
 from storage.captures import Stack
 from workflows.images import decode, encode_png
-from workflows.ingest.report import Finding, Report, report
+from workflows.ingest.findings import Finding
+from workflows.ingest.report import Report, report
 from workflows.presets import preset
 from workflows.scene import write_capture
 from workflows.simulate import glass_ball

@@ -1,0 +1,84 @@
+"""The figures of a report: what was measured of a capture."""
+
+from typing import Any, Literal
+
+from pydantic import BaseModel
+
+from workflows.tone import Curve
+
+
+class Frames(BaseModel):
+    """How many frames were kept, of how many patterns, in how many exposures, and the patterns without a frame."""
+
+    kept: int
+    patterns: int
+    exposures: int
+    missing: list[int]
+
+
+class Clipping(BaseModel):
+    """Shares of the pixels, 0 to 1: at white in the white frame, at black in the black one, and of both in patterns."""
+
+    white: float
+    black: float
+    patterns_white: float
+    patterns_black: float
+
+
+class Drift(BaseModel):
+    """How far the camera moved between quarters of the capture, in pixels, and that figure's standard error."""
+
+    pixels: float
+    error: float
+    quarters: list[tuple[float, float]]
+
+
+class Flicker(BaseModel):
+    """How much the light varied between frames: its deviation, and the frame that is furthest off."""
+
+    percent: float
+    worst_percent: float
+    worst_frame: int
+    frames: int
+
+
+class Noise(BaseModel):
+    """Standard deviations in grey levels of 8 bits, in linear light: before a black monitor, and at full scale.
+
+    ``read`` and ``shot`` are the variance ``read + shot v`` of a value v, full scale being 1.
+    """
+
+    black: float
+    full: float
+    read: float
+    shot: float
+
+
+class ToneCurve(BaseModel):
+    """A tone curve, and whether the capture names it, constant levels tell it, or it is only assumed."""
+
+    curve: Curve
+    source: Literal["given", "estimated", "assumed"]
+
+
+class Quality(BaseModel):
+    """PSNR in dB to expect of composites: of glass that scatters or disperses, and of clear glass."""
+
+    low: float
+    high: float
+
+
+class Figures(BaseModel):
+    """What was measured of a capture."""
+
+    frames: Frames
+    clipping: Clipping
+    white_reaches: float
+    drift: Drift | None
+    flicker: Flicker | None
+    noise: Noise
+    crosstalk: list[list[float]]
+    monitor: ToneCurve
+    camera: ToneCurve
+    quality: Quality | None
+    video: dict[str, Any] | None
