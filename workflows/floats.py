@@ -64,6 +64,7 @@ def _exr(data: bytes, memory: int) -> Floats:
             raise ImageError("EXR images are read with one part, flat and not deep: export it so")
         header = file.header()
         channels = {channel.name: channel for channel in header["channels"]}
+        tiles = header.get("tiles")
         low, high = (corner.astype(np.int64) for corner in header["dataWindow"])
     names = ["R", "G", "B"] if {"R", "G", "B"} <= channels.keys() else ["Y"]
     if not channels.keys() >= set(names):
@@ -75,6 +76,8 @@ def _exr(data: bytes, memory: int) -> Floats:
     width, height = (high - low + 1).tolist()
     # All channels are decoded, with 4 bytes a value at most, before the wanted ones are copied.
     _see_that_it_fits(width, height, 4 * (len(channels) + len(names)), memory)
+    if tiles is not None:  # which the library decodes whole, however little of one the image fills
+        _see_that_it_fits(tiles.xSize, tiles.ySize, 4 * len(channels), memory)
     with OpenEXR.File(io.BytesIO(data), separate_channels=True, num_threads=0) as file:
         planes = file.channels()
         pixels = np.empty((height, width, len(names)), np.float32)
@@ -90,13 +93,15 @@ def _tiff(data: bytes, memory: int) -> Floats:
             tifffile.PHOTOMETRIC.MINISWHITE
         }:
             raise ImageError("float TIFF images are read as grey or RGB, uncompressed or deflated")
-        if page.axes not in ("YX", "YXS", "SYX") or page.samplesperpixel > 4:
+        if page.axes not in ("YX", "YXS", "SYX") or not 1 <= page.samplesperpixel <= 4:
             raise ImageError(f"float TIFF images are read as grey or RGB; this one has the axes {page.axes}")
         height, width = page.imagelength, page.imagewidth
         stored = -(-page.nbytes // (width * height))
         channels = 3 if page.samplesperpixel > 2 else 1
         _see_that_it_fits(width, height, stored + 4 * channels, memory)
         array = np.asarray(page.asarray())
+        if array.size != height * width * page.samplesperpixel:
+            raise ImageError("the TIFF image is cut off or damaged: its tags contradict each other")
         if page.axes == "SYX":
             array = np.moveaxis(array, 0, -1)
         return np.ascontiguousarray(array.reshape(height, width, -1)[:, :, :channels], np.float32)

@@ -62,8 +62,10 @@ def decode(data: bytes, *, memory: int) -> NDArray[np.float32]:
             "this camera's RAW format is not known here: convert the frames to DNG, or develop them to TIFF "
             "of 16 bits with a linear curve"
         ) from error
-    except rawpy.LibRawError as error:
-        raise ImageError(f"the RAW image is cut off or damaged: {error.args[0].decode()}") from error
+    except ImageError:
+        raise
+    except Exception as error:  # what LibRaw's wrapper raises on damaged bytes is not a closed set
+        raise ImageError(f"the RAW image is cut off or damaged: {error}") from error
 
 
 def _light(raw: rawpy.RawPy) -> NDArray[np.float32]:
