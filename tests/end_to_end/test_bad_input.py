@@ -76,6 +76,10 @@ def monitor_of_nothing(manifest: dict, files: dict[str, bytes]) -> None:
     manifest["program"]["monitor"]["width"] = 0
 
 
+def exposure_of_nothing(manifest: dict, files: dict[str, bytes]) -> None:
+    manifest["frames"][2]["exposure"] = 0
+
+
 def program_too_large(manifest: dict, files: dict[str, bytes]) -> None:
     manifest["program"]["parts"][1] |= {"columns": 1280, "rows": 960, "count": 100_000}
 
@@ -96,6 +100,7 @@ def a_video(manifest: dict, files: dict[str, bytes]) -> None:
         (one_level, "capture.json", "program"),
         (leaves, "../evil.png", None),
         (monitor_of_nothing, "capture.json", "program.monitor.width"),
+        (exposure_of_nothing, "capture.json", "frames.2.exposure"),
         (program_too_large, "capture.json", "program"),
         (a_video, "clip.mp4", "video.file"),
     ],
@@ -160,7 +165,14 @@ def bomb(manifest: dict, files: dict[str, bytes]) -> None:
     files["frames/00009.png"] = bytes(data)
 
 
-@pytest.mark.parametrize("change", [of_another_size, of_another_kind, no_image, cut_off, bomb])
+def unknown_camera(manifest: dict, files: dict[str, bytes]) -> None:
+    manifest["frames"][9]["file"] = "frames/00009.nef"
+    files["frames/00009.nef"] = bytes(9000)
+
+
+@pytest.mark.parametrize(
+    "change", [of_another_size, of_another_kind, no_image, cut_off, bomb, unknown_camera]
+)
 def test_a_frame_that_is_refused_by_the_ingest(service: Service, bundle: Path, change) -> None:
     before = service.stored()
     answer = service.http.post("/v1/captures", content=remade(bundle, change), headers=ZIP)
@@ -171,12 +183,13 @@ def test_a_frame_that_is_refused_by_the_ingest(service: Service, bundle: Path, c
         pass
     assert found["state"] == "failed"
     assert found["problem"]["type"] == "urn:envmatte:problem:bad-capture"
-    assert found["problem"]["entry"] == "frames/00009.png"
+    entry = found["problem"]["entry"]
+    assert entry in ("frames/00009.png", "frames/00009.nef")
     assert service.client.job(made["job"])["problem"] == found["problem"]
     while (job := service.client.job(waiting["id"]))["state"] in ("queued", "running"):
         pass
     assert job["state"] == "failed"
-    assert "frames/00009.png" in job["problem"]["detail"]
+    assert entry in job["problem"]["detail"]
     check_problem(service.http.post("/v1/jobs", json={"capture": made["id"]}), 409, "conflict")
     assert service.stored() == before
 

@@ -79,9 +79,10 @@ def ingest(objects: Objects, put: Callable[[str, bytes], None]) -> Ingest:
         data: bytes,
         memory: int = 1 << 26,
         order: Callable[[range], Iterator[int]] = iter,  # type: ignore[assignment]
+        unpacked: int = 1 << 30,
     ) -> Stack:
         put(capture, data)
-        limits = Limits(unpacked=1 << 30, memory=memory)
+        limits = Limits(unpacked=unpacked, memory=memory)
         plan = frames.prepare(objects, capture, limits)
         for index in order(range(plan["tiles"])):
             frames.read_slab(objects, capture, limits, plan["slab"], index)

@@ -77,7 +77,7 @@ class Limits:
     Attributes
     ----------
     unpacked : int
-        Bytes of all its entries together.
+        Bytes of all its entries together, and of all its frames once they are decoded.
     memory : int
         Bytes that one reader may hold; an entry, or an image decoded, may take a quarter of it.
     """

@@ -1,5 +1,6 @@
 """The ingest of a capture: frames are read one at a time and written, a slab of them at once, into the stack."""
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -14,7 +15,7 @@ from storage.objects import Objects
 from workflows import images
 from workflows.grids import smallest_grid
 from workflows.ingest import stills
-from workflows.ingest.bundle import Bundle, Limits
+from workflows.ingest.bundle import MANIFEST, Bundle, Limits
 from workflows.ingest.content import lay_out
 from workflows.ingest.sorting import Sorted, sort
 from workflows.ingest.video import Share, opened
@@ -59,6 +60,15 @@ def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, Any]:
                     entry=manifest.mask,
                 )
     frames, height, width, _ = shape
+    size = math.prod(shape) * storage.dtype.itemsize
+    if size > limits.unpacked:
+        raise CaptureError(
+            f"{frames} frames of {width} x {height} pixels take {size} bytes, more than the {limits.unpacked} allowed: "
+            "use fewer or smaller ones",
+            entry=MANIFEST,
+            field="frames" if filmed is None else "video",
+            limit=limits.unpacked,
+        )
     slab = create_stack(
         objects,
         capture,

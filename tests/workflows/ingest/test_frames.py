@@ -243,6 +243,19 @@ def test_the_noise_is_the_cameras(ingest: Ingest) -> None:
         assert deviation == pytest.approx(2 * (0.002 + 0.006 * value**0.5), rel=0.25)
 
 
+def test_a_stack_that_takes_more_than_is_allowed_is_refused(make_zip: Zip, ingest: Ingest) -> None:
+    # One small file, named by a hundred thousand frames.
+    flat = encode_png(np.full((100, 100, 3), 9, np.uint8))
+    given = record([n % 6 for n in range(100_000)])
+    for frame in given["frames"]:
+        frame["file"] = "0.png"
+    with pytest.raises(
+        CaptureError, match="100000 frames of 100 x 100 pixels take 3000000000 bytes"
+    ) as caught:
+        ingest("c", make_zip(given, {"0.png": flat}, zipfile.ZIP_DEFLATED), unpacked=1 << 31)
+    assert caught.value.fields == {"entry": "capture.json", "field": "frames", "limit": 1 << 31}
+
+
 CHILD = """
 import re, sys
 from pathlib import Path
