@@ -15,7 +15,7 @@ Job = dict[str, Any]
 TUS = {"Tus-Resumable": "1.0.0"}
 LARGEST, SMALLEST = 8 << 20, 64 << 10
 """Bytes of a file that are sent at once: half as many after a fault, twice as many after a success."""
-PATIENCE = 60.0
+PATIENCE = 120.0
 """Seconds without progress after which an upload is given up: a service may be started again meanwhile."""
 PASSING = (408, 409, 423, 429, 460, 500, 502, 503, 504)
 """Statuses after which an upload is tried again, from where the service says it stands."""

@@ -170,14 +170,15 @@ async def _from_body(context: Context, request: Request, name: str, key: str | N
     await anyio.to_thread.run_sync(_check_room, context, length)
     capture = new_id()
     try:
-        size = await _receive(context, capture, request.stream(), limit)
-        part = Part(ONLY, size)
+        part = Part(ONLY, await _receive(context, capture, request.stream(), limit))
         row = await anyio.to_thread.run_sync(_register, context, capture, [part], name, key, False)
-    except BaseException:
-        uploads.remove(context.objects, capture)
+    except (
+        Exception
+    ):  # not when cancelled, where `_register` may still be at work: the next start sweeps then
+        await anyio.to_thread.run_sync(uploads.remove, context.objects, capture)
         raise
     if row.id != capture:  # a repeat with the same key was quicker
-        uploads.remove(context.objects, capture)
+        await anyio.to_thread.run_sync(uploads.remove, context.objects, capture)
     return row
 
 

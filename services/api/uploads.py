@@ -134,15 +134,16 @@ async def _append(context: Context, request: Request, row: Row[Any], checksum: C
                         raise
             stored[-1] = Part(name, size)
             if not size:
-                context.objects.delete(uploads.part_path(row.id, stored.pop().name))
+                nothing = uploads.part_path(row.id, stored.pop().name)
+                await anyio.to_thread.run_sync(context.objects.delete, nothing)
             if not checksum:
                 offset = await anyio.to_thread.run_sync(_advance, context, row.id, offset, stored)
+                stored = []
         if checksum:
             checksum.check()
             await anyio.to_thread.run_sync(_advance, context, row.id, offset, stored)
-    except BaseException:
-        with anyio.CancelScope(shield=True):
-            await anyio.to_thread.run_sync(_take_back, context, row.id, stored)
+    except Exception:  # not when cancelled, where `_advance` may still be at work: the next start sweeps then
+        await anyio.to_thread.run_sync(_take_back, context, row.id, stored)
         raise
     return await anyio.to_thread.run_sync(_get, context, row.id)
 
@@ -162,9 +163,7 @@ async def _heard(body: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
 
 def _advance(context: Context, upload: str, offset: int, stored: list[Part]) -> int:
     with writing(context.engine) as c:
-        offset = uploads.advance(c, upload, offset, stored, context.settings.upload_seconds)
-    stored.clear()  # here, for a request may be cancelled when this is done and before it goes on
-    return offset
+        return uploads.advance(c, upload, offset, stored, context.settings.upload_seconds)
 
 
 def _take_back(context: Context, upload: str, stored: list[Part]) -> None:

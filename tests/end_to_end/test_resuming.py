@@ -23,7 +23,7 @@ from storage.database import open_engine
 from storage.objects import Objects
 from tests.end_to_end.conftest import Service, paused, serving
 from tests.end_to_end.lines import Line
-from tests.end_to_end.test_uploads import CHUNK, TUS, begin, create, offset_of, uploads_of
+from tests.end_to_end.test_uploads import CHUNK, TUS, begin, create, gone, offset_of, uploads_of
 
 MB = 1_000_000
 SIZES = [50 * MB, pytest.param(1000 * MB, marks=[pytest.mark.full, pytest.mark.timeout(1800)])]
@@ -77,7 +77,7 @@ def test_the_client_outlives_a_hundred_cuts(
         assert told == sorted(set(told))
         assert told[-1] == file.stat().st_size
     assert service.client.wait(made["job"])["state"] == "succeeded"
-    assert not [name for name in uploads_of(service) if made["id"] in name]
+    gone(service, made["id"])
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -141,11 +141,13 @@ def test_a_server_that_is_killed_costs_nothing(bundle: Path, tmp_path: Path) -> 
             assert offset_of(second, other) == 0
             assert not [name for name in uploads_of(second) if other.rsplit("/", 1)[1] in name]
             line.target, carried = second.url, line.carried
-            sender.join(60)
+            sender.join(120)
+            assert made
             assert told == sorted(set(told))
             assert line.carried - carried < file.stat().st_size - reached + MB
             assert second.client.wait(made[0]["job"])["state"] == "succeeded"
             assert second.http.delete(other, headers=TUS).status_code == 204
+            gone(second, made[0]["id"])
             assert not uploads_of(second)
 
 
