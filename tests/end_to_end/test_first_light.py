@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from tests.end_to_end.conftest import Service, digests, png
+from tests.end_to_end.test_uploads import gone
 from workflows import images
 from workflows.program import Images, Program
 from workflows.scene import Scene, write_capture
@@ -27,7 +28,7 @@ def test_an_upload_is_ingested(service: Service, bundle: Path, scene: Scene) -> 
     found = service.client.capture(made["id"])
     assert (found["state"], found["width"], found["height"], found["frames"]) == ("ready", 96, 72, 57)
     assert datetime.fromisoformat(found["created_at"]).utcoffset() is not None
-    assert not (service.data / "store" / "uploads" / made["id"]).exists()
+    gone(service, made["id"])
 
 
 def test_frames_are_kept_as_they_were_filmed(service: Service, capture: str, scene: Scene, program) -> None:
