@@ -140,6 +140,28 @@ def test_a_torn_frame_shows_two_numbers_and_where_it_is_torn() -> None:
         np.testing.assert_array_equal(odd, below)  # 42 + 1 is odd
 
 
+def test_a_film_of_a_camera_that_runs_by_itself_is_read_whole() -> None:
+    rng = np.random.default_rng(8)
+    rate, frames_a_second, exposure, rolling = 2.0, 29.97, 1 / 60, 0.02
+    steps = schedule(60, rate)
+    starts = np.array([step.start for step in steps])
+    codes = np.array([code(step.number) for step in steps], float)
+    numbers = np.array([step.number for step in steps])
+
+    def filmed(begin: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The cells of an edge in frames whose exposure of it begins at these times."""
+        moments = begin[:, None] + exposure * (np.arange(16) + 0.5) / 16
+        shown_then = codes[np.searchsorted(starts, moments, "right") - 1].mean(axis=1)
+        return (0.03 + 0.5 * shown_then) ** (1 / 2.2) + rng.normal(0, 0.02, (len(begin), codes.shape[1]))
+
+    times = 0.011 + np.arange(int(frames_a_second * (steps[-1].start + 0.4))) / frames_a_second
+    (top, sure), (bottom, sure_too) = read(filmed(times)), read(filmed(times + rolling))
+    whole = sure & sure_too & (top == bottom)
+    middle = times + (rolling + exposure) / 2
+    np.testing.assert_array_equal(top[whole], numbers[np.searchsorted(starts, middle[whole], "right") - 1])
+    assert np.all(np.bincount(top[whole & (top >= 0)], minlength=60) >= frames_a_second / rate - 3)
+
+
 @pytest.mark.parametrize("level", [0.0, 0.3])
 def test_no_display_in_view_is_not_certain(level: float) -> None:
     noise = np.random.default_rng(7).normal(level, 0.01, (1000, 2 * (BITS + 1)))
