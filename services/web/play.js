@@ -108,8 +108,9 @@ class Pictures {
 
 const nextFrame = () => new Promise(requestAnimationFrame);
 
-// Shows the steps, each for a whole number of the display's refreshes, and none before its picture is there. A step that
-// came late is followed by one as long as any: no step is ever left out. Returns when each of them was first shown.
+// Shows the steps, each for a whole number of the display's refreshes, and none before its picture is there. Where one
+// refresh was missed, the next step makes up for it; where more were, it is as long as any, and the beat starts anew: no
+// step is ever left out. Returns when each of them was first shown.
 async function show(context, border, steps, pictures, refresh, stopped) {
   const shown = [];
   let due = -Infinity;
@@ -124,7 +125,7 @@ async function show(context, border, steps, pictures, refresh, stopped) {
     draw(context, border, step, picture);
     shown.push({ number: step.number, white: step.white, at: now });
     // On time, the next is due by the steady beat; too late, by a new one.
-    const start = now < due + refresh ? due : now;
+    const start = now < due + 1.5 * refresh ? due : now;
     due = start + Math.max(1, Math.round((step.seconds * 1000) / refresh)) * refresh;
     if (i + 1 < steps.length && steps[i + 1].number !== LEAD) {
       pictures.prepare(steps[i + 1].number).catch(() => {}); // a picture that fails is waited for, until Escape
