@@ -1,5 +1,7 @@
 """What the frames of constant monitors say of the camera: its noise, its crosstalk, and curves that are unknown."""
 
+from collections.abc import Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -9,13 +11,17 @@ from pydantic import TypeAdapter
 from storage.captures import Stack
 from storage.objects import Objects
 from workflows.program import Program
-from workflows.recovery.photometry import estimate_crosstalk, estimate_noise
+from workflows.recovery.excess import estimate_excess
+from workflows.recovery.photometry import Noise, estimate_crosstalk, estimate_noise
 from workflows.tone import Curve, Response, estimate, table, to_light
 
 SAMPLES = 20_000
 """Pixels, about, from which the noise and unknown curves are measured."""
 FRAMES = 64
 """Frames of constant levels, at most, from which they are."""
+
+COMPRESSED_SAMPLES = 4096
+"""Pixels, at most, from which the noise of a video is measured, in all of its frames."""
 
 
 def measure(objects: Objects, capture: str) -> None:
@@ -45,10 +51,13 @@ def measure(objects: Objects, capture: str) -> None:
     # Of one exposure, so that they have one noise.
     shortest = np.flatnonzero(exposures == exposures.min())
     codes, usable, sent, grey = codes[:, shortest], usable[:, shortest], sent[shortest], grey[shortest]
-    light, shown = table(found.camera, stack.dtype, black)[codes], to_light(sent, found.monitor)
+    look_up = table(found.camera, stack.dtype, black)
+    light, shown = look_up[codes], to_light(sent, found.monitor)
     # what the channels see of each other's colours is no noise
     some = grey if np.count_nonzero(grey) >= 4 else np.ones_like(grey)
     noise = estimate_noise(light[:, some], shown[some], usable[:, some], 1 / (top - black))
+    if "video" in stack.attributes:
+        noise = _compressed(stack, look_up, frames, shown, noise)
     stack.annotate(
         monitor_curve=_plain(found.monitor),
         camera_curve=_plain(found.camera),
@@ -56,6 +65,30 @@ def measure(objects: Objects, capture: str) -> None:
         noise={"read": noise.read, "shot": noise.shot},
         crosstalk=estimate_crosstalk(light, shown, usable).tolist(),
     )
+
+
+def _compressed(
+    stack: Stack,
+    look_up: NDArray[np.float32],
+    constants: Sequence[int],
+    shown: NDArray[np.float32],
+    noise: Noise,
+) -> Noise:
+    """The noise of a video's frames, which compression makes larger before patterns than before constants.
+
+    Every frame counts as one, whatever went into its mean: what compression does is not averaged away.
+    """
+    squares = product(_spread(stack.height), _spread(stack.width))
+    read = [stack.read_masked(y, x) for y, x in squares]
+    codes = np.concatenate([values[:, mask] for values, mask in read], axis=1).transpose(1, 0, 2)
+    codes = codes[:: -(-len(codes) // COMPRESSED_SAMPLES) or 1]
+    light = look_up[codes]
+    design = np.stack([np.ones(len(shown)), shown.mean(axis=1)], axis=1)
+    black, slope = np.einsum("dk,nkc->dnc", np.linalg.pinv(design), light[:, constants]).astype(np.float32)
+    usable = (codes > 0) & (codes < len(look_up) - 1)
+    excess = estimate_excess(light, black, black + np.maximum(slope, 0), usable)
+    grey = np.array([0.5], np.float32)
+    return noise if excess is None or excess.variance(grey) < noise.variance(grey) else excess
 
 
 def constant_frames(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from storage.errors import CaptureError
 from workflows.ingest import content
 from workflows.ingest.recording import Recording
-from workflows.ingest.timing import Found, find
+from workflows.ingest.timing import Edge, Found, find
 from workflows.ingest.video import PARTS, Share, Signatures
 from workflows.program import Program
 
@@ -21,7 +21,14 @@ LEAST_SHARE = 0.6
 """Of the patterns that are not constant: with fewer, a recording is refused."""
 LEAST_RESEMBLANCE = 2.5
 """Standard deviations, see `content.resemblance`."""
-_EVENTS = 4
+EDGES: tuple[tuple[tuple[Edge, Edge], ...], ...] = (
+    (("seen", "seen"), ("hidden", "seen"), ("seen", "hidden"), ("hidden", "hidden")),
+    (("seen", "cut"), ("cut", "seen"), ("hidden", "cut"), ("cut", "hidden")),
+)
+"""How the program may begin and end: what is more likely comes first."""
+_AS_LIKELY = 10.0  # difference of the -ln likelihoods of the timing
+_EVENTS = 4  # for each pattern
+_RESTLESS = 5.0  # codes
 _GAMMA = 2.2  # near enough to any camera's curve to compare what it saw
 
 
@@ -87,6 +94,11 @@ def sort(
         return CaptureError(f"{entry}: {what}", entry=entry)
 
     recording = Recording(signatures, (ticks - ticks[0]) * tick, 1 / rate)
+    if not recording.events and recording.noise.max(initial=0) > _RESTLESS:
+        raise refused(
+            "the picture changes from each frame to the next and never stands still: record more frames a second, show "
+            "fewer patterns, and keep the camera at rest"
+        )
     if not recording.events:
         raise refused("nothing changes in the video: film the monitor while it shows the program")
     if len(recording.events) > _EVENTS * program.count + 100:
@@ -95,11 +107,12 @@ def sort(
             "the camera, the light and the glass at rest, and cut off what does not belong to the program"
         )
     found, looks, resemblance = _best(recording, rate, program, light, refused)
-    reasons = dict(found.reasons)
-    for number in content.odd(program, light, looks):
+    reasons, odd = dict(found.reasons), content.odd(program, light, looks)
+    for number in odd:
         reasons[number] = "it looks unlike others of its kind, as if something had been in front"
         del looks[number]
-    if resemblance is not None and resemblance < LEAST_RESEMBLANCE:
+    wrong = np.isin(program.constants[0], odd).mean() > 0.5
+    if wrong or (resemblance is not None and resemblance < LEAST_RESEMBLANCE):
         raise refused(
             "what changes in the video does not look like the patterns of the program: see that capture.json has the "
             "program that was shown, and its patterns_per_second"
@@ -122,26 +135,35 @@ def sort(
 def _best(
     recording: Recording, rate: float, program: Program, light: content.Light, refused: Any
 ) -> tuple[Found, dict[int, Doubles], float | None]:
-    """The whole program in the recording; or if that can't be, a part of it: its beginning, or its end."""
+    """What fits the timing, and of that what looks most like the program.
+
+    The whole program; or if that can't be, a part of it: all but its end, or its beginning.
+    """
     flat = light.reshape(len(light), -1)
     same = (flat[1:] == flat[:-1]).all(axis=1)
-    tried = []
-    for begun, cut in ((False, False), (False, True), (True, False)):
-        found = find(recording, rate, same, begun=begun, cut=cut)
-        if found is None or found.jump is not None:
-            continue
-        looks = {n: (recording.look(f) / 255) ** _GAMMA for n, f in enumerate(found.frames) if f.size}
-        resemblance = content.resemblance(program, light, looks)
-        tried.append((found, looks, resemblance))
-        if not begun and not cut:
+    for edges in EDGES:
+        tried = [find(recording, rate, same, begin, end) for begin, end in edges]
+        fitting = [found for found in tried if found is not None and not found.jumps]
+        if fitting:
             break
-    if not tried:
+    else:
         raise refused(
             f"the {len(recording.events)} changes in the video do not fit {program.count} patterns at {rate:g} a "
             "second: see that capture.json has the program that was shown and its patterns_per_second, and record "
             "all of it in one go, with everything at rest"
         )
-    return max(tried, key=lambda each: each[2] or 0.0)
+    least = min(found.cost for found in fitting)
+    chosen, best = None, -np.inf
+    for found in sorted(fitting, key=lambda found: found.cost):
+        if found.cost > least + _AS_LIKELY:
+            break
+        looks = {n: (recording.look(f) / 255) ** _GAMMA for n, f in enumerate(found.frames) if f.size}
+        resemblance = content.resemblance(program, light, looks)
+        score = (resemblance or 0.0) - len(content.odd(program, light, looks))
+        if score > best:
+            chosen, best = (found, looks, resemblance), score
+    assert chosen is not None
+    return chosen
 
 
 def _see_that_it_is_enough(

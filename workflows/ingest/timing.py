@@ -8,7 +8,7 @@ first and the last.
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,18 +17,27 @@ from workflows.ingest.recording import Doubles, Integers, Recording
 
 Bools = NDArray[np.bool_]
 
+Edge = Literal["seen", "hidden", "cut"]
+"""How the program begins or ends: with a change; unseen, for the monitor shows the same before or after; or it does so
+before the recording begins, or after it has ended."""
+
 JITTER = 0.1
 """Of a pattern's hold, in units of itself: standard deviation."""
 # Costs in units of -ln likelihood.
 _HIDDEN = 12.0  # a boundary that no event shows, between patterns that differ
 _SAME = 0.5  # the same, between patterns that do not
-_IDLE_IS_SAME = 6.0  # the same, at the start and the end: the monitor showed the first pattern before
 _JUNK = 8.0  # an event that is no boundary
 _JUNK_OUTSIDE = 3.0  # the same, before the program and after it
 _MOST_JUNK = 24
-_CUT = 40.0  # the recording begins within the program, or ends within it
+_EDGE = {"seen": 0.0, "hidden": 6.0, "cut": 40.0}
+_AT_EDGE = {
+    "seen": slice(0, 1),
+    "hidden": slice(1, 2),
+    "cut": slice(1, None),
+}  # boundaries, from an end of the program
 _ENOUGH = 0.7  # of a hold: what is surely the pattern's
-_SLACK = 0.2  # of a hold: how far the time of an event may be off
+_UNLIKELY = 3.5  # standard deviations
+_SLACK = 0.2  # of a hold: how far the time of an event may be off where something moves
 _ELBOW = 4.0  # standard deviations from which on timing costs less
 
 
@@ -46,8 +55,10 @@ class Found:
         Why a pattern has no frames.
     start, rate : float
         Seconds from the first frame to the first pattern, and patterns a second.
-    jump : float or None
-        Seconds at which more patterns must have passed than there was time for: something is cut out, or all is wrong.
+    cost : float
+        -ln likelihood of the timing, but for a constant.
+    jumps : bool
+        Whether more patterns must have passed somewhere than there was time for: something is cut out, or all is wrong.
     """
 
     frames: list[Integers]
@@ -55,7 +66,8 @@ class Found:
     reasons: dict[int, str]
     start: float
     rate: float
-    jump: float | None
+    cost: float
+    jumps: bool
 
 
 class Step(NamedTuple):
@@ -79,9 +91,7 @@ class _Option(NamedTuple):
     cost: float
 
 
-def find(
-    recording: Recording, rate: float, same: Bools, *, begun: bool = False, cut: bool = False
-) -> Found | None:
+def find(recording: Recording, rate: float, same: Bools, begin: Edge, end: Edge) -> Found | None:
     """Find the frames of each pattern.
 
     Parameters
@@ -91,22 +101,22 @@ def find(
         Patterns a second, about.
     same : (n - 1,) bool
         Whether a pattern is the same picture as the one before it.
-    begun, cut : bool
-        Whether the recording may begin, or end, within the program.
+    begin, end : Edge
+        How the first pattern begins, and how the last one ends.
 
     Returns
     -------
     Found or None
         None if no n patterns fit the events.
     """
-    path = _shortest(recording, 1 / rate, same, begun, cut)
+    path = _shortest(recording, 1 / rate, same, begin, end)
     if path is None:
         return None
-    steps = path
-    hold = _hold(steps, 1 / rate)
+    hold = _hold(path[0], 1 / rate)
     if abs(hold * rate - 1) > 0.02:
-        steps = _shortest(recording, hold, same, begun, cut) or path
-        hold = _hold(steps, hold)
+        path = _shortest(recording, hold, same, begin, end) or path
+        hold = _hold(path[0], hold)
+    steps, cost = path
     frames: list[Integers] = [np.zeros(0, np.intp)] * (len(same) + 1)
     weights: list[Doubles] = [np.zeros(0)] * (len(same) + 1)
     reasons: dict[int, str] = {}
@@ -116,16 +126,17 @@ def find(
         else:
             frames[pattern], weights[pattern] = recording.clean(given)
     start = steps[0].begin - steps[0].first * hold - float(recording.times[0])
-    return Found(frames, weights, reasons, start, 1 / hold, _jump(recording, steps, hold))
+    return Found(frames, weights, reasons, start, 1 / hold, cost, _jumps(steps, hold))
 
 
-def _jump(recording: Recording, steps: list[Step], hold: float) -> float | None:
-    """When more than one boundary lies where there is time for fewer."""
+def _jumps(steps: list[Step], hold: float) -> bool:
+    """Whether more than one boundary lies somewhere where there is time for fewer."""
     for a, b in pairwise(steps):
-        holds = b.first - a.last
-        if holds > 1 and (b.begin - a.end) / hold < holds - _ELBOW * JITTER * math.sqrt(holds) - _SLACK:
-            return a.end
-    return None
+        holds, disturbed = b.first - a.last, b.event > a.event + 1
+        least = holds - _UNLIKELY * JITTER * math.sqrt(holds) - _SLACK * disturbed
+        if holds > 1 and b.begin - a.end < least * hold:
+            return True
+    return False
 
 
 def _hold(steps: list[Step], about: float) -> float:
@@ -162,19 +173,19 @@ def _options(recording: Recording, hold: float) -> list[_Option]:
     return options
 
 
-def _shortest(recording: Recording, hold: float, same: Bools, begun: bool, cut: bool) -> list[Step] | None:
-    """The boundaries' path through the events that costs least."""
+def _shortest(
+    recording: Recording, hold: float, same: Bools, begin: Edge, end: Edge
+) -> tuple[list[Step], float] | None:
+    """The boundaries' path through the events that costs least, and its cost."""
     n, times, options = len(same) + 1, recording.times, _options(recording, hold)
     hidden = np.concatenate([[0, 0], np.cumsum(np.where(same, _SAME, _HIDDEN)), [np.inf]])  # up to a boundary
     cost = np.full((len(options), n + 1), np.inf)
     before = np.full((len(options), n + 1, 2), -1)
     begins = np.searchsorted([option.event for option in options], range(len(recording.events)))
     for at, option in enumerate(options):
-        # as the first: the program begins here, or did before, unseen
-        entry = np.full(n + 1, _CUT if begun else np.inf)
-        entry[0] = 0
-        if option.begin - times[0] > _ENOUGH * hold:
-            entry[1] = min(entry[1], _IDLE_IS_SAME)
+        entry = np.full(n + 1, np.inf)  # as the first event that holds a boundary
+        if _fits(begin, option.begin - times[0], hold, outside=option.event):
+            entry[_AT_EDGE[begin]] = _EDGE[begin]
         more = option.boundaries - 1
         cost[at, more:] = entry[: n + 1 - more] + option.cost + _JUNK_OUTSIDE * option.event
         for event in range(option.event - 1, max(option.event - _MOST_JUNK, 0) - 1, -1):
@@ -199,20 +210,29 @@ def _shortest(recording: Recording, hold: float, same: Bools, begun: bool, cut: 
                         [np.full(n + 1 - to, earlier), np.arange(n + 1 - to)], 1
                     )[better]
     ends = cost + np.array([_JUNK_OUTSIDE * (len(recording.events) - 1 - o.event) for o in options])[:, None]
-    leave = np.full((len(options), n + 1), _CUT if cut else np.inf)
-    leave[:, n] = 0
-    late = np.array([times[-1] - o.end > _ENOUGH * hold for o in options], bool)
-    leave[late, n - 1] = np.minimum(leave[late, n - 1], _IDLE_IS_SAME)
-    ends += leave
+    for at, option in enumerate(options):
+        outside = len(recording.events) - 1 - option.event
+        leave = np.full(n + 1, np.inf)
+        if _fits(end, times[-1] - option.end, hold, outside):
+            leave[::-1][_AT_EDGE[end]] = _EDGE[end]
+        ends[at] += leave
     if not np.isfinite(ends).any():
         return None
     at, index = (int(i) for i in np.unravel_index(np.argmin(ends), ends.shape))
-    steps = []
+    steps, least = [], float(ends[at, index])
     while at >= 0:
         option = options[at]
         steps.append(Step(option.event, index - option.boundaries + 1, index, option.begin, option.end))
         at, index = (int(i) for i in before[at, index])
-    return steps[::-1]
+    return steps[::-1], least
+
+
+def _fits(edge: Edge, time: float, hold: float, outside: int) -> bool:
+    """Whether there is time for an edge of the program between an event and an end of the recording."""
+    if edge == "hidden":
+        return time > _ENOUGH * hold
+    # Who cut the recording left no more of it than of a pattern: what stands still for longer is no pattern.
+    return edge == "seen" or (outside == 0 and time < (1 + 3 * JITTER) * hold)
 
 
 def _late(late: float, hold: float, holds: int, variance: float) -> float:
@@ -263,7 +283,8 @@ def _frames_of(recording: Recording, steps: list[Step], hold: float, same: Bools
         plateau = recording.plateau(last.event + 1)
         found[last.last] = within(plateau, last.end, last.end + _ENOUGH * hold)
     return {
-        pattern: "no frame shows it whole" if isinstance(given, range) and not given else given
+        # One frame alone may be torn: it has none to be compared with.
+        pattern: "no two frames show it whole" if isinstance(given, range) and len(given) < 2 else given
         for pattern, given in sorted(found.items())
     }
 

@@ -20,6 +20,8 @@ CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
 CODECS = frozenset({"h264", "hevc", "mjpeg", "mpeg4", "vp8", "vp9", "av1", "libdav1d", "prores", "ffv1"})
 CELLS = (32, 24)
 """Columns and rows of a frame's signature."""
+ROUNDED = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
+"""Without these, colours come out half a code too dark."""
 PARTS = 257
 """What the weights of a pattern's frames add up to: 257 times a code of 8 bits is the same one of 16."""
 
@@ -155,7 +157,7 @@ class Clip:
                         "damaged there. Copy it anew from the camera",
                         entry=self._entry,
                     )
-                mean += _pixels(frame.reformat(format="rgb24")) * np.uint16(weight)
+                mean += _pixels(frame.reformat(format="rgb24", interpolation=ROUNDED)) * np.uint16(weight)
             yield np.ascontiguousarray(np.rot90(mean, self._turn))
 
     def _open(self) -> VideoStream:
@@ -171,7 +173,8 @@ class Clip:
             )
         self._see_that_it_fits(codec.width, codec.height)
         # What the container says may not be what the stream says: a decoder makes room for no more than this.
-        codec.options = {"max_pixels": str(max(self._limit // 6, 1))}
+        # Damage is to be an error, not a guess at what was there.
+        codec.options = {"max_pixels": str(max(self._limit // 6, 1)), "err_detect": "explode"}
         codec.thread_count, codec.thread_type = 2, "AUTO"
         return stream
 
@@ -199,16 +202,22 @@ class Clip:
                 yield frame
 
     def _decoded(self) -> Iterator[VideoFrame]:
-        packets = self._container.demux(self._stream)
+        packets, whole = self._container.demux(self._stream), True
         while True:
             try:
                 packet = next(packets)
             except (StopIteration, av.FFmpegError, OSError):
                 return
             try:
-                yield from self._stream.decode(packet)
+                frames = self._stream.decode(packet)
             except av.FFmpegError:
+                whole = False
                 continue
+            for frame in frames:
+                # What was lost goes on from frame to frame until one is coded by itself.
+                whole = not frame.is_corrupt and (whole or frame.key_frame)
+                if whole:
+                    yield frame
 
     def _see_that_it_fits(self, width: int, height: int) -> None:
         if 6 * width * height > self._limit:

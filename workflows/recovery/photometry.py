@@ -166,13 +166,37 @@ def estimate_noise(
     pairs = [_residuals(values[::step, :, c], levels[:, c], usable[::step, :, c], share) for c in channels]
     level = np.concatenate([np.zeros(0), *(pair[0] for pair in pairs)])
     square = np.concatenate([np.zeros(0), *(pair[1] for pair in pairs)])
+    return noise_line(level, square, floor) or typical
+
+
+def noise_line(
+    level: NDArray[np.floating], square: NDArray[np.floating], floor: float, *, trim: float = _TRIM
+) -> Noise | None:
+    """The noise of which there are samples.
+
+    Parameters
+    ----------
+    level : (k,) float
+        Linear camera values.
+    square : (k,) float
+        Squares of single errors at these, each its variance times a chi-square variable of one degree.
+    floor : float
+        The least variance.
+    trim : float
+        Share of the samples of a level that is used, the least ones: 0.9, or 1.
+
+    Returns
+    -------
+    Noise or None
+        None of fewer than 120 samples.
+    """
     if level.size < 10 * _BINS:
-        return typical
+        return None
     order = np.argsort(level, kind="stable")
     bins = np.array_split(order, _BINS)
     middle = np.array([level[b].mean() for b in bins])
-    lowest = [np.sort(square[b])[: int(_TRIM * len(b))] for b in bins]
-    variance = np.array([least.mean() for least in lowest]) / _TRIMMED_CHI_SQUARE
+    lowest = [np.sort(square[b])[: int(trim * len(b))] for b in bins]
+    variance = np.array([least.mean() for least in lowest]) / (_TRIMMED_CHI_SQUARE if trim < 1 else 1)
     variance = np.maximum(variance, floor)
     # the error of a sample variance is in proportion to it
     design = np.stack([np.ones(_BINS), np.maximum(middle, 0)], axis=1) / variance[:, None]

@@ -1,0 +1,75 @@
+"""A video goes in over HTTP, a composite comes out."""
+
+import io
+import json
+import zipfile
+
+import numpy as np
+import pytest
+
+from tests.end_to_end.conftest import Service, png
+from tests.workflows.ingest.camera import Camera, capture, film, lights
+from workflows import images
+from workflows.program import Program
+from workflows.scene import Scene
+from workflows.tone import to_light
+
+CAMERA = Camera(hold=0.25, hand=(6.0, 6.8), options={"crf": "12"})
+
+
+@pytest.fixture(scope="module")
+def uploaded(service: Service, scene: Scene, program: Program) -> dict:
+    """A recording of the scene, a hand in front of it for a while, as it was ingested."""
+    made = film(lights(scene, program), CAMERA)
+    record, files = capture(program, made.data, 1 / CAMERA.hold)
+    target = io.BytesIO()
+    with zipfile.ZipFile(target, "w") as archive:
+        archive.writestr("capture.json", json.dumps(record | {"mask": "mask.png"}))
+        archive.writestr("clip.mp4", files["clip.mp4"])
+        archive.writestr("mask.png", images.encode_png(scene.object_mask.astype(np.uint8)[..., None] * 255))
+    answer = service.http.post(
+        "/v1/captures", content=target.getvalue(), headers={"Content-Type": "application/zip"}
+    )
+    assert answer.status_code == 201, answer.text
+    service.client.wait(answer.json()["job"])
+    return service.client.capture(answer.json()["id"])
+
+
+def test_what_was_found_is_told(service: Service, uploaded: dict, program: Program) -> None:
+    assert (uploaded["state"], uploaded["width"], uploaded["height"]) == ("ready", 96, 72)
+    assert program.count - 6 <= uploaded["frames"] < program.count
+    lines = [line["text"] for line in service.http.get(f"/v1/jobs/{uploaded['job']}/log").json()["lines"]]
+    assert any(f"{uploaded['frames']} of {program.count} patterns found" in line for line in lines), lines
+    assert any(line.startswith("no frame of pattern") for line in lines), lines
+    frame = service.http.get(f"/v1/captures/{uploaded['id']}/frames/0.png")
+    assert images.decode(frame.content, memory=1 << 24).shape == (72, 96, 3)
+
+
+@pytest.mark.parametrize("method", ["lobes", "nn-dgsr"])
+def test_a_composite_is_close_to_the_truth(
+    service: Service, uploaded: dict, scene: Scene, method: str
+) -> None:
+    matte = service.client.wait(service.client.recover(uploaded["id"], method=method)["id"])["matte"]
+    y, x = np.mgrid[:96, :128] / 128
+    backdrop = np.stack([x, 1 - x, 0.5 + 0.4 * np.sin(9 * y)], axis=-1).astype(np.float32)
+    answer = service.client.composite(matte, png(backdrop, "linear", np.uint16), transfer="linear")
+    pixels = images.to_unit(images.decode(answer, memory=1 << 24))[..., :3]
+    error = to_light(pixels, "linear") - np.clip(scene.truth(backdrop), 0, 1)
+    assert -10 * np.log10(np.mean(error[scene.object_mask] ** 2)) > 32
+
+
+def test_a_recording_of_another_program_is_refused(service: Service, scene: Scene, program: Program) -> None:
+    record, files = capture(program, film(lights(scene, program)[:12], CAMERA).data, 1 / CAMERA.hold)
+    target = io.BytesIO()
+    with zipfile.ZipFile(target, "w") as archive:
+        archive.writestr("capture.json", json.dumps(record))
+        archive.writestr("clip.mp4", files["clip.mp4"])
+    before = service.stored()
+    made = service.http.post(
+        "/v1/captures", content=target.getvalue(), headers={"Content-Type": "application/zip"}
+    ).json()
+    job = service.http.get(f"/v1/jobs/{made['job']}").json()
+    while job["state"] in ("queued", "running"):
+        job = service.http.get(f"/v1/jobs/{made['job']}").json()
+    assert (job["state"], job["problem"]["entry"]) == ("failed", "clip.mp4")
+    assert not [name for name in service.stored() - before if made["id"] in name]
