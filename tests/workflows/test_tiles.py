@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 from storage import mattes
+from storage.captures import Stack
 from storage.errors import Corrupt
 from storage.objects import Objects
+from tests.workflows.ingest.camera import Camera, capture, film, lights
 from workflows.composite import composite
 from workflows.images import decode, encode_png
 from workflows.ingest.bundle import Limits
@@ -22,6 +24,7 @@ from workflows.scene import Scene, nested_program, write_capture
 from workflows.simulate import glass_ball
 from workflows.tiles import _merge, cut
 
+Zip = Callable[..., bytes]
 Ingest = Callable[..., object]
 Digests = Callable[[str], dict[str, str]]
 
@@ -283,3 +286,22 @@ def test_a_clipped_repeat_takes_its_whole_exposure_out() -> None:
     assert usable[0, 0].tolist() == [False, True, False]
     np.testing.assert_allclose(light[0, 0] * 255, [252.5, 105, 4.5])
     np.testing.assert_array_equal(worth, 2)
+
+
+@pytest.mark.parametrize("method", ["lobes", "nn-dgsr"])
+def test_patterns_that_a_video_lacks_are_done_without(
+    recover: Callable[..., tuple[mattes.Matte, int]],
+    objects: Objects,
+    scene: Scene,
+    make_zip: Zip,
+    method: str,
+) -> None:
+    program = nested_program((64, 48), ((4, 3, 14), (8, 6, 10)), levels=5)
+    made = film(lights(scene, program), Camera(hold=0.2, tail=-0.7, options={"crf": "10"}))
+    matte, _ = recover(make_zip(*capture(program, made.data, 5)), method=method)
+    lacking = Stack(objects, "c").attributes["video"]["missing"]
+    assert 2 <= len(lacking) <= 6
+    y, x = np.mgrid[:48, :64] / 64
+    backdrop = np.stack([x, 1 - x, y], axis=2).astype(np.float32)
+    error = composite(matte, backdrop)[..., :3] - scene.truth(backdrop)
+    assert -10 * np.log10(np.mean(error[scene.object_mask] ** 2)) > 24

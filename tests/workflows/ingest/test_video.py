@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from storage.captures import Stack
-from tests.workflows.ingest.camera import TICK, Camera, Film, capture, film, lights
+from storage.errors import CaptureError
+from tests.workflows.ingest.camera import TICK, Camera, Film, boxes, capture, film, lights, turned
 from workflows.program import Program
 from workflows.scene import nested_program
 from workflows.simulate import glass_ball
