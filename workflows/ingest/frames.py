@@ -17,7 +17,7 @@ from workflows.grids import smallest_grid
 from workflows.ingest import stills
 from workflows.ingest.bundle import MANIFEST, Bundle, Limits
 from workflows.ingest.content import lay_out
-from workflows.ingest.sorting import Sorted, sort
+from workflows.ingest.sorting import MOST_PATTERNS, Sorted, sort
 from workflows.ingest.video import Share, opened
 from workflows.program import Images
 from workflows.tone import Response
@@ -108,6 +108,13 @@ def _look(
         shape = len(manifest.frames), height, width, channels
         return shape, stills.storage_of(bundle, first, limits), None
     program, entry = manifest.program, manifest.video.file
+    if program.count > MOST_PATTERNS:
+        raise CaptureError(
+            f"{entry} shows {program.count} patterns, more than the {MOST_PATTERNS} that are told apart in a video: "
+            "send frames, or show fewer",
+            entry=entry,
+            limit=MOST_PATTERNS,
+        )
     curve = "srgb" if program.monitor.response == "unknown" else program.monitor.response
     light = lay_out(program, curve, patterns)
     with bundle.open(entry) as file, opened(file, entry, limits.image) as clip:

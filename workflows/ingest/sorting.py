@@ -17,6 +17,8 @@ from workflows.program import Program
 
 Doubles = NDArray[np.float64]
 
+MOST_PATTERNS = 2000
+"""Of a program that is filmed: sorting takes memory in proportion to their square."""
 LEAST_SHARE = 0.6
 """Of the patterns that are not constant: with fewer, a recording is refused."""
 LEAST_RESEMBLANCE = 2.5
@@ -27,7 +29,7 @@ EDGES: tuple[tuple[tuple[Edge, Edge], ...], ...] = (
 )
 """How the program may begin and end: what is more likely comes first."""
 _AS_LIKELY = 10.0  # difference of the -ln likelihoods of the timing
-_EVENTS = 4  # for each pattern
+_EVENTS = 2  # for each pattern
 _RESTLESS = 5.0  # codes
 _GAMMA = 2.2  # near enough to any camera's curve to compare what it saw
 

@@ -180,7 +180,7 @@ def _shortest(
     n, times, options = len(same) + 1, recording.times, _options(recording, hold)
     hidden = np.concatenate([[0, 0], np.cumsum(np.where(same, _SAME, _HIDDEN)), [np.inf]])  # up to a boundary
     cost = np.full((len(options), n + 1), np.inf)
-    before = np.full((len(options), n + 1, 2), -1)
+    before = np.full((len(options), n + 1, 2), -1, np.int32)
     begins = np.searchsorted([option.event for option in options], range(len(recording.events)))
     for at, option in enumerate(options):
         entry = np.full(n + 1, np.inf)  # as the first event that holds a boundary

@@ -258,6 +258,12 @@ def test_frames_larger_than_the_container_says_are_never_decoded(
     assert caught.value.fields["entry"] == "clip.mp4"
 
 
+def test_more_patterns_than_are_sorted_are_refused(take: Callable[..., Stack], filmed: Film) -> None:
+    with pytest.raises(CaptureError, match="more than the 2000") as caught:
+        take(filmed.data, program=other(count=700))
+    assert caught.value.fields == {"entry": "clip.mp4", "limit": 2000}
+
+
 def test_more_frames_than_are_sorted_are_refused(take: Callable[..., Stack], filmed: Film) -> None:
     with pytest.raises(CaptureError, match="which is the most that is sorted"):
         take(filmed.data, memory=1 << 20)
