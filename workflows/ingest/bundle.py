@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from storage.errors import CaptureError
+from workflows.clock import Border
 from workflows.program import Images, Program
 from workflows.tone import Response
 
@@ -55,6 +56,7 @@ class Video(BaseModel):
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
     file: str
     patterns_per_second: float = Field(ge=0.01, le=120)
+    border: Border | None = None
 
 
 class Manifest(BaseModel):

@@ -15,8 +15,8 @@ Light = NDArray[np.float32]
 
 GRIDS = ((4, 3), (8, 6), (16, 12), (32, 24))
 """On which patterns are compared: how much of the monitor a cell of a frame sees is not known."""
-FEWEST = 6
-"""Patterns of a part that are compared with one another."""
+FEWEST = 8
+"""Patterns of a part that are compared with one another: the orders of fewer look too much alike."""
 _ORDERS = 64
 _ODD = 5.0
 _APART = 0.1

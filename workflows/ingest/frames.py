@@ -119,7 +119,16 @@ def _look(
     light = lay_out(program, curve, patterns)
     with bundle.open(entry) as file, opened(file, entry, limits.image) as clip:
         signatures, ticks = clip.signatures(limits.memory // 4)
-        filmed = sort(signatures, ticks, clip.tick, program, light, manifest.video.patterns_per_second, entry)
+        filmed = sort(
+            signatures,
+            ticks,
+            clip.tick,
+            program,
+            light,
+            manifest.video.patterns_per_second,
+            entry,
+            has_lead=manifest.video.border is not None,
+        )
         shape = len(filmed.shares), clip.height, clip.width, 3
         return shape, stills.Storage(np.dtype(np.uint16), 0, 1.0, True), filmed
 

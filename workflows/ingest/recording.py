@@ -13,9 +13,11 @@ Integers = NDArray[np.intp]
 
 MOST_FRAMES = 64
 """That go into one mean: more make it no better than the video's compression allows."""
+_LOUD = 0.98  # quantile of the changes between frames that no noise is as large as
 _QUIET = 0.2  # quantile of the changes between frames that is noise alone
 _CHANGE = 5.0  # times the noise: an event
 _LEAST_CHANGE = 0.6  # codes
+_LEAST_SHARE = 0.015  # of the large changes: what a codec adds to a picture after it has come
 _CLEAN = 3.0  # times the plateaus' own spread: a frame that is not torn
 _LEAST_CLEAN = 0.3  # codes
 
@@ -50,7 +52,8 @@ class Recording:
         self.signatures, self.times = signatures, times
         change = np.array([difference(*signatures[t : t + 2]).max() for t in range(len(times) - 1)])
         self.noise = _quiet(change, times, hold)
-        limit = np.maximum(_CHANGE * self.noise, _LEAST_CHANGE)
+        large = _LEAST_SHARE * float(np.quantile(change, _LOUD)) if change.size else 0.0
+        limit = np.maximum(_CHANGE * self.noise, max(_LEAST_CHANGE, large))
         busy = change > limit
         edges = np.flatnonzero(np.diff(np.concatenate([[False], busy, [False]]).astype(np.int8)))
         events = [Event(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

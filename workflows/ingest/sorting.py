@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.errors import CaptureError
-from workflows.ingest import content
+from workflows.ingest import content, lead
 from workflows.ingest.recording import Recording
 from workflows.ingest.timing import Edge, Found, find
 from workflows.ingest.video import PARTS, Share, Signatures
@@ -68,6 +68,8 @@ def sort(
     light: content.Light,
     rate: float,
     entry: str,
+    *,
+    has_lead: bool = False,
 ) -> Sorted:
     """Sort the frames of a recording by the patterns of a program.
 
@@ -85,6 +87,8 @@ def sort(
         Patterns a second, about.
     entry : str
         The video's name, for errors.
+    has_lead : bool
+        Whether the patterns were shown between a lead-in and a lead-out, see `workflows.clock.schedule`.
 
     Raises
     ------
@@ -95,7 +99,16 @@ def sort(
     def refused(what: str) -> CaptureError:
         return CaptureError(f"{entry}: {what}", entry=entry)
 
+    decoded = len(ticks)
     recording = Recording(signatures, (ticks - ticks[0]) * tick, 1 / rate)
+    begins, ends, cut_off = False, False, 0.0
+    if has_lead:
+        frames, first, ends = lead.find(recording)
+        cut_off = float(recording.times[frames.start])
+        recording = Recording(signatures[frames], recording.times[frames], 1 / rate)
+        ticks, begins = ticks[frames], first is not None
+        if first is not None:
+            lead.with_begin(recording, first)
     if not recording.events and recording.noise.max(initial=0) > _RESTLESS:
         raise refused(
             "the picture changes from each frame to the next and never stands still: record more frames a second, show "
@@ -108,7 +121,7 @@ def sort(
             f"the picture changes {len(recording.events)} times, but the program has {program.count} patterns: keep "
             "the camera, the light and the glass at rest, and cut off what does not belong to the program"
         )
-    found, looks, resemblance = _best(recording, rate, program, light, refused)
+    found, looks, resemblance = _best(recording, rate, program, light, begins, ends, refused)
     reasons, odd = dict(found.reasons), content.odd(program, light, looks)
     for number in odd:
         reasons[number] = "it looks unlike others of its kind, as if something had been in front"
@@ -124,9 +137,9 @@ def sort(
     shares = {number: _shares(ticks[found.frames[number]], found.weights[number]) for number in kept}
     record = {
         "tick": tick,
-        "frames": len(ticks),
+        "frames": decoded,
         "kept": sum(len(share) for share in shares.values()),
-        "first_pattern_seconds": round(found.start, 3),
+        "first_pattern_seconds": round(cut_off + found.start, 3),
         "patterns_per_second": round(found.rate, 4),
         "resemblance": None if resemblance is None else round(resemblance, 1),
         "missing": {str(number): reason for number, reason in sorted(reasons.items())},
@@ -135,16 +148,27 @@ def sort(
 
 
 def _best(
-    recording: Recording, rate: float, program: Program, light: content.Light, refused: Any
+    recording: Recording,
+    rate: float,
+    program: Program,
+    light: content.Light,
+    begins: bool,
+    ends: bool,
+    refused: Any,
 ) -> tuple[Found, dict[int, Doubles], float | None]:
     """What fits the timing, and of that what looks most like the program.
 
-    The whole program; or if that can't be, a part of it: all but its end, or its beginning.
+    The whole program; or if that can't be, a part of it: all but its end, or its beginning. Where a lead-in or a
+    lead-out was found, it `begins` or `ends` with the first or the last event.
     """
     flat = light.reshape(len(light), -1)
     same = (flat[1:] == flat[:-1]).all(axis=1)
     for edges in EDGES:
-        tried = [find(recording, rate, same, begin, end) for begin, end in edges]
+        tried = [
+            find(recording, rate, same, begin, end)
+            for begin, end in edges
+            if (begin == "seen" or not begins) and (end == "seen" or not ends)
+        ]
         fitting = [found for found in tried if found is not None and not found.jumps]
         if fitting:
             break
