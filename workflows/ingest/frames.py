@@ -63,8 +63,8 @@ def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, Any]:
     taken = math.prod(shape) * storage.dtype.itemsize
     if taken > limits.unpacked:
         raise CaptureError(
-            f"{frames} frames of {width} x {height} take {taken} bytes, more than the {limits.unpacked} allowed: "
-            "use fewer or smaller ones",
+            f"{frames} frames of {width} x {height} pixels take {taken} bytes, more than the "
+            f"{limits.unpacked} allowed: use fewer or smaller ones",
             entry=MANIFEST,
             field="frames" if filmed is None else "video",
             limit=limits.unpacked,
