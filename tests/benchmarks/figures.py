@@ -71,7 +71,7 @@ def measure(
     else:
         patterns = folder / case.program
         if not patterns.exists():
-            write(preset(case.program), patterns, lambda _: None)
+            write(preset(case.program), patterns, lambda *_: None)
         program = ["--program", str(patterns)]
     with redirect_stdout(None):
         kit.main(["capture", str(scene), str(bundle), *program, "--mask", *film])
