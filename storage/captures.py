@@ -155,8 +155,7 @@ class Stack:
     ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """As `read`, and (y, x) bool: the pixels to recover."""
         if self._mask is None:
-            values = self.read(rows, columns)
-            return values, np.ones(values.shape[1:3], bool)
+            return self.read(rows, columns), self.recovered(rows, columns)
         values, mask = together(
             self._frames.async_array.getitem((slice(None), rows, columns)),
             self._mask.async_array.getitem((rows, columns)),

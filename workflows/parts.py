@@ -78,10 +78,7 @@ class Bernoulli(Record):
         The raw 64-bit words of PCG64, little-endian, least significant bit first, in the order
         (pattern, row, column, channel). `random_raw` is a stable stream; Generator's distributions are not.
         """
-        shape = (self.count, self.rows, self.columns, self.channels)
-        words = np.random.PCG64(self.seed).random_raw(self._words).astype("<u8")
-        bits = np.unpackbits(words.view(np.uint8), bitorder="little", count=int(np.prod(shape)))
-        return bits.reshape(shape)
+        return np.stack([self.pattern(index) for index in range(self.count)])
 
     def pattern(self, index: int) -> NDArray[np.uint8]:
         """(rows, columns, 1 or 3) uint8: the bits of one pattern, in the memory of one."""

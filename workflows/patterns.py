@@ -7,11 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workflows.grids import area_mean
+from workflows.images import Codes, to_integers
 from workflows.program import Program
 from workflows.recovery.pyramid import Pyramid, halve_codes
 from workflows.recovery.sensing import Patterns
 from workflows.tone import Curve, to_light
 
+CODE = np.dtype(np.uint8)
 PATTERNS_BYTES = 256 << 20
 """What a worker may hold of a program; with more patterns or pixels, the pyramid starts at cells of several pixels."""
 
@@ -68,15 +70,12 @@ def lay_out(program: Program, curve: Curve, images: Sequence[NDArray[np.float32]
 
 def _codes(
     program: Program, curve: Curve, images: Sequence[NDArray[np.float32]], columns: int, rows: int
-) -> Iterator[NDArray[np.uint8]]:
+) -> Iterator[Codes]:
     """The light of a program's pictures on a grid, (rows, columns, 1 or 3) uint8 each."""
     if (columns, rows) == (program.monitor.width, program.monitor.height):
-        return program.mapped(lambda values: _rounded(to_light(values, curve)), 0, program.count, images)
+        return program.mapped(
+            lambda values: to_integers(to_light(values, curve), CODE), 0, program.count, images
+        )
     # A cell's light is the mean of its pixels': rounding comes after it, the curve before.
     lights = program.mapped(lambda values: to_light(values, curve), 0, program.count, images)
-    return (_rounded(area_mean(light, columns, rows)) for light in lights)
-
-
-def _rounded(light: NDArray[np.float32]) -> NDArray[np.uint8]:
-    code: NDArray[np.uint8] = np.rint(light * np.float32(255)).astype(np.uint8)
-    return code
+    return (to_integers(area_mean(light, columns, rows), CODE) for light in lights)

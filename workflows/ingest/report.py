@@ -7,7 +7,7 @@ import numpy as np
 
 from workflows.ingest.figures import Clipping, Figures, Frames, Noise, Quality, ToneCurve
 from workflows.ingest.findings import LEVELS, Finding, Level, findings
-from workflows.program import Constant, Program
+from workflows.program import Program
 
 
 class Report(Figures):
@@ -83,7 +83,7 @@ def _quality(program: Program, survey: dict[str, Any]) -> Quality | None:
     k from the noise once and four times, c and the power from the presets of 128, 49 and 25 patterns. Ball, solid
     and a frosted lens are at most 2.5 dB outside the range, with the noisy sketch, of which the fit knew nothing.
     """
-    patterns = sum(part.count for part in program.parts if not isinstance(part, Constant))
+    patterns = program.measured.size
     s2, rho = survey["deviation"] ** 2, survey["contrast"]
     if rho <= 0:
         return None
