@@ -10,7 +10,7 @@ import av
 import numpy as np
 from av.container import InputContainer
 from av.video.frame import VideoFrame
-from av.video.reformatter import Interpolation
+from av.video.reformatter import ColorRange, Interpolation
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
@@ -23,6 +23,15 @@ CELLS = (32, 24)
 """Columns and rows of a frame's signature."""
 LARGE = (128, 96)
 """The same of what shows the cells of a border."""
+PLANAR = {
+    "gray": "gray16le",
+    **{
+        name: f"yuv{kind}p16le"
+        for kind in (420, 422, 444)
+        for name in (f"yuv{kind}p", f"yuvj{kind}p", *(f"yuv{kind}p{bits}le" for bits in (10, 12, 16)))
+    },
+}
+"""Formats of frames that are averaged as they are, and the same with 16 bits a value."""
 ROUNDED = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
 """Without these, colours come out half a code too dark."""
 PARTS = 257
@@ -151,7 +160,7 @@ class Clip:
         return np.stack(found), np.array(ticks, np.int64), Large(grey, np.array(list(large), np.intp))
 
     def means(self, plan: Sequence[Sequence[Share]]) -> Iterator[NDArray[np.uint16]]:
-        """Weighted means of frames.
+        """Weighted means of frames, in the colour system of the video, brought to RGB.
 
         Parameters
         ----------
@@ -161,7 +170,7 @@ class Clip:
         Yields
         ------
         (height, width, 3) uint16
-            Means of the 8-bit codes, times 257: exact.
+            65535 for a code of 255.
 
         Raises
         ------
@@ -175,7 +184,7 @@ class Clip:
             frames = self._from_start
         frame = next(frames, None)
         for shares in plan:
-            mean = np.zeros((self._size[1], self._size[0], 3), np.uint16)
+            sums: list[NDArray[Any]] = []
             for tick, weight in shares:
                 while frame is not None and _tick(frame) < tick:
                     frame = next(frames, None)
@@ -185,8 +194,15 @@ class Clip:
                         "damaged there. Copy it anew from the camera",
                         entry=self._entry,
                     )
-                mean += _pixels(frame.reformat(format="rgb24", interpolation=ROUNDED)) * np.uint16(weight)
-            yield np.ascontiguousarray(np.rot90(mean, self._turn))
+                seen = frame if frame.format.name in PLANAR else frame.reformat(format="yuv444p16le")
+                planes = _planes(seen)
+                if not sums:
+                    # what the weights add up to times a code of 8 bits just fits
+                    kind = np.uint16 if planes[0].dtype == np.uint8 else np.uint32
+                    sums = [np.zeros(plane.shape, kind) for plane in planes]
+                for total, plane in zip(sums, planes, strict=True):
+                    total += np.multiply(plane, weight, dtype=total.dtype)
+            yield np.ascontiguousarray(np.rot90(_to_rgb(sums, seen), self._turn))
 
     def _open(self) -> VideoStream:
         if not self._container.streams.video:
@@ -270,6 +286,43 @@ def _tick(frame: VideoFrame) -> int:
 def _pixels(frame: VideoFrame) -> NDArray[np.uint8]:
     pixels: NDArray[np.uint8] = np.asarray(frame.to_ndarray(), np.uint8)
     return pixels
+
+
+def _planes(frame: VideoFrame) -> list[NDArray[Any]]:
+    """The planes of a frame of one of `PLANAR`, each (rows, columns)."""
+    kind: np.dtype[Any] = np.dtype("u1" if frame.format.components[0].bits == 8 else "<u2")
+    return [
+        np.frombuffer(memoryview(plane), kind).reshape(plane.height, plane.line_size // kind.itemsize)[
+            :, : plane.width
+        ]
+        for plane in frame.planes
+    ]
+
+
+def _to_rgb(sums: Sequence[NDArray[Any]], like: VideoFrame) -> NDArray[np.uint16]:
+    """(height, width, 3) RGB of a mean: of its planes times `PARTS`, in the colour system of a frame.
+
+    Notes
+    -----
+    Limited codes (ITU-R BT.709, sect. 6.10: black 16, white 235, colours 112 about 128) are stretched to full ones
+    here: swscale takes the white of 16 bits for a little less than white, so that it would never be clipped.
+    """
+    name, bits = like.format.name, like.format.components[0].bits
+    full = like.color_range == ColorRange.JPEG or name.startswith(("gray", "yuvj"))
+    step = 2.0 ** (bits - 8)
+    mean = VideoFrame(like.width, like.height, PLANAR[name])
+    mean.colorspace, mean.color_range = like.colorspace, ColorRange.JPEG
+    for at, (total, plane) in enumerate(zip(sums, mean.planes, strict=True)):
+        # the code that becomes zero, or grey; how many there are from black to white; what the first becomes
+        zero, span, level = (128 * step, 224 * step, 32768) if at else (16 * step, 219 * step, 0)
+        if full:
+            zero, span = (128 * step if at else 0, 2.0**bits - 1)
+        scaled = (total / np.float32(PARTS) - np.float32(zero)) * np.float32(65535 / span) + np.float32(level)
+        rows = np.zeros((plane.height, plane.line_size // 2), "<u2")
+        rows[:, : plane.width] = np.rint(np.clip(scaled, 0, 65535))
+        plane.update(rows.tobytes())
+    rgb = mean.reformat(format="rgb48le", interpolation=ROUNDED)
+    return np.asarray(rgb.to_ndarray(), np.uint16)
 
 
 def _refuse(url: str, *_: object) -> BinaryIO:
