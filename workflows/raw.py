@@ -142,7 +142,7 @@ def _superpixels(raw: rawpy.RawPy) -> NDArray[np.float32]:
     for y, x in np.ndindex(period, period):
         row, column = y // block, x // block
         whole = colours[block * row : block * (row + 1), block * column : block * (column + 1)]
-        light = _light(values[y::period, x::period], raw, numbers[y, x])
+        light = _light(values[y::period, x::period], raw, int(numbers[y, x]))
         light /= np.float32(np.count_nonzero(whole == colours[y, x]))
         pixels[row::step, column::step, "RGB".index(colours[y, x])] += light
     return pixels
