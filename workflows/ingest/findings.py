@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from workflows.ingest.figures import Drift, Figures, Flicker
+from workflows.ingest.unfound import by_reason, ranges, remedy
 from workflows.program import Images, Program
 
 Level = Literal["good", "warning", "bad"]
@@ -53,13 +54,15 @@ def _graded(value: float, warning: float, bad: float) -> Level:
 
 
 def _frames(made: Figures) -> Finding:
-    missing = made.frames.missing
+    # Only those of a recording may be without one.
+    missing = {int(number): why for number, why in made.video["missing"].items()} if made.video else {}
     if missing:
+        which = "; ".join(f"{ranges(numbers)} ({why})" for numbers, why in by_reason(missing))
         return Finding(
             name="frames",
             level=_graded(len(missing) / made.frames.patterns, 0, 0.1),
-            message=f"{len(missing)} of {made.frames.patterns} patterns have no frame, the first of them {missing[0]}",
-            remedy="show each pattern for longer, or film again",
+            message=f"{len(missing)} of {made.frames.patterns} patterns have no frame that can be used: {which}",
+            remedy=remedy(missing.values()),
         )
     several = f", in {made.frames.exposures} exposures" if made.frames.exposures > 1 else ""
     return Finding(

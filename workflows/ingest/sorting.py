@@ -1,8 +1,7 @@
 """The frames of a video sorted by the patterns that they show, and what to make of those that are not found."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ from storage.errors import CaptureError
 from workflows.ingest import content, lead
 from workflows.ingest.recording import Recording
 from workflows.ingest.timing import Edge, Found, find
+from workflows.ingest.unfound import by_reason, ranges
 from workflows.ingest.video import PARTS, Share, Signatures
 from workflows.program import Program
 
@@ -225,19 +225,7 @@ def _summary(record: Mapping[str, Any], kept: int, count: int) -> str:
 
 def _by_reason(reasons: Mapping[int, str]) -> list[str]:
     """A line a reason: the patterns that it holds for, as ranges."""
-    ordered = sorted(reasons.items(), key=lambda item: (item[1], item[0]))
     return [
-        f"no frame of pattern{'s' * (len(numbers) > 1)} {_ranges(numbers)}: {reason}"
-        for reason, items in groupby(ordered, key=lambda item: item[1])
-        for numbers in [[number for number, _ in items]]
+        f"no frame of pattern{'s' * (len(numbers) > 1)} {ranges(numbers)}: {reason}"
+        for numbers, reason in by_reason(reasons)
     ]
-
-
-def _ranges(numbers: Iterable[int]) -> str:
-    runs: list[list[int]] = []
-    for number in numbers:
-        if runs and number == runs[-1][1] + 1:
-            runs[-1][1] = number
-        else:
-            runs.append([number, number])
-    return ", ".join(str(a) if a == b else f"{a} to {b}" for a, b in runs)
