@@ -17,6 +17,7 @@ from workflows.grids import smallest_grid
 from workflows.ingest import stills
 from workflows.ingest.bundle import MANIFEST, Bundle, Limits
 from workflows.ingest.content import lay_out
+from workflows.ingest.display import LOOKS
 from workflows.ingest.sorting import MOST_PATTERNS, Sorted, sort
 from workflows.ingest.video import Share, opened
 from workflows.program import Images
@@ -118,16 +119,20 @@ def _look(
     curve = "srgb" if program.monitor.response == "unknown" else program.monitor.response
     light = lay_out(program, curve, patterns)
     with bundle.open(entry) as file, opened(file, entry, limits.image) as clip:
-        signatures, ticks = clip.signatures(limits.memory // 4)
+        border, rate = manifest.video.border, manifest.video.patterns_per_second
+        signatures, ticks, large = clip.signatures(
+            limits.memory // 4, math.inf if border is None else 1 / (LOOKS * rate)
+        )
         filmed = sort(
             signatures,
             ticks,
             clip.tick,
             program,
             light,
-            manifest.video.patterns_per_second,
+            rate,
             entry,
-            has_lead=manifest.video.border is not None,
+            large,
+            border,
         )
         shape = len(filmed.shares), clip.height, clip.width, 3
         return shape, stills.Storage(np.dtype(np.uint16), 0, 1.0, True), filmed

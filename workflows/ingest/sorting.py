@@ -1,18 +1,19 @@
 """The frames of a video sorted by the patterns that they show, and what to make of those that are not found."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from storage.errors import CaptureError
-from workflows.ingest import content, lead
+from workflows.clock import Border
+from workflows.ingest import content, display, lead
 from workflows.ingest.recording import Recording
 from workflows.ingest.timing import Edge, Found, find
 from workflows.ingest.unfound import by_reason, ranges
-from workflows.ingest.video import PARTS, Share, Signatures
+from workflows.ingest.video import PARTS, Large, Share, Signatures
 from workflows.program import Program
 
 Doubles = NDArray[np.float64]
@@ -43,8 +44,9 @@ class Sorted:
     shares : dict of int to tuple of Share
         The frames of each pattern that was found.
     record : dict
-        What was found, as JSON: ``tick`` in seconds, ``frames`` that were decoded, ``kept``, ``first_pattern_seconds``,
-        ``patterns_per_second``, ``resemblance``, and ``missing``: the number of each pattern without frames, and why.
+        What was found, as JSON: ``tick`` in seconds, ``frames`` that were decoded, ``kept``, ``numbered``: whether
+        patterns are told by the numbers in the border, ``first_pattern_seconds``, ``patterns_per_second``,
+        ``resemblance``, and ``missing``: the number of each pattern without frames, and why.
     notes : list of str
         The same for people.
     """
@@ -68,8 +70,8 @@ def sort(
     light: content.Light,
     rate: float,
     entry: str,
-    *,
-    has_lead: bool = False,
+    large: Large,
+    border: Border | None,
 ) -> Sorted:
     """Sort the frames of a recording by the patterns of a program.
 
@@ -87,8 +89,10 @@ def sort(
         Patterns a second, about.
     entry : str
         The video's name, for errors.
-    has_lead : bool
-        Whether the patterns were shown between a lead-in and a lead-out, see `workflows.clock.schedule`.
+    large : Large
+        Some of the frames at a size that shows the cells of a border; of no use without one.
+    border : Border or None
+        What the patterns were shown in, between a lead-in and a lead-out, see `workflows.clock.schedule`.
 
     Raises
     ------
@@ -99,30 +103,13 @@ def sort(
     def refused(what: str) -> CaptureError:
         return CaptureError(f"{entry}: {what}", entry=entry)
 
-    decoded = len(ticks)
     recording = Recording(signatures, (ticks - ticks[0]) * tick, 1 / rate)
-    begins, ends, cut_off = False, False, 0.0
-    if has_lead:
-        frames, first, ends = lead.find(recording)
-        cut_off = float(recording.times[frames.start])
-        recording = Recording(signatures[frames], recording.times[frames], 1 / rate)
-        ticks, begins = ticks[frames], first is not None
-        if first is not None:
-            lead.with_begin(recording, first)
-    if not recording.events and recording.noise.max(initial=0) > _RESTLESS:
-        raise refused(
-            "the picture changes from each frame to the next and never stands still: record more frames a second, show "
-            "fewer patterns, and keep the camera at rest"
-        )
-    if not recording.events:
-        raise refused("nothing changes in the video: film the monitor while it shows the program")
-    if len(recording.events) > _EVENTS * program.count + 100:
-        raise refused(
-            f"the picture changes {len(recording.events)} times, but the program has {program.count} patterns: keep "
-            "the camera, the light and the glass at rest, and cut off what does not belong to the program"
-        )
-    found, looks, resemblance = _best(recording, rate, program, light, begins, ends, refused)
-    reasons, odd = dict(found.reasons), content.odd(program, light, looks)
+    found = display.find(recording, large, border, program.count) if border is not None else None
+    numbered = found is not None
+    if found is None:
+        found = _by_timing(recording, rate, program, light, border is not None, refused)
+    looks, resemblance, odd = _compared(recording, found, program, light)
+    reasons = dict(found.reasons)
     for number in odd:
         reasons[number] = "it looks unlike others of its kind, as if something had been in front"
         del looks[number]
@@ -137,14 +124,46 @@ def sort(
     shares = {number: _shares(ticks[found.frames[number]], found.weights[number]) for number in kept}
     record = {
         "tick": tick,
-        "frames": decoded,
+        "frames": len(ticks),
         "kept": sum(len(share) for share in shares.values()),
-        "first_pattern_seconds": round(cut_off + found.start, 3),
+        "numbered": numbered,
+        "first_pattern_seconds": round(found.start, 3),
         "patterns_per_second": round(found.rate, 4),
         "resemblance": None if resemblance is None else round(resemblance, 1),
         "missing": {str(number): reason for number, reason in sorted(reasons.items())},
     }
-    return Sorted(shares, record, [_summary(record, len(kept), program.count), *_by_reason(reasons)])
+    notes = [_summary(record, len(kept), program.count), *_by_reason(reasons)]
+    if border is not None and not numbered:
+        notes.append("the numbers in the border can't be read: patterns are told by the times of the changes")
+    return Sorted(shares, record, notes)
+
+
+def _by_timing(
+    recording: Recording, rate: float, program: Program, light: content.Light, has_lead: bool, refused: Any
+) -> Found:
+    """The frames of each pattern by when the picture changes."""
+    frames, begins, ends = slice(0, len(recording.times)), False, False
+    if has_lead:
+        frames, first, ends = lead.find(recording)
+        recording = Recording(recording.signatures[frames], recording.times[frames], 1 / rate)
+        begins = first is not None
+        if first is not None:
+            lead.with_begin(recording, first)
+    if not recording.events and recording.noise.max(initial=0) > _RESTLESS:
+        raise refused(
+            "the picture changes from each frame to the next and never stands still: record more frames a second, show "
+            "fewer patterns, and keep the camera at rest"
+        )
+    if not recording.events:
+        raise refused("nothing changes in the video: film the monitor while it shows the program")
+    if len(recording.events) > _EVENTS * program.count + 100:
+        raise refused(
+            f"the picture changes {len(recording.events)} times, but the program has {program.count} patterns: keep "
+            "the camera, the light and the glass at rest, and cut off what does not belong to the program"
+        )
+    found = _best(recording, rate, program, light, begins, ends, refused)
+    start = found.start + float(recording.times[0])
+    return replace(found, frames=[some + frames.start for some in found.frames], start=start)
 
 
 def _best(
@@ -155,7 +174,7 @@ def _best(
     begins: bool,
     ends: bool,
     refused: Any,
-) -> tuple[Found, dict[int, Doubles], float | None]:
+) -> Found:
     """What fits the timing, and of that what looks most like the program.
 
     The whole program; or if that can't be, a part of it: all but its end, or its beginning. Where a lead-in or a
@@ -179,17 +198,21 @@ def _best(
             "all of it in one go, with everything at rest"
         )
     least = min(found.cost for found in fitting)
-    chosen, best = None, -np.inf
-    for found in sorted(fitting, key=lambda found: found.cost):
-        if found.cost > least + _AS_LIKELY:
-            break
-        looks = {n: (recording.look(f) / 255) ** _GAMMA for n, f in enumerate(found.frames) if f.size}
-        resemblance = content.resemblance(program, light, looks)
-        score = (resemblance or 0.0) - len(content.odd(program, light, looks))
-        if score > best:
-            chosen, best = (found, looks, resemblance), score
-    assert chosen is not None
-    return chosen
+    likely = [found for found in fitting if found.cost <= least + _AS_LIKELY]
+
+    def score(found: Found) -> float:
+        _, resemblance, odd = _compared(recording, found, program, light)
+        return (resemblance or 0.0) - len(odd)
+
+    return likely[0] if len(likely) == 1 else max(sorted(likely, key=lambda found: found.cost), key=score)
+
+
+def _compared(
+    recording: Recording, found: Found, program: Program, light: content.Light
+) -> tuple[dict[int, Doubles], float | None, list[int]]:
+    """What was seen of each pattern, about in linear light; its resemblance to the program; the odd ones."""
+    looks = {n: (recording.look(f) / 255) ** _GAMMA for n, f in enumerate(found.frames) if f.size}
+    return looks, content.resemblance(program, light, looks), content.odd(program, light, looks)
 
 
 def _see_that_it_is_enough(

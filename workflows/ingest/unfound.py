@@ -11,6 +11,7 @@ REMEDIES = {
     "no two frames show it whole": _LONGER,
     "no two frames of it are alike: it was too short, or something moved": f"{_LONGER}; {_AT_REST}",
     "the changes before and after it can't be told from others, or did not show": _AT_REST,
+    "no frames that stand still show its number in the border": f"{_LONGER}; {_AT_REST}",
     "something changed while it was shown": _AT_REST,
     "it looks unlike others of its kind, as if something had been in front": _AT_REST,
 }

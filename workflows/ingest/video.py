@@ -1,5 +1,6 @@
 """A video in a bundle: opened as hostile, looked over frame by frame, and averaged."""
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from itertools import chain
@@ -20,6 +21,8 @@ CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
 CODECS = frozenset({"h264", "hevc", "mjpeg", "mpeg4", "vp8", "vp9", "av1", "libdav1d", "prores", "ffv1"})
 CELLS = (32, 24)
 """Columns and rows of a frame's signature."""
+LARGE = (128, 96)
+"""The same of what shows the cells of a border."""
 ROUNDED = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
 """Without these, colours come out half a code too dark."""
 PARTS = 257
@@ -27,6 +30,21 @@ PARTS = 257
 
 Signatures = NDArray[np.uint8]
 """(frames, rows, columns, 3) uint8: mean RGB codes over each cell of a grid, before rotation."""
+
+
+class Large(NamedTuple):
+    """Some frames of a recording at a size that shows the cells of a border.
+
+    Attributes
+    ----------
+    grey : (k, rows, columns) uint8
+        Luma, before rotation.
+    frames : (k,) intp
+        Which ones they are, ascending.
+    """
+
+    grey: NDArray[np.uint8]
+    frames: NDArray[np.intp]
 
 
 class Share(NamedTuple):
@@ -94,33 +112,43 @@ class Clip:
         """Seconds of a tick of the container's clock."""
         return float(self._stream.time_base or 1)
 
-    def signatures(self, most: int) -> tuple[Signatures, NDArray[np.int64]]:
+    def signatures(self, most: int, every: float = math.inf) -> tuple[Signatures, NDArray[np.int64], Large]:
         """The frames' signatures, and when each is shown, in ticks. Once: it reads the video to its end.
 
         Parameters
         ----------
         most : int
-            Bytes that the signatures may take.
+            Bytes that all of it may take.
+        every : float
+            Seconds between the frames that are taken large as well: none are if it is infinite.
 
         Raises
         ------
         CaptureError
-            If they take more, or the frames change their size.
+            If it takes more, or the frames change their size.
         """
-        columns, rows = (min(cells, size) for cells, size in zip(CELLS, self._size, strict=True))
+        (columns, rows), (across, down) = (np.minimum(grid, self._size).tolist() for grid in (CELLS, LARGE))
         found, ticks = [], []
-        for frame in self._from_start:
+        large: dict[int, NDArray[np.uint8]] = {}
+        step, due = every / self.tick, -math.inf
+        for number, frame in enumerate(self._from_start):
             small = frame.reformat(columns, rows, "rgb24", interpolation=Interpolation.AREA)
             found.append(_pixels(small))
-            ticks.append(frame.pts)
-            if len(found) * found[0].nbytes > most:
+            ticks.append(_tick(frame))
+            if step < math.inf and ticks[-1] >= due:
+                due = ticks[-1] + step
+                large[number] = _pixels(
+                    frame.reformat(across, down, "gray", interpolation=Interpolation.AREA)
+                )
+            if len(found) * found[0].nbytes + len(large) * across * down > most:
                 raise CaptureError(
                     f"{self._entry} has more than {len(found)} frames, which is the most that is sorted: cut off "
                     "what was recorded before and after the program",
                     entry=self._entry,
                     limit=len(found),
                 )
-        return np.stack(found), np.array(ticks, np.int64)
+        grey = np.array(list(large.values()), np.uint8).reshape(-1, down, across)
+        return np.stack(found), np.array(ticks, np.int64), Large(grey, np.array(list(large), np.intp))
 
     def means(self, plan: Sequence[Sequence[Share]]) -> Iterator[NDArray[np.uint16]]:
         """Weighted means of frames.

@@ -3,7 +3,6 @@
 import io
 import json
 import random
-import subprocess
 import sys
 import zipfile
 from collections.abc import Callable, Iterator
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from storage.captures import Stack
 from storage.errors import CaptureError, Corrupt
 from storage.objects import Objects
+from tests.workflows.ingest import peak
 from workflows.images import encode_png
 from workflows.ingest import frames
 from workflows.recovery.photometry import Noise
@@ -256,39 +256,10 @@ def test_a_stack_that_takes_more_than_is_allowed_is_refused(make_zip: Zip, inges
     assert caught.value.fields == {"entry": "capture.json", "field": "frames", "limit": 1 << 31}
 
 
-CHILD = """
-import re, sys
-from pathlib import Path
-from storage.objects import Objects
-from workflows.ingest import frames
-from workflows.ingest.bundle import Limits
-from workflows.ingest.measure import measure
-
-def ingest(capture, memory):
-    objects, limits = Objects(sys.argv[1]), Limits(1 << 30, memory)
-    plan = frames.prepare(objects, capture, limits)
-    for index in range(plan["tiles"]):
-        frames.read_slab(objects, capture, limits, plan["slab"], index)
-    measure(objects, capture)
-    return plan["tiles"]
-
-def peak():
-    return int(re.search(r"VmHWM:\\s+(\\d+) kB", Path("/proc/self/status").read_text())[1]) << 10
-
-ingest("small", 1 << 20)
-before = peak()
-tiles = ingest("large", int(sys.argv[2]))
-print(tiles, peak() - before)
-"""
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="the resident peak is read from Linux's /proc")
 def test_a_stack_larger_than_the_memory_is_ingested_within_it(
     make_zip: Zip, put: Put, objects: Objects
 ) -> None:
-    # In a process of its own, by its resident peak: decoders and compressors allocate where tracemalloc does
-    # not look. Linux's VmHWM, for ru_maxrss begins at what the process that started it had. A small ingest
-    # comes first, so that libraries and thread pools are in the baseline.
     memory, count = 128 << 20, 100
     patterns = [n % 6 for n in range(count)]
     put("small", bundle_of(make_zip, shots(6, 3, "uint8"), list(range(6))))
@@ -301,10 +272,7 @@ def test_a_stack_larger_than_the_memory_is_ingested_within_it(
     put("large", make_zip(given, files))
     stack = count * smooth.nbytes
     assert stack > 3 * memory
-    done = subprocess.run(
-        [sys.executable, "-c", CHILD, objects.url, str(memory)], capture_output=True, text=True, check=True
-    )
-    tiles, grown = map(int, done.stdout.split())
+    tiles, grown = peak.of_large_after_small(objects, memory)
     assert tiles > 4
     assert memory // 3 < grown <= memory
     assert Stack(objects, "large").frames == count

@@ -1,5 +1,6 @@
 """A video capture: every pattern from the right frames, whatever the camera, and what can't be used is refused."""
 
+import sys
 import zipfile
 from collections.abc import Callable
 from typing import Any
@@ -9,6 +10,8 @@ import pytest
 
 from storage.captures import Stack
 from storage.errors import CaptureError
+from storage.objects import Objects
+from tests.workflows.ingest import peak
 from tests.workflows.ingest.camera import TICK, Camera, Film, boxes, capture, film, lights, turned
 from workflows.program import Program
 from workflows.scene import nested_program
@@ -267,3 +270,21 @@ def test_more_patterns_than_are_sorted_are_refused(take: Callable[..., Stack], f
 def test_more_frames_than_are_sorted_are_refused(take: Callable[..., Stack], filmed: Film) -> None:
     with pytest.raises(CaptureError, match="which is the most that is sorted"):
         take(filmed.data, memory=1 << 20)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the resident peak is read from Linux's /proc")
+def test_a_long_video_takes_no_more_memory_than_is_allowed(
+    make_zip: Zip, put: Callable[[str, bytes], None], objects: Objects, light: list[np.ndarray]
+) -> None:
+    memory, rate = 64 << 20, 1 / CAMERA.hold
+    coarse = [np.kron(picture, np.ones((4, 4, 1), np.float32)) for picture in light]
+    for name, camera in {
+        "small": Camera(options={"g": "20"}),
+        "large": Camera(fps=90, options={"g": "20"}),
+    }.items():
+        made = film(coarse, camera)
+        put(name, make_zip(*capture(PROGRAM, made.data, rate)))
+    decoded = len(made.shown) * coarse[0].size
+    assert decoded > 4 * memory
+    _, grown = peak.of_large_after_small(objects, memory)
+    assert grown <= memory // 4

@@ -1,0 +1,45 @@
+"""What an ingest takes in memory: in a process of its own, by its resident peak.
+
+Decoders and compressors allocate where tracemalloc does not look. Linux's VmHWM, for ru_maxrss begins at what the
+process that started it had. A small ingest comes first, so that libraries and thread pools are in the baseline.
+"""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+from storage.objects import Objects
+from workflows.ingest import frames
+from workflows.ingest.bundle import Limits
+from workflows.ingest.measure import measure
+
+
+def of_large_after_small(objects: Objects, memory: int) -> tuple[int, int]:
+    """Slabs of the capture `large`, and the bytes by which ingesting it takes more than ingesting `small`."""
+    command = [sys.executable, "-m", __name__, objects.url, str(memory)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    tiles, grown = map(int, done.stdout.split())
+    return tiles, grown
+
+
+def _ingest(objects: Objects, capture: str, memory: int) -> int:
+    limits = Limits(1 << 30, memory)
+    plan = frames.prepare(objects, capture, limits)
+    for index in range(plan["tiles"]):
+        frames.read_slab(objects, capture, limits, plan["slab"], index)
+    measure(objects, capture)
+    return int(plan["tiles"])
+
+
+def _peak() -> int:
+    found = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
+    assert found is not None
+    return int(found[1]) << 10
+
+
+if __name__ == "__main__":
+    store = Objects(sys.argv[1])
+    _ingest(store, "small", int(sys.argv[2]))
+    before = _peak()
+    print(_ingest(store, "large", int(sys.argv[2])), _peak() - before)
