@@ -17,6 +17,10 @@ LARGEST, SMALLEST = 8 << 20, 64 << 10
 """Bytes of a file that are sent at once: half as many after a fault, twice as many after a success."""
 PATIENCE = 120.0
 """Seconds without progress after which an upload is given up: a service may be started again meanwhile."""
+SILENCE = 60.0
+"""Seconds without an answer, or a byte of it, after which a service counts as gone."""
+COMPUTING = 600.0
+"""The same where the service computes the whole answer before its first byte."""
 PASSING = (408, 409, 423, 429, 460, 500, 502, 503, 504)
 """Statuses after which an upload is tried again, from where the service says it stands."""
 
@@ -46,7 +50,7 @@ class Client:
 
     def __init__(self, url: str, key: str | None = None) -> None:
         headers = {"Authorization": f"Bearer {key}"} if key else {}
-        self._http = httpx2.Client(base_url=url, headers=headers, timeout=60)
+        self._http = httpx2.Client(base_url=url, headers=headers, timeout=SILENCE)
 
     def __enter__(self) -> Self:
         return self
@@ -172,14 +176,15 @@ class Client:
 
     def composite(self, matte: str, backdrop: bytes, *, transfer: str = "srgb") -> bytes:
         """Put a matte before a backdrop, the bytes of an image; returns those of a PNG."""
-        answer = self._send(
-            "POST", f"/v1/mattes/{matte}/composite", params={"transfer": transfer}, content=backdrop
-        )
-        return answer.content
+        path = f"/v1/mattes/{matte}/composite"
+        return self._computed("POST", path, params={"transfer": transfer}, content=backdrop)
 
     def layer(self, matte: str, name: str) -> bytes:
         """A layer of a matte, as `confidence.png`."""
-        return self._send("GET", f"/v1/mattes/{matte}/layers/{name}").content
+        return self._computed("GET", f"/v1/mattes/{matte}/layers/{name}")
+
+    def _computed(self, method: str, path: str, **request: Any) -> bytes:
+        return self._send(method, path, timeout=httpx2.Timeout(SILENCE, read=COMPUTING), **request).content
 
     def _json(self, method: str, path: str, **request: Any) -> dict[str, Any]:
         found: dict[str, Any] = self._send(method, path, **request).json()

@@ -1,6 +1,7 @@
 """The database: its tables, and the engine that opens it."""
 
 import secrets
+import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -24,8 +25,9 @@ from sqlalchemy import (
     event,
     select,
 )
+from sqlalchemy.exc import OperationalError
 
-from storage.errors import NotFound
+from storage.errors import DISK_FULL, NoRoom, NotFound
 
 metadata = MetaData()
 
@@ -221,9 +223,20 @@ def page(
 
 @contextmanager
 def writing(engine: Engine) -> Iterator[Connection]:
-    """A transaction that may write: committed at the end, rolled back by an exception."""
-    with engine.connect().execution_options(writes=True) as connection, connection.begin():
-        yield connection
+    """A transaction that may write: committed at the end, rolled back by an exception.
+
+    Raises
+    ------
+    NoRoom
+        If the disk is full.
+    """
+    try:
+        with engine.connect().execution_options(writes=True) as connection, connection.begin():
+            yield connection
+    except OperationalError as error:
+        if getattr(error.orig, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL:
+            raise NoRoom(DISK_FULL) from error
+        raise
 
 
 def _on_connect(connection: object, record: object) -> None:

@@ -17,6 +17,11 @@ Every error says in ``detail`` what is wrong and what to do; ``fields`` locate t
 ``limit``). They cross process borders, so they are made of plain values only.
 """
 
+DISK_FULL = (
+    "the disk is full: delete captures, mattes or uploads, or free room on it, and try again; what was stored before "
+    "is kept"
+)
+
 
 class EnvmatteError(Exception):
     """Base of every error that a caller can act on.

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import io
 import json
 import shutil
 import threading
-from contextlib import AbstractAsyncContextManager
+from contextlib import asynccontextmanager, contextmanager
 from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -18,15 +19,16 @@ import numpy as np
 import obstore
 import zarr
 from numpy.typing import NDArray
+from obstore.exceptions import BaseError
 from obstore.store import LocalStore, ObjectStore, from_url
 from zarr.buffer import default_buffer_prototype
 from zarr.storage import MemoryStore, StorePath, WrapperStore
 from zarr.storage import ObjectStore as ZarrStore
 
-from storage.errors import Corrupt
+from storage.errors import DISK_FULL, Corrupt, NoRoom
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine
+    from collections.abc import AsyncIterator, Coroutine, Iterator
 
     from obstore import AsyncWritableFile, ReadableFile
     from zarr.abc.store import ByteRequest
@@ -142,10 +144,20 @@ class Objects:
         for name, document in node.metadata.to_buffer_dict(default_buffer_prototype()).items():
             await self.zarr.set(f"{path}/{name}", document)
 
-    def write(self, path: str) -> AbstractAsyncContextManager[AsyncWritableFile]:
-        """A writer that streams into an object; left by an exception it leaves no object."""
+    @asynccontextmanager
+    async def write(self, path: str) -> AsyncIterator[AsyncWritableFile]:
+        """A writer that streams into an object; left by an exception it leaves no object.
+
+        Raises
+        ------
+        NoRoom
+            If the disk is full.
+        """
         # Two parts under way bound the memory of an upload to a few parts, whatever its size.
-        return obstore.open_writer_async(self._store, path, buffer_size=PART, max_concurrency=2)
+        writer = obstore.open_writer_async(self._store, path, buffer_size=PART, max_concurrency=2)
+        with _full_disk_told():
+            async with writer as file:
+                yield file
 
     def read(self, path: str) -> BinaryIO:
         """A seekable file over an object.
@@ -160,8 +172,15 @@ class Objects:
         )
 
     def put(self, path: str, data: bytes) -> None:
-        """Write a small object, whole."""
-        obstore.put(self._store, path, data)
+        """Write a small object, whole.
+
+        Raises
+        ------
+        NoRoom
+            If the disk is full.
+        """
+        with _full_disk_told():
+            obstore.put(self._store, path, data)
 
     def names(self, folder: str) -> list[str]:
         """What lies directly in a folder, folders and objects, by name."""
@@ -200,6 +219,17 @@ class Objects:
     def check(self) -> None:
         """Reach the store once; raises whatever it raises when it can't be reached."""
         obstore.list_with_delimiter(self._store, None)
+
+
+@contextmanager
+def _full_disk_told() -> Iterator[None]:
+    """Turns what obstore raises when the disk is full, of several kinds and without an ``errno``, to `NoRoom`."""
+    try:
+        yield
+    except (BaseError, OSError) as error:
+        if not any(f"(os error {number})" in str(error) for number in (errno.ENOSPC, errno.EDQUOT)):
+            raise
+        raise NoRoom(DISK_FULL) from error
 
 
 def _array(store: _Whole, path: str, document: bytes) -> zarr.Array[Any]:

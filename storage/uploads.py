@@ -74,7 +74,8 @@ def get(connection: Connection, upload: str) -> Row[Any]:
     Raises
     ------
     NotFound
-        If there is none, or not any more.
+        If there is none, or not any more. tus would like to know which, but that would take a record of every upload
+        that ever expired.
     """
     query = select(uploads).where(uploads.c.id == upload, uploads.c.expires_at > time.time())
     row = connection.execute(query).one_or_none()

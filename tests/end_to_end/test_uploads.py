@@ -2,6 +2,7 @@
 
 import base64
 import hashlib
+import os
 import socket
 import time
 from collections.abc import Iterator
@@ -18,6 +19,7 @@ from sqlalchemy import update
 from services.client import ServiceError
 from storage.database import open_engine, writing
 from storage.database import uploads as table
+from tests.disks import small_disk
 from tests.end_to_end.conftest import Service, paused, serving
 from tests.end_to_end.test_bad_input import check_problem
 
@@ -230,6 +232,26 @@ def test_the_quota_is_told_before_the_first_byte(tmp_path: Path, bundle: Path) -
         assert raw.getresponse().status == 507
         raw.close()
         assert service.stored() == set()
+
+
+def test_a_disk_that_fills_up_is_told_and_loses_nothing(tmp_path: Path) -> None:
+    with (
+        small_disk(tmp_path / "disk", 48 << 20) as disk,
+        serving(disk / "data", "--workers", "1") as service,
+    ):
+        where = create(service, 20 << 20)
+        assert patch(service, where, 0, bytes(4 << 20)).status_code == 204
+        # Another takes the room that was promised.
+        filler = disk / "filler"
+        filler.write_bytes(bytes(os.statvfs(disk).f_bavail * os.statvfs(disk).f_bsize - (6 << 20)))
+        before = uploads_of(service)
+        body = iter([b"a" * (1 << 20)] * 16)
+        problem = check_problem(patch(service, where, 4 << 20, body), 507, "no-room")
+        assert "the disk is full" in problem["detail"]
+        assert offset_of(service, where) == 4 << 20
+        assert uploads_of(service) == before
+        filler.unlink()
+        assert patch(service, where, 4 << 20, b"a" * (16 << 20)).headers["upload-offset"] == str(20 << 20)
 
 
 def test_what_came_before_a_line_broke_is_kept(service: Service) -> None:

@@ -3,7 +3,9 @@
 import subprocess
 import sys
 import threading
-from http.server import BaseHTTPRequestHandler, HTTPServer
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
@@ -47,6 +49,19 @@ def test_an_upload_to_a_service_that_is_not_there_ends_at_once(tmp_path: Path) -
         client.upload(tmp_path / "any.zip")
 
 
+@contextmanager
+def answering(handler: type[BaseHTTPRequestHandler]) -> Iterator[str]:
+    """A web server of its own; its URL."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}"
+        finally:
+            server.shutdown()
+            thread.join()
+
+
 def test_the_page_of_a_proxy_becomes_an_error() -> None:
     class Proxy(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -55,14 +70,40 @@ def test_the_page_of_a_proxy_becomes_an_error() -> None:
         def log_message(self, *arguments: object) -> None:
             pass
 
-    with HTTPServer(("127.0.0.1", 0), Proxy) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        with (
-            Client(f"http://127.0.0.1:{server.server_port}") as client,
-            pytest.raises(ServiceError, match="502 Bad Gateway") as caught,
-        ):
-            client.job("any")
-        server.shutdown()
-        thread.join()
+    with (
+        answering(Proxy) as url,
+        Client(url) as client,
+        pytest.raises(ServiceError, match="502 Bad Gateway") as caught,
+    ):
+        client.job("any")
     assert caught.value.problem["status"] == 502
+
+
+def test_what_the_service_computes_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("services.client.SILENCE", 0.2)
+    gone = threading.Event()
+
+    class Slow(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            if "layers" in self.path:
+                gone.wait(
+                    30
+                )  # until the other request was given up, and so for longer than it was waited for
+                self.send_response(200)
+                self.end_headers()
+                self.wfile.write(b"pixels")
+            else:
+                gone.wait(30)
+
+        def log_message(self, *arguments: object) -> None:
+            pass
+
+    found: list[bytes] = []
+    with answering(Slow) as url, Client(url) as patient, Client(url) as client:
+        waiting = threading.Thread(target=lambda: found.append(patient.layer("m", "S.png")))
+        waiting.start()
+        with pytest.raises(ServiceError, match="no answer"):
+            client.job("any")
+        gone.set()
+        waiting.join()
+    assert found == [b"pixels"]

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import tifffile
 from numpy.typing import NDArray
@@ -95,16 +94,20 @@ def ingest(objects: Objects, put: Callable[[str, bytes], None]) -> Ingest:
 
 @pytest.fixture(scope="session")
 def make_dng() -> Callable[..., bytes]:
-    """Makes a DNG of a sensor's counts, the least that LibRaw takes for one."""
+    """Makes a DNG of a sensor's counts, or of linear pixels, the least that LibRaw takes for one."""
 
     def make(
-        counts: NDArray[np.uint16], black: int, white: int, pattern: tuple[int, ...] = (0, 1, 1, 2)
+        counts: NDArray[Any],
+        black: int,
+        white: int,
+        pattern: tuple[int, ...] = (0, 1, 1, 2),
+        active: tuple[int, ...] = (),
+        **how: Any,
     ) -> bytes:
+        period = int(len(pattern) ** 0.5)
         tags = [
             (271, "s", 0, "Acme", True),
             (272, "s", 0, "Box", True),
-            (33421, "H", 2, (2, 2), True),  # the colour filter's size, and its colours
-            (33422, "B", 4, bytes(pattern), True),
             (50706, "B", 4, bytes((1, 4, 0, 0)), True),  # the DNG's version
             (50708, "s", 0, "Acme Box", True),
             (50714, "I", 1, black, True),
@@ -112,8 +115,13 @@ def make_dng() -> Callable[..., bytes]:
             (50721, "2i", 9, tuple(v for n in range(9) for v in (int(n % 4 == 0), 1)), True),  # colour matrix
             (50728, "2I", 3, (1, 1) * 3, True),  # neutral
         ]
+        if counts.ndim == 2:  # the colour filter's size, and its colours
+            tags += [(33421, "H", 2, (period, period), True), (33422, "B", period**2, bytes(pattern), True)]
+        if active:  # top, left, bottom, right
+            tags.append((50829, "I", 4, active, True))
         target = io.BytesIO()
-        tifffile.imwrite(target, counts, photometric="cfa", extratags=tags)
+        kind = "cfa" if counts.ndim == 2 else tifffile.PHOTOMETRIC.LINEAR_RAW
+        tifffile.imwrite(target, counts, photometric=kind, extratags=tags, **how)
         return target.getvalue()
 
     return make

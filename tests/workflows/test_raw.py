@@ -1,4 +1,4 @@
-"""Camera RAW: a DNG made here, with known counts, by LibRaw to linear light."""
+"""Camera RAW: DNGs made here, with known counts, by LibRaw to linear light."""
 
 import io
 from collections.abc import Callable
@@ -15,6 +15,9 @@ from workflows.raw import decode, is_raw
 MEMORY = 1 << 20
 BLACK, WHITE = 256, 4095
 COUNTS = np.random.default_rng(8).integers(200, 4000, (40, 60), np.uint16)
+XTRANS = "GBGGRG RGRBGB GBGGRG GRGGBG BGBRGR GRGGBG"
+"""Fuji's filter, by rows."""
+COLOURS = np.array([[*row] for row in XTRANS.split()])
 Dng = Callable[..., bytes]
 
 
@@ -90,8 +93,88 @@ def test_another_colour_filter_is_refused(make_dng: Dng) -> None:
         decode(make_dng(COUNTS, BLACK, WHITE, pattern=(0, 1, 1, 1)), memory=MEMORY)
 
 
-def test_a_truncated_dng_is_refused(make_dng: Dng) -> None:
-    data = make_dng(COUNTS, BLACK, WHITE)
+@pytest.mark.parametrize("shape", [(40, 60), (40, 60, 3)])
+def test_a_truncated_dng_is_refused(make_dng: Dng, shape: tuple[int, ...]) -> None:
+    data = make_dng(np.ones(shape, np.uint16), BLACK, WHITE)
     for length in np.linspace(0, len(data) * 0.9, 20).astype(int):
         with pytest.raises(ImageError):
             decode(data[:length], memory=MEMORY)
+
+
+def numbered(colours: NDArray[Any]) -> tuple[int, ...]:
+    """A filter as DNG has it."""
+    return tuple("RGB".index(colour) for colour in colours.ravel())
+
+
+@pytest.mark.parametrize(("down", "right"), [(0, 0), (1, 0), (2, 1), (4, 5)])
+def test_xtrans_is_linear_light_at_a_third_of_its_size(make_dng: Dng, down: int, right: int) -> None:
+    turned = np.roll(COLOURS, (-down, -right), (0, 1))
+    light = decode(make_dng(COUNTS, BLACK, WHITE, pattern=numbered(turned)), memory=MEMORY)
+    top, left = -down % 3, -right % 3
+    assert light.shape == ((40 - top) // 3, (60 - left) // 3, 3)
+    of_element = (COUNTS.astype(np.float32) - BLACK) / (WHITE - BLACK)
+    for row, column in np.ndindex(light.shape[:2]):
+        at = slice(top + 3 * row, top + 3 * row + 3), slice(left + 3 * column, left + 3 * column + 3)
+        colours = np.tile(turned, (8, 12))[at]
+        means = [of_element[at][colours == colour].mean() for colour in "RGB"]
+        assert [int((colours == colour).sum()) for colour in "RGB"] == [2, 5, 2]
+        np.testing.assert_allclose(light[row, column], means, atol=1e-6)
+
+
+def test_a_clipped_element_of_xtrans_clips_its_colour_of_its_pixel(make_dng: Dng) -> None:
+    counts = COUNTS.copy()
+    counts[4, 7] = WHITE  # the centre of a block
+    light = decode(make_dng(counts, BLACK, WHITE, pattern=numbered(COLOURS)), memory=MEMORY)
+    assert np.argwhere(np.isinf(light)).tolist() == [[1, 2, 1]]
+
+
+@pytest.mark.parametrize("pattern", [(0, 1, 1, 2), numbered(COLOURS)])
+def test_the_margin_is_cut_off(make_dng: Dng, pattern: tuple[int, ...]) -> None:
+    # By DNG, the filter begins at the active area; 8 and 10 are no multiple of 3 or 6.
+    framed = np.zeros((50, 74), np.uint16)
+    framed[8:48, 10:70] = COUNTS
+    got = decode(make_dng(framed, BLACK, WHITE, pattern, active=(8, 10, 48, 70)), memory=MEMORY)
+    np.testing.assert_array_equal(got, decode(make_dng(COUNTS, BLACK, WHITE, pattern), memory=MEMORY))
+
+
+def test_a_filter_of_36_that_is_not_xtrans_is_refused(make_dng: Dng) -> None:
+    other = np.array([[*"RGBRGB"]] * 6)
+    with pytest.raises(ImageError, match="not that of an X-Trans"):
+        decode(make_dng(COUNTS, BLACK, WHITE, pattern=numbered(other)), memory=MEMORY)
+
+
+PIXELS = np.random.default_rng(9).integers(200, 4000, (40, 60, 3), np.uint16)
+
+
+@pytest.mark.parametrize(
+    "how",
+    [{}, {"compression": "jpeg", "compressionargs": {"lossless": True}, "tile": (16, 16)}],
+    ids=["plain", "lossless JPEG in tiles"],
+)
+def test_a_linear_dng_is_read_pixel_by_pixel(make_dng: Dng, how: dict[str, Any]) -> None:
+    pixels = PIXELS.copy()
+    pixels[3, 5, 1] = WHITE
+    light = decode(make_dng(pixels, BLACK, WHITE, **how), memory=MEMORY)
+    assert light.dtype == np.float32
+    assert np.argwhere(np.isinf(light)).tolist() == [[3, 5, 1]]
+    light[3, 5, 1] = 1
+    np.testing.assert_allclose(light, (pixels.astype(np.float32) - BLACK) / (WHITE - BLACK), atol=1e-6)
+
+
+def test_a_linear_dngs_margin_is_cut_off_and_its_limit_checked_first(make_dng: Dng) -> None:
+    data = make_dng(PIXELS, BLACK, WHITE, active=(4, 6, 38, 56))
+    assert decode(data, memory=40 * 60 * 24).shape == (34, 50, 3)
+    with pytest.raises(ImageError, match="60 x 40 linear pixels"):
+        decode(data, memory=40 * 60 * 24 - 1)
+
+
+@pytest.mark.parametrize("shape", [(40, 60), (40, 60, 3)])
+def test_a_dng_of_floats_is_refused(make_dng: Dng, shape: tuple[int, ...]) -> None:
+    with pytest.raises(ImageError, match="EXR or float TIFF"):
+        decode(make_dng(np.ones(shape, np.float32), 0, 1), memory=MEMORY)
+
+
+def test_a_dng_in_a_compression_that_libraw_has_not_is_refused(make_dng: Dng) -> None:
+    data = make_dng(PIXELS, BLACK, WHITE, compression=tifffile.COMPRESSION.JPEGXL_DNG)
+    with pytest.raises(ImageError, match="not by JPEG XL"):
+        decode(data, memory=MEMORY)

@@ -62,10 +62,15 @@ class ToneCurve(BaseModel):
 
 
 class Quality(BaseModel):
-    """PSNR in dB to expect of composites: of glass that scatters or disperses, and of clear glass."""
+    """PSNR in dB to expect of composites, of worse and of better glass.
+
+    ``blocks`` is how many the finest random grid has along the monitor's shorter side if no grid has offsets: then
+    clear glass is worst and frosted glass best. Else it is None, and clear glass best.
+    """
 
     low: float
     high: float
+    blocks: int | None
 
 
 class Figures(BaseModel):

@@ -6,7 +6,8 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel
 
-from workflows.ingest.figures import Drift, Figures, Flicker
+from workflows.ingest.figures import Drift, Figures, Flicker, Quality
+from workflows.ingest.unfound import by_reason, ranges, remedy
 from workflows.program import Images, Program
 
 Level = Literal["good", "warning", "bad"]
@@ -37,14 +38,7 @@ def findings(made: Figures, program: Program, attributes: dict[str, Any]) -> lis
         *_curves(made, program),
     ]
     if made.quality is not None:
-        found.append(
-            Finding(
-                name="quality",
-                level="good",
-                message=f"composites of about {made.quality.low:.0f} dB (frosted glass, dispersion, many edges) to "
-                f"{made.quality.high:.0f} dB (clear glass) are to be expected, if nothing else is wrong",
-            )
-        )
+        found.append(_quality(made.quality))
     return found
 
 
@@ -52,14 +46,33 @@ def _graded(value: float, warning: float, bad: float) -> Level:
     return "bad" if value >= bad else "warning" if value >= warning else "good"
 
 
+def _quality(quality: Quality) -> Finding:
+    if quality.blocks is None:
+        worst, best, why = "frosted glass, dispersion, many edges", "clear glass", ""
+    else:
+        worst, best = "clear glass, many edges", "frosted glass"
+        why = (
+            f": the random grids lie still, and where in a block of the finest, {quality.blocks} along the shorter "
+            "side, light comes from is not told. Patterns with offsets, as of the preset `default`, do better"
+        )
+    return Finding(
+        name="quality",
+        level="good",
+        message=f"composites of about {quality.low:.0f} dB ({worst}) to {quality.high:.0f} dB ({best}) are to be "
+        f"expected, if nothing else is wrong{why}",
+    )
+
+
 def _frames(made: Figures) -> Finding:
-    missing = made.frames.missing
+    # Only those of a recording may be without one.
+    missing = {int(number): why for number, why in made.video["missing"].items()} if made.video else {}
     if missing:
+        which = "; ".join(f"{ranges(numbers)} ({why})" for numbers, why in by_reason(missing))
         return Finding(
             name="frames",
             level=_graded(len(missing) / made.frames.patterns, 0, 0.1),
-            message=f"{len(missing)} of {made.frames.patterns} patterns have no frame, the first of them {missing[0]}",
-            remedy="show each pattern for longer, or film again",
+            message=f"{len(missing)} of {made.frames.patterns} patterns have no frame that can be used: {which}",
+            remedy=remedy(missing.values()),
         )
     several = f", in {made.frames.exposures} exposures" if made.frames.exposures > 1 else ""
     return Finding(

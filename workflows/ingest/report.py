@@ -1,12 +1,12 @@
 """A report on a capture that a person can act on: what was measured, what it means, and what to do about it."""
 
-from math import log10
 from typing import Any
 
 import numpy as np
 
-from workflows.ingest.figures import Clipping, Figures, Frames, Noise, Quality, ToneCurve
+from workflows.ingest.figures import Clipping, Figures, Frames, Noise, ToneCurve
 from workflows.ingest.findings import LEVELS, Finding, Level, findings
+from workflows.ingest.quality import expected
 from workflows.program import Program
 
 
@@ -65,29 +65,8 @@ def report(attributes: dict[str, Any], frames: int) -> Report:
         ),
         crosstalk=attributes["crosstalk"],
         **curves,
-        quality=_quality(program, survey),
+        quality=expected(program, survey),
         video=attributes.get("video"),
     )
     found = findings(made, program, attributes)
     return Report(**dict(made), level=max((f.level for f in found), key=LEVELS.index), findings=found)
-
-
-def _quality(program: Program, survey: dict[str, Any]) -> Quality | None:
-    """PSNR to expect, from the noise, the contrast and the number m of patterns.
-
-    Notes
-    -----
-    The squared error is modelled as ``k s^2 / m + c rho^2 / m^1.2``: noise of the deviation s goes into some k
-    parameters of T, S and rho; what the patterns did not ask is the rest, in proportion to the contrast rho. k and
-    c are those of the traced scenes that `tests/benchmarks/figures.py` measures, a dispersing solid and a clear ball:
-    k from the noise once and four times, c and the power from the presets of 128, 49 and 25 patterns. Ball, solid
-    and a frosted lens are at most 2.5 dB outside the range, with the noisy sketch, of which the fit knew nothing.
-    """
-    patterns = program.measured.size
-    s2, rho = survey["deviation"] ** 2, survey["contrast"]
-    if rho <= 0:
-        return None
-    low, high = (
-        -10 * log10(k * s2 / patterns + c * rho**2 / patterns**1.2) for k, c in ((19.0, 0.040), (5.5, 0.0044))
-    )
-    return Quality(low=low, high=high)

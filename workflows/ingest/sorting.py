@@ -1,8 +1,7 @@
 """The frames of a video sorted by the patterns that they show, and what to make of those that are not found."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -11,8 +10,10 @@ from numpy.typing import NDArray
 from storage.errors import CaptureError
 from workflows.clock import Border
 from workflows.ingest import content, display, lead
+from workflows.ingest.bordered import without_border
 from workflows.ingest.recording import Recording
 from workflows.ingest.timing import Edge, Found, find
+from workflows.ingest.unfound import by_reason, ranges
 from workflows.ingest.video import PARTS, Large, Share, Signatures
 from workflows.program import Program
 
@@ -108,7 +109,7 @@ def sort(
     numbered = found is not None
     if found is None:
         found = _by_timing(recording, rate, program, light, border is not None, refused)
-    looks, resemblance, odd = _compared(recording, found, program, light)
+    looks, resemblance, odd = _compared(recording, found, program, light, border is not None)
     reasons = dict(found.reasons)
     for number in odd:
         reasons[number] = "it looks unlike others of its kind, as if something had been in front"
@@ -161,7 +162,7 @@ def _by_timing(
             f"the picture changes {len(recording.events)} times, but the program has {program.count} patterns: keep "
             "the camera, the light and the glass at rest, and cut off what does not belong to the program"
         )
-    found = _best(recording, rate, program, light, begins, ends, refused)
+    found = _best(recording, rate, program, light, has_lead, begins, ends, refused)
     start = found.start + float(recording.times[0])
     return replace(found, frames=[some + frames.start for some in found.frames], start=start)
 
@@ -171,6 +172,7 @@ def _best(
     rate: float,
     program: Program,
     light: content.Light,
+    has_border: bool,
     begins: bool,
     ends: bool,
     refused: Any,
@@ -201,17 +203,19 @@ def _best(
     likely = [found for found in fitting if found.cost <= least + _AS_LIKELY]
 
     def score(found: Found) -> float:
-        _, resemblance, odd = _compared(recording, found, program, light)
+        _, resemblance, odd = _compared(recording, found, program, light, has_border)
         return (resemblance or 0.0) - len(odd)
 
     return likely[0] if len(likely) == 1 else max(sorted(likely, key=lambda found: found.cost), key=score)
 
 
 def _compared(
-    recording: Recording, found: Found, program: Program, light: content.Light
+    recording: Recording, found: Found, program: Program, light: content.Light, has_border: bool
 ) -> tuple[dict[int, Doubles], float | None, list[int]]:
     """What was seen of each pattern, about in linear light; its resemblance to the program; the odd ones."""
     looks = {n: (recording.look(f) / 255) ** _GAMMA for n, f in enumerate(found.frames) if f.size}
+    if has_border:
+        looks = without_border(program, looks)
     return looks, content.resemblance(program, light, looks), content.odd(program, light, looks)
 
 
@@ -248,19 +252,7 @@ def _summary(record: Mapping[str, Any], kept: int, count: int) -> str:
 
 def _by_reason(reasons: Mapping[int, str]) -> list[str]:
     """A line a reason: the patterns that it holds for, as ranges."""
-    ordered = sorted(reasons.items(), key=lambda item: (item[1], item[0]))
     return [
-        f"no frame of pattern{'s' * (len(numbers) > 1)} {_ranges(numbers)}: {reason}"
-        for reason, items in groupby(ordered, key=lambda item: item[1])
-        for numbers in [[number for number, _ in items]]
+        f"no frame of pattern{'s' * (len(numbers) > 1)} {ranges(numbers)}: {reason}"
+        for numbers, reason in by_reason(reasons)
     ]
-
-
-def _ranges(numbers: Iterable[int]) -> str:
-    runs: list[list[int]] = []
-    for number in numbers:
-        if runs and number == runs[-1][1] + 1:
-            runs[-1][1] = number
-        else:
-            runs.append([number, number])
-    return ", ".join(str(a) if a == b else f"{a} to {b}" for a, b in runs)
