@@ -12,6 +12,7 @@ from workflows import clock
 from workflows.clock import Border, Box
 from workflows.ingest.recording import Recording
 from workflows.ingest.timing import Found
+from workflows.ingest.unfound import Reason
 from workflows.ingest.video import Large
 
 LOOKS = 6
@@ -206,7 +207,7 @@ def _found(recording: Recording, seen: dict[int, int], patterns: int) -> Found:
     """The frames of the plateaus that show a number: of several with the same one, of the longest."""
     frames = [np.zeros(0, np.intp)] * patterns
     weights = [np.zeros(0)] * patterns
-    reasons: dict[int, str] = {}
+    reasons: dict[int, Reason] = {}
     longest: dict[int, range] = {}
     for plateau, number in seen.items():
         if len(recording.plateau(plateau)) > len(longest.get(number, ())):
@@ -215,13 +216,13 @@ def _found(recording: Recording, seen: dict[int, int], patterns: int) -> Found:
         if number in longest and len(longest[number]) > 1:
             frames[number], weights[number] = recording.clean(longest[number])
         elif number in longest:
-            reasons[number] = "no two frames show it whole"
+            reasons[number] = Reason.TORN
         elif number < min(longest):
-            reasons[number] = "the recording begins after it"
+            reasons[number] = Reason.BEFORE
         elif number > max(longest):
-            reasons[number] = "the recording ends before it"
+            reasons[number] = Reason.AFTER
         else:
-            reasons[number] = "no frames that stand still show its number in the border"
+            reasons[number] = Reason.UNNUMBERED
     begins = np.array([recording.times[longest[number].start] for number in sorted(longest)])
     holds = np.diff(begins) / np.diff(sorted(longest))
     hold = float(trim_mean(holds, 0.25))  # of most: what was cut out, or stood still, is left aside

@@ -13,7 +13,7 @@ from workflows.ingest import content, display, lead
 from workflows.ingest.bordered import without_border
 from workflows.ingest.recording import Recording
 from workflows.ingest.timing import Edge, Found, find
-from workflows.ingest.unfound import by_reason, ranges
+from workflows.ingest.unfound import Reason, by_reason, ranges
 from workflows.ingest.video import PARTS, Large, Share, Signatures
 from workflows.program import Program
 
@@ -112,7 +112,7 @@ def sort(
     looks, resemblance, odd = _compared(recording, found, program, light, border is not None)
     reasons = dict(found.reasons)
     for number in odd:
-        reasons[number] = "it looks unlike others of its kind, as if something had been in front"
+        reasons[number] = Reason.ODD
         del looks[number]
     wrong = np.isin(program.constants[0], odd).mean() > 0.5
     if wrong or (resemblance is not None and resemblance < LEAST_RESEMBLANCE):
@@ -220,7 +220,7 @@ def _compared(
 
 
 def _see_that_it_is_enough(
-    program: Program, looks: Mapping[int, Doubles], reasons: Mapping[int, str], rate: float, refused: Any
+    program: Program, looks: Mapping[int, Doubles], reasons: Mapping[int, Reason], rate: float, refused: Any
 ) -> None:
     numbers, sent = program.constants
     there = np.isin(numbers, list(looks))
@@ -250,7 +250,7 @@ def _summary(record: Mapping[str, Any], kept: int, count: int) -> str:
     )
 
 
-def _by_reason(reasons: Mapping[int, str]) -> list[str]:
+def _by_reason(reasons: Mapping[int, Reason]) -> list[str]:
     """A line a reason: the patterns that it holds for, as ranges."""
     return [
         f"no frame of pattern{'s' * (len(numbers) > 1)} {ranges(numbers)}: {reason}"

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workflows.ingest.recording import Doubles, Integers, Recording
+from workflows.ingest.unfound import Reason
 
 Bools = NDArray[np.bool_]
 
@@ -51,7 +52,7 @@ class Found:
         Clean frames of each pattern, in the order of time; none where the pattern was not found.
     weights : list of (k,) float64
         How much each of them is to count.
-    reasons : dict of int to str
+    reasons : dict of int to Reason
         Why a pattern has no frames.
     start, rate : float
         Seconds from the first frame to the first pattern, and patterns a second.
@@ -63,7 +64,7 @@ class Found:
 
     frames: list[Integers]
     weights: list[Doubles]
-    reasons: dict[int, str]
+    reasons: dict[int, Reason]
     start: float
     rate: float
     cost: float
@@ -119,9 +120,9 @@ def find(recording: Recording, rate: float, same: Bools, begin: Edge, end: Edge)
     steps, cost = path
     frames: list[Integers] = [np.zeros(0, np.intp)] * (len(same) + 1)
     weights: list[Doubles] = [np.zeros(0)] * (len(same) + 1)
-    reasons: dict[int, str] = {}
+    reasons: dict[int, Reason] = {}
     for pattern, given in _frames_of(recording, steps, hold, same).items():
-        if isinstance(given, str):
+        if isinstance(given, Reason):
             reasons[pattern] = given
         else:
             frames[pattern], weights[pattern] = recording.clean(given)
@@ -243,23 +244,25 @@ def _late(late: float, hold: float, holds: int, variance: float) -> float:
     return (z**2 / 2 if z < _ELBOW else _ELBOW * (z - _ELBOW / 2)) + math.log(spread / own)
 
 
-def _frames_of(recording: Recording, steps: list[Step], hold: float, same: Bools) -> dict[int, range | str]:
+def _frames_of(
+    recording: Recording, steps: list[Step], hold: float, same: Bools
+) -> dict[int, range | Reason]:
     """The frames between the boundaries of each pattern, or why there are none."""
     n, times = len(same) + 1, recording.times
-    found: dict[int, range | str] = {}
+    found: dict[int, range | Reason] = {}
 
     def within(plateau: range, begin: float, end: float) -> range:
         return range(*np.clip(np.searchsorted(times, [begin, end]), plateau.start, plateau.stop).tolist())
 
     first, last = steps[0], steps[-1]
     for pattern in range(first.first):
-        found[pattern] = "the recording begins after it"
+        found[pattern] = Reason.BEFORE
     if first.first > 0:  # the end of what the monitor showed before
         plateau = recording.plateau(first.event)
         found[first.first - 1] = within(plateau, first.begin - _ENOUGH * hold, first.begin)
     for step in steps:
         for pattern in range(step.first, step.last):
-            found[pattern] = "no two frames of it are alike: it was too short, or something moved"
+            found[pattern] = Reason.SHORT
     for a, b in pairwise(steps):
         head, tail = recording.plateau(a.event + 1), recording.plateau(b.event)
         undisturbed = b.event == a.event + 1
@@ -272,26 +275,26 @@ def _frames_of(recording: Recording, steps: list[Step], hold: float, same: Bools
                 begin = a.end + (pattern - a.last) * share
                 found[pattern] = within(head, begin + 0.2 * share, begin + 0.8 * share)
             else:
-                found[pattern] = "the changes before and after it can't be told from others, or did not show"
+                found[pattern] = Reason.UNCLEAR
         if not undisturbed:
             for pattern, plateau in ((a.last, head), (b.first - 1, tail)):
                 if times[plateau[-1]] - times[plateau[0]] < hold * (1 + 3 * JITTER):
                     found[pattern] = plateau
     for pattern in range(last.last, n):
-        found[pattern] = "the recording ends before it"
+        found[pattern] = Reason.AFTER
     if last.last < n:
         plateau = recording.plateau(last.event + 1)
         found[last.last] = within(plateau, last.end, last.end + _ENOUGH * hold)
     return {
         # One frame alone may be torn: it has none to be compared with.
-        pattern: "no two frames show it whole" if isinstance(given, range) and len(given) < 2 else given
+        pattern: Reason.TORN if isinstance(given, range) and len(given) < 2 else given
         for pattern, given in sorted(found.items())
     }
 
 
-def _alike(recording: Recording, plateaus: range) -> range | str:
+def _alike(recording: Recording, plateaus: range) -> range | Reason:
     """The longest of the plateaus of one pattern, if it holds most of their frames."""
     longest = max((recording.plateau(n) for n in plateaus), key=len)
     if 2 * len(longest) > sum(len(recording.plateau(n)) for n in plateaus):
         return longest
-    return "something changed while it was shown"
+    return Reason.DISTURBED

@@ -1,21 +1,36 @@
 """Patterns of which a recording has no frame that can be used: in words, and what to do about them."""
 
 from collections.abc import Iterable, Mapping
+from enum import StrEnum
 from itertools import chain, groupby
 
 _LONGER = "record more frames a second, or show each pattern for longer"
 _AT_REST = "keep hands and other light away, and camera, glass and monitor at rest"
-REMEDIES = {
-    "the recording begins after it": "start the recording before the program",
-    "the recording ends before it": "let the recording go on until after the program",
-    "no two frames show it whole": _LONGER,
-    "no two frames of it are alike: it was too short, or something moved": f"{_LONGER}; {_AT_REST}",
-    "the changes before and after it can't be told from others, or did not show": _AT_REST,
-    "no frames that stand still show its number in the border": f"{_LONGER}; {_AT_REST}",
-    "something changed while it was shown": _AT_REST,
-    "it looks unlike others of its kind, as if something had been in front": _AT_REST,
+
+
+class Reason(StrEnum):
+    """Why a pattern has no frames."""
+
+    BEFORE = "the recording begins after it"
+    AFTER = "the recording ends before it"
+    TORN = "no two frames show it whole"
+    SHORT = "no two frames of it are alike: it was too short, or something moved"
+    UNCLEAR = "the changes before and after it can't be told from others, or did not show"
+    UNNUMBERED = "no frames that stand still show its number in the border"
+    DISTURBED = "something changed while it was shown"
+    ODD = "it looks unlike others of its kind, as if something had been in front"
+
+
+REMEDIES: dict[str, str] = {
+    Reason.BEFORE: "start the recording before the program",
+    Reason.AFTER: "let the recording go on until after the program",
+    Reason.TORN: _LONGER,
+    Reason.SHORT: f"{_LONGER}; {_AT_REST}",
+    Reason.UNCLEAR: _AT_REST,
+    Reason.UNNUMBERED: f"{_LONGER}; {_AT_REST}",
+    Reason.DISTURBED: _AT_REST,
+    Reason.ODD: _AT_REST,
 }
-"""What to do, by the reasons that sorting gives."""
 
 
 def by_reason(reasons: Mapping[int, str]) -> list[tuple[list[int], str]]:
