@@ -12,8 +12,8 @@ from workflows.program import Images, Program
 Level = Literal["good", "warning", "bad"]
 LEVELS: tuple[Level, ...] = ("good", "warning", "bad")
 
-SURE = 5.0
-"""Standard errors of a frame's place that the frames lie apart, from which they moved: of many, two are far off."""
+SURE = 4.0
+"""Standard errors of a frame's, from which a drift or a flicker is one."""
 
 
 class Finding(BaseModel):
@@ -161,7 +161,7 @@ def _flicker(flicker: Flicker | None) -> list[Finding]:
     if flicker is None:
         return []
     limits = (2.0, 10.0) if flicker.corrected else (0.5, 2.0)
-    level = _graded(flicker.percent if flicker.percent > flicker.error else 0.0, *limits)
+    level = _graded(flicker.percent if flicker.percent > SURE * flicker.error else 0.0, *limits)
     return [
         Finding(
             name="flicker",
