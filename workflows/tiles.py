@@ -2,7 +2,7 @@
 
 from functools import lru_cache
 from itertools import product
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,14 +11,14 @@ from pydantic import TypeAdapter
 from storage.captures import Stack
 from storage.mattes import Block, Matte
 from storage.objects import Objects
-from workflows.images import Codes
+from workflows.light import read_light
 from workflows.options import RecoveryOptions
 from workflows.patterns import lay_out, pyramid_of
 from workflows.program import Program
 from workflows.recovery import dgsr, lobes
 from workflows.recovery.photometry import Noise, fit_photometry, normalise
 from workflows.recovery.sensing import Patterns, Sensing
-from workflows.tone import Curve, table, to_light
+from workflows.tone import Curve, to_light
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
@@ -79,12 +79,8 @@ def _recover_block(
     attributes = stack.attributes
     camera = TypeAdapter[Curve](Curve).validate_python(attributes["camera_curve"])
     noise = Noise(**attributes["noise"])
-    codes, recovered = stack.read_masked(*span)
-    light, usable, worth = _merge(codes[:, recovered], attributes, program.count, camera)
+    (light, usable, worth), recovered = read_light(stack, span, program, camera)
     crosstalk = np.array(attributes["crosstalk"])
-    if np.any(crosstalk != np.eye(3)):
-        light = (light @ np.linalg.inv(crosstalk).T).astype(np.float32)
-        usable &= usable.all(axis=2, keepdims=True)
     numbers, sent = program.constants
     filmed = np.isin(numbers, attributes["patterns"])  # a video may lack some
     numbers, sent = numbers[filmed], sent[filmed]
@@ -120,55 +116,6 @@ def _recover_block(
         transport.cell,
         transport.weight,
     )
-
-
-def _merge(
-    codes: Codes, attributes: dict[str, Any], count: int, camera: Curve
-) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
-    """The light of each pattern, from its frames.
-
-    Returns
-    -------
-    light : (n, count, 3) float32
-        In units of what fills the camera's range in the shortest exposure.
-    usable : (n, count, 3) bool
-        False where in every exposure some frame is clipped, at black or at white, and where there is no frame.
-    worth : (n, count, 3) float32
-        Frames of the shortest exposure that say as much.
-
-    Notes
-    -----
-    A frame that was exposed t times as long as the shortest has the value v = t x of the light x, with the variance
-    ``read + shot v``. Where the photons' noise counts most, the likelihood's maximum is ``sum v / sum t``, over the
-    exposures that are not clipped, with the variance ``shot x / sum t``: `worth` is ``sum t``. Read noise, which long
-    exposures have less of, is then rather overstated.
-    """
-    look_up = table(camera, codes.dtype, attributes["storage"]["black"])
-    top = np.iinfo(codes.dtype).max
-    exposures = np.array(attributes["exposures"], np.float32)
-    exposures /= exposures.min()
-    shape = (codes.shape[1], count, 3)
-    light, worth = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    every, times = np.zeros(shape, np.float32), np.zeros(count, np.float32)
-    of_exposure: dict[tuple[int, float], list[int]] = {}
-    for frame, key in enumerate(zip(attributes["patterns"], exposures.tolist(), strict=True)):
-        of_exposure.setdefault(key, []).append(frame)
-    for (pattern, exposure), frames in of_exposure.items():
-        total = np.zeros((shape[0], 3), np.float32)
-        whole = np.ones((shape[0], 3), bool)
-        for frame in frames:
-            total += look_up[codes[frame]]
-            whole &= (codes[frame] > 0) & (codes[frame] < top)
-        time = np.float32(len(frames) * exposure)
-        light[:, pattern] += np.where(whole, total, 0)
-        worth[:, pattern] += np.where(whole, time, 0)
-        every[:, pattern] += total
-        times[pattern] += time
-    usable = worth > 0
-    np.copyto(worth, np.maximum(times, 1)[:, np.newaxis], where=~usable)
-    np.copyto(light, every, where=~usable)
-    light /= worth
-    return light, usable, worth
 
 
 def grid_of(url: str, capture: str, options: RecoveryOptions) -> tuple[int, int]:

@@ -22,7 +22,7 @@ from workflows.ingest.bundle import Limits
 from workflows.jobs import Task, run_finish, run_prepare, run_tile
 from workflows.scene import Scene, nested_program, write_capture
 from workflows.simulate import glass_ball
-from workflows.tiles import _merge, cut
+from workflows.tiles import cut
 
 Zip = Callable[..., bytes]
 Ingest = Callable[..., object]
@@ -212,6 +212,24 @@ def test_a_damaged_stack_is_corrupt(
         run_finish("recover", task)
 
 
+def test_frames_that_are_moved_back_are_the_same_in_any_tile(
+    ingest: Callable[..., Stack], objects: Objects, digests: Digests, bundles: dict[bool, bytes]
+) -> None:
+    stack = ingest("c", bundles[True])
+    random = np.random.default_rng(2)
+    stack.annotate(
+        shifts=random.uniform(-2.5, 2.5, (stack.frames, 2)).tolist(),
+        gains=random.uniform(0.9, 1.1, stack.frames).tolist(),
+    )
+    made = []
+    for tile in (16, 32, 1024):
+        task = Task(objects.url, "c", "m", {"tile": tile}, Limits(1 << 30, 1 << 26), {})
+        for index in range(run_prepare("recover", task)["tiles"]):
+            run_tile("recover", task, index)
+        made.append(digests("mattes/m"))
+    assert made[0] == made[1] == made[2]
+
+
 @pytest.mark.parametrize(("capture", "matte"), [("c", "none"), ("none", "m")])
 def test_what_the_store_lacks_is_corrupt(
     recover: Callable[..., tuple[mattes.Matte, int]],
@@ -264,28 +282,6 @@ def test_exposures_are_merged_by_what_they_say(objects: Objects, ingest: Ingest)
     # the longest clips the brightest pixels
     many = error("many", bracketed(target.getvalue(), (1, 4, 20)))
     assert many < 0.4 * one
-
-
-def test_merged_light_leaves_out_what_is_clipped() -> None:
-    storage = {"black": 0, "full": 1.0}
-    codes = np.array(
-        [[[51, 0, 255]], [[102, 0, 255]], [[204, 4, 255]], [[255, 8, 255]], [[10, 20, 30]]], np.uint8
-    )
-    given = {"patterns": [0, 0, 0, 0, 1], "exposures": [0.5, 1.0, 2.0, 4.0, 1.0], "storage": storage}
-    light, usable, worth = _merge(codes, given, 2, "linear")
-    assert usable[0].tolist() == [[True, True, False], [True, True, True]]
-    np.testing.assert_allclose(worth[0], [[7, 12, 15], [2, 2, 2]])
-    np.testing.assert_allclose(light[0, 0, :2] * 255, [357 / 7, 12 / 12], rtol=1e-6)
-    np.testing.assert_allclose(light[0, 1] * 255, [5, 10, 15], rtol=1e-6)
-
-
-def test_a_clipped_repeat_takes_its_whole_exposure_out() -> None:
-    codes = np.array([[[250, 100, 9]], [[255, 110, 0]]], np.uint8)
-    given = {"patterns": [0, 0], "exposures": [1.0, 1.0], "storage": {"black": 0, "full": 1.0}}
-    light, usable, worth = _merge(codes, given, 1, "linear")
-    assert usable[0, 0].tolist() == [False, True, False]
-    np.testing.assert_allclose(light[0, 0] * 255, [252.5, 105, 4.5])
-    np.testing.assert_array_equal(worth, 2)
 
 
 @pytest.mark.parametrize("method", ["lobes", "nn-dgsr"])

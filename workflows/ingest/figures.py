@@ -26,20 +26,29 @@ class Clipping(BaseModel):
 
 
 class Drift(BaseModel):
-    """How far the camera moved between quarters of the capture, in pixels, and that figure's standard error."""
+    """The largest distance between two frames' places in pixels, and the standard error of a frame's place.
+
+    ``quarters`` are the mean places in the quarters of the capture, x and y. ``corrected``: recovery moves frames back.
+    """
 
     pixels: float
     error: float
     quarters: list[tuple[float, float]]
+    corrected: bool
 
 
 class Flicker(BaseModel):
-    """How much the light varied between frames: its deviation, and the frame that is furthest off."""
+    """How much the monitor's light varied between frames, in per cent: its deviation, and the frame furthest off.
+
+    ``error`` is the standard error of a frame's. ``corrected``: recovery takes it out.
+    """
 
     percent: float
+    error: float
     worst_percent: float
     worst_frame: int
     frames: int
+    corrected: bool
 
 
 class Noise(BaseModel):

@@ -13,6 +13,9 @@ from workflows.program import Images, Program
 Level = Literal["good", "warning", "bad"]
 LEVELS: tuple[Level, ...] = ("good", "warning", "bad")
 
+SURE = 4.0
+"""Standard errors of a frame's, from which a drift or a flicker is one."""
+
 
 class Finding(BaseModel):
     """One thing that was looked at.
@@ -31,6 +34,7 @@ def findings(made: Figures, program: Program, attributes: dict[str, Any]) -> lis
     found = [
         _frames(made),
         *_exposure(made, attributes["storage"]),
+        *_steadiness(attributes["steadiness"]),
         *_drift(made.drift),
         *_flicker(made.flicker),
         _noise(made, attributes["survey"]),
@@ -127,19 +131,41 @@ def _white(made: Figures) -> Finding:
     )
 
 
+def _steadiness(found: dict[str, Any] | None) -> list[Finding]:
+    if found != {}:
+        return []
+    return [
+        Finding(
+            name="steadiness",
+            level="warning",
+            message="the patterns of the program don't explain what the frames show: how still the camera was and how "
+            "even the light can't be told",
+            remedy="name the camera's curve (`response`), see that the frames show the patterns that capture.json "
+            "says, and that neither camera nor glass was moved by more than three pixels",
+        )
+    ]
+
+
 def _drift(drift: Drift | None) -> list[Finding]:
     if drift is None:
         return []
-    # What is within its own error is none.
-    level = _graded(drift.pixels if drift.pixels > 2 * drift.error else 0.0, 0.25, 0.75)
+    # Of what is taken out, a little is left; what is within its own error is none.
+    limits = (0.5, 2.0) if drift.corrected else (0.1, 0.5)
+    level = _graded(drift.pixels if drift.corrected or drift.pixels > SURE * drift.error else 0.0, *limits)
+    found = f"the camera moved by {drift.pixels:.2f} pixels (a frame's place is told to {drift.error:.3f})"
     return [
         Finding(
             name="drift",
             level=level,
-            message=f"the camera moved by {drift.pixels:.2f} pixels (give or take {drift.error:.2f})",
+            message=found + (": recovery moves the frames back" if drift.corrected else ""),
             remedy=""
             if level == "good"
-            else "fix camera, glass and monitor better, release from afar, and film again: it is not corrected",
+            else "fix camera, glass and monitor better, release from afar, and film again: "
+            + (
+                "what moved so far is taken out only in part"
+                if drift.corrected
+                else "no common shift of the frames explains it, so it is not corrected"
+            ),
         )
     ]
 
@@ -147,17 +173,23 @@ def _drift(drift: Drift | None) -> list[Finding]:
 def _flicker(flicker: Flicker | None) -> list[Finding]:
     if flicker is None:
         return []
-    level = _graded(flicker.percent, 0.5, 2.0)
+    limits = (2.0, 10.0) if flicker.corrected else (0.5, 2.0)
+    level = _graded(flicker.percent if flicker.percent > SURE * flicker.error else 0.0, *limits)
     return [
         Finding(
             name="flicker",
             level=level,
             message=f"the light varies by {flicker.percent:.2f} % between frames, by {flicker.worst_percent:+.1f} % in "
-            f"frame {flicker.worst_frame}",
+            f"frame {flicker.worst_frame}" + (": recovery takes it out" if flicker.corrected else ""),
             remedy=""
             if level == "good"
             else "switch automatic exposure and the monitor's dimming off, let the monitor warm up, and expose "
-            "for whole periods of its refresh: it is not corrected",
+            "for whole periods of its refresh"
+            + (
+                ": so much is taken out only in part"
+                if flicker.corrected
+                else ": it is not corrected, for it is not told surely, or no frame is black"
+            ),
         )
     ]
 

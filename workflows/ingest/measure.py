@@ -24,8 +24,15 @@ COMPRESSED_SAMPLES = 4096
 """Pixels, at most, from which the noise of a video is measured, in all of its frames."""
 
 
-def measure(objects: Objects, capture: str) -> None:
+def measure(objects: Objects, capture: str, gains: Sequence[float] | None = None) -> None:
     """Measure the noise, the crosstalk, and the curves that the capture calls unknown, from frames of constant levels.
+
+    Parameters
+    ----------
+    objects, capture
+        Where the stack is.
+    gains : sequence of float, optional
+        Of the monitor's light in each frame; 1 if left out.
 
     Raises
     ------
@@ -53,6 +60,8 @@ def measure(objects: Objects, capture: str) -> None:
     codes, usable, sent, grey = codes[:, shortest], usable[:, shortest], sent[shortest], grey[shortest]
     look_up = table(found.camera, stack.dtype, black)
     light, shown = look_up[codes], to_light(sent, found.monitor)
+    if gains is not None:
+        shown *= np.array([gains[frames[at]] for at in shortest], np.float32)[:, np.newaxis]
     # what the channels see of each other's colours is no noise
     some = grey if np.count_nonzero(grey) >= 4 else np.ones_like(grey)
     noise = estimate_noise(light[:, some], shown[some], usable[:, some], 1 / (top - black))

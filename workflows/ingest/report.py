@@ -28,7 +28,7 @@ def report(attributes: dict[str, Any], frames: int) -> Report:
         Of the stack.
     """
     program = Program.model_validate(attributes["program"])
-    survey, noise = attributes["survey"], attributes["noise"]
+    survey, noise, steadiness = attributes["survey"], attributes["noise"], attributes["steadiness"] or {}
     said = {"monitor": program.monitor.response, "camera": attributes["response"]}
     curves = {
         name: ToneCurve(
@@ -55,8 +55,8 @@ def report(attributes: dict[str, Any], frames: int) -> Report:
             patterns_black=survey["patterns"]["clipped_low"],
         ),
         white_reaches=survey["white"]["reaches"],
-        drift=survey["drift"],
-        flicker=survey["flicker"],
+        drift=steadiness.get("drift"),
+        flicker=steadiness.get("flicker"),
         noise=Noise(
             black=255 * noise["read"] ** 0.5,
             full=255 * (noise["read"] + noise["shot"]) ** 0.5,
