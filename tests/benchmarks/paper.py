@@ -42,7 +42,9 @@ from workflows.patterns import lay_out
 from workflows.program import Program
 from workflows.recovery import dgsr, lobes
 from workflows.recovery.groups import Rows
-from workflows.recovery.photometry import Noise, Photometry, estimate_noise, fit_photometry, normalise
+from workflows.recovery.measured import normalise
+from workflows.recovery.noise import Noise
+from workflows.recovery.photometry import Photometry, estimate_noise, fit_photometry
 from workflows.recovery.pyramid import Pyramid
 from workflows.recovery.sensing import Patterns, Sensing
 from workflows.recovery.transport import Transport

@@ -12,7 +12,7 @@ from storage.captures import Stack
 from storage.objects import Objects
 from workflows.ingest.measure import constant_frames
 from workflows.program import Program
-from workflows.recovery.photometry import Noise
+from workflows.recovery.noise import Noise
 from workflows.tone import Curve, table
 
 EDGE = 96

@@ -7,7 +7,9 @@ from numpy.typing import NDArray
 
 from workflows.recovery.gaussian import filter_rows
 from workflows.recovery.groups import Rows
-from workflows.recovery.photometry import Measured, Noise, Photometry, expected_error, normalise
+from workflows.recovery.measured import Measured, expected_error, normalise
+from workflows.recovery.noise import Noise
+from workflows.recovery.photometry import Photometry
 from workflows.recovery.pursuit import grow_rows
 from workflows.recovery.sensing import Sensing
 from workflows.recovery.transport import Transport

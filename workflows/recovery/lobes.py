@@ -5,8 +5,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from workflows.recovery.measured import Measured, expected_error, normalise, refit
 from workflows.recovery.mixture import Effort
-from workflows.recovery.photometry import Measured, Noise, Photometry, expected_error, normalise, refit
+from workflows.recovery.noise import Noise
+from workflows.recovery.photometry import Photometry
 from workflows.recovery.pixels import recover_pixels
 from workflows.recovery.sensing import Patterns
 from workflows.recovery.transport import Transport

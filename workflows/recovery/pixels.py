@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from workflows.recovery.footprint import NODES, PARAMETERS, Shown
 from workflows.recovery.likelihood import price
+from workflows.recovery.measured import Measured
 from workflows.recovery.mixture import Effort, Mixture, copy_mixture
 from workflows.recovery.nodes import gather_lobes, rows_of, spread_lobes
-from workflows.recovery.photometry import Measured
 from workflows.recovery.posterior import update
 from workflows.recovery.pyramid import Grids
 from workflows.recovery.search import fit

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from workflows.recovery import lobes
-from workflows.recovery.photometry import Noise, Photometry, fit_photometry
+from workflows.recovery.noise import Noise
+from workflows.recovery.photometry import Photometry, fit_photometry
 from workflows.recovery.sensing import Patterns
 
 COLUMNS, ROWS = 64, 48
