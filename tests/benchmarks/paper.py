@@ -19,7 +19,6 @@ Times are of one core, errors the mean over the backdrops. "grid" is what the tr
 Rivals need scikit-learn (``pip install envmatte[bench]``).
 """
 
-import argparse
 import json
 import time
 import warnings
@@ -31,7 +30,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from figures import load
+from kits import load, parser_of
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 from sklearn.exceptions import ConvergenceWarning
@@ -314,11 +313,7 @@ def show(title: str, rows: list[dict[str, Any]]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("kit", type=Path)
-    parser.add_argument("scenes", type=Path)
+    parser = parser_of(__doc__)
     parser.add_argument("--pixels", type=int, default=150, help="pixels of each scene; table 2 takes a tenth")
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
