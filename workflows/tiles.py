@@ -16,7 +16,9 @@ from workflows.options import RecoveryOptions
 from workflows.patterns import lay_out, pyramid_of
 from workflows.program import Program
 from workflows.recovery import dgsr, lobes
-from workflows.recovery.photometry import Noise, fit_photometry, normalise
+from workflows.recovery.measured import normalise
+from workflows.recovery.noise import Noise
+from workflows.recovery.photometry import fit_photometry
 from workflows.recovery.sensing import Patterns, Sensing
 from workflows.tone import Curve, to_light
 

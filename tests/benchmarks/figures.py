@@ -9,24 +9,20 @@ error in the 5 % of least confidence (and in the worst 5 %, the most there can b
 and error, and the seconds of work for 1,000 pixels. Options in `--film` go to the kit's `capture`.
 """
 
-import argparse
-import importlib.util
 import json
 import shlex
 import sqlite3
-import sys
-import tempfile
 from contextlib import redirect_stdout
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
+from kits import load, parser_of, served, show
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
 from services.client import Client
-from services.demo import service
 from services.patterns import write
 from workflows import images
 from workflows.presets import preset
@@ -48,17 +44,6 @@ CASES = {
     "nested": Case(NESTED, {}),
     "nn-dgsr": Case("16x12:24,128x96:250", {"method": "nn-dgsr"}),
 }
-
-
-def load(kit: Path) -> ModuleType:
-    """Import a kit from its path."""
-    spec = importlib.util.spec_from_file_location("kit", kit)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["kit"] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 def measure(
@@ -116,11 +101,7 @@ def share(error: NDArray[np.floating], doubt: NDArray[np.floating], worst: int) 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("kit", type=Path)
-    parser.add_argument("scenes", type=Path)
+    parser = parser_of(__doc__)
     parser.add_argument("--case", choices=CASES, action="append")
     parser.add_argument("--film", default="", help="Options of the kit's capture.")
     parser.add_argument("--workers", type=int, default=1)
@@ -128,15 +109,11 @@ def main() -> None:
     given = parser.parse_args()
     kit = load(given.kit)
     rows: list[dict[str, Any]] = []
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        service(Path(folder, "data"), given.workers) as url,
-        Client(url) as client,
-    ):
+    with served(given.workers) as (client, folder):
         for case in given.case or CASES:
             found = []
             for scene in sorted(given.scenes.glob("*.npz")):
-                row = measure(kit, scene, CASES[case], shlex.split(given.film), client, Path(folder))
+                row = measure(kit, scene, CASES[case], shlex.split(given.film), client, folder)
                 found.append({"case": case, **row})
                 if not rows and len(found) == 1:
                     print("  ".join(f"{name:>8}" for name in found[0]))
@@ -148,11 +125,6 @@ def main() -> None:
             show({"case": case, "scene": "mean", "frames": "", "pixels": "", **means})
     if given.json:
         given.json.write_text(json.dumps(rows, indent=2))
-
-
-def show(row: dict[str, Any]) -> None:
-    """Print a row under the heads of its columns."""
-    print("  ".join(f"{value!s:>{max(8, len(name))}}" for name, value in row.items()), flush=True)
 
 
 if __name__ == "__main__":

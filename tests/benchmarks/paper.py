@@ -19,7 +19,6 @@ Times are of one core, errors the mean over the backdrops. "grid" is what the tr
 Rivals need scikit-learn (``pip install envmatte[bench]``).
 """
 
-import argparse
 import json
 import time
 import warnings
@@ -31,7 +30,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from figures import load
+from kits import load, parser_of
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 from sklearn.exceptions import ConvergenceWarning
@@ -42,7 +41,9 @@ from workflows.patterns import lay_out
 from workflows.program import Program
 from workflows.recovery import dgsr, lobes
 from workflows.recovery.groups import Rows
-from workflows.recovery.photometry import Noise, Photometry, estimate_noise, fit_photometry, normalise
+from workflows.recovery.measured import normalise
+from workflows.recovery.noise import Noise
+from workflows.recovery.photometry import Photometry, estimate_noise, fit_photometry
 from workflows.recovery.pyramid import Pyramid
 from workflows.recovery.sensing import Patterns, Sensing
 from workflows.recovery.transport import Transport
@@ -312,11 +313,7 @@ def show(title: str, rows: list[dict[str, Any]]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("kit", type=Path)
-    parser.add_argument("scenes", type=Path)
+    parser = parser_of(__doc__)
     parser.add_argument("--pixels", type=int, default=150, help="pixels of each scene; table 2 takes a tenth")
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()

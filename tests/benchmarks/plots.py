@@ -12,7 +12,6 @@ KIT is the path of a `kit.py` that films scenes, SCENES a folder of its scenes (
 Needs matplotlib (``pip install envmatte[bench]``).
 """
 
-import argparse
 import json
 import time
 from pathlib import Path
@@ -21,7 +20,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from figures import load
+from kits import load, parser_of
 from numpy.typing import NDArray
 from paper import sample
 from scipy.stats import spearmanr
@@ -96,11 +95,7 @@ def scaled(factor: float) -> Program:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("kit", type=Path)
-    parser.add_argument("scenes", type=Path)
+    parser = parser_of(__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--pixels", type=int, default=max(PIXELS))
     given = parser.parse_args()

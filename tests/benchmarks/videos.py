@@ -9,9 +9,7 @@ video and of its ingest; the PSNR of composites over the object's pixels, mean o
 lacks to that of a capture of stills.
 """
 
-import argparse
 import json
-import tempfile
 import zipfile
 from contextlib import redirect_stdout
 from pathlib import Path
@@ -19,11 +17,11 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
-from figures import NESTED, load, show
+from figures import NESTED
+from kits import load, parser_of, served, show
 from numpy.typing import NDArray
 
 from services.client import Client
-from services.demo import service
 from storage.captures import Stack
 from storage.objects import Objects
 from workflows import images
@@ -131,11 +129,7 @@ def filmed_as_stills(kit: ModuleType, scene: Path, client: Client, folder: Path)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("kit", type=Path)
-    parser.add_argument("scenes", type=Path)
+    parser = parser_of(__doc__)
     parser.add_argument("--scene", action="append", help="Name of a scene; all of them if left out.")
     parser.add_argument("--fps", type=int, action="append")
     parser.add_argument("--workers", type=int, default=2)
@@ -144,19 +138,15 @@ def main() -> None:
     given = parser.parse_args()
     kit = load(given.kit)
     rows: list[dict[str, Any]] = []
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        service(Path(folder, "data"), given.workers) as url,
-        Client(url) as client,
-    ):
+    with served(given.workers) as (client, folder):
         for scene in sorted(given.scenes.glob("*.npz")):
             if given.scene and scene.stem not in given.scene:
                 continue
-            stills = None if given.no_recovery else filmed_as_stills(kit, scene, client, Path(folder))
+            stills = None if given.no_recovery else filmed_as_stills(kit, scene, client, folder)
             for case in CASES:
                 if given.fps and case.fps not in given.fps:
                     continue
-                rows.append(measure(kit, scene, case, client, Path(folder), stills))
+                rows.append(measure(kit, scene, case, client, folder, stills))
                 if len(rows) == 1:
                     print("  ".join(f"{name:>8}" for name in rows[0]))
                 show(rows[-1])

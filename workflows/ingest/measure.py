@@ -12,7 +12,8 @@ from storage.captures import Stack
 from storage.objects import Objects
 from workflows.program import Program
 from workflows.recovery.excess import estimate_excess
-from workflows.recovery.photometry import Noise, estimate_crosstalk, estimate_noise
+from workflows.recovery.noise import Noise
+from workflows.recovery.photometry import estimate_crosstalk, estimate_noise
 from workflows.tone import Curve, Response, estimate, table, to_light
 
 SAMPLES = 20_000

@@ -13,7 +13,7 @@ from storage.objects import Objects
 from workflows.ingest.measure import constant_frames, measure
 from workflows.ingest.steadiness import find_steadiness
 from workflows.program import Program
-from workflows.recovery.photometry import Noise
+from workflows.recovery.noise import Noise
 from workflows.tone import Curve, table
 
 EDGE = 96

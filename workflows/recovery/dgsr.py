@@ -5,10 +5,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from workflows.recovery.gaussian import filter_rows
+from workflows.recovery.gaussian import Filter, filter_rows
 from workflows.recovery.groups import Rows
-from workflows.recovery.photometry import Measured, Noise, Photometry, expected_error, normalise
-from workflows.recovery.pursuit import grow_rows
+from workflows.recovery.measured import Measured, expected_error, normalise
+from workflows.recovery.noise import Noise
+from workflows.recovery.photometry import Photometry
+from workflows.recovery.pursuit import Pursuit, System, grow_rows
 from workflows.recovery.sensing import Sensing
 from workflows.recovery.transport import Transport
 
@@ -129,6 +131,8 @@ def recover(
     """
     measured = normalise(measurements, photometry, noise, least_contrast, usable, frames)
     value, weight = _weigh(measured.value[..., :-2], measured.variance[..., :-2])
+    pursuit = Pursuit(sparsity, growth, sum_tolerance, rounds, stall, sweeps, tolerance)
+    by = Filter(clusters, reach, fits, stall, steps, precision)
     used = sensing.levels if levels == "hierarchical" else sensing.levels[-1:]
     parts = []
     for first in range(0, max(len(value), 1), _BLOCK):
@@ -156,46 +160,10 @@ def recover(
                 None if channels == "joint" else channel,
                 grey=len(light) == 1,
             )
-            grow_rows(
-                light,
-                source,
-                scale,
-                target,
-                rows.begin,
-                rows.cell,
-                rows.weight,
-                level.columns,
-                level.rows,
-                finest,
-                sparsity,
-                growth,
-                sum_tolerance,
-                rounds,
-                stall,
-                sweeps,
-                tolerance,
-            )
+            system = System(light, level.columns, level.rows, source, scale, target, variance)
+            grow_rows(system, rows, finest, pursuit)
             if finest and prior == "gaussian":
-                rows = Rows(
-                    *filter_rows(
-                        light,
-                        source,
-                        scale,
-                        target,
-                        variance,
-                        rows.begin,
-                        rows.cell,
-                        rows.weight,
-                        level.columns,
-                        level.rows,
-                        clusters,
-                        reach,
-                        fits,
-                        stall,
-                        steps,
-                        precision,
-                    )
-                )
+                rows = filter_rows(system, rows, by)
         parts.append(rows.transport(used[-1], np.where(alive, index, -1)))
     return Transport.concatenate(parts)
 

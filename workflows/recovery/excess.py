@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from workflows.recovery.photometry import LEAST_READ, Noise, noise_line
+from workflows.recovery.noise import LEAST_READ, Noise, noise_line
 
 
 def estimate_excess(

@@ -6,10 +6,13 @@ sampled on. It lies on the coarsest grid that resolves it.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+
+from workflows.recovery.pyramid import Grids
 
 PARAMETERS = 6
 NODES = 1024
@@ -19,6 +22,28 @@ NODES = 1024
 _REACH = 10.0
 # The least standard deviation of a sampled Gaussian, in spacings of its grid: a narrower one falls between nodes.
 _SHARPEST = 0.6
+
+
+class Shown(NamedTuple):
+    """The patterns that the measurements of a pixel saw.
+
+    Attributes
+    ----------
+    grids : Grids
+        Of the pyramid.
+    code : (nodes, first + groups * m or more) uint8
+        Light, 0 (black) to 255 (white), on the nodes of the pyramid.
+    first : int
+        The column of `code` with the first pattern.
+    groups, m : int
+        Groups of measurements, and patterns of each.
+    """
+
+    grids: Grids
+    code: NDArray[np.uint8]
+    first: int
+    groups: int
+    m: int
 
 
 @njit(nogil=True, cache=True)
@@ -75,9 +100,7 @@ def fit_level(lobe: NDArray[np.float64], level: int, columns: NDArray[np.int64],
 def sample(
     lobe: NDArray[np.float64],
     level: int,
-    columns: NDArray[np.int64],
-    rows: NDArray[np.int64],
-    starts: NDArray[np.int64],
+    grids: Grids,
     node: NDArray[np.int64],
     terms: NDArray[np.float32],
 ) -> int:
@@ -87,8 +110,7 @@ def sample(
     ----------
     lobe : (6,) float64
     level : int
-    columns, rows, starts : int64
-        Of the pyramid.
+    grids : Grids
     node : (NODES,) int64
         Written.
     terms : (1 or 6, NODES) float32
@@ -103,6 +125,7 @@ def sample(
     -----
     With z = L^-1 (node - centre), ln share = -z'z / 2 + const, and d ln share = z' L^-1 (d centre + dL z).
     """
+    columns, rows, starts = grids
     spacing = 2.0**level
     x, y, l00, l10, l11 = lobe[1], lobe[2], lobe[3], lobe[4], lobe[5]
     yy = l10**2 + l11**2

@@ -1,7 +1,6 @@
 """Sparse rows of cells on a grid: their neighbours, and the step from a grid to the next finer one."""
 
-from dataclasses import dataclass
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numba import njit
@@ -14,8 +13,7 @@ from workflows.recovery.transport import Transport, ragged_entries
 NEIGHBOUR_SHARE = 0.5
 
 
-@dataclass(frozen=True)
-class Rows:
+class Rows(NamedTuple):
     """Sparse rows while they are being solved for, one for each problem.
 
     Attributes
@@ -52,7 +50,7 @@ class Rows:
             self.weight[entries],
         )
 
-    def split(self, parent: Level, child: Level, least_group: float, reach: int) -> Self:
+    def split(self, parent: Level, child: Level, least_group: float, reach: int) -> "Rows":
         """Prune, widen by the neighbours, and split every cell into its children.
 
         Parameters
@@ -69,19 +67,9 @@ class Rows:
         Rows
             On the finer grid; a child has an equal share of its parent's weight.
         """
-        return type(self)(
-            *split_cells(
-                self.begin,
-                self.cell,
-                self.weight,
-                parent.columns,
-                parent.rows,
-                child.columns // parent.columns,
-                child.rows // parent.rows,
-                least_group,
-                reach,
-            )
-        )
+        across, down = child.columns // parent.columns, child.rows // parent.rows
+        split: Rows = split_cells(self, parent.columns, parent.rows, across, down, least_group, reach)
+        return split
 
     def transport(self, level: Level, index: NDArray[np.integer]) -> Transport:
         """Transport of n pixels from ``index (n, 3)``, the row of each channel; -1 gives an empty one."""
@@ -134,17 +122,10 @@ def group_sums(
 
 @njit(nogil=True, cache=True)
 def split_cells(
-    begin: NDArray[np.int64],
-    cell: NDArray[np.int32],
-    weight: NDArray[np.float32],
-    columns: int,
-    rows: int,
-    across: int,
-    down: int,
-    least_group: float,
-    reach: int,
-) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
+    coarse: Rows, columns: int, rows: int, across: int, down: int, least_group: float, reach: int
+) -> Rows:
     """Kernel of :meth:`Rows.split`; a cell of the ``columns`` by ``rows`` grid has ``across * down`` children."""
+    begin, cell, weight = coarse
     n = begin.size - 1
     given = np.zeros((rows + 2, columns + 2), np.float32)
     kept = np.zeros((rows, columns), np.bool_)
@@ -186,4 +167,4 @@ def split_cells(
             r, c = divmod(own[e], columns)
             given[r + 1, c + 1] = 0
         new_begin[p + 1] = end
-    return new_begin, new_cell[:end].copy(), new_weight[:end].copy()
+    return Rows(new_begin, new_cell[:end].copy(), new_weight[:end].copy())

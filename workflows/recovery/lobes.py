@@ -5,8 +5,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from workflows.recovery.photometry import Measured, Noise, Photometry, expected_error, normalise, refit
-from workflows.recovery.pixels import Effort, recover_pixels
+from workflows.recovery.measured import Measured, expected_error, normalise, refit
+from workflows.recovery.mixture import Effort
+from workflows.recovery.noise import Noise
+from workflows.recovery.photometry import Photometry
+from workflows.recovery.pixels import recover_pixels
 from workflows.recovery.sensing import Patterns
 from workflows.recovery.transport import Transport
 
@@ -118,18 +121,9 @@ def recover(
     if measurements.shape != (n, m, 3):
         raise ValueError(f"measurements must be (n, {m}, 3), not {measurements.shape}")
     effort = Effort(
-        most_lobes,
-        fit_resolution,
-        resolution,
-        rounds,
-        steps,
-        tolerance,
-        beam,
-        doubt,
-        passes,
-        gradients,
+        most_lobes, fit_resolution, resolution, rounds, steps, tolerance, beam, doubt, passes, gradients,
         least_weight,
-    )
+    )  # fmt: skip
     measured = normalise(measurements, photometry, noise, least_contrast, usable, frames)
     response, kappa, misfit = np.zeros_like(measured.value), np.zeros((n, 3)), np.zeros((n, 3))
     parts = []
@@ -157,31 +151,18 @@ def _recover_block(
     """Recover some pixels; `response`, `kappa` and `misfit` are written."""
     columns, rows = patterns.pyramid.grids[0]
     alive = np.isfinite(measured.variance).any(axis=(1, 2))
-    own, own_variance = measured.value[alive], measured.variance[alive]
+    own = Measured(measured.value[alive], measured.variance[alive])
     if patterns.channels == 1:
-        joint, joint_variance = _mean(own, own_variance)
-        apart = _disagree(own, own_variance, joint, disagreement)
+        joint = _mean(own)
+        apart = _disagree(own, joint.value, disagreement)
     else:
-        flat = len(own), own.shape[1] * own.shape[2]
-        joint, joint_variance = own.reshape(flat), own_variance.reshape(flat)
-        apart = np.zeros(len(own), bool)
-    counts = np.zeros((len(own), 3), np.int64)
-    seen, left_out, missed = np.zeros_like(own), np.zeros((len(own), 3)), np.zeros((len(own), 3))
+        n, channels, m = own.value.shape
+        joint = Measured(own.value.reshape(n, channels * m), own.variance.reshape(n, channels * m))
+        apart = np.zeros(n, bool)
+    counts = np.zeros((len(apart), 3), np.int64)
+    seen, left_out, missed = np.zeros_like(own.value), np.zeros(counts.shape), np.zeros(counts.shape)
     node, weight = recover_pixels(
-        patterns.code,
-        patterns.count,
-        *(np.array(size) for size in zip(*patterns.pyramid.grids, strict=True)),
-        patterns.pyramid.starts,
-        joint,
-        joint_variance,
-        own,
-        own_variance,
-        apart,
-        effort,
-        seen,
-        left_out,
-        missed,
-        counts,
+        patterns.pyramid.arrays, patterns.code, joint, own, apart, effort, seen, left_out, missed, counts
     )
     response[alive], kappa[alive], misfit[alive] = seen, left_out, missed
     count, shared = np.zeros((alive.size, 3), np.int64), np.zeros(alive.size, bool)
@@ -197,25 +178,19 @@ def _recover_block(
     return Transport.from_rows(columns, rows, count, node[begin], merged, shared, effort.least_weight)
 
 
-def _mean(
-    value: NDArray[np.float32], variance: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _mean(own: Measured) -> Measured:
     """The mean of the channels, (n, m + 2), each weighed by its precision, and its variance."""
-    precision = 1 / variance
+    precision = 1 / own.variance
     total = precision.sum(axis=1)
     with np.errstate(divide="ignore"):
         joint_variance = 1 / total
-    joint = (value * precision).sum(axis=1) * np.where(total > 0, joint_variance, 0)
-    return joint, joint_variance
+    joint = (own.value * precision).sum(axis=1) * np.where(total > 0, joint_variance, 0)
+    return Measured(joint, joint_variance)
 
 
-def _disagree(
-    value: NDArray[np.float32],
-    variance: NDArray[np.float32],
-    joint: NDArray[np.float32],
-    disagreement: float,
-) -> NDArray[np.bool_]:
+def _disagree(own: Measured, joint: NDArray[np.float32], disagreement: float) -> NDArray[np.bool_]:
     """(n,) bool: whether the channels differ by more than noise, and S and rho that are not quite known."""
+    value, variance = own
     precision, x = 1 / variance, joint[:, np.newaxis]
     total = np.maximum(precision.sum(axis=2, keepdims=True), 1e-12)
     dx = x - (precision * x).sum(axis=2, keepdims=True) / total

@@ -1,46 +1,18 @@
-"""S and rho of each pixel from constant monitors, the camera's noise, and measurements in units of T."""
+"""What constant monitors say: S and rho of each pixel, the camera's noise, and its crosstalk."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
+
+from workflows.recovery.noise import LEAST_READ, Noise, noise_line
 
 # A camera of which nothing is known: a full well of 20,000 electrons, and read noise of 0.15 % of full scale.
 TYPICAL_SHOT = 1 / 20_000
 TYPICAL_READ = 0.0015**2
-# No frame is exact: 16 bits alone leave this much.
-LEAST_READ = 2e-11
 
 _SAMPLE = 4096
-_BINS = 12
-# A chi-square variable's mean without its largest tenth: P(chi-square of 3 <= its 90th percentile) / 0.9.
-_TRIM, _TRIMMED_CHI_SQUARE = 0.9, 0.623011
 _MOST_CROSSTALK = 0.9
-# Standard deviations that S and S + rho may move when they are fitted once more.
-_TRUST = 2.0
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Noise of one frame: a linear camera value v has the variance ``read + shot * max(v, 0)``.
-
-    Attributes
-    ----------
-    read : float
-        Variance at black, in units of full scale squared; quantisation is part of it.
-    shot : float
-        Growth of the variance with the value, in units of full scale.
-    """
-
-    read: float
-    shot: float
-
-    def variance(self, values: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Variance of linear camera values of any shape."""
-        lit: NDArray[np.float32] = np.maximum(values, 0).astype(np.float32)
-        return np.float32(self.read) + np.float32(self.shot) * lit
 
 
 @dataclass(frozen=True)
@@ -169,57 +141,6 @@ def estimate_noise(
     return noise_line(level, square, floor) or typical
 
 
-def noise_line(
-    level: NDArray[np.floating], square: NDArray[np.floating], floor: float, *, trim: float = _TRIM
-) -> Noise | None:
-    """The noise of which there are samples.
-
-    Parameters
-    ----------
-    level : (k,) float
-        Linear camera values.
-    square : (k,) float
-        Squares of single errors at these, each its variance times a chi-square variable of one degree.
-    floor : float
-        The least variance.
-    trim : float
-        Share of the samples of a level that is used, the least ones: 0.9, or 1.
-
-    Returns
-    -------
-    Noise or None
-        None of fewer than 120 samples.
-    """
-    if level.size < 10 * _BINS:
-        return None
-    order = np.argsort(level, kind="stable")
-    bins = np.array_split(order, _BINS)
-    middle = np.array([level[b].mean() for b in bins])
-    lowest = [np.sort(square[b])[: int(trim * len(b))] for b in bins]
-    variance = np.array([least.mean() for least in lowest]) / (_TRIMMED_CHI_SQUARE if trim < 1 else 1)
-    variance = np.maximum(variance, floor)
-    # the error of a sample variance is in proportion to it
-    design = np.stack([np.ones(_BINS), np.maximum(middle, 0)], axis=1) / variance[:, None]
-    (read, shot), _ = nnls(design, np.ones(_BINS))
-    return Noise(max(float(read), floor), float(shot))
-
-
-class Measured(NamedTuple):
-    """Measurements in the +-1 form of eq. 8, where T is all there is between patterns and camera.
-
-    Attributes
-    ----------
-    value : (n, 3, m + 2) float32
-        ``2 (C - S) / rho - 1``: T times patterns of -1 (black) and 1 (white). The last two are a black and a white
-        monitor, -1 and 1. 0 where nothing was measured.
-    variance : (n, 3, m + 2) float32
-        Of `value`; infinite where nothing was measured.
-    """
-
-    value: NDArray[np.float32]
-    variance: NDArray[np.float32]
-
-
 def estimate_crosstalk(
     values: NDArray[np.float32], levels: NDArray[np.float32], usable: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
@@ -262,151 +183,6 @@ def estimate_crosstalk(
     mixed: NDArray[np.float64] = np.einsum("ncd,nd->cd", gain, own) / energy
     # a camera without colours sees all of them alike
     return mixed if np.abs(mixed - np.eye(3)).sum(axis=1).max() < _MOST_CROSSTALK else np.eye(3)
-
-
-def normalise(
-    measurements: NDArray[np.float32],
-    photometry: Photometry,
-    noise: Noise,
-    least_contrast: float,
-    usable: NDArray[np.bool_] | None = None,
-    frames: NDArray[np.number] | None = None,
-) -> Measured:
-    """Bring measurements to the +-1 form of eq. 8.
-
-    Parameters
-    ----------
-    measurements : (n, m, 3) float32
-        Linear camera values C. One that is not finite was not measured.
-    photometry : Photometry
-        S and rho of the n pixels.
-    noise : Noise
-        Noise of a frame.
-    least_contrast : float
-        A channel whose rho is below this many standard deviations of a mid-grey value says nothing of T.
-    usable : (n, m, 3) bool, optional
-        False where a value says nothing, as where the camera clipped it; all say something if left out.
-    frames : (m,) or (n, m, 3) number, optional
-        Frames averaged into each value, above 0; one each if left out.
-
-    Returns
-    -------
-    Measured
-
-    Raises
-    ------
-    ValueError
-        If the shapes do not fit.
-    """
-    n = photometry.rho.shape[0]
-    if measurements.ndim != 3 or measurements.shape[0] != n or measurements.shape[2] != 3:
-        raise ValueError(f"measurements must be ({n}, m, 3), not {measurements.shape}")
-    rho, S = photometry.rho[..., None], photometry.S[..., None]
-    alive = (rho > 0) & (rho**2 >= least_contrast**2 * noise.variance(S + rho / 2))
-    scale = np.where(alive, rho, 1)
-    light = np.ascontiguousarray(measurements.transpose(0, 2, 1), dtype=np.float32)
-    there = alive & np.isfinite(light)
-    if usable is not None:
-        there &= usable.transpose(0, 2, 1)
-    light = np.where(there, light, 0)
-    if frames is not None and frames.ndim == 3:
-        frames = frames.transpose(0, 2, 1)
-    variance = noise.variance(light) / (1 if frames is None else frames)
-    ends = np.stack([photometry.black, photometry.white], axis=2)
-    value = np.where(there, 2 * (light - S) / scale - 1, 0)
-    known = np.where(alive, np.array([-1, 1], np.float32), 0)
-    spread = np.where(there, 4 * variance / scale**2, np.inf)
-    return Measured(
-        np.concatenate([value, known], axis=2).astype(np.float32),
-        np.concatenate([spread, np.where(alive, 4 * ends / scale**2, np.inf)], axis=2).astype(np.float32),
-    )
-
-
-def refit(
-    photometry: Photometry,
-    measured: Measured,
-    response: NDArray[np.float32],
-    kappa: NDArray[np.floating],
-) -> Photometry:
-    """Fit S and rho once more, now that T says what each pattern was: all frames know of them, not the constant ones.
-
-    Parameters
-    ----------
-    photometry : Photometry
-        With which the measurements were brought to their form.
-    measured : Measured
-    response : (n, 3, m + 2) float32
-        What T makes of the patterns, in the same form.
-    kappa : (n, 3) float
-        Variance of a pattern of full contrast that T does not account for.
-
-    Returns
-    -------
-    Photometry
-        The old one where T says nothing, and everywhere within two standard deviations of it: of a T that is wrong,
-        slopes come out too low.
-
-    Notes
-    -----
-    With ``value = a + g response``, ``S + rho (value + 1) / 2`` is ``S' + rho' (response + 1) / 2`` of
-    ``rho' = g rho`` and ``S' = S + rho (1 + a - g) / 2``.
-    """
-    m = response.shape[2] - 2
-    unknown = np.zeros(response.shape)
-    unknown[:, :, :m] = kappa[..., None] * np.maximum(1 - response[:, :, :m] ** 2, 0)
-    weight = 1 / (measured.variance + unknown)
-    total = weight.sum(axis=2, keepdims=True)
-    known = total[..., 0] > 0
-    total[~known] = 1
-    mean = (weight * response).sum(axis=2, keepdims=True) / total
-    mean_value = (weight * measured.value).sum(axis=2, keepdims=True) / total
-    offset = response - mean
-    spread = (weight * offset**2).sum(axis=2)
-    known &= spread > 0
-    g = (weight * offset * (measured.value - mean_value)).sum(axis=2) / np.where(known, spread, 1)
-    g = np.where(known, np.maximum(g, 0), 1)
-    a = np.where(known, (mean_value - g[..., None] * mean)[..., 0], 0)
-    S, white = photometry.S, photometry.S + photometry.rho
-    black_range, white_range = _TRUST * np.sqrt(photometry.black), _TRUST * np.sqrt(photometry.white)
-    new_S = np.clip(S + photometry.rho * (1 + a - g) / 2, S - black_range, S + black_range)
-    new_white = np.clip(S + photometry.rho * (1 + a + g) / 2, white - white_range, white + white_range)
-    S, white = np.where(known, new_S, S), np.where(known, np.maximum(new_white, new_S), white)
-    return Photometry(
-        S.astype(np.float32),
-        np.where(known, white - S, photometry.rho).astype(np.float32),
-        photometry.black,
-        photometry.white,
-    )
-
-
-def expected_error(
-    photometry: Photometry, measured: Measured, misfit: NDArray[np.floating]
-) -> NDArray[np.float32]:
-    """The error to expect of composites, from how far T was from explaining the measurements.
-
-    Parameters
-    ----------
-    photometry : Photometry
-    measured : Measured
-    misfit : (n, 3) float
-        Squared residuals of the measurements less their variances, in the mean.
-
-    Returns
-    -------
-    (n,) float32
-        Root of the mean square over the channels, in camera units; infinite where no channel was measured.
-
-    Notes
-    -----
-    A pattern is a backdrop like any other: what T misses of the patterns it misses of composites, times rho / 2, for
-    patterns are +-1. Where the residuals are no larger than noise, the error is at least that of a mean of them.
-    """
-    there = np.isfinite(measured.variance)
-    used = there.sum(axis=2)
-    noise = np.where(there, measured.variance, 0).sum(axis=2) / np.maximum(used, 1) ** 2
-    square = (photometry.rho**2 / 4 * np.maximum(misfit, noise)).mean(axis=1)
-    error: NDArray[np.float32] = np.where(used.any(axis=1), np.sqrt(square), np.inf).astype(np.float32)
-    return error
 
 
 def _check(values: NDArray[np.float32], levels: NDArray[np.float32], usable: NDArray[np.bool_]) -> None:

@@ -1,13 +1,10 @@
 """The posterior mean of T about a first estimate: what the lobes of a pixel do not say, its measurements still may."""
 
-import math
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from workflows.recovery.footprint import NODES, fit_level, load, sample
-from workflows.recovery.mixture import scatter
+from workflows.recovery.likelihood import scatter
 from workflows.recovery.solvers import inner, subtract
 
 # Standard deviation of the offset of a group, in units of T: S is known better than that.
@@ -16,131 +13,6 @@ _OFFSET = 0.03
 _ENOUGH = 1e-5
 # T is never known to be the first estimate.
 _LEAST_KAPPA = 1e-5
-
-
-@njit(nogil=True, cache=True)
-def spread_lobes(
-    columns: NDArray[np.int64],
-    rows: NDArray[np.int64],
-    starts: NDArray[np.int64],
-    lobes: NDArray[np.float64],
-    level: NDArray[np.int64],
-    k: int,
-    resolution: float,
-    node: NDArray[np.int64],
-    weight: NDArray[np.float32],
-    end: NDArray[np.int64],
-) -> int:
-    """Write the nodes under k lobes and their weights, which sum to 1.
-
-    Parameters
-    ----------
-    columns, rows, starts
-        Of the pyramid.
-    lobes, level
-        Changed: moved to the levels of the resolution.
-    k : int
-    resolution : float
-        As in :func:`~workflows.recovery.footprint.fit_level`.
-    node, weight : (k NODES,)
-        Written, lobe after lobe; a node under two lobes is there twice.
-    end : (k or more,) int64
-        Written: where the nodes of each lobe end.
-
-    Returns
-    -------
-    int
-        How many there are.
-    """
-    terms, n, total = np.empty((1, NODES), np.float32), 0, 0.0
-    for i in range(k):
-        total += lobes[i, 0]
-    for i in range(k):
-        level[i] = fit_level(lobes[i], level[i], columns, resolution)
-        found = sample(lobes[i], level[i], columns, rows, starts, node[n:], terms)
-        for j in range(found):
-            weight[n + j] = terms[0, j] * lobes[i, 0] / total
-        n += found
-        end[i] = n
-    return n
-
-
-@njit(nogil=True, cache=True)
-def gather_lobes(
-    columns: NDArray[np.int64],
-    starts: NDArray[np.int64],
-    node: NDArray[np.int64],
-    weight: NDArray[np.float32],
-    end: NDArray[np.int64],
-    lobes: NDArray[np.float64],
-    level: NDArray[np.int64],
-    k: int,
-    resolution: float,
-) -> None:
-    """Give k lobes the moments of the weights under them: what :func:`spread_lobes` did, the other way round.
-
-    Parameters
-    ----------
-    columns, starts
-        Of the pyramid.
-    node, weight, end
-        As from :func:`spread_lobes`, with any weights.
-    lobes, level
-        Changed; a lobe with no weight left stays as it is, but for its own.
-    k : int
-    resolution : float
-        As in :func:`~workflows.recovery.footprint.fit_level`.
-    """
-    begin = 0
-    for i in range(k):
-        spacing, lobe = 2.0 ** level[i], lobes[i]
-        total, sx, sy, sxx, sxy, syy = 1e-30, 0.0, 0.0, 0.0, 0.0, 0.0
-        for j in range(begin, end[i]):
-            row, column = divmod(node[j] - starts[level[i]], columns[level[i]])
-            # about the lobe's centre, for the squares of small numbers lose nothing
-            w, x, y = weight[j], (column + 0.5) * spacing - lobe[1], (row + 0.5) * spacing - lobe[2]
-            total += w
-            sx, sy = sx + w * x, sy + w * y
-            sxx, sxy, syy = sxx + w * x * x, sxy + w * x * y, syy + w * y * y
-        begin = end[i]
-        lobe[0] = total
-        if total > 1e-6:
-            x, y = sx / total, sy / total
-            least = (0.3 * spacing) ** 2
-            lobe[1], lobe[2] = lobe[1] + x, lobe[2] + y
-            lobe[3] = math.sqrt(max(sxx / total - x * x, least))
-            lobe[4] = (sxy / total - x * y) / lobe[3]
-            lobe[5] = math.sqrt(max(syy / total - y * y - lobe[4] ** 2, least))
-            level[i] = fit_level(lobe, level[i], columns, resolution)
-
-
-@njit(nogil=True, cache=True)
-def rows_of(
-    code: NDArray[np.uint8],
-    first: int,
-    groups: int,
-    m: int,
-    node: NDArray[np.int64],
-    n: int,
-    A: NDArray[np.float32],
-) -> None:
-    """Write what the measurements of a pixel would be if all light came from a node.
-
-    Parameters
-    ----------
-    code, first, groups
-        As in :func:`~workflows.recovery.mixture.predict`.
-    m : int
-    node : (n or more,) int64
-    n : int
-    A : (n or more, groups (m + 2)) float32
-        Written.
-    """
-    for g in range(groups):
-        to = g * (m + 2)
-        load(code, first + g * m, m, node, n, A, to)
-        for i in range(n):
-            A[i, to + m], A[i, to + m + 1] = -1.0, 1.0
 
 
 @njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})
@@ -221,7 +93,7 @@ def unresolved(
     Returns
     -------
     kappa, misfit : float
-        As from :func:`~workflows.recovery.mixture.scatter`.
+        As from :func:`~workflows.recovery.likelihood.scatter`.
     """
     m = y.size // groups - 2
     kappa, misfit = scatter(y, f, mean, variance, groups, 0, _LEAST_KAPPA)
@@ -248,7 +120,7 @@ def update(
     Parameters
     ----------
     A : (n, groups (m + 2)) float32
-        As from :func:`rows_of`.
+        As from :func:`~workflows.recovery.nodes.rows_of`.
     weight : (n,) float32
         Zero or more, of sum 1; changed.
     y, variance : (groups (m + 2),) float32

@@ -1,53 +1,70 @@
 """The search for the cells of a T: non-negative dynamic group sparsity, kernels on the rows of many pixels."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from workflows.recovery.groups import group_sums
+from workflows.recovery.groups import Rows, group_sums
 from workflows.recovery.solvers import descend, inner, stack_rows
 
 
-@njit(nogil=True, cache=True)
-def grow_rows(
-    light: NDArray[np.float32],
-    source: NDArray[np.int64],
-    scale: NDArray[np.float32],
-    target: NDArray[np.float32],
-    begin: NDArray[np.int64],
-    cell: NDArray[np.int32],
-    weight: NDArray[np.float32],
-    columns: int,
-    rows: int,
-    finest: bool,
-    sparsity: float,
-    growth: float,
-    sum_tolerance: float,
-    rounds: int,
-    stall: float,
-    sweeps: int,
-    tolerance: float,
-) -> None:
-    """Fit the weights of sparse rows to measurements by NN-DGSR, from zero.
+class System(NamedTuple):
+    """The measurements that rows of T on a level's grid are solved from.
 
-    Parameters
+    Attributes
     ----------
     light : (channels, cells, m) float32
         Light of the level, 0 to 1.
+    columns, rows : int
+        The level's grid.
     source : (n,) int64
         First channel of `light` that a row's measurements belong to.
     scale, target : (n, c * m) float32
         Measurements in +-1 form of c channels, scaled to one variance, and the scales: zero where a measurement
         says nothing.
-    begin, cell, weight
-        Candidates as in :class:`~workflows.recovery.groups.Rows`; weights are overwritten.
-    columns, rows : int
-        The level's grid.
+    variance : (n,) float64
+        Of a row's scaled measurements.
+    """
+
+    light: NDArray[np.float32]
+    columns: int
+    rows: int
+    source: NDArray[np.int64]
+    scale: NDArray[np.float32]
+    target: NDArray[np.float32]
+    variance: NDArray[np.float64]
+
+
+class Pursuit(NamedTuple):
+    """The constants of :func:`~workflows.recovery.dgsr.recover` that the search needs."""
+
+    sparsity: float
+    growth: float
+    sum_tolerance: float
+    rounds: int
+    stall: float
+    sweeps: int
+    tolerance: float
+
+
+@njit(nogil=True, cache=True)
+def grow_rows(system: System, found: Rows, finest: bool, pursuit: Pursuit) -> None:
+    """Fit the weights of sparse rows to measurements by NN-DGSR, from zero.
+
+    Parameters
+    ----------
+    system : System
+    found : Rows
+        Candidates; weights are overwritten.
     finest : bool
         Whether to stop growing, and to drop cells, where more cells explain nothing.
-    sparsity, growth, sum_tolerance, rounds, stall, sweeps, tolerance
-        As in :func:`~workflows.recovery.dgsr.recover`.
+    pursuit : Pursuit
     """
+    light, columns, rows, source, scale, target, _ = system
+    begin, cell, weight = found
+    sparsity, growth, sum_tolerance, rounds, stall, sweeps, tolerance = pursuit
     field = np.zeros((rows + 2, columns + 2), np.float32)
     channels = scale.shape[1] // light.shape[2]
     for p in range(source.size):

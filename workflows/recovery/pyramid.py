@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numba import njit
@@ -10,6 +10,21 @@ from numpy.typing import NDArray
 
 _COARSEST = 32
 """Nodes along the longer side of the coarsest grid, at most."""
+
+
+class Grids(NamedTuple):
+    """The grids of a pyramid, as kernels take them.
+
+    Attributes
+    ----------
+    columns, rows : (levels,) int64
+    starts : (levels + 1,) int64
+        The first node of each grid, and at the end the number of nodes.
+    """
+
+    columns: NDArray[np.int64]
+    rows: NDArray[np.int64]
+    starts: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -44,6 +59,12 @@ class Pyramid:
     def starts(self) -> NDArray[np.int64]:
         """(len(grids) + 1,) int64: the first node of each grid, and at the end the number of nodes."""
         return np.cumsum([0, *(columns * rows for columns, rows in self.grids)])
+
+    @property
+    def arrays(self) -> Grids:
+        """`grids` and `starts`."""
+        columns, rows = np.array(self.grids).T.copy()
+        return Grids(columns, rows, self.starts)
 
     @property
     def nodes(self) -> int:

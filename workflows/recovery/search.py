@@ -6,8 +6,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from workflows.recovery.footprint import PARAMETERS, fit_level
-from workflows.recovery.mixture import copy_lobes, price, refine, weigh
+from workflows.recovery.footprint import PARAMETERS, Shown, fit_level
+from workflows.recovery.likelihood import price, weigh
+from workflows.recovery.mixture import Effort, Mixture, copy_mixture, refine
 
 # Rounds of a further lobe go on while it is no worse than this behind in -2 ln likelihood.
 _HOPE = 30.0
@@ -52,12 +53,7 @@ def score(
 
 @njit(nogil=True, cache=True)
 def search(
-    code: NDArray[np.uint8],
-    first: int,
-    groups: int,
-    columns: NDArray[np.int64],
-    rows: NDArray[np.int64],
-    starts: NDArray[np.int64],
+    shown: Shown,
     y: NDArray[np.float32],
     f: NDArray[np.float32],
     precision: NDArray[np.float32],
@@ -67,8 +63,7 @@ def search(
 
     Parameters
     ----------
-    code, first, groups, columns, rows, starts
-        As in :func:`~workflows.recovery.mixture.predict`.
+    shown : Shown
     y, f, precision : (groups (m + 2),) float32
     beam : int
         Nodes of a grid whose children are looked at.
@@ -82,13 +77,11 @@ def search(
     amount : float
         Of light.
     """
-    m = y.size // groups - 2
+    columns, rows, starts = shown.grids
+    groups, m = shown.groups, shown.m
     size = groups * m
-    codes_of_f, residual, weight = (
-        np.empty(size, np.float32),
-        np.empty(size, np.float32),
-        np.empty(size, np.float32),
-    )
+    codes_of_f, residual = np.empty(size, np.float32), np.empty(size, np.float32)
+    weight = np.empty(size, np.float32)
     unit = np.float32(2 / 255)
     for g in range(groups):
         for j in range(m):
@@ -112,18 +105,12 @@ def search(
                 column, row = 2 * parents[p // 4, 0] + p % 2, 2 * parents[p // 4, 1] + p % 4 // 2
             if column >= wide or row >= high:
                 continue
-            codes = code[starts[level] + row * wide + column, first : first + size]
+            codes = shown.code[starts[level] + row * wide + column, shown.first : shown.first + size]
             z, much = score(codes, codes_of_f, residual, weight)
             z_found = max(z_found, z)
             if z > 0 and z * z - place > gain:
-                best_level, best_column, best_row, gain, amount, best_z = (
-                    level,
-                    column,
-                    row,
-                    z * z - place,
-                    much,
-                    z,
-                )
+                best_level, best_column, best_row = level, column, row
+                gain, amount, best_z = z * z - place, much, z
             if found < beam or z > z_of[found - 1]:
                 at = min(found, beam - 1)
                 found = at + 1
@@ -142,90 +129,65 @@ def search(
 
 @njit(nogil=True, cache=True)
 def fit(
-    code: NDArray[np.uint8],
-    first: int,
-    groups: int,
-    columns: NDArray[np.int64],
-    rows: NDArray[np.int64],
-    starts: NDArray[np.int64],
+    shown: Shown,
     y: NDArray[np.float32],
     variance: NDArray[np.float32],
-    lobes: NDArray[np.float64],
-    level: NDArray[np.int64],
+    mixture: Mixture,
     k: int,
-    offset: NDArray[np.float64],
-    most: int,
-    resolution: float,
-    rounds: int,
-    steps: int,
-    tolerance: float,
-    beam: int,
+    effort: Effort,
 ) -> tuple[int, float, float]:
     """Fit as many lobes to a pixel as pay for themselves.
 
     Parameters
     ----------
-    code, first, groups, columns, rows, starts, y, variance
+    shown, y, variance
         As in :func:`~workflows.recovery.mixture.refine`.
-    lobes, level, offset
-        The first k lobes are the start; changed. There is room for `most` lobes.
-    k, most : int
-        Lobes at the start, and at the end at most.
-    resolution, rounds, steps, tolerance
-        As in :func:`~workflows.recovery.mixture.refine`.
-    beam : int
-        As in :func:`search`.
+    mixture : Mixture
+        The first k lobes are the start; changed. There is room for `effort.most_lobes`.
+    k : int
+    effort : Effort
 
     Returns
     -------
     k : int
         Lobes; one at least.
     kappa, objective : float
-        As from :func:`~workflows.recovery.mixture.weigh`.
+        As from :func:`~workflows.recovery.likelihood.weigh`.
     """
-    m = y.size // groups - 2
+    grids, groups, m = shown.grids, shown.groups, shown.m
     f, precision = np.zeros_like(y), np.empty_like(y)
     for g in range(groups):
         # light from everywhere: of a pattern its mean, about nothing
         f[g * (m + 2) + m], f[g * (m + 2) + m + 1] = -1.0, 1.0
     if k > 0:
-        kappa, objective, f, precision = refine(
-            code, first, groups, columns, rows, starts, y, variance, lobes, level, k, offset,
-            resolution, rounds, steps, tolerance, _NEVER,
-        )  # fmt: skip
-        objective += price(columns, rows, level, k)
+        kappa, objective, f, precision = refine(shown, y, variance, mixture, k, effort, _NEVER)
+        objective += price(grids, mixture.level, k)
     else:
         kappa, objective = weigh(y, f, variance, groups, groups, precision)
         objective = _NEVER
-    tried, tried_level, tried_offset = lobes.copy(), level.copy(), offset.copy()
-    while k < most:
-        at, column, row, gain, amount = search(
-            code, first, groups, columns, rows, starts, y, f, precision, beam
-        )
+    tried = Mixture(mixture.lobes.copy(), mixture.level.copy(), mixture.offset.copy())
+    while k < effort.most_lobes:
+        at, column, row, gain, amount = search(shown, y, f, precision, effort.beam)
         if k > 0 and gain < 2 * (PARAMETERS - 2):
             break
         if at < 0:  # nothing says anything: light from everywhere
-            at, column, row = columns.size - 1, columns[-1] // 2, rows[-1] // 2
-        copy_lobes(k, lobes, level, tried, tried_level)
-        for g in range(groups):
-            tried_offset[g] = offset[g]
+            at, column, row = grids.columns.size - 1, grids.columns[-1] // 2, grids.rows[-1] // 2
+        copy_mixture(k, groups, mixture, tried)
         spacing = 2.0**at
         share = min(max(amount, 0.02), 1.0) if k > 0 else 1.0
         for i in range(k):
-            tried[i, 0] *= 1 - share
-        tried[k, 0], tried[k, 1], tried[k, 2] = share, (column + 0.5) * spacing, (row + 0.5) * spacing
-        tried[k, 3], tried[k, 4], tried[k, 5] = 0.8 * spacing, 0.0, 0.8 * spacing
-        tried_level[k] = fit_level(tried[k], at, columns, resolution)
+            tried.lobes[i, 0] *= 1 - share
+        lobe = tried.lobes[k]
+        lobe[0], lobe[1], lobe[2] = share, (column + 0.5) * spacing, (row + 0.5) * spacing
+        lobe[3], lobe[4], lobe[5] = 0.8 * spacing, 0.0, 0.8 * spacing
+        tried.level[k] = fit_level(lobe, at, grids.columns, effort.fit_resolution)
         new_kappa, new, new_f, new_precision = refine(
-            code, first, groups, columns, rows, starts, y, variance, tried, tried_level, k + 1, tried_offset,
-            resolution, rounds, steps, tolerance, objective + _HOPE,
-        )  # fmt: skip
-        new += price(columns, rows, tried_level, k + 1)
+            shown, y, variance, tried, k + 1, effort, objective + _HOPE
+        )
+        new += price(grids, tried.level, k + 1)
         if new >= objective:
             break
         k += 1
         kappa, objective, f, precision = new_kappa, new, new_f, new_precision
-        copy_lobes(k, tried, tried_level, lobes, level)
-        for g in range(groups):
-            offset[g] = tried_offset[g]
-    return k, kappa, objective - price(columns, rows, level, k)
+        copy_mixture(k, groups, tried, mixture)
+    return k, kappa, objective - price(grids, mixture.level, k)

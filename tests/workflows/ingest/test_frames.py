@@ -19,7 +19,7 @@ from storage.objects import Objects
 from tests.workflows.ingest import peak
 from workflows.images import encode_png
 from workflows.ingest import frames
-from workflows.recovery.photometry import Noise
+from workflows.recovery.noise import Noise
 from workflows.scene import nested_program, write_capture
 from workflows.simulate import glass_ball
 

@@ -1,12 +1,14 @@
 """Small programs, and what a camera sees of them through a known T."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from workflows.recovery.photometry import Noise, Photometry
+from workflows.recovery.noise import Noise
+from workflows.recovery.photometry import Photometry
 from workflows.recovery.pyramid import Pyramid
 from workflows.recovery.sensing import Level, Patterns, Sensing
 
@@ -74,6 +76,30 @@ def _observe(
     clean = photometry.S[:, None] + photometry.rho[:, None] * arrived
     noisy = clean + np.sqrt(noise.variance(clean)) * rng.standard_normal(clean.shape)
     return noisy.astype(np.float32), photometry, noise
+
+
+def _spoil(
+    measurements: NDArray[np.float32], photometry: Photometry, far: float
+) -> tuple[NDArray[np.float32], Photometry]:
+    """Twelve pixels, each with something else that is wrong; of pixels 1, 9 and 10 nothing is left."""
+    measurements, S, rho = measurements.copy(), photometry.S.copy(), photometry.rho.copy()
+    measurements[0, 3:40] = np.nan
+    measurements[1] = np.nan
+    measurements[2, 5] = np.inf
+    measurements[3, 7] = far
+    measurements[4] = 1  # saturated
+    measurements[5, :, 1] = np.nan
+    measurements[6] = 0
+    measurements[7] = np.random.default_rng(0).random(measurements[7].shape)
+    rho[8] = 1e-12
+    S[9], rho[10] = np.nan, np.nan
+    S[11] = 50
+    return measurements, replace(photometry, S=S, rho=rho)
+
+
+@pytest.fixture
+def spoil() -> Callable[..., tuple[NDArray[np.float32], Photometry]]:
+    return _spoil
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from workflows.recovery.pyramid import Pyramid
 
 COLUMNS, ROWS = 128, 96
 PYRAMID = Pyramid.over(COLUMNS, ROWS)
-GRIDS = tuple(np.array(size) for size in zip(*PYRAMID.grids, strict=True))
+GRIDS = PYRAMID.arrays
 SHAPES = [(60.3, 41.8, 3.0, 0.0, 3.0), (70.6, 50.1, 2.5, 2.0, 4.0), (50.0, 44.5, 6.0, -3.0, 1.5)]
 
 
@@ -18,7 +18,7 @@ def lobe_of(x, y, l00, l10, l11, weight=1.0):
 
 def sampled(lobe, level, terms=PARAMETERS):
     node, out = np.empty(NODES, np.int64), np.empty((terms, NODES), np.float32)
-    n = sample(lobe, level, *GRIDS, PYRAMID.starts, node, out)
+    n = sample(lobe, level, GRIDS, node, out)
     assert 1 <= n <= NODES
     return node[:n], out[:, :n]
 
@@ -103,7 +103,7 @@ def test_every_node_within_reach_is_sampled(shape):
 def test_a_lobe_goes_to_the_level_that_resolves_it_and_stays_as_wide(shape, resolution):
     lobe = lobe_of(*shape, weight=0.5)
     before = covariance(lobe) + bump_variance(0) * np.eye(2)
-    level = fit_level(lobe, 0, GRIDS[0], resolution)
+    level = fit_level(lobe, 0, GRIDS.columns, resolution)
     minor = np.sqrt(np.linalg.eigvalsh(before)[0])
     assert level == 0 or minor >= resolution * 2**level
     assert minor < 2 * resolution * 2**level or level == len(PYRAMID.grids) - 1
@@ -111,17 +111,17 @@ def test_a_lobe_goes_to_the_level_that_resolves_it_and_stays_as_wide(shape, reso
     np.testing.assert_allclose(after, before, rtol=1e-6, atol=1e-6)
     np.testing.assert_array_equal(lobe[:3], [0.5, *shape[:2]])
     again = lobe.copy()
-    assert fit_level(again, level, GRIDS[0], resolution) == level
+    assert fit_level(again, level, GRIDS.columns, resolution) == level
     np.testing.assert_allclose(again, lobe, rtol=1e-6, atol=1e-9)
 
 
 def test_levels_differ():
-    assert [fit_level(lobe_of(40, 40, s, 0, s), 0, GRIDS[0], 1.3) for s in (1, 4, 9)] == [0, 1, 2]
+    assert [fit_level(lobe_of(40, 40, s, 0, s), 0, GRIDS.columns, 1.3) for s in (1, 4, 9)] == [0, 1, 2]
 
 
 def test_a_lobe_too_narrow_for_its_nodes_is_widened():
     lobe = lobe_of(40.0, 40.0, 0.01, 0.5, 0.01)
-    assert fit_level(lobe, 0, GRIDS[0], 0.8) == 0
+    assert fit_level(lobe, 0, GRIDS.columns, 0.8) == 0
     np.testing.assert_allclose(np.linalg.eigvalsh(covariance(lobe))[0], 0.6**2, rtol=1e-6)
     # and does not fall between them
     for lobe[1] in np.arange(40, 41, 0.125):
@@ -135,7 +135,7 @@ def test_never_more_nodes_than_there_is_room_for(shape):
     lobe = lobe_of(*shape)
     crowded, _ = sampled(lobe, 0)
     assert crowded.size == NODES
-    level = fit_level(lobe, 0, GRIDS[0], 0.8)
+    level = fit_level(lobe, 0, GRIDS.columns, 0.8)
     assert level > 0
     node, terms = sampled(lobe, level)
     assert terms[0].sum() == pytest.approx(1, abs=1e-5)

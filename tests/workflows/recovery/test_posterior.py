@@ -3,13 +3,15 @@
 import numpy as np
 import pytest
 
-from workflows.recovery.footprint import NODES, PARAMETERS
-from workflows.recovery.posterior import gather_lobes, rows_of, spread_lobes, unresolved, update
+from workflows.recovery.footprint import Shown
+from workflows.recovery.nodes import rows_of
+from workflows.recovery.posterior import unresolved, update
 from workflows.recovery.pyramid import Pyramid
 
 # Standard deviation of an offset.
 OFFSET = 0.03
 M = 50
+GRIDS = Pyramid.over(8, 6).arrays
 
 
 def problem(groups, n=40, seed=0, sigma=0.02):
@@ -17,25 +19,11 @@ def problem(groups, n=40, seed=0, sigma=0.02):
     rng = np.random.default_rng(seed)
     code = rng.integers(0, 256, (n, groups * M), np.uint8)
     A = np.empty((n, groups * (M + 2)), np.float32)
-    rows_of(code, 0, groups, M, np.arange(n), n, A)
+    rows_of(Shown(GRIDS, code, 0, groups, M), np.arange(n), n, A)
     weight, truth = rng.dirichlet(np.full(n, 5.0), 2)
     variance = np.full(groups * (M + 2), sigma**2, np.float32)
     y = truth @ A + sigma * rng.standard_normal(variance.size)
     return A, weight.astype(np.float32), y.astype(np.float32), variance, truth
-
-
-@pytest.mark.parametrize("groups", [1, 3])
-def test_rows_are_the_signed_codes_between_black_and_white(groups):
-    code = np.random.default_rng(0).integers(0, 256, (9, 2 + groups * M), np.uint8)
-    node = np.array([7, 0, 3, 3])
-    A = np.full((4, groups * (M + 2)), np.nan, np.float32)
-    rows_of(code, 2, groups, M, node, 3, A)
-    assert np.isnan(A[3]).all()
-    A = A[:3]
-    for g in range(groups):
-        of_group = A[:, g * (M + 2) : (g + 1) * (M + 2)]
-        np.testing.assert_allclose(of_group[:, :M], code[node[:3], 2 + g * M :][:, :M] / 127.5 - 1, atol=1e-6)
-        np.testing.assert_array_equal(of_group[:, M:], [[-1, 1]] * 3)
 
 
 @pytest.mark.parametrize("groups", [1, 3])
@@ -111,7 +99,7 @@ def test_unresolved_finds_the_variance_about_a_first_estimate():
     m, kappa = 20_000, 0.05
     code = 255 * rng.integers(0, 2, (6, m)).astype(np.uint8)
     A = np.empty((6, m + 2), np.float32)
-    rows_of(code, 0, 1, m, np.arange(6), 6, A)
+    rows_of(Shown(GRIDS, code, 0, 1, m), np.arange(6), 6, A)
     weight = rng.dirichlet(np.full(6, 5.0)).astype(np.float32)
     f, variance = weight @ A, rng.uniform(1e-4, 2e-3, m + 2).astype(np.float32)
     spread = variance + kappa * np.maximum(1 - f**2, 0)
@@ -122,42 +110,3 @@ def test_unresolved_finds_the_variance_about_a_first_estimate():
     assert misfit == pytest.approx(np.mean((y - f)[:m] ** 2 - variance[:m]), rel=1e-4)
     # black and white nodes leave nothing to what is finer than them
     np.testing.assert_allclose(total, variance, atol=1e-7)
-
-
-def test_lobes_are_spread_by_their_weights():
-    pyramid = Pyramid.over(64, 48)
-    grids = (*(np.array(size) for size in zip(*pyramid.grids, strict=True)), pyramid.starts)
-    lobes = np.array([[0.6, 20, 15, 1.5, 0, 1.5], [0.3, 21, 16, 2, 0, 2], [7, 1, 1, 1, 0, 1]], float)
-    level = np.zeros(3, np.int64)
-    node, weight = np.empty(3 * NODES, np.int64), np.empty(3 * NODES, np.float32)
-    assert lobes.shape[1] == PARAMETERS
-    end = np.zeros(3, np.int64)
-    n = spread_lobes(*grids, lobes, level, 2, 0.8, node, weight, end)
-    assert n == end[1]
-    assert weight[:n].sum() == pytest.approx(1, abs=1e-5)
-    y, x = np.mgrid[:48, :64] + 0.5
-    light = pyramid.light(np.stack([x, y], axis=2))[node[:n]]
-    assert weight[: end[0]].sum() == pytest.approx(0.6 / 0.9, abs=1e-5)
-    for part, centre in ((slice(end[0]), (20, 15)), (slice(end[0], n), (21, 16))):
-        np.testing.assert_allclose(weight[part] @ light[part] / weight[part].sum(), centre, atol=0.02)
-
-
-def test_gathered_lobes_are_those_that_were_spread():
-    pyramid = Pyramid.over(64, 48)
-    grids = (*(np.array(size) for size in zip(*pyramid.grids, strict=True)), pyramid.starts)
-    lobes = np.array([[0.7, 20, 15, 2.5, 1, 1.8], [0.3, 41, 30, 3, -2, 2.2]])
-    level, end = np.zeros(2, np.int64), np.zeros(2, np.int64)
-    node, weight = np.empty(2 * NODES, np.int64), np.empty(2 * NODES, np.float32)
-    n = spread_lobes(*grids, lobes, level, 2, 1.1, node, weight, end)
-    found, found_level = lobes + 1.0, level.copy()
-    gather_lobes(grids[0], grids[2], node, weight, end, found, found_level, 2, 1.1)
-    np.testing.assert_array_equal(found_level, level)
-    # what is beyond the reach of a lobe is a few per cent of its covariance
-    np.testing.assert_allclose(found, lobes, rtol=0.05, atol=0.02)
-
-    weight[:n] *= np.where(node[:n] % 64 < 20, 1, 0)
-    gather_lobes(grids[0], grids[2], node, weight, end, found, found_level, 2, 1.1)
-    assert found[0, 1] < 20
-    # nothing is left of the second: it stays where it is
-    assert found[1, 0] < 1e-6
-    np.testing.assert_allclose(found[1, 1:], lobes[1, 1:], rtol=0.05, atol=0.02)

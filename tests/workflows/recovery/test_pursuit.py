@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from workflows.recovery.pursuit import choose_groups, correlate, grow_rows
+from workflows.recovery.groups import Rows
+from workflows.recovery.pursuit import Pursuit, System, choose_groups, correlate, grow_rows
 
 COLUMNS, ROWS = 8, 6
 
@@ -52,24 +53,12 @@ def test_measurements_of_scale_zero_change_nothing(finest):
     scale = np.ones((2, 40), np.float32)
     scale[1, ::4] = 0
     target = scale * (truth @ (2 * light[0] - 1))
-    weight = np.empty(2 * truth.size, np.float32)
-    grow_rows(
-        light,
-        np.zeros(2, np.int64),
-        scale,
-        target.astype(np.float32),
+    source, variance = np.zeros(2, np.int64), np.ones(2)
+    system = System(light, COLUMNS, ROWS, source, scale, target.astype(np.float32), variance)
+    found = Rows(
         np.array([0, truth.size, 2 * truth.size]),
         np.tile(np.arange(truth.size, dtype=np.int32), 2),
-        weight,
-        COLUMNS,
-        ROWS,
-        finest,
-        0.2,
-        1.25,
-        0.02,
-        10,
-        0.01,
-        30,
-        1e-4,
+        np.empty(2 * truth.size, np.float32),
     )
-    np.testing.assert_allclose(weight.reshape(2, -1), [truth, truth], atol=0.01)
+    grow_rows(system, found, finest, Pursuit(0.2, 1.25, 0.02, 10, 0.01, 30, 1e-4))
+    np.testing.assert_allclose(found.weight.reshape(2, -1), [truth, truth], atol=0.01)

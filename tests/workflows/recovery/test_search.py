@@ -6,11 +6,25 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from workflows.recovery.footprint import PARAMETERS, bump_variance
+from workflows.recovery.footprint import PARAMETERS, Shown, bump_variance
+from workflows.recovery.mixture import Effort, Mixture
 from workflows.recovery.search import fit, search
 
 COLUMNS, ROWS, MOST = 64, 48, 3
 SIGMA = 0.01
+EFFORT = Effort(
+    most_lobes=MOST,
+    fit_resolution=0.8,
+    resolution=1.3,
+    rounds=2,
+    steps=20,
+    tolerance=0.1,
+    beam=6,
+    doubt=0.01,
+    passes=1,
+    gradients=10,
+    least_weight=1e-4,
+)
 
 
 class Fitted(NamedTuple):
@@ -34,9 +48,8 @@ def patterns(patterns_of):
 
 
 @pytest.fixture(scope="module")
-def pyramid(patterns):
-    """What the kernels know of the pyramid."""
-    return (*(np.array(size) for size in zip(*patterns.pyramid.grids, strict=True)), patterns.pyramid.starts)
+def shown(patterns):
+    return Shown(patterns.pyramid.arrays, patterns.code, 0, 1, patterns.count)
 
 
 @pytest.fixture(scope="module")
@@ -54,14 +67,12 @@ def measure(patterns):
 
 
 @pytest.fixture(scope="module")
-def fitted(patterns, pyramid):
+def fitted(shown):
     def run(y, variance, most=MOST):
-        lobes, level, offset = np.zeros((MOST, PARAMETERS)), np.zeros(MOST, np.int64), np.zeros(1)
-        k, kappa, objective = fit(
-            patterns.code, 0, 1, *pyramid, y, variance, lobes, level, 0, offset, most, 0.8, 2, 20, 0.1, 6
-        )
-        order = np.argsort(-lobes[:k, 0], kind="stable")
-        return Fitted(lobes[order], level[order], offset, kappa, objective)
+        mixture = Mixture(np.zeros((MOST, PARAMETERS)), np.zeros(MOST, np.int64), np.zeros(1))
+        k, kappa, objective = fit(shown, y, variance, mixture, 0, EFFORT._replace(most_lobes=most))
+        order = np.argsort(-mixture.lobes[:k, 0], kind="stable")
+        return Fitted(mixture.lobes[order], mixture.level[order], mixture.offset, kappa, objective)
 
     return run
 
@@ -146,18 +157,18 @@ def test_too_few_measurements_give_one_finite_lobe(measure, fitted, truth, known
     assert np.isfinite([found.kappa, found.objective]).all()
 
 
-def test_search_finds_the_node_that_is_missing(patterns, pyramid):
-    m = patterns.count
+def test_search_finds_the_node_that_is_missing(patterns, shown):
+    m, grids = patterns.count, shown.grids
     for level, column, row in ((0, 41, 17), (1, 9, 20)):
-        node = pyramid[2][level] + row * pyramid[0][level] + column
+        node = grids.starts[level] + row * grids.columns[level] + column
         f = np.append(np.zeros(m), [-1, 1]).astype(np.float32)
         y = np.append(0.2 * (patterns.code[node] / 127.5 - 1), [-1, 1]).astype(np.float32)
         precision = np.full(m + 2, SIGMA**-2, np.float32)
-        found = search(patterns.code, 0, 1, *pyramid, y, f, precision, 6)
+        found = search(shown, y, f, precision, 6)
         assert found[:3] == (level, column, row)
         assert found[4] == pytest.approx(0.2, rel=1e-4)
         d = patterns.code[node] / 127.5 - 1
         z_squared = 0.04 * (d @ d) / SIGMA**2
-        places = pyramid[0][level] * pyramid[1][level]
+        places = grids.columns[level] * grids.rows[level]
         assert found[3] == pytest.approx(z_squared - 2 * np.log(places), rel=1e-4)
-    assert search(patterns.code, 0, 1, *pyramid, f, f, precision, 6)[0] == -1
+    assert search(shown, f, f, precision, 6)[0] == -1

@@ -1,0 +1,150 @@
+"""Clusters of the cells of a T by their moments, and the mass on cells of the Gaussians with these."""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+# A lobe is never narrower than a cell: this is the variance of one, in cells squared.
+CELL_VARIANCE = 1 / 12
+# Of a Gaussian: its weight, centre, variances and covariance.
+PARAMETERS = 6
+# A cell with less of a T than this is no part of it; a Gaussian neither.
+LEAST_MASS = 1e-6
+
+
+@njit(nogil=True, cache=True)
+def add_moments(moments: NDArray[np.float64], cell: int, columns: int, weight: float) -> None:
+    """Add a weight at a cell's centre to the raw moments of order 0 to 2: 1, x, y, xx, xy, yy."""
+    row, column = divmod(cell, columns)
+    x, y = column + 0.5, row + 0.5
+    moments[0] += weight
+    moments[1] += weight * x
+    moments[2] += weight * y
+    moments[3] += weight * x * x
+    moments[4] += weight * x * y
+    moments[5] += weight * y * y
+
+
+@njit(nogil=True, cache=True)
+def merge_clusters(moments: NDArray[np.float64], count: int, most: int) -> int:
+    """Merge clusters until there are no more than `most`.
+
+    Parameters
+    ----------
+    moments : (n, 6) float64
+        Raw moments of the clusters, of positive weight; the first `count` are overwritten.
+    count, most : int
+        How many there are, and may be.
+
+    Returns
+    -------
+    int
+        How many are left.
+
+    Notes
+    -----
+    Always the two whose merger adds least to the squared distances from the centres,
+    ``w_a w_b / (w_a + w_b) |c_a - c_b|^2`` (Ward, "Hierarchical grouping to optimize an objective function",
+    J. Am. Stat. Assoc., 1963).
+    """
+    while count > most:
+        least, first, second = np.inf, 0, 1
+        for a in range(count):
+            wa = moments[a, 0]
+            xa, ya = moments[a, 1] / wa, moments[a, 2] / wa
+            for b in range(a + 1, count):
+                wb = moments[b, 0]
+                dx, dy = moments[b, 1] / wb - xa, moments[b, 2] / wb - ya
+                cost = wa * wb / (wa + wb) * (dx * dx + dy * dy)
+                if cost < least:
+                    least, first, second = cost, a, b
+        count -= 1
+        for k in range(PARAMETERS):
+            moments[first, k] += moments[second, k]
+            moments[second, k] = moments[count, k]
+    return count
+
+
+@njit(nogil=True, cache=True)
+def spread(
+    moments: NDArray[np.float64], columns: int, reach: float, field: NDArray[np.float32]
+) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """The mass of Gaussians on the cells of a grid.
+
+    Parameters
+    ----------
+    moments : (q, 6) float64
+        Raw moments; a Gaussian has their mean and covariance less a cell's own.
+    columns : int
+        Columns of the grid.
+    reach : float
+        Standard deviations at which a Gaussian ends.
+    field : (q or more, rows, columns) float32
+        Working space, all zero before and after.
+
+    Returns
+    -------
+    cell : (s,) int32
+        Cells that hold some, ascending.
+    mass : (q, s) float32
+        Each Gaussian's on them; together 1.
+
+    Notes
+    -----
+    A Gaussian is integrated over each row, and over the columns given the row, whose x is taken to be normal with
+    the mean and the variance that it has there.
+    """
+    q, rows = moments.shape[0], field.shape[1]
+    left = np.full(rows, columns, np.int64)
+    right = np.full(rows, -1, np.int64)
+    total = 0.0
+    for i in range(q):
+        w = moments[i, 0]
+        x, y = moments[i, 1] / w, moments[i, 2] / w
+        xx = max(moments[i, 3] / w - x * x - CELL_VARIANCE, CELL_VARIANCE)
+        yy = max(moments[i, 5] / w - y * y - CELL_VARIANCE, CELL_VARIANCE)
+        # what the floor or rounding left degenerate stays an ellipse
+        limit = 0.99 * math.sqrt(xx * yy)
+        xy = min(max(moments[i, 4] / w - x * y, -limit), limit)
+        slope = xy / yy
+        narrow = xx - slope * xy
+        sigma = math.sqrt(yy)
+        for r in range(max(int(y - reach * sigma), 0), min(int(y + reach * sigma) + 1, rows)):
+            a, b = (r - y) / sigma, (r + 1 - y) / sigma
+            share = 0.5 * (math.erf(b / math.sqrt(2.0)) - math.erf(a / math.sqrt(2.0)))
+            if share < LEAST_MASS:
+                continue
+            pa = math.exp(-a * a / 2) / math.sqrt(2 * math.pi) / share
+            pb = math.exp(-b * b / 2) / math.sqrt(2 * math.pi) / share
+            inner_yy = min(max(yy * (1 + a * pa - b * pb - (pa - pb) ** 2), 0.0), CELL_VARIANCE)
+            middle = x + slope * sigma * (pa - pb)
+            width = math.sqrt(narrow + slope * slope * inner_yy)
+            start = max(int(middle - reach * width), 0)
+            stop = min(int(middle + reach * width) + 1, columns)
+            if start >= stop:
+                continue
+            edge = math.erf((start - middle) / width / math.sqrt(2.0))
+            for c in range(start, stop):
+                ahead = math.erf((c + 1 - middle) / width / math.sqrt(2.0))
+                held = w * share * 0.5 * (ahead - edge)
+                field[i, r, c] = held
+                total += held
+                edge = ahead
+            left[r], right[r] = min(left[r], start), max(right[r], stop - 1)
+    size = 0
+    for r in range(rows):
+        size += max(right[r] - left[r] + 1, 0)
+    cell, mass = np.empty(size, np.int32), np.empty((q, size), np.float32)
+    s = 0
+    for r in range(rows):
+        for c in range(left[r], right[r] + 1):
+            held = 0.0
+            for i in range(q):
+                mass[i, s] = field[i, r, c] / total
+                held += mass[i, s]
+                field[i, r, c] = 0
+            cell[s] = r * columns + c
+            s += held > LEAST_MASS
+    return cell[:s].copy(), mass[:, :s].copy()
