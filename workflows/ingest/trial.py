@@ -12,7 +12,8 @@ from workflows.images import Codes
 from workflows.light import LOBES, light_of, unclipped_light
 from workflows.program import Program
 from workflows.recovery import lobes
-from workflows.recovery.photometry import Noise, fit_photometry
+from workflows.recovery.noise import Noise
+from workflows.recovery.photometry import fit_photometry
 from workflows.recovery.sensing import Patterns
 from workflows.recovery.transport import Transport
 from workflows.tone import Curve, table, to_light
