@@ -1,6 +1,10 @@
 """Least squares on the few cells of one pixel: kernels that more than one method uses.
 
 A matrix here has one row a cell, as long as the measurements: every inner loop runs over contiguous memory.
+
+Kernels that are called from several compiled ones are declared with their types, so that they are compiled when their
+module is loaded. Compiled when first called, they would be optimised together with whichever method came first: the
+sums of both methods would then depend, in their last bits, on which was run first on a machine.
 """
 
 import numpy as np
@@ -10,7 +14,7 @@ from numpy.typing import NDArray
 
 # "reassoc" lets the sum run in vector lanes. Its order depends on the length and the machine's vector width
 # only, never on where the data lie or what else is in the batch.
-@njit(nogil=True, cache=True, fastmath={"reassoc"})
+@njit("float32(float32[::1], float32[::1])", nogil=True, cache=True, fastmath={"reassoc"})
 def inner(a: NDArray[np.float32], b: NDArray[np.float32]) -> np.float32:
     """Inner product of two float32 vectors of one length."""
     total = np.float32(0)
@@ -19,7 +23,7 @@ def inner(a: NDArray[np.float32], b: NDArray[np.float32]) -> np.float32:
     return total
 
 
-@njit(nogil=True, cache=True)
+@njit("void(float32[::1], float32, float32[::1])", nogil=True, cache=True)
 def subtract(residual: NDArray[np.float32], factor: np.float32, row: NDArray[np.float32]) -> None:
     """Take ``factor * row`` from `residual`, in place."""
     for k in range(residual.size):
@@ -150,7 +154,7 @@ def posterior_mean(
     return t
 
 
-@njit(nogil=True, cache=True)
+@njit("void(float32[:, ::1], int32[::1], float32[::1], int64, float32[:, ::1])", nogil=True, cache=True)
 def signed_rows(
     light: NDArray[np.float32],
     cell: NDArray[np.int32],
@@ -179,7 +183,7 @@ def signed_rows(
             written[k] = scale[k] * (2 * row[k] - 1)
 
 
-@njit(nogil=True, cache=True)
+@njit("void(float32[:, :, ::1], int32[::1], float32[::1], float32[:, ::1])", nogil=True, cache=True)
 def stack_rows(
     light: NDArray[np.float32],
     cell: NDArray[np.int32],

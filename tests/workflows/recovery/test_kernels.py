@@ -1,0 +1,60 @@
+"""The compiled kernels as a whole: what one method computes does not depend on which was compiled before."""
+
+import importlib
+import pkgutil
+from collections import Counter
+from collections.abc import Iterator
+from types import CodeType, FunctionType
+
+import pytest
+from numba.core.dispatcher import Dispatcher
+
+from workflows import recovery
+
+
+def code_in(code: CodeType) -> Iterator[CodeType]:
+    yield code
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from code_in(constant)
+
+
+def called_by(function: FunctionType) -> set[Dispatcher]:
+    """The kernels that a function names."""
+    names = {name for code in code_in(function.__code__) for name in code.co_names}
+    there = (function.__globals__.get(name) for name in names)
+    return {kernel for kernel in there if isinstance(kernel, Dispatcher)}
+
+
+def within(kernel: Dispatcher) -> set[Dispatcher]:
+    """A kernel and all that it calls."""
+    found, left = set(), {kernel}
+    while left:
+        one = left.pop()
+        found.add(one)
+        left |= called_by(one.py_func) - found
+    return found
+
+
+def test_kernels_that_several_others_share_are_compiled_when_they_are_loaded() -> None:
+    modules = [
+        importlib.import_module(f"{recovery.__name__}.{found.name}")
+        for found in pkgutil.iter_modules(recovery.__path__)
+    ]
+    plain = [
+        value
+        for module in modules
+        for value in vars(module).values()
+        if isinstance(value, FunctionType) and value.__module__ == module.__name__
+    ]
+    entries = set().union(*map(called_by, plain))
+    shared = [
+        kernel
+        for kernel, times in Counter(k for entry in entries for k in within(entry)).items()
+        if times > 1
+    ]
+    assert {"inner", "subtract"} <= {kernel.py_func.__name__ for kernel in shared}
+    for kernel in shared:
+        # what has types of its own takes no others
+        with pytest.raises(TypeError, match="No matching definition"):
+            kernel(*[0j] * kernel.py_func.__code__.co_argcount)
