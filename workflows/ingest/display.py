@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, find_objects, label
 from scipy.optimize import minimize
-from scipy.stats import trim_mean
 
 from workflows import clock
 from workflows.clock import Border, Box
@@ -225,7 +224,8 @@ def _found(recording: Recording, seen: dict[int, int], patterns: int) -> Found:
             reasons[number] = Reason.UNNUMBERED
     begins = np.array([recording.times[longest[number].start] for number in sorted(longest)])
     holds = np.diff(begins) / np.diff(sorted(longest))
-    hold = float(trim_mean(holds, 0.25))  # of most: what was cut out, or stood still, is left aside
+    # of the middle half: what was cut out, or stood still, is left aside
+    hold = float(np.sort(holds)[len(holds) // 4 : len(holds) - len(holds) // 4].mean())
     return Found(
         frames,
         weights,
