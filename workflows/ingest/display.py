@@ -18,9 +18,11 @@ LOOKS = 6
 """Frames that are to be looked at for the numbers while a pattern is shown."""
 FEWEST = 8
 """Plateaus that are needed to tell cells from patterns."""
-MOST = 64
-"""Plateaus from which the display's place is told, at most."""
-_GAMMA = 2.2  # near enough to any camera's curve to compare the cells of a pair
+MOST = 128
+"""Plateaus from which the display's place is told, at most, and whose numbers are read at once."""
+_PLATEAUS = 2  # for each pattern
+# Of a code: near enough to any camera's curve to compare the cells of a pair.
+_LIGHT = ((np.arange(256) / 255) ** 2.2).astype(np.float32)
 _ALTERNATES = 0.6  # see `_alternation`
 _CONTRAST = 0.15  # of a pixel, as a share of the frame's largest
 _WITHIN = (0.3, 0.5, 0.7)  # of a cell: where it is looked at
@@ -28,6 +30,8 @@ _SIMPLEX = 1.0  # pixels, the first step of the search for the corners
 _MOSTLY = 0.5  # of the plateaus with numbers: that are in order, of a display that was found
 
 Doubles = NDArray[np.float64]
+Floats = NDArray[np.float32]
+"""(plateaus, rows, columns) float32: what was seen, about in linear light."""
 Points = NDArray[np.float64]
 """(n, 2) float64: x, y in pixels."""
 
@@ -58,21 +62,27 @@ def find(recording: Recording, large: Large, border: Border, patterns: int) -> F
     in time; what stands out of the longest row that does is a misreading.
     """
     plateaus = [recording.plateau(n) for n in range(len(recording.events) + 1)]
+    if len(plateaus) > _PLATEAUS * patterns + 100:
+        return None
     # The first and the last of a plateau may be torn.
     inner = [_among(large, plateau[1:-1]) for plateau in plateaus]
-    whole = np.array([looks.size > 0 for looks in inner])
     chosen = [looks if looks.size else _among(large, p) for looks, p in zip(inner, plateaus, strict=True)]
     there = np.flatnonzero([looks.size > 0 for looks in chosen])
-    whole = whole[there]
-    if np.count_nonzero(whole) < FEWEST:
+    whole = np.flatnonzero([inner[n].size > 0 for n in there])
+    if whole.size < FEWEST:
         return None
-    light = np.stack([(np.median(large.grey[chosen[n]], axis=0) / 255) ** _GAMMA for n in there])
+    codes = np.stack([np.median(large.grey[chosen[n]], axis=0).astype(np.uint8) for n in there])
+    middle = max((whole.size - MOST) // 2, 0)
+    some = codes[whole[middle : middle + MOST]]
     for quarters in range(4):
-        upright = np.rot90(light, quarters, axes=(1, 2))
-        ends = _columns(upright[whole])
+        light = _LIGHT[np.rot90(some, quarters, axes=(1, 2))]
+        ends = _columns(light)
         if ends is None:
             continue
-        numbers = _numbers(upright, _adjusted(upright[whole], ends, border), border)
+        homography = _adjusted(light, ends, border)
+        upright = np.rot90(codes, quarters, axes=(1, 2))
+        parts = (_LIGHT[upright[at : at + MOST]] for at in range(0, len(upright), MOST))
+        numbers = np.concatenate([_numbers(part, homography, border) for part in parts])
         numbers[numbers >= patterns] = clock.LEAD
         row = _ascending(numbers)
         if len(row) >= max(FEWEST, _MOSTLY * np.count_nonzero(numbers > clock.LEAD)):
@@ -85,7 +95,7 @@ def _among(large: Large, frames: range) -> NDArray[np.intp]:
     return np.flatnonzero((large.frames >= frames.start) & (large.frames < frames.stop))
 
 
-def _columns(light: Doubles) -> Points | None:
+def _columns(light: Floats) -> Points | None:
     """The ends of the sides' middle lines: left top, left bottom, right top, right bottom."""
     column: list[list[tuple[float, float]]] = []
     mask = binary_dilation(_alternation(light) > _ALTERNATES, np.ones((5, 1), bool))
@@ -112,8 +122,8 @@ def _columns(light: Doubles) -> Points | None:
     return np.array(sorted(column)).reshape(4, 2)
 
 
-def _alternation(light: Doubles) -> Doubles:
-    """(rows, columns) float64: 1 where each plateau differs from the next and not from the one after; 0 by chance.
+def _alternation(light: Floats) -> Floats:
+    """(rows, columns) float32: 1 where each plateau differs from the next and not from the one after; 0 by chance.
 
     It does not count for how long nothing changes.
     """
@@ -124,17 +134,16 @@ def _alternation(light: Doubles) -> Doubles:
     return np.where(seen, (near - far) / np.maximum(near + far, 1e-6), 0)
 
 
-def _adjusted(light: Doubles, ends: Points, border: Border) -> Doubles:
+def _adjusted(light: Floats, ends: Points, border: Border) -> Doubles:
     """(3, 3) homography from the display's pixels to the frame's, where the cells of the pairs differ most."""
     first, last = border.left[0], border.left[-1]
     top, bottom = first[1], last[1] + last[3]
     left, right = border.thickness / 2, border.width - border.thickness / 2
     known = np.array([(left, top), (left, bottom), (right, top), (right, bottom)])
-    chosen = light[:: -(-len(light) // MOST)]
     cells = (*border.top, *border.bottom, *border.left, *border.right)
 
     def alike(moved: Doubles) -> float:
-        pairs = _cells(chosen, _homography(known, ends + moved.reshape(4, 2)), cells)
+        pairs = _cells(light, _homography(known, ends + moved.reshape(4, 2)), cells)
         return -float(np.abs(pairs[:, ::2] - pairs[:, 1::2]).mean())
 
     simplex = np.concatenate([np.zeros((1, 8)), _SIMPLEX * np.eye(8)])
@@ -156,7 +165,7 @@ def _homography(known: Points, seen: Points) -> Doubles:
     return np.append(solved, 1.0).reshape(3, 3)
 
 
-def _cells(light: Doubles, homography: Doubles, cells: Sequence[Box]) -> Doubles:
+def _cells(light: Floats, homography: Doubles, cells: Sequence[Box]) -> Doubles:
     """(plateaus, cells) mean light of the cells' inner halves, between pixels linear; 0 outside of the frame."""
     box = np.array(cells, float)
     x = box[:, 0, None, None] + box[:, 2, None, None] * np.array(_WITHIN)[:, None]
@@ -175,7 +184,7 @@ def _cells(light: Doubles, homography: Doubles, cells: Sequence[Box]) -> Doubles
     return np.asarray((values * inside).mean(axis=(2, 3)))
 
 
-def _numbers(light: Doubles, homography: Doubles, border: Border) -> NDArray[np.intp]:
+def _numbers(light: Floats, homography: Doubles, border: Border) -> NDArray[np.intp]:
     """(plateaus,) the pattern's number, or `LEAD` where there is none, or none that is certain."""
     read = [clock.read(_cells(light, homography, cells)) for cells in (border.top, border.bottom)]
     (above, clear_above), (below, clear_below) = read
