@@ -18,6 +18,7 @@ from workflows.clock import LEAD_SECONDS
 from workflows.ingest import frames
 from workflows.ingest.bundle import Limits
 
+pytestmark = pytest.mark.full
 RATE = 2.0
 
 

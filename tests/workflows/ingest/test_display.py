@@ -16,6 +16,7 @@ from workflows.ingest.video import Large
 from workflows.presets import preset
 from workflows.simulate import glass_ball
 
+pytestmark = pytest.mark.full
 BORDER = Border.on(640, 480)
 WIDTH, HEIGHT = 224, 168
 HOLD = 0.25

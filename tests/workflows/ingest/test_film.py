@@ -12,6 +12,7 @@ from workflows.clock import LEAD, schedule
 from workflows.presets import preset
 from workflows.simulate import glass_ball
 
+pytestmark = pytest.mark.full
 MONITOR = (192, 144)
 HOLD = 0.5
 
