@@ -34,7 +34,7 @@ def findings(made: Figures, program: Program, attributes: dict[str, Any]) -> lis
     found = [
         _frames(made),
         *_exposure(made, attributes["storage"]),
-        *_steadiness(attributes["steadiness"]),
+        *_steadiness(attributes.get("steadiness")),
         *_drift(made.drift),
         *_flicker(made.flicker),
         _noise(made, attributes["survey"]),
@@ -132,7 +132,7 @@ def _white(made: Figures) -> Finding:
 
 
 def _steadiness(found: dict[str, Any] | None) -> list[Finding]:
-    if found != {}:
+    if found is None or (found.get("drift") and found.get("flicker")):
         return []
     return [
         Finding(

@@ -28,7 +28,7 @@ def report(attributes: dict[str, Any], frames: int) -> Report:
         Of the stack.
     """
     program = Program.model_validate(attributes["program"])
-    survey, noise, steadiness = attributes["survey"], attributes["noise"], attributes["steadiness"] or {}
+    survey, noise, steadiness = attributes["survey"], attributes["noise"], attributes.get("steadiness") or {}
     said = {"monitor": program.monitor.response, "camera": attributes["response"]}
     curves = {
         name: ToneCurve(

@@ -43,9 +43,9 @@ def find_steadiness(stack: Stack) -> None:
     """Find each frame's shift and gain, and write them into the stack's attributes.
 
     ``steadiness`` says what was found; it is None if too few pixels tell anything, and empty if the patterns don't
-    explain what the frames show. ``shifts`` (frames, 2), x and y in pixels, and ``gains`` (frames) are None unless they
-    are to be taken out, which `workflows.light` does. Shifts are about the patterns' mean place, gains about their
-    median.
+    explain what the frames show. Its ``drift`` and ``flicker`` are None where they are too large to be either.
+    ``shifts`` (frames, 2), x and y in pixels, and ``gains`` (frames) are None unless they are to be taken out, which
+    `workflows.light` does. Shifts are about the patterns' mean place, gains about their median.
 
     Notes
     -----
@@ -108,16 +108,16 @@ def find_steadiness(stack: Stack) -> None:
     if not moves and not flickers and last.residual > EXPLAINED[0]:
         stack.annotate(steadiness={})
         return
-    if (
-        not moves and not flickers
-    ):  # a first look sees part of what there is, but further ones may lead astray
+    if not moves and not flickers:
+        # A first look sees part of what there is, but further ones may lead astray.
         found, last = _filled(first.off, shown), first
     gain = np.exp(found[:, 2] - np.median(found[shown, 2]))
+    drift = _drift(found[shown, :2], last.error[shown, :2]) | {"corrected": moves}
+    flicker = _flicker(gain, last.error[:, 2], np.flatnonzero(shown)) | {"corrected": flickers}
+    # What is beyond all that is looked for is something else.
+    told = _within(found, shown)
     stack.annotate(
-        steadiness={
-            "drift": _drift(found[shown, :2], last.error[shown, :2]) | {"corrected": moves},
-            "flicker": _flicker(gain, last.error[:, 2], np.flatnonzero(shown)) | {"corrected": flickers},
-        },
+        steadiness={"drift": drift if told[0] else None, "flicker": flicker if told[1] else None},
         **({"shifts": found[:, :2].round(4).tolist()} if moves else {}),
         **({"gains": gain.round(5).tolist()} if flickers else {}),
     )

@@ -18,12 +18,14 @@ from workflows.recovery.sensing import Patterns
 from workflows.recovery.transport import Transport
 from workflows.tone import Curve, table, to_light
 
-EDGE = 16
+EDGE = 8
 """Pixels of the squares that are looked at."""
 SQUARES = 40
 """Of these, at most, spread over what is recovered."""
 BYTES = 96 << 20
 """Of their frames, at most."""
+FEWEST_SQUARES = 8
+"""For anything to be told: how far their answers lie apart is how sure it is."""
 PIXELS = 640
 """Of the squares, at most, that are recovered."""
 VALUES = 1 << 20
@@ -96,8 +98,8 @@ def sampled(stack: Stack) -> Sample | None:
     counts = np.array([np.count_nonzero(wanted[y : y + EDGE, x : x + EDGE]) for y, x in corners], int)
     useful = np.flatnonzero(counts >= EDGE**2 // 4)
     size = stack.frames * (EDGE + 2 * _MARGIN) ** 2 * stack.channels * stack.dtype.itemsize
-    most = min(len(useful), SQUARES, max(BYTES // size, 1))
-    if most == 0:
+    most = min(len(useful), SQUARES, BYTES // size)
+    if most < FEWEST_SQUARES:
         return None
     corners = [corners[useful[at]] for at in np.linspace(0, len(useful) - 1, most).astype(int)]
     wide = EDGE + _MARGIN
@@ -213,5 +215,8 @@ def _fit(
         trust = np.minimum(1, HUBER * 1.4826 * np.median(size) / np.maximum(size, 1e-12))
     pull = (weighed * (r - A @ found)[:, np.newaxis]) @ np.linalg.inv(gram)
     sums = np.stack([np.bincount(square, p) for p in pull.T])
-    error: Doubles = np.sqrt((sums**2).sum(axis=1))
+    count = np.count_nonzero(np.bincount(square))
+    if count <= A.shape[1]:
+        return None
+    error: Doubles = np.sqrt((sums**2).sum(axis=1) * count / (count - A.shape[1]))
     return found.astype(np.float64), error

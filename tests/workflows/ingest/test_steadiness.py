@@ -22,7 +22,7 @@ from workflows.ingest.report import report
 from workflows.jobs import Task, run_prepare, run_tile
 from workflows.presets import preset
 from workflows.program import Program
-from workflows.scene import Scene
+from workflows.scene import Scene, nested_program, write_capture
 from workflows.simulate import glass_ball
 from workflows.tone import to_light
 
@@ -167,3 +167,12 @@ def test_flicker_is_found_and_taken_out(
     assert found["flicker"].level == "warning"
     assert not stack.attributes["steadiness"]["drift"]["corrected"]
     assert with_it > without + gain
+
+
+def test_too_small_a_frame_tells_nothing(ingest: Ingest) -> None:
+    target = io.BytesIO()
+    program = nested_program((64, 48), ((4, 3, 14), (8, 6, 10)), levels=5)
+    write_capture(glass_ball(36, 28, monitor=(64, 48), rays=4), program, target, noise=0.5)
+    stack = ingest("c", target.getvalue())
+    assert stack.attributes["steadiness"] is None
+    assert stack.attributes["shifts"] is stack.attributes["gains"] is None

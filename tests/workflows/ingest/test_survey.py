@@ -102,6 +102,7 @@ def test_more_noise_and_fewer_patterns_promise_less(ingest: Ingest, bundle: byte
 def test_a_curve_that_is_assumed_is_a_warning(ingest: Ingest, bundle: bytes) -> None:
     made, found = reported(ingest, filmed(bundle, response="unknown"))
     assert made.camera.source == "assumed"
+    assert [f for f in made.findings if f.level == "bad"] == []
     assert made.level == found["camera_curve"].level == "warning"
     assert "name it in capture.json" in found["camera_curve"].remedy
 
