@@ -120,8 +120,11 @@ def make_dng() -> Callable[..., bytes]:
         if active:  # top, left, bottom, right
             tags.append((50829, "I", 4, active, True))
         target = io.BytesIO()
-        kind = "cfa" if counts.ndim == 2 else tifffile.PHOTOMETRIC.LINEAR_RAW
-        tifffile.imwrite(target, counts, photometric=kind, extratags=tags, **how)
+        if counts.ndim == 2:
+            how["photometric"] = "cfa"
+        else:
+            how |= {"photometric": tifffile.PHOTOMETRIC.LINEAR_RAW, "planarconfig": "contig"}
+        tifffile.imwrite(target, counts, extratags=tags, **how)
         return target.getvalue()
 
     return make
