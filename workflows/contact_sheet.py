@@ -6,11 +6,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
-from pydantic import TypeAdapter
 
 from storage.captures import Stack
+from workflows.light import look_up_of
 from workflows.program import Program
-from workflows.tone import Curve, from_light, table
+from workflows.tone import from_light
 
 WIDTH, HEIGHT = 240, 240
 """Pixels of a thumbnail, at most."""
@@ -87,10 +87,8 @@ def _shrink(
     factor = max(1, -(-stack.width // WIDTH), -(-stack.height // HEIGHT))
     height, width = stack.height // factor, stack.width // factor
     # The light is shown as if full scale were white, whatever the camera's curve.
-    top, black = np.iinfo(stack.dtype).max, stack.attributes["storage"]["black"]
-    look_up = table(
-        TypeAdapter[Curve](Curve).validate_python(stack.attributes["camera_curve"]), stack.dtype, black
-    )
+    top = np.iinfo(stack.dtype).max
+    look_up = look_up_of(stack)
     light = np.zeros((len(frames), height, width, stack.channels), np.float32)
     high, low = (np.zeros((len(frames), height, width), bool) for _ in range(2))
     band = max(1, 64 // factor)

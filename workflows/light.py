@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
 from storage.captures import Stack
 from workflows.images import Codes
@@ -41,9 +42,20 @@ class Light(NamedTuple):
     worth: Floats
 
 
-def read_light(
-    stack: Stack, span: tuple[slice, slice], program: Program, camera: Curve
-) -> tuple[Light, Bools]:
+def look_up_of(stack: Stack) -> Floats:
+    """(k,) float32: the light of each value that a stack stores."""
+    camera = TypeAdapter[Curve](Curve).validate_python(stack.attributes["camera_curve"])
+    return table(camera, stack.dtype, stack.attributes["storage"]["black"])
+
+
+def exposures_of(attributes: dict[str, Any]) -> Floats:
+    """(frames,) float32: how long a stack's frames were exposed, in units of the shortest."""
+    exposures = np.array(attributes["exposures"], np.float32)
+    exposures /= exposures.min()
+    return exposures
+
+
+def read_light(stack: Stack, span: tuple[slice, slice], program: Program) -> tuple[Light, Bools]:
     """The light of each pattern at the pixels of a rectangle that are to be recovered, and (y, x) bool: which they are.
 
     Drift and flicker are taken out if `workflows.ingest.steadiness` was sure of them, crosstalk always.
@@ -55,7 +67,7 @@ def read_light(
     """
     attributes = stack.attributes
     shifts = attributes.get("shifts")
-    look_up = table(camera, stack.dtype, attributes["storage"]["black"])
+    look_up = look_up_of(stack)
     top = np.iinfo(stack.dtype).max
     if shifts is None:
         codes, recovered = stack.read_masked(*span)
@@ -111,8 +123,7 @@ def merge(
     exposures that are not clipped, with the variance ``shot x / sum t``: `worth` is ``sum t``. Read noise, which long
     exposures have less of, is then rather overstated. The gain, as the light, is ``sum g t / sum t``.
     """
-    exposures = np.array(attributes["exposures"], np.float32)
-    exposures /= exposures.min()
+    exposures = exposures_of(attributes)
     gains = attributes.get("gains")
     shape = (pixels, count, 3)
     light, worth = np.zeros(shape, np.float32), np.zeros(shape, np.float32)

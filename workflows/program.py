@@ -81,6 +81,12 @@ class Program(Record):
         ]
         return np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
 
+    def constants_among(self, patterns: Sequence[int]) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+        """`constants`, less those that are not among some patterns: a video may lack some."""
+        numbers, sent = self.constants
+        there = np.isin(numbers, patterns)
+        return numbers[there], sent[there]
+
     def values(
         self, first: int, last: int, images: Sequence[NDArray[np.float32]] = ()
     ) -> list[NDArray[np.float32]]:

@@ -79,13 +79,10 @@ def _recover_block(
 ) -> Block:
     program, monitor = program_of(url, capture)
     attributes = stack.attributes
-    camera = TypeAdapter[Curve](Curve).validate_python(attributes["camera_curve"])
     noise = Noise(**attributes["noise"])
-    (light, usable, worth), recovered = read_light(stack, span, program, camera)
+    (light, usable, worth), recovered = read_light(stack, span, program)
     crosstalk = np.array(attributes["crosstalk"])
-    numbers, sent = program.constants
-    filmed = np.isin(numbers, attributes["patterns"])  # a video may lack some
-    numbers, sent = numbers[filmed], sent[filmed]
+    numbers, sent = program.constants_among(attributes["patterns"])
     photometry = fit_photometry(
         light[:, numbers], to_light(sent, monitor), usable[:, numbers], noise, worth[:, numbers]
     )

@@ -172,9 +172,8 @@ async def _from_body(context: Context, request: Request, name: str, key: str | N
     try:
         part = Part(ONLY, await _receive(context, capture, request.stream(), limit))
         row = await anyio.to_thread.run_sync(_register, context, capture, [part], name, key, False)
-    except (
-        Exception
-    ):  # not when cancelled, where `_register` may still be at work: the next start sweeps then
+    except Exception:
+        # Not when cancelled, where `_register` may still be at work: the next start sweeps then.
         await anyio.to_thread.run_sync(uploads.remove, context.objects, capture)
         raise
     if row.id != capture:  # a repeat with the same key was quicker

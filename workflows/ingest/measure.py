@@ -10,6 +10,7 @@ from pydantic import TypeAdapter
 
 from storage.captures import Stack
 from storage.objects import Objects
+from workflows.light import exposures_of
 from workflows.program import Program
 from workflows.recovery.excess import estimate_excess
 from workflows.recovery.noise import Noise
@@ -115,8 +116,7 @@ def constant_frames(
     exposures : (k,) float32
         In units of the stack's shortest.
     """
-    exposures = np.array(stack.attributes["exposures"], np.float32)
-    exposures /= exposures.min()
+    exposures = exposures_of(stack.attributes)
     numbers, sent = program.constants
     first: dict[tuple[int, float], int] = {}
     for frame, key in enumerate(zip(stack.attributes["patterns"], exposures.tolist(), strict=True)):

@@ -6,15 +6,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter
 
 from storage.captures import Stack
 from storage.objects import Objects
 from workflows.ingest.measure import constant_frames, measure
 from workflows.ingest.steadiness import find_steadiness
+from workflows.light import look_up_of
 from workflows.program import Program
 from workflows.recovery.noise import Noise
-from workflows.tone import Curve, table
 
 EDGE = 96
 """Pixels of a window, at most; there are four by four, spread over the frame."""
@@ -36,8 +35,7 @@ def survey(objects: Objects, capture: str) -> None:
         stack = Stack(objects, capture)
     attributes = stack.attributes
     program = Program.model_validate(attributes["program"])
-    camera: Curve = TypeAdapter[Curve](Curve).validate_python(attributes["camera_curve"])
-    look_up = table(camera, stack.dtype, attributes["storage"]["black"])
+    look_up = look_up_of(stack)
     patterns = np.array(attributes["patterns"])
     chosen = np.unique(np.linspace(0, stack.frames - 1, FRAMES).astype(int))
     is_pattern = ~np.isin(patterns[chosen], program.constants[0])

@@ -5,18 +5,17 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from pydantic import TypeAdapter
 
 from storage.captures import Stack
 from workflows.images import Codes
-from workflows.light import LOBES, light_of, unclipped_light
+from workflows.light import LOBES, exposures_of, light_of, look_up_of, unclipped_light
 from workflows.program import Program
 from workflows.recovery import lobes
 from workflows.recovery.noise import Noise
 from workflows.recovery.photometry import fit_photometry
 from workflows.recovery.sensing import Patterns
 from workflows.recovery.transport import Transport
-from workflows.tone import Curve, table, to_light
+from workflows.tone import Curve, to_light
 
 EDGE = 8
 """Pixels of the squares that are looked at."""
@@ -113,8 +112,7 @@ def sampled(stack: Stack) -> Sample | None:
 
 def _see(stack: Stack, sample: Sample, shifts: Doubles) -> _Seen:
     """The sample's pixels in frames that are moved back."""
-    camera: Curve = TypeAdapter[Curve](Curve).validate_python(stack.attributes["camera_curve"])
-    look_up = table(camera, stack.dtype, stack.attributes["storage"]["black"])
+    look_up = look_up_of(stack)
     square, y, x = sample.chosen
     y, x = y + _SLOPE, x + _SLOPE
     shape = (stack.frames, len(square), stack.channels)
@@ -141,9 +139,8 @@ def look(
     light, usable, worth = light_of(
         lambda n: (seen.values[n], seen.whole[n]), attributes, program, len(sample.chosen[0])
     )
-    numbers, sent = program.constants
-    filmed = np.isin(numbers, attributes["patterns"])
-    numbers, levels = numbers[filmed], to_light(sent[filmed], monitor)
+    numbers, sent = program.constants_among(attributes["patterns"])
+    levels = to_light(sent, monitor)
     photometry = fit_photometry(light[:, numbers], levels, usable[:, numbers], noise, worth[:, numbers])
     alive = photometry.rho**2 > CONTRAST**2 * noise.variance(photometry.S + photometry.rho / 2)
     if np.count_nonzero(alive.any(axis=1)) < FEWEST:
@@ -155,8 +152,7 @@ def look(
     predicted = np.zeros((program.count, *alive.shape), np.float32)
     predicted[shown] = photometry.rho * _arrived(transport, patterns)
     predicted[numbers] = photometry.rho * levels[:, np.newaxis]
-    exposures = np.array(attributes["exposures"], np.float32)
-    exposures /= exposures.min()
+    exposures = exposures_of(attributes)
     apart = np.linalg.inv(np.array(attributes["crosstalk"])).astype(np.float32).T
     off, error = np.full((2, stack.frames, 3), np.nan)
     squares: list[float] = []
