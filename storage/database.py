@@ -26,6 +26,9 @@ from sqlalchemy import (
     select,
 )
 from sqlalchemy.exc import OperationalError
+from sqlalchemy.ext.compiler import compiles
+from sqlalchemy.sql.compiler import SQLCompiler
+from sqlalchemy.sql.functions import FunctionElement
 
 from storage.errors import DISK_FULL, NoRoom, NotFound
 
@@ -90,6 +93,14 @@ jobs = Table(
     Column("created_at", Float, nullable=False),
     Column("started_at", Float),
     Column("finished_at", Float),
+    Column(
+        "misses", Integer, nullable=False, server_default="0"
+    ),  # failed attempts at the present single step
+    Column("stage_at", Float),  # when the present stage was entered
+    Column("moved_at", Float),  # when last something of it got done
+    Column("paced_at", Float),  # the pace of tiles is measured from here: when, and how many were done
+    Column("paced_done", Integer, nullable=False, server_default="0"),
+    Column("trace", String(64)),  # the request's traceparent (W3C)
 )
 
 tiles = Table(
@@ -100,6 +111,7 @@ tiles = Table(
     Column("state", String(16), nullable=False),
     Column("attempts", Integer, nullable=False),
     Column("seconds", Float),
+    Column("losses", Integer, nullable=False, server_default="0"),  # how often its worker died
     Index("tiles_by_state", "job", "state"),
 )
 
@@ -116,11 +128,25 @@ coordinator = Table(
     "coordinator",
     metadata,
     Column("id", Integer, primary_key=True),
+    Column("token", Integer, nullable=False),  # grows by one at each takeover
+    Column("holder", String(64)),  # the process that drives
+    Column("expires_at", Float, nullable=False),
     Column("beat_at", Float, nullable=False),
-    Column("workers", Integer, nullable=False),
-    Column("threads", Integer, nullable=False),
+    Column("cluster", JSON, nullable=False),  # what the holder last saw: workers, problem
 )
-"""One row: the coordinator's last sign of life, and the cluster as it saw it."""
+"""One row: the lease of the coordinator. Its times are by the database's clock."""
+
+totals = Table(
+    "totals",
+    metadata,
+    Column("kind", String(16), primary_key=True),
+    Column("tiles", BigInteger, nullable=False),
+    Column("misses", BigInteger, nullable=False),
+    Column("losses", BigInteger, nullable=False),
+    Column("pixels", BigInteger, nullable=False),
+    Column("seconds", Float, nullable=False),
+)
+"""What has ever been done by each kind of job, also by those that are deleted: for metrics."""
 
 uploads = Table(
     "uploads",
@@ -168,6 +194,23 @@ def open_engine(url: str) -> Engine:
         event.listen(engine, "begin", _on_begin)
     metadata.create_all(engine)
     return engine
+
+
+class clock(FunctionElement[float]):
+    """The database's clock as an SQL expression: seconds since 1970, also within a transaction going on."""
+
+    type = Float()
+    inherit_cache = True
+
+
+@compiles(clock, "sqlite")
+def _clock_of_sqlite(element: clock, compiler: SQLCompiler, **options: object) -> str:
+    return "((julianday('now') - 2440587.5) * 86400.0)"
+
+
+@compiles(clock, "postgresql")
+def _clock_of_postgresql(element: clock, compiler: SQLCompiler, **options: object) -> str:
+    return "CAST(EXTRACT(EPOCH FROM clock_timestamp()) AS DOUBLE PRECISION)"
 
 
 def new_id() -> str:

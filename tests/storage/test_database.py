@@ -5,11 +5,11 @@ import time
 from pathlib import Path
 
 import pytest
-from sqlalchemy import Engine, inspect, text
+from sqlalchemy import Engine, inspect, select, text, update
 from sqlalchemy.exc import IntegrityError
 
 from storage import jobs
-from storage.database import metadata, open_engine, writing
+from storage.database import clock, metadata, open_engine, writing
 
 
 def test_sqlite_is_set_up(engine: Engine) -> None:
@@ -82,3 +82,18 @@ def test_a_reader_does_not_wait_for_a_writer(engine: Engine) -> None:
         assert time.monotonic() - start < 5
     with engine.connect() as reader:
         assert [row.id for row in jobs.active(reader)] == [job]
+
+
+def test_the_clock_is_in_seconds_since_1970_and_goes_on_within_a_transaction(engine: Engine) -> None:
+    with writing(engine) as connection:
+        before = time.time()
+        first = connection.scalar(select(clock()))
+        time.sleep(0.05)
+        then = connection.scalar(select(clock()))
+    assert isinstance(first, float)
+    assert abs(first - before) < 60
+    assert then > first
+    with writing(engine) as connection:
+        job = jobs.add(connection, "ingest", "c", {})
+        connection.execute(update(metadata.tables["jobs"]).values(stage_at=clock() + 10))
+        assert abs(jobs.get(connection, job).stage_at - then - 10) < 60
