@@ -1,325 +1,293 @@
 """The coordinator: takes queued jobs and drives them on dask, one step after another.
 
-It polls, and it alone writes progress: results that travel with callbacks are lost with their client, and a scheduler
-keeps nothing over a restart. Whatever it holds in memory can be made again from the ledger.
+Any number of coordinators may run; the one that holds the lease drives (`storage.leases`). It polls, and it alone writes
+progress: results that travel with callbacks are lost with their client, and a scheduler keeps nothing over a restart.
+Whatever it holds in memory can be made again from the ledger.
 """
 
 import logging
+import os
+import socket
 import threading
 import time
-from collections import deque
-from collections.abc import Callable
-from concurrent.futures import CancelledError
-from dataclasses import dataclass, field, replace
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from typing import Any
 
-from distributed import Client, Future
-from sqlalchemy import Engine, Row, select
+from sqlalchemy import Connection, Engine, Row
 
 from services.api.errors import problem_of
+from services.dispatch import Dispatcher
+from services.drive import Drive, end_badly
+from services.housekeeping import discard, sweep
 from services.settings import Settings
-from storage import captures, database, jobs, mattes, uploads
-from storage.database import writing
-from storage.errors import Conflict, EnvmatteError, GaveUp
+from storage import captures, jobs, leases, mattes, uploads
+from storage.database import reading, writing
+from storage.errors import Conflict, EnvmatteError, GaveUp, Unavailable
+from storage.leases import Superseded
 from storage.objects import Objects
-from workflows.jobs import KINDS, Task, run_finish, run_prepare, run_tile
 
 logger = logging.getLogger(__name__)
 
 POLL = 0.1
-"""Seconds between two looks at the ledger and the cluster."""
+"""Seconds between two looks at the ledger; what the cluster has done is looked at as soon as it is."""
 BEAT = 2.0
 """Seconds between two signs of life."""
-FETCH = 5.0
-"""Seconds to wait for the small result of a task that is done, before it counts as gone with its worker."""
-DEPTH = 2
-"""Tasks in flight for each thread of the cluster: one that runs, and one that waits so that no thread does."""
-
-
-@dataclass
-class Drive:
-    """A job that is being driven."""
-
-    job: str
-    kind: str
-    task: Task
-    stage: str
-    to_do: deque[int] = field(default_factory=deque)
-    tiles: dict[Future, int] = field(default_factory=dict)
-    step: Future | None = None
-    """The task of the stage, where that is a single one."""
-    misses: int = 0
-    """How often that one has failed."""
-
-    @property
-    def in_flight(self) -> list[Future]:
-        """All that the cluster has of it."""
-        return [*self.tiles, *([self.step] if self.step else [])]
+SETTLE = 0.25
+"""Seconds between two writes of progress, whatever the number of jobs and tiles."""
+DYING = 1.2
+"""Seconds after which no worker works on a job any more that was cancelled, see `services.preload`."""
+SWEEP = 3600.0
+"""Seconds between two sweeps of the store."""
 
 
 class Coordinator:
-    """Drives jobs until it is stopped. There is one for a database.
+    """Drives jobs until it is stopped, whenever it holds the lease.
 
     Parameters
     ----------
     settings : Settings
     engine : sqlalchemy.Engine
     objects : Objects
-    client : distributed.Client
-        Synchronous.
+    dispatcher : Dispatcher
+    alone : bool
+        Whether the caller knows that there is no other coordinator, and that nobody writes to the store yet.
     """
 
-    def __init__(self, settings: Settings, engine: Engine, objects: Objects, client: Client) -> None:
+    def __init__(
+        self, settings: Settings, engine: Engine, objects: Objects, dispatcher: Dispatcher, *, alone: bool
+    ) -> None:
         self._settings = settings
         self._engine = engine
         self._objects = objects
-        self._client = client
+        self._dispatcher = dispatcher
+        self._alone = alone
+        self._name = f"{socket.gethostname()}:{os.getpid()}"
+        self._token: int | None = None
         self._drives: dict[str, Drive] = {}
-        self._threads = 0
-        self._beat_at = 0.0
+        self._leaving: deque[tuple[float, str, str, str]] = deque()
+        """When what ended jobs wrote is removed: a time, and a kind, a capture and a matte."""
+        self._troubles: Counter[str] = Counter()
+        self._beat_at = self._swept_at = self._settled_at = -1e9
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="coordinator")
+        self._house = ThreadPoolExecutor(1, thread_name_prefix="housekeeping")
 
     def __enter__(self) -> "Coordinator":
-        self._reconcile()
+        if self._alone:
+            sweep(self._engine, self._objects, seconds=0)
         self._thread.start()
         return self
 
     def __exit__(self, *exception: object) -> None:
         self._stopped.set()
+        self._dispatcher.news.set()
         self._thread.join()
+        self._house.shutdown()
+        if self._token is not None:
+            with suppress(Unavailable), writing(self._engine) as c:
+                leases.give_back(c, self._token)
 
     def _run(self) -> None:
-        while not self._stopped.wait(POLL):
+        while not self._stopped.is_set():
+            self._dispatcher.news.clear()
             try:
-                self._step()
-            except Exception:  # the database or the scheduler may be away for a while: jobs must not be
+                if self._leads():
+                    self._step()
+            except Superseded as error:
+                logger.warning("%s: %s", self._name, error)
+                self._stand_down()
+            except Unavailable as error:
+                logger.warning("going on as soon as it can: %s", error.detail)
+                self._stopped.wait(1)
+            except Exception:  # nothing may end this thread
                 logger.exception("the coordinator goes on after an error")
                 self._stopped.wait(1)
+            self._dispatcher.news.wait(POLL)
+
+    def _leads(self) -> bool:
+        """Whether the lease is held: it is extended, or asked for, when that is due."""
+        now = time.monotonic()
+        if now - self._beat_at < BEAT:
+            return self._token is not None
+        self._beat_at = now
+        if self._token is None:
+            with writing(self._engine) as c:
+                self._token = leases.take(c, self._name, seize=self._alone)
+            if self._token is None:
+                return False
+            logger.info("%s drives the jobs from now on", self._name)
+        with self._writing() as c:
+            leases.beat(c, self._token, self._dispatcher.cluster)
+            expired = uploads.forget_expired(c)
+        for upload in expired:
+            self._house.submit(_logged, uploads.remove, self._objects, upload)
+        if now - self._swept_at > SWEEP:
+            self._swept_at = now
+            self._house.submit(_logged, sweep, self._engine, self._objects)
+        return True
+
+    def _stand_down(self) -> None:
+        """Let go of everything: another has it."""
+        self._token = None
+        for job in list(self._drives):
+            self._drop(job)
+        self._leaving.clear()
+
+    @contextmanager
+    def _writing(self) -> Iterator[Connection]:
+        """A transaction that is refused once another coordinator has taken over."""
+        if self._token is None:
+            raise Superseded("this coordinator holds no lease")
+        with writing(self._engine) as c:
+            leases.check(c, self._token)
+            yield c
 
     def _step(self) -> None:
-        if time.monotonic() - self._beat_at > BEAT:
-            threads = self._client.nthreads()
-            self._threads = sum(threads.values())
-            with writing(self._engine) as c:
-                jobs.beat(c, len(threads), self._threads)
-                expired = uploads.forget_expired(c)
-            for upload in expired:
-                uploads.remove(self._objects, upload)
-            self._beat_at = time.monotonic()
-        with self._engine.connect() as c:
-            rows = {row.id: row for row in jobs.active(c)}
+        with reading(self._engine) as c:
+            active = {row.id: row for row in jobs.active(c)}
             cancelled = jobs.not_wound_up(c)
-        for row in rows.values():
-            if row.id not in self._drives and self._may_start(row):
-                self._take_up(row)
-        for row in cancelled:
+        for row in active.values():
             if row.id not in self._drives:
-                self._discard(row.kind, row.capture, row.matte)
-        for drive in list(self._drives.values()):
-            try:
-                self._advance(drive, row=rows.get(drive.job))
-            except EnvmatteError as error:
-                self._fail(drive, error)
-            except Exception:
-                # Whatever it was, and whatever it left half done here: the ledger knows where the job stands.
-                del self._drives[drive.job]
-                raise
+                self._guarded(row.id, self._take_up, row)
+        for job in self._drives.keys() - active.keys():
+            self._drop(job)
+        for row in cancelled:
+            self._wind_up(row)
+        self._discard()
+        for outcome in self._dispatcher.collect():
+            if outcome.job in self._drives:
+                self._drives[outcome.job].news.append(outcome)
+        for drive in self._due():
+            self._guarded(drive.job, self._settle, drive)
         self._submit()
 
-    def _may_start(self, row: Row[Any]) -> bool:
-        """Whether the capture of a job is there; a job whose capture never will be is ended."""
-        if row.kind == "ingest":
-            return True
-        with self._engine.connect() as c:
-            capture = captures.get(c, row.capture)
-        if capture.state == "failed":
-            error = Conflict(f"capture {row.capture} could not be ingested: {capture.problem['detail']}")
-            with writing(self._engine) as c:
-                jobs.end(c, row.id, "failed", problem_of(error))
-                mattes.change(c, row.matte, state="failed")
-        return bool(capture.state == "ready")
+    def _guarded(self, job: str, act: Any, *arguments: Any) -> None:
+        """Do something about a job; what is wrong with it must not hold up the others."""
+        try:
+            act(*arguments)
+        except (Superseded, Unavailable):
+            raise
+        except EnvmatteError as error:
+            self._fail(job, error)
+        except Exception as error:
+            # Whatever it was, and whatever it left half done here: the ledger knows where the job stands.
+            logger.exception("job %s is taken up anew", job)
+            if job in self._drives:
+                self._drop(job)
+            self._troubles[job] += 1
+            if self._troubles[job] >= self._settings.attempts:
+                self._fail(job, GaveUp(f"the coordinator failed at it, last with {error!r}"))
 
     def _take_up(self, row: Row[Any]) -> None:
-        task = Task(
-            store=self._objects.url,
-            capture=row.capture,
-            matte=row.matte or "",
-            options=row.options,
-            limits=self._settings.limits,
-            plan=row.plan or {},
-        )
-        drive = Drive(row.id, row.kind, task, "preparing")
-        with writing(self._engine) as c:
-            if row.plan is None:
-                jobs.enter(c, row.id, drive.stage)
-            else:
-                drive.stage = KINDS[row.kind].stage
-                drive.to_do.extend(jobs.to_do(c, row.id))
-                jobs.enter(c, row.id, drive.stage)
+        """Begin to drive a job, once its capture is there; one whose capture never will be is ended."""
+        if row.kind != "ingest":
+            with reading(self._engine) as c:
+                capture = captures.get(c, row.capture)
+            if capture.state == "failed":
+                raise Conflict(f"capture {capture.id} could not be ingested: {capture.problem['detail']}")
+            if capture.state != "ready":
+                return
+        with self._writing() as c:
+            jobs.begin(c, row.id)
+            drive = self._drive_of(c, row)
+            jobs.enter(c, row.id, drive.stage)
         self._drives[row.id] = drive
 
-    def _advance(self, drive: Drive, row: Row[Any] | None) -> None:
-        if row is None:
-            self._wind_up(drive)
-        elif drive.stage == "preparing":
-            self._in_one_step(drive, run_prepare, self._prepared)
-        elif drive.stage == "finishing":
-            self._in_one_step(drive, run_finish, self._finished)
-        else:
-            self._collect(drive)
-            if not drive.to_do and not drive.tiles and drive.job in self._drives:
-                self._enter(drive, "finishing")
+    def _drive_of(self, connection: Connection, row: Row[Any]) -> Drive:
+        return Drive.of(row, jobs.to_do(connection, row.id), self._objects.url, self._settings.limits)
 
-    def _enter(self, drive: Drive, stage: str) -> None:
-        drive.stage = stage
-        with writing(self._engine) as c:
-            jobs.enter(c, drive.job, stage)
+    def _due(self) -> list[Drive]:
+        """The jobs of which something is written down now.
 
-    def _in_one_step(
-        self,
-        drive: Drive,
-        function: Callable[[str, Task], dict[str, Any]],
-        then: Callable[[Drive, dict[str, Any]], None],
-    ) -> None:
-        if drive.step is None:
-            drive.step = self._client.submit(function, drive.kind, drive.task, pure=False)
-        if not drive.step.done():
+        Those that can't go on before it is, and otherwise one at a time: the one that has waited longest.
+        """
+        due = []
+        for drive in self._drives.values():
+            if drive.news and not drive.to_do and not self._dispatcher.under_way(drive.job):
+                due.append(drive)
+        now = time.monotonic()
+        if now - self._settled_at > SETTLE:
+            waiting = [drive for drive in self._drives.values() if drive.news and drive not in due]
+            if waiting:
+                due.append(min(waiting, key=lambda drive: drive.settled_at))
+                self._settled_at = now
+        return due
+
+    def _settle(self, drive: Drive) -> None:
+        """Write down what became of a job's tiles, and go on with it from there."""
+        under_way = self._dispatcher.under_way(drive.job)
+        with self._writing() as c:
+            following = drive.settle(c, self._settings.attempts, self._dispatcher.threads, under_way)
+        drive.go_on(following)
+        if following.ended:
+            self._drop(drive.job)
+            self._tidy(drive.kind, drive.task.capture)
+
+    def _drop(self, job: str) -> None:
+        """Drive a job no more: what the cluster has of it is cancelled."""
+        del self._drives[job]
+        self._dispatcher.drop(job)
+
+    def _fail(self, job: str, error: EnvmatteError) -> None:
+        """End a job that can't be driven."""
+        with self._writing() as c:
+            row = jobs.get(c, job)
+            end_badly(c, row.kind, self._drive_of(c, row).task, error)
+        if job in self._drives:
+            self._drop(job)
+        self._tidy(row.kind, row.capture)
+
+    def _tidy(self, kind: str, capture: str) -> None:
+        """Remove what an ingest needs no more once it has ended: the archive, or all of a capture that can't be used."""
+        if kind != "ingest":
             return
-        step, drive.step = drive.step, None
-        try:
-            result = step.result(timeout=FETCH)
-        except EnvmatteError:  # it would be the same the next time
-            raise
-        except (TimeoutError, CancelledError):
-            return
-        except Exception as error:
-            drive.misses += 1
-            if drive.misses >= self._settings.attempts:
-                raise GaveUp(f"{drive.stage} failed {drive.misses} times, last with {error!r}") from error
-        else:
-            drive.misses = 0
-            then(drive, result)
+        with reading(self._engine) as c:
+            row = captures.get(c, capture)
+        if row.state == "ready":
+            self._house.submit(_logged, uploads.remove, self._objects, capture)
+        elif row.state == "failed" and not captures.may_be_retried(row.problem):
+            self._leaving.append((time.monotonic() + DYING, kind, capture, ""))
 
-    def _prepared(self, drive: Drive, plan: dict[str, Any]) -> None:
-        drive.task = replace(drive.task, plan=plan)
-        drive.to_do.extend(range(plan["tiles"]))
-        drive.stage = KINDS[drive.kind].stage
-        with writing(self._engine) as c:
-            jobs.lay_down(c, drive.job, plan)
-            if drive.kind == "ingest":
-                found = {name: plan[name] for name in ("width", "height", "frames")}
-                captures.change(c, drive.task.capture, **found)
-            for line in plan.get("notes", ()):
-                jobs.note(c, drive.job, line)
-            jobs.enter(c, drive.job, drive.stage)
-
-    def _finished(self, drive: Drive, figures: dict[str, Any]) -> None:
-        with writing(self._engine) as c:
-            if not jobs.end(c, drive.job, "succeeded"):
-                return  # it was cancelled at the last moment, and is wound up next
-            if drive.kind == "ingest":
-                captures.change(c, drive.task.capture, state="ready")
+    def _wind_up(self, row: Row[Any]) -> None:
+        """Free what a cancelled job wrote, once nobody works on it."""
+        with self._writing() as c:
+            if row.kind == "recover":
+                mattes.forget(c, row.matte)
             else:
-                mattes.change(c, drive.task.matte, state="ready", figures=figures)
-        del self._drives[drive.job]
-        if drive.kind == "ingest":
-            uploads.remove(self._objects, drive.task.capture)
+                problem = problem_of(Conflict("the ingest was cancelled; upload the capture again"))
+                captures.change(c, row.capture, state="failed", problem=problem)
+        dying = DYING if row.started_at else 0
+        self._leaving.append((time.monotonic() + dying, row.kind, row.capture, row.matte or ""))
 
-    def _collect(self, drive: Drive) -> None:
-        """Write down the tiles that have ended since the last look, all in one transaction."""
-        ended = {future: tile for future, tile in drive.tiles.items() if future.done()}
-        if not ended:
-            return
-        errors: list[tuple[int, Exception]] = []
-        finished: list[tuple[int, float, int]] = []
-        for future, tile in ended.items():
-            del drive.tiles[future]
-            try:
-                finished.append((tile, *future.result(timeout=FETCH)))
-            except (TimeoutError, CancelledError):  # gone with its worker, or forgotten by the scheduler
-                drive.to_do.append(tile)
-            except Exception as failure:
-                errors.append((tile, failure))
-        with writing(self._engine) as c:
-            jobs.finish_tiles(c, drive.job, finished)
-            for tile, error in errors:
-                if jobs.miss_tile(c, drive.job, tile, repr(error), self._settings.attempts):
-                    drive.to_do.append(tile)
-        for tile, error in errors:
-            if isinstance(error, EnvmatteError):  # it would be the same the next time
-                raise error
-            if tile not in drive.to_do:
-                raise GaveUp(
-                    f"tile {tile} failed {self._settings.attempts} times, last with {error!r}"
-                ) from error
+    def _discard(self) -> None:
+        """Remove what ended jobs wrote, as soon as no worker works on them any more."""
+        now = time.monotonic()
+        while self._leaving and self._leaving[0][0] <= now:
+            _, kind, capture, matte = self._leaving.popleft()
+            self._house.submit(_logged, discard, self._objects, kind, capture, matte)
 
     def _submit(self) -> None:
-        """Fill the cluster from all jobs in turn, so that a small one is not kept waiting by a large one."""
-        free = DEPTH * self._threads - sum(len(drive.tiles) for drive in self._drives.values())
-        waiting = deque(drive for drive in self._drives.values() if drive.to_do)
-        while free > 0 and waiting:
-            drive = waiting.popleft()
-            tile = drive.to_do.popleft()
-            future = self._client.submit(run_tile, drive.kind, drive.task, tile, pure=False)
-            drive.tiles[future] = tile
-            free -= 1
-            if drive.to_do:
-                waiting.append(drive)
+        """Fill the cluster, the job that has the least of it first: a small one never waits for a large one to end."""
+        dispatcher = self._dispatcher
+        share = {job: dispatcher.under_way(job) for job, drive in self._drives.items() if drive.to_do}
+        dispatcher.want(sum(len(drive.to_do) + share.get(job, 0) for job, drive in self._drives.items()))
+        for _ in range(dispatcher.free):
+            if not share:
+                return
+            job = min(share, key=lambda job: (share[job], len(self._drives[job].to_do)))
+            drive = self._drives[job]
+            dispatcher.submit(drive.kind, drive.task, drive.to_do.popleft())
+            share[job] += 1
+            if not drive.to_do:
+                del share[job]
 
-    def _wind_up(self, drive: Drive) -> None:
-        """Let the running tasks of a job that has ended early end too, for they can't be stopped.
 
-        Only then is what they wrote removed, or they would go on to write it.
-        """
-        drive.to_do.clear()
-        if all(future.done() for future in drive.in_flight):
-            del self._drives[drive.job]
-            self._discard(drive.kind, drive.task.capture, drive.task.matte)
-
-    def _fail(self, drive: Drive, error: EnvmatteError) -> None:
-        logger.error("job %s failed", drive.job, exc_info=error)
-        problem = problem_of(error)
-        with writing(self._engine) as c:
-            jobs.end(c, drive.job, "failed", problem)
-            if drive.kind == "ingest":
-                captures.change(c, drive.task.capture, state="failed", problem=problem)
-            else:
-                mattes.change(c, drive.task.matte, state="failed")
-        if drive.kind == "recover" or captures.may_be_retried(problem):  # what is done is kept
-            self._client.cancel(drive.in_flight)
-            del self._drives[drive.job]
-
-    def _discard(self, kind: str, capture: str, matte: str) -> None:
-        """Remove what an ended job wrote: a matte whole, of a capture all but the row that says what was wrong."""
-        if kind == "recover":
-            with writing(self._engine) as c:
-                mattes.forget(c, matte)
-            self._objects.delete(mattes.path(matte))
-            return
-        with writing(self._engine) as c:
-            if captures.get(c, capture).state != "failed":
-                problem = problem_of(Conflict("the ingest was cancelled; upload the capture again"))
-                captures.change(c, capture, state="failed", problem=problem)
-        self._objects.delete(captures.path(capture))
-        uploads.remove(self._objects, capture)
-
-    def _reconcile(self) -> None:
-        """Remove what has no row in the ledger: what a killed process left."""
-        with self._engine.connect() as c:
-            rows = c.execute(select(database.captures)).all()
-            kept = [row for row in rows if row.state != "failed" or captures.may_be_retried(row.problem)]
-            under_way = {id: uploads.parts_of(c, id) for id in c.scalars(select(database.uploads.c.id))}
-            known = {
-                "captures": {row.id for row in kept},
-                "uploads": {row.id for row in kept if row.state != "ready"} | under_way.keys(),
-                "mattes": set(c.scalars(select(database.mattes.c.id))),
-            }
-        self._objects.sweep("uploads")
-        for folder, names in known.items():
-            for name in self._objects.names(folder):
-                if name not in names and name != "zarr.json":
-                    logger.info("removing %s/%s, which nothing refers to", folder, name)
-                    self._objects.delete(f"{folder}/{name}")
-        for upload, parts in under_way.items():
-            uploads.sweep(self._objects, upload, parts)
+def _logged(act: Callable[..., None], *arguments: Any) -> None:
+    """Do something in the background; what it could not do, the next sweep does."""
+    try:
+        act(*arguments)
+    except Exception:
+        logger.exception("housekeeping failed, and is tried again later")

@@ -2,24 +2,28 @@
 
 In the store, under ``captures/ID``, a zarr group: ``frames`` (frame, y, x, channel), the optional ``mask`` (y, x) and
 ``images/N`` (row, column, channel), the patterns that came as images; of a video also ``shares`` (share, column),
-which of its frames make up each frame of the stack. Its attributes hold the manifest. The archive that was uploaded
-lies where `storage.uploads` puts it until its frames are in the stack.
+which of its frames make up each frame of the stack. Its attributes hold the manifest, those of the group ``measured`` in
+it what was measured from the frames. The archive that was uploaded lies where `storage.uploads` puts it until its frames
+are in the stack.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Coroutine, Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
 import zarr
 from numpy.typing import NDArray
 from sqlalchemy import Connection, Row, delete, insert, select, update
+from zarr.storage import MemoryStore
 
 from storage.database import captures, find
 from storage.errors import Corrupt
 from storage.grid import block_edge
 from storage.objects import EVERY_CHUNK, Objects, together
 
+MEASURED = "measured"
 CHUNK = 1 << 20
 """Bytes of a chunk of the stack, about: small enough that a tile reads little more than its own."""
 
@@ -41,7 +45,7 @@ def create_stack(
     images: Sequence[NDArray[np.float32]],
     shares: NDArray[np.int64] | None = None,
 ) -> int:
-    """Make the empty stack of a capture, in place of an earlier one.
+    """Make the empty stack of a capture; a repeat writes the same, and touches nothing that was written since.
 
     Parameters
     ----------
@@ -74,13 +78,13 @@ def create_stack(
     edge = block_edge(height, width)
     while edge < max(height, width) and 2 * slab * edge * edge * pixel <= CHUNK:
         edge *= 2
-    group = zarr.create_group(objects.zarr, path=path(capture), overwrite=True, attributes=attributes)
+    layout = MemoryStore()
+    group = zarr.create_group(layout, attributes=attributes)
     group.create_array(
         "frames",
         shape=shape,
         dtype=dtype,
         chunks=(slab, min(edge, height), min(edge, width), channels),
-        config=EVERY_CHUNK,
         dimension_names=("frame", "y", "x", "channel"),
     )
     if mask is not None:
@@ -91,6 +95,7 @@ def create_stack(
         group.create_array(
             f"images/{n}", data=image, config=EVERY_CHUNK, dimension_names=("row", "column", "channel")
         )
+    objects.put_tree(path(capture), layout)
     return slab
 
 
@@ -106,7 +111,7 @@ class Stack:
     Attributes
     ----------
     attributes : dict
-        The manifest, as JSON.
+        The manifest and what was measured, as JSON.
     frames, height, width : int
     dtype : numpy.dtype
         Of the values: uint8 or uint16.
@@ -115,9 +120,9 @@ class Stack:
     def __init__(self, objects: Objects, capture: str) -> None:
         at = path(capture)
 
-        async def mask() -> zarr.Array[Any] | None:
+        async def if_there(found: Coroutine[Any, Any, Any]) -> Any:
             try:
-                return await objects.array(f"{at}/mask")
+                return await found
             except FileNotFoundError:
                 return None
 
@@ -125,12 +130,17 @@ class Stack:
         self._frames: zarr.Array[Any]
         self._mask: zarr.Array[Any] | None
         try:
-            self._group, self._frames, self._mask = together(
-                objects.group(at), objects.array(f"{at}/frames"), mask()
+            self._group, self._frames, self._mask, measured = together(
+                objects.group(at),
+                objects.array(f"{at}/frames"),
+                if_there(objects.array(f"{at}/mask")),
+                if_there(objects.group(f"{at}/{MEASURED}")),
             )
         except FileNotFoundError as error:
             raise Corrupt(f"capture {capture} is not in the store; upload it again") from error
-        self.attributes: dict[str, Any] = dict(self._group.attrs)
+        self._objects, self._path = objects, at
+        self._measured: dict[str, Any] = {} if measured is None else dict(measured.attrs)
+        self.attributes: dict[str, Any] = dict(self._group.attrs) | self._measured
         self.frames, self.height, self.width, self.channels = self._frames.shape
         self.dtype = self._frames.dtype
 
@@ -181,21 +191,23 @@ class Stack:
         """What the frames of a video go into, as given to `create_stack`."""
         return np.asarray(self._array("shares")[:], np.int64)
 
-    def check(self) -> None:
-        """See that every chunk is there, without reading them.
-
-        Raises
-        ------
-        Corrupt
-        """
-        missing = self._frames.nchunks - self._frames.nchunks_initialized
-        if missing:
-            raise Corrupt(f"{missing} of {self._frames.nchunks} chunks of the frame stack are missing")
+    def missing(self) -> list[int]:
+        """The slabs of which a chunk is not there, ascending; nothing is read."""
+        stored = self._objects.below(f"{self._path}/frames")
+        grid = [range(-(-size // chunk)) for size, chunk in zip(self._frames.shape, self._frames.chunks, strict=True)]
+        chunks = product(*grid)
+        return sorted(
+            {at[0] for at in chunks if f"{self._path}/frames/c/{'/'.join(map(str, at))}" not in stored}
+        )
 
     def annotate(self, **attributes: Any) -> None:
-        """Add to the manifest what was measured from the frames."""
-        self._group.update_attributes(attributes)
+        """Add to the attributes what was measured from the frames; `save` stores it."""
+        self._measured |= attributes
         self.attributes |= attributes
+
+    def save(self) -> None:
+        """Store what was measured, all at once: nobody ever reads half of it."""
+        together(self._objects.put_group(f"{self._path}/{MEASURED}", self._measured))
 
     def _array(self, name: str) -> zarr.Array[Any]:
         array = self._group[name]

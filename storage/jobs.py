@@ -2,25 +2,40 @@
 
 A job is ``queued``, ``running``, and then one of ``succeeded``, ``failed`` and ``cancelled``. Its work is cut into
 tiles (frames of a capture by slabs, pixels of a matte by rectangles), each ``queued``, ``done`` or ``failed``; a tile
-is done when what it writes is stored and its row here says so.
+is done when what it writes is stored and its row here says so. One that is done here, and then not to be found in the
+store, is ``missing`` until it is done again.
 """
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import Connection, Row, delete, insert, or_, select, update
+from sqlalchemy import Column, Connection, Row, bindparam, delete, func, insert, or_, select, update
 
-from storage.database import captures, coordinator, find, jobs, log, made, mattes, new_id, tiles
+from storage.database import captures, find, jobs, log, made, mattes, new_id, tiles, totals
 from storage.errors import Conflict
 
 ACTIVE = ("queued", "running")
+TO_DO = ("queued", "missing")
+PREPARE, FINISH = -2, -1
+"""The steps before and after a job's tiles: tiles too, of which nobody counts the pixels."""
 
 
 def add(
-    connection: Connection, kind: str, capture: str, options: dict[str, Any], matte: str | None = None
+    connection: Connection,
+    kind: str,
+    capture: str,
+    options: dict[str, Any],
+    matte: str | None = None,
+    trace: str | None = None,
 ) -> str:
-    """Queue a job; returns its id."""
+    """Queue a job; returns its id.
+
+    Parameters
+    ----------
+    trace : str, optional
+        The ``traceparent`` (W3C Trace Context) of the request that asks for it.
+    """
     job = new_id()
     row = {
         "id": job,
@@ -30,6 +45,7 @@ def add(
         "capture": capture,
         "matte": matte,
         "options": options,
+        "trace": trace,
         "created_at": time.time(),
     }
     connection.execute(insert(jobs).values(row))
@@ -61,13 +77,22 @@ def not_wound_up(connection: Connection) -> Sequence[Row[Any]]:
     return connection.execute(query).all()
 
 
+def begin(connection: Connection, job: str) -> None:
+    """Write down the two steps around a job's tiles, once: a repeat changes nothing."""
+    known = set(connection.scalars(select(tiles.c.tile).where(tiles.c.job == job, tiles.c.tile < 0)))
+    rows = [_tile(job, step) for step in (PREPARE, FINISH) if step not in known]
+    if rows:
+        connection.execute(insert(tiles), rows)
+
+
 def enter(connection: Connection, job: str, stage: str) -> None:
     """Put an active job into a stage; the first one starts it."""
     row = get(connection, job)
     if row.state not in ACTIVE:
         return
-    started = row.started_at or time.time()
-    values = {"state": "running", "stage": stage, "started_at": started}
+    now = time.time()
+    values = {"state": "running", "stage": stage, "started_at": row.started_at or now, "stage_at": now}
+    values |= {"moved_at": now, "paced_at": None}
     connection.execute(update(jobs).where(jobs.c.id == job).values(values))
     note(connection, job, stage)
 
@@ -76,45 +101,101 @@ def lay_down(connection: Connection, job: str, plan: dict[str, Any]) -> None:
     """Write down a job's plan and its tiles, once: a repeat changes nothing."""
     if get(connection, job).plan is not None:
         return
-    rows = [{"job": job, "tile": tile, "state": "queued", "attempts": 0} for tile in range(plan["tiles"])]
-    connection.execute(insert(tiles), rows)
+    connection.execute(insert(tiles), [_tile(job, tile) for tile in range(plan["tiles"])])
     connection.execute(update(jobs).where(jobs.c.id == job).values(plan=plan, total=plan["tiles"]))
+
+
+def _tile(job: str, tile: int) -> dict[str, Any]:
+    return {"job": job, "tile": tile, "state": "queued", "attempts": 0, "losses": 0}
 
 
 def to_do(connection: Connection, job: str) -> list[int]:
     """The tiles of a job that are still to do, ascending."""
-    query = select(tiles.c.tile).where(tiles.c.job == job, tiles.c.state == "queued").order_by(tiles.c.tile)
-    return list(connection.scalars(query))
+    query = select(tiles.c.tile).where(tiles.c.job == job, tiles.c.tile >= 0, tiles.c.state.in_(TO_DO))
+    return list(connection.scalars(query.order_by(tiles.c.tile)))
 
 
-def finish_tiles(connection: Connection, job: str, finished: Iterable[tuple[int, float, int]]) -> None:
+def finish(connection: Connection, job: str, finished: Sequence[tuple[int, float, int]]) -> None:
     """Write down finished tiles, each (tile, seconds, pixels); one that was done before counts once."""
-    done = pixels = 0
-    for tile, seconds, size in finished:
-        result = connection.execute(
-            update(tiles)
-            .where(tiles.c.job == job, tiles.c.tile == tile, tiles.c.state == "queued")
-            .values(state="done", seconds=seconds, attempts=tiles.c.attempts + 1)
-        )
-        done += result.rowcount
-        pixels += size * result.rowcount
-    connection.execute(
-        update(jobs).where(jobs.c.id == job).values(done=jobs.c.done + done, pixels=jobs.c.pixels + pixels)
+    query = select(tiles.c.tile, tiles.c.state).where(
+        tiles.c.job == job, tiles.c.tile.in_([tile for tile, _, _ in finished]), tiles.c.state.in_(TO_DO)
     )
+    states = {tile: state for tile, state in connection.execute(query)}
+    ended = {tile: (seconds, pixels) for tile, seconds, pixels in finished if tile in states}
+    if not ended:
+        return
+    connection.execute(
+        update(tiles)
+        .where(tiles.c.job == job, tiles.c.tile == bindparam("which"))
+        .values(state="done", seconds=bindparam("took"), attempts=tiles.c.attempts + 1),
+        [{"which": tile, "took": seconds} for tile, (seconds, _) in ended.items()],
+    )
+    new = [tile for tile in ended if tile >= 0 and states[tile] == "queued"]
+    pixels = sum(ended[tile][1] for tile in new)
+    connection.execute(
+        update(jobs)
+        .where(jobs.c.id == job)
+        .values(done=jobs.c.done + len(new), pixels=jobs.c.pixels + pixels, moved_at=time.time())
+    )
+    _count(connection, job, tiles=len(new), pixels=pixels, seconds=sum(took for took, _ in ended.values()))
 
 
-def miss_tile(connection: Connection, job: str, tile: int, reason: str, allowed: int) -> bool:
+def pace(connection: Connection, job: str, after: int) -> bool:
+    """Measure the pace of a job's tiles from here on; false, and nothing changed, until some are done."""
+    values = {"paced_at": time.time(), "paced_done": jobs.c.done}
+    result = connection.execute(update(jobs).where(jobs.c.id == job, jobs.c.done >= after).values(values))
+    return bool(result.rowcount)
+
+
+def miss(connection: Connection, job: str, tile: int, reason: str, allowed: int) -> bool:
     """Write down a failed attempt at a tile; true if it may be tried again, which one that is done need not be."""
-    here = (tiles.c.job == job, tiles.c.tile == tile, tiles.c.state == "queued")
-    if not connection.execute(update(tiles).where(*here).values(attempts=tiles.c.attempts + 1)).rowcount:
+    return _again(connection, job, tile, tiles.c.attempts, "attempt", reason, allowed)
+
+
+def lose(connection: Connection, job: str, tile: int, reason: str, allowed: int) -> bool:
+    """Write down that the worker of a tile died; true if it may be tried again, as `miss` says."""
+    return _again(connection, job, tile, tiles.c.losses, "loss", reason, allowed)
+
+
+def _again(
+    connection: Connection, job: str, tile: int, counter: Column[int], what: str, reason: str, allowed: int
+) -> bool:
+    here = (tiles.c.job == job, tiles.c.tile == tile, tiles.c.state.in_(TO_DO))
+    if not connection.execute(update(tiles).where(*here).values({counter: counter + 1})).rowcount:
         return False
-    attempts = connection.scalar(select(tiles.c.attempts).where(*here)) or 0
-    note(connection, job, f"tile {tile}, attempt {attempts} of {allowed}: {reason}")
-    if attempts < allowed:
+    count = connection.scalar(select(counter).where(*here)) or 0
+    note(connection, job, f"{name_of(tile)}, {what} {count} of {allowed}: {reason}")
+    _count(connection, job, **{"misses" if what == "attempt" else "losses": 1})
+    if count < allowed:
         return True
     connection.execute(update(tiles).where(*here).values(state="failed"))
-    connection.execute(update(jobs).where(jobs.c.id == job).values(failed=jobs.c.failed + 1))
+    if tile >= 0:
+        connection.execute(update(jobs).where(jobs.c.id == job).values(failed=jobs.c.failed + 1))
     return False
+
+
+def reopen(connection: Connection, job: str, missing: Sequence[int], allowed: int) -> list[int]:
+    """Queue tiles again that are done by the ledger, and are not in the store; returns those that may be."""
+    connection.execute(
+        update(tiles)
+        .where(tiles.c.job == job, tiles.c.tile.in_(missing), tiles.c.state == "done")
+        .values(state="missing")
+    )
+    return [tile for tile in missing if miss(connection, job, tile, "it is missing in the store", allowed)]
+
+
+def name_of(tile: int) -> str:
+    """What people call a tile, or a step around them."""
+    return {PREPARE: "preparing", FINISH: "finishing"}.get(tile, f"tile {tile}")
+
+
+def _count(connection: Connection, job: str, **more: float) -> None:
+    """Add to what was ever done by jobs of a kind."""
+    kind = get(connection, job).kind
+    values = {totals.c[name]: totals.c[name] + value for name, value in more.items()}
+    if not connection.execute(update(totals).where(totals.c.kind == kind).values(values)).rowcount:
+        none = {"tiles": 0, "misses": 0, "losses": 0, "pixels": 0, "seconds": 0.0}
+        connection.execute(insert(totals).values(kind=kind, **(none | more)))
 
 
 def end(connection: Connection, job: str, state: str, problem: dict[str, Any] | None = None) -> bool:
@@ -158,9 +239,13 @@ def retry(connection: Connection, job: str) -> None:
     if row.state != "failed":
         raise Conflict(f"job {job} is {row.state}; only a failed job can be tried again")
     connection.execute(
-        update(tiles).where(tiles.c.job == job, tiles.c.state != "done").values(state="queued", attempts=0)
+        update(tiles)
+        .where(tiles.c.job == job, tiles.c.state != "done")
+        .values(state="queued", attempts=0, losses=0)
     )
+    done = (tiles.c.job == job, tiles.c.tile >= 0, tiles.c.state == "done")
     values = {"state": "queued", "stage": "waiting", "failed": 0, "problem": None, "finished_at": None}
+    values["done"] = connection.scalar(select(func.count()).where(*done))
     connection.execute(update(jobs).where(jobs.c.id == job).values(values))
     note(connection, job, "queued again")
 
@@ -200,15 +285,3 @@ def made_by(connection: Connection, key: str, call: str) -> str | None:
 def remember(connection: Connection, key: str, call: str, made_id: str) -> None:
     """Write down what a call with an Idempotency-Key made."""
     connection.execute(insert(made).values(key=key, call=call, id=made_id))
-
-
-def beat(connection: Connection, workers: int, threads: int) -> None:
-    """Write down that the coordinator lives, and the cluster that it sees."""
-    values = {"beat_at": time.time(), "workers": workers, "threads": threads}
-    if not connection.execute(update(coordinator).values(values)).rowcount:
-        connection.execute(insert(coordinator).values(id=1, **values))
-
-
-def last_beat(connection: Connection) -> Row[Any] | None:
-    """The coordinator's last sign of life, if there ever was one."""
-    return connection.execute(select(coordinator)).one_or_none()

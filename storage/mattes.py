@@ -24,12 +24,14 @@ it and nothing else, so blocks can be written in any order, by anyone, and again
 
 import time
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
 import zarr
 from numpy.typing import NDArray
 from sqlalchemy import Connection, Row, delete, insert, update
+from zarr.storage import MemoryStore
 
 from storage.database import find, mattes
 from storage.errors import Corrupt
@@ -166,24 +168,24 @@ class Matte:
         """
         return np.asarray(self._frames[name][:])
 
-    def check(self) -> None:
-        """See that every block is there.
+    def missing(self) -> set[tuple[int, int]]:
+        """Rows and columns of the blocks of which something is not there; nothing is read."""
+        stored = self._objects.below(self._path)
 
-        Raises
-        ------
-        Corrupt
-        """
-        for name, array in self._frames.items():
-            if array.nchunks_initialized != array.nchunks:
-                raise Corrupt(f"{array.nchunks - array.nchunks_initialized} chunks of {name} are missing")
-        stored = self._objects.below(f"{self._path}/T")
-        for row in range(self.block_rows):
-            for column in range(self.block_columns):
-                arrays = [f"{self._path}/T/{row}.{column}/{name}" for name in ("cell", "weight")]
-                # A block whose rows are all empty has no chunk in either.
-                chunks = {f"{array}/c/0" in stored for array in arrays}
-                if len(chunks) == 2 or not all(f"{array}/zarr.json" in stored for array in arrays):
-                    raise self._corrupt(row, column)
+        def is_there(row: int, column: int) -> bool:
+            chunks = (
+                f"{self._path}/{name}/c/{row}/{column}" + "/0" * (array.ndim - 2) for name, array in self._frames.items()
+            )
+            rows = [f"{self._path}/T/{row}.{column}/{name}" for name in ("cell", "weight")]
+            # A block whose rows are all empty has no chunk in either.
+            return (
+                all(chunk in stored for chunk in chunks)
+                and all(f"{array}/zarr.json" in stored for array in rows)
+                and len({f"{array}/c/0" in stored for array in rows}) == 1
+            )
+
+        blocks = product(range(self.block_rows), range(self.block_columns))
+        return {block for block in blocks if not is_there(*block)}
 
     def _corrupt(self, row: int, column: int) -> Corrupt:
         return Corrupt(f"block {row}.{column} of the matte is missing or damaged; recover it again")
@@ -192,7 +194,7 @@ class Matte:
 def create(
     objects: Objects, matte: str, *, height: int, width: int, columns: int, rows: int, **attributes: Any
 ) -> Matte:
-    """Make an empty matte, in place of an earlier one.
+    """Make an empty matte; a repeat writes the same, and touches nothing that was written since.
 
     Parameters
     ----------
@@ -212,7 +214,8 @@ def create(
         "rows": rows,
         "block": edge,
     }
-    group = zarr.create_group(objects.zarr, path=path(matte), overwrite=True, attributes=layout | attributes)
+    made = MemoryStore()
+    group = zarr.create_group(made, attributes=layout | attributes)
     frame, chunk = (height, width), (min(edge, height), min(edge, width))
     dims = ("y", "x", "channel")
     for name in ("S", "rho"):
@@ -233,6 +236,7 @@ def create(
     for name, kind in (("error", "float32"), ("recovered", "bool"), ("shared", "bool")):
         group.create_array(name, shape=frame, chunks=chunk, dtype=kind, dimension_names=dims[:2])
     group.create_group("T")
+    objects.put_tree(path(matte), made)
     return Matte(objects, matte)
 
 

@@ -117,10 +117,10 @@ class Objects:
             raise FileNotFoundError(path)
         return self._array(path, document.to_bytes())
 
-    async def put_group(self, path: str) -> None:
-        """Make a zarr group without attributes at a path, for `together`; what is in it already stays."""
-        plain = {"zarr_format": 3, "node_type": "group"}
-        group = zarr.AsyncGroup.from_dict(StorePath(self.zarr, path), plain)
+    async def put_group(self, path: str, attributes: dict[str, Any] | None = None) -> None:
+        """Make a zarr group at a path, for `together`; what is in it already stays."""
+        document = {"zarr_format": 3, "node_type": "group", "attributes": attributes or {}}
+        group = zarr.AsyncGroup.from_dict(StorePath(self.zarr, path), document)
         await self._put_metadata(path, group)
 
     async def put_array(self, path: str, values: NDArray[Any]) -> None:
@@ -143,6 +143,18 @@ class Objects:
     async def _put_metadata(self, path: str, node: zarr.AsyncGroup | zarr.AsyncArray[Any]) -> None:
         for name, document in node.metadata.to_buffer_dict(default_buffer_prototype()).items():
             await self.zarr.set(f"{path}/{name}", document)
+
+    def put_tree(self, path: str, tree: MemoryStore) -> None:
+        """Write what zarr has laid out in memory below a path; what is there besides stays."""
+
+        async def copy() -> None:
+            prototype = default_buffer_prototype()
+            async for name in tree.list():
+                value = await tree.get(name, prototype)
+                assert value is not None
+                await self.zarr.set(f"{path}/{name}", value)
+
+        together(copy())
 
     @asynccontextmanager
     async def write(self, path: str) -> AsyncIterator[AsyncWritableFile]:

@@ -1,17 +1,19 @@
 """The steps of a job in order: prepare, its tiles in any order, finish.
 
-Each step is what a dask task runs. It is told ids and numbers, never arrays; it can be run again, by anyone, and
-writes the same bytes.
+Each step is what a dask task runs. It is told ids and numbers, never arrays; it can be run again, by anyone, at any time,
+and writes the same bytes: a worker that was thought dead may wake up and go on.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 from typing import Any
 
 from storage import captures, mattes
 from storage.captures import Stack
+from storage.jobs import FINISH, PREPARE
 from storage.objects import Objects
 from workflows import tiles
 from workflows.ingest import frames
@@ -20,6 +22,8 @@ from workflows.ingest.measure import measure
 from workflows.ingest.survey import survey
 from workflows.options import parse_options
 
+GOLDEN = 0.6180339887498949
+
 
 @dataclass(frozen=True)
 class Task:
@@ -27,6 +31,8 @@ class Task:
 
     Attributes
     ----------
+    job : str
+        Id of the job.
     store : str
         URL of the object store.
     capture : str
@@ -41,6 +47,7 @@ class Task:
         What `prepare` returned; empty before.
     """
 
+    job: str
     store: str
     capture: str
     matte: str
@@ -62,14 +69,21 @@ class Kind:
         has any, are lines for the job's log.
     work : callable
         Does a tile; returns its pixels.
+    missing : callable
+        Returns the tiles that are not in the store, once all are done.
     finish : callable
         Ends it; returns figures for the record.
+    scattered : bool
+        Whether its tiles are taken from all over the frame, so that the first of them tell how long the rest will take,
+        and not one after another, which is how a video is read.
     """
 
     stage: str
     prepare: Callable[[Task], dict[str, Any]]
     work: Callable[[Task, int], int]
+    missing: Callable[[Task], list[int]]
     finish: Callable[[Task], dict[str, Any]]
+    scattered: bool
 
 
 def _ingest_prepare(task: Task) -> dict[str, Any]:
@@ -80,10 +94,16 @@ def _ingest_work(task: Task, tile: int) -> int:
     return frames.read_slab(_objects(task.store), task.capture, task.limits, task.plan["slab"], tile)
 
 
+def _ingest_missing(task: Task) -> list[int]:
+    return Stack(_objects(task.store), task.capture).missing()
+
+
 def _ingest_finish(task: Task) -> dict[str, Any]:
     _objects(task.store).sweep(captures.path(task.capture))
-    measure(_objects(task.store), task.capture)
-    survey(_objects(task.store), task.capture)
+    stack = Stack(_objects(task.store), task.capture)
+    measure(stack)
+    survey(stack)
+    stack.save()
     return {}
 
 
@@ -113,36 +133,60 @@ def _recover_work(task: Task, tile: int) -> int:
     return tiles.recover_tile(_objects(task.store), task.capture, task.matte, options, tile)
 
 
+def _recover_missing(task: Task) -> list[int]:
+    matte = mattes.Matte(_objects(task.store), task.matte)
+    blocks = matte.missing()
+    return [
+        tile
+        for tile, (rows, columns) in enumerate(tiles.cut(matte, parse_options(task.options).tile or matte.block))
+        if not blocks.isdisjoint(product(rows, columns))
+    ]
+
+
 def _recover_finish(task: Task) -> dict[str, Any]:
     _objects(task.store).sweep(mattes.path(task.matte))
     matte = mattes.Matte(_objects(task.store), task.matte)
-    matte.check()
     return {
         name: matte.attributes[name] for name in ("width", "height", "monitor", "columns", "rows", "block")
     }
 
 
 KINDS = {
-    "ingest": Kind("reading", _ingest_prepare, _ingest_work, _ingest_finish),
-    "recover": Kind("recovering", _recover_prepare, _recover_work, _recover_finish),
+    "ingest": Kind("reading", _ingest_prepare, _ingest_work, _ingest_missing, _ingest_finish, False),
+    "recover": Kind("recovering", _recover_prepare, _recover_work, _recover_missing, _recover_finish, True),
 }
 
 
-def run_prepare(kind: str, task: Task) -> dict[str, Any]:
-    """The first step of a job; returns its plan."""
-    return KINDS[kind].prepare(task)
+def order(kind: str, todo: Sequence[int]) -> list[int]:
+    """The order in which the tiles of a job are best done."""
+    if not KINDS[kind].scattered:
+        return sorted(todo)
+    # Multiples of the golden ratio, modulo 1, fall evenly over the unit interval however many there are.
+    return sorted(todo, key=lambda tile: tile * GOLDEN % 1)
 
 
-def run_tile(kind: str, task: Task, tile: int) -> tuple[float, int]:
-    """One tile of a job; returns the seconds it took and its pixels."""
+def run(kind: str, task: Task, tile: int) -> tuple[float, Any]:
+    """A step of a job: one of its tiles, or `PREPARE` or `FINISH`.
+
+    Returns
+    -------
+    float
+        Seconds that it took.
+    int or dict
+        Of a tile, its pixels. Of `PREPARE`, the plan. Of `FINISH`, figures for the record; or, under ``missing``, the
+        tiles that are not in the store and must be done again first.
+    """
     start = time.perf_counter()
-    pixels = KINDS[kind].work(task, tile)
-    return time.perf_counter() - start, pixels
-
-
-def run_finish(kind: str, task: Task) -> dict[str, Any]:
-    """The last step of a job; returns figures for the record."""
-    return KINDS[kind].finish(task)
+    steps = KINDS[kind]
+    result: Any
+    if tile == PREPARE:
+        result = steps.prepare(task)
+    elif tile == FINISH:
+        missing = steps.missing(task)
+        result = {"missing": missing} if missing else steps.finish(task)
+    else:
+        result = steps.work(task, tile)
+    return time.perf_counter() - start, result
 
 
 @lru_cache(maxsize=1)

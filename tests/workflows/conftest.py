@@ -85,8 +85,10 @@ def ingest(objects: Objects, put: Callable[[str, bytes], None]) -> Ingest:
         plan = frames.prepare(objects, capture, limits)
         for index in order(range(plan["tiles"])):
             frames.read_slab(objects, capture, limits, plan["slab"], index)
-        measure(objects, capture)
-        survey(objects, capture)
+        stack = Stack(objects, capture)
+        measure(stack)
+        survey(stack)
+        stack.save()
         return Stack(objects, capture)
 
     return run

@@ -19,7 +19,8 @@ from tests.workflows.ingest.camera import Camera, capture, film, lights
 from workflows.composite import composite
 from workflows.images import decode, encode_png
 from workflows.ingest.bundle import Limits
-from workflows.jobs import Task, run_finish, run_prepare, run_tile
+from storage.jobs import FINISH, PREPARE
+from workflows.jobs import Task, run
 from workflows.scene import Scene, nested_program, write_capture
 from workflows.simulate import glass_ball
 from workflows.tiles import cut
@@ -66,7 +67,7 @@ def bundles(scene: Scene) -> dict[bool, bytes]:
 
 @pytest.fixture
 def recover(objects: Objects, ingest: Ingest) -> Callable[..., tuple[mattes.Matte, int]]:
-    def run(
+    def whole(
         data: bytes,
         tile: int | None = None,
         *,
@@ -76,15 +77,15 @@ def recover(objects: Objects, ingest: Ingest) -> Callable[..., tuple[mattes.Matt
     ) -> tuple[mattes.Matte, int]:
         ingest("c", data, memory=memory)
         options = {"method": method, "tile": tile}
-        task = Task(objects.url, "c", "m", options, Limits(1 << 30, memory), {})
-        plan = run_prepare("recover", task)
+        task = Task("j", objects.url, "c", "m", options, Limits(1 << 30, memory), {})
+        plan = run("recover", task, PREPARE)[1]
         tiles = list(order(range(plan["tiles"])))  # type: ignore[call-overload]
-        pixels = sum(run_tile("recover", task, index)[1] for index in tiles)
+        pixels = sum(run("recover", task, index)[1] for index in tiles)
         # of the monitor's pixels, or of the program's finest grid
-        assert run_finish("recover", task)["columns"] == {"lobes": 64, "nn-dgsr": 8}[method]
+        assert run("recover", task, FINISH)[1]["columns"] == {"lobes": 64, "nn-dgsr": 8}[method]
         return mattes.Matte(objects, "m"), pixels
 
-    return run
+    return whole
 
 
 @pytest.mark.parametrize("method", ["lobes", "nn-dgsr"])
@@ -204,12 +205,11 @@ def test_a_damaged_stack_is_corrupt(
     recover(bundles[False])
     chunk = next(path for path in (folder / "captures/c/frames/c").rglob("*") if path.is_file())
     chunk.unlink()
-    task = Task(objects.url, "c", "m", {}, Limits(1 << 30, 1 << 26), {})
-    plan = run_prepare("recover", task)
+    task = Task("j", objects.url, "c", "m", {}, Limits(1 << 30, 1 << 26), {})
+    plan = run("recover", task, PREPARE)[1]
     with pytest.raises(Corrupt, match="frames"):
-        sum(run_tile("recover", task, index)[1] for index in range(plan["tiles"]))
-    with pytest.raises(Corrupt):
-        run_finish("recover", task)
+        sum(run("recover", task, index)[1] for index in range(plan["tiles"]))
+    assert run("recover", task, FINISH)[1] == {"missing": list(range(plan["tiles"]))}
 
 
 def test_frames_that_are_moved_back_are_the_same_in_any_tile(
@@ -221,11 +221,12 @@ def test_frames_that_are_moved_back_are_the_same_in_any_tile(
         shifts=random.uniform(-2.5, 2.5, (stack.frames, 2)).tolist(),
         gains=random.uniform(0.9, 1.1, stack.frames).tolist(),
     )
+    stack.save()
     made = []
     for tile in (16, 32, 1024):
-        task = Task(objects.url, "c", "m", {"tile": tile}, Limits(1 << 30, 1 << 26), {})
-        for index in range(run_prepare("recover", task)["tiles"]):
-            run_tile("recover", task, index)
+        task = Task("j", objects.url, "c", "m", {"tile": tile}, Limits(1 << 30, 1 << 26), {})
+        for index in range(run("recover", task, PREPARE)[1]["tiles"]):
+            run("recover", task, index)
         made.append(digests("mattes/m"))
     assert made[0] == made[1] == made[2]
 
@@ -240,7 +241,7 @@ def test_what_the_store_lacks_is_corrupt(
 ) -> None:
     recover(bundles[False], tile=1024)
     with pytest.raises(Corrupt, match="none is not in the store"):
-        run_tile("recover", Task(objects.url, capture, matte, {}, Limits(1, 1), {}), 0)
+        run("recover", Task("j", objects.url, capture, matte, {}, Limits(1, 1), {}), 0)
 
 
 def bracketed(data: bytes, exposures: tuple[float, ...]) -> bytes:
@@ -271,10 +272,10 @@ def test_exposures_are_merged_by_what_they_say(objects: Objects, ingest: Ingest)
 
     def error(capture: str, data: bytes) -> float:
         ingest(capture, data)
-        task = Task(objects.url, capture, f"m-{capture}", {}, Limits(1 << 30, 1 << 26), {})
-        task = replace(task, plan=run_prepare("recover", task))
+        task = Task("j", objects.url, capture, f"m-{capture}", {}, Limits(1 << 30, 1 << 26), {})
+        task = replace(task, plan=run("recover", task, PREPARE)[1])
         for tile in range(task.plan["tiles"]):
-            run_tile("recover", task, tile)
+            run("recover", task, tile)
         got = composite(mattes.Matte(objects, task.matte), backdrop)[..., :3]
         return float(np.sqrt(np.mean((got - exact) ** 2)))
 

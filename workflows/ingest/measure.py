@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from storage.captures import Stack
-from storage.objects import Objects
 from workflows.light import exposures_of
 from workflows.program import Program
 from workflows.recovery.excess import estimate_excess
@@ -26,23 +25,16 @@ COMPRESSED_SAMPLES = 4096
 """Pixels, at most, from which the noise of a video is measured, in all of its frames."""
 
 
-def measure(objects: Objects, capture: str, gains: Sequence[float] | None = None) -> None:
+def measure(stack: Stack, gains: Sequence[float] | None = None) -> None:
     """Measure the noise, the crosstalk, and the curves that the capture calls unknown, from frames of constant levels.
 
     Parameters
     ----------
-    objects, capture
-        Where the stack is.
+    stack : Stack
+        It is annotated with what was found, and not saved.
     gains : sequence of float, optional
         Of the monitor's light in each frame; 1 if left out.
-
-    Raises
-    ------
-    Corrupt
-        If part of the stack is missing.
     """
-    stack = Stack(objects, capture)
-    stack.check()
     program = Program.model_validate(stack.attributes["program"])
     frames, sent, exposures = constant_frames(stack, program)
     codes = np.stack([_sample(stack, frame) for frame in frames], axis=1)

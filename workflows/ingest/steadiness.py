@@ -40,7 +40,7 @@ QUARTERS = 4
 
 
 def find_steadiness(stack: Stack) -> None:
-    """Find each frame's shift and gain, and write them into the stack's attributes.
+    """Find each frame's shift and gain, and annotate the stack with them.
 
     ``steadiness`` says what was found; it is None if too few pixels tell anything, and empty if the patterns don't
     explain what the frames show. Its ``drift`` and ``flicker`` are None where they are too large to be either.

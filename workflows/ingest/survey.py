@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.captures import Stack
-from storage.objects import Objects
 from workflows.ingest.measure import constant_frames, measure
 from workflows.ingest.steadiness import find_steadiness
 from workflows.light import look_up_of
@@ -23,16 +22,14 @@ BATCH = 32 << 20
 """Bytes of a window's frames that are read at once, about."""
 
 
-def survey(objects: Objects, capture: str) -> None:
-    """Measure what a report on a capture needs, and write it into the stack's attributes as ``survey``.
+def survey(stack: Stack) -> None:
+    """Measure what a report on a capture needs, and annotate the stack with it as ``survey``, which is not saved.
 
     How steady it was is found first, and the noise measured anew where frames flicker: that is none.
     """
-    stack = Stack(objects, capture)
     find_steadiness(stack)
     if stack.attributes["gains"] is not None:
-        measure(objects, capture, stack.attributes["gains"])
-        stack = Stack(objects, capture)
+        measure(stack, stack.attributes["gains"])
     attributes = stack.attributes
     program = Program.model_validate(attributes["program"])
     look_up = look_up_of(stack)

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+from storage.captures import Stack
 from storage.objects import Objects
 from workflows.ingest import frames
 from workflows.ingest.bundle import Limits
@@ -28,7 +29,7 @@ def _ingest(objects: Objects, capture: str, memory: int) -> int:
     plan = frames.prepare(objects, capture, limits)
     for index in range(plan["tiles"]):
         frames.read_slab(objects, capture, limits, plan["slab"], index)
-    measure(objects, capture)
+    measure(Stack(objects, capture))
     return int(plan["tiles"])
 
 

@@ -19,7 +19,8 @@ from workflows.images import encode_png
 from workflows.ingest.bundle import Limits
 from workflows.ingest.findings import Finding
 from workflows.ingest.report import report
-from workflows.jobs import Task, run_prepare, run_tile
+from storage.jobs import PREPARE
+from workflows.jobs import Task, run
 from workflows.presets import preset
 from workflows.program import Program
 from workflows.scene import Scene, nested_program, write_capture
@@ -81,10 +82,10 @@ def filmed(ball: Ball, shifts: NDArray[np.float64], gains: NDArray[np.float64]) 
 def decibels(objects: Objects, ball: Ball, shift: tuple[float, float]) -> float:
     """PSNR of a composite over the ball, where it lies by a shift."""
     scene, _, _, mask = ball
-    task = Task(objects.url, "c", "m", {}, Limits(1 << 30, 1 << 26), {})
-    task = replace(task, plan=run_prepare("recover", task))
+    task = Task("j", objects.url, "c", "m", {}, Limits(1 << 30, 1 << 26), {})
+    task = replace(task, plan=run("recover", task, PREPARE)[1])
     for tile in range(task.plan["tiles"]):
-        run_tile("recover", task, tile)
+        run("recover", task, tile)
     y, x = np.mgrid[:240, :320]
     checker = ((y // 24 + x // 24) % 2).astype(np.float32)
     backdrop = np.stack([checker, x.astype(np.float32) / 320, 1 - checker], axis=2)
@@ -103,6 +104,7 @@ def compared(
     middle = shifts[ball[1].measured].mean(axis=0)
     with_it = decibels(objects, ball, tuple(middle))
     stack.annotate(shifts=None, gains=None)
+    stack.save()
     return stack, found, with_it, decibels(objects, ball, tuple(middle))
 
 

@@ -1,0 +1,196 @@
+"""A job that is being driven: what of it is to be done, and what the ledger is told of what was."""
+
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from sqlalchemy import Connection, Row
+
+from services.api.errors import problem_of
+from services.dispatch import Outcome
+from storage import captures, jobs, mattes
+from storage.errors import EnvmatteError, GaveUp, Unavailable
+from storage.jobs import FINISH, PREPARE
+from workflows.ingest.bundle import Limits
+from workflows.jobs import KINDS, Task, order
+
+LOSSES = 8
+"""Workers that may die of a tile before its job fails: most die of something else, a machine that is turned off say."""
+
+
+@dataclass(frozen=True)
+class Next:
+    """How a job goes on, once what was written about it is committed.
+
+    Attributes
+    ----------
+    stage : str
+    to_do : sequence of int
+        Tiles to do besides those there are.
+    task : Task
+    ended : bool
+        Whether it does not go on.
+    """
+
+    stage: str
+    to_do: Sequence[int]
+    task: Task
+    ended: bool = False
+
+
+@dataclass
+class Drive:
+    """A job that is being driven.
+
+    Attributes
+    ----------
+    to_do : deque of int
+        Tiles that the cluster has not got, `PREPARE` and `FINISH` among them.
+    news : list of Outcome
+        What became of those it had, and is not written down yet.
+    settled_at : float
+        When something last was.
+    paced : int
+        Threads of the cluster for which the pace of its tiles is measured; 0 until there is a pace.
+    """
+
+    job: str
+    kind: str
+    stage: str
+    task: Task
+    to_do: deque[int]
+    news: list[Outcome] = field(default_factory=list)
+    settled_at: float = 0.0
+    paced: int = 0
+
+    @classmethod
+    def of(cls, row: Row[Any], tiles: Sequence[int], store: str, limits: Limits) -> "Drive":
+        """Take up a job where the ledger says that it stands: ``tiles`` are still to do."""
+        task = Task(
+            job=row.id,
+            store=store,
+            capture=row.capture,
+            matte=row.matte or "",
+            options=row.options,
+            limits=limits,
+            plan=row.plan or {},
+        )
+        if row.plan is None:
+            return cls(row.id, row.kind, "preparing", task, deque([PREPARE]))
+        if tiles:
+            return cls(row.id, row.kind, KINDS[row.kind].stage, task, deque(order(row.kind, tiles)))
+        return cls(row.id, row.kind, "finishing", task, deque([FINISH]))
+
+    def settle(self, connection: Connection, attempts: int, threads: int, under_way: int) -> Next:
+        """Write down the news of a job.
+
+        Parameters
+        ----------
+        attempts : int
+            How often a tile may fail.
+        threads : int
+            Of the cluster, now.
+        under_way : int
+            Tiles that the cluster still has.
+        """
+        again: list[int] = []
+        error: EnvmatteError | None = None
+        results = {outcome.tile: outcome.done for outcome in self.news if outcome.done is not None}
+        tiles = [(tile, seconds, pixels) for tile, (seconds, pixels) in results.items() if tile >= 0]
+        jobs.finish(connection, self.job, tiles)
+        if tiles and self.paced != threads:
+            # Not the first tiles: their workers load what the others find loaded.
+            self.paced = threads if jobs.pace(connection, self.job, after=threads) else 0
+        for outcome in self.news:
+            if outcome.done is not None:
+                continue
+            try:
+                if self._may_go_on(connection, outcome, attempts):
+                    again.append(outcome.tile)
+            except EnvmatteError as found:
+                error = error or found
+        if error is not None:
+            end_badly(connection, self.kind, self.task, error)
+            return Next(self.stage, (), self.task, ended=True)
+        if PREPARE in results:
+            return self._prepared(connection, results[PREPARE][1])
+        if FINISH in results:
+            return self._finished(connection, results[FINISH][1], attempts)
+        if self.stage == KINDS[self.kind].stage and not (again or self.to_do or under_way):
+            return self._enter(connection, "finishing", [FINISH])
+        return Next(self.stage, again, self.task)
+
+    def go_on(self, following: Next) -> None:
+        """Go on with a job as `settle` said; call it once that is committed."""
+        if following.stage != self.stage:
+            self.paced = 0
+        self.stage, self.task = following.stage, following.task
+        self.to_do.extend(following.to_do)
+        self.news.clear()
+        self.settled_at = time.monotonic()
+
+    def _may_go_on(self, connection: Connection, outcome: Outcome, attempts: int) -> bool:
+        """Whether a tile that came to nothing is to be done again.
+
+        Raises
+        ------
+        EnvmatteError
+            If the job can't go on without it.
+        """
+        tile, error, name = outcome.tile, outcome.error, jobs.name_of(outcome.tile)
+        if isinstance(error, EnvmatteError) and not isinstance(error, Unavailable):
+            raise error  # it would be the same the next time
+        if error is not None:
+            if jobs.miss(connection, self.job, tile, repr(error), attempts):
+                return True
+            raise GaveUp(f"{name} failed {attempts} times, last with {error!r}") from error
+        if outcome.died is not None:
+            if jobs.lose(connection, self.job, tile, f"its worker {outcome.died} died", LOSSES):
+                return True
+            raise GaveUp(
+                f"{name}: {LOSSES} workers that did it died, for want of memory perhaps: give workers more "
+                "(ENVMATTE_WORKER_MEMORY), or have them hold less (ENVMATTE_INGEST_MEMORY), and retry the job"
+            )
+        return True
+
+    def _enter(self, connection: Connection, stage: str, to_do: Sequence[int], task: Task | None = None) -> Next:
+        jobs.enter(connection, self.job, stage)
+        return Next(stage, to_do, task or self.task)
+
+    def _prepared(self, connection: Connection, plan: dict[str, Any]) -> Next:
+        jobs.lay_down(connection, self.job, plan)
+        if self.kind == "ingest":
+            found = {name: plan[name] for name in ("width", "height", "frames")}
+            captures.change(connection, self.task.capture, **found)
+        for line in plan.get("notes", ()):
+            jobs.note(connection, self.job, line)
+        tiles = order(self.kind, range(plan["tiles"]))
+        return self._enter(connection, KINDS[self.kind].stage, tiles, replace(self.task, plan=plan))
+
+    def _finished(self, connection: Connection, figures: dict[str, Any], attempts: int) -> Next:
+        if missing := figures.get("missing"):
+            again = jobs.reopen(connection, self.job, missing, attempts)
+            if len(again) == len(missing):
+                return self._enter(connection, KINDS[self.kind].stage, again)
+            error = GaveUp(f"{len(missing)} tiles that were done {attempts} times are missing in the store")
+            end_badly(connection, self.kind, self.task, error)
+        # Unless it was cancelled at the last moment, and is wound up next.
+        elif jobs.end(connection, self.job, "succeeded"):
+            if self.kind == "ingest":
+                captures.change(connection, self.task.capture, state="ready")
+            else:
+                mattes.change(connection, self.task.matte, state="ready", figures=figures)
+        return Next(self.stage, (), self.task, ended=True)
+
+
+def end_badly(connection: Connection, kind: str, task: Task, error: EnvmatteError) -> None:
+    """Write down that a job failed."""
+    problem = problem_of(error)
+    if not jobs.end(connection, task.job, "failed", problem):
+        return
+    if kind == "ingest":
+        captures.change(connection, task.capture, state="failed", problem=problem)
+    else:
+        mattes.change(connection, task.matte, state="failed")

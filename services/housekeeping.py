@@ -1,0 +1,51 @@
+"""What the coordinator removes from the store: what ended jobs wrote, and what nothing refers to."""
+
+import logging
+
+from sqlalchemy import Engine, select
+
+from storage import captures, database, mattes, uploads
+from storage.database import reading
+from storage.objects import Objects
+
+logger = logging.getLogger(__name__)
+
+KEPT = 3600.0
+"""Seconds for which what nothing refers to is left alone: someone may be about to write down that it is there."""
+
+
+def discard(objects: Objects, kind: str, capture: str, matte: str) -> None:
+    """Remove what an ended job wrote: a matte, or a capture and the archive it came in."""
+    if kind == "recover":
+        objects.delete(mattes.path(matte))
+    else:
+        objects.delete(captures.path(capture))
+        uploads.remove(objects, capture)
+
+
+def sweep(engine: Engine, objects: Objects, seconds: float = KEPT) -> None:
+    """Remove what has no row in the database: what killed processes left.
+
+    Parameters
+    ----------
+    seconds : float
+        For how long it must not have been written to. 0 is for whoever knows that nobody writes.
+    """
+    with reading(engine) as c:
+        rows = c.execute(select(database.captures)).all()
+        kept = [row for row in rows if row.state != "failed" or captures.may_be_retried(row.problem)]
+        under_way = {id: uploads.parts_of(c, id) for id in c.scalars(select(database.uploads.c.id))}
+        known = {
+            "captures": {row.id for row in kept},
+            "uploads": {row.id for row in kept if row.state != "ready"} | under_way.keys(),
+            "mattes": set(c.scalars(select(database.mattes.c.id))),
+        }
+    for folder, names in known.items():
+        for name in objects.stale(folder, seconds):
+            if name not in names and name != "zarr.json":
+                logger.info("removing %s/%s, which nothing refers to", folder, name)
+                objects.delete(f"{folder}/{name}")
+    if not seconds:
+        objects.sweep("uploads")
+        for upload, parts in under_way.items():
+            uploads.sweep(objects, upload, parts)

@@ -1,0 +1,39 @@
+"""What dask runs in every worker process at its start: `distributed` calls `dask_setup`.
+
+A task can't be stopped, and one that nobody wants any more (its job was cancelled, its coordinator died) may run on for
+long, and write what nobody will remove. So its process ends with it, and the nanny starts another.
+"""
+
+import logging
+import os
+import time
+
+from distributed import Worker
+from tornado.ioloop import PeriodicCallback
+
+# Importing the kernels takes seconds: not out of the first job's time.
+import workflows.jobs  # noqa: F401
+
+logger = logging.getLogger(__name__)
+
+LOOK = 0.2
+"""Seconds between two looks at what runs."""
+PATIENCE = 0.5
+"""Seconds that a task may run on after it was cancelled."""
+
+
+def dask_setup(worker: Worker) -> None:
+    """Watch for tasks that were cancelled while they run."""
+    since: dict[str, float] = {}
+
+    def look() -> None:
+        now = time.monotonic()
+        strays = {task.key for task in worker.state.executing if task.state == "cancelled"}
+        for key in since.keys() - strays:
+            del since[key]
+        for key in strays:
+            if now - since.setdefault(key, now) > PATIENCE:
+                logger.info("%s was cancelled and runs on: ending this process", key)
+                os._exit(1)
+
+    worker.periodic_callbacks["strays"] = PeriodicCallback(look, 1000 * LOOK)
