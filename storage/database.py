@@ -1,7 +1,6 @@
 """The database: its tables, and the engine that opens it."""
 
 import secrets
-import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -21,16 +20,13 @@ from sqlalchemy import (
     String,
     Table,
     Text,
-    create_engine,
-    event,
     select,
 )
-from sqlalchemy.exc import OperationalError
-from sqlalchemy.ext.compiler import compiles
-from sqlalchemy.sql.compiler import SQLCompiler
-from sqlalchemy.sql.functions import FunctionElement
+from sqlalchemy.exc import SQLAlchemyError
 
-from storage.errors import DISK_FULL, NoRoom, NotFound
+from storage import dialects, migrations
+from storage.dialects import clock as clock
+from storage.errors import NotFound, Unavailable
 
 metadata = MetaData()
 
@@ -181,36 +177,40 @@ made = Table(
 
 
 def open_engine(url: str) -> Engine:
-    """Open the database, and make the tables that are missing.
+    """Open a database, and bring its schema up to date; any number of processes may do so at once.
 
     Parameters
     ----------
     url : str
-        As SQLAlchemy takes it, e.g. ``sqlite:////folder/envmatte.db``.
+        As SQLAlchemy takes it: ``sqlite:////folder/envmatte.db`` or ``postgresql://user:password@host/database``.
+
+    Raises
+    ------
+    InvalidInput
+        If it is no such URL.
+    Conflict
+        If a newer envmatte has used the database.
+    Unavailable
+        If the database can't be reached.
+    NoRoom
+        If its disk is full.
     """
-    engine = create_engine(url)
-    if engine.dialect.name == "sqlite":
-        event.listen(engine, "connect", _on_connect)
-        event.listen(engine, "begin", _on_begin)
-    metadata.create_all(engine)
+    engine = dialects.create(url)
+    try:
+        with reading(engine) as connection:
+            current = migrations.revision(connection) == migrations.newest()
+        if not current:
+            with writing(engine) as connection:
+                migrations.upgrade(connection)
+    except BaseException as error:
+        engine.dispose()
+        if not isinstance(error, Unavailable):
+            raise
+        raise Unavailable(
+            f"the database {dialects.place(engine.url)} can't be opened: {dialects.reason(error.__cause__)}; see that "
+            "it runs and that its URL is right, and try again"
+        ) from error
     return engine
-
-
-class clock(FunctionElement[float]):
-    """The database's clock as an SQL expression: seconds since 1970, also within a transaction going on."""
-
-    type = Float()
-    inherit_cache = True
-
-
-@compiles(clock, "sqlite")
-def _clock_of_sqlite(element: clock, compiler: SQLCompiler, **options: object) -> str:
-    return "((julianday('now') - 2440587.5) * 86400.0)"
-
-
-@compiles(clock, "postgresql")
-def _clock_of_postgresql(element: clock, compiler: SQLCompiler, **options: object) -> str:
-    return "CAST(EXTRACT(EPOCH FROM clock_timestamp()) AS DOUBLE PRECISION)"
 
 
 def new_id() -> str:
@@ -265,33 +265,39 @@ def page(
 
 
 @contextmanager
+def reading(engine: Engine) -> Iterator[Connection]:
+    """A transaction that only reads: all of it sees the database as it was at one time.
+
+    Raises
+    ------
+    Unavailable
+        If the database can't be reached.
+    """
+    with _told(), engine.connect().execution_options(**dialects.READ_ONLY[engine.dialect.name]) as connection:
+        yield connection
+
+
+@contextmanager
 def writing(engine: Engine) -> Iterator[Connection]:
-    """A transaction that may write: committed at the end, rolled back by an exception.
+    """A transaction that may write, one at a time: committed at the end, rolled back by an exception.
 
     Raises
     ------
     NoRoom
         If the disk is full.
+    Unavailable
+        If the database can't be reached, or others write for too long. Whether it was committed is not known then.
     """
+    with _told(), engine.connect().execution_options(writes=True) as connection, connection.begin():
+        yield connection
+
+
+@contextmanager
+def _told() -> Iterator[None]:
     try:
-        with engine.connect().execution_options(writes=True) as connection, connection.begin():
-            yield connection
-    except OperationalError as error:
-        if getattr(error.orig, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL:
-            raise NoRoom(DISK_FULL) from error
-        raise
-
-
-def _on_connect(connection: object, record: object) -> None:
-    connection.isolation_level = None  # type: ignore[attr-defined]  # BEGIN is ours, see _on_begin
-    cursor = connection.cursor()  # type: ignore[attr-defined]
-    for pragma in ("journal_mode=WAL", "synchronous=NORMAL", "busy_timeout=10000", "foreign_keys=ON"):
-        cursor.execute(f"PRAGMA {pragma}")
-    cursor.close()
-
-
-def _on_begin(connection: Connection) -> None:
-    # A transaction that reads before it writes must hold the lock from the start, or SQLite refuses the
-    # write at once whenever another writer came in between, without waiting for busy_timeout.
-    immediate = connection.get_execution_options().get("writes", False)
-    connection.exec_driver_sql("BEGIN IMMEDIATE" if immediate else "BEGIN")
+        yield
+    except SQLAlchemyError as error:
+        told = dialects.meaning(error)
+        if told is None:
+            raise
+        raise told from error

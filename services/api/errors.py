@@ -21,6 +21,7 @@ from storage.errors import (
     NoRoom,
     NotFound,
     OptionError,
+    Unavailable,
 )
 
 MEDIA_TYPE = "application/problem+json"
@@ -70,9 +71,15 @@ PROBLEMS: dict[type[Exception], tuple[int, str, str]] = {
     NotFound: (HTTPStatus.NOT_FOUND, "not-found", "Not found"),
     Conflict: (HTTPStatus.CONFLICT, "conflict", "Not in this state"),
     NoRoom: (HTTPStatus.INSUFFICIENT_STORAGE, "no-room", "The store is full"),
+    Unavailable: (HTTPStatus.SERVICE_UNAVAILABLE, "unavailable", "Out of reach for now"),
     Corrupt: (HTTPStatus.INTERNAL_SERVER_ERROR, "corrupt", "Stored data is missing or damaged"),
     GaveUp: (HTTPStatus.INTERNAL_SERVER_ERROR, "gave-up", "The work failed again and again"),
     Exception: (HTTPStatus.INTERNAL_SERVER_ERROR, "internal", "Something went wrong here"),
+}
+
+HEADERS: dict[type[EnvmatteError], dict[str, str]] = {
+    Unauthorized: {"WWW-Authenticate": "Bearer"},
+    Unavailable: {"Retry-After": "2"},  # seconds
 }
 
 
@@ -106,8 +113,7 @@ def register(app: FastAPI) -> None:
 
     @app.exception_handler(EnvmatteError)
     async def _ours(request: Request, error: EnvmatteError) -> JSONResponse:
-        headers = {"WWW-Authenticate": "Bearer"} if isinstance(error, Unauthorized) else None
-        return answer(problem_of(error), headers)
+        return answer(problem_of(error), HEADERS.get(type(error)))
 
     @app.exception_handler(HTTPException)
     async def _framework(request: Request, error: HTTPException) -> JSONResponse:

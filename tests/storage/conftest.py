@@ -1,4 +1,4 @@
-"""A store in a folder and a SQLite database, both real, for the tests of storage."""
+"""A store in a folder and databases of both engines, all real, for the tests of storage."""
 
 import hashlib
 from collections.abc import Callable, Iterator
@@ -22,8 +22,21 @@ def objects(folder: Path) -> Objects:
 
 
 @pytest.fixture
-def engine(tmp_path: Path) -> Iterator[Engine]:
-    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
+def sqlite(tmp_path: Path) -> str:
+    """The URL of a SQLite database that is not there yet."""
+    return f"sqlite:///{tmp_path}/ledger.db"
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def url(request: pytest.FixtureRequest) -> str:
+    """The URL of a fresh database, of each engine in turn."""
+    url: str = request.getfixturevalue(request.param)
+    return url
+
+
+@pytest.fixture
+def engine(url: str) -> Iterator[Engine]:
+    engine = open_engine(url)
     yield engine
     engine.dispose()
 

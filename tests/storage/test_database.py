@@ -2,30 +2,59 @@
 
 import threading
 import time
-from pathlib import Path
 
 import pytest
-from sqlalchemy import Engine, inspect, select, text, update
+from sqlalchemy import Connection, Engine, select, text, update
 from sqlalchemy.exc import IntegrityError
 
 from storage import jobs
-from storage.database import clock, metadata, open_engine, writing
+from storage.database import clock, metadata, open_engine, reading, writing
+from storage.errors import InvalidInput
 
 
-def test_sqlite_is_set_up(engine: Engine) -> None:
-    with engine.connect() as connection:
+def test_sqlite_is_set_up(sqlite: str) -> None:
+    engine = open_engine(sqlite)
+    with reading(engine) as connection:
         assert connection.scalar(text("PRAGMA journal_mode")) == "wal"
         assert connection.scalar(text("PRAGMA foreign_keys")) == 1
         assert connection.scalar(text("PRAGMA busy_timeout")) == 10000
-    assert set(inspect(engine).get_table_names()) == set(metadata.tables)
+    engine.dispose()
 
 
-def test_what_was_written_is_there_when_opened_again(engine: Engine, tmp_path: Path) -> None:
+def test_postgresql_is_set_up(postgresql: str) -> None:
+    engine = open_engine(postgresql)
+    for opened, isolation, read_only in (
+        (reading, "repeatable read", "on"),
+        (writing, "read committed", "off"),
+    ):
+        with opened(engine) as connection:
+
+            def setting(name: str, connection: Connection = connection) -> str:
+                return str(connection.scalar(text(f"SHOW {name}")))
+
+            assert setting("transaction_isolation") == isolation
+            assert setting("transaction_read_only") == read_only
+            assert setting("lock_timeout") == "20s"
+            assert setting("idle_in_transaction_session_timeout") == "10s"
+            assert setting("statement_timeout") == "1min"
+    engine.dispose()
+
+
+@pytest.mark.parametrize(
+    "url", ["", "here", "mysql://user:secret@host/name", "postgresql://host:secret/name"]
+)
+def test_a_url_of_no_such_database_is_told_without_repeating_it(url: str) -> None:
+    with pytest.raises(InvalidInput, match="must be sqlite:") as caught:
+        open_engine(url)
+    assert "secret" not in str(caught.value)
+
+
+def test_what_was_written_is_there_when_opened_again(engine: Engine, url: str) -> None:
     with writing(engine) as connection:
         job = jobs.add(connection, "ingest", "c", {})
     engine.dispose()
-    again = open_engine(f"sqlite:///{tmp_path}/ledger.db")
-    with again.connect() as connection:
+    again = open_engine(url)
+    with reading(again) as connection:
         assert jobs.get(connection, job).state == "queued"
     again.dispose()
 
@@ -34,7 +63,7 @@ def test_an_exception_rolls_back(engine: Engine) -> None:
     with pytest.raises(ZeroDivisionError), writing(engine) as connection:  # noqa: PT012
         jobs.add(connection, "ingest", "c", {})
         raise ZeroDivisionError
-    with engine.connect() as connection:
+    with reading(engine) as connection:
         assert jobs.active(connection) == []
 
 
@@ -67,7 +96,7 @@ def test_writers_that_read_first_wait_for_each_other(engine: Engine) -> None:
     for thread in threads:
         thread.join()
     assert failed == []
-    with engine.connect() as connection:
+    with reading(engine) as connection:
         row = jobs.get(connection, job)
         assert (row.done, row.pixels) == (40, 400)
         assert jobs.to_do(connection, job) == []
@@ -77,10 +106,10 @@ def test_a_reader_does_not_wait_for_a_writer(engine: Engine) -> None:
     with writing(engine) as writer:
         job = jobs.add(writer, "ingest", "c", {})
         start = time.monotonic()
-        with engine.connect() as reader:
+        with reading(engine) as reader:
             assert jobs.active(reader) == []
         assert time.monotonic() - start < 5
-    with engine.connect() as reader:
+    with reading(engine) as reader:
         assert [row.id for row in jobs.active(reader)] == [job]
 
 

@@ -1,0 +1,162 @@
+"""What SQLite and PostgreSQL do differently: how they are opened, how a transaction begins, what their errors mean."""
+
+import logging
+import sqlite3
+from typing import Any
+
+from sqlalchemy import URL, Connection, Engine, Float, create_engine, event, make_url
+from sqlalchemy.exc import ArgumentError, DBAPIError, InterfaceError, OperationalError, SQLAlchemyError
+from sqlalchemy.exc import TimeoutError as NoConnectionFree
+from sqlalchemy.ext.compiler import compiles
+from sqlalchemy.sql.compiler import SQLCompiler
+from sqlalchemy.sql.functions import FunctionElement
+
+from storage.errors import DISK_FULL, EnvmatteError, InvalidInput, NoRoom, Unavailable
+
+logger = logging.getLogger(__name__)
+
+WRITERS = int.from_bytes(b"envmatte")
+"""The advisory lock of PostgreSQL that whoever writes holds."""
+
+LINK: dict[str, Any] = {
+    "connect_timeout": 10,
+    "keepalives_idle": 10,
+    "keepalives_interval": 5,
+    "keepalives_count": 2,
+    "tcp_user_timeout": 20_000,
+}
+"""libpq's settings: a link that is cut without a word is given up after some 20 s."""
+
+LIMITS = {
+    "lock_timeout": "20s",
+    "idle_in_transaction_session_timeout": "10s",  # of a process that is frozen while it has the writers' lock
+    "statement_timeout": "60s",
+}
+
+READ_ONLY: dict[str, dict[str, Any]] = {
+    "sqlite": {},
+    "postgresql": {"isolation_level": "REPEATABLE READ", "postgresql_readonly": True},
+}
+"""Options of a connection whose reads all see the database at one time, as SQLite's always do."""
+
+_SQLITE_AWAY = {
+    sqlite3.SQLITE_BUSY,
+    sqlite3.SQLITE_LOCKED,
+    sqlite3.SQLITE_CANTOPEN,
+    sqlite3.SQLITE_IOERR,
+    sqlite3.SQLITE_PROTOCOL,
+}
+# A session that was ended for being idle within a transaction; a server that was made another's standby.
+_POSTGRESQL_AWAY = {"25P03", "25006"}
+
+
+def create(url: str) -> Engine:
+    """An engine for a URL, set up for its database; nothing is connected yet.
+
+    Raises
+    ------
+    InvalidInput
+        If it is no URL of a SQLite or PostgreSQL database.
+    """
+    try:
+        parsed = make_url(url)
+        name = parsed.get_backend_name()
+    except (ArgumentError, ValueError):
+        name = ""
+    if name == "sqlite":
+        engine = create_engine(parsed)
+        event.listen(engine, "connect", _set_up_sqlite)
+    elif name == "postgresql":
+        engine = create_engine(
+            parsed.set(drivername="postgresql+psycopg"),
+            pool_pre_ping=True,
+            isolation_level="READ COMMITTED",
+            connect_args=LINK,
+        )
+        event.listen(engine, "connect", _set_up_postgresql)
+    else:  # what was given may hold a password: it is not repeated
+        raise InvalidInput(
+            "the database's URL must be sqlite:////folder/file.db or postgresql://user:password@host:port/database"
+        )
+    event.listen(engine, "begin", _begin)
+    return engine
+
+
+def _set_up_sqlite(connection: Any, record: object) -> None:
+    connection.isolation_level = None  # BEGIN is ours, see _begin
+    cursor = connection.cursor()
+    for pragma in ("busy_timeout=10000", "journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON"):
+        cursor.execute(f"PRAGMA {pragma}")
+    cursor.close()
+
+
+def _set_up_postgresql(connection: Any, record: object) -> None:
+    with connection.cursor() as cursor:
+        cursor.execute("; ".join(f"SET {name} = '{value}'" for name, value in LIMITS.items()))
+    connection.commit()
+
+
+def _begin(connection: Connection) -> None:
+    # A transaction that reads before it writes must hold the lock from the start: SQLite refuses the write at
+    # once whenever another writer came in between, without waiting for busy_timeout, and PostgreSQL overwrites.
+    writes = connection.get_execution_options().get("writes", False)
+    if connection.dialect.name == "sqlite":
+        connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+    elif writes:
+        connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({WRITERS})")
+
+
+def meaning(error: SQLAlchemyError) -> EnvmatteError | None:
+    """What a database's error is to a caller: no room, out of reach for now, or None if it is a fault of ours."""
+    if isinstance(error, NoConnectionFree):
+        return Unavailable(
+            "more is asked of the database at once than it is set up for; try again in a few seconds"
+        )
+    if not isinstance(error, DBAPIError):
+        return None
+    full = away = False
+    if isinstance(error.orig, sqlite3.Error):
+        code = getattr(error.orig, "sqlite_errorcode", 0) & 0xFF  # the rest says more about the same
+        full, away = code == sqlite3.SQLITE_FULL, code in _SQLITE_AWAY
+    else:
+        state = getattr(error.orig, "sqlstate", None)
+        full = state == "53100"
+        away = (
+            isinstance(error, (OperationalError, InterfaceError))
+            or error.connection_invalidated
+            or state in _POSTGRESQL_AWAY
+        )
+    if full:
+        return NoRoom(DISK_FULL)
+    if away:
+        logger.warning("the database can't be reached: %s", reason(error))
+        return Unavailable("the database can't be reached or is busy for now; try again in a few seconds")
+    return None
+
+
+def reason(error: BaseException | None) -> str:
+    """The first line of what the driver says, which holds no password."""
+    said = str(error.orig if isinstance(error, DBAPIError) else error)
+    return said.partition("\n")[0]
+
+
+def place(url: URL) -> str:
+    """A URL as it may be shown: without its password, nor options, that may hold one."""
+    return url.set(query={}).render_as_string(hide_password=True)
+
+
+class clock(FunctionElement[float]):
+    """The database's clock as an SQL expression: seconds since 1970, which go on within a transaction."""
+
+    type = Float()
+    inherit_cache = True
+
+
+@compiles(clock, "sqlite")
+def _clock_of_sqlite(element: clock, compiler: SQLCompiler, **options: object) -> str:
+    return "((julianday('now') - 2440587.5) * 86400.0)"
+
+
+@compiles(clock, "postgresql")
+def _clock_of_postgresql(element: clock, compiler: SQLCompiler, **options: object) -> str:
+    return "CAST(EXTRACT(EPOCH FROM clock_timestamp()) AS DOUBLE PRECISION)"

