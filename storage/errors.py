@@ -10,6 +10,7 @@
     ├── NotFound                no such capture, job, matte or frame
     ├── Conflict                it exists, but not in a state that allows this
     ├── NoRoom                  the store has no space for it
+    ├── Unavailable             something the service needs can't be reached for now
     ├── Corrupt                 something stored is missing or damaged
     └── GaveUp                  work that failed as often as it may
 
@@ -73,6 +74,10 @@ class Conflict(EnvmatteError):
 
 class NoRoom(EnvmatteError):
     """The store has no space for it."""
+
+
+class Unavailable(EnvmatteError):
+    """Something the service needs can't be reached for now: try again."""
 
 
 class Corrupt(EnvmatteError):

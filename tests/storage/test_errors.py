@@ -15,6 +15,7 @@ from storage import errors
         errors.OptionError,
         errors.NotFound,
         errors.Conflict,
+        errors.Unavailable,
         errors.Corrupt,
     ],
 )
