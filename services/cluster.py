@@ -1,12 +1,17 @@
 """The dask cluster that does the work: processes of this machine, or a scheduler somewhere else."""
 
+import asyncio
+import threading
 from collections.abc import Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 import dask
 from distributed import Client, LocalCluster
 from distributed.security import Security
+from tornado.ioloop import IOLoop
 
 from services.settings import Settings
 from storage.errors import Unavailable
@@ -84,12 +89,25 @@ def connect(address: str, security: Security | None) -> Client:
         If no scheduler answers within some seconds, or not to these certificates.
     """
     try:
-        return Client(address, security=security, timeout=PATIENCE, set_as_default=False)
+        return Client(address, security=security, timeout=PATIENCE, set_as_default=False, loop=_loop())
     except OSError as error:  # a time-out too
         raise Unavailable(
             f"no scheduler answers at {address}: see that `envmatte scheduler` runs there, can be reached from here "
             "and has the same certificates"
         ) from error
+
+
+@cache
+def _loop() -> IOLoop:
+    """The loop of all clients, in a thread: a client that nobody answered would leave one of its own running."""
+    running: Future[IOLoop] = Future()
+
+    async def run() -> None:
+        running.set_result(IOLoop.current())
+        await asyncio.Event().wait()
+
+    threading.Thread(target=asyncio.run, args=(run(),), name="clients", daemon=True).start()
+    return running.result()
 
 
 @contextmanager
