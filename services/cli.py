@@ -51,8 +51,12 @@ def main() -> None:
 @click.option("--host", help="Address to listen on.")
 @click.option("--port", type=int, help="Port to listen on; 0 takes a free one.")
 @click.option("--workers", type=int, help="Worker processes.")
+@click.option("--cluster", help="Scheduler of a cluster to use instead: tls://HOST:PORT.")
+@click.option("--certs", type=click.Path(path_type=Path), help="Folder of that cluster's certificates.")
+@click.option("--database", help="Database to use: postgresql://USER:PASSWORD@HOST/NAME.")
+@click.option("--store", help="Store to use: s3://BUCKET/PREFIX or file:///FOLDER.")
 def serve(**given: Any) -> None:
-    """Run the service: API, database, store and a cluster of this machine.
+    """Run the service: API, database, store and a cluster of this machine, unless others are named.
 
     Every setting is an environment variable ENVMATTE_… too, and a line in .env; an option here wins.
     """

@@ -1,36 +1,132 @@
-"""The dask cluster that does the work: processes of this machine."""
+"""The dask cluster that does the work: processes of this machine, or a scheduler somewhere else."""
 
+import asyncio
+import threading
 from collections.abc import Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager
+from functools import cache
+from typing import Any
 
+import dask
 from distributed import Client, LocalCluster
+from distributed.security import Security
+from tornado.ioloop import IOLoop
 
 from services.settings import Settings
+from storage.errors import Unavailable
+
+PATIENCE = 5
+"""Seconds that a scheduler may take to answer a new client."""
+START = 60
+"""Seconds that a worker may take to start on a busy machine."""
+PRELOAD = "workflows.jobs"
+"""What a worker imports before it takes work: importing the kernels takes seconds."""
+
+CONFIG: dict[str, Any] = {
+    # A tile of an innocent job must not be blamed for the workers that died with it: the ledger counts its misses.
+    "distributed.scheduler.allowed-failures": 0,
+    # A worker whose machine is gone without a word has gone after this long, and its tiles are given to others.
+    "distributed.scheduler.worker-ttl": "30 s",
+    # Results are numbers: there is nothing to spill. A worker that is short of memory is no better off for a pause,
+    # in which it would hold the tiles it was given for ever; it is ended and started again.
+    "distributed.worker.memory.target": False,
+    "distributed.worker.memory.spill": False,
+    "distributed.worker.memory.pause": False,
+    "distributed.worker.memory.terminate": 0.95,
+    "distributed.comm.timeouts.connect": "10 s",
+    "distributed.comm.timeouts.tcp": "15 s",
+    # Every scheduler and worker has an HTTP server, which can't be left out and knows no TLS: it serves nothing, and
+    # listens on loopback alone, see `NO_DASHBOARD`.
+    "distributed.scheduler.http.routes": [],
+    "distributed.worker.http.routes": [],
+}
+NO_DASHBOARD: dict[str, Any] = {"dashboard": False, "dashboard_address": "127.0.0.1:0"}
+"""For whoever starts a scheduler or a worker."""
+
+dask.config.set(
+    CONFIG
+)  # here, and so before any of them is made in whatever process; nannies hand it on to workers
+
+
+@contextmanager
+def embedded(settings: Settings) -> Iterator[LocalCluster]:
+    """Start a scheduler and worker processes on loopback, and end them at the end."""
+    with LocalCluster(
+        n_workers=settings.workers,
+        threads_per_worker=1,
+        processes=True,
+        host="127.0.0.1",
+        dashboard_address=None,
+        scheduler_kwargs=NO_DASHBOARD,
+        local_directory=str(settings.data.resolve() / "scratch"),
+        memory_limit=settings.worker_memory,
+        silence_logs=30,
+        death_timeout=f"{START} s",
+        preload=PRELOAD,
+    ) as cluster:
+        yield cluster
+
+
+def connect(address: str, security: Security | None) -> Client:
+    """A client of a scheduler that runs.
+
+    Parameters
+    ----------
+    address : str
+        ``tls://HOST:PORT``, or ``tcp://HOST:PORT`` without TLS.
+    security : distributed.security.Security or None
+        As `services.certs.security_of` makes it, for TLS.
+
+    Returns
+    -------
+    distributed.Client
+        Synchronous; may be used from any thread.
+
+    Raises
+    ------
+    Unavailable
+        If no scheduler answers within some seconds, or not to these certificates.
+    """
+    try:
+        return Client(address, security=security, timeout=PATIENCE, set_as_default=False, loop=_loop())
+    except OSError as error:  # a time-out too
+        raise Unavailable(
+            f"no scheduler answers at {address}: see that `envmatte scheduler` runs there, can be reached from here "
+            "and has the same certificates"
+        ) from error
+
+
+@cache
+def _loop() -> IOLoop:
+    """The loop of all clients, in a thread: a client that nobody answered would leave one of its own running."""
+    running: Future[IOLoop] = Future()
+
+    async def run() -> None:
+        running.set_result(IOLoop.current())
+        await asyncio.Event().wait()
+
+    threading.Thread(target=asyncio.run, args=(run(),), name="clients", daemon=True).start()
+    return running.result()
 
 
 @contextmanager
 def open_cluster(settings: Settings) -> Iterator[Client]:
-    """Start worker processes on loopback, and end them at the end.
+    """A client of the cluster that the settings name, or of one that is started here.
 
     Yields
     ------
     distributed.Client
         Synchronous; may be used from any thread.
+
+    Raises
+    ------
+    Unavailable
+        If the cluster that the settings name does not answer.
     """
-    scratch = settings.data.resolve() / "scratch"
-    with (
-        LocalCluster(
-            n_workers=settings.workers,
-            threads_per_worker=1,
-            processes=True,
-            host="127.0.0.1",
-            dashboard_address=None,
-            local_directory=str(scratch),
-            silence_logs=30,
-            death_timeout="60s",  # what a worker may take to start on a busy machine
-            # Importing the kernels takes seconds: not out of the first job's time.
-            preload="workflows.jobs",
-        ) as cluster,
-        Client(cluster) as client,
-    ):
-        yield client
+    if settings.cluster:
+        with connect(settings.cluster, settings.security()) as client:
+            yield client
+    else:
+        with embedded(settings) as cluster, Client(cluster) as client:
+            yield client

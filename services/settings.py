@@ -4,28 +4,109 @@ import ipaddress
 import os
 from pathlib import Path
 from typing import Annotated
+from urllib.parse import urlsplit
 
+from distributed.security import Security
+from distributed.system import MEMORY_LIMIT
 from pydantic import Field, field_validator, model_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+from sqlalchemy import make_url
+from sqlalchemy.exc import ArgumentError
 
+from services.certs import security_of
+from storage.errors import InvalidInput
 from workflows.ingest.bundle import Limits
 
 
-class Settings(BaseSettings):
-    """Every setting is an environment variable ``ENVMATTE_…`` too, and a line in ``.env``."""
+class ClusterSettings(BaseSettings):
+    """What every process of a cluster is told; each an environment variable ``ENVMATTE_…`` and a line in ``.env``."""
 
     model_config = SettingsConfigDict(env_prefix="ENVMATTE_", env_file=".env", extra="ignore", frozen=True)
 
     data: Path = Field(Path("envmatte-data"), description="Folder of the database and of everything stored.")
-    host: str = Field("127.0.0.1", description="Address to listen on. Other than loopback only with keys.")
-    port: int = Field(8000, ge=0, le=65535, description="Port to listen on; 0 takes a free one.")
-    keys: Annotated[tuple[str, ...], NoDecode] = Field(
-        (), description="API keys, separated by commas. With none the service is open, and on loopback alone."
+    cluster: str | None = Field(
+        None,
+        description="Address of a dask scheduler, tls://HOST:PORT, or tcp://127.0.0.1:PORT on one machine. "
+        "Without one the service has a cluster of its own.",
+    )
+    certs: Path | None = Field(
+        None,
+        description="Folder that `envmatte certs` made, for a cluster. Default: certs in the data folder, if there.",
     )
     workers: int = Field(
         default_factory=lambda: os.cpu_count() or 1,
         ge=1,
-        description="Worker processes of the embedded cluster, one thread each. Default: one a core.",
+        description="Worker processes on this machine, one thread each. Default: one a core.",
+    )
+    worker_memory: int = Field(
+        default_factory=lambda settings: MEMORY_LIMIT // settings["workers"],
+        ge=0,
+        description="Bytes that a worker process may take before it is ended and started again; 0 sets no limit. "
+        "Default: the machine's memory, shared out among the workers.",
+    )
+
+    @model_validator(mode="after")
+    def _trusted(self) -> "ClusterSettings":
+        """No address without TLS but on loopback, and none with TLS but with certificates."""
+        if self.cluster is None:
+            return self
+        url = urlsplit(self.cluster)
+        if url.scheme not in ("tcp", "tls") or not url.hostname or not _port(url.netloc):
+            raise ValueError(f"cluster {self.cluster!r}: give it as tls://HOST:PORT, or tcp://127.0.0.1:PORT")
+        if url.scheme == "tcp" and not is_loopback(url.hostname):
+            raise ValueError(
+                f"cluster {self.cluster}: without TLS only on loopback, for whoever reaches it may run what he likes: "
+                "make certificates with `envmatte certs DIR`, give every process of the cluster a copy with --certs, "
+                f"and name it tls://{url.netloc}"
+            )
+        if url.scheme == "tls":
+            try:
+                self.security()
+            except InvalidInput as error:
+                raise ValueError(error.detail) from error
+        return self
+
+    @property
+    def certificates(self) -> Path | None:
+        """The folder of the certificates, or None if there is none."""
+        made = self.data / "certs"
+        return self.certs or (made if made.is_dir() else None)
+
+    def security(self) -> Security | None:
+        """What this process needs to talk to the cluster; None for one without TLS.
+
+        Raises
+        ------
+        InvalidInput
+            If the certificates can't be used.
+        """
+        if self.cluster is None or not self.cluster.startswith("tls://"):
+            return None
+        if self.certificates is None:
+            raise InvalidInput(
+                f"cluster {self.cluster} speaks TLS, and there are no certificates: name the folder that "
+                "`envmatte certs` made for it with --certs"
+            )
+        return security_of(self.certificates)
+
+
+class Settings(ClusterSettings):
+    """All of them."""
+
+    database: str | None = Field(
+        None,
+        description="URL of the database, postgresql://USER:PASSWORD@HOST/NAME or sqlite:////FILE. "
+        "Default: a file in the data folder.",
+    )
+    store: str | None = Field(
+        None,
+        description="URL of the object store, s3://BUCKET/PREFIX or file:///FOLDER. Default: in the data folder.",
+    )
+    coordinate: bool = Field(True, description="Whether this process drives jobs, and not the API alone.")
+    host: str = Field("127.0.0.1", description="Address to listen on. Other than loopback only with keys.")
+    port: int = Field(8000, ge=0, le=65535, description="Port to listen on; 0 takes a free one.")
+    keys: Annotated[tuple[str, ...], NoDecode] = Field(
+        (), description="API keys, separated by commas. With none the service is open, and on loopback alone."
     )
     upload_bytes: int = Field(8 << 30, ge=1, description="Bytes of the largest archive that is taken.")
     upload_seconds: int = Field(
@@ -50,24 +131,54 @@ class Settings(BaseSettings):
             return tuple(key.strip() for key in value.split(",") if key.strip())
         return value
 
+    @field_validator("database")
+    @classmethod
+    def _database_known(cls, value: str | None) -> str | None:
+        try:
+            known = value is None or make_url(value).get_backend_name() in ("sqlite", "postgresql")
+        except ArgumentError:
+            known = False
+        if not known:  # without showing the URL, which may hold a password
+            raise ValueError("give it as postgresql://USER:PASSWORD@HOST/NAME or sqlite:////FILE")
+        return value
+
+    @field_validator("store")
+    @classmethod
+    def _store_known(cls, value: str | None) -> str | None:
+        url = urlsplit(value or "file:///")
+        if not (url.scheme == "file" and not url.netloc and url.path) and not (
+            url.scheme == "s3" and url.netloc
+        ):
+            raise ValueError(f"{value!r}: give it as s3://BUCKET/PREFIX or file:///FOLDER")
+        return value
+
     @model_validator(mode="after")
     def _no_open_door(self) -> "Settings":
-        if not self.keys and not _is_loopback(self.host):
+        if not self.keys and not is_loopback(self.host):
             raise ValueError(
                 f"asked to listen on {self.host} without a key, where anyone on the network could use the service: "
                 "set ENVMATTE_KEYS to one or more keys, separated by commas, or listen on 127.0.0.1"
             )
         return self
 
+    @model_validator(mode="after")
+    def _store_shared(self) -> "Settings":
+        if self.cluster and self.store is None and not is_loopback(str(urlsplit(self.cluster).hostname)):
+            raise ValueError(
+                f"the workers of {self.cluster} can't reach a folder of this machine: name the store that they share "
+                "with it, s3://BUCKET/PREFIX or file:///FOLDER, with --store"
+            )
+        return self
+
     @property
     def database_url(self) -> str:
         """Where the ledger is, as SQLAlchemy takes it."""
-        return f"sqlite:///{self.data.resolve() / 'envmatte.db'}"
+        return self.database or f"sqlite:///{self.data.resolve() / 'envmatte.db'}"
 
     @property
     def store_url(self) -> str:
         """Where captures and mattes are, as `storage.objects.Objects` takes it."""
-        return (self.data.resolve() / "store").as_uri()
+        return self.store or (self.data.resolve() / "store").as_uri()
 
     @property
     def limits(self) -> Limits:
@@ -75,8 +186,17 @@ class Settings(BaseSettings):
         return Limits(unpacked=self.unpacked_bytes, memory=self.ingest_memory)
 
 
-def _is_loopback(host: str) -> bool:
+def is_loopback(host: str) -> bool:
+    """Whether an address or a name is this machine's own."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
+
+
+def _port(netloc: str) -> bool:
+    """Whether a host comes with a port."""
+    try:
+        return bool(urlsplit(f"//{netloc}").port)
+    except ValueError:
+        return False

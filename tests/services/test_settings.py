@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from services.settings import Settings
+from services import certs
+from services.settings import ClusterSettings, Settings
 
 
 @pytest.fixture(autouse=True)
@@ -46,3 +47,91 @@ def test_loopback_needs_no_key(host: str) -> None:
 def test_what_is_out_of_range_is_refused(wrong: dict[str, int]) -> None:
     with pytest.raises(ValidationError, match=next(iter(wrong))):
         Settings(**wrong)
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("certs") / "certs"
+    certs.make(folder)
+    return folder
+
+
+def test_a_laptop_needs_nothing(tmp_path: Path) -> None:
+    settings = Settings(data=tmp_path)
+    assert settings.cluster is None
+    assert settings.coordinate
+    assert settings.database_url == f"sqlite:///{tmp_path}/envmatte.db"
+    assert settings.store_url == f"file://{tmp_path}/store"
+    assert settings.security() is None
+    assert settings.worker_memory * settings.workers > 0
+
+
+def test_a_cluster_is_named_with_its_database_and_store(certificates: Path) -> None:
+    database, store = "postgresql://me:secret@db/envmatte", "s3://bucket/some/prefix"
+    cluster = "tls://scheduler.example.org:8786"
+    settings = Settings(cluster=cluster, certs=certificates, database=database, store=store)
+    assert (settings.database_url, settings.store_url) == (database, store)
+    security = settings.security()
+    assert security is not None
+    assert security.require_encryption
+
+
+def test_certificates_are_looked_for_in_the_data_folder(certificates: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValidationError, match="--certs"):
+        ClusterSettings(data=tmp_path, cluster="tls://192.0.2.1:8786")
+    (tmp_path / "certs").symlink_to(certificates)
+    found = ClusterSettings(data=tmp_path, cluster="tls://192.0.2.1:8786")
+    assert found.certificates == tmp_path / "certs"
+    assert ClusterSettings(data=tmp_path, cluster="tcp://127.0.0.1:8786").security() is None
+
+
+@pytest.mark.parametrize("address", ["tcp://192.0.2.1:8786", "tcp://scheduler:8786", "tcp://0.0.0.0:8786"])
+def test_a_cluster_without_tls_stays_on_loopback(address: str) -> None:
+    with pytest.raises(ValidationError, match=r"make certificates with `envmatte certs"):
+        ClusterSettings(cluster=address)
+
+
+@pytest.mark.parametrize(
+    "address", ["tcp://127.0.0.1:8786", "tcp://localhost:8786", "tcp://127.0.0.9:1", "tcp://[::1]:8786"]
+)
+def test_on_loopback_a_cluster_needs_neither_tls_nor_a_store(address: str) -> None:
+    assert Settings(cluster=address).cluster == address
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["scheduler:8786", "tls://", "tls://host", "http://127.0.0.1:80", "tcp://127.0.0.1:x", "", "tls:"],
+)
+def test_what_is_no_address_is_refused(address: str) -> None:
+    with pytest.raises(ValidationError, match="tls://HOST:PORT"):
+        ClusterSettings(cluster=address)
+
+
+def test_certificates_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValidationError, match=r"ca\.pem: No such file"):
+        ClusterSettings(cluster="tls://192.0.2.1:8786", certs=tmp_path / "none")
+
+
+def test_workers_elsewhere_need_a_shared_store(certificates: Path) -> None:
+    with pytest.raises(ValidationError, match="--store"):
+        Settings(cluster="tls://192.0.2.1:8786", certs=certificates)
+    shared = Settings(cluster="tls://192.0.2.1:8786", certs=certificates, store="file:///shared")
+    assert shared.store_url == "file:///shared"
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"store": "gs://bucket"},
+        {"store": "s3:///prefix"},
+        {"store": "/shared"},
+        {"store": "file://shared/store"},
+        {"database": "mysql://me:secret@host/name"},
+        {"database": "envmatte.db"},
+    ],
+)
+def test_stores_and_databases_of_other_kinds_are_refused(wrong: dict[str, str]) -> None:
+    with pytest.raises(ValidationError, match=next(iter(wrong))) as caught:
+        Settings(**wrong)
+    assert "give it as" in caught.value.errors()[0]["msg"]
+    assert "secret" not in caught.value.errors()[0]["msg"]

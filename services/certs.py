@@ -1,0 +1,164 @@
+"""Certificates of a cluster: whoever has the folder belongs to it, and nobody else gets in.
+
+::
+
+    ca.pem      the certificate of the cluster's own authority, whose key was thrown away
+    cert.pem    the one certificate that it signed, of schedulers, workers and clients alike
+    key.pem     its key: who has it may run what he likes on every machine of the cluster
+
+A host is added by copying the folder to it; to renew them all, they are made anew.
+"""
+
+import os
+import ssl
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+from distributed.security import Security
+
+from storage.errors import Conflict, InvalidInput
+
+CA, CERT, KEY = "ca.pem", "cert.pem", "key.pem"
+LIFETIME = timedelta(days=3650)
+SKEW = timedelta(days=1)
+"""How far the clock of a host may be behind that of the one where certificates are made."""
+
+
+def make(certs: Path) -> bool:
+    """Make the certificates of a cluster in a folder; false if a whole set that can be used is there already.
+
+    Raises
+    ------
+    Conflict
+        If something is there that is not a whole set, or one that has expired: it is not overwritten.
+    """
+    there = [name for name in (CA, CERT, KEY) if (certs / name).exists()]
+    if there:
+        try:
+            security_of(certs)
+        except InvalidInput as error:
+            raise Conflict(
+                f"{certs} has {', '.join(there)} already, which are not overwritten, and can't be used: "
+                f"{error.detail}. Remove them first, or name another folder"
+            ) from error
+        return False
+    authority, key = ec.generate_private_key(ec.SECP256R1()), ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "envmatte cluster")])
+    issued = (
+        _builder(
+            x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "envmatte member")]), name, key, authority
+        )
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(
+            x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]),
+            critical=False,
+        )
+    )
+    root = (
+        _builder(name, name, authority, authority)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(
+            x509.KeyUsage(
+                key_cert_sign=True,
+                crl_sign=True,
+                digital_signature=False,
+                content_commitment=False,
+                key_encipherment=False,
+                data_encipherment=False,
+                key_agreement=False,
+                encipher_only=False,
+                decipher_only=False,
+            ),
+            critical=True,
+        )
+    )
+    secret = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    certs.mkdir(parents=True, exist_ok=True)
+    # The key last: what an interrupt leaves is not a whole set, and is told as such.
+    for file, data in (
+        (CA, root.sign(authority, SHA256()).public_bytes(Encoding.PEM)),
+        (CERT, issued.sign(authority, SHA256()).public_bytes(Encoding.PEM)),
+        (KEY, secret),
+    ):
+        _write(certs / file, data)
+    return True
+
+
+def security_of(certs: Path) -> Security:
+    """What dask needs to let in members of a cluster alone, and to be let in.
+
+    Parameters
+    ----------
+    certs : Path
+        Folder that `make` made.
+
+    Raises
+    ------
+    InvalidInput
+        If a file is missing, can't be read or belongs to another set, or the certificates have expired.
+    """
+    ca, cert, key = (str((certs / name).resolve()) for name in (CA, CERT, KEY))
+    try:
+        root, issued = (x509.load_pem_x509_certificate(Path(file).read_bytes()) for file in (ca, cert))
+        issued.verify_directly_issued_by(root)
+        ssl.create_default_context().load_cert_chain(cert, key)
+    except OSError as error:  # ssl.SSLError too: of a key that is damaged, or not the certificate's
+        reason = error.strerror if error.filename else "key.pem is not the key of cert.pem"
+        raise _unusable(certs, f"{error.filename or key}: {reason}") from error
+    except (ValueError, TypeError, InvalidSignature) as error:
+        raise _unusable(certs, "they are damaged, or not of one set") from error
+    now = datetime.now(UTC)
+    for one in (root, issued):
+        if not one.not_valid_before_utc <= now <= one.not_valid_after_utc:
+            raise InvalidInput(
+                f"the certificates in {certs} are valid from {one.not_valid_before_utc:%Y-%m-%d} to "
+                f"{one.not_valid_after_utc:%Y-%m-%d}, and today is {now:%Y-%m-%d}: see that the clock is right, or "
+                "make them anew with `envmatte certs DIR` and copy them to every host of the cluster"
+            )
+    return Security(
+        require_encryption=True,
+        tls_ca_file=ca,
+        **{f"tls_{role}_cert": cert for role in ("scheduler", "worker", "client")},
+        **{f"tls_{role}_key": key for role in ("scheduler", "worker", "client")},
+    )
+
+
+def _unusable(certs: Path, reason: str) -> InvalidInput:
+    return InvalidInput(
+        f"the certificates in {certs} can't be used: {reason}. Make a folder of them with `envmatte certs DIR`, once "
+        "for a whole cluster, and copy it whole to every host"
+    )
+
+
+def _builder(
+    subject: x509.Name,
+    issuer: x509.Name,
+    key: ec.EllipticCurvePrivateKey,
+    authority: ec.EllipticCurvePrivateKey,
+) -> x509.CertificateBuilder:
+    now = datetime.now(UTC)
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - SKEW)
+        .not_valid_after(now + LIFETIME)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+        .add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.public_key()), critical=False
+        )
+    )
+
+
+def _write(path: Path, data: bytes) -> None:
+    """Write a file that its owner alone may read, and never over another."""
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+        file.write(data)
