@@ -2,10 +2,11 @@
 
 import asyncio
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import dask
@@ -13,6 +14,7 @@ from distributed import Client, LocalCluster
 from distributed.security import Security
 from tornado.ioloop import IOLoop
 
+from services.dispatch import Dispatcher
 from services.settings import Settings
 from storage.errors import Unavailable
 
@@ -20,8 +22,10 @@ PATIENCE = 5
 """Seconds that a scheduler may take to answer a new client."""
 START = 60
 """Seconds that a worker may take to start on a busy machine."""
-PRELOAD = "workflows.jobs"
-"""What a worker imports before it takes work: importing the kernels takes seconds."""
+PRELOAD = "services.preload"
+"""What a worker imports before it takes work."""
+IDLE = 300.0
+"""Seconds without a job after which all workers but one are let go: they hold some 300 MB each."""
 
 CONFIG: dict[str, Any] = {
     # A tile of an innocent job must not be blamed for the workers that died with it: the ledger counts its misses.
@@ -111,22 +115,44 @@ def _loop() -> IOLoop:
 
 
 @contextmanager
-def open_cluster(settings: Settings) -> Iterator[Client]:
-    """A client of the cluster that the settings name, or of one that is started here.
-
-    Yields
-    ------
-    distributed.Client
-        Synchronous; may be used from any thread.
-
-    Raises
-    ------
-    Unavailable
-        If the cluster that the settings name does not answer.
-    """
+def dispatcher_of(settings: Settings) -> Iterator[Dispatcher]:
+    """What hands tiles to the cluster that the settings name, reached or not yet, or to one of its own."""
     if settings.cluster:
-        with connect(settings.cluster, settings.security()) as client:
-            yield client
+        with Dispatcher(partial(connect, settings.cluster, settings.security())) as dispatcher:
+            yield dispatcher
     else:
-        with embedded(settings) as cluster, Client(cluster) as client:
-            yield client
+        with (
+            embedded(settings) as cluster,
+            Dispatcher(
+                partial(Client, cluster, set_as_default=False), Scale(cluster.scale, settings.workers)
+            ) as dispatcher,
+        ):
+            yield dispatcher
+
+
+class Scale:
+    """How many workers a cluster of this machine has: as many as are of use, and one while there is nothing to do.
+
+    Parameters
+    ----------
+    scale : callable
+        Told the number of workers, whenever another one is wanted.
+    most : int
+        The largest number, and how many there are to begin with.
+    """
+
+    def __init__(self, scale: Callable[[int], None], most: int) -> None:
+        self._scale = scale
+        self._most = self._now = most
+        self._busy_at = time.monotonic()
+
+    def __call__(self, tiles: int) -> None:
+        """Say how many tiles there are to do."""
+        if tiles:
+            self._busy_at = time.monotonic()
+            number = min(max(tiles, self._now), self._most)
+        else:
+            number = self._now if time.monotonic() - self._busy_at < IDLE else 1
+        if number != self._now:
+            self._now = number
+            self._scale(number)

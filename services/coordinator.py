@@ -1,8 +1,8 @@
 """The coordinator: takes queued jobs and drives them on dask, one step after another.
 
-Any number of coordinators may run; the one that holds the lease drives (`storage.leases`). It polls, and it alone writes
-progress: results that travel with callbacks are lost with their client, and a scheduler keeps nothing over a restart.
-Whatever it holds in memory can be made again from the ledger.
+Any number of coordinators may run; the one that holds the lease drives (`storage.leases`). It polls, and it alone
+writes progress: results that travel with callbacks are lost with their client, and a scheduler keeps nothing over a
+restart. Whatever it holds in memory can be made again from the ledger.
 """
 
 import logging
@@ -52,18 +52,13 @@ class Coordinator:
     engine : sqlalchemy.Engine
     objects : Objects
     dispatcher : Dispatcher
-    alone : bool
-        Whether the caller knows that there is no other coordinator, and that nobody writes to the store yet.
     """
 
-    def __init__(
-        self, settings: Settings, engine: Engine, objects: Objects, dispatcher: Dispatcher, *, alone: bool
-    ) -> None:
+    def __init__(self, settings: Settings, engine: Engine, objects: Objects, dispatcher: Dispatcher) -> None:
         self._settings = settings
         self._engine = engine
         self._objects = objects
         self._dispatcher = dispatcher
-        self._alone = alone
         self._name = f"{socket.gethostname()}:{os.getpid()}"
         self._token: int | None = None
         self._drives: dict[str, Drive] = {}
@@ -76,7 +71,7 @@ class Coordinator:
         self._house = ThreadPoolExecutor(1, thread_name_prefix="housekeeping")
 
     def __enter__(self) -> "Coordinator":
-        if self._alone:
+        if self._settings.alone:  # and nobody writes to the store yet
             sweep(self._engine, self._objects, seconds=0)
         self._thread.start()
         return self
@@ -115,7 +110,7 @@ class Coordinator:
         self._beat_at = now
         if self._token is None:
             with writing(self._engine) as c:
-                self._token = leases.take(c, self._name, seize=self._alone)
+                self._token = leases.take(c, self._name, seize=self._settings.alone)
             if self._token is None:
                 return False
             logger.info("%s drives the jobs from now on", self._name)
@@ -241,7 +236,7 @@ class Coordinator:
         self._tidy(row.kind, row.capture)
 
     def _tidy(self, kind: str, capture: str) -> None:
-        """Remove what an ingest needs no more once it has ended: the archive, or all of a capture that can't be used."""
+        """Remove what nobody needs once an ingest has ended: the archive, or all of a capture that can't be used."""
         if kind != "ingest":
             return
         with reading(self._engine) as c:

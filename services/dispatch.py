@@ -1,8 +1,8 @@
 """What goes to dask, and what comes back: tiles of jobs, and what became of them.
 
 Nothing here waits for the cluster, but for results that are there already: a thread of its own holds the connection,
-makes it anew whenever it is lost, and looks at the workers. What was under way on a connection that is lost is reported as
-gone. dask's own callbacks are taken for no more than a hint to look.
+makes it anew whenever it is lost, and looks at the workers. What was under way on a connection that is lost is
+reported as gone. dask's own callbacks are taken for no more than a hint to look.
 """
 
 import logging
@@ -77,9 +77,7 @@ class Dispatcher:
         Told how many workers are of use, where they can be had for the asking.
     """
 
-    def __init__(
-        self, connect: Callable[[], Client], scale: Callable[[int], None] | None = None
-    ) -> None:
+    def __init__(self, connect: Callable[[], Client], scale: Callable[[int], None] | None = None) -> None:
         self._connect = connect
         self._scale = scale
         self._client: Client | None = None
@@ -169,7 +167,9 @@ class Dispatcher:
         if client is None or not finished:
             return {}
         try:
-            return dict(zip(finished, client.sync(client._gather, finished, callback_timeout=ANSWER), strict=True))
+            return dict(
+                zip(finished, client.sync(client._gather, finished, callback_timeout=ANSWER), strict=True)
+            )
         except Exception as error:  # a worker that is gone, or frozen: what it had is done again
             logger.warning("%d results can't be had: %r", len(finished), error)
             return {}
@@ -193,19 +193,23 @@ class Dispatcher:
                 return
 
     def _look(self) -> dict[str, Any]:
+        client: Any
         try:
             if self._usable() is None:
                 old, self._client = self._client, None
                 if old is not None:
                     _close(old)
                 self._client = self._connect()
-            info = self._client.sync(self._client.scheduler.identity, n_workers=-1, callback_timeout=ANSWER)
+            client = self._client
+            info = client.sync(client.scheduler.identity, n_workers=-1, callback_timeout=ANSWER)
         except EnvmatteError as error:
             return {"workers": [], "problem": error.detail}
         except Exception as error:
             return {"workers": [], "problem": f"the scheduler does not answer: {error!r}"}
         workers = [_worker(address, found) for address, found in sorted(info["workers"].items())]
-        problem = None if workers else "no worker is connected to the scheduler; start some with `envmatte worker`"
+        problem = (
+            None if workers else "no worker is connected to the scheduler; start some with `envmatte worker`"
+        )
         return {"workers": workers, "problem": problem}
 
 

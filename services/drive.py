@@ -155,7 +155,9 @@ class Drive:
             )
         return True
 
-    def _enter(self, connection: Connection, stage: str, to_do: Sequence[int], task: Task | None = None) -> Next:
+    def _enter(
+        self, connection: Connection, stage: str, to_do: Sequence[int], task: Task | None = None
+    ) -> Next:
         jobs.enter(connection, self.job, stage)
         return Next(stage, to_do, task or self.task)
 

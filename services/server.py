@@ -1,16 +1,16 @@
-"""`envmatte serve`: the API, the coordinator and the cluster in one process tree."""
+"""`envmatte serve`: the API, a coordinator and the cluster in one process tree; and `envmatte coordinator` alone."""
 
 import fcntl
 import logging
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 import uvicorn
 
 from services.api import build_app
-from services.cluster import open_cluster
+from services.cluster import dispatcher_of
 from services.coordinator import Coordinator
 from services.settings import Settings
 from storage.database import open_engine
@@ -22,18 +22,19 @@ GRACE = 3
 
 
 def serve(settings: Settings) -> None:
-    """Serve until interrupted; jobs under way go on at the next start.
+    """Serve until interrupted; jobs under way go on at the next start, or with another coordinator.
 
     Raises
     ------
     Conflict
         If another service has the data folder.
     """
-    # uvicorn raises the signal that stopped it once more at its end: what is open here must close before we go.
-    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s %(message)s")
-    with _sole_user(settings):
+    _set_up()
+    with ExitStack() as stack:
+        if settings.alone:
+            stack.enter_context(_sole_user(settings))
         engine = open_engine(settings.database_url)
+        stack.callback(engine.dispose)
         objects = Objects(settings.store_url)
         # The port is taken before workers start, so that one in use is told at once.
         config = uvicorn.Config(
@@ -44,13 +45,35 @@ def serve(settings: Settings) -> None:
             lifespan="off",
             timeout_graceful_shutdown=GRACE,
         )
-        socket = config.bind_socket()
-        with socket, open_cluster(settings) as client, Coordinator(settings, engine, objects, client):
-            socket.listen()  # from here on whoever connects is answered, if not yet at once
-            host, port = socket.getsockname()[:2]
-            print(f"envmatte serves {settings.data} at http://{host}:{port}", flush=True)
-            uvicorn.Server(config).run(sockets=[socket])
-        engine.dispose()
+        socket = stack.enter_context(config.bind_socket())
+        if settings.coordinate:
+            dispatcher = stack.enter_context(dispatcher_of(settings))
+            stack.enter_context(Coordinator(settings, engine, objects, dispatcher))
+        socket.listen()  # from here on whoever connects is answered, if not yet at once
+        host, port = socket.getsockname()[:2]
+        where = settings.data if settings.alone else "jobs"
+        print(f"envmatte serves {where} at http://{host}:{port}", flush=True)
+        uvicorn.Server(config).run(sockets=[socket])
+
+
+def coordinate(settings: Settings) -> None:
+    """Drive jobs, whenever no other coordinator does, until interrupted."""
+    _set_up()
+    with ExitStack() as stack:
+        if settings.alone:
+            stack.enter_context(_sole_user(settings))
+        engine = open_engine(settings.database_url)
+        stack.callback(engine.dispose)
+        dispatcher = stack.enter_context(dispatcher_of(settings))
+        stack.enter_context(Coordinator(settings, engine, Objects(settings.store_url), dispatcher))
+        print("envmatte coordinates", flush=True)
+        signal.pause()
+
+
+def _set_up() -> None:
+    # uvicorn raises the signal that stopped it once more at its end: what is open here must close before we go.
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s %(message)s")
 
 
 @contextmanager

@@ -181,6 +181,11 @@ class Settings(ClusterSettings):
         return self.store or (self.data.resolve() / "store").as_uri()
 
     @property
+    def alone(self) -> bool:
+        """Whether all that belongs to the service is in its data folder: then no other can have a part in it."""
+        return self.cluster is None and self.database is None and self.store is None
+
+    @property
     def limits(self) -> Limits:
         """What a bundle may cost."""
         return Limits(unpacked=self.unpacked_bytes, memory=self.ingest_memory)

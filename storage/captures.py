@@ -2,9 +2,9 @@
 
 In the store, under ``captures/ID``, a zarr group: ``frames`` (frame, y, x, channel), the optional ``mask`` (y, x) and
 ``images/N`` (row, column, channel), the patterns that came as images; of a video also ``shares`` (share, column),
-which of its frames make up each frame of the stack. Its attributes hold the manifest, those of the group ``measured`` in
-it what was measured from the frames. The archive that was uploaded lies where `storage.uploads` puts it until its frames
-are in the stack.
+which of its frames make up each frame of the stack. Its attributes hold the manifest, those of the group ``measured``
+in it what was measured from the frames. The archive that was uploaded lies where `storage.uploads` puts it until its
+frames are in the stack.
 """
 
 import time
@@ -194,7 +194,10 @@ class Stack:
     def missing(self) -> list[int]:
         """The slabs of which a chunk is not there, ascending; nothing is read."""
         stored = self._objects.below(f"{self._path}/frames")
-        grid = [range(-(-size // chunk)) for size, chunk in zip(self._frames.shape, self._frames.chunks, strict=True)]
+        grid = [
+            range(-(-size // chunk))
+            for size, chunk in zip(self._frames.shape, self._frames.chunks, strict=True)
+        ]
         chunks = product(*grid)
         return sorted(
             {at[0] for at in chunks if f"{self._path}/frames/c/{'/'.join(map(str, at))}" not in stored}

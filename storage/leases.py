@@ -55,16 +55,14 @@ def take(connection: Connection, holder: str, *, seize: bool = False) -> int | N
     """
     row = connection.execute(select(coordinator, clock().label("now"))).one_or_none()
     if row is None:
-        now = connection.scalar(select(clock()))
+        now = connection.execute(select(clock())).scalar_one()
         values = {"id": 1, "token": 1, "holder": holder, "cluster": NOBODY}
         connection.execute(insert(coordinator).values(beat_at=now, expires_at=now + SECONDS, **values))
         return 1
     if row.holder is not None and row.expires_at > row.now and not seize:
         return None
     values = {"token": row.token + 1, "holder": holder, "cluster": NOBODY}
-    connection.execute(
-        update(coordinator).values(beat_at=row.now, expires_at=row.now + SECONDS, **values)
-    )
+    connection.execute(update(coordinator).values(beat_at=row.now, expires_at=row.now + SECONDS, **values))
     return int(row.token) + 1
 
 
@@ -90,9 +88,7 @@ def beat(connection: Connection, token: int, cluster: dict[str, Any]) -> None:
     """
     check(connection, token)
     now = clock()
-    connection.execute(
-        update(coordinator).values(beat_at=now, expires_at=now + SECONDS, cluster=cluster)
-    )
+    connection.execute(update(coordinator).values(beat_at=now, expires_at=now + SECONDS, cluster=cluster))
 
 
 def give_back(connection: Connection, token: int) -> None:
@@ -103,4 +99,4 @@ def give_back(connection: Connection, token: int) -> None:
 def last_sign(connection: Connection) -> Sign | None:
     """The last sign of life of a coordinator, if there ever was one."""
     row = connection.execute(select(coordinator, clock().label("now"))).one_or_none()
-    return row and Sign(row.holder, row.now - row.beat_at, row.cluster)
+    return None if row is None else Sign(row.holder, row.now - row.beat_at, row.cluster)

@@ -174,7 +174,8 @@ class Matte:
 
         def is_there(row: int, column: int) -> bool:
             chunks = (
-                f"{self._path}/{name}/c/{row}/{column}" + "/0" * (array.ndim - 2) for name, array in self._frames.items()
+                f"{self._path}/{name}/c/{row}/{column}" + "/0" * (array.ndim - 2)
+                for name, array in self._frames.items()
             )
             rows = [f"{self._path}/T/{row}.{column}/{name}" for name in ("cell", "weight")]
             # A block whose rows are all empty has no chunk in either.

@@ -1,7 +1,7 @@
 """The steps of a job in order: prepare, its tiles in any order, finish.
 
-Each step is what a dask task runs. It is told ids and numbers, never arrays; it can be run again, by anyone, at any time,
-and writes the same bytes: a worker that was thought dead may wake up and go on.
+Each step is what a dask task runs. It is told ids and numbers, never arrays; it can be run again, by anyone, at any
+time, and writes the same bytes: a worker that was thought dead may wake up and go on.
 """
 
 import time
@@ -138,7 +138,9 @@ def _recover_missing(task: Task) -> list[int]:
     blocks = matte.missing()
     return [
         tile
-        for tile, (rows, columns) in enumerate(tiles.cut(matte, parse_options(task.options).tile or matte.block))
+        for tile, (rows, columns) in enumerate(
+            tiles.cut(matte, parse_options(task.options).tile or matte.block)
+        )
         if not blocks.isdisjoint(product(rows, columns))
     ]
 

@@ -17,7 +17,7 @@ from services.api.uploads import too_large
 from storage import captures, jobs, uploads
 from storage.captures import Stack
 from storage.database import captures as table
-from storage.database import new_id, page, writing
+from storage.database import new_id, page, reading, writing
 from storage.errors import CaptureError, Conflict, NotFound
 from storage.uploads import Part
 from workflows.images import encode_png
@@ -121,14 +121,14 @@ def list_captures(
     state: Literal["ingesting", "ready", "failed"] | None = None,
 ) -> Captures:
     """Captures, newest first."""
-    with context.engine.connect() as c:
+    with reading(context.engine) as c:
         return Captures(captures=[Capture.of(row) for row in page(c, table, limit, after, state=state)])
 
 
 @router.get("/captures/{id}")
 def get_capture(context: Needs, id: str) -> Capture:
     """A capture."""
-    with context.engine.connect() as c:
+    with reading(context.engine) as c:
         return Capture.of(captures.get(c, id))
 
 
@@ -148,7 +148,7 @@ def delete_capture(context: Needs, id: str) -> None:
 @router.get("/captures/{id}/frames/{n}.png", response_class=Response)
 def get_frame(context: Needs, id: str, n: int) -> Response:
     """A frame as it was stored."""
-    with context.engine.connect() as c:
+    with reading(context.engine) as c:
         row = captures.get(c, id)
     if row.state != "ready":
         raise Conflict(f"capture {id} is {row.state}; its frames can be seen once it is ready")
@@ -205,7 +205,7 @@ def _from_upload(context: Context, wanted: FromUpload, key: str | None) -> Row[A
     made = _made(context, key)
     if made is not None:
         return made
-    with context.engine.connect() as c:
+    with reading(context.engine) as c:
         if captures.exists(c, upload):
             return captures.get(c, upload)
         row = uploads.get(c, upload)
@@ -230,13 +230,13 @@ def _from_upload(context: Context, wanted: FromUpload, key: str | None) -> Row[A
 
 
 def _made(context: Context, key: str | None) -> Row[Any] | None:
-    with context.engine.connect() as c:
+    with reading(context.engine) as c:
         made = jobs.made_by(c, key, CALL) if key else None
         return captures.get(c, made) if made else None
 
 
 def _check_room(context: Context, length: int) -> None:
-    with context.engine.connect() as c:
+    with reading(context.engine) as c:
         uploads.check_room(c, context.objects, length)
 
 

@@ -9,9 +9,10 @@ from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection, Row
 
 from services.api.context import After, Limit, Needs, read_json
-from storage import captures, jobs, mattes
+from services.api.waiting import reason
+from storage import captures, jobs, leases, mattes
 from storage.database import jobs as table
-from storage.database import new_id, page, writing
+from storage.database import new_id, page, reading, writing
 from storage.errors import Conflict
 from workflows.options import describe_options, parse_options
 from workflows.program import Program
@@ -53,6 +54,7 @@ class Job(BaseModel):
     tiles: Tiles
     pixels: int
     eta_seconds: float | None
+    waits_for: str | None
     queued_seconds: float
     run_seconds: float
     workers: int
@@ -65,8 +67,9 @@ class Job(BaseModel):
     finished_at: datetime | None
 
     @classmethod
-    def of(cls, row: Row[Any], workers: int) -> "Job":
+    def of(cls, connection: Connection, row: Row[Any]) -> "Job":
         now = time.time()
+        sign = leases.last_sign(connection)
         ran = ((row.finished_at or now) - row.started_at) if row.started_at else 0.0
         running = row.state == "running"
         # The step after the last tile counts as one more: only a job that has succeeded is at 1.
@@ -78,10 +81,11 @@ class Job(BaseModel):
             },
             progress=progress,
             tiles=Tiles(total=row.total, done=row.done, failed=row.failed),
-            eta_seconds=ran * (row.total - row.done) / row.done if running and row.done else None,
+            eta_seconds=_left(row, now) if running else None,
+            waits_for=reason(connection, row, sign),
             queued_seconds=(row.started_at or row.finished_at or now) - row.created_at,
             run_seconds=ran,
-            workers=workers if running else 0,
+            workers=len(sign.cluster["workers"]) if running and sign else 0,
             options=row.options,
             problem=row.problem,
             created_at=datetime.fromtimestamp(row.created_at, UTC),
@@ -164,31 +168,29 @@ def post_job(
             mattes.add(c, matte, capture.id, job, chosen)
             if idempotency_key:
                 jobs.remember(c, idempotency_key, CALL, job)
-        row = jobs.get(c, job)
-        workers = _workers(c)
+        made = Job.of(c, jobs.get(c, job))
     response.headers["Location"] = f"/v1/jobs/{job}"
-    return Job.of(row, workers)
+    return made
 
 
 @router.get("/jobs")
 def list_jobs(context: Needs, limit: Limit = 100, after: After = None, state: State | None = None) -> Jobs:
     """Jobs, newest first."""
-    with context.engine.connect() as c:
-        workers = _workers(c)
-        return Jobs(jobs=[Job.of(row, workers) for row in page(c, table, limit, after, state=state)])
+    with reading(context.engine) as c:
+        return Jobs(jobs=[Job.of(c, row) for row in page(c, table, limit, after, state=state)])
 
 
 @router.get("/jobs/{id}")
 def get_job(context: Needs, id: str) -> Job:
     """A job."""
-    with context.engine.connect() as c:
-        return Job.of(jobs.get(c, id), _workers(c))
+    with reading(context.engine) as c:
+        return Job.of(c, jobs.get(c, id))
 
 
 @router.get("/jobs/{id}/log")
 def get_log(context: Needs, id: str, limit: Limit = 1000, after: Annotated[int, Query(ge=0)] = 0) -> Log:
     """What happened to a job, line by line."""
-    with context.engine.connect() as c:
+    with reading(context.engine) as c:
         jobs.get(c, id)
         rows = jobs.notes(c, id, after, limit)
     return Log(lines=[Line(line=r.line, at=datetime.fromtimestamp(r.at, UTC), text=r.text) for r in rows])
@@ -199,7 +201,7 @@ def cancel_job(context: Needs, id: str) -> Job:
     """Cancel a job; what it wrote is removed as soon as its running tasks have ended."""
     with writing(context.engine) as c:
         jobs.cancel(c, id)
-        return Job.of(jobs.get(c, id), _workers(c))
+        return Job.of(c, jobs.get(c, id))
 
 
 @router.post("/jobs/{id}/retry", status_code=202)
@@ -217,7 +219,7 @@ def retry_job(context: Needs, id: str) -> Job:
             captures.change(c, capture.id, state="ingesting", problem=None)
         else:
             raise Conflict(f"capture {capture.id} can't be used, and nothing of it was kept; upload it again")
-        return Job.of(jobs.get(c, id), _workers(c))
+        return Job.of(c, jobs.get(c, id))
 
 
 @router.delete("/jobs/{id}", status_code=204)
@@ -227,9 +229,14 @@ def delete_job(context: Needs, id: str) -> None:
         jobs.forget(c, id)
 
 
-def _workers(connection: Connection) -> int:
-    beat = jobs.last_beat(connection)
-    return beat.workers if beat else 0
+def _left(row: Row[Any], now: float) -> float | None:
+    """Seconds until a job's last tile is done, by the pace of those that were done last."""
+    if row.done == row.total:
+        return 0.0 if row.total else None
+    if row.paced_at is None or row.done <= row.paced_done:
+        return None
+    pace = (row.moved_at - row.paced_at) / (row.done - row.paced_done)
+    return float(max((row.total - row.done) * pace - (now - row.moved_at), 0.0))
 
 
 def _time(seconds: float | None) -> datetime | None:

@@ -15,7 +15,7 @@ from services.api.context import After, Context, Limit, Needs, read_body
 from services.api.errors import NotAcceptable
 from storage import jobs, mattes
 from storage.database import mattes as table
-from storage.database import page, writing
+from storage.database import page, reading, writing
 from storage.errors import Conflict
 from workflows import images
 from workflows.composite import composite, confidence
@@ -65,14 +65,14 @@ def list_mattes(
     state: Literal["recovering", "ready", "failed"] | None = None,
 ) -> Mattes:
     """Mattes, newest first."""
-    with context.engine.connect() as c:
+    with reading(context.engine) as c:
         return Mattes(mattes=[Matte.of(row) for row in page(c, table, limit, after, state=state)])
 
 
 @router.get("/mattes/{id}")
 def get_matte(context: Needs, id: str) -> Matte:
     """A matte."""
-    with context.engine.connect() as c:
+    with reading(context.engine) as c:
         return Matte.of(mattes.get(c, id))
 
 
@@ -135,7 +135,7 @@ def get_confidence(context: Needs, id: str) -> Response:
 
 
 def _ready(context: Context, id: str) -> Row[Any]:
-    with context.engine.connect() as c:
+    with reading(context.engine) as c:
         row = mattes.get(c, id)
     if row.state != "ready":
         raise Conflict(f"matte {id} is {row.state}; job {row.job} says more")

@@ -20,7 +20,7 @@ from services.presets import PRESETS
 from storage import programs
 from storage.database import page as page_of
 from storage.database import programs as table
-from storage.database import writing
+from storage.database import reading, writing
 from storage.errors import NotFound, OptionError
 from workflows.clock import MOST, Border
 from workflows.parts import Monitor
@@ -148,14 +148,14 @@ def post_program(
 @router.get("/programs")
 def list_programs(context: Needs, limit: Limit = 100, after: After = None) -> Programs:
     """Programs, newest first."""
-    with context.engine.connect() as c:
+    with reading(context.engine) as c:
         return Programs(programs=[Program.of(row) for row in page_of(c, table, limit, after)])
 
 
 @router.get("/programs/{id}")
 def get_program(context: Needs, id: str) -> Program:
     """A program."""
-    with context.engine.connect() as c:
+    with reading(context.engine) as c:
         return Program.of(programs.get(c, id))
 
 
@@ -168,7 +168,7 @@ def delete_program(context: Needs, id: str) -> None:
 
 
 def _shown(context: Needs, id: str) -> Shown:
-    with context.engine.connect() as c:
+    with reading(context.engine) as c:
         return Shown.model_validate(programs.get(c, id).program)
 
 
@@ -178,7 +178,7 @@ Asked = Annotated[Shown, Depends(_shown)]
 @router.get("/programs/{id}/program.json")
 def get_record(context: Needs, id: str) -> dict[str, Any]:
     """A program as capture.json has it."""
-    with context.engine.connect() as c:
+    with reading(context.engine) as c:
         found: dict[str, Any] = programs.get(c, id).program
     return found
 
@@ -233,7 +233,7 @@ async def get_film(
 @page.get("/programs/{id}/play", response_class=FileResponse)
 def get_page(context: Needs, id: str) -> FileResponse:
     """A page that shows the program full screen. It holds nothing of it: asked for without a key, it asks for one."""
-    with context.engine.connect() as c:
+    with reading(context.engine) as c:
         programs.get(c, id)
     return FileResponse(WEB / "play.html", media_type="text/html")
 

@@ -5,6 +5,7 @@ from fastapi import APIRouter, Response
 from services.api.context import Context, Needs
 from storage import captures
 from storage.captures import Stack
+from storage.database import reading
 from storage.errors import Conflict
 from workflows.contact_sheet import contact_sheet
 from workflows.ingest.report import Report, report
@@ -26,7 +27,7 @@ def get_contact_sheet(context: Needs, id: str) -> Response:
 
 
 def _stack(context: Context, id: str) -> Stack:
-    with context.engine.connect() as c:
+    with reading(context.engine) as c:
         row = captures.get(c, id)
     if row.state != "ready":
         raise Conflict(f"capture {id} is {row.state}; it can be looked at once it is ready")

@@ -1,6 +1,5 @@
 """Whether the service lives, and whether it can work."""
 
-import time
 from collections.abc import Callable
 from typing import Literal
 
@@ -8,11 +7,11 @@ from fastapi import APIRouter, Response
 from pydantic import BaseModel
 
 from services.api.context import Needs
-from storage import jobs
+from services.api.waiting import trouble_of
+from storage import leases
+from storage.database import reading, writing
 
 router = APIRouter(tags=["system"])
-SILENCE = 15.0
-"""Seconds after which a coordinator that gave no sign of life counts as gone."""
 
 
 class Health(BaseModel):
@@ -41,20 +40,17 @@ def readiness(context: Needs, response: Response) -> Readiness:
     """Whether the database, the store and the cluster can be reached; 503 if not."""
 
     def database() -> str:
-        with context.engine.connect() as c:
-            jobs.last_beat(c)
-        return "ok"
+        with writing(context.engine):  # one that is full can still be read
+            return "ok"
 
     def store() -> str:
         context.objects.check()
         return "ok"
 
     def cluster() -> str:
-        with context.engine.connect() as c:
-            beat = jobs.last_beat(c)
-        if beat is None or time.time() - beat.beat_at > SILENCE:
-            return "the coordinator gives no sign of life"
-        return "ok" if beat.workers else "there are no workers"
+        with reading(context.engine) as c:
+            sign = leases.last_sign(c)
+        return trouble_of(sign) or "ok"
 
     found = {check.__name__: _try(check) for check in (database, store, cluster)}
     ready = all(value == "ok" for value in found.values())

@@ -24,7 +24,7 @@ from services.api.tus import (
     version_spoken,
 )
 from storage import captures, uploads
-from storage.database import new_id, writing
+from storage.database import new_id, reading, writing
 from storage.errors import InvalidInput, NotFound
 from storage.uploads import MOST_PARTS, Part
 
@@ -69,7 +69,7 @@ async def create_upload(
 @router.head("/{id}", dependencies=[Spoken], response_class=Response)
 def get_upload(context: Needs, id: str) -> Response:
     """How far an upload is: `Upload-Offset` of `Upload-Length` bytes."""
-    with context.engine.connect() as c:
+    with reading(context.engine) as c:
         row = uploads.get(c, id)
     headers = {"Upload-Length": str(row.length), "Cache-Control": "no-store"} | _headers(row)
     return Response(headers=headers | ({"Upload-Metadata": row.metadata} if row.metadata else {}))
@@ -173,7 +173,7 @@ def _take_back(context: Context, upload: str, stored: list[Part]) -> None:
     try:
         _get(context, upload)
     except NotFound:
-        with context.engine.connect() as c:
+        with reading(context.engine) as c:
             is_capture = captures.exists(c, upload)
         if not is_capture:
             uploads.remove(context.objects, upload)
@@ -181,7 +181,7 @@ def _take_back(context: Context, upload: str, stored: list[Part]) -> None:
 
 
 def _get(context: Context, upload: str) -> Row[Any]:
-    with context.engine.connect() as c:
+    with reading(context.engine) as c:
         return uploads.get(c, upload)
 
 
@@ -201,7 +201,7 @@ def _create(context: Context, length: int, metadata: str, key: str | None) -> tu
             uploads.add(c, upload, length, metadata, context.settings.upload_seconds, key)
             return uploads.get(c, upload), True
     except IntegrityError:  # the repeat came at the same time
-        with context.engine.connect() as c:
+        with reading(context.engine) as c:
             row = uploads.by_key(c, key) if key else None
         if row is None:
             raise

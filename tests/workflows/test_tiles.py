@@ -14,12 +14,12 @@ import pytest
 from storage import mattes
 from storage.captures import Stack
 from storage.errors import Corrupt
+from storage.jobs import FINISH, PREPARE
 from storage.objects import Objects
 from tests.workflows.ingest.camera import Camera, capture, film, lights
 from workflows.composite import composite
 from workflows.images import decode, encode_png
 from workflows.ingest.bundle import Limits
-from storage.jobs import FINISH, PREPARE
 from workflows.jobs import Task, run
 from workflows.scene import Scene, nested_program, write_capture
 from workflows.simulate import glass_ball

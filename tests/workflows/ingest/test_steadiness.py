@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from storage import mattes
 from storage.captures import Stack
+from storage.jobs import PREPARE
 from storage.objects import Objects
 from workflows.composite import composite
 from workflows.grids import area_mean
@@ -19,7 +20,6 @@ from workflows.images import encode_png
 from workflows.ingest.bundle import Limits
 from workflows.ingest.findings import Finding
 from workflows.ingest.report import report
-from storage.jobs import PREPARE
 from workflows.jobs import Task, run
 from workflows.presets import preset
 from workflows.program import Program
