@@ -7,7 +7,8 @@ import json
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -37,6 +38,32 @@ def _remote(command: F) -> F:
     return url(key(as_json(command)))
 
 
+_certs = click.option(
+    "--certs",
+    type=click.Path(path_type=Path),
+    help="Folder of the cluster's certificates, see `envmatte certs`.",
+)
+
+
+def _those_given(options: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in options.items() if value is not None}
+
+
+@contextmanager
+def _refusals_told() -> Iterator[None]:
+    """What a process of the service refuses becomes a message and an exit code."""
+    from pydantic import ValidationError
+
+    from storage.errors import EnvmatteError
+
+    try:
+        yield
+    except ValidationError as error:
+        raise click.UsageError(_first(error)) from error
+    except EnvmatteError as error:
+        raise click.ClickException(error.detail) from error
+
+
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="envmatte")
 def main() -> None:
@@ -52,7 +79,7 @@ def main() -> None:
 @click.option("--port", type=int, help="Port to listen on; 0 takes a free one.")
 @click.option("--workers", type=int, help="Worker processes.")
 @click.option("--cluster", help="Scheduler of a cluster to use instead: tls://HOST:PORT.")
-@click.option("--certs", type=click.Path(path_type=Path), help="Folder of that cluster's certificates.")
+@_certs
 @click.option("--database", help="Database to use: postgresql://USER:PASSWORD@HOST/NAME.")
 @click.option("--store", help="Store to use: s3://BUCKET/PREFIX or file:///FOLDER.")
 def serve(**given: Any) -> None:
@@ -60,18 +87,61 @@ def serve(**given: Any) -> None:
 
     Every setting is an environment variable ENVMATTE_… too, and a line in .env; an option here wins.
     """
-    from pydantic import ValidationError
-
     from services.server import serve as run
     from services.settings import Settings
-    from storage.errors import EnvmatteError
 
-    try:
-        run(Settings(**{name: value for name, value in given.items() if value is not None}))
-    except ValidationError as error:
-        raise click.UsageError(_first(error)) from error
-    except EnvmatteError as error:
-        raise click.ClickException(error.detail) from error
+    with _refusals_told():
+        run(Settings(**_those_given(given)))
+
+
+@main.command()
+@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
+@click.option(
+    "--port", type=int, default=8786, show_default=True, help="Port to listen on; 0 takes a free one."
+)
+@_certs
+def scheduler(host: str, port: int, **given: Any) -> None:
+    """Run the scheduler of a cluster, for workers and services of many machines.
+
+    With certificates it speaks TLS; without it listens on loopback alone.
+    """
+    from services.scheduler import schedule
+    from services.settings import ClusterSettings
+
+    with _refusals_told():
+        schedule(ClusterSettings(**_those_given(given)), host, port)
+
+
+@main.command()
+@click.option("--cluster", help="Scheduler to work for: tls://HOST:PORT, or tcp://127.0.0.1:PORT.")
+@_certs
+@click.option("--workers", type=int, help="Worker processes. Default: one a core.")
+@click.option("--host", help="Address to listen on. Default: that by which the scheduler is reached.")
+def worker(host: str | None, **given: Any) -> None:
+    """Run workers of a cluster on this machine.
+
+    They wait for the scheduler as long as it takes, and join it again whenever it was gone.
+    """
+    from services.settings import ClusterSettings
+    from services.worker import work
+
+    with _refusals_told():
+        work(ClusterSettings(**_those_given(given)), host)
+
+
+@main.command()
+@click.argument("folder", type=click.Path(file_okay=False, path_type=Path), metavar="DIR")
+def certs(folder: Path) -> None:
+    """Make the certificates of a cluster in DIR.
+
+    Every process of the cluster gets a copy with --certs; whoever has one may run what he likes on all of its
+    machines. Where there is a whole set already it stays.
+    """
+    from services.certs import make
+
+    with _refusals_told():
+        made = make(folder)
+    click.echo(f"{folder}: made, copy it to every host" if made else f"{folder}: there already, and stays")
 
 
 @main.command()

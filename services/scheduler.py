@@ -1,0 +1,63 @@
+"""`envmatte scheduler`: the dask scheduler of a cluster, which hands tasks to workers and keeps nothing."""
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from distributed import Scheduler
+
+from services.certs import security_of
+from services.cluster import NO_DASHBOARD
+from services.process import keep_open, log
+from services.settings import ClusterSettings, is_loopback
+from storage.errors import Conflict, InvalidInput
+
+
+def schedule(settings: ClusterSettings, host: str, port: int) -> None:
+    """Schedule until SIGTERM; prints the address as soon as it listens there.
+
+    Parameters
+    ----------
+    settings : ClusterSettings
+        Of which the certificates count. Without any there is no TLS.
+    host : str
+        Address to listen on.
+    port : int
+        0 takes a free one.
+
+    Raises
+    ------
+    InvalidInput
+        If it should listen on other than loopback without certificates, or they can't be used.
+    Conflict
+        If it can't listen there.
+    KeyboardInterrupt
+        At SIGINT.
+    """
+    log()
+    certs = settings.certificates
+    if certs is None and not is_loopback(host):
+        raise InvalidInput(
+            f"asked to listen on {host} without TLS, where whoever reaches it may run what he likes: make certificates "
+            "with `envmatte certs DIR`, give every process of the cluster a copy with --certs, or listen on 127.0.0.1"
+        )
+    security = security_of(certs) if certs else None
+
+    @asynccontextmanager
+    async def scheduler() -> AsyncIterator[None]:
+        try:
+            running = await Scheduler(
+                host=host,
+                port=port,
+                protocol="tls" if security else "tcp",
+                security=security,
+                **NO_DASHBOARD,
+            )
+        except OSError as error:
+            raise Conflict(f"can't listen on {host}, port {port}: {error.strerror or error}") from error
+        print(f"envmatte schedules at {running.address}", flush=True)
+        try:
+            yield
+        finally:
+            await running.close()
+
+    keep_open(scheduler())
