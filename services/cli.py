@@ -95,6 +95,20 @@ def serve(**given: Any) -> None:
 
 
 @main.command()
+@click.option("--cluster", help="Scheduler to hand work to: tls://HOST:PORT.")
+@_certs
+@click.option("--database", help="Database that the API uses: postgresql://USER:PASSWORD@HOST/NAME.")
+@click.option("--store", help="Store that all of them use: s3://BUCKET/PREFIX or file:///FOLDER.")
+def coordinator(**given: Any) -> None:
+    """Run a coordinator without an API: it drives jobs whenever no other coordinator does."""
+    from services.server import coordinate
+    from services.settings import Settings
+
+    with _refusals_told():
+        coordinate(Settings(**_those_given(given)))
+
+
+@main.command()
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
 @click.option(
     "--port", type=int, default=8786, show_default=True, help="Port to listen on; 0 takes a free one."

@@ -1,7 +1,6 @@
 """`envmatte serve`: the API, a coordinator and the cluster in one process tree; and `envmatte coordinator` alone."""
 
 import fcntl
-import logging
 import signal
 import sys
 from collections.abc import Iterator
@@ -12,6 +11,7 @@ import uvicorn
 from services.api import build_app
 from services.cluster import dispatcher_of
 from services.coordinator import Coordinator
+from services.process import log
 from services.settings import Settings
 from storage.database import open_engine
 from storage.errors import Conflict
@@ -73,7 +73,7 @@ def coordinate(settings: Settings) -> None:
 def _set_up() -> None:
     # uvicorn raises the signal that stopped it once more at its end: what is open here must close before we go.
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s %(message)s")
+    log()
 
 
 @contextmanager
