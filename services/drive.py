@@ -17,7 +17,7 @@ from workflows.ingest.bundle import Limits
 from workflows.jobs import KINDS, Task, order
 
 LOSSES = 8
-"""Workers that may die of a tile before its job fails: most die of something else, a machine that is turned off say."""
+"""How often a tile may be lost before its job fails: most workers die of something else, turned off say."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class Drive:
         if PREPARE in results:
             return self._prepared(connection, results[PREPARE][1])
         if FINISH in results:
-            return self._finished(connection, results[FINISH][1], attempts)
+            return self._finished(connection, results[FINISH][1])
         if self.stage == KINDS[self.kind].stage and not (again or self.to_do or under_way):
             return self._enter(connection, "finishing", [FINISH])
         return Next(self.stage, again, self.task)
@@ -171,12 +171,14 @@ class Drive:
         tiles = order(self.kind, range(plan["tiles"]))
         return self._enter(connection, KINDS[self.kind].stage, tiles, replace(self.task, plan=plan))
 
-    def _finished(self, connection: Connection, figures: dict[str, Any], attempts: int) -> Next:
+    def _finished(self, connection: Connection, figures: dict[str, Any]) -> Next:
         if missing := figures.get("missing"):
-            again = jobs.reopen(connection, self.job, missing, attempts)
+            again = jobs.reopen(connection, self.job, missing, LOSSES)
             if len(again) == len(missing):
                 return self._enter(connection, KINDS[self.kind].stage, again)
-            error = GaveUp(f"{len(missing)} tiles that were done {attempts} times are missing in the store")
+            error = GaveUp(
+                f"{len(missing)} tiles are missing in the store, however often they are done; see that it keeps what it is given"
+            )
             end_badly(connection, self.kind, self.task, error)
         # Unless it was cancelled at the last moment, and is wound up next.
         elif jobs.end(connection, self.job, "succeeded"):

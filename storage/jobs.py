@@ -153,7 +153,7 @@ def miss(connection: Connection, job: str, tile: int, reason: str, allowed: int)
 
 
 def lose(connection: Connection, job: str, tile: int, reason: str, allowed: int) -> bool:
-    """Write down that the worker of a tile died; true if it may be tried again, as `miss` says."""
+    """Write down that a tile was lost, with its worker say; true if it may be tried again, as `miss` says."""
     return _again(connection, job, tile, tiles.c.losses, "loss", reason, allowed)
 
 
@@ -181,7 +181,7 @@ def reopen(connection: Connection, job: str, missing: Sequence[int], allowed: in
         .where(tiles.c.job == job, tiles.c.tile.in_(missing), tiles.c.state == "done")
         .values(state="missing")
     )
-    return [tile for tile in missing if miss(connection, job, tile, "it is missing in the store", allowed)]
+    return [tile for tile in missing if lose(connection, job, tile, "it is missing in the store", allowed)]
 
 
 def name_of(tile: int) -> str:

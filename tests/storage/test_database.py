@@ -86,7 +86,7 @@ def test_writers_that_read_first_wait_for_each_other(engine: Engine) -> None:
                 with writing(engine) as connection:
                     jobs.get(connection, job)  # without the lock from the start, the write below is refused
                     time.sleep(0.002)
-                    jobs.finish_tiles(connection, job, [(tile, 0.1, 10)])
+                    jobs.finish(connection, job, [(tile, 0.1, 10)])
         except BaseException as error:
             failed.append(error)
 

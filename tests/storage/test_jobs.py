@@ -50,7 +50,7 @@ def test_a_job_from_queue_to_success(connection: Connection) -> None:
         {"tiles": 2, "slab": 5},
     )
     assert row.started_at == started is not None
-    jobs.finish_tiles(connection, job, [(0, 0.5, 100), (1, 0.25, 60)])
+    jobs.finish(connection, job, [(0, 0.5, 100), (1, 0.25, 60)])
     assert jobs.end(connection, job, "succeeded")
     row = jobs.get(connection, job)
     assert (row.state, row.done, row.pixels, row.problem) == ("succeeded", 2, 160, None)
@@ -72,7 +72,7 @@ def test_what_is_not_there(connection: Connection) -> None:
 
 def test_a_plan_is_laid_down_once(connection: Connection) -> None:
     job = laid(connection)
-    jobs.finish_tiles(connection, job, [(1, 0.1, 5)])
+    jobs.finish(connection, job, [(1, 0.1, 5)])
     jobs.lay_down(connection, job, {"tiles": 7})
     assert jobs.get(connection, job).total == 3
     assert jobs.to_do(connection, job) == [0, 2]
@@ -80,8 +80,8 @@ def test_a_plan_is_laid_down_once(connection: Connection) -> None:
 
 def test_a_tile_done_twice_counts_once(connection: Connection) -> None:
     job, other = laid(connection), laid(connection)
-    jobs.finish_tiles(connection, job, [(1, 0.1, 50), (1, 0.1, 50)])
-    jobs.finish_tiles(connection, job, [(1, 9.0, 50), (2, 0.1, 30)])
+    jobs.finish(connection, job, [(1, 0.1, 50), (1, 0.1, 50)])
+    jobs.finish(connection, job, [(1, 9.0, 50), (2, 0.1, 30)])
     row = jobs.get(connection, job)
     assert (row.done, row.pixels) == (2, 80)
     assert jobs.to_do(connection, job) == [0]
@@ -91,11 +91,11 @@ def test_a_tile_done_twice_counts_once(connection: Connection) -> None:
 
 def test_a_tile_is_tried_as_often_as_allowed(connection: Connection) -> None:
     job = laid(connection)
-    assert [jobs.miss_tile(connection, job, 1, "out of memory", 3) for _ in range(3)] == [True, True, False]
+    assert [jobs.miss(connection, job, 1, "out of memory", 3) for _ in range(3)] == [True, True, False]
     assert jobs.get(connection, job).failed == 1
     assert jobs.to_do(connection, job) == [0, 2]
     assert lines(connection, job)[1:] == [f"tile 1, attempt {n} of 3: out of memory" for n in (1, 2, 3)]
-    jobs.finish_tiles(connection, job, [(1, 0.1, 10)])
+    jobs.finish(connection, job, [(1, 0.1, 10)])
     assert jobs.get(connection, job).done == 0
 
 
@@ -133,15 +133,15 @@ def test_cancelling(connection: Connection) -> None:
 def test_a_retry_keeps_what_is_done(connection: Connection) -> None:
     job = laid(connection)
     jobs.enter(connection, job, "recovering")
-    jobs.finish_tiles(connection, job, [(0, 0.1, 10)])
-    jobs.miss_tile(connection, job, 1, "why", 1)
+    jobs.finish(connection, job, [(0, 0.1, 10)])
+    jobs.miss(connection, job, 1, "why", 1)
     jobs.end(connection, job, "failed", {"detail": "a tile failed"})
     jobs.retry(connection, job)
     row = jobs.get(connection, job)
     assert (row.state, row.stage, row.done, row.failed, row.pixels) == ("queued", "waiting", 1, 0, 10)
     assert (row.problem, row.finished_at) == (None, None)
     assert jobs.to_do(connection, job) == [1, 2]
-    assert jobs.miss_tile(connection, job, 1, "again", 2)
+    assert jobs.miss(connection, job, 1, "again", 2)
 
 
 def test_only_a_failed_job_is_tried_again(connection: Connection) -> None:
@@ -216,13 +216,70 @@ def test_what_a_key_made(connection: Connection) -> None:
     assert jobs.made_by(connection, "other", "POST /v1/jobs") is None
 
 
-def test_a_sign_of_life(connection: Connection) -> None:
-    assert jobs.last_beat(connection) is None
-    jobs.beat(connection, workers=2, threads=8)
-    first = jobs.last_beat(connection)
-    jobs.beat(connection, workers=3, threads=12)
-    last = jobs.last_beat(connection)
-    assert first is not None
-    assert last is not None
-    assert (last.workers, last.threads) == (3, 12)
-    assert last.beat_at >= first.beat_at
+def test_the_steps_around_the_tiles_are_tried_as_often_as_allowed(connection: Connection) -> None:
+    job = laid(connection)
+    jobs.begin(connection, job)
+    jobs.begin(connection, job)
+    assert jobs.to_do(connection, job) == [0, 1, 2]
+    assert [jobs.miss(connection, job, jobs.PREPARE, "why", 2) for _ in range(2)] == [True, False]
+    assert jobs.miss(connection, job, jobs.FINISH, "why", 2)
+    assert lines(connection, job)[1:] == [
+        "preparing, attempt 1 of 2: why",
+        "preparing, attempt 2 of 2: why",
+        "finishing, attempt 1 of 2: why",
+    ]
+    assert jobs.get(connection, job).failed == 0
+
+
+def test_workers_that_die_are_counted_apart(connection: Connection) -> None:
+    job = laid(connection)
+    assert jobs.lose(connection, job, 1, "it died", 2)
+    assert jobs.miss(connection, job, 1, "why", 2)
+    assert not jobs.lose(connection, job, 1, "it died", 2)
+    assert lines(connection, job)[1:] == [
+        "tile 1, loss 1 of 2: it died",
+        "tile 1, attempt 1 of 2: why",
+        "tile 1, loss 2 of 2: it died",
+    ]
+    assert jobs.to_do(connection, job) == [0, 2]
+
+
+def test_a_tile_that_the_store_lacks_is_done_again_and_counts_once(connection: Connection) -> None:
+    job = laid(connection)
+    jobs.finish(connection, job, [(n, 0.1, 10) for n in range(3)])
+    assert jobs.reopen(connection, job, [0, 2], 2) == [0, 2]
+    assert jobs.to_do(connection, job) == [0, 2]
+    assert (jobs.get(connection, job).done, jobs.get(connection, job).pixels) == (3, 30)
+    jobs.finish(connection, job, [(0, 0.1, 10), (2, 0.1, 10)])
+    assert (jobs.get(connection, job).done, jobs.get(connection, job).pixels) == (3, 30)
+    assert jobs.reopen(connection, job, [2], 2) == []
+    jobs.end(connection, job, "failed", {"detail": "gone again"})
+    jobs.retry(connection, job)
+    assert jobs.get(connection, job).done == 2
+    jobs.finish(connection, job, [(2, 0.1, 10)])
+    assert jobs.get(connection, job).done == 3
+
+
+def test_the_pace_is_measured_from_where_tiles_are_done(connection: Connection) -> None:
+    job = laid(connection)
+    jobs.enter(connection, job, "recovering")
+    assert not jobs.pace(connection, job, after=2)
+    jobs.finish(connection, job, [(0, 0.1, 10), (1, 0.1, 10)])
+    assert jobs.pace(connection, job, after=2)
+    row = jobs.get(connection, job)
+    assert row.paced_done == 2
+    assert row.moved_at <= row.paced_at
+    jobs.enter(connection, job, "finishing")
+    assert jobs.get(connection, job).paced_at is None
+
+
+def test_what_was_ever_done_is_added_up(connection: Connection) -> None:
+    job, other = laid(connection), laid(connection)
+    jobs.finish(connection, job, [(0, 0.5, 10), (0, 0.5, 10), (1, 0.25, 20)])
+    jobs.miss(connection, job, 2, "why", 3)
+    jobs.finish(connection, other, [(0, 0.25, 5)])
+    jobs.lose(connection, other, 1, "why", 3)
+    jobs.cancel(connection, job)
+    jobs.forget(connection, job)
+    (row,) = connection.execute(select(database.totals))
+    assert tuple(row) == ("recover", 3, 1, 1, 35, 1.0)
