@@ -24,7 +24,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.exc import SQLAlchemyError
 
-from storage import dialects, migrations
+from storage import dialects
 from storage.dialects import clock as clock
 from storage.errors import NotFound, Unavailable
 
@@ -195,6 +195,8 @@ def open_engine(url: str) -> Engine:
     NoRoom
         If its disk is full.
     """
+    from storage import migrations  # with alembic, whose import takes a time that no worker should spend
+
     engine = dialects.create(url)
     try:
         with reading(engine) as connection:
