@@ -1,5 +1,6 @@
 """The database: its tables, and the engine that opens it."""
 
+import logging
 import secrets
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -29,6 +30,9 @@ from storage.dialects import clock as clock
 from storage.errors import NotFound, Unavailable
 
 metadata = MetaData()
+logging.getLogger("alembic").setLevel(
+    logging.WARNING
+)  # else it has a line for every step, from its import on
 
 captures = Table(
     "captures",

@@ -1,6 +1,5 @@
 """The schema's revisions: databases of every age end with the same tables, and what they hold."""
 
-import logging
 import sqlite3
 import subprocess
 import sys
@@ -30,6 +29,14 @@ sys.stdin.readline()
 engine = open_engine(sys.argv[1])
 with reading(engine) as connection:
     print(migrations.revision(connection))
+"""
+
+LOGGED = """
+import logging, sys
+from storage.database import open_engine
+logging.basicConfig(level=logging.INFO)
+for _ in range(2):
+    open_engine(sys.argv[1]).dispose()
 """
 
 
@@ -204,15 +211,7 @@ def test_processes_that_open_it_at_once_upgrade_it_once(bare: Engine) -> None:
         assert differences(connection) == []
 
 
-def test_an_upgrade_is_logged_in_a_line_of_ours(
-    old: str, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
-) -> None:
-    handlers = list(logging.getLogger().handlers)
-    with caplog.at_level(logging.INFO):
-        for _ in range(2):
-            open_engine(old).dispose()
-    assert [record.getMessage() for record in caplog.records] == [
-        f"the database's schema is upgraded from revision none to {migrations.newest()}"
-    ]
-    assert logging.getLogger().handlers == handlers
-    assert capfd.readouterr() == ("", "")
+def test_an_upgrade_is_logged_in_a_line_of_ours(old: str) -> None:
+    done = subprocess.run([sys.executable, "-c", LOGGED, old], capture_output=True, text=True, check=True)
+    upgraded = f"the database's schema is upgraded from revision none to {migrations.newest()}"
+    assert (done.stdout, done.stderr) == ("", f"INFO:storage.migrations:{upgraded}\n")
