@@ -1,5 +1,6 @@
 """The database: its tables, and the engine that opens it."""
 
+import logging
 import secrets
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -24,11 +25,14 @@ from sqlalchemy import (
 )
 from sqlalchemy.exc import SQLAlchemyError
 
-from storage import dialects, migrations
+from storage import dialects
 from storage.dialects import clock as clock
 from storage.errors import NotFound, Unavailable
 
 metadata = MetaData()
+logging.getLogger("alembic").setLevel(
+    logging.WARNING
+)  # else it has a line for every step, from its import on
 
 captures = Table(
     "captures",
@@ -195,6 +199,8 @@ def open_engine(url: str) -> Engine:
     NoRoom
         If its disk is full.
     """
+    from storage import migrations  # with alembic, whose import takes a time that no worker should spend
+
     engine = dialects.create(url)
     try:
         with reading(engine) as connection:

@@ -5,7 +5,14 @@ import sqlite3
 from typing import Any
 
 from sqlalchemy import URL, Connection, Engine, Float, create_engine, event, make_url
-from sqlalchemy.exc import ArgumentError, DBAPIError, InterfaceError, OperationalError, SQLAlchemyError
+from sqlalchemy.exc import (
+    ArgumentError,
+    DataError,
+    DBAPIError,
+    InterfaceError,
+    OperationalError,
+    SQLAlchemyError,
+)
 from sqlalchemy.exc import TimeoutError as NoConnectionFree
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.compiler import SQLCompiler
@@ -25,7 +32,7 @@ LINK: dict[str, Any] = {
     "keepalives_count": 2,
     "tcp_user_timeout": 20_000,
 }
-"""libpq's settings: a link that is cut without a word is given up after some 20 s."""
+"""libpq's settings, where a URL has no others: a link that is cut without a word is given up after some 20 s."""
 
 LIMITS = {
     "lock_timeout": "20s",
@@ -71,7 +78,7 @@ def create(url: str) -> Engine:
             parsed.set(drivername="postgresql+psycopg"),
             pool_pre_ping=True,
             isolation_level="READ COMMITTED",
-            connect_args=LINK,
+            connect_args={name: value for name, value in LINK.items() if name not in parsed.query},
         )
         event.listen(engine, "connect", _set_up_postgresql)
     else:  # what was given may hold a password: it is not repeated
@@ -107,14 +114,15 @@ def _begin(connection: Connection) -> None:
 
 
 def meaning(error: SQLAlchemyError) -> EnvmatteError | None:
-    """What a database's error is to a caller: no room, out of reach for now, or None if it is a fault of ours."""
+    """What a database's error means to a caller; None if it is a fault of ours."""
     if isinstance(error, NoConnectionFree):
         return Unavailable(
             "more is asked of the database at once than it is set up for; try again in a few seconds"
         )
     if not isinstance(error, DBAPIError):
         return None
-    full = away = False
+    if isinstance(error, DataError):  # a NUL in a text, a text too long: what SQLite would have kept
+        return InvalidInput(f"the database can't hold what was sent: {reason(error)}")
     if isinstance(error.orig, sqlite3.Error):
         code = getattr(error.orig, "sqlite_errorcode", 0) & 0xFF  # the rest says more about the same
         full, away = code == sqlite3.SQLITE_FULL, code in _SQLITE_AWAY

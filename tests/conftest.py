@@ -7,13 +7,11 @@ import pytest
 from storage.database import open_engine
 from tests import postgres
 
-TEMPLATE = "with_tables"
-
 
 @pytest.fixture(scope="session")
 def postgresql_server() -> Iterator[postgres.Server]:
     """A PostgreSQL server; skipped where none can be run."""
-    with postgres.server() as server, server.database(TEMPLATE) as url:
+    with postgres.server() as server, server.database(postgres.TEMPLATE) as url:
         open_engine(url).dispose()
         yield server
 
@@ -21,5 +19,5 @@ def postgresql_server() -> Iterator[postgres.Server]:
 @pytest.fixture
 def postgresql(postgresql_server: postgres.Server) -> Iterator[str]:
     """The URL of a fresh database that has the tables."""
-    with postgresql_server.database(like=TEMPLATE) as url:
+    with postgresql_server.database(like=postgres.TEMPLATE) as url:
         yield url

@@ -16,6 +16,9 @@ from pathlib import Path
 import psycopg
 import pytest
 
+TEMPLATE = "with_tables"
+"""The database of a server that fresh ones are copied from."""
+
 SETTINGS = {
     "listen_addresses": "",  # the socket in its own folder alone
     "fsync": "off",
@@ -30,7 +33,7 @@ class Server:
 
     def __init__(self, binaries: Path, folder: Path) -> None:
         self._binaries = binaries
-        self._folder = folder
+        self.folder = folder
         self._process: subprocess.Popen[bytes] | None = None
         initdb = ["--pgdata", str(folder / "data"), "--username=postgres", "--auth=trust", "--no-sync"]
         self._run("initdb", [*initdb, "--locale=C", "--encoding=UTF8"]).wait()
@@ -41,7 +44,7 @@ class Server:
     def _run(self, program: str, arguments: Sequence[str]) -> subprocess.Popen[bytes]:
         # PostgreSQL refuses to run as root.
         user = "nobody" if os.getuid() == 0 else None
-        with (self._folder / "log").open("ab") as log:
+        with (self.folder / "log").open("ab") as log:
             return subprocess.Popen(
                 [self._binaries / program, *arguments],
                 stdout=log,
@@ -55,20 +58,20 @@ class Server:
 
     def url(self, database: str) -> str:
         """The URL of a database, as `storage.database.open_engine` takes it."""
-        return f"postgresql://postgres@/{database}?host={self._folder}"
+        return f"postgresql://postgres@/{database}?host={self.folder}"
 
     def start(self) -> None:
         """Start the server, and wait until it answers."""
-        settings = SETTINGS | {"unix_socket_directories": str(self._folder)}
+        settings = SETTINGS | {"unix_socket_directories": str(self.folder)}
         options = [f"--{name}={value}" for name, value in settings.items()]
-        self._process = self._run("postgres", ["-D", str(self._folder / "data"), *options])
+        self._process = self._run("postgres", ["-D", str(self.folder / "data"), *options])
         while True:
             try:
                 psycopg.connect(self.url("postgres")).close()
                 return
             except psycopg.OperationalError:
                 if self._process.poll() is not None:
-                    raise RuntimeError((self._folder / "log").read_text().strip()) from None
+                    raise RuntimeError((self.folder / "log").read_text().strip()) from None
                 time.sleep(0.02)
 
     def stop(self) -> None:
@@ -95,13 +98,14 @@ class Server:
     def database(self, name: str | None = None, like: str = "template0") -> Iterator[str]:
         """A database that is there while this lasts, a copy of another that nobody uses; yields its URL."""
         name = name or f"test_{secrets.token_hex(6)}"
-        self._execute(f"CREATE DATABASE {name} TEMPLATE {like}")
+        self.execute(f"CREATE DATABASE {name} TEMPLATE {like}")
         try:
             yield self.url(name)
         finally:
-            self._execute(f"DROP DATABASE {name} WITH (FORCE)")
+            self.execute(f"DROP DATABASE {name} WITH (FORCE)")
 
-    def _execute(self, statement: str) -> None:
+    def execute(self, statement: str) -> None:
+        """Run a statement as the server's superuser, in no transaction."""
         with psycopg.connect(self.url("postgres"), autocommit=True) as connection:
             connection.execute(statement)
 

@@ -11,13 +11,11 @@ from alembic import command
 from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from alembic.util import CommandError
 from sqlalchemy import Connection
 
 from storage.errors import Conflict
 
 logger = logging.getLogger(__name__)
-logging.getLogger("alembic").setLevel(logging.WARNING)  # a line for every step, at every start
 
 _config = Config()
 _config.set_main_option("script_location", "storage:migrations")
@@ -45,25 +43,18 @@ def upgrade(connection: Connection, to: str = "head") -> None:
         If the schema is newer than this code.
     """
     before = revision(connection)
+    known = {script.revision for script in ScriptDirectory.from_config(_config).walk_revisions()}
+    if before is not None and before not in known:
+        raise Conflict(
+            f"the database is of a newer envmatte: it has revision {before}, and this one knows those up to "
+            f"{newest()}; install the newer envmatte, or use another database"
+        )
     with _one_at_a_time:
+        _config.attributes["connection"] = connection
         try:
-            _config.attributes["connection"] = connection
             command.upgrade(_config, to)
-        except CommandError as error:
-            if before is None or _is_known(before):
-                raise
-            raise Conflict(
-                f"the database is of a newer envmatte: it has revision {before}, and this one knows those up to "
-                f"{newest()}; install the newer envmatte, or use another database"
-            ) from error
         finally:
             del _config.attributes["connection"]
     after = revision(connection)
     if after != before:
         logger.info("the database's schema is upgraded from revision %s to %s", before or "none", after)
-
-
-def _is_known(revision: str) -> bool:
-    return any(
-        script.revision == revision for script in ScriptDirectory.from_config(_config).walk_revisions()
-    )

@@ -1,6 +1,7 @@
 """A store in a folder and databases of both engines, all real, for the tests of storage."""
 
 import hashlib
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -21,10 +22,20 @@ def objects(folder: Path) -> Objects:
     return Objects(folder.as_uri())
 
 
+@pytest.fixture(scope="session")
+def sqlite_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A SQLite database that has the tables, for fresh ones to be copied from."""
+    path = tmp_path_factory.mktemp("sqlite") / "with_tables.db"
+    open_engine(f"sqlite:///{path}").dispose()
+    return path
+
+
 @pytest.fixture
-def sqlite(tmp_path: Path) -> str:
-    """The URL of a SQLite database that is not there yet."""
-    return f"sqlite:///{tmp_path}/ledger.db"
+def sqlite(tmp_path: Path, sqlite_template: Path) -> str:
+    """The URL of a fresh SQLite database that has the tables."""
+    path = tmp_path / "ledger.db"
+    shutil.copyfile(sqlite_template, path)
+    return f"sqlite:///{path}"
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])

@@ -2,6 +2,8 @@
 
 import asyncio
 import os
+import secrets
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +14,7 @@ from storage.database import open_engine, writing
 from storage.errors import NoRoom
 from storage.objects import Objects
 from tests.disks import small_disk
+from tests.postgres import TEMPLATE, Server
 
 SIZE = 12 << 20
 
@@ -50,7 +53,7 @@ def test_a_small_object_on_a_full_disk(disk: Path) -> None:
     assert objects.read("a").read() == b"1"
 
 
-def test_the_ledger_on_a_full_disk(disk: Path) -> None:
+def test_a_sqlite_ledger_on_a_full_disk(disk: Path) -> None:
     engine = open_engine(f"sqlite:///{disk / 'ledger.db'}")
     with writing(engine) as c:
         uploads.add(c, "before", 10, "", 1000.0, None)
@@ -69,3 +72,22 @@ def test_the_ledger_on_a_full_disk(disk: Path) -> None:
     with writing(engine) as c:
         uploads.add(c, "upload 0", 10, "", 1000.0, None)
     engine.dispose()
+
+
+def test_a_postgresql_ledger_on_a_full_disk(postgresql_server: Server) -> None:
+    server = postgresql_server
+    with small_disk(server.folder / "disk", 2 * SIZE) as disk:
+        shutil.chown(disk, server.folder.owner())
+        server.execute(f"CREATE TABLESPACE small LOCATION '{disk}'")
+        with server.database(like=f"{TEMPLATE} TABLESPACE small") as url:
+            engine = open_engine(url)
+            with writing(engine) as c:
+                uploads.add(c, "before", 10, "", 1000.0, None)
+            big = secrets.token_hex(SIZE)  # which does not compress to fit
+            with pytest.raises(NoRoom, match="free room"), writing(engine) as c:
+                uploads.add(c, "big", 10, big, 1000.0, None)
+            with writing(engine) as c:
+                assert uploads.get(c, "before").length == 10
+                uploads.add(c, "small", 10, "", 1000.0, None)
+            engine.dispose()
+        server.execute("DROP TABLESPACE small")
