@@ -2,6 +2,7 @@
 
 import logging
 import sqlite3
+import time
 from typing import Any
 
 from sqlalchemy import URL, Connection, Engine, Float, create_engine, event, make_url
@@ -39,6 +40,9 @@ LIMITS = {
     "idle_in_transaction_session_timeout": "10s",  # of a process that is frozen while it has the writers' lock
     "statement_timeout": "60s",
 }
+
+PATIENCE = 10
+"""Seconds that SQLite waits for a lock."""
 
 READ_ONLY: dict[str, dict[str, Any]] = {
     "sqlite": {},
@@ -92,8 +96,18 @@ def create(url: str) -> Engine:
 def _set_up_sqlite(connection: Any, record: object) -> None:
     connection.isolation_level = None  # BEGIN is ours, see _begin
     cursor = connection.cursor()
-    for pragma in ("busy_timeout=10000", "journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON"):
+    for pragma in (f"busy_timeout={PATIENCE * 1000}", "synchronous=NORMAL", "foreign_keys=ON"):
         cursor.execute(f"PRAGMA {pragma}")
+    deadline = time.monotonic() + PATIENCE
+    while True:
+        try:
+            cursor.execute("PRAGMA journal_mode=WAL")
+            break
+        except sqlite3.OperationalError as error:
+            # Of those that turn a new file to WAL at once SQLite refuses all but one, without waiting.
+            if error.sqlite_errorcode & 0xFF != sqlite3.SQLITE_BUSY or time.monotonic() > deadline:
+                raise
+            time.sleep(0.01)
     cursor.close()
 
 
