@@ -25,6 +25,8 @@ from services.settings import Settings
 from storage.errors import Unavailable
 from tests.services.clusters import address, children, listening, running, started, wait, workers
 
+pytestmark = pytest.mark.full
+
 WORKERS = 2
 
 
@@ -211,16 +213,18 @@ def test_memory_has_an_end_and_a_task_that_takes_it_all_is_blamed_at_once(
 def test_workers_that_are_asked_to_end_leave_nothing(
     cluster: Cluster, client: Client, tmp_path: Path, number: signal.Signals
 ) -> None:
+    before = client.nthreads().keys()
     with working(cluster.folder, cluster.address, "--workers", "2", TMPDIR=str(tmp_path)) as process:
         wait(lambda: len(client.nthreads()) == WORKERS + 2)
         assert any(tmp_path.iterdir())
-        busy = [client.submit(time.sleep, 1000 + n) for n in range(WORKERS + 2)]
-        wait(lambda: all(client.processing().values()))
+        these = client.nthreads().keys() - before
+        busy = [client.submit(time.sleep, 1000, workers=[one], pure=False) for one in these]
+        wait(lambda: all(client.processing()[one] for one in these))
         tree = children(process)
         process.send_signal(number)
         assert process.wait(60) == (0 if number == signal.SIGTERM else 130)
         assert not any(tmp_path.iterdir())
-        assert not running(tree)
+        wait(lambda: not running(tree))
         client.cancel(busy)
     wait(lambda: len(client.nthreads()) == WORKERS)
     assert "Traceback" not in cluster.log[-2000:]
