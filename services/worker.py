@@ -10,10 +10,9 @@ from contextlib import asynccontextmanager
 from urllib.parse import urlsplit
 
 from distributed import Nanny
-from distributed.comm import connect
 from distributed.security import Security
 
-from services.cluster import NO_DASHBOARD, PATIENCE, PRELOAD, START
+from services.cluster import NO_DASHBOARD, PRELOAD, START, reach
 from services.process import keep_open, log
 from services.settings import ClusterSettings, is_loopback
 from storage.errors import InvalidInput
@@ -95,15 +94,13 @@ class _Workers:
         async with self._looking:  # one after another, so that it is said once
             while True:
                 try:
-                    args = self._security.get_connection_args("worker")
-                    comm = await connect(self._scheduler, timeout=PATIENCE, **args)
+                    await reach(self._scheduler, self._security, "worker")
                 except OSError as error:
                     if time.monotonic() - self._said_at >= SAY:
                         logger.warning("waiting for the scheduler at %s: %s", self._scheduler, error)
                         self._said_at = time.monotonic()
                     await asyncio.sleep(PAUSE)
                 else:
-                    await comm.close()
                     if self._said_at > 0:
                         logger.info("the scheduler at %s answers", self._scheduler)
                         self._said_at = -SAY
