@@ -20,7 +20,7 @@ from distributed.scheduler import KilledWorker
 from distributed.security import Security
 
 from services import certs
-from services.cluster import connect, embedded, open_cluster
+from services.cluster import connect, embedded
 from services.settings import Settings
 from storage.errors import Unavailable
 from tests.services.clusters import address, children, listening, running, started, wait, workers
@@ -270,7 +270,7 @@ def test_a_scheduler_without_certificates_is_for_this_machine_alone(tmp_path: Pa
         assert "without TLS" in (tmp_path / "log").read_text()
         with (
             started(tmp_path / "log", "worker", "--cluster", at, "--workers", "1", **data) as worker,
-            open_cluster(Settings(data=tmp_path, cluster=at)) as client,
+            connect(at, None) as client,
         ):
             wait(lambda: client.nthreads())
             for one in (psutil.Process(worker.pid), *children(worker)):
