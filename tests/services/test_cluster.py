@@ -230,6 +230,16 @@ def test_workers_that_are_asked_to_end_leave_nothing(
     assert "Traceback" not in cluster.log[-2000:]
 
 
+def test_workers_that_are_still_starting_end_when_they_are_asked(cluster: Cluster, tmp_path: Path) -> None:
+    with working(cluster.folder, cluster.address, "--workers", "2", TMPDIR=str(tmp_path)) as process:
+        wait(lambda: len(workers(process)) == 2)
+        tree = children(process)
+        process.terminate()
+        assert process.wait(60) == 0
+        assert not any(tmp_path.iterdir())
+        wait(lambda: not running(tree))
+
+
 def test_workers_die_with_their_nanny(cluster: Cluster, client: Client) -> None:
     with working(cluster.folder, cluster.address, "--workers", "2") as process:
         wait(lambda: len(client.nthreads()) == WORKERS + 2)
