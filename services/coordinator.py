@@ -22,6 +22,7 @@ from services.api.errors import problem_of
 from services.dispatch import Dispatcher
 from services.drive import Drive, end_badly
 from services.housekeeping import discard, sweep
+from services.process import about
 from services.settings import Settings
 from storage import captures, jobs, leases, mattes, uploads
 from storage.database import reading, writing
@@ -169,14 +170,16 @@ class Coordinator:
     def _guarded(self, job: str, act: Any, *arguments: Any) -> None:
         """Do something about a job; what is wrong with it must not hold up the others."""
         try:
-            act(*arguments)
+            with about(job):
+                act(*arguments)
         except (Superseded, Unavailable):
             raise
         except EnvmatteError as error:
             self._fail(job, error)
         except Exception as error:
             # Whatever it was, and whatever it left half done here: the ledger knows where the job stands.
-            logger.exception("job %s is taken up anew", job)
+            with about(job):
+                logger.exception("the job is taken up anew")
             if job in self._drives:
                 self._drop(job)
             self._troubles[job] += 1
@@ -197,6 +200,7 @@ class Coordinator:
             drive = self._drive_of(c, row)
             jobs.enter(c, row.id, drive.stage)
         self._drives[row.id] = drive
+        logger.info("%s, from the stage %s on", row.kind, drive.stage)
 
     def _drive_of(self, connection: Connection, row: Row[Any]) -> Drive:
         return Drive.of(row, jobs.to_do(connection, row.id), self._objects.url, self._settings.limits)
@@ -281,7 +285,7 @@ class Coordinator:
                 return
             job = min(share, key=lambda job: (share[job], len(self._drives[job].to_do)))
             drive = self._drives[job]
-            dispatcher.submit(drive.kind, drive.task, drive.to_do.popleft())
+            dispatcher.submit(drive.kind, drive.task, drive.to_do.popleft(), drive.trace)
             share[job] += 1
             if not drive.to_do:
                 del share[job]

@@ -12,7 +12,9 @@ from distributed import Worker
 from tornado.ioloop import PeriodicCallback
 
 # Importing the kernels takes seconds: not out of the first job's time.
-import workflows.jobs  # noqa: F401
+import services.step  # noqa: F401
+from services import tracing
+from services.process import about, log_as_nanny_does
 
 logger = logging.getLogger(__name__)
 
@@ -23,7 +25,9 @@ PATIENCE = 0.5
 
 
 def dask_setup(worker: Worker) -> None:
-    """Watch for tasks that were cancelled while they run."""
+    """Log and trace, and watch for tasks that were cancelled while they run."""
+    log_as_nanny_does()
+    tracing.start("worker")
     since: dict[str, float] = {}
 
     def look() -> None:
@@ -33,7 +37,9 @@ def dask_setup(worker: Worker) -> None:
             del since[key]
         for key in strays:
             if now - since.setdefault(key, now) > PATIENCE:
-                logger.info("%s was cancelled and runs on: ending this process", key)
+                _, job, rest = key.split("-", 2)  # as `services.dispatch` makes it
+                with about(job, int(rest.rpartition("-")[0])):
+                    logger.info("cancelled, and runs on: ending this process")
                 os._exit(1)
 
     worker.periodic_callbacks["strays"] = PeriodicCallback(look, 1000 * LOOK)

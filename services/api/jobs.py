@@ -8,6 +8,7 @@ from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection, Row
 
+from services import tracing
 from services.api.context import After, Limit, Needs, read_json
 from services.api.waiting import reason
 from storage import captures, jobs, leases, mattes
@@ -164,7 +165,7 @@ def post_job(
             Program.model_validate(capture.program).bands()
             matte = new_id()
             chosen = options.model_dump(mode="json")
-            job = jobs.add(c, "recover", capture.id, chosen, matte)
+            job = jobs.add(c, "recover", capture.id, chosen, matte, tracing.asked_by())
             mattes.add(c, matte, capture.id, job, chosen)
             if idempotency_key:
                 jobs.remember(c, idempotency_key, CALL, job)
