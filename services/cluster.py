@@ -11,6 +11,7 @@ from typing import Any
 
 import dask
 from distributed import Client, LocalCluster
+from distributed.comm import connect as open_comm
 from distributed.security import Security
 from tornado.ioloop import IOLoop
 
@@ -72,6 +73,19 @@ def embedded(settings: Settings) -> Iterator[LocalCluster]:
         yield cluster
 
 
+async def reach(address: str, security: Security | None, role: str = "client") -> None:
+    """See that a scheduler answers.
+
+    Raises
+    ------
+    OSError
+        If none does within some seconds; dask alone would wait for ever for one that takes a connection and is silent.
+    """
+    args = (security or Security()).get_connection_args(role)
+    comm = await asyncio.wait_for(open_comm(address, timeout=PATIENCE, **args), PATIENCE + 1)
+    comm.abort()
+
+
 def connect(address: str, security: Security | None) -> Client:
     """A client of a scheduler that runs.
 
@@ -93,6 +107,7 @@ def connect(address: str, security: Security | None) -> Client:
         If no scheduler answers within some seconds, or not to these certificates.
     """
     try:
+        asyncio.run(reach(address, security))
         return Client(address, security=security, timeout=PATIENCE, set_as_default=False, loop=_loop())
     except OSError as error:  # a time-out too
         raise Unavailable(

@@ -177,7 +177,7 @@ class Drive:
             if len(again) == len(missing):
                 return self._enter(connection, KINDS[self.kind].stage, again)
             error = GaveUp(
-                f"{len(missing)} tiles are missing in the store, however often they are done; see that it keeps what it is given"
+                f"{len(missing)} tiles are missing in the store, however often they are done: it loses what it is given"
             )
             end_badly(connection, self.kind, self.task, error)
         # Unless it was cancelled at the last moment, and is wound up next.

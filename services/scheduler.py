@@ -52,8 +52,10 @@ def schedule(settings: ClusterSettings, host: str, port: int) -> None:
                 security=security,
                 **NO_DASHBOARD,
             )
-        except OSError as error:
-            raise Conflict(f"can't listen on {host}, port {port}: {error.strerror or error}") from error
+        except RuntimeError as error:
+            if not isinstance(error.__cause__, OSError):
+                raise
+            raise Conflict(f"can't listen on {host}, port {port}: {error.__cause__.strerror}") from error
         print(f"envmatte schedules at {running.address}", flush=True)
         try:
             yield

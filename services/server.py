@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
 import uvicorn
+from sqlalchemy import Engine
 
 from services.api import build_app
 from services.cluster import dispatcher_of
@@ -29,13 +30,7 @@ def serve(settings: Settings) -> None:
     Conflict
         If another service has the data folder.
     """
-    _set_up()
-    with ExitStack() as stack:
-        if settings.alone:
-            stack.enter_context(_sole_user(settings))
-        engine = open_engine(settings.database_url)
-        stack.callback(engine.dispose)
-        objects = Objects(settings.store_url)
+    with _opened(settings) as (stack, engine, objects):
         # The port is taken before workers start, so that one in use is told at once.
         config = uvicorn.Config(
             build_app(settings, engine, objects),
@@ -58,28 +53,31 @@ def serve(settings: Settings) -> None:
 
 def coordinate(settings: Settings) -> None:
     """Drive jobs, whenever no other coordinator does, until interrupted."""
-    _set_up()
+    with _opened(settings) as (stack, engine, objects):
+        dispatcher = stack.enter_context(dispatcher_of(settings))
+        stack.enter_context(Coordinator(settings, engine, objects, dispatcher))
+        print("envmatte coordinates", flush=True)
+        signal.pause()
+
+
+@contextmanager
+def _opened(settings: Settings) -> Iterator[tuple[ExitStack, Engine, Objects]]:
+    """The database and the store, and a stack that is unwound before they are closed."""
+    # uvicorn raises the signal that stopped it once more at its end: what is open here must close before we go.
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))
+    log()
+    settings.data.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         if settings.alone:
             stack.enter_context(_sole_user(settings))
         engine = open_engine(settings.database_url)
         stack.callback(engine.dispose)
-        dispatcher = stack.enter_context(dispatcher_of(settings))
-        stack.enter_context(Coordinator(settings, engine, Objects(settings.store_url), dispatcher))
-        print("envmatte coordinates", flush=True)
-        signal.pause()
-
-
-def _set_up() -> None:
-    # uvicorn raises the signal that stopped it once more at its end: what is open here must close before we go.
-    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))
-    log()
+        yield stack, engine, Objects(settings.store_url)
 
 
 @contextmanager
 def _sole_user(settings: Settings) -> Iterator[None]:
     """Hold the data folder's lock: two services on one folder would drive the same jobs."""
-    settings.data.mkdir(parents=True, exist_ok=True)
     with (settings.data / "lock").open("a") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

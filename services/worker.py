@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import multiprocessing
 import socket
 import tempfile
 import time
@@ -10,10 +11,9 @@ from contextlib import asynccontextmanager
 from urllib.parse import urlsplit
 
 from distributed import Nanny
-from distributed.comm import connect
 from distributed.security import Security
 
-from services.cluster import NO_DASHBOARD, PATIENCE, PRELOAD, START
+from services.cluster import NO_DASHBOARD, PRELOAD, START, reach
 from services.process import keep_open, log
 from services.settings import ClusterSettings, is_loopback
 from storage.errors import InvalidInput
@@ -68,6 +68,7 @@ class _Workers:
         self._host = host
         self._looking = asyncio.Lock()
         self._said_at = -SAY
+        self._ending = False
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
@@ -76,17 +77,24 @@ class _Workers:
             try:
                 yield
             finally:
+                self._ending = True
                 for task in kept:
                     task.cancel()
                 await asyncio.gather(*kept, return_exceptions=True)
+                for process in multiprocessing.active_children():
+                    process.kill()  # a nanny that has not started yet can't end its own
 
     async def _keep(self, scratch: str) -> None:
         """Have one nanny, and another one whenever it ends, as it does with its scheduler."""
-        while True:
+        while not self._ending:
             await self._find_scheduler()
             try:
                 await self._have_nanny(scratch)
             except Exception as error:
+                if (
+                    self._ending
+                ):  # closing a nanny that has not started fails, and takes the place of the cancellation
+                    return
                 logger.warning("a worker could not join %s: %r; trying again", self._scheduler, error)
             await asyncio.sleep(PAUSE)
 
@@ -95,15 +103,13 @@ class _Workers:
         async with self._looking:  # one after another, so that it is said once
             while True:
                 try:
-                    args = self._security.get_connection_args("worker")
-                    comm = await connect(self._scheduler, timeout=PATIENCE, **args)
+                    await reach(self._scheduler, self._security, "worker")
                 except OSError as error:
                     if time.monotonic() - self._said_at >= SAY:
                         logger.warning("waiting for the scheduler at %s: %s", self._scheduler, error)
                         self._said_at = time.monotonic()
                     await asyncio.sleep(PAUSE)
                 else:
-                    await comm.close()
                     if self._said_at > 0:
                         logger.info("the scheduler at %s answers", self._scheduler)
                         self._said_at = -SAY

@@ -6,9 +6,12 @@ import asyncio
 import errno
 import io
 import json
+import re
 import shutil
 import threading
-from contextlib import asynccontextmanager, contextmanager
+import time
+from contextlib import asynccontextmanager, contextmanager, suppress
+from datetime import timedelta
 from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -25,12 +28,13 @@ from zarr.buffer import default_buffer_prototype
 from zarr.storage import MemoryStore, StorePath, WrapperStore
 from zarr.storage import ObjectStore as ZarrStore
 
-from storage.errors import DISK_FULL, Corrupt, NoRoom
+from storage.errors import DISK_FULL, Corrupt, NoRoom, Unavailable
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Coroutine, Iterator
+    from collections.abc import AsyncIterator, Collection, Coroutine, Iterator
 
     from obstore import AsyncWritableFile, ReadableFile
+    from obstore.store import ClientConfig, RetryConfig
     from zarr.abc.store import ByteRequest
     from zarr.core.array_spec import ArrayConfigParams
     from zarr.core.buffer import Buffer, BufferPrototype
@@ -41,6 +45,19 @@ METADATA = ("zarr.json", ".zarray", ".zgroup", ".zattrs", ".zmetadata")
 """Objects that zarr looks for to see whether there is an array or a group: they may be missing."""
 PART = 8 << 20
 """Bytes of one part of a large object: S3 takes parts of 5 MiB and more."""
+REQUESTS: ClientConfig = {
+    "connect_timeout": timedelta(seconds=5),
+    "timeout": timedelta(seconds=20),  # of a part of 8 MiB, too
+    "allow_http": True,  # where AWS_ENDPOINT_URL names it, and nowhere else
+}
+RETRIES: RetryConfig = {
+    "max_retries": 10,
+    "retry_timeout": timedelta(seconds=40),
+    "backoff": {"init_backoff": timedelta(seconds=0.1), "max_backoff": timedelta(seconds=5), "base": 2},
+}
+"""Of what a bucket does not answer, or with an error of its own: a minute in all, with the last request."""
+UNREACHABLE = re.compile(r"HTTP error|status code: (429|5\d\d)|error sending request|response body")
+"""What obstore says when a bucket does not answer, or with an error of its own; it has no kind of error for that."""
 
 
 def together(*work: Coroutine[Any, Any, Any]) -> list[Any]:
@@ -77,7 +94,12 @@ class Objects:
     Parameters
     ----------
     url : str
-        ``file:///folder`` (made if it does not exist) or ``s3://bucket/prefix``.
+        ``file:///folder`` (made if it does not exist) or ``s3://bucket/prefix``; where the bucket is and who asks say
+        the environment variables ``AWS_ENDPOINT_URL``, ``AWS_REGION``, ``AWS_ACCESS_KEY_ID`` and so on.
+
+    Notes
+    -----
+    Whatever reads or writes a bucket raises `Unavailable` if it can't be reached.
     """
 
     def __init__(self, url: str) -> None:
@@ -89,7 +111,7 @@ class Objects:
             # Whoever deletes the last object of a folder, zarr too, takes the folder with it.
             self._store = LocalStore.from_url(url, mkdir=True, automatic_cleanup=True)
         else:
-            self._store = from_url(url)
+            self._store = from_url(url, client_options=REQUESTS, retry_config=RETRIES)
         self.zarr = _Whole(ZarrStore(self._store))
         # Every tile opens the same ten arrays anew, to see that they are there; to parse them takes longer.
         self._array = lru_cache(maxsize=64)(partial(_array, self.zarr))
@@ -167,7 +189,7 @@ class Objects:
         """
         # Two parts under way bound the memory of an upload to a few parts, whatever its size.
         writer = obstore.open_writer_async(self._store, path, buffer_size=PART, max_concurrency=2)
-        with _full_disk_told():
+        with _told():
             async with writer as file:
                 yield file
 
@@ -179,9 +201,9 @@ class Objects:
         FileNotFoundError
             If there is none.
         """
-        return io.BufferedReader(
-            _Reader(obstore.open_reader(self._store, path, buffer_size=1 << 20)), 1 << 16
-        )
+        with _told():
+            reader = obstore.open_reader(self._store, path, buffer_size=1 << 20)
+        return io.BufferedReader(_Reader(reader), 1 << 16)
 
     def put(self, path: str, data: bytes) -> None:
         """Write a small object, whole.
@@ -191,18 +213,53 @@ class Objects:
         NoRoom
             If the disk is full.
         """
-        with _full_disk_told():
+        with _told():
             obstore.put(self._store, path, data)
 
     def names(self, folder: str) -> list[str]:
         """What lies directly in a folder, folders and objects, by name."""
-        found = obstore.list_with_delimiter(self._store, folder)
+        with _told():
+            found = obstore.list_with_delimiter(self._store, folder)
         paths = [*found["common_prefixes"], *(meta["path"] for meta in found["objects"])]
         return sorted(path.rsplit("/", 1)[-1] for path in paths)
 
     def below(self, folder: str) -> set[str]:
         """The paths of all objects below a folder, however deep."""
-        return {meta["path"] for batch in obstore.list(self._store, folder) for meta in batch}
+        with _told():
+            return {meta["path"] for batch in obstore.list(self._store, folder) for meta in batch}
+
+    def stale(self, folder: str, seconds: float, but: Collection[str] = ()) -> list[str]:
+        """What lies directly in a folder and was not written to for some time, by name: for whoever tidies up.
+
+        Parameters
+        ----------
+        seconds : float
+            How long ago the newest object of it was written, or removed from a folder of this machine. The store's
+            clock says when it was, and this machine's what time it is.
+        but : collection of str
+            Names that are left out, and not looked at.
+        """
+        end = time.time() - seconds
+        return [
+            name
+            for name in self.names(folder)
+            if name not in but and self._written_at(f"{folder}/{name}") < end
+        ]
+
+    def _written_at(self, path: str) -> float:
+        """When the newest object at a path or below it was written; infinity if there is none any more."""
+        if self._folder is not None:  # with what is under way, see `sweep`, and folders
+            newest = -np.inf
+            for one in (self._folder / path, *(self._folder / path).rglob("*")):
+                with suppress(FileNotFoundError):
+                    newest = max(newest, one.stat().st_mtime)
+        else:
+            with _told():
+                found = [meta for batch in obstore.list(self._store, path) for meta in batch]
+                with suppress(FileNotFoundError):  # which a bucket does not list below itself
+                    found.append(obstore.head(self._store, path))
+            newest = max((meta["last_modified"].timestamp() for meta in found), default=-np.inf)
+        return newest if newest > -np.inf else np.inf
 
     def delete(self, path: str) -> None:
         """Remove an object, or everything below a folder; nothing there is no error."""
@@ -210,15 +267,17 @@ class Objects:
             target = self._folder / path
             shutil.rmtree(target) if target.is_dir() else target.unlink(missing_ok=True)
             return
-        obstore.delete(self._store, path)  # which a bucket does not list below itself
-        for batch in obstore.list(self._store, path, chunk_size=500):
-            obstore.delete(self._store, [meta["path"] for meta in batch])
+        with _told():
+            obstore.delete(self._store, path)  # which a bucket does not list below itself
+            for batch in obstore.list(self._store, path, chunk_size=500):
+                obstore.delete(self._store, [meta["path"] for meta in batch])
 
     def sweep(self, path: str) -> None:
         """Remove what writers that were killed have left below a folder that nobody writes to.
 
         In a folder of this machine an object is written beside its place, under a name with a ``#``, and
-        then moved. A bucket has nothing of the kind.
+        then moved. A bucket shows nothing of the kind: what it keeps of uploads that were cut off, a rule of its own
+        for incomplete multipart uploads removes.
         """
         if self._folder is not None:
             for part in (self._folder / path).rglob("*#*"):
@@ -230,18 +289,24 @@ class Objects:
 
     def check(self) -> None:
         """Reach the store once; raises whatever it raises when it can't be reached."""
-        obstore.list_with_delimiter(self._store, None)
+        with _told():
+            obstore.list_with_delimiter(self._store, None)
 
 
 @contextmanager
-def _full_disk_told() -> Iterator[None]:
-    """Turns what obstore raises when the disk is full, of several kinds and without an ``errno``, to `NoRoom`."""
+def _told() -> Iterator[None]:
+    """Turns what obstore raises, of several kinds and without a number, to `NoRoom` and `Unavailable`."""
     try:
         yield
     except (BaseError, OSError) as error:
-        if not any(f"(os error {number})" in str(error) for number in (errno.ENOSPC, errno.EDQUOT)):
-            raise
-        raise NoRoom(DISK_FULL) from error
+        said = str(error).partition("\n")[0]
+        if any(f"(os error {number})" in str(error) for number in (errno.ENOSPC, errno.EDQUOT)):
+            raise NoRoom(DISK_FULL) from error
+        if said.startswith("Generic S3 error") and UNREACHABLE.search(said):
+            raise Unavailable(
+                f"the store can't be reached for now; try again ({said.rpartition(' - ')[2].strip(': ')})"
+            ) from error
+        raise
 
 
 def _array(store: _Whole, path: str, document: bytes) -> zarr.Array[Any]:
@@ -258,15 +323,39 @@ def _metadata(dtype: np.dtype[Any]) -> dict[str, Any]:
 
 
 class _Whole(WrapperStore[ZarrStore[ObjectStore]]):
-    """A store for zarr in which a missing chunk is an error: zarr reads it as its fill value, without a word."""
+    """A store for zarr in which a missing chunk is an error: zarr reads it as its fill value, without a word.
+
+    What can't be written or reached is told as everywhere here; these are the calls that zarr makes.
+    """
 
     async def get(
         self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
     ) -> Buffer | None:
-        value = await self._store.get(key, prototype, byte_range)
+        with _told():
+            value = await self._store.get(key, prototype, byte_range)
         if value is None and not key.endswith(METADATA):
             raise Corrupt(f"{key} is missing in the store: what it belongs to is damaged, make it again")
         return value
+
+    async def set(self, key: str, value: Buffer) -> None:
+        with _told():
+            await self._store.set(key, value)
+
+    async def set_if_not_exists(self, key: str, value: Buffer) -> None:
+        with _told():
+            await self._store.set_if_not_exists(key, value)
+
+    async def delete(self, key: str) -> None:
+        with _told():
+            await self._store.delete(key)
+
+    async def delete_dir(self, prefix: str) -> None:
+        with _told():
+            await self._store.delete_dir(prefix)
+
+    async def exists(self, key: str) -> bool:
+        with _told():
+            return await self._store.exists(key)
 
 
 class _Reader(io.RawIOBase):
@@ -288,6 +377,7 @@ class _Reader(io.RawIOBase):
         return self._file.tell()
 
     def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
-        data = self._file.read(len(buffer))
+        with _told():
+            data = self._file.read(len(buffer))
         buffer[: len(data)] = memoryview(data)
         return len(data)

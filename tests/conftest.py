@@ -6,6 +6,9 @@ import pytest
 
 from storage.database import open_engine
 from tests import postgres
+from tests.s3 import s3, s3_server
+
+__all__ = ["postgresql", "postgresql_server", "s3", "s3_server"]
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,8 @@
-"""A store in a folder and databases of both engines, all real, for the tests of storage."""
+"""A store and a database, both real, for the tests of storage.
+
+A test of `objects` runs twice, with a folder and with a bucket, one that looks into the folder once; a test of `engine`
+runs with SQLite and with PostgreSQL.
+"""
 
 import hashlib
 import shutil
@@ -17,9 +21,24 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "store"
 
 
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "store" in metafunc.fixturenames:
+        kinds = ["folder"] if "folder" in metafunc.fixturenames else ["folder", "bucket"]
+        metafunc.parametrize("store", kinds, indirect=True)
+
+
 @pytest.fixture
-def objects(folder: Path) -> Objects:
-    return Objects(folder.as_uri())
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """The URL of an empty store."""
+    if request.param == "folder":
+        return (tmp_path / "store").as_uri()
+    url: str = request.getfixturevalue("s3")
+    return url
+
+
+@pytest.fixture
+def objects(store: str) -> Objects:
+    return Objects(store)
 
 
 @pytest.fixture(scope="session")
@@ -53,13 +72,15 @@ def engine(url: str) -> Iterator[Engine]:
 
 
 @pytest.fixture
-def digests(folder: Path) -> Callable[[str], dict[str, str]]:
-    """The files below a folder of the store, each with the hash of its bytes."""
+def digests(objects: Objects) -> Callable[[str], dict[str, str]]:
+    """The objects below a folder of the store, each with the hash of its bytes."""
 
     def of(below: str) -> dict[str, str]:
-        root = folder / below
-        files = [path for path in sorted(root.rglob("*")) if path.is_file()]
-        assert files
-        return {str(f.relative_to(root)): hashlib.sha256(f.read_bytes()).hexdigest() for f in files}
+        paths = sorted(objects.below(below))
+        assert paths
+        return {
+            path.removeprefix(f"{below}/"): hashlib.sha256(objects.read(path).read()).hexdigest()
+            for path in paths
+        }
 
     return of

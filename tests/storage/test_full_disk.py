@@ -7,7 +7,9 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
+import zarr
 
 from storage import uploads
 from storage.database import open_engine, writing
@@ -51,6 +53,22 @@ def test_a_small_object_on_a_full_disk(disk: Path) -> None:
         objects.put("a", bytes(SIZE + 1))
     objects.put("a", b"1")
     assert objects.read("a").read() == b"1"
+
+
+def test_a_chunk_of_an_array_on_a_full_disk(disk: Path) -> None:
+    objects = Objects((disk / "store").as_uri())
+    array = zarr.create_array(
+        objects.zarr,
+        name="a",
+        shape=(2, SIZE * 2 // 3),
+        chunks=(1, SIZE * 2 // 3),
+        dtype="u1",
+        compressors=None,
+    )
+    array[0, :] = 1
+    with pytest.raises(NoRoom, match="free room"):
+        array[1, :] = 1
+    assert np.asarray(array[0, :10]).all()
 
 
 def test_a_sqlite_ledger_on_a_full_disk(disk: Path) -> None:

@@ -2,9 +2,15 @@
 
 import asyncio
 import io
+import os
+import socket
+import threading
+import time
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from datetime import timedelta
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +18,8 @@ import pytest
 import zarr
 from numpy.typing import NDArray
 
-from storage.errors import Corrupt
+from storage import objects as module
+from storage.errors import Corrupt, Unavailable
 from storage.objects import EVERY_CHUNK, PART, Objects, together
 
 
@@ -181,3 +188,143 @@ def test_a_folder_with_an_odd_name_is_itself(tmp_path: Path) -> None:
     assert store.names("") == ["x"]
     store.delete("x")
     assert list(odd.iterdir()) == []
+
+
+def test_what_nobody_writes_to_is_stale(objects: Objects) -> None:
+    put(objects, "c/old/deep/x", b"1")
+    put(objects, "c/busy/deep/x", b"1")
+    put(objects, "c/busy/zarr.json", b"1")
+    put(objects, "c/object", b"1")
+    assert objects.stale("c", 3600) == []
+    assert objects.stale("none", 0) == []
+    time.sleep(2)  # a bucket's times are whole seconds
+    put(objects, "c/busy/deep/x", b"2")
+    assert objects.stale("c", 1.5) == ["object", "old"]
+    assert objects.stale("c", 1.5, but={"old"}) == ["object"]
+    assert objects.stale("c", -10) == ["busy", "object", "old"]
+
+
+def test_a_file_under_way_and_an_empty_folder_count_in_a_folder(objects: Objects, folder: Path) -> None:
+    for path in (folder / "c" / "under way" / "x#1", folder / "c" / "left"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"1")
+    (folder / "c" / "empty").mkdir()
+    for path in ("c/under way", "c/empty", "c/left"):
+        os.utime(folder / path, (1000, 1000))
+    assert objects.stale("c", 3600) == ["empty", "left"]
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gives up on a bucket at once, and not after a minute."""
+    backoff = {
+        "init_backoff": timedelta(milliseconds=1),
+        "max_backoff": timedelta(milliseconds=10),
+        "base": 2,
+    }
+    monkeypatch.setattr(module, "RETRIES", module.RETRIES | {"max_retries": 1, "backoff": backoff})
+    monkeypatch.setattr(module, "REQUESTS", module.REQUESTS | {"timeout": timedelta(seconds=1)})
+
+
+@pytest.fixture(params=["refused", "silent", "503", "429"])
+def nobody(
+    impatient: None, request: pytest.FixtureRequest, s3: str, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[str]:
+    """A store whose bucket does not answer, or is too busy to."""
+
+    class Busy(BaseHTTPRequestHandler):
+        def _refuse(self) -> None:
+            self.send_response(int(request.param))
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+
+        do_GET = do_PUT = do_POST = do_HEAD = do_DELETE = _refuse
+
+        def log_message(self, format: str, *args: object) -> None:
+            pass
+
+    if request.param in ("503", "429"):
+        with ThreadingHTTPServer(("127.0.0.1", 0), Busy) as server:
+            threading.Thread(target=server.serve_forever).start()
+            monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{server.server_port}")
+            yield s3
+            server.shutdown()
+        return
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        if request.param == "silent":
+            taken.listen(100)
+            short = module.REQUESTS | {"timeout": timedelta(seconds=0.2)}
+            monkeypatch.setattr(module, "REQUESTS", short)
+        monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{taken.getsockname()[1]}")
+        yield s3
+
+
+def test_a_bucket_that_cannot_be_reached_is_told_whatever_is_asked(nobody: str) -> None:
+    objects = Objects(nobody)
+    array = np.zeros(3)
+    asked: list[Callable[[], object]] = [
+        objects.check,
+        lambda: objects.read("a"),
+        lambda: objects.put("a", b"1"),
+        lambda: put(objects, "a", b"1"),
+        lambda: put(objects, "a", bytes(PART + 1)),
+        lambda: objects.names("a"),
+        lambda: objects.below("a"),
+        lambda: objects.stale("a", 1),
+        lambda: objects.delete("a"),
+        lambda: together(objects.group("a")),
+        lambda: together(objects.array("a")),
+        lambda: together(objects.put_array("a", array)),
+        lambda: zarr.create_array(objects.zarr, name="a", data=array),
+        lambda: zarr.open_group(objects.zarr, path="a"),
+    ]
+    for ask in asked:
+        with pytest.raises(Unavailable, match="try again"):
+            ask()
+
+
+def test_a_bucket_that_goes_away_while_it_is_read(impatient: None, s3: str) -> None:
+    there = os.environ["AWS_ENDPOINT_URL"].removeprefix("http://").split(":")
+    with socket.create_server(("127.0.0.1", 0)) as between:
+        os.environ["AWS_ENDPOINT_URL"] = f"http://127.0.0.1:{between.getsockname()[1]}"
+        sockets: list[socket.socket] = []
+
+        def relay() -> None:
+            while True:
+                try:
+                    near, _ = between.accept()
+                except OSError:
+                    return
+                far = socket.create_connection((there[0], int(there[1])))
+                sockets.extend((near, far))
+                for one, other in ((near, far), (far, near)):
+                    threading.Thread(target=carry, args=(one, other)).start()
+
+        def carry(one: socket.socket, other: socket.socket) -> None:
+            try:
+                while data := one.recv(1 << 16):
+                    other.sendall(data)
+            except OSError:
+                pass
+
+        thread = threading.Thread(target=relay)
+        thread.start()
+        objects = Objects(s3)
+        data = np.random.default_rng(0).bytes(3 << 20)
+        put(objects, "a", data)
+        with objects.read("a") as file:
+            assert file.read(1000) == data[:1000]
+            between.shutdown(socket.SHUT_RDWR)
+            thread.join()
+            for one in sockets:
+                one.close()
+            with pytest.raises(Unavailable):
+                file.read()
+
+
+def test_a_bucket_that_is_not_there_is_no_matter_of_waiting(s3: str) -> None:
+    objects = Objects(s3.replace("envmatte", "nobodys"))
+    with pytest.raises(Exception, match="NoSuchBucket") as caught:
+        objects.check()
+    assert not isinstance(caught.value, Unavailable)

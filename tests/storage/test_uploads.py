@@ -123,7 +123,10 @@ def test_there_is_one_for_a_key(engine: Engine) -> None:
 
 def test_room_counts_what_is_promised(engine: Engine, objects: Objects) -> None:
     free = objects.free()
-    assert free is not None
+    if free is None:  # a bucket has no end
+        with engine.connect() as c:
+            uploads.check_room(c, objects, 1 << 60)
+        return
     with writing(engine) as c:
         uploads.check_room(c, objects, free // 2)
         with pytest.raises(NoRoom, match="Delete captures") as caught:

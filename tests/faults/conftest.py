@@ -1,0 +1,72 @@
+"""A cluster that is disturbed, and the matte of one that is not."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.end_to_end.conftest import BANDS
+from tests.faults.rig import Rig, Row
+from workflows import simulate
+from workflows.scene import nested_program, write_capture
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--times", type=int, default=2, help="How often each fault is injected.")
+    parser.addoption("--table", type=Path, help="A file for the table of faults, as JSON.")
+
+
+@pytest.fixture(scope="session")
+def times(pytestconfig: pytest.Config) -> int:
+    return int(pytestconfig.getoption("--times"))
+
+
+@pytest.fixture(scope="session")
+def table(pytestconfig: pytest.Config) -> Iterator[list[Row]]:
+    """The rows of the table of faults: printed at the end, and written if asked for."""
+    rows: list[Row] = []
+    yield rows
+    print(f"\n{'fault':<34}{'injected':>9}{'lost':>6}{'differing':>11}{'median s':>10}{'longest s':>11}")
+    for row in (row.as_dict() for row in rows):
+        print(
+            f"{row['fault']:<34}{row['injected']:>9}{row['lost']:>6}{row['differing']:>11}"
+            f"{row['median']:>10}{row['longest']:>11}"
+        )
+    if path := pytestconfig.getoption("--table"):
+        path.write_text(json.dumps([row.as_dict() for row in rows], indent=2))
+
+
+@pytest.fixture(scope="session")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A capture of a glass ball, of 60 tiles."""
+    path = tmp_path_factory.mktemp("bundle") / "ball.zip"
+    write_capture(simulate.glass_ball(160, 96, rays=9), nested_program(bands=BANDS, levels=5), path)
+    return path
+
+
+@dataclass
+class Known:
+    """A rig, a capture in it, and the files of its matte when nothing is disturbed."""
+
+    rig: Rig
+    capture: str
+    files: dict[str, str]
+
+
+@pytest.fixture(scope="session")
+def known(tmp_path_factory: pytest.TempPathFactory, bundle: Path) -> Iterator[Known]:
+    with Rig(tmp_path_factory.mktemp("rig")) as rig:
+        yield prepared(rig, bundle)
+
+
+def prepared(rig: Rig, bundle: Path) -> Known:
+    """A rig with a capture that was recovered once."""
+    uploaded = rig.ask(
+        "POST", "/v1/captures", content=bundle.read_bytes(), headers={"Content-Type": "application/zip"}
+    ).json()
+    assert rig.ended(uploaded["job"])["state"] == "succeeded"
+    found = rig.ended(rig.recover(uploaded["id"])["id"])
+    assert found["state"] == "succeeded"
+    return Known(rig, uploaded["id"], rig.files(found["matte"]))

@@ -1,0 +1,171 @@
+"""A cluster of real processes on loopback, and what can be done to it."""
+
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import httpx2
+import psutil
+
+from tests.end_to_end.conftest import digests
+from tests.services.clusters import started, workers
+
+STUCK = 240.0
+"""Seconds after which a job that has not ended counts as lost."""
+
+
+@dataclass
+class Row:
+    """A line of the table of faults; seconds are from the fault to the job's end."""
+
+    fault: str
+    injected: int = 0
+    lost: int = 0
+    differing: int = 0
+    seconds: list[float] = field(default_factory=list)
+
+    def as_dict(self) -> dict[str, Any]:
+        ordered = sorted(self.seconds)
+        middle, last = (ordered[len(ordered) // 2], ordered[-1]) if ordered else (None, None)
+        return asdict(self) | {"median": middle, "longest": last}
+
+
+class Rig:
+    """A scheduler, two workers, and two services with a coordinator each, on one store and one database."""
+
+    def __init__(self, folder: Path, database: str | None = None) -> None:
+        self.folder = folder
+        self.store = folder / "store"
+        self._database = database
+        self._stack = ExitStack()
+        self._commands: dict[str, tuple[str, ...]] = {}
+        self._processes: dict[str, subprocess.Popen[str]] = {}
+        self._random = random.Random(5)
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            self._stack = stack
+            self._start_all()
+            self._stack = stack.pop_all()
+        return self
+
+    def _start_all(self) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        cluster = f"tcp://127.0.0.1:{_free_port()}"
+        self.start("scheduler", "scheduler", "--port", cluster.rsplit(":", 1)[1])
+        for n in range(2):
+            self.start(f"worker{n}", "worker", "--cluster", cluster, "--workers", "1")
+        where = ["--data", str(self.folder / "data"), "--cluster", cluster, "--store", self.store.as_uri()]
+        if self._database is not None:
+            where += ["--database", self._database]
+        for n in range(2):
+            self.start(f"service{n}", "serve", "--port", str(_free_port()), *where)
+        lines = [(self._processes[f"service{n}"].stdout or sys.stdin).readline() for n in range(2)]
+        assert all(" at http" in line for line in lines), lines
+        self.urls = [line.rsplit(" at ", 1)[1].strip() for line in lines]
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.close()
+
+    def start(self, name: str, *command: str) -> None:
+        """Start a process, or the same once more."""
+        self._commands[name] = command or self._commands[name]
+        log = self.folder / f"{name}.log"
+        self._processes[name] = self._stack.enter_context(started(log, *self._commands[name]))
+
+    def kill(self, name: str) -> None:
+        """SIGKILL for a process, and for nothing that it started; then it is started again, as a supervisor would."""
+        self._processes[name].kill()
+        self._processes[name].wait()
+        self.start(name)
+
+    def workers(self) -> list[psutil.Process]:
+        """The processes in which tiles are recovered."""
+        names = [name for name in self._processes if name.startswith("worker")]
+        return [one for name in names for one in workers(self._processes[name])]
+
+    def driver(self) -> str:
+        """The name of the service whose coordinator drives the jobs."""
+        logs = {n: (self.folder / f"service{n}.log").read_text() for n in range(2)}
+        at = {n: max(log.rfind("drives the jobs"), 0) for n, log in logs.items()}
+        lines = {n: logs[n][: at[n]].rsplit("\n", 1)[-1][:23] for n in at}
+        return f"service{max(lines, key=lambda n: lines[n])}"
+
+    def ask(self, method: str, path: str, **content: Any) -> httpx2.Response:
+        """A request to whichever service answers."""
+        end = time.monotonic() + 60
+        while True:
+            for url in self.urls:
+                try:
+                    answer = httpx2.request(method, url + path, timeout=10, **content)
+                    if answer.status_code != 503:
+                        return answer
+                except httpx2.TransportError:
+                    pass
+            assert time.monotonic() < end, f"{method} {path}: no service answers"
+            time.sleep(0.1)
+
+    def job(self, job: str) -> dict[str, Any]:
+        found: dict[str, Any] = self.ask("GET", f"/v1/jobs/{job}").json()
+        return found
+
+    def recover(self, capture: str) -> dict[str, Any]:
+        made: dict[str, Any] = self.ask("POST", "/v1/jobs", json={"capture": capture}).json()
+        return made
+
+    def ended(self, job: str, seconds: float = STUCK) -> dict[str, Any]:
+        """The job once it has ended, or as it is after a long time."""
+        end = time.monotonic() + seconds
+        while True:
+            found = self.job(job)
+            if found["state"] not in ("queued", "running") or time.monotonic() > end:
+                return found
+            time.sleep(0.05)
+
+    def files(self, matte: str) -> dict[str, str]:
+        """A digest of every file of a matte."""
+        return digests(self.store / "mattes" / matte)
+
+    def disturb(
+        self, fault: str, act: Callable[[], object], capture: str, expected: dict[str, str], times: int
+    ) -> Row:
+        """Do something bad at random moments of jobs, and see what comes of them."""
+        row = Row(fault)
+        for _ in range(times):
+            job = self.recover(capture)
+            moment = self._random.random()
+            while (now := self.job(job["id"]))["progress"] < moment * 0.9 and now["state"] != "succeeded":
+                time.sleep(0.01)
+            act()
+            row.injected += 1
+            start = time.monotonic()
+            found = self.ended(job["id"])
+            row.seconds.append(round(time.monotonic() - start, 2))
+            row.lost += found["state"] != "succeeded"
+            row.differing += found["state"] == "succeeded" and self.files(job["matte"]) != expected
+        return row
+
+
+def freeze(process: psutil.Process) -> None:
+    process.send_signal(signal.SIGSTOP)
+
+
+def thaw(process: psutil.Process) -> None:
+    process.send_signal(signal.SIGCONT)
+
+
+def _free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port: int = taken.getsockname()[1]
+        return port

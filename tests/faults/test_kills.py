@@ -1,0 +1,69 @@
+"""Processes are killed and frozen at random moments: no job is lost, and every matte is the same to the byte."""
+
+import random
+import time
+from contextlib import suppress
+
+import psutil
+import pytest
+
+from tests.faults.conftest import Known
+from tests.faults.rig import Row, freeze, thaw
+
+pytestmark = [pytest.mark.full, pytest.mark.timeout(7200)]
+
+
+def check(known: Known, table: list[Row], row: Row) -> None:
+    table.append(row)
+    assert (row.lost, row.differing) == (0, 0), row
+
+
+def test_a_killed_worker(known: Known, table: list[Row], times: int) -> None:
+    def kill() -> None:
+        while not (there := known.rig.workers()):
+            time.sleep(0.05)
+        random.choice(there).kill()
+
+    check(known, table, known.rig.disturb("SIGKILL of a worker", kill, known.capture, known.files, times))
+
+
+def test_all_workers_killed(known: Known, table: list[Row], times: int) -> None:
+    def kill() -> None:
+        for worker in known.rig.workers():
+            worker.kill()
+
+    check(known, table, known.rig.disturb("SIGKILL of all workers", kill, known.capture, known.files, times))
+
+
+def test_a_killed_scheduler(known: Known, table: list[Row], times: int) -> None:
+    rig = known.rig
+    row = rig.disturb(
+        "SIGKILL of the scheduler", lambda: rig.kill("scheduler"), known.capture, known.files, times
+    )
+    check(known, table, row)
+
+
+def test_a_killed_service_that_drives(known: Known, table: list[Row], times: int) -> None:
+    rig = known.rig
+    row = rig.disturb(
+        "SIGKILL of API and coordinator", lambda: rig.kill(rig.driver()), known.capture, known.files, times
+    )
+    check(known, table, row)
+
+
+def test_a_frozen_worker(known: Known, table: list[Row]) -> None:
+    frozen: list[psutil.Process] = []
+
+    def act() -> None:
+        frozen.append(known.rig.workers()[0])
+        freeze(frozen[0])
+
+    start = time.monotonic()
+    row = known.rig.disturb("SIGSTOP of a worker, for 60 s", act, known.capture, known.files, 1)
+    time.sleep(max(0.0, 60 - (time.monotonic() - start)))
+    with suppress(psutil.NoSuchProcess):  # its nanny may have ended it meanwhile
+        thaw(frozen[0])
+    time.sleep(3)  # in which it may do what it was frozen over
+    (matte, *_) = known.rig.ask("GET", "/v1/mattes").json()["mattes"]
+    assert known.rig.files(matte["id"]) == known.files
+    check(known, table, row)

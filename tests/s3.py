@@ -1,0 +1,59 @@
+"""An S3 server in a process of its own, moto's, with a bucket: not a store that a service could rely on, but one that
+speaks the protocol.
+"""
+
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.error import URLError
+from urllib.request import Request, urlopen
+
+import pytest
+
+BUCKET = "envmatte"
+KEYS = {"AWS_ACCESS_KEY_ID": "somebody", "AWS_SECRET_ACCESS_KEY": "secret", "AWS_REGION": "us-east-1"}
+
+
+@pytest.fixture(scope="session")
+def s3_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The server's URL."""
+    log: Path = tmp_path_factory.mktemp("s3") / "server.log"
+    with log.open("wb") as file:
+        command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", "0"]
+        server = subprocess.Popen(command, stdout=file, stderr=file)
+    try:
+        yield _with_bucket(server, log)
+    finally:
+        server.kill()
+        server.wait()
+
+
+@pytest.fixture
+def s3(s3_server: str, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The URL of an empty store; processes that are started find it too."""
+    for name, value in {"AWS_ENDPOINT_URL": s3_server, **KEYS}.items():
+        monkeypatch.setenv(name, value)
+    return f"s3://{BUCKET}/{uuid.uuid4().hex}"
+
+
+def _with_bucket(server: "subprocess.Popen[bytes]", log: Path) -> str:
+    """Wait until the server says where it listens, and make the bucket."""
+    end = time.monotonic() + 60
+    while True:
+        said = [word for word in log.read_text().split() if word.startswith("http://127.0.0.1:")]
+        if said:
+            url = said[0].rstrip("/")
+            signed = {
+                "Authorization": "AWS4-HMAC-SHA256 Credential=somebody/20260101/us-east-1/s3/aws4_request"
+            }
+            try:
+                with urlopen(Request(f"{url}/{BUCKET}", method="PUT", headers=signed), timeout=30):
+                    return url
+            except URLError:
+                pass
+        assert server.poll() is None, log.read_text()
+        assert time.monotonic() < end, log.read_text()
+        time.sleep(0.1)
