@@ -68,9 +68,9 @@ def watched(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 
 
 def _without_frames(service: Service, capture: str) -> str:
-    """A job that fails: frames of its capture are gone while it runs."""
-    frames = service.data / "store" / "captures" / capture / "images" / "frames"
-    away = frames.with_name("away")
+    """A job that fails: its capture is away while it runs."""
+    frames = service.data / "store" / "captures" / capture
+    away = service.data / "away"
     frames.rename(away)
     job = str(service.client.recover(capture)["id"])
     with pytest.raises(ServiceError):
