@@ -81,7 +81,7 @@ def _without_frames(service: Service, capture: str) -> str:
 
 def _figures(text: str) -> dict[tuple[str, ...], float]:
     return {
-        (sample.name, *sorted(sample.labels.values())): sample.value
+        (sample.name, *(sample.labels[name] for name in sorted(sample.labels))): sample.value
         for family in parse(text)
         for sample in family.samples
     }
@@ -96,7 +96,7 @@ def test_figures_are_those_of_the_jobs(watched: Watched) -> None:
     assert found["envmatte_jobs", "ingest", "succeeded"] == 1
     for state, number in {"succeeded": 1, "failed": 1, "cancelled": 1, "queued": 0, "running": 0}.items():
         assert found["envmatte_jobs", "recover", state] == number
-    assert found["envmatte_tiles", "queued", "recover"] == 0
+    assert found["envmatte_tiles", "recover", "queued"] == 0
     assert found["envmatte_tile_seconds_count", "recover"] >= recover["tiles"]["total"]
     assert found["envmatte_tile_seconds_sum", "recover"] > 0
     assert found["envmatte_pixels_total", "ingest"] == ingest["pixels"]
