@@ -239,12 +239,16 @@ def composite(
     help="Folder to leave the capture and backdrop in.",
 )
 @click.option("--workers", type=int, help="Worker processes of the demo's service.")
+@click.option("--url", help="Of a service that runs, to use in place of one of the demo's own.")
+@click.option("--key", envvar="ENVMATTE_KEY", help="API key of that service.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
-def demo(output: Path, keep: Path | None, workers: int | None, as_json: bool) -> None:
+def demo(
+    output: Path, keep: Path | None, workers: int | None, url: str | None, key: str | None, as_json: bool
+) -> None:
     """Trace a glass ball, film it, serve, upload, recover, composite: all of it, in a picture."""
     from services.demo import run
 
-    picture, figures = run(workers, keep)
+    picture, figures = run(workers, keep, url=url, key=key)
     _write(output, picture)
     if not as_json:
         for name, value in figures.items():

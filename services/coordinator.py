@@ -66,7 +66,7 @@ class Coordinator:
         self._leaving: deque[tuple[float, str, str, str]] = deque()
         """When what ended jobs wrote is removed: a time, and a kind, a capture and a matte."""
         self._troubles: Counter[str] = Counter()
-        self._beat_at = self._swept_at = self._settled_at = -1e9
+        self._beat_at = self._swept_at = self._settled_at = self._read_at = -1e9
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="coordinator")
         self._house = ThreadPoolExecutor(1, thread_name_prefix="housekeeping")
@@ -142,6 +142,20 @@ class Coordinator:
             yield c
 
     def _step(self) -> None:
+        now = time.monotonic()
+        if now - self._read_at >= POLL:
+            self._read_at = now
+            self._read()
+        for outcome in self._dispatcher.collect():
+            if outcome.job in self._drives:
+                self._drives[outcome.job].news.append(outcome)
+        for drive in self._due():
+            self._guarded(drive.job, self._settle, drive)
+        self._discard()
+        self._submit()
+
+    def _read(self) -> None:
+        """See in the ledger which jobs there are to drive, and which no more."""
         with reading(self._engine) as c:
             active = {row.id: row for row in jobs.active(c)}
             cancelled = jobs.not_wound_up(c)
@@ -152,13 +166,6 @@ class Coordinator:
             self._drop(job)
         for row in cancelled:
             self._wind_up(row)
-        self._discard()
-        for outcome in self._dispatcher.collect():
-            if outcome.job in self._drives:
-                self._drives[outcome.job].news.append(outcome)
-        for drive in self._due():
-            self._guarded(drive.job, self._settle, drive)
-        self._submit()
 
     def _guarded(self, job: str, act: Any, *arguments: Any) -> None:
         """Do something about a job; what is wrong with it must not hold up the others."""

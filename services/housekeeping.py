@@ -41,10 +41,9 @@ def sweep(engine: Engine, objects: Objects, seconds: float = KEPT) -> None:
             "mattes": set(c.scalars(select(database.mattes.c.id))),
         }
     for folder, names in known.items():
-        for name in objects.stale(folder, seconds):
-            if name not in names and name != "zarr.json":
-                logger.info("removing %s/%s, which nothing refers to", folder, name)
-                objects.delete(f"{folder}/{name}")
+        for name in objects.stale(folder, seconds, but={*names, "zarr.json"}):
+            logger.info("removing %s/%s, which nothing refers to", folder, name)
+            objects.delete(f"{folder}/{name}")
     if not seconds:
         objects.sweep("uploads")
         for upload, parts in under_way.items():

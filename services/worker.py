@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import multiprocessing
 import socket
 import tempfile
 import time
@@ -67,6 +68,7 @@ class _Workers:
         self._host = host
         self._looking = asyncio.Lock()
         self._said_at = -SAY
+        self._ending = False
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
@@ -75,17 +77,24 @@ class _Workers:
             try:
                 yield
             finally:
+                self._ending = True
                 for task in kept:
                     task.cancel()
                 await asyncio.gather(*kept, return_exceptions=True)
+                for process in multiprocessing.active_children():
+                    process.kill()  # a nanny that has not started yet can't end its own
 
     async def _keep(self, scratch: str) -> None:
         """Have one nanny, and another one whenever it ends, as it does with its scheduler."""
-        while True:
+        while not self._ending:
             await self._find_scheduler()
             try:
                 await self._have_nanny(scratch)
             except Exception as error:
+                if (
+                    self._ending
+                ):  # closing a nanny that has not started fails, and takes the place of the cancellation
+                    return
                 logger.warning("a worker could not join %s: %r; trying again", self._scheduler, error)
             await asyncio.sleep(PAUSE)
 

@@ -46,6 +46,11 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.fixture(scope="session")
+def bundle_bytes(bundle: Path) -> bytes:
+    return bundle.read_bytes()
+
+
 @dataclass
 class Known:
     """A rig, a capture in it, and the files of its matte when nothing is disturbed."""

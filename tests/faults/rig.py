@@ -4,10 +4,9 @@ import random
 import signal
 import socket
 import subprocess
-import sys
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -67,11 +66,10 @@ class Rig:
         where = ["--data", str(self.folder / "data"), "--cluster", cluster, "--store", self.store.as_uri()]
         if self._database is not None:
             where += ["--database", self._database]
+        self._where = where
         for n in range(2):
             self.start(f"service{n}", "serve", "--port", str(_free_port()), *where)
-        lines = [(self._processes[f"service{n}"].stdout or sys.stdin).readline() for n in range(2)]
-        assert all(" at http" in line for line in lines), lines
-        self.urls = [line.rsplit(" at ", 1)[1].strip() for line in lines]
+        self.urls = [_url(self._processes[f"service{n}"]) for n in range(2)]
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -85,10 +83,21 @@ class Rig:
         self._processes[name] = self._stack.enter_context(started(log, *self._commands[name]))
 
     def kill(self, name: str) -> None:
-        """SIGKILL for a process, and for nothing that it started; then it is started again, as a supervisor would."""
+        """SIGKILL for a process, and for nothing that it started."""
         self._processes[name].kill()
         self._processes[name].wait()
+
+    def restart(self, name: str) -> None:
+        """Kill a process, and start it again, as a supervisor would."""
+        self.kill(name)
         self.start(name)
+
+    @contextmanager
+    def api_alone(self) -> Iterator[str]:
+        """A service without a coordinator; yields its URL."""
+        command = ["serve", "--port", "0", *self._where]
+        with started(self.folder / "api.log", *command, ENVMATTE_COORDINATE="false") as process:
+            yield _url(process)
 
     def workers(self) -> list[psutil.Process]:
         """The processes in which tiles are recovered."""
@@ -102,14 +111,16 @@ class Rig:
         lines = {n: logs[n][: at[n]].rsplit("\n", 1)[-1][:23] for n in at}
         return f"service{max(lines, key=lambda n: lines[n])}"
 
-    def ask(self, method: str, path: str, **content: Any) -> httpx2.Response:
-        """A request to whichever service answers."""
+    def ask(
+        self, method: str, path: str, *, at: str | None = None, repeat: bool = True, **content: Any
+    ) -> httpx2.Response:
+        """A request to whichever service answers, or to one."""
         end = time.monotonic() + 60
         while True:
-            for url in self.urls:
+            for url in [at] if at else self.urls:
                 try:
                     answer = httpx2.request(method, url + path, timeout=10, **content)
-                    if answer.status_code != 503:
+                    if answer.status_code != 503 or not repeat:
                         return answer
                 except httpx2.TransportError:
                     pass
@@ -163,6 +174,13 @@ def freeze(process: psutil.Process) -> None:
 
 def thaw(process: psutil.Process) -> None:
     process.send_signal(signal.SIGCONT)
+
+
+def _url(service: subprocess.Popen[str]) -> str:
+    assert service.stdout is not None
+    line = service.stdout.readline()
+    assert " at http" in line, line
+    return line.rsplit(" at ", 1)[1].strip()
 
 
 def _free_port() -> int:

@@ -38,7 +38,7 @@ def test_all_workers_killed(known: Known, table: list[Row], times: int) -> None:
 def test_a_killed_scheduler(known: Known, table: list[Row], times: int) -> None:
     rig = known.rig
     row = rig.disturb(
-        "SIGKILL of the scheduler", lambda: rig.kill("scheduler"), known.capture, known.files, times
+        "SIGKILL of the scheduler", lambda: rig.restart("scheduler"), known.capture, known.files, times
     )
     check(known, table, row)
 
@@ -46,7 +46,7 @@ def test_a_killed_scheduler(known: Known, table: list[Row], times: int) -> None:
 def test_a_killed_service_that_drives(known: Known, table: list[Row], times: int) -> None:
     rig = known.rig
     row = rig.disturb(
-        "SIGKILL of API and coordinator", lambda: rig.kill(rig.driver()), known.capture, known.files, times
+        "SIGKILL of API and coordinator", lambda: rig.restart(rig.driver()), known.capture, known.files, times
     )
     check(known, table, row)
 

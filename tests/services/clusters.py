@@ -29,7 +29,7 @@ def started(log: Path, *command: str, **environment: str) -> Iterator[subprocess
             stderr=stderr,
             text=True,
             start_new_session=True,
-            env=os.environ | environment,
+            env=os.environ | {"TMPDIR": str(log.parent)} | environment,
         )
     assert process.stdout is not None
     try:

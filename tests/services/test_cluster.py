@@ -20,7 +20,7 @@ from distributed.scheduler import KilledWorker
 from distributed.security import Security
 
 from services import certs
-from services.cluster import connect, embedded, open_cluster
+from services.cluster import connect, embedded
 from services.settings import Settings
 from storage.errors import Unavailable
 from tests.services.clusters import address, children, listening, running, started, wait, workers
@@ -230,6 +230,16 @@ def test_workers_that_are_asked_to_end_leave_nothing(
     assert "Traceback" not in cluster.log[-2000:]
 
 
+def test_workers_that_are_still_starting_end_when_they_are_asked(cluster: Cluster, tmp_path: Path) -> None:
+    with working(cluster.folder, cluster.address, "--workers", "2", TMPDIR=str(tmp_path)) as process:
+        wait(lambda: len(workers(process)) == 2)
+        tree = children(process)
+        process.terminate()
+        assert process.wait(60) == 0
+        assert not any(tmp_path.iterdir())
+        wait(lambda: not running(tree))
+
+
 def test_workers_die_with_their_nanny(cluster: Cluster, client: Client) -> None:
     with working(cluster.folder, cluster.address, "--workers", "2") as process:
         wait(lambda: len(client.nthreads()) == WORKERS + 2)
@@ -270,7 +280,7 @@ def test_a_scheduler_without_certificates_is_for_this_machine_alone(tmp_path: Pa
         assert "without TLS" in (tmp_path / "log").read_text()
         with (
             started(tmp_path / "log", "worker", "--cluster", at, "--workers", "1", **data) as worker,
-            open_cluster(Settings(data=tmp_path, cluster=at)) as client,
+            connect(at, None) as client,
         ):
             wait(lambda: client.nthreads())
             for one in (psutil.Process(worker.pid), *children(worker)):

@@ -138,7 +138,7 @@ def test_a_database_older_than_revisions_keeps_its_rows(old: str) -> None:
         for table in (coordinator, totals):
             assert connection.scalar(select(func.count()).select_from(table)) == 0
     with writing(engine) as connection:
-        jobs.finish_tiles(connection, "j", [(1, 0.5, 10)])
+        jobs.finish(connection, "j", [(1, 0.5, 10)])
         assert jobs.get(connection, "j").done == 2
     engine.dispose()
 
