@@ -6,9 +6,12 @@ too. Spans are sent by a thread in the background, and dropped if nobody takes t
 its ``traceparent`` (https://www.w3.org/TR/trace-context), in the ledger and with every tile.
 """
 
+import atexit
 import logging
 import os
 import re
+import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -27,6 +30,9 @@ ENDPOINTS = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT"
 TRACEPARENT = re.compile("00-(?!0{32})[0-9a-f]{32}-(?!0{16})[0-9a-f]{16}-[0-9a-f]{2}")
 TRACED = ("/v1/captures", "/v1/jobs")
 """Where a POST makes a job."""
+
+LAST = 2.0
+"""Seconds that a process takes at its end to send what it has not sent yet."""
 
 _tracer: "Tracer | None" = None
 _asked_by: ContextVar[str | None] = ContextVar("asked_by", default=None)
@@ -48,8 +54,21 @@ def start(role: str) -> None:
         )
         return
     resource = Resource({"service.name": f"envmatte-{role}"}).merge(OTELResourceDetector().detect())
-    provider = TracerProvider(resource=resource)
-    provider.add_span_processor(BatchSpanProcessor(OTLPSpanExporter()))
+    provider, exporter = TracerProvider(resource=resource, shutdown_on_exit=False), OTLPSpanExporter()
+    provider.add_span_processor(BatchSpanProcessor(exporter))
+    ending = threading.Event()
+
+    def cut_off() -> None:
+        ending.wait()
+        time.sleep(LAST)
+        exporter.shutdown()  # type: ignore[no-untyped-call]
+
+    def end() -> None:
+        ending.set()
+        provider.shutdown()
+
+    threading.Thread(target=cut_off, name="last spans", daemon=True).start()
+    atexit.register(end)
     _tracer = provider.get_tracer("envmatte")
 
 

@@ -10,6 +10,7 @@ from sqlalchemy import Connection, Row
 
 from services import tracing
 from services.api.context import After, Limit, Needs, read_json
+from services.api.eta import seconds_left
 from services.api.waiting import reason
 from storage import captures, jobs, leases, mattes
 from storage.database import jobs as table
@@ -82,7 +83,7 @@ class Job(BaseModel):
             },
             progress=progress,
             tiles=Tiles(total=row.total, done=row.done, failed=row.failed),
-            eta_seconds=_left(row, now) if running else None,
+            eta_seconds=seconds_left(connection, row, now) if running else None,
             waits_for=reason(connection, row, sign),
             queued_seconds=(row.started_at or row.finished_at or now) - row.created_at,
             run_seconds=ran,
@@ -228,16 +229,6 @@ def delete_job(context: Needs, id: str) -> None:
     """Delete a job that has ended, and its log; its matte stays."""
     with writing(context.engine) as c:
         jobs.forget(c, id)
-
-
-def _left(row: Row[Any], now: float) -> float | None:
-    """Seconds until a job's last tile is done, by the pace of those that were done last."""
-    if row.done == row.total:
-        return 0.0 if row.total else None
-    if row.paced_at is None or row.done <= row.paced_done:
-        return None
-    pace = (row.moved_at - row.paced_at) / (row.done - row.paced_done)
-    return float(max((row.total - row.done) * pace - (now - row.moved_at), 0.0))
 
 
 def _time(seconds: float | None) -> datetime | None:
