@@ -25,7 +25,7 @@ from services.housekeeping import discard, sweep
 from services.settings import Settings
 from storage import captures, jobs, leases, mattes, uploads
 from storage.database import reading, writing
-from storage.errors import Conflict, EnvmatteError, GaveUp, Unavailable
+from storage.errors import Conflict, EnvmatteError, GaveUp, NoRoom, Unavailable
 from storage.leases import Superseded
 from storage.objects import Objects
 
@@ -82,7 +82,7 @@ class Coordinator:
         self._thread.join()
         self._house.shutdown()
         if self._token is not None:
-            with suppress(Unavailable), writing(self._engine) as c:
+            with suppress(Unavailable, NoRoom), writing(self._engine) as c:
                 leases.give_back(c, self._token)
 
     def _run(self) -> None:
@@ -94,7 +94,7 @@ class Coordinator:
             except Superseded as error:
                 logger.warning("%s: %s", self._name, error)
                 self._stand_down()
-            except Unavailable as error:
+            except (Unavailable, NoRoom) as error:
                 logger.warning("going on as soon as it can: %s", error.detail)
                 self._stopped.wait(1)
             except Exception:  # nothing may end this thread
@@ -163,7 +163,7 @@ class Coordinator:
         """Do something about a job; what is wrong with it must not hold up the others."""
         try:
             act(*arguments)
-        except (Superseded, Unavailable):
+        except (Superseded, Unavailable, NoRoom):  # of the ledger: no job is to blame
             raise
         except EnvmatteError as error:
             self._fail(job, error)

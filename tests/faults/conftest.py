@@ -1,7 +1,7 @@
 """A cluster that is disturbed, and the matte of one that is not."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +21,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 @pytest.fixture(scope="session")
 def times(pytestconfig: pytest.Config) -> int:
     return int(pytestconfig.getoption("--times"))
+
+
+@pytest.fixture(scope="session")
+def seldom(times: int) -> int:
+    """How often what takes half a minute is injected."""
+    return max(1, times // 2)
 
 
 @pytest.fixture(scope="session")
@@ -58,6 +64,16 @@ class Known:
     rig: Rig
     capture: str
     files: dict[str, str]
+
+    def disturb(self, fault: str, act: Callable[[], object], times: int) -> Row:
+        """Do something bad at random moments of jobs, and see what comes of them."""
+        return self.rig.disturb(fault, act, self.capture, self.files, times)
+
+
+def check(table: list[Row], row: Row) -> None:
+    """Add a row to the table, and see that nothing was lost and all is the same to the byte."""
+    table.append(row)
+    assert (row.lost, row.differing) == (0, 0), row
 
 
 @pytest.fixture(scope="session")
