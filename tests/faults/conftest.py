@@ -38,7 +38,7 @@ def table(pytestconfig: pytest.Config) -> Iterator[list[Row]]:
     for row in (row.as_dict() for row in rows):
         print(
             f"{row['fault']:<34}{row['injected']:>9}{row['lost']:>6}{row['differing']:>11}"
-            f"{row['median']:>10}{row['longest']:>11}"
+            f"{row['median'] or '-':>10}{row['longest'] or '-':>11}"
         )
     if path := pytestconfig.getoption("--table"):
         path.write_text(json.dumps([row.as_dict() for row in rows], indent=2))

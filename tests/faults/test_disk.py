@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -34,6 +35,10 @@ class Small:
 
     def matte(self, matte: str) -> dict[str, str]:
         return stored(Objects((self.store / "store").as_uri()), mattes.path(matte))
+
+    def row(self, fault: str, start: float, matte: str) -> Row:
+        differing = self.matte(matte) != self.files
+        return Row(fault, 1, differing=int(differing), seconds=[round(time.monotonic() - start, 2)])
 
     def half_written(self) -> list[Path]:
         return [path for path in self.store.rglob("*#*")]
@@ -80,7 +85,7 @@ def full(disk: Path, left: int = 0) -> Iterator[None]:
 
 
 def test_at_ingest(small: Small, bundle: Path, table: list[Row]) -> None:
-    service = small.service
+    service, start = small.service, time.monotonic()
     with ExitStack() as filled:
         with paused(service):
             uploaded = service.client.upload(bundle)
@@ -88,19 +93,20 @@ def test_at_ingest(small: Small, bundle: Path, table: list[Row]) -> None:
         assert small.failed_for_room(uploaded["job"])
     assert small.retried(uploaded["job"]) == "succeeded"
     job = service.client.wait(service.client.recover(uploaded["id"])["id"])
-    check(table, Row("a full disk at ingest", 1, 0, small.matte(job["matte"]) != small.files))
+    check(table, small.row("a full disk at ingest", start, job["matte"]))
 
 
 def test_at_tiles(small: Small, table: list[Row]) -> None:
+    start = time.monotonic()
     with full(small.store, 256 << 10):
         job = small.service.client.recover(small.capture)
         assert small.failed_for_room(job["id"])
     assert small.retried(job["id"]) == "succeeded"
-    check(table, Row("a full disk at tiles", 1, 0, small.matte(job["matte"]) != small.files))
+    check(table, small.row("a full disk at tiles", start, job["matte"]))
 
 
 def test_in_sqlite(small: Small, table: list[Row]) -> None:
-    service = small.service
+    service, start = small.service, time.monotonic()
     job = service.client.recover(small.capture)
     wait(lambda: service.client.job(job["id"])["progress"] > 0.1)
 
@@ -127,4 +133,4 @@ def test_in_sqlite(small: Small, table: list[Row]) -> None:
     assert service.client.wait(job["id"])["state"] == "succeeded"
     wait(lambda: service.http.get("/readyz").status_code == 200)
     assert "Traceback" not in log.read_text()
-    check(table, Row("a full disk of SQLite", 1, 0, small.matte(job["matte"]) != small.files))
+    check(table, small.row("a full disk of SQLite", start, job["matte"]))

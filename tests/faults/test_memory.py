@@ -1,6 +1,7 @@
 """An ingest that wants more memory than its worker may have: it fails with what to do, and no other job suffers."""
 
 import json
+import time
 import zipfile
 from pathlib import Path
 
@@ -44,7 +45,7 @@ def test_a_worker_out_of_memory(bundle: Path, large: Path, tmp_path: Path, table
         capture = service.client.upload(bundle)
         service.client.wait(capture["job"])
         undisturbed = service.client.wait(service.client.recover(capture["id"])["id"])["matte"]
-        uploaded = service.client.upload(large)
+        uploaded, start = service.client.upload(large), time.monotonic()
         wait(lambda: service.client.job(uploaded["job"])["stage"] == "reading")
         other = service.client.recover(capture["id"])
         wait(lambda: service.client.job(uploaded["job"])["state"] not in ("queued", "running"), 300)
@@ -61,6 +62,6 @@ def test_a_worker_out_of_memory(bundle: Path, large: Path, tmp_path: Path, table
         assert service.http.post(f"/v1/jobs/{uploaded['job']}/retry").status_code == 202
         assert service.client.wait(uploaded["job"])["tiles"]["total"] > 1
     stored = tmp_path / "data" / "store" / "mattes"
-    row = Row("a worker out of memory", 1)
+    row = Row("a worker out of memory", 1, seconds=[round(time.monotonic() - start, 2)])
     row.differing += digests(stored / other["matte"]) != digests(stored / undisturbed)
     check(table, row)
