@@ -33,6 +33,8 @@ CONFIG: dict[str, Any] = {
     "distributed.scheduler.allowed-failures": 0,
     # A worker whose machine is gone without a word has gone after this long, and its tiles are given to others.
     "distributed.scheduler.worker-ttl": "30 s",
+    # A nanny starts its worker again however long that takes; the embedded cluster would close it for good meanwhile.
+    "distributed.deploy.lost-worker-timeout": "365 days",
     # Results are numbers: there is nothing to spill. A worker that is short of memory is no better off for a pause,
     # in which it would hold the tiles it was given for ever; it is ended and started again.
     "distributed.worker.memory.target": False,

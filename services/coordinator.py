@@ -26,7 +26,7 @@ from services.process import about
 from services.settings import Settings
 from storage import captures, jobs, leases, mattes, uploads
 from storage.database import reading, writing
-from storage.errors import Conflict, EnvmatteError, GaveUp, Unavailable
+from storage.errors import Conflict, EnvmatteError, GaveUp, NoRoom, Unavailable
 from storage.leases import Superseded
 from storage.objects import Objects
 
@@ -83,7 +83,7 @@ class Coordinator:
         self._thread.join()
         self._house.shutdown()
         if self._token is not None:
-            with suppress(Unavailable), writing(self._engine) as c:
+            with suppress(Unavailable, NoRoom), writing(self._engine) as c:
                 leases.give_back(c, self._token)
 
     def _run(self) -> None:
@@ -95,7 +95,7 @@ class Coordinator:
             except Superseded as error:
                 logger.warning("%s: %s", self._name, error)
                 self._stand_down()
-            except Unavailable as error:
+            except (Unavailable, NoRoom) as error:
                 logger.warning("going on as soon as it can: %s", error.detail)
                 self._stopped.wait(1)
             except Exception:  # nothing may end this thread
@@ -172,7 +172,7 @@ class Coordinator:
         try:
             with about(job):
                 act(*arguments)
-        except (Superseded, Unavailable):
+        except (Superseded, Unavailable, NoRoom):  # of the ledger: no job is to blame
             raise
         except EnvmatteError as error:
             self._fail(job, error)

@@ -7,7 +7,7 @@ reported as gone. dask's own callbacks are taken for no more than a hint to look
 
 import logging
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from concurrent.futures import CancelledError
 from contextlib import suppress
 from dataclasses import dataclass
@@ -29,6 +29,8 @@ LOOK = 1.0
 """Seconds between two looks at the cluster."""
 ANSWER = 5.0
 """Seconds that the scheduler has to answer, and a worker to hand over the small result of what is done."""
+MEMORY = "worker-restart-memory"
+"""The topic under which a nanny tells the scheduler that it ends its worker for the memory that it takes."""
 DEPTH = 2
 """Tasks in flight for each thread of the cluster: one that runs, and one that waits so that no thread does."""
 
@@ -47,6 +49,8 @@ class Outcome:
         What it raised.
     died : str, optional
         The address of the worker that died of it, as far as can be told.
+    starved : bool
+        Whether that worker was ended because it took more memory than it may.
 
     Without any of these it is gone for no fault of its own: with its worker, its scheduler or the connection.
     """
@@ -56,6 +60,7 @@ class Outcome:
     done: tuple[float, Any] | None = None
     error: Exception | None = None
     died: str | None = None
+    starved: bool = False
 
 
 @dataclass(frozen=True)
@@ -121,7 +126,10 @@ class Dispatcher:
             return
         # The steps of a job overtake its tiles: they are few, and others wait for them.
         key, priority = f"{kind}-{task.job}-{tile}-{uuid4().hex[:8]}", 1 if tile < 0 else 0
-        future = client.submit(run, kind, task, tile, trace, key=key, pure=False, priority=priority)
+        # By default what is submitted within 100 ms of one another runs in any order: `_blamed` goes by this one.
+        future = client.submit(
+            run, kind, task, tile, trace, key=key, pure=False, priority=priority, fifo_timeout="0 ms"
+        )
         self._flights[future] = flight
         future.add_done_callback(lambda _: self.news.set())
 
@@ -155,7 +163,7 @@ class Dispatcher:
                 dead.append((flight, error.last_worker.address))
             else:
                 outcomes.append(Outcome(flight.job, flight.tile, error=error))
-        return outcomes + _blamed(dead)
+        return outcomes + _blamed(dead, self._starved() if dead else ())
 
     def want(self, tiles: int) -> None:
         """Say how many tiles there are to do, those under way included."""
@@ -174,6 +182,18 @@ class Dispatcher:
         except Exception as error:  # a worker that is gone, or frozen: what it had is done again
             logger.warning("%d results can't be had: %r", len(finished), error)
             return {}
+
+    def _starved(self) -> set[str]:
+        """The workers that were ended for their memory, as far as their nannies have told the scheduler."""
+        client: Any = self._usable()
+        if client is None:
+            return set()
+        try:
+            told = client.sync(client.scheduler.events, topic=MEMORY, callback_timeout=ANSWER)
+        except Exception as error:
+            logger.warning("what workers died of can't be had: %r", error)
+            return set()
+        return {event["worker"] for _, event in told}
 
     def _usable(self) -> Client | None:
         client = self._client
@@ -235,13 +255,15 @@ def _error_of(future: Future) -> Exception | None:
     return error if isinstance(error, Exception) else None
 
 
-def _blamed(dead: Iterable[tuple[Flight, str]]) -> list[Outcome]:
+def _blamed(dead: Iterable[tuple[Flight, str]], starved: Container[str] = ()) -> list[Outcome]:
     """Who is to blame for the death of a worker: of what it had, the tile that it had got first, for that one ran."""
     ran: dict[str, int] = {}
     for flight, address in dead:
         ran[address] = min(flight.number, ran.get(address, flight.number))
     return [
-        Outcome(flight.job, flight.tile, died=address if ran[address] == flight.number else None)
+        Outcome(flight.job, flight.tile, died=address, starved=address in starved)
+        if ran[address] == flight.number
+        else Outcome(flight.job, flight.tile)
         for flight, address in dead
     ]
 

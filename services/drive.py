@@ -23,6 +23,7 @@ logger = logging.getLogger(__name__)
 
 LOSSES = 8
 """How often a tile may be lost before its job fails: most workers die of something else, turned off say."""
+REMEDY = "give workers more (ENVMATTE_WORKER_MEMORY) or have them hold less (ENVMATTE_INGEST_MEMORY), and retry the job"
 
 
 @dataclass(frozen=True)
@@ -159,12 +160,17 @@ class Drive:
             if jobs.miss(connection, self.job, tile, repr(error), attempts):
                 return True
             raise GaveUp(f"{name} failed {attempts} times, last with {error!r}") from error
+        if outcome.starved:  # which its tile did, and would do again
+            if jobs.miss(
+                connection, self.job, tile, f"its worker {outcome.died} ran out of memory", attempts
+            ):
+                return True
+            raise GaveUp(f"{name} ran out of its worker's memory {attempts} times: {REMEDY}")
         if outcome.died is not None:
             if jobs.lose(connection, self.job, tile, f"its worker {outcome.died} died", LOSSES):
                 return True
             raise GaveUp(
-                f"{name}: {LOSSES} workers that did it died, for want of memory perhaps: give workers more "
-                "(ENVMATTE_WORKER_MEMORY), or have them hold less (ENVMATTE_INGEST_MEMORY), and retry the job"
+                f"{name}: {LOSSES} workers that did it died, for want of memory of their machines perhaps: {REMEDY}"
             )
         return True
 

@@ -235,8 +235,13 @@ def cancel(connection: Connection, job: str) -> None:
         raise Conflict(f"job {job} has {row.state} already and can't be cancelled")
 
 
-def retry(connection: Connection, job: str) -> None:
+def retry(connection: Connection, job: str, *, anew: bool = False) -> None:
     """Queue a failed job again; the tiles that are done stay done.
+
+    Parameters
+    ----------
+    anew : bool
+        Forget its plan and its tiles, because the plan would be another one today.
 
     Raises
     ------
@@ -248,6 +253,10 @@ def retry(connection: Connection, job: str) -> None:
     row = get(connection, job)
     if row.state != "failed":
         raise Conflict(f"job {job} is {row.state}; only a failed job can be tried again")
+    if anew:
+        connection.execute(delete(tiles).where(tiles.c.job == job, tiles.c.tile >= 0))
+        nothing = {"plan": None, "total": 0, "pixels": 0}
+        connection.execute(update(jobs).where(jobs.c.id == job).values(nothing))
     connection.execute(
         update(tiles)
         .where(tiles.c.job == job, tiles.c.state != "done")

@@ -208,11 +208,13 @@ def cancel_job(context: Needs, id: str) -> Job:
 
 @router.post("/jobs/{id}/retry", status_code=202)
 def retry_job(context: Needs, id: str) -> Job:
-    """Queue a failed job again; the tiles that are done are kept."""
+    """Queue a failed job again; the tiles that are done are kept, unless `ENVMATTE_INGEST_MEMORY` has changed."""
     with writing(context.engine) as c:
         row = jobs.get(c, id)
         capture = captures.get(c, row.capture)
-        jobs.retry(c, id)
+        # Slabs of an ingest are as large as the memory allows, and want to be smaller where that was too much.
+        memory = (row.plan or {}).get("memory", context.settings.ingest_memory)
+        jobs.retry(c, id, anew=memory != context.settings.ingest_memory)
         if row.kind == "recover":
             if capture.state == "failed":
                 raise Conflict(f"capture {capture.id} failed: {capture.problem['detail']}")

@@ -1,7 +1,7 @@
 """A cluster that is disturbed, and the matte of one that is not."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +24,12 @@ def times(pytestconfig: pytest.Config) -> int:
 
 
 @pytest.fixture(scope="session")
+def seldom(times: int) -> int:
+    """How often what takes half a minute is injected."""
+    return max(1, times // 2)
+
+
+@pytest.fixture(scope="session")
 def table(pytestconfig: pytest.Config) -> Iterator[list[Row]]:
     """The rows of the table of faults: printed at the end, and written if asked for."""
     rows: list[Row] = []
@@ -32,7 +38,7 @@ def table(pytestconfig: pytest.Config) -> Iterator[list[Row]]:
     for row in (row.as_dict() for row in rows):
         print(
             f"{row['fault']:<34}{row['injected']:>9}{row['lost']:>6}{row['differing']:>11}"
-            f"{row['median']:>10}{row['longest']:>11}"
+            f"{row['median'] or '-':>10}{row['longest'] or '-':>11}"
         )
     if path := pytestconfig.getoption("--table"):
         path.write_text(json.dumps([row.as_dict() for row in rows], indent=2))
@@ -58,6 +64,16 @@ class Known:
     rig: Rig
     capture: str
     files: dict[str, str]
+
+    def disturb(self, fault: str, act: Callable[[], object], times: int) -> Row:
+        """Do something bad at random moments of jobs, and see what comes of them."""
+        return self.rig.disturb(fault, act, self.capture, self.files, times)
+
+
+def check(table: list[Row], row: Row) -> None:
+    """Add a row to the table, and see that nothing was lost and all is the same to the byte."""
+    table.append(row)
+    assert (row.lost, row.differing) == (0, 0), row
 
 
 @pytest.fixture(scope="session")

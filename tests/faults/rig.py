@@ -1,11 +1,12 @@
 """A cluster of real processes on loopback, and what can be done to it."""
 
+import hashlib
 import random
 import signal
 import socket
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -15,7 +16,8 @@ from typing import Any, Self
 import httpx2
 import psutil
 
-from tests.end_to_end.conftest import digests
+from storage import mattes
+from storage.objects import Objects
 from tests.services.clusters import started, workers
 
 STUCK = 240.0
@@ -41,10 +43,13 @@ class Row:
 class Rig:
     """A scheduler, two workers, and two services with a coordinator each, on one store and one database."""
 
-    def __init__(self, folder: Path, database: str | None = None) -> None:
+    def __init__(
+        self, folder: Path, database: str | None = None, store: str | None = None, **environment: str
+    ) -> None:
         self.folder = folder
-        self.store = folder / "store"
+        self.store = store or (folder / "store").as_uri()
         self._database = database
+        self._environment = environment
         self._stack = ExitStack()
         self._commands: dict[str, tuple[str, ...]] = {}
         self._processes: dict[str, subprocess.Popen[str]] = {}
@@ -59,17 +64,17 @@ class Rig:
 
     def _start_all(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
-        cluster = f"tcp://127.0.0.1:{_free_port()}"
+        self.cluster = cluster = f"tcp://127.0.0.1:{free_port()}"
         self.start("scheduler", "scheduler", "--port", cluster.rsplit(":", 1)[1])
         for n in range(2):
             self.start(f"worker{n}", "worker", "--cluster", cluster, "--workers", "1")
-        where = ["--data", str(self.folder / "data"), "--cluster", cluster, "--store", self.store.as_uri()]
+        where = ["--data", str(self.folder / "data"), "--cluster", cluster, "--store", self.store]
         if self._database is not None:
             where += ["--database", self._database]
         self._where = where
         for n in range(2):
-            self.start(f"service{n}", "serve", "--port", str(_free_port()), *where)
-        self.urls = [_url(self._processes[f"service{n}"]) for n in range(2)]
+            self.start(f"service{n}", "serve", "--port", str(free_port()), *where)
+        self.urls = [url_of(self._processes[f"service{n}"]) for n in range(2)]
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -80,7 +85,12 @@ class Rig:
         """Start a process, or the same once more."""
         self._commands[name] = command or self._commands[name]
         log = self.folder / f"{name}.log"
-        self._processes[name] = self._stack.enter_context(started(log, *self._commands[name]))
+        process = started(log, *self._commands[name], within=self._within(name), **self._environment)
+        self._processes[name] = self._stack.enter_context(process)
+
+    def _within(self, name: str) -> Sequence[str]:
+        """What a process is started by, to be on a host of its own."""
+        return ()
 
     def kill(self, name: str) -> None:
         """SIGKILL for a process, and for nothing that it started."""
@@ -97,17 +107,24 @@ class Rig:
         """A service without a coordinator; yields its URL."""
         command = ["serve", "--port", "0", *self._where]
         with started(self.folder / "api.log", *command, ENVMATTE_COORDINATE="false") as process:
-            yield _url(process)
+            yield url_of(process)
 
     def workers(self) -> list[psutil.Process]:
         """The processes in which tiles are recovered."""
         names = [name for name in self._processes if name.startswith("worker")]
         return [one for name in names for one in workers(self._processes[name])]
 
+    def log(self, name: str) -> str:
+        """What a process has said so far."""
+        return (self.folder / f"{name}.log").read_text()
+
+    def process(self, name: str) -> psutil.Process:
+        return psutil.Process(self._processes[name].pid)
+
     def driver(self) -> str:
         """The name of the service whose coordinator drives the jobs."""
-        logs = {n: (self.folder / f"service{n}.log").read_text() for n in range(2)}
-        at = {n: max(log.rfind("drives the jobs"), 0) for n, log in logs.items()}
+        logs = {n: self.log(f"service{n}") for n in range(2)}
+        at = {n: max(log.rfind("drives the jobs from now on"), 0) for n, log in logs.items()}
         lines = {n: logs[n][: at[n]].rsplit("\n", 1)[-1][:23] for n in at}
         return f"service{max(lines, key=lambda n: lines[n])}"
 
@@ -119,7 +136,7 @@ class Rig:
         while True:
             for url in [at] if at else self.urls:
                 try:
-                    answer = httpx2.request(method, url + path, timeout=10, **content)
+                    answer = self._request(method, url + path, **content)
                     if answer.status_code != 503 or not repeat:
                         return answer
                 except httpx2.TransportError:
@@ -127,8 +144,11 @@ class Rig:
             assert time.monotonic() < end, f"{method} {path}: no service answers"
             time.sleep(0.1)
 
-    def job(self, job: str) -> dict[str, Any]:
-        found: dict[str, Any] = self.ask("GET", f"/v1/jobs/{job}").json()
+    def _request(self, method: str, url: str, **content: Any) -> httpx2.Response:
+        return httpx2.request(method, url, timeout=10, **content)
+
+    def job(self, job: str, at: str | None = None) -> dict[str, Any]:
+        found: dict[str, Any] = self.ask("GET", f"/v1/jobs/{job}", at=at).json()
         return found
 
     def recover(self, capture: str) -> dict[str, Any]:
@@ -146,7 +166,7 @@ class Rig:
 
     def files(self, matte: str) -> dict[str, str]:
         """A digest of every file of a matte."""
-        return digests(self.store / "mattes" / matte)
+        return stored(Objects(self.store), mattes.path(matte))
 
     def disturb(
         self, fault: str, act: Callable[[], object], capture: str, expected: dict[str, str], times: int
@@ -158,14 +178,22 @@ class Rig:
             moment = self._random.random()
             while (now := self.job(job["id"]))["progress"] < moment * 0.9 and now["state"] != "succeeded":
                 time.sleep(0.01)
+            start = time.monotonic()
             act()
             row.injected += 1
-            start = time.monotonic()
             found = self.ended(job["id"])
             row.seconds.append(round(time.monotonic() - start, 2))
             row.lost += found["state"] != "succeeded"
             row.differing += found["state"] == "succeeded" and self.files(job["matte"]) != expected
         return row
+
+
+def stored(objects: Objects, folder: str) -> dict[str, str]:
+    """A digest of everything below a folder of a store, by its relative name."""
+    return {
+        path.removeprefix(f"{folder}/"): hashlib.sha256(objects.read(path).read()).hexdigest()
+        for path in sorted(objects.below(folder))
+    }
 
 
 def freeze(process: psutil.Process) -> None:
@@ -176,14 +204,14 @@ def thaw(process: psutil.Process) -> None:
     process.send_signal(signal.SIGCONT)
 
 
-def _url(service: subprocess.Popen[str]) -> str:
+def url_of(service: subprocess.Popen[str]) -> str:
     assert service.stdout is not None
     line = service.stdout.readline()
     assert " at http" in line, line
     return line.rsplit(" at ", 1)[1].strip()
 
 
-def _free_port() -> int:
+def free_port() -> int:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port: int = taken.getsockname()[1]
         return port

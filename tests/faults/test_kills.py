@@ -7,15 +7,10 @@ from contextlib import suppress
 import psutil
 import pytest
 
-from tests.faults.conftest import Known
+from tests.faults.conftest import Known, check
 from tests.faults.rig import Row, freeze, thaw
 
 pytestmark = [pytest.mark.full, pytest.mark.timeout(7200)]
-
-
-def check(known: Known, table: list[Row], row: Row) -> None:
-    table.append(row)
-    assert (row.lost, row.differing) == (0, 0), row
 
 
 def test_a_killed_worker(known: Known, table: list[Row], times: int) -> None:
@@ -24,7 +19,7 @@ def test_a_killed_worker(known: Known, table: list[Row], times: int) -> None:
             time.sleep(0.05)
         random.choice(there).kill()
 
-    check(known, table, known.rig.disturb("SIGKILL of a worker", kill, known.capture, known.files, times))
+    check(table, known.disturb("SIGKILL of a worker", kill, times))
 
 
 def test_all_workers_killed(known: Known, table: list[Row], times: int) -> None:
@@ -32,23 +27,19 @@ def test_all_workers_killed(known: Known, table: list[Row], times: int) -> None:
         for worker in known.rig.workers():
             worker.kill()
 
-    check(known, table, known.rig.disturb("SIGKILL of all workers", kill, known.capture, known.files, times))
+    check(table, known.disturb("SIGKILL of all workers", kill, times))
 
 
 def test_a_killed_scheduler(known: Known, table: list[Row], times: int) -> None:
     rig = known.rig
-    row = rig.disturb(
-        "SIGKILL of the scheduler", lambda: rig.restart("scheduler"), known.capture, known.files, times
-    )
-    check(known, table, row)
+    row = known.disturb("SIGKILL of the scheduler", lambda: rig.restart("scheduler"), times)
+    check(table, row)
 
 
 def test_a_killed_service_that_drives(known: Known, table: list[Row], times: int) -> None:
     rig = known.rig
-    row = rig.disturb(
-        "SIGKILL of API and coordinator", lambda: rig.restart(rig.driver()), known.capture, known.files, times
-    )
-    check(known, table, row)
+    row = known.disturb("SIGKILL of API and coordinator", lambda: rig.restart(rig.driver()), times)
+    check(table, row)
 
 
 def test_a_frozen_worker(known: Known, table: list[Row]) -> None:
@@ -59,11 +50,11 @@ def test_a_frozen_worker(known: Known, table: list[Row]) -> None:
         freeze(frozen[0])
 
     start = time.monotonic()
-    row = known.rig.disturb("SIGSTOP of a worker, for 60 s", act, known.capture, known.files, 1)
+    row = known.disturb("SIGSTOP of a worker, for 60 s", act, 1)
     time.sleep(max(0.0, 60 - (time.monotonic() - start)))
     with suppress(psutil.NoSuchProcess):  # its nanny may have ended it meanwhile
         thaw(frozen[0])
     time.sleep(3)  # in which it may do what it was frozen over
     (matte, *_) = known.rig.ask("GET", "/v1/mattes").json()["mattes"]
     assert known.rig.files(matte["id"]) == known.files
-    check(known, table, row)
+    check(table, row)

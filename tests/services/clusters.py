@@ -4,7 +4,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -20,11 +20,16 @@ def wait(until: Callable[[], object], seconds: float = 90) -> None:
 
 
 @contextmanager
-def started(log: Path, *command: str, **environment: str) -> Iterator[subprocess.Popen[str]]:
-    """A command of envmatte that runs, its stderr in a file; it and all that it started are gone in the end."""
+def started(
+    log: Path, *command: str, within: Sequence[str] = (), **environment: str
+) -> Iterator[subprocess.Popen[str]]:
+    """A command of envmatte that runs, its stderr in a file; it and all that it started are gone in the end.
+
+    ``within`` is put before it, to have it run on another host say.
+    """
     with log.open("ab") as stderr:
         process = subprocess.Popen(
-            [sys.executable, "-m", "services", *command],
+            [*within, sys.executable, "-m", "services", *command],
             stdout=subprocess.PIPE,
             stderr=stderr,
             text=True,

@@ -24,10 +24,10 @@ def test_of_what_a_dead_worker_had_the_first_is_to_blame() -> None:
         (Flight("a", 3, 4), "two"),
         (Flight("b", 4, 6), "one"),
     ]
-    assert _blamed(dead) == [
+    assert _blamed(dead, {"two"}) == [
         Outcome("a", 1),
         Outcome("b", 2, died="one"),
-        Outcome("a", 3, died="two"),
+        Outcome("a", 3, died="two", starved=True),
         Outcome("b", 4),
     ]
 

@@ -126,6 +126,16 @@ def test_a_tile_of_which_workers_die(connection: Connection, job: str) -> None:
     assert jobs.get(connection, job).failed == 1
 
 
+def test_a_tile_that_wants_more_memory_than_there_is(connection: Connection, job: str) -> None:
+    drive = working(connection, job)
+    death = Outcome(job, 1, died="tls://host:1", starved=True)
+    assert [told(connection, drive, death) for _ in range(3)] == [True, True, False]
+    detail = jobs.get(connection, job).problem["detail"]
+    assert (
+        "tile 1 ran out of its worker's memory 3 times: give workers more (ENVMATTE_WORKER_MEMORY)" in detail
+    )
+
+
 def test_what_the_store_lacks_is_done_again(connection: Connection, job: str) -> None:
     drive = working(connection, job)
     told(connection, drive, *(done(drive, n) for n in range(3)))

@@ -144,6 +144,17 @@ def test_a_retry_keeps_what_is_done(connection: Connection) -> None:
     assert jobs.miss(connection, job, 1, "again", 2)
 
 
+def test_a_retry_may_begin_anew(connection: Connection) -> None:
+    job = laid(connection)
+    jobs.finish(connection, job, [(0, 0.1, 10)])
+    jobs.end(connection, job, "failed", {"detail": "its slabs were too large"})
+    jobs.retry(connection, job, anew=True)
+    row = jobs.get(connection, job)
+    assert (row.state, row.plan, row.total, row.done, row.pixels) == ("queued", None, 0, 0, 0)
+    jobs.lay_down(connection, job, {"tiles": 5})
+    assert jobs.to_do(connection, job) == [0, 1, 2, 3, 4]
+
+
 def test_only_a_failed_job_is_tried_again(connection: Connection) -> None:
     for state in (None, "succeeded", "cancelled"):
         job = laid(connection)

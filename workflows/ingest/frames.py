@@ -30,8 +30,8 @@ def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``tiles``: the number of slabs; ``slab``: frames of one; ``width``, ``height``, ``frames``; ``notes``: lines
-        for people about what was found in a video.
+        ``tiles``: the number of slabs; ``slab``: frames of one; ``memory``: the limit that it comes of; ``width``,
+        ``height``, ``frames``; ``notes``: lines for people about what was found in a video.
 
     Raises
     ------
@@ -95,7 +95,7 @@ def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, Any]:
     )
     notes = [] if filmed is None else filmed.notes
     size = {"width": width, "height": height, "frames": frames}
-    return {"tiles": -(-frames // slab), "slab": slab, **size, "notes": notes}
+    return {"tiles": -(-frames // slab), "slab": slab, "memory": limits.memory, **size, "notes": notes}
 
 
 def _look(

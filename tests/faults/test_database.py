@@ -1,0 +1,80 @@
+"""PostgreSQL is restarted and stays away, and a coordinator sleeps over its lease: two services go on by themselves."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.faults.conftest import Known, check, prepared
+from tests.faults.rig import Rig, Row, freeze, thaw
+from tests.postgres import TEMPLATE, Server
+from tests.services.clusters import wait
+
+pytestmark = [pytest.mark.full, pytest.mark.timeout(3600)]
+
+AWAY = 5.0
+"""Seconds for which the server is stopped."""
+ASLEEP = 15.0
+"""Seconds for which a coordinator is frozen: longer than its lease."""
+
+
+@pytest.fixture(scope="module")
+def on_postgresql(
+    postgresql_server: Server, tmp_path_factory: pytest.TempPathFactory, bundle: Path
+) -> Iterator[Known]:
+    with (
+        postgresql_server.database(like=TEMPLATE) as url,
+        Rig(tmp_path_factory.mktemp("postgresql"), url) as rig,
+    ):
+        yield prepared(rig, bundle)
+
+
+def test_a_restarted_server(
+    on_postgresql: Known, postgresql_server: Server, table: list[Row], times: int
+) -> None:
+    row = on_postgresql.disturb("restart of PostgreSQL", postgresql_server.restart, times)
+    check(table, row)
+
+
+def test_a_server_that_stays_away(
+    on_postgresql: Known, postgresql_server: Server, table: list[Row], times: int
+) -> None:
+    rig = on_postgresql.rig
+    answers: set[int] = set()
+
+    def stop() -> None:
+        with postgresql_server.stopped():
+            end = time.monotonic() + AWAY
+            while time.monotonic() < end:
+                for url in rig.urls:
+                    for path in ("/v1/jobs", "/v1/captures", "/readyz"):
+                        answers.add(rig.ask("GET", path, at=url, repeat=False).status_code)
+                    assert rig.ask("GET", "/healthz", at=url, repeat=False).status_code == 200
+
+    check(table, on_postgresql.disturb("PostgreSQL stopped, for 5 s", stop, times))
+    assert answers == {503}
+
+
+def test_a_late_writer(on_postgresql: Known, table: list[Row], seldom: int) -> None:
+    rig = on_postgresql.rig
+    told = "another coordinator drives the jobs now"
+
+    def sleep() -> None:
+        name = rig.driver()
+        before, end = rig.log(name).count(told), time.monotonic() + ASLEEP
+        other = rig.urls[1 - int(name[-1])]
+        freeze(rig.process(name))
+        try:
+            job = rig.ask("GET", "/v1/jobs?limit=1", at=other).json()["jobs"][0]["id"]
+            wait(lambda: rig.job(job, at=other)["state"] == "succeeded" and time.monotonic() > end)
+            record = [rig.ask("GET", f"/v1/jobs/{job}{more}", at=other).json() for more in ("", "/log")]
+        finally:
+            thaw(rig.process(name))
+        wait(lambda: rig.log(name).count(told) > before)
+        time.sleep(1)  # in which it may do what it was frozen over
+        assert rig.log(name).count(told) == before + 1
+        assert rig.driver() != name
+        assert record == [rig.ask("GET", f"/v1/jobs/{job}{more}").json() for more in ("", "/log")]
+
+    check(table, on_postgresql.disturb("SIGSTOP of a coordinator, for 15 s", sleep, seldom))

@@ -1,0 +1,136 @@
+"""Disks that are full: a job fails with words, or waits, and nothing half written stays; with room all goes on."""
+
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from storage import mattes
+from storage.objects import Objects
+from tests.disks import small_disk
+from tests.end_to_end.conftest import Service, paused, serving
+from tests.faults.conftest import check
+from tests.faults.rig import Row, stored
+from tests.services.clusters import wait
+
+pytestmark = [pytest.mark.full, pytest.mark.timeout(900)]
+
+STORE, LEDGER = 64 << 20, 8 << 20
+
+
+@dataclass
+class Small:
+    """A service whose store and database are on a small disk each, and the matte of a capture there."""
+
+    service: Service
+    store: Path
+    ledger: Path
+    capture: str
+    files: dict[str, str]
+
+    def matte(self, matte: str) -> dict[str, str]:
+        return stored(Objects((self.store / "store").as_uri()), mattes.path(matte))
+
+    def row(self, fault: str, start: float, matte: str) -> Row:
+        differing = self.matte(matte) != self.files
+        return Row(fault, 1, differing=int(differing), seconds=[round(time.monotonic() - start, 2)])
+
+    def half_written(self) -> list[Path]:
+        return [path for path in self.store.rglob("*#*")]
+
+    def retried(self, job: str) -> str:
+        assert self.service.http.post(f"/v1/jobs/{job}/retry").status_code == 202
+        return str(self.service.client.wait(job)["state"])
+
+    def failed_for_room(self, job: str) -> bool:
+        """Whether a job ends for want of room, and the service is none the worse for it."""
+        wait(lambda: self.service.client.job(job)["state"] not in ("queued", "running"))
+        found = self.service.client.job(job)
+        assert (found["state"], found["problem"]["type"]) == ("failed", "urn:envmatte:problem:no-room"), found
+        assert "the disk is full" in found["problem"]["detail"]
+        assert not self.half_written()
+        return self.service.http.get("/healthz").status_code == 200
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory, bundle: Path) -> Iterator[Small]:
+    folder = tmp_path_factory.mktemp("disks")
+    with small_disk(folder / "store", STORE) as store, small_disk(folder / "ledger", LEDGER) as ledger:
+        where = ("--store", (store / "store").as_uri(), "--database", f"sqlite:///{ledger / 'ledger.db'}")
+        with serving(folder / "data", "--workers", "1", *where) as service:
+            uploaded = service.client.upload(bundle)
+            service.client.wait(uploaded["job"])
+            found = Small(service, store, ledger, uploaded["id"], {})
+            found.files = found.matte(
+                service.client.wait(service.client.recover(uploaded["id"])["id"])["matte"]
+            )
+            yield found
+
+
+@contextmanager
+def full(disk: Path, left: int = 0) -> Iterator[None]:
+    """Leave so many bytes of a disk, while this lasts."""
+    ballast = disk / "ballast"
+    with ballast.open("wb") as file:
+        os.posix_fallocate(file.fileno(), 0, shutil.disk_usage(disk).free - left)
+    try:
+        yield
+    finally:
+        ballast.unlink()
+
+
+def test_at_ingest(small: Small, bundle: Path, table: list[Row]) -> None:
+    service, start = small.service, time.monotonic()
+    with ExitStack() as filled:
+        with paused(service):
+            uploaded = service.client.upload(bundle)
+            filled.enter_context(full(small.store, 256 << 10))
+        assert small.failed_for_room(uploaded["job"])
+    assert small.retried(uploaded["job"]) == "succeeded"
+    job = service.client.wait(service.client.recover(uploaded["id"])["id"])
+    check(table, small.row("a full disk at ingest", start, job["matte"]))
+
+
+def test_at_tiles(small: Small, table: list[Row]) -> None:
+    start = time.monotonic()
+    with full(small.store, 256 << 10):
+        job = small.service.client.recover(small.capture)
+        assert small.failed_for_room(job["id"])
+    assert small.retried(job["id"]) == "succeeded"
+    check(table, small.row("a full disk at tiles", start, job["matte"]))
+
+
+def test_in_sqlite(small: Small, table: list[Row]) -> None:
+    service, start = small.service, time.monotonic()
+    job = service.client.recover(small.capture)
+    wait(lambda: service.client.job(job["id"])["progress"] > 0.1)
+
+    def refused() -> bool:
+        """Whether an upload is, in the end: what the log of SQLite has taken before it may take again."""
+        headers = {"Tus-Resumable": "1.0.0", "Upload-Length": "1", "Upload-Metadata": "name " + "QUFB" * 1000}
+        answer = service.http.post("/v1/uploads", headers=headers)
+        assert answer.status_code in (201, 507), answer.text
+        if answer.status_code == 507:
+            assert "the disk is full" in answer.json()["detail"]
+        return answer.status_code == 507
+
+    log = service.data.parent / f"{service.data.name}.log"
+    told = "going on as soon as it can: the disk is full"
+    with ExitStack() as filled:
+        with paused(service):
+            filled.enter_context(full(small.ledger))
+            while not refused():
+                pass
+        said = log.read_text().count(told)
+        wait(lambda: log.read_text().count(told) > said + 2)
+        wait(lambda: service.http.get("/readyz").status_code == 503)
+        assert service.client.job(job["id"])["state"] == "running"
+    assert service.client.wait(job["id"])["state"] == "succeeded"
+    wait(lambda: service.http.get("/readyz").status_code == 200)
+    assert "Traceback" not in log.read_text()
+    check(table, small.row("a full disk of SQLite", start, job["matte"]))

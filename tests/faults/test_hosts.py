@@ -1,0 +1,49 @@
+"""The link between hosts is cut without a word, and mended: jobs end, and whoever was cut off is back."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from storage import leases
+from storage.database import open_engine, reading
+from tests.faults.conftest import Known, check, prepared
+from tests.faults.hosts import Hosts
+from tests.faults.rig import Row
+from tests.services.clusters import wait
+
+pytestmark = [pytest.mark.full, pytest.mark.timeout(3600)]
+
+AWAY = 20.0
+"""Seconds for which a link is cut: longer than dask waits for an answer."""
+
+
+@pytest.fixture(scope="module")
+def hosts(tmp_path_factory: pytest.TempPathFactory, bundle: Path) -> Iterator[Known]:
+    with Hosts(tmp_path_factory.mktemp("hosts")) as rig:
+        yield prepared(rig, bundle)
+
+
+@pytest.mark.parametrize("name", ["worker0", "service0", "scheduler"])
+def test_a_link_that_is_cut(hosts: Known, table: list[Row], seldom: int, name: str) -> None:
+    assert isinstance(hosts.rig, Hosts)
+    network = hosts.rig.network
+
+    def cut() -> None:
+        network.cut(name)
+        time.sleep(AWAY)
+        network.mend(name)
+
+    row = hosts.disturb(f"the link of {name} cut, for 20 s", cut, seldom)
+    wait(lambda: workers_of(hosts.rig.folder / "data" / "envmatte.db") == 2)
+    check(table, row)
+
+
+def workers_of(ledger: Path) -> int:
+    """How many workers the coordinator sees."""
+    engine = open_engine(f"sqlite:///{ledger}")
+    with reading(engine) as c:
+        sign = leases.last_sign(c)
+    engine.dispose()
+    return len(sign.cluster["workers"]) if sign else 0

@@ -1,0 +1,152 @@
+"""The object store answers with 503, late or not at all: jobs go on, and one that can't end fails with words."""
+
+import http.client
+import random
+import threading
+import time
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+
+from tests.faults.conftest import Known, check, prepared
+from tests.faults.rig import Rig, Row
+from tests.s3 import BUCKET, KEYS
+
+pytestmark = [pytest.mark.full, pytest.mark.timeout(3600)]
+
+AWAY = 10.0
+"""Seconds for which the store is away."""
+SHARE = 0.2
+"""Of the requests, those that come to nothing."""
+
+
+class Proxy(ThreadingHTTPServer):
+    """Between a bucket and who uses it: hands on what it is asked, or what it is told to do instead."""
+
+    daemon_threads = True
+    request_queue_size = 64
+
+    def __init__(self, server: str) -> None:
+        super().__init__(("127.0.0.1", 0), _Handler)
+        self.server = urlsplit(server).netloc
+        self.refused = 0.0
+        """Share of the requests that are answered with 503."""
+        self.silent = 0.0
+        """Share of those that are not answered, until the connection is closed after some seconds."""
+        self.lost = 0
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.server_port}"
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Of those who are gone before they are answered: nothing."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    server: Proxy
+
+    def _hand_on(self) -> None:
+        body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+        fate = random.random()
+        if fate < self.server.refused:
+            self.server.lost += 1
+            self._answer(503, {}, b"")
+            return
+        if fate < self.server.refused + self.server.silent:
+            self.server.lost += 1
+            self.close_connection = True
+            time.sleep(3)
+            return
+        there = http.client.HTTPConnection(self.server.server, timeout=30)
+        there.request(self.command, self.path, body, dict(self.headers))
+        answer = there.getresponse()
+        self._answer(answer.status, dict(answer.getheaders()), answer.read())
+        there.close()
+
+    def _answer(self, status: int, headers: dict[str, str], body: bytes) -> None:
+        self.send_response_only(status)
+        for name, value in headers.items():
+            if name.lower() not in ("transfer-encoding", "connection", "content-length"):
+                self.send_header(name, value)
+        length = headers.get("Content-Length", len(body)) if self.command == "HEAD" else len(body)
+        self.send_header("Content-Length", str(length))
+        self.end_headers()
+        self.wfile.write(body)
+
+    do_GET = do_HEAD = do_PUT = do_POST = do_DELETE = _hand_on
+
+    def log_message(self, format: str, *arguments: object) -> None:
+        """Nothing."""
+
+
+@pytest.fixture(scope="module")
+def proxy(s3_server: str) -> Iterator[Proxy]:
+    with Proxy(s3_server) as proxy:
+        thread = threading.Thread(target=proxy.serve_forever)
+        thread.start()
+        yield proxy
+        proxy.shutdown()
+        thread.join()
+
+
+@pytest.fixture(scope="module")
+def in_bucket(
+    s3_server: str, proxy: Proxy, tmp_path_factory: pytest.TempPathFactory, bundle: Path
+) -> Iterator[Known]:
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in {"AWS_ENDPOINT_URL": s3_server, **KEYS}.items():
+            patch.setenv(name, value)  # for the test itself: past the proxy
+        through = {"AWS_ENDPOINT_URL": proxy.url, "ENVMATTE_ATTEMPTS": "1"}
+        with Rig(tmp_path_factory.mktemp("bucket"), store=f"s3://{BUCKET}/faults", **through) as rig:
+            yield prepared(rig, bundle)
+
+
+def test_a_share_of_answers_503(in_bucket: Known, proxy: Proxy, table: list[Row], seldom: int) -> None:
+    proxy.refused, before = SHARE, proxy.lost
+    row = in_bucket.disturb("503 from the store, of one in 5", lambda: None, seldom)
+    proxy.refused = 0
+    assert proxy.lost > before
+    check(table, row)
+
+
+def test_a_share_without_an_answer(in_bucket: Known, proxy: Proxy, table: list[Row], seldom: int) -> None:
+    def act() -> None:
+        proxy.silent = SHARE
+        time.sleep(5)
+        proxy.silent = 0
+
+    row = in_bucket.disturb("no answer from the store, of one in 5", act, seldom)
+    check(table, row)
+
+
+def test_a_store_that_is_away(in_bucket: Known, proxy: Proxy, table: list[Row], seldom: int) -> None:
+    def act() -> None:
+        proxy.refused = 1
+        time.sleep(AWAY)
+        proxy.refused = 0
+
+    check(table, in_bucket.disturb("503 from the store, for 10 s", act, seldom))
+
+
+def test_a_store_that_stays_away(in_bucket: Known, proxy: Proxy, table: list[Row]) -> None:
+    rig = in_bucket.rig
+    job = rig.recover(in_bucket.capture)
+    while rig.job(job["id"])["progress"] < 0.2:
+        time.sleep(0.05)
+    proxy.refused = 1
+    start = time.monotonic()
+    failed = rig.ended(job["id"])
+    proxy.refused = 0
+    assert failed["state"] == "failed"
+    assert "the store can't be reached" in failed["problem"]["detail"]
+    assert rig.ask("POST", f"/v1/jobs/{job['id']}/retry").status_code == 202
+    row = Row("a store that stays away, and retry", 1)
+    row.lost += rig.ended(job["id"])["state"] != "succeeded"
+    row.seconds.append(round(time.monotonic() - start, 2))
+    row.differing += rig.files(job["matte"]) != in_bucket.files
+    check(table, row)
