@@ -7,19 +7,16 @@ import json
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import click
 
 from services.client import Client, ServiceError
 from services.presets import PRESETS
 from services.progress import Progress
-
-if TYPE_CHECKING:
-    from pydantic import ValidationError
+from services.running import COMMANDS, first_of
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -38,32 +35,6 @@ def _remote(command: F) -> F:
     return url(key(as_json(command)))
 
 
-_certs = click.option(
-    "--certs",
-    type=click.Path(path_type=Path),
-    help="Folder of the cluster's certificates, see `envmatte certs`.",
-)
-
-
-def _those_given(options: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in options.items() if value is not None}
-
-
-@contextmanager
-def _refusals_told() -> Iterator[None]:
-    """What a process of the service refuses becomes a message and an exit code."""
-    from pydantic import ValidationError
-
-    from storage.errors import EnvmatteError
-
-    try:
-        yield
-    except ValidationError as error:
-        raise click.UsageError(_first(error)) from error
-    except EnvmatteError as error:
-        raise click.ClickException(error.detail) from error
-
-
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="envmatte")
 def main() -> None:
@@ -73,89 +44,8 @@ def main() -> None:
     """
 
 
-@main.command()
-@click.option("--data", type=click.Path(path_type=Path), help="Folder of the database and everything stored.")
-@click.option("--host", help="Address to listen on.")
-@click.option("--port", type=int, help="Port to listen on; 0 takes a free one.")
-@click.option("--workers", type=int, help="Worker processes.")
-@click.option("--cluster", help="Scheduler of a cluster to use instead: tls://HOST:PORT.")
-@_certs
-@click.option("--database", help="Database to use: postgresql://USER:PASSWORD@HOST/NAME.")
-@click.option("--store", help="Store to use: s3://BUCKET/PREFIX or file:///FOLDER.")
-def serve(**given: Any) -> None:
-    """Run the service: API, database, store and a cluster of this machine, unless others are named.
-
-    Every setting is an environment variable ENVMATTE_… too, and a line in .env; an option here wins.
-    """
-    from services.server import serve as run
-    from services.settings import Settings
-
-    with _refusals_told():
-        run(Settings(**_those_given(given)))
-
-
-@main.command()
-@click.option("--cluster", help="Scheduler to hand work to: tls://HOST:PORT.")
-@_certs
-@click.option("--database", help="Database that the API uses: postgresql://USER:PASSWORD@HOST/NAME.")
-@click.option("--store", help="Store that all of them use: s3://BUCKET/PREFIX or file:///FOLDER.")
-def coordinator(**given: Any) -> None:
-    """Run a coordinator without an API: it drives jobs whenever no other coordinator does."""
-    from services.server import coordinate
-    from services.settings import Settings
-
-    with _refusals_told():
-        coordinate(Settings(**_those_given(given)))
-
-
-@main.command()
-@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
-@click.option(
-    "--port", type=int, default=8786, show_default=True, help="Port to listen on; 0 takes a free one."
-)
-@_certs
-def scheduler(host: str, port: int, **given: Any) -> None:
-    """Run the scheduler of a cluster, for workers and services of many machines.
-
-    With certificates it speaks TLS; without it listens on loopback alone.
-    """
-    from services.scheduler import schedule
-    from services.settings import ClusterSettings
-
-    with _refusals_told():
-        schedule(ClusterSettings(**_those_given(given)), host, port)
-
-
-@main.command()
-@click.option("--cluster", help="Scheduler to work for: tls://HOST:PORT, or tcp://127.0.0.1:PORT.")
-@_certs
-@click.option("--workers", type=int, help="Worker processes. Default: one a core.")
-@click.option("--host", help="Address to listen on. Default: that by which the scheduler is reached.")
-def worker(host: str | None, **given: Any) -> None:
-    """Run workers of a cluster on this machine.
-
-    They wait for the scheduler as long as it takes, and join it again whenever it was gone.
-    """
-    from services.settings import ClusterSettings
-    from services.worker import work
-
-    with _refusals_told():
-        work(ClusterSettings(**_those_given(given)), host)
-
-
-@main.command()
-@click.argument("folder", type=click.Path(file_okay=False, path_type=Path), metavar="DIR")
-def certs(folder: Path) -> None:
-    """Make the certificates of a cluster in DIR.
-
-    Every process of the cluster gets a copy with --certs; whoever has one may run what he likes on all of its
-    machines. Where there is a whole set already it stays.
-    """
-    from services.certs import make
-
-    with _refusals_told():
-        made = make(folder)
-    click.echo(f"{folder}: made, copy it to every host" if made else f"{folder}: there already, and stays")
+for command in COMMANDS:
+    main.add_command(command)
 
 
 @main.command()
@@ -239,12 +129,16 @@ def composite(
     help="Folder to leave the capture and backdrop in.",
 )
 @click.option("--workers", type=int, help="Worker processes of the demo's service.")
+@click.option("--url", help="Of a service that runs, to use in place of one of the demo's own.")
+@click.option("--key", envvar="ENVMATTE_KEY", help="API key of that service.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
-def demo(output: Path, keep: Path | None, workers: int | None, as_json: bool) -> None:
+def demo(
+    output: Path, keep: Path | None, workers: int | None, url: str | None, key: str | None, as_json: bool
+) -> None:
     """Trace a glass ball, film it, serve, upload, recover, composite: all of it, in a picture."""
     from services.demo import run
 
-    picture, figures = run(workers, keep)
+    picture, figures = run(workers, keep, url=url, key=key)
     _write(output, picture)
     if not as_json:
         for name, value in figures.items():
@@ -306,7 +200,7 @@ def patterns(program: str, out: Path, monitor: tuple[int, int] | None, rate: flo
             else:
                 files.write(shown, out, progress)
     except ValidationError as error:
-        raise click.UsageError(_first(error)) from error
+        raise click.UsageError(first_of(error)) from error
     except EnvmatteError as error:
         raise click.UsageError(error.detail) from error
     except OSError as error:
@@ -324,11 +218,6 @@ def _pair(option: str) -> tuple[str, Any]:
         return name, json.loads(value)
     except json.JSONDecodeError:
         return name, value
-
-
-def _first(error: "ValidationError") -> str:
-    first = error.errors()[0]
-    return f"{'.'.join(map(str, first['loc']))} {first['msg']}".strip()
 
 
 def _write(path: Path, data: bytes) -> None:

@@ -2,6 +2,7 @@
 
 import base64
 import hashlib
+import secrets
 import time
 from collections.abc import Callable
 from http import HTTPStatus
@@ -16,11 +17,13 @@ TUS = {"Tus-Resumable": "1.0.0"}
 LARGEST, SMALLEST = 8 << 20, 64 << 10
 """Bytes of a file that are sent at once: half as many after a fault, twice as many after a success."""
 PATIENCE = 120.0
-"""Seconds without progress after which an upload is given up: a service may be started again meanwhile."""
+"""Seconds without progress after which an upload or a job is given up: a service may be started again meanwhile."""
 SILENCE = 60.0
 """Seconds without an answer, or a byte of it, after which a service counts as gone."""
 COMPUTING = 600.0
 """The same where the service computes the whole answer before its first byte."""
+AWAY = (502, 503, 504)
+"""Statuses of a service that is away, with a proxy before it or without."""
 PASSING = (408, 409, 423, 429, 460, 500, 502, 503, 504)
 """Statuses after which an upload is tried again, from where the service says it stands."""
 
@@ -51,6 +54,7 @@ class Client:
     def __init__(self, url: str, key: str | None = None) -> None:
         headers = {"Authorization": f"Bearer {key}"} if key else {}
         self._http = httpx2.Client(base_url=url, headers=headers, timeout=SILENCE)
+        self._answered = False
 
     def __enter__(self) -> Self:
         return self
@@ -133,11 +137,13 @@ class Client:
 
     def recover(self, capture: str, **options: Any) -> Job:
         """Queue the recovery of a matte; returns its job."""
-        return self._json("POST", "/v1/jobs", json={"capture": capture, "options": options})
+        key = {"Idempotency-Key": secrets.token_hex(16)}
+        body = {"capture": capture, "options": options}
+        return self._patiently("POST", "/v1/jobs", json=body, headers=key)
 
     def job(self, job: str) -> Job:
         """A job."""
-        return self._json("GET", f"/v1/jobs/{job}")
+        return self._patiently("GET", f"/v1/jobs/{job}")
 
     def cancel(self, job: str) -> Job:
         """Cancel a job."""
@@ -145,6 +151,8 @@ class Client:
 
     def wait(self, job: str, *, progress: Callable[[Job], None] | None = None, poll: float = 0.2) -> Job:
         """Wait until a job has ended; raises `ServiceError` unless it succeeded.
+
+        A service that is started again meanwhile is outlived.
 
         Parameters
         ----------
@@ -190,6 +198,19 @@ class Client:
         found: dict[str, Any] = self._send(method, path, **request).json()
         return found
 
+    def _patiently(self, method: str, path: str, **request: Any) -> dict[str, Any]:
+        """What may be asked again, asked again for as long as a service that was there is away."""
+        give_up, pause = time.monotonic() + PATIENCE, 0.1
+        while True:
+            try:
+                return self._json(method, path, **request)
+            except ServiceError as error:
+                away = error.problem["status"] in AWAY and self._answered
+                if not away or time.monotonic() > give_up:
+                    raise
+            time.sleep(pause)
+            pause = min(2 * pause, 5)
+
     def _send(self, method: str, path: str, **request: Any) -> httpx2.Response:
         try:
             answer = self._http.request(method, path, **request)
@@ -203,6 +224,7 @@ class Client:
                 }
             ) from error
         if answer.is_success:
+            self._answered = True
             return answer
         if answer.headers.get("content-type") != "application/problem+json" or not answer.content:
             # Of a proxy between, or to HEAD.

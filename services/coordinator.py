@@ -22,6 +22,7 @@ from services.api.errors import problem_of
 from services.dispatch import Dispatcher
 from services.drive import Drive, end_badly
 from services.housekeeping import discard, sweep
+from services.process import about
 from services.settings import Settings
 from storage import captures, jobs, leases, mattes, uploads
 from storage.database import reading, writing
@@ -65,7 +66,7 @@ class Coordinator:
         self._leaving: deque[tuple[float, str, str, str]] = deque()
         """When what ended jobs wrote is removed: a time, and a kind, a capture and a matte."""
         self._troubles: Counter[str] = Counter()
-        self._beat_at = self._swept_at = self._settled_at = -1e9
+        self._beat_at = self._swept_at = self._settled_at = self._read_at = -1e9
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="coordinator")
         self._house = ThreadPoolExecutor(1, thread_name_prefix="housekeeping")
@@ -141,6 +142,20 @@ class Coordinator:
             yield c
 
     def _step(self) -> None:
+        now = time.monotonic()
+        if now - self._read_at >= POLL:
+            self._read_at = now
+            self._read()
+        for outcome in self._dispatcher.collect():
+            if outcome.job in self._drives:
+                self._drives[outcome.job].news.append(outcome)
+        for drive in self._due():
+            self._guarded(drive.job, self._settle, drive)
+        self._discard()
+        self._submit()
+
+    def _read(self) -> None:
+        """See in the ledger which jobs there are to drive, and which no more."""
         with reading(self._engine) as c:
             active = {row.id: row for row in jobs.active(c)}
             cancelled = jobs.not_wound_up(c)
@@ -151,25 +166,20 @@ class Coordinator:
             self._drop(job)
         for row in cancelled:
             self._wind_up(row)
-        self._discard()
-        for outcome in self._dispatcher.collect():
-            if outcome.job in self._drives:
-                self._drives[outcome.job].news.append(outcome)
-        for drive in self._due():
-            self._guarded(drive.job, self._settle, drive)
-        self._submit()
 
     def _guarded(self, job: str, act: Any, *arguments: Any) -> None:
         """Do something about a job; what is wrong with it must not hold up the others."""
         try:
-            act(*arguments)
+            with about(job):
+                act(*arguments)
         except (Superseded, Unavailable, NoRoom):  # of the ledger: no job is to blame
             raise
         except EnvmatteError as error:
             self._fail(job, error)
         except Exception as error:
             # Whatever it was, and whatever it left half done here: the ledger knows where the job stands.
-            logger.exception("job %s is taken up anew", job)
+            with about(job):
+                logger.exception("the job is taken up anew")
             if job in self._drives:
                 self._drop(job)
             self._troubles[job] += 1
@@ -190,6 +200,7 @@ class Coordinator:
             drive = self._drive_of(c, row)
             jobs.enter(c, row.id, drive.stage)
         self._drives[row.id] = drive
+        logger.info("%s, from the stage %s on", row.kind, drive.stage)
 
     def _drive_of(self, connection: Connection, row: Row[Any]) -> Drive:
         return Drive.of(row, jobs.to_do(connection, row.id), self._objects.url, self._settings.limits)
@@ -274,7 +285,7 @@ class Coordinator:
                 return
             job = min(share, key=lambda job: (share[job], len(self._drives[job].to_do)))
             drive = self._drives[job]
-            dispatcher.submit(drive.kind, drive.task, drive.to_do.popleft())
+            dispatcher.submit(drive.kind, drive.task, drive.to_do.popleft(), drive.trace)
             share[job] += 1
             if not drive.to_do:
                 del share[job]

@@ -7,7 +7,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,9 @@ PANEL = 480, 360
 ERROR_GAIN = 8
 
 
-def run(workers: int | None, keep: Path | None = None) -> tuple[bytes, dict[str, Any]]:
+def run(
+    workers: int | None, keep: Path | None = None, *, url: str | None = None, key: str | None = None
+) -> tuple[bytes, dict[str, Any]]:
     """Trace, film, serve, upload, recover, composite.
 
     Parameters
@@ -37,6 +39,8 @@ def run(workers: int | None, keep: Path | None = None) -> tuple[bytes, dict[str,
         Worker processes; one a core if left out.
     keep : Path, optional
         Folder to leave the capture and the backdrop in, as `glass-ball.zip` and `backdrop.png`.
+    url, key : str, optional
+        A service that runs, to use in place of one of its own, and an API key of it.
 
     Returns
     -------
@@ -61,7 +65,8 @@ def run(workers: int | None, keep: Path | None = None) -> tuple[bytes, dict[str,
             write_capture(scene, preset("default"), capture, name="glass ball")
         bar.show(0.1, "starting the service")
         start = time.perf_counter()
-        with service(Path(folder, "data"), workers) as url, Client(url) as client:
+        serving = nullcontext(url) if url else service(Path(folder, "data"), workers)
+        with serving as at, Client(at, key) as client:
             times["starting_seconds"] = round(time.perf_counter() - start, 1)
             with step("ingest"):
                 bar.show(0.2, "uploading the capture")

@@ -19,8 +19,9 @@ from uuid import uuid4
 from distributed import Client, Future
 from distributed.scheduler import KilledWorker
 
+from services.step import run
 from storage.errors import EnvmatteError
-from workflows.jobs import Task, run
+from workflows.jobs import Task
 
 logger = logging.getLogger(__name__)
 
@@ -93,7 +94,7 @@ class Dispatcher:
         self.news = threading.Event()
         """Set when something may have become of a tile, or of the cluster."""
         self.cluster: dict[str, Any] = {"workers": [], "problem": "the scheduler has not been reached yet"}
-        """As last seen: the ``workers``, and ``problem``, what is wrong in words or None."""
+        """As last seen: the ``workers``, the tiles ``under_way``, and ``problem``, what is wrong in words or None."""
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -117,8 +118,8 @@ class Dispatcher:
         """How many more tiles the cluster is to have."""
         return DEPTH * self.threads - len(self._flights) if self._usable() else 0
 
-    def submit(self, kind: str, task: Task, tile: int) -> None:
-        """Hand over a tile; `collect` says what became of it."""
+    def submit(self, kind: str, task: Task, tile: int, trace: str | None = None) -> None:
+        """Hand over a tile, and the trace that it is part of; `collect` says what became of it."""
         client, number = self._usable(), next(self._number)
         flight = Flight(task.job, tile, number)
         if client is None:
@@ -127,7 +128,7 @@ class Dispatcher:
         key, priority = f"{kind}-{task.job}-{tile}-{uuid4().hex[:8]}", 1 if tile < 0 else 0
         # By default what is submitted within 100 ms of one another runs in any order: `_blamed` goes by this one.
         future = client.submit(
-            run, kind, task, tile, key=key, pure=False, priority=priority, fifo_timeout="0 ms"
+            run, kind, task, tile, trace, key=key, pure=False, priority=priority, fifo_timeout="0 ms"
         )
         self._flights[future] = flight
         future.add_done_callback(lambda _: self.news.set())
@@ -230,7 +231,7 @@ class Dispatcher:
         problem = (
             None if workers else "no worker is connected to the scheduler; start some with `envmatte worker`"
         )
-        return {"workers": workers, "problem": problem}
+        return {"workers": workers, "under_way": len(self._flights), "problem": problem}
 
 
 def _worker(address: str, found: dict[str, Any]) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """A job that is being driven: what of it is to be done, and what the ledger is told of what was."""
 
+import logging
 import time
 from collections import deque
 from collections.abc import Sequence
@@ -8,13 +9,17 @@ from typing import Any
 
 from sqlalchemy import Connection, Row
 
+from services import tracing
 from services.api.errors import problem_of
 from services.dispatch import Outcome
+from services.process import about
 from storage import captures, jobs, mattes
 from storage.errors import EnvmatteError, GaveUp, Unavailable
 from storage.jobs import FINISH, PREPARE
 from workflows.ingest.bundle import Limits
 from workflows.jobs import KINDS, Task, order
+
+logger = logging.getLogger(__name__)
 
 LOSSES = 8
 """How often a tile may be lost before its job fails: most workers die of something else, turned off say."""
@@ -55,6 +60,8 @@ class Drive:
         When something last was.
     paced : int
         Threads of the cluster for which the pace of its tiles is measured; 0 until there is a pace.
+    trace : str, optional
+        The ``traceparent`` of the request that asked for it.
     """
 
     job: str
@@ -65,6 +72,7 @@ class Drive:
     news: list[Outcome] = field(default_factory=list)
     settled_at: float = 0.0
     paced: int = 0
+    trace: str | None = None
 
     @classmethod
     def of(cls, row: Row[Any], tiles: Sequence[int], store: str, limits: Limits) -> "Drive":
@@ -79,10 +87,12 @@ class Drive:
             plan=row.plan or {},
         )
         if row.plan is None:
-            return cls(row.id, row.kind, "preparing", task, deque([PREPARE]))
-        if tiles:
-            return cls(row.id, row.kind, KINDS[row.kind].stage, task, deque(order(row.kind, tiles)))
-        return cls(row.id, row.kind, "finishing", task, deque([FINISH]))
+            stage, to_do = "preparing", [PREPARE]
+        elif tiles:
+            stage, to_do = KINDS[row.kind].stage, order(row.kind, tiles)
+        else:
+            stage, to_do = "finishing", [FINISH]
+        return cls(row.id, row.kind, stage, task, deque(to_do), trace=row.trace)
 
     def settle(self, connection: Connection, attempts: int, threads: int, under_way: int) -> Next:
         """Write down the news of a job.
@@ -141,6 +151,9 @@ class Drive:
             If the job can't go on without it.
         """
         tile, error, name = outcome.tile, outcome.error, jobs.name_of(outcome.tile)
+        if outcome.died is not None:  # which says nothing any more
+            with about(self.job, tile):
+                logger.warning("its worker %s died", outcome.died)
         if isinstance(error, EnvmatteError) and not isinstance(error, Unavailable):
             raise error  # it would be the same the next time
         if error is not None:
@@ -169,6 +182,8 @@ class Drive:
 
     def _prepared(self, connection: Connection, plan: dict[str, Any]) -> Next:
         jobs.lay_down(connection, self.job, plan)
+        row = jobs.get(connection, self.job)
+        tracing.waited("queue", row.trace, row.created_at, row.started_at, job=self.job, kind=self.kind)
         if self.kind == "ingest":
             found = {name: plan[name] for name in ("width", "height", "frames")}
             captures.change(connection, self.task.capture, **found)
@@ -188,6 +203,7 @@ class Drive:
             end_badly(connection, self.kind, self.task, error)
         # Unless it was cancelled at the last moment, and is wound up next.
         elif jobs.end(connection, self.job, "succeeded"):
+            logger.info("succeeded")
             if self.kind == "ingest":
                 captures.change(connection, self.task.capture, state="ready")
             else:
@@ -198,6 +214,8 @@ class Drive:
 def end_badly(connection: Connection, kind: str, task: Task, error: EnvmatteError) -> None:
     """Write down that a job failed."""
     problem = problem_of(error)
+    with about(task.job):
+        logger.warning("failed: %s", problem["detail"])
     if not jobs.end(connection, task.job, "failed", problem):
         return
     if kind == "ingest":

@@ -1,7 +1,7 @@
 """What dask runs in every worker process at its start: `distributed` calls `dask_setup`.
 
-A task can't be stopped, and one that nobody wants any more (its job was cancelled, its coordinator died) may run on for
-long, and write what nobody will remove. So its process ends with it, and the nanny starts another.
+A task can't be stopped, and one that nobody wants any more (its job was cancelled, its coordinator or its scheduler is
+gone) may run on for long, and write what nobody will remove. So its process ends with it, and the nanny starts another.
 """
 
 import logging
@@ -9,10 +9,13 @@ import os
 import time
 
 from distributed import Worker
+from distributed.core import Status
 from tornado.ioloop import PeriodicCallback
 
 # Importing the kernels takes seconds: not out of the first job's time.
-import workflows.jobs  # noqa: F401
+import services.step  # noqa: F401
+from services import tracing
+from services.process import about, log_as_nanny_does
 
 logger = logging.getLogger(__name__)
 
@@ -23,17 +26,23 @@ PATIENCE = 0.5
 
 
 def dask_setup(worker: Worker) -> None:
-    """Watch for tasks that were cancelled while they run."""
+    """Log and trace, and watch for tasks that nobody wants any more while they run."""
+    log_as_nanny_does()
+    tracing.start("worker")
     since: dict[str, float] = {}
 
     def look() -> None:
         now = time.monotonic()
-        strays = {task.key for task in worker.state.executing if task.state == "cancelled"}
+        ending = worker.status in (Status.closing, Status.closed)
+        strays = {task.key for task in worker.state.executing if ending or task.state == "cancelled"}
         for key in since.keys() - strays:
             del since[key]
         for key in strays:
             if now - since.setdefault(key, now) > PATIENCE:
-                logger.info("%s was cancelled and runs on: ending this process", key)
+                _, job, rest = key.split("-", 2)  # as `services.dispatch` makes it
+                with about(job, int(rest.rpartition("-")[0])):
+                    logger.info("nobody wants it any more, and it runs on: ending this process")
                 os._exit(1)
 
-    worker.periodic_callbacks["strays"] = PeriodicCallback(look, 1000 * LOOK)
+    # Not one of the worker's own, which stop as soon as it begins to close.
+    PeriodicCallback(look, 1000 * LOOK).start()

@@ -50,4 +50,5 @@ class Progress:
         eta = job["eta_seconds"]
         left = f", {eta:.0f} s left" if eta else ""
         tiles = job["tiles"]
-        self.show(job["progress"], f"{job['stage']}, {tiles['done']} of {tiles['total']} tiles{left}")
+        waits = f"; {job['waits_for']}" if job["waits_for"] else ""
+        self.show(job["progress"], f"{job['stage']}, {tiles['done']} of {tiles['total']} tiles{left}{waits}")

@@ -33,7 +33,7 @@ def schedule(settings: ClusterSettings, host: str, port: int) -> None:
     KeyboardInterrupt
         At SIGINT.
     """
-    log()
+    log(settings.log, settings.log_level, "scheduler")
     certs = settings.certificates
     if certs is None and not is_loopback(host):
         raise InvalidInput(

@@ -9,6 +9,7 @@ from contextlib import ExitStack, contextmanager
 import uvicorn
 from sqlalchemy import Engine
 
+from services import tracing
 from services.api import build_app
 from services.cluster import dispatcher_of
 from services.coordinator import Coordinator
@@ -30,12 +31,13 @@ def serve(settings: Settings) -> None:
     Conflict
         If another service has the data folder.
     """
-    with _opened(settings) as (stack, engine, objects):
+    with _opened(settings, "service") as (stack, engine, objects):
         # The port is taken before workers start, so that one in use is told at once.
         config = uvicorn.Config(
             build_app(settings, engine, objects),
             settings.host,
             settings.port,
+            log_config=None,
             log_level="warning",
             lifespan="off",
             timeout_graceful_shutdown=GRACE,
@@ -53,7 +55,7 @@ def serve(settings: Settings) -> None:
 
 def coordinate(settings: Settings) -> None:
     """Drive jobs, whenever no other coordinator does, until interrupted."""
-    with _opened(settings) as (stack, engine, objects):
+    with _opened(settings, "coordinator") as (stack, engine, objects):
         dispatcher = stack.enter_context(dispatcher_of(settings))
         stack.enter_context(Coordinator(settings, engine, objects, dispatcher))
         print("envmatte coordinates", flush=True)
@@ -61,11 +63,12 @@ def coordinate(settings: Settings) -> None:
 
 
 @contextmanager
-def _opened(settings: Settings) -> Iterator[tuple[ExitStack, Engine, Objects]]:
+def _opened(settings: Settings, role: str) -> Iterator[tuple[ExitStack, Engine, Objects]]:
     """The database and the store, and a stack that is unwound before they are closed."""
     # uvicorn raises the signal that stopped it once more at its end: what is open here must close before we go.
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))
-    log()
+    log(settings.log, settings.log_level, role)
+    tracing.start(role)
     settings.data.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         if settings.alone:

@@ -3,7 +3,7 @@
 import ipaddress
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 from urllib.parse import urlsplit
 
 from distributed.security import Security
@@ -43,6 +43,13 @@ class ClusterSettings(BaseSettings):
         ge=0,
         description="Bytes that a worker process may take before it is ended and started again; 0 sets no limit. "
         "Default: the machine's memory, shared out among the workers.",
+    )
+
+    log: Literal["text", "json"] = Field(
+        "text", description="Form of the logs on stderr: text, or json, an object a line."
+    )
+    log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = Field(
+        "INFO", description="The lowest level that is logged; debug has a line for every tile."
     )
 
     @model_validator(mode="after")

@@ -42,7 +42,7 @@ def work(settings: ClusterSettings, host: str | None) -> None:
     KeyboardInterrupt
         At SIGINT.
     """
-    log()
+    log(settings.log, settings.log_level, "nanny")
     if settings.cluster is None:
         raise InvalidInput(
             "name the scheduler to work for with --cluster tls://HOST:PORT, or ENVMATTE_CLUSTER"

@@ -147,6 +147,16 @@ def pace(connection: Connection, job: str, after: int) -> bool:
     return bool(result.rowcount)
 
 
+def finished_ingests(connection: Connection, most: int) -> list[tuple[dict[str, Any], float]]:
+    """Of the last ingests that succeeded: their plans, and the seconds that the step after their tiles took."""
+    step = (tiles.c.job == jobs.c.id) & (tiles.c.tile == FINISH)
+    query = select(jobs.c.plan, tiles.c.seconds).join(tiles, step)
+    query = query.where(jobs.c.kind == "ingest", jobs.c.state == "succeeded", tiles.c.seconds.is_not(None))
+    return [
+        (plan, took) for plan, took in connection.execute(query.order_by(jobs.c.number.desc()).limit(most))
+    ]
+
+
 def miss(connection: Connection, job: str, tile: int, reason: str, allowed: int) -> bool:
     """Write down a failed attempt at a tile; true if it may be tried again, which one that is done need not be."""
     return _again(connection, job, tile, tiles.c.attempts, "attempt", reason, allowed)

@@ -6,7 +6,20 @@ from fastapi import Depends, FastAPI, Request
 from fastapi.staticfiles import StaticFiles
 from sqlalchemy import Engine
 
-from services.api import captures, errors, jobs, mattes, programs, reports, system, tus, uploads
+from services import tracing
+from services.api import (
+    captures,
+    cluster,
+    errors,
+    jobs,
+    mattes,
+    metrics,
+    programs,
+    reports,
+    system,
+    tus,
+    uploads,
+)
 from services.api.context import PROBLEM, WEB, Context
 from services.settings import Settings
 from storage.objects import Objects
@@ -23,6 +36,7 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
     app.state.context = Context(settings, engine, objects)
     errors.register(app)
     app.add_middleware(tus.Protocol)
+    app.add_middleware(tracing.Requests)
 
     def authorize(request: Request) -> None:
         if not settings.keys:
@@ -39,9 +53,11 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
         jobs.router,
         mattes.router,
         programs.router,
+        cluster.router,
     ):
         app.include_router(router, prefix="/v1", dependencies=[Depends(authorize)])
     app.include_router(programs.page, prefix="/v1")
     app.include_router(system.router)
+    app.include_router(metrics.router)
     app.mount("/web", StaticFiles(directory=WEB))
     return app

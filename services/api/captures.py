@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from sqlalchemy import Row
 from sqlalchemy.exc import IntegrityError
 
+from services import tracing
 from services.api.context import After, Context, Limit, Needs, read_body
 from services.api.errors import WrongMediaType
 from services.api.uploads import too_large
@@ -251,7 +252,7 @@ def _register(
         with writing(context.engine) as c:
             if resumable and not uploads.forget(c, capture):
                 raise NotFound(f"upload {capture} is gone")
-            job = jobs.add(c, "ingest", capture, {})
+            job = jobs.add(c, "ingest", capture, {}, trace=tracing.asked_by())
             captures.add(
                 c,
                 capture,

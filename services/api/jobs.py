@@ -8,7 +8,9 @@ from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection, Row
 
+from services import tracing
 from services.api.context import After, Limit, Needs, read_json
+from services.api.eta import seconds_left
 from services.api.waiting import reason
 from storage import captures, jobs, leases, mattes
 from storage.database import jobs as table
@@ -81,7 +83,7 @@ class Job(BaseModel):
             },
             progress=progress,
             tiles=Tiles(total=row.total, done=row.done, failed=row.failed),
-            eta_seconds=_left(row, now) if running else None,
+            eta_seconds=seconds_left(connection, row, now) if running else None,
             waits_for=reason(connection, row, sign),
             queued_seconds=(row.started_at or row.finished_at or now) - row.created_at,
             run_seconds=ran,
@@ -164,7 +166,7 @@ def post_job(
             Program.model_validate(capture.program).bands()
             matte = new_id()
             chosen = options.model_dump(mode="json")
-            job = jobs.add(c, "recover", capture.id, chosen, matte)
+            job = jobs.add(c, "recover", capture.id, chosen, matte, tracing.asked_by())
             mattes.add(c, matte, capture.id, job, chosen)
             if idempotency_key:
                 jobs.remember(c, idempotency_key, CALL, job)
@@ -229,16 +231,6 @@ def delete_job(context: Needs, id: str) -> None:
     """Delete a job that has ended, and its log; its matte stays."""
     with writing(context.engine) as c:
         jobs.forget(c, id)
-
-
-def _left(row: Row[Any], now: float) -> float | None:
-    """Seconds until a job's last tile is done, by the pace of those that were done last."""
-    if row.done == row.total:
-        return 0.0 if row.total else None
-    if row.paced_at is None or row.done <= row.paced_done:
-        return None
-    pace = (row.moved_at - row.paced_at) / (row.done - row.paced_done)
-    return float(max((row.total - row.done) * pace - (now - row.moved_at), 0.0))
 
 
 def _time(seconds: float | None) -> datetime | None:

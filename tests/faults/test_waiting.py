@@ -2,9 +2,11 @@
 
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from services.client import Client
 from tests.faults.conftest import Known
 from tests.faults.rig import Rig
 from tests.services.clusters import wait
@@ -69,6 +71,16 @@ def test_for_its_capture_and_beside_others(known: Known, bundle_bytes: bytes) ->
     wait(says(rig, other["id"], "shares 2 workers with"))
     for one in (job, other):
         goes_on(known, one["id"], one["matte"])
+
+
+def test_a_client_that_waits_outlives_its_service(known: Known) -> None:
+    rig = known.rig
+    with Client(rig.urls[0]) as client, ThreadPoolExecutor(1) as pool:
+        job = client.recover(known.capture)
+        waiting = pool.submit(client.wait, job["id"])
+        rig.restart("service0")
+        assert waiting.result(240)["state"] == "succeeded"
+    goes_on(known, job["id"], job["matte"])
 
 
 def test_a_cancelled_job_frees_its_workers_and_what_it_wrote(known: Known) -> None:

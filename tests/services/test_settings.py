@@ -43,7 +43,9 @@ def test_loopback_needs_no_key(host: str) -> None:
     assert Settings(host=host).keys == ()
 
 
-@pytest.mark.parametrize("wrong", [{"port": 70000}, {"workers": 0}, {"ingest_memory": 5}, {"attempts": 0}])
+@pytest.mark.parametrize(
+    "wrong", [{"port": 70000}, {"workers": 0}, {"ingest_memory": 5}, {"attempts": 0}, {"log": "xml"}]
+)
 def test_what_is_out_of_range_is_refused(wrong: dict[str, int]) -> None:
     with pytest.raises(ValidationError, match=next(iter(wrong))):
         Settings(**wrong)

@@ -1,0 +1,145 @@
+"""Traces by OpenTelemetry, from the request that asks for a job to each of its tiles.
+
+There are none, and nothing of OpenTelemetry is imported, unless OTEL_EXPORTER_OTLP_ENDPOINT is set in a process'
+environment; where to, by which sampler and how many at once is said by the variables of the OpenTelemetry specification
+too. Spans are sent by a thread in the background, and dropped if nobody takes them. Between processes a trace goes by
+its ``traceparent`` (https://www.w3.org/TR/trace-context), in the ledger and with every tile.
+"""
+
+import atexit
+import logging
+import os
+import re
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import TYPE_CHECKING, Any
+
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+if TYPE_CHECKING:
+    from opentelemetry.context import Context
+    from opentelemetry.trace import Span, Tracer
+
+logger = logging.getLogger(__name__)
+
+ENDPOINTS = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
+TRACEPARENT = re.compile("00-(?!0{32})[0-9a-f]{32}-(?!0{16})[0-9a-f]{16}-[0-9a-f]{2}")
+TRACED = ("/v1/captures", "/v1/jobs")
+"""Where a POST makes a job."""
+
+LAST = 2.0
+"""Seconds that a process takes at its end to send what it has not sent yet."""
+
+_tracer: "Tracer | None" = None
+_asked_by: ContextVar[str | None] = ContextVar("asked_by", default=None)
+
+
+def start(role: str) -> None:
+    """Trace what this process does, if that is asked for."""
+    global _tracer
+    if not any(os.environ.get(name) for name in ENDPOINTS):
+        return
+    try:
+        from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
+        from opentelemetry.sdk.resources import OTELResourceDetector, Resource
+        from opentelemetry.sdk.trace import TracerProvider
+        from opentelemetry.sdk.trace.export import BatchSpanProcessor
+    except ImportError:
+        logger.warning(
+            "%s asks for traces, which need another package: pip install 'envmatte[otel]'", ENDPOINTS[0]
+        )
+        return
+    resource = Resource({"service.name": f"envmatte-{role}"}).merge(OTELResourceDetector().detect())
+    provider, exporter = TracerProvider(resource=resource, shutdown_on_exit=False), OTLPSpanExporter()
+    provider.add_span_processor(BatchSpanProcessor(exporter))
+    ending = threading.Event()
+
+    def cut_off() -> None:
+        ending.wait()
+        time.sleep(LAST)
+        exporter.shutdown()  # type: ignore[no-untyped-call]
+
+    def end() -> None:
+        ending.set()
+        provider.shutdown()
+
+    threading.Thread(target=cut_off, name="last spans", daemon=True).start()
+    atexit.register(end)
+    _tracer = provider.get_tracer("envmatte")
+
+
+@contextmanager
+def span(name: str, parent: str | None, **attributes: str | int) -> Iterator["Span | None"]:
+    """What is done inside is a span, of a trace that another process began.
+
+    Parameters
+    ----------
+    parent : str, optional
+        A ``traceparent``; without one a trace begins here.
+    **attributes
+        Called ``envmatte.…`` in the trace.
+    """
+    if _tracer is None:
+        yield None
+        return
+    with _tracer.start_as_current_span(name, _context(parent), attributes=_named(attributes)) as made:
+        yield made
+
+
+def waited(name: str, parent: str | None, begin: float, end: float, **attributes: str | int) -> None:
+    """A span from one time to another, in seconds of the epoch."""
+    if _tracer is not None:
+        began, ended = int(begin * 1e9), int(end * 1e9)
+        _tracer.start_span(name, _context(parent), attributes=_named(attributes), start_time=began).end(ended)
+
+
+def asked_by() -> str | None:
+    """The ``traceparent`` of what is made by the present request."""
+    return _asked_by.get()
+
+
+class Requests:
+    """Middleware: a request that makes a job continues the trace of its caller, or begins one."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http" or scope["method"] != "POST" or scope["path"] not in TRACED:
+            await self.app(scope, receive, send)
+            return
+        given = Headers(scope=scope).get("traceparent", "")
+        parent = given if TRACEPARENT.fullmatch(given) else None
+        with span(f"POST {scope['path']}", parent) as made:
+
+            async def send_and_note(message: Message) -> None:
+                if made is not None and message["type"] == "http.response.start":
+                    made.set_attribute("http.response.status_code", message["status"])
+                await send(message)
+
+            _asked_by.set(parent if made is None else _traceparent())
+            await self.app(scope, receive, send_and_note)
+
+
+def _named(attributes: dict[str, str | int]) -> dict[str, Any]:
+    return {f"envmatte.{name}": value for name, value in attributes.items()}
+
+
+def _context(parent: str | None) -> "Context":
+    from opentelemetry.context import Context
+    from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
+
+    return TraceContextTextMapPropagator().extract({"traceparent": parent or ""}, Context())
+
+
+def _traceparent() -> str | None:
+    """Of the present span."""
+    from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
+
+    carrier: dict[str, str] = {}
+    TraceContextTextMapPropagator().inject(carrier)
+    return carrier.get("traceparent")
