@@ -51,9 +51,10 @@ REQUESTS: ClientConfig = {
     "allow_http": True,  # where AWS_ENDPOINT_URL names it, and nowhere else
 }
 RETRIES: RetryConfig = {
-    "max_retries": 10,
+    "max_retries": 1000,  # it is the time that ends them
     "retry_timeout": timedelta(seconds=40),
-    "backoff": {"init_backoff": timedelta(seconds=0.1), "max_backoff": timedelta(seconds=5), "base": 2},
+    # Each pause is drawn between the first and the last one times the base: with less than e they don't get longer.
+    "backoff": {"init_backoff": timedelta(seconds=0.1), "max_backoff": timedelta(seconds=5), "base": 4},
 }
 """Of what a bucket does not answer, or with an error of its own: a minute in all, with the last request."""
 UNREACHABLE = re.compile(r"HTTP error|status code: (429|5\d\d)|error sending request|response body")

@@ -26,7 +26,9 @@ def hosts(tmp_path_factory: pytest.TempPathFactory, bundle: Path) -> Iterator[Kn
 
 
 @pytest.mark.parametrize("name", ["worker0", "service0", "scheduler"])
-def test_a_link_that_is_cut(hosts: Known, table: list[Row], seldom: int, name: str) -> None:
+def test_a_link_that_is_cut(hosts: Known, table: list[Row], times: int, seldom: int, name: str) -> None:
+    if name == "scheduler" and times < 3:
+        pytest.skip("it takes a minute: with --times 3 and more")
     assert isinstance(hosts.rig, Hosts)
     network = hosts.rig.network
 
