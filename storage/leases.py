@@ -96,6 +96,11 @@ def give_back(connection: Connection, token: int) -> None:
     connection.execute(update(coordinator).where(coordinator.c.token == token).values(holder=None))
 
 
+def touch(connection: Connection) -> None:
+    """Write what is there already, to see that the database can be written to."""
+    connection.execute(update(coordinator).values(token=coordinator.c.token))
+
+
 def last_sign(connection: Connection) -> Sign | None:
     """The last sign of life of a coordinator, if there ever was one."""
     row = connection.execute(select(coordinator, clock().label("now"))).one_or_none()

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import errno
 import io
 import json
-import re
 import shutil
 import threading
 import time
-from contextlib import asynccontextmanager, contextmanager, suppress
-from datetime import timedelta
+from contextlib import asynccontextmanager, suppress
 from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -22,19 +19,18 @@ import numpy as np
 import obstore
 import zarr
 from numpy.typing import NDArray
-from obstore.exceptions import BaseError
 from obstore.store import LocalStore, ObjectStore, from_url
 from zarr.buffer import default_buffer_prototype
 from zarr.storage import MemoryStore, StorePath, WrapperStore
 from zarr.storage import ObjectStore as ZarrStore
 
-from storage.errors import DISK_FULL, Corrupt, NoRoom, Unavailable
+from storage.errors import Corrupt
+from storage.outages import REQUESTS, RETRIES, told
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Collection, Coroutine, Iterator
+    from collections.abc import AsyncIterator, Collection, Coroutine
 
     from obstore import AsyncWritableFile, ReadableFile
-    from obstore.store import ClientConfig, RetryConfig
     from zarr.abc.store import ByteRequest
     from zarr.core.array_spec import ArrayConfigParams
     from zarr.core.buffer import Buffer, BufferPrototype
@@ -45,20 +41,6 @@ METADATA = ("zarr.json", ".zarray", ".zgroup", ".zattrs", ".zmetadata")
 """Objects that zarr looks for to see whether there is an array or a group: they may be missing."""
 PART = 8 << 20
 """Bytes of one part of a large object: S3 takes parts of 5 MiB and more."""
-REQUESTS: ClientConfig = {
-    "connect_timeout": timedelta(seconds=5),
-    "timeout": timedelta(seconds=20),  # of a part of 8 MiB, too
-    "allow_http": True,  # where AWS_ENDPOINT_URL names it, and nowhere else
-}
-RETRIES: RetryConfig = {
-    "max_retries": 1000,  # it is the time that ends them
-    "retry_timeout": timedelta(seconds=40),
-    # Each pause is drawn between the first and the last one times the base: with less than e they don't get longer.
-    "backoff": {"init_backoff": timedelta(seconds=0.1), "max_backoff": timedelta(seconds=5), "base": 4},
-}
-"""Of what a bucket does not answer, or with an error of its own: a minute in all, with the last request."""
-UNREACHABLE = re.compile(r"HTTP error|status code: (429|5\d\d)|error sending request|response body")
-"""What obstore says when a bucket does not answer, or with an error of its own; it has no kind of error for that."""
 
 
 def together(*work: Coroutine[Any, Any, Any]) -> list[Any]:
@@ -190,7 +172,7 @@ class Objects:
         """
         # Two parts under way bound the memory of an upload to a few parts, whatever its size.
         writer = obstore.open_writer_async(self._store, path, buffer_size=PART, max_concurrency=2)
-        with _told():
+        with told():
             async with writer as file:
                 yield file
 
@@ -202,7 +184,7 @@ class Objects:
         FileNotFoundError
             If there is none.
         """
-        with _told():
+        with told():
             reader = obstore.open_reader(self._store, path, buffer_size=1 << 20)
         return io.BufferedReader(_Reader(reader), 1 << 16)
 
@@ -214,19 +196,19 @@ class Objects:
         NoRoom
             If the disk is full.
         """
-        with _told():
+        with told():
             obstore.put(self._store, path, data)
 
     def names(self, folder: str) -> list[str]:
         """What lies directly in a folder, folders and objects, by name."""
-        with _told():
+        with told():
             found = obstore.list_with_delimiter(self._store, folder)
         paths = [*found["common_prefixes"], *(meta["path"] for meta in found["objects"])]
         return sorted(path.rsplit("/", 1)[-1] for path in paths)
 
     def below(self, folder: str) -> set[str]:
         """The paths of all objects below a folder, however deep."""
-        with _told():
+        with told():
             return {meta["path"] for batch in obstore.list(self._store, folder) for meta in batch}
 
     def stale(self, folder: str, seconds: float, but: Collection[str] = ()) -> list[str]:
@@ -255,7 +237,7 @@ class Objects:
                 with suppress(FileNotFoundError):
                     newest = max(newest, one.stat().st_mtime)
         else:
-            with _told():
+            with told():
                 found = [meta for batch in obstore.list(self._store, path) for meta in batch]
                 with suppress(FileNotFoundError):  # which a bucket does not list below itself
                     found.append(obstore.head(self._store, path))
@@ -268,7 +250,7 @@ class Objects:
             target = self._folder / path
             shutil.rmtree(target) if target.is_dir() else target.unlink(missing_ok=True)
             return
-        with _told():
+        with told():
             obstore.delete(self._store, path)  # which a bucket does not list below itself
             for batch in obstore.list(self._store, path, chunk_size=500):
                 obstore.delete(self._store, [meta["path"] for meta in batch])
@@ -290,24 +272,8 @@ class Objects:
 
     def check(self) -> None:
         """Reach the store once; raises whatever it raises when it can't be reached."""
-        with _told():
+        with told():
             obstore.list_with_delimiter(self._store, None)
-
-
-@contextmanager
-def _told() -> Iterator[None]:
-    """Turns what obstore raises, of several kinds and without a number, to `NoRoom` and `Unavailable`."""
-    try:
-        yield
-    except (BaseError, OSError) as error:
-        said = str(error).partition("\n")[0]
-        if any(f"(os error {number})" in str(error) for number in (errno.ENOSPC, errno.EDQUOT)):
-            raise NoRoom(DISK_FULL) from error
-        if said.startswith("Generic S3 error") and UNREACHABLE.search(said):
-            raise Unavailable(
-                f"the store can't be reached for now; try again ({said.rpartition(' - ')[2].strip(': ')})"
-            ) from error
-        raise
 
 
 def _array(store: _Whole, path: str, document: bytes) -> zarr.Array[Any]:
@@ -332,30 +298,30 @@ class _Whole(WrapperStore[ZarrStore[ObjectStore]]):
     async def get(
         self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
     ) -> Buffer | None:
-        with _told():
+        with told():
             value = await self._store.get(key, prototype, byte_range)
         if value is None and not key.endswith(METADATA):
             raise Corrupt(f"{key} is missing in the store: what it belongs to is damaged, make it again")
         return value
 
     async def set(self, key: str, value: Buffer) -> None:
-        with _told():
+        with told():
             await self._store.set(key, value)
 
     async def set_if_not_exists(self, key: str, value: Buffer) -> None:
-        with _told():
+        with told():
             await self._store.set_if_not_exists(key, value)
 
     async def delete(self, key: str) -> None:
-        with _told():
+        with told():
             await self._store.delete(key)
 
     async def delete_dir(self, prefix: str) -> None:
-        with _told():
+        with told():
             await self._store.delete_dir(prefix)
 
     async def exists(self, key: str) -> bool:
-        with _told():
+        with told():
             return await self._store.exists(key)
 
 
@@ -378,7 +344,7 @@ class _Reader(io.RawIOBase):
         return self._file.tell()
 
     def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
-        with _told():
+        with told():
             data = self._file.read(len(buffer))
         buffer[: len(data)] = memoryview(data)
         return len(data)
