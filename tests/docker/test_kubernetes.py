@@ -1,0 +1,174 @@
+"""kubernetes.yaml, without a Kubernetes: its objects against the schemas of the API, its commands in real processes."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import httpx2
+import kubernetes_validate
+import pytest
+import yaml
+
+from services.certs import make
+from services.settings import Settings
+from tests.services.clusters import address, started, wait
+
+MANIFEST = Path(__file__).parents[2] / "docker" / "kubernetes.yaml"
+OLDEST = "1.25"
+TEXT = MANIFEST.read_text()
+OBJECTS: list[dict[str, Any]] = list(yaml.safe_load_all(TEXT))
+SECRETS = {  # by the commands at the head of the file
+    name: re.findall(r"--from-literal=(\w+)", rest)
+    for name, rest in re.findall(r"create secret generic (\S+)((?:.*\\\n)*.*)", TEXT)
+}
+KEY = "a-key-of-the-test"
+
+
+def the(kind: str, name: str) -> dict[str, Any]:
+    (found,) = [one for one in OBJECTS if (one["kind"], one["metadata"]["name"]) == (kind, name)]
+    return found
+
+
+def pod(name: str) -> dict[str, Any]:
+    spec: dict[str, Any] = the("Deployment", name)["spec"]["template"]["spec"]
+    return spec
+
+
+def container(name: str) -> dict[str, Any]:
+    (only,) = pod(name)["containers"]
+    return only
+
+
+DEPLOYMENTS = [one["metadata"]["name"] for one in OBJECTS if one["kind"] == "Deployment"]
+
+
+def environment(name: str) -> dict[str, str]:
+    """What a container finds in its environment, secrets by their names."""
+    found: dict[str, str] = {}
+    for source in container(name)["envFrom"]:
+        if "configMapRef" in source:
+            found |= the("ConfigMap", source["configMapRef"]["name"])["data"]
+        else:
+            found |= {variable: "" for variable in SECRETS[source["secretRef"]["name"]]}
+    return found | {one["name"]: one["value"] for one in container(name).get("env", [])}
+
+
+@pytest.mark.parametrize("version", [OLDEST, kubernetes_validate.latest_version()])
+@pytest.mark.parametrize("object", OBJECTS, ids=lambda one: f"{one['kind']}-{one['metadata']['name']}")
+def test_objects_are_what_the_api_takes(object: dict[str, Any], version: str) -> None:
+    kubernetes_validate.validate(object, version, strict=True)
+
+
+def test_what_is_named_is_there() -> None:
+    for name in DEPLOYMENTS:
+        deployment, spec = the("Deployment", name)["spec"], pod(name)
+        assert deployment["selector"]["matchLabels"] == deployment["template"]["metadata"]["labels"]
+        volumes = {volume["name"]: volume for volume in spec["volumes"]}
+        assert {mount["name"] for mount in container(name)["volumeMounts"]} == set(volumes)
+        assert volumes["certs"]["secret"]["secretName"] in SECRETS
+    for service in (one for one in OBJECTS if one["kind"] == "Service"):
+        (port,) = service["spec"]["ports"]
+        (served,) = [
+            name
+            for name in DEPLOYMENTS
+            if the("Deployment", name)["spec"]["selector"]["matchLabels"] == service["spec"]["selector"]
+        ]
+        assert port["targetPort"] in [one["name"] for one in container(served)["ports"]]
+    scaled = the("HorizontalPodAutoscaler", "envmatte-worker")["spec"]["scaleTargetRef"]["name"]
+    assert "cpu" in container(scaled)["resources"]["requests"]  # which utilisation is a share of
+    assert "replicas" not in the("Deployment", scaled)["spec"]  # or every `kubectl apply` would set it
+
+
+def test_every_variable_is_a_setting() -> None:
+    known = {f"ENVMATTE_{name.upper()}" for name in Settings.model_fields}
+    for name in DEPLOYMENTS:
+        ours = {variable for variable in environment(name) if variable.startswith("ENVMATTE_")}
+        assert ours <= known
+        # Else Kubernetes would make variables of the names of Services, ENVMATTE_PORT=tcp://… among them.
+        assert pod(name)["enableServiceLinks"] is False
+
+
+def test_addresses_and_ports_are_those_that_are_listened_on() -> None:
+    cluster = urlsplit(environment("envmatte-worker")["ENVMATTE_CLUSTER"])
+    (port,) = the("Service", str(cluster.hostname))["spec"]["ports"]
+    assert port["port"] == cluster.port
+    shown = subprocess.run(
+        [sys.executable, "-m", "services", "scheduler", "--help"], capture_output=True, text=True, check=True
+    ).stdout
+    (scheduler,) = container("envmatte-scheduler")["ports"]
+    assert f"[default: {scheduler['containerPort']}]" in re.sub(r"\s+", " ", shown)
+    (served,) = container("envmatte")["ports"]
+    assert served["containerPort"] == Settings.model_fields["port"].default
+
+
+def test_pods_have_no_more_rights_than_they_need() -> None:
+    for name in DEPLOYMENTS:
+        spec = pod(name)
+        assert spec["automountServiceAccountToken"] is False
+        assert spec["securityContext"]["runAsNonRoot"] is True
+        assert f"USER {spec['securityContext']['runAsUser']}:" in MANIFEST.with_name("Dockerfile").read_text()
+        assert container(name)["securityContext"] == {
+            "allowPrivilegeEscalation": False,
+            "readOnlyRootFilesystem": True,
+            "capabilities": {"drop": ["ALL"]},
+        }
+    assert not {"ENVMATTE_KEYS", "ENVMATTE_DATABASE"} & set(environment("envmatte-worker"))
+    assert not set(SECRETS["envmatte-store"]) & set(environment("envmatte-scheduler"))
+
+
+def test_a_worker_is_ended_before_kubernetes_ends_its_pod() -> None:
+    worker = container("envmatte-worker")
+    limit = int(worker["resources"]["limits"]["memory"].removesuffix("Gi")) << 30
+    assert 0.95 * int(environment("envmatte-worker")["ENVMATTE_WORKER_MEMORY"]) < limit - (200 << 20)
+
+
+@pytest.mark.full
+def test_its_commands_make_a_cluster_and_its_probes_find_it_well(tmp_path: Path) -> None:
+    certs = tmp_path / "certs"
+    make(certs)
+
+    def here(name: str) -> dict[str, str]:
+        """The environment of a container, with what is here in place of what is there."""
+        local = {
+            "ENVMATTE_CERTS": str(certs),
+            "ENVMATTE_CLUSTER": cluster,
+            "ENVMATTE_DATABASE": f"sqlite:///{tmp_path / 'envmatte.db'}",
+            "ENVMATTE_STORE": (tmp_path / "store").as_uri(),
+            "ENVMATTE_KEYS": KEY,
+        }
+        return {variable: local.get(variable, value) for variable, value in environment(name).items()}
+
+    cluster = "tls://127.0.0.1:1"
+    command = [*container("envmatte-scheduler")["args"], "--port", "0"]
+    with started(tmp_path / "scheduler.log", *command, **here("envmatte-scheduler")) as scheduler:
+        port = address(scheduler).rsplit(":", 1)[1]
+        cluster = f"tls://127.0.0.1:{port}"
+        probe = container("envmatte-scheduler")["livenessProbe"]["exec"]["command"]
+        code = probe[2].replace("/certs", str(certs)).replace("8786", port)
+        subprocess.run([sys.executable, *probe[1:2], code], check=True)
+        assert "handshake" not in (tmp_path / "scheduler.log").read_text()
+        serve = [*container("envmatte")["args"], "--port", "0"]
+        with (
+            started(tmp_path / "api.log", *serve, **here("envmatte")) as api,
+            started(
+                tmp_path / "worker.log", *container("envmatte-worker")["args"], **here("envmatte-worker")
+            ),
+        ):
+            assert api.stdout is not None
+            url = f"http://127.0.0.1:{api.stdout.readline().rsplit(':', 1)[1].strip()}"
+            for kind in ("startupProbe", "readinessProbe", "livenessProbe"):
+                path = container("envmatte")[kind]["httpGet"]["path"]
+                assert httpx2.get(url + path).status_code == 200
+
+            def workers() -> list[dict[str, Any]]:
+                answer = httpx2.get(f"{url}/v1/cluster", headers={"Authorization": f"Bearer {KEY}"})
+                found: list[dict[str, Any]] = answer.json()["workers"]
+                return found
+
+            wait(workers)
+            limit = int(environment("envmatte-worker")["ENVMATTE_WORKER_MEMORY"])
+            assert [one["memory_limit_bytes"] for one in workers()] == [limit]
+            wait(lambda: httpx2.get(f"{url}/readyz").status_code == 200)
