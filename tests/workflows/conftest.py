@@ -13,7 +13,7 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
-from storage import uploads
+from storage import captures, uploads
 from storage.captures import Stack
 from storage.objects import Objects
 from workflows.ingest import frames
@@ -80,6 +80,7 @@ def ingest(objects: Objects, put: Callable[[str, bytes], None]) -> Ingest:
         order: Callable[[range], Iterator[int]] = iter,  # type: ignore[assignment]
         unpacked: int = 1 << 30,
     ) -> Stack:
+        objects.delete(captures.path(capture))  # nothing of an earlier one
         put(capture, data)
         limits = Limits(unpacked=unpacked, memory=memory)
         plan = frames.prepare(objects, capture, limits)

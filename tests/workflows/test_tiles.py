@@ -76,6 +76,7 @@ def recover(objects: Objects, ingest: Ingest) -> Callable[..., tuple[mattes.Matt
         method: str = "lobes",
     ) -> tuple[mattes.Matte, int]:
         ingest("c", data, memory=memory)
+        objects.delete(mattes.path("m"))
         options = {"method": method, "tile": tile}
         task = Task("j", objects.url, "c", "m", options, Limits(1 << 30, memory), {})
         plan = run("recover", task, PREPARE)[1]
@@ -205,6 +206,7 @@ def test_a_damaged_stack_is_corrupt(
     recover(bundles[False])
     chunk = next(path for path in (folder / "captures/c/frames/c").rglob("*") if path.is_file())
     chunk.unlink()
+    objects.delete(mattes.path("m"))
     task = Task("j", objects.url, "c", "m", {}, Limits(1 << 30, 1 << 26), {})
     plan = run("recover", task, PREPARE)[1]
     with pytest.raises(Corrupt, match="frames"):
