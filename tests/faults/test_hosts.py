@@ -25,10 +25,17 @@ def hosts(tmp_path_factory: pytest.TempPathFactory, bundle: Path) -> Iterator[Kn
         yield prepared(rig, bundle)
 
 
-@pytest.mark.parametrize("name", ["worker0", "service0", "scheduler"])
-def test_a_link_that_is_cut(hosts: Known, table: list[Row], times: int, seldom: int, name: str) -> None:
-    if name == "scheduler" and times < 3:
-        pytest.skip("it takes a minute: with --times 3 and more")
+@pytest.mark.parametrize("name", ["service0", "scheduler"])
+@pytest.mark.usefixtures("at_length")
+def test_the_link_of_another_that_is_cut(hosts: Known, table: list[Row], seldom: int, name: str) -> None:
+    cut_off(hosts, table, name, seldom)
+
+
+def test_the_link_of_a_worker_that_is_cut(hosts: Known, table: list[Row], seldom: int) -> None:
+    cut_off(hosts, table, "worker0", seldom)
+
+
+def cut_off(hosts: Known, table: list[Row], name: str, times: int) -> None:
     assert isinstance(hosts.rig, Hosts)
     network = hosts.rig.network
 
@@ -37,7 +44,7 @@ def test_a_link_that_is_cut(hosts: Known, table: list[Row], times: int, seldom: 
         time.sleep(AWAY)
         network.mend(name)
 
-    row = hosts.disturb(f"the link of {name} cut, for 20 s", cut, seldom)
+    row = hosts.disturb(f"the link of {name} cut, for 20 s", cut, times)
     wait(lambda: workers_of(hosts.rig.folder / "data" / "envmatte.db") == 2)
     check(table, row)
 
