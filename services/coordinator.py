@@ -81,7 +81,7 @@ class Coordinator:
         self._stopped.set()
         self._dispatcher.news.set()
         self._thread.join()
-        self._house.shutdown()
+        self._house.shutdown(cancel_futures=True)
         if self._token is not None:
             with suppress(Unavailable, NoRoom), writing(self._engine) as c:
                 leases.give_back(c, self._token)
@@ -285,7 +285,9 @@ class Coordinator:
                 return
             job = min(share, key=lambda job: (share[job], len(self._drives[job].to_do)))
             drive = self._drives[job]
-            dispatcher.submit(drive.kind, drive.task, drive.to_do.popleft(), drive.trace)
+            if not dispatcher.submit(drive.kind, drive.task, drive.to_do[0], drive.trace):
+                return
+            drive.to_do.popleft()
             share[job] += 1
             if not drive.to_do:
                 del share[job]

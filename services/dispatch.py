@@ -118,20 +118,28 @@ class Dispatcher:
         """How many more tiles the cluster is to have."""
         return DEPTH * self.threads - len(self._flights) if self._usable() else 0
 
-    def submit(self, kind: str, task: Task, tile: int, trace: str | None = None) -> None:
-        """Hand over a tile, and the trace that it is part of; `collect` says what became of it."""
+    def submit(self, kind: str, task: Task, tile: int, trace: str | None = None) -> bool:
+        """Hand over a tile, and the trace that it is part of; `collect` says what became of it.
+
+        False if it can't be, because the scheduler is being lost.
+        """
         client, number = self._usable(), next(self._number)
         flight = Flight(task.job, tile, number)
         if client is None:
-            return
+            return False
         # The steps of a job overtake its tiles: they are few, and others wait for them.
         key, priority = f"{kind}-{task.job}-{tile}-{uuid4().hex[:8]}", 1 if tile < 0 else 0
         # By default what is submitted within 100 ms of one another runs in any order: `_blamed` goes by this one.
-        future = client.submit(
-            run, kind, task, tile, trace, key=key, pure=False, priority=priority, fifo_timeout="0 ms"
-        )
+        try:
+            future = client.submit(
+                run, kind, task, tile, trace, key=key, pure=False, priority=priority, fifo_timeout="0 ms"
+            )
+        except Exception as error:
+            logger.warning("nothing can be handed over: %r", error)
+            return False
         self._flights[future] = flight
         future.add_done_callback(lambda _: self.news.set())
+        return True
 
     def under_way(self, job: str) -> int:
         """How many tiles of a job are."""
@@ -252,6 +260,8 @@ def _error_of(future: Future) -> Exception | None:
         error = future.exception(timeout=ANSWER)
     except (TimeoutError, CancelledError):
         return None
+    except Exception as unread:  # it can't be read here: it is an error all the same
+        return unread
     return error if isinstance(error, Exception) else None
 
 

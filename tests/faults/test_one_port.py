@@ -1,0 +1,48 @@
+"""Two services behind one port serve one another's uploads, jobs and mattes."""
+
+from itertools import cycle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from services.client import Client
+from tests.end_to_end.conftest import png
+from tests.end_to_end.lines import Line
+from tests.faults.conftest import Known
+
+pytestmark = [pytest.mark.full, pytest.mark.timeout(900)]
+
+
+class InTurn(Line):
+    """A line whose connections go to one service and to the other in turn, and which cuts some of them."""
+
+    def __init__(self, targets: list[str], **cuts: int) -> None:
+        self._targets = cycle(targets)
+        super().__init__(targets[0], **cuts)
+
+    @property
+    def target(self) -> str:
+        return next(self._targets)
+
+    @target.setter
+    def target(self, target: str) -> None:
+        pass
+
+
+def test_two_services_behind_one_port(known: Known, bundle: Path) -> None:
+    rig = known.rig
+    size = bundle.stat().st_size
+    with InTurn(rig.urls, cuts=7, mean=size // 4, seed=3) as line, Client(line.url) as client:
+        uploaded = client.upload(bundle)
+        assert line.made == 7
+        client.wait(uploaded["job"])
+        job = client.wait(client.recover(uploaded["id"])["id"])
+    assert rig.files(job["matte"]) == known.files
+    seen = [rig.ask("GET", f"/v1/jobs/{job['id']}", at=url).json() for url in rig.urls]
+    assert seen[0] == seen[1] == job
+    backdrop = png(np.full((2, 2, 3), 0.5, np.float32), "srgb", np.uint8)
+    path = f"/v1/mattes/{job['matte']}/composite"
+    answers = [rig.ask("POST", path, at=url, content=backdrop) for url in rig.urls]
+    assert answers[0].status_code == 200
+    assert answers[0].content == answers[1].content
