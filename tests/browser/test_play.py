@@ -17,6 +17,8 @@ from tests.end_to_end.conftest import Service, serving
 from workflows import clock
 from workflows.program import Program
 
+pytestmark = pytest.mark.full
+
 SCREEN = {"width": 640, "height": 360}
 DISPLAYS = [(640, 360), (1920, 1080), (1080, 1920), (3440, 1440), (161, 121), (90, 60), (200, 5000)]
 NUMBERS = [clock.LEAD, 0, 1, 62, 63, 64, 1023, clock.MOST - 1]

@@ -12,6 +12,8 @@ import pytest
 from tests.end_to_end.conftest import Service, serving
 from tests.end_to_end.test_uploads import create, patch
 
+pytestmark = pytest.mark.full
+
 GIB = 1 << 30
 
 

@@ -25,6 +25,8 @@ from tests.end_to_end.conftest import Service, paused, serving
 from tests.end_to_end.lines import Line
 from tests.end_to_end.test_uploads import CHUNK, TUS, begin, create, gone, offset_of, uploads_of
 
+pytestmark = pytest.mark.full
+
 MB = 1_000_000
 SIZES = [50 * MB, pytest.param(1000 * MB, marks=[pytest.mark.full, pytest.mark.timeout(1800)])]
 

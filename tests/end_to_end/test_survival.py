@@ -15,6 +15,8 @@ from services.client import ServiceError
 from tests.end_to_end.conftest import Service, digests, png, serving
 from tests.end_to_end.test_uploads import begin, create
 
+pytestmark = pytest.mark.full
+
 
 def files_of(service: Service, matte: str) -> dict[str, str]:
     return digests(service.data / "store" / "mattes" / matte)

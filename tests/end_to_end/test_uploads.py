@@ -23,6 +23,8 @@ from tests.disks import small_disk
 from tests.end_to_end.conftest import Service, paused, serving
 from tests.end_to_end.test_bad_input import check_problem
 
+pytestmark = pytest.mark.full
+
 TUS = {"Tus-Resumable": "1.0.0"}
 CHUNK = TUS | {"Content-Type": "application/offset+octet-stream"}
 

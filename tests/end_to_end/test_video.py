@@ -15,6 +15,8 @@ from workflows.program import Program
 from workflows.scene import Scene
 from workflows.tone import to_light
 
+pytestmark = pytest.mark.full
+
 CAMERA = Camera(hold=0.25, hand=(6.0, 6.8), options={"crf": "12"})
 
 
