@@ -14,12 +14,11 @@ from dataclasses import dataclass
 from itertools import count
 from types import TracebackType
 from typing import Any, Self
-from uuid import uuid4
 
 from distributed import Client, Future
 from distributed.scheduler import KilledWorker
 
-from services.step import run
+from services.step import key_of, run
 from storage.errors import EnvmatteError
 from workflows.jobs import Task
 
@@ -128,7 +127,7 @@ class Dispatcher:
         if client is None:
             return False
         # The steps of a job overtake its tiles: they are few, and others wait for them.
-        key, priority = f"{kind}-{task.job}-{tile}-{uuid4().hex[:8]}", 1 if tile < 0 else 0
+        key, priority = key_of(kind, task.job, tile), 1 if tile < 0 else 0
         # By default what is submitted within 100 ms of one another runs in any order: `_blamed` goes by this one.
         try:
             future = client.submit(

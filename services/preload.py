@@ -7,15 +7,17 @@ gone) may run on for long, and write what nobody will remove. So its process end
 import logging
 import os
 import time
+from contextlib import nullcontext
 
 from distributed import Worker
 from distributed.core import Status
 from tornado.ioloop import PeriodicCallback
 
-# Importing the kernels takes seconds: not out of the first job's time.
-import services.step  # noqa: F401
 from services import tracing
 from services.process import about, log_as_nanny_does
+
+# Importing the kernels, as this does, takes seconds: not out of the first job's time.
+from services.step import read_key
 
 logger = logging.getLogger(__name__)
 
@@ -39,8 +41,8 @@ def dask_setup(worker: Worker) -> None:
             del since[key]
         for key in strays:
             if now - since.setdefault(key, now) > PATIENCE:
-                _, job, rest = key.split("-", 2)  # as `services.dispatch` makes it
-                with about(job, int(rest.rpartition("-")[0])):
+                found = read_key(key)
+                with about(*found) if found else nullcontext():
                     logger.info("nobody wants it any more, and it runs on: ending this process")
                 os._exit(1)
 

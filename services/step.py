@@ -1,7 +1,9 @@
 """What a dask task runs: a step of a job, known by its ids to the worker's log and to the trace of the request."""
 
 import logging
+import re
 from typing import Any
+from uuid import uuid4
 
 from services import tracing
 from services.process import about
@@ -13,6 +15,18 @@ from workflows.jobs import Task
 logger = logging.getLogger(__name__)
 
 NAMES = {PREPARE: "prepare", FINISH: "finish"}
+KEY = re.compile(r"[a-z]+-([0-9a-f]+)-(-?\d+)-[0-9a-f]+")
+
+
+def key_of(kind: str, job: str, tile: int) -> str:
+    """A name for a task, another one each time."""
+    return f"{kind}-{job}-{tile}-{uuid4().hex[:8]}"
+
+
+def read_key(key: str) -> tuple[str, int] | None:
+    """The job and the tile of a task by its name; None if it has another kind of name."""
+    found = KEY.fullmatch(key)
+    return (found[1], int(found[2])) if found else None
 
 
 def run(kind: str, task: Task, tile: int, trace: str | None) -> tuple[float, Any]:

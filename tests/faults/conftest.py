@@ -23,9 +23,9 @@ def times(pytestconfig: pytest.Config) -> int:
     return int(pytestconfig.getoption("--times"))
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def at_length(times: int) -> None:
-    """For what takes minutes, or as long as one."""
+    """For what takes minutes, or as long as one; of the session, so that it comes before what is set up for it."""
     if times < 3:
         pytest.skip("it takes a minute or more: run with --times 3 and more")
 

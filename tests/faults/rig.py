@@ -168,6 +168,10 @@ class Rig:
         """A digest of every file of a matte."""
         return stored(Objects(self.store), mattes.path(matte))
 
+    def names(self, matte: str) -> set[str]:
+        """Every file of a matte."""
+        return Objects(self.store).below(mattes.path(matte))
+
     def disturb(
         self, fault: str, act: Callable[[], object], capture: str, expected: dict[str, str], times: int
     ) -> Row:

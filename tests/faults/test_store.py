@@ -15,7 +15,7 @@ from tests.faults.conftest import Known, check, prepared
 from tests.faults.rig import Rig, Row
 from tests.s3 import BUCKET, KEYS
 
-pytestmark = [pytest.mark.full, pytest.mark.timeout(3600)]
+pytestmark = [pytest.mark.full, pytest.mark.timeout(3600), pytest.mark.usefixtures("at_length")]
 
 AWAY = 10.0
 """Seconds for which the store is away."""
@@ -114,7 +114,6 @@ def test_a_share_of_answers_503(in_bucket: Known, proxy: Proxy, table: list[Row]
     check(table, row)
 
 
-@pytest.mark.usefixtures("at_length")
 def test_a_share_without_an_answer(in_bucket: Known, proxy: Proxy, table: list[Row], seldom: int) -> None:
     def act() -> None:
         proxy.silent = SHARE
@@ -134,7 +133,6 @@ def test_a_store_that_is_away(in_bucket: Known, proxy: Proxy, table: list[Row], 
     check(table, in_bucket.disturb("503 from the store, for 10 s", act, seldom))
 
 
-@pytest.mark.usefixtures("at_length")
 def test_a_store_that_stays_away(in_bucket: Known, proxy: Proxy, table: list[Row]) -> None:
     rig = in_bucket.rig
     job = rig.recover(in_bucket.capture)

@@ -92,8 +92,8 @@ def test_a_cancelled_job_frees_its_workers_and_what_it_wrote(known: Known) -> No
     time.sleep(1)
     cancelled = rig.ask("POST", f"/v1/jobs/{job['id']}/cancel").json()
     assert cancelled["state"] == "cancelled"
-    wait(lambda: not rig.files(job["matte"]), 10)
+    wait(lambda: not rig.names(job["matte"]), 10)
     assert rig.ask("GET", f"/v1/mattes/{job['matte']}").status_code == 404
     after = rig.recover(known.capture)
     goes_on(known, after["id"], after["matte"])
-    assert not rig.files(job["matte"])
+    assert not rig.names(job["matte"])

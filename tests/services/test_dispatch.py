@@ -12,6 +12,7 @@ from distributed import Client, LocalCluster
 from services.cluster import Scale, embedded
 from services.dispatch import Dispatcher, Flight, Outcome, _blamed
 from services.settings import Settings
+from services.step import key_of, read_key
 from storage.errors import Unavailable
 from workflows.ingest.bundle import Limits
 from workflows.jobs import Task
@@ -111,3 +112,10 @@ def test_a_scheduler_that_is_not_there_is_a_problem_in_words() -> None:
         assert (dispatcher.free, dispatcher.threads) == (0, 0)
         assert dispatcher.collect() == []
         dispatcher.drop("a")
+
+
+def test_a_task_is_known_by_its_name() -> None:
+    assert read_key(key_of("recover", "0ab1", -2)) == ("0ab1", -2)
+    assert read_key(key_of("ingest", "0ab1", 12)) == ("0ab1", 12)
+    assert key_of("ingest", "0ab1", 12) != key_of("ingest", "0ab1", 12)
+    assert read_key("sleep-47ad-b581-4a62-8164") is None
