@@ -1,6 +1,5 @@
 """A service whose work is done by a cluster on a bucket: the same bytes come out as on a laptop's folder."""
 
-import hashlib
 from pathlib import Path
 
 import pytest
@@ -8,6 +7,7 @@ import pytest
 from services import certs
 from storage.objects import Objects
 from tests.end_to_end.conftest import Service, digests, serving
+from tests.faults.rig import stored
 from tests.services.clusters import address, started
 
 
@@ -29,10 +29,7 @@ def test_a_matte_is_the_same_in_a_bucket_and_in_a_folder(
             remote.client.wait(uploaded["job"])
             made = remote.client.wait(remote.client.recover(uploaded["id"])["id"])["matte"]
             objects = Objects(s3)
-            in_bucket = {
-                path.removeprefix(f"mattes/{made}/"): hashlib.sha256(objects.read(path).read()).hexdigest()
-                for path in objects.below(f"mattes/{made}")
-            }
+            in_bucket = stored(objects, f"mattes/{made}")
             assert in_bucket == digests(service.data / "store" / "mattes" / matte)
             assert objects.names("uploads") == []
             assert not (tmp_path / "data" / "store").exists()
