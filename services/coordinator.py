@@ -142,13 +142,14 @@ class Coordinator:
             yield c
 
     def _step(self) -> None:
+        self._submit()  # first, for a thread may be idle
         now = time.monotonic()
         if now - self._read_at >= POLL:
             self._read_at = now
             self._read()
         for outcome in self._dispatcher.collect():
             if outcome.job in self._drives:
-                self._drives[outcome.job].news.append(outcome)
+                self._drives[outcome.job].hear(outcome)
         for drive in self._due():
             self._guarded(drive.job, self._settle, drive)
         self._discard()
@@ -199,6 +200,7 @@ class Coordinator:
             jobs.begin(c, row.id)
             drive = self._drive_of(c, row)
             jobs.enter(c, row.id, drive.stage)
+        drive.start = min((other.used() for other in self._drives.values()), default=0.0)
         self._drives[row.id] = drive
         logger.info("%s, from the stage %s on", row.kind, drive.stage)
 
@@ -276,21 +278,25 @@ class Coordinator:
             self._house.submit(_logged, discard, self._objects, kind, capture, matte)
 
     def _submit(self) -> None:
-        """Fill the cluster, the job that has the least of it first: a small one never waits for a large one to end."""
+        """Fill the cluster, the job that has had the fewest seconds of it first.
+
+        One that begins counts from the least of the others, so that it neither waits for a large one to end nor takes
+        everything until it has caught up.
+        """
         dispatcher = self._dispatcher
-        share = {job: dispatcher.under_way(job) for job, drive in self._drives.items() if drive.to_do}
-        dispatcher.want(sum(len(drive.to_do) + share.get(job, 0) for job, drive in self._drives.items()))
+        under_way = {job: dispatcher.under_way(job) for job in self._drives}
+        dispatcher.want(sum(len(drive.to_do) + under_way[job] for job, drive in self._drives.items()))
+        waiting = [drive for drive in self._drives.values() if drive.to_do]
         for _ in range(dispatcher.free):
-            if not share:
+            if not waiting:
                 return
-            job = min(share, key=lambda job: (share[job], len(self._drives[job].to_do)))
-            drive = self._drives[job]
+            drive = min(waiting, key=lambda drive: (drive.used(under_way[drive.job]), under_way[drive.job]))
             if not dispatcher.submit(drive.kind, drive.task, drive.to_do[0], drive.trace):
                 return
             drive.to_do.popleft()
-            share[job] += 1
+            under_way[drive.job] += 1
             if not drive.to_do:
-                del share[job]
+                waiting.remove(drive)
 
 
 def _logged(act: Callable[..., None], *arguments: Any) -> None:

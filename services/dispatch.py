@@ -30,8 +30,6 @@ ANSWER = 5.0
 """Seconds that the scheduler has to answer, and a worker to hand over the small result of what is done."""
 MEMORY = "worker-restart-memory"
 """The topic under which a nanny tells the scheduler that it ends its worker for the memory that it takes."""
-DEPTH = 2
-"""Tasks in flight for each thread of the cluster: one that runs, and one that waits so that no thread does."""
 
 
 @dataclass(frozen=True)
@@ -114,8 +112,11 @@ class Dispatcher:
 
     @property
     def free(self) -> int:
-        """How many more tiles the cluster is to have."""
-        return DEPTH * self.threads - len(self._flights) if self._usable() else 0
+        """How many more tiles the cluster is to have: one for each thread.
+
+        None waits there: who comes next is decided when a thread is free, and who dies is known to die of what it has.
+        """
+        return self.threads - sum(not future.done() for future in self._flights) if self._usable() else 0
 
     def submit(self, kind: str, task: Task, tile: int, trace: str | None = None) -> bool:
         """Hand over a tile, and the trace that it is part of; `collect` says what became of it.
@@ -126,13 +127,10 @@ class Dispatcher:
         flight = Flight(task.job, tile, number)
         if client is None:
             return False
-        # The steps of a job overtake its tiles: they are few, and others wait for them.
-        key, priority = key_of(kind, task.job, tile), 1 if tile < 0 else 0
+        key = key_of(kind, task.job, tile)
         # By default what is submitted within 100 ms of one another runs in any order: `_blamed` goes by this one.
         try:
-            future = client.submit(
-                run, kind, task, tile, trace, key=key, pure=False, priority=priority, fifo_timeout="0 ms"
-            )
+            future = client.submit(run, kind, task, tile, trace, key=key, pure=False, fifo_timeout="0 ms")
         except Exception as error:
             logger.warning("nothing can be handed over: %r", error)
             return False
@@ -265,7 +263,10 @@ def _error_of(future: Future) -> Exception | None:
 
 
 def _blamed(dead: Iterable[tuple[Flight, str]], starved: Container[str] = ()) -> list[Outcome]:
-    """Who is to blame for the death of a worker: of what it had, the tile that it had got first, for that one ran."""
+    """Who is to blame for the death of a worker: the tile that it had.
+
+    Where workers go, one may for a moment have two: then the tile that it had got first, for that one ran.
+    """
     ran: dict[str, int] = {}
     for flight, address in dead:
         ran[address] = min(flight.number, ran.get(address, flight.number))

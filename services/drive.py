@@ -62,6 +62,10 @@ class Drive:
         Threads of the cluster for which the pace of its tiles is measured; 0 until there is a pace.
     trace : str, optional
         The ``traceparent`` of the request that asked for it.
+    start, spent : float
+        Seconds of workers that it is taken to have had when it began, and that it has had since.
+    counted : int
+        Tiles that took the latter.
     """
 
     job: str
@@ -73,6 +77,9 @@ class Drive:
     settled_at: float = 0.0
     paced: int = 0
     trace: str | None = None
+    start: float = 0.0
+    spent: float = 0.0
+    counted: int = 0
 
     @classmethod
     def of(cls, row: Row[Any], tiles: Sequence[int], store: str, limits: Limits) -> "Drive":
@@ -94,6 +101,17 @@ class Drive:
             stage, to_do = "finishing", [FINISH]
         return cls(row.id, row.kind, stage, task, deque(to_do), trace=row.trace)
 
+    def hear(self, outcome: Outcome) -> None:
+        """Take in what became of a tile."""
+        self.news.append(outcome)
+        if outcome.done is not None:
+            self.spent += outcome.done[0]
+            self.counted += 1
+
+    def used(self, under_way: int = 0) -> float:
+        """Seconds of workers that it will have had once the tiles under way are done."""
+        return self.start + self.spent * (1 + under_way / max(self.counted, 1))
+
     def settle(self, connection: Connection, attempts: int, threads: int, under_way: int) -> Next:
         """Write down the news of a job.
 
@@ -110,7 +128,12 @@ class Drive:
         error: EnvmatteError | None = None
         results = {outcome.tile: outcome.done for outcome in self.news if outcome.done is not None}
         tiles = [(tile, seconds, pixels) for tile, (seconds, pixels) in results.items() if tile >= 0]
-        jobs.finish(connection, self.job, tiles)
+        steps = [
+            (tile, seconds, 0)
+            for tile, (seconds, result) in results.items()
+            if tile < 0 and "missing" not in result
+        ]
+        jobs.finish(connection, self.job, tiles + steps)
         if tiles and self.paced != threads:
             # Not the first tiles: their workers load what the others find loaded.
             self.paced = threads if jobs.pace(connection, self.job, after=threads) else 0

@@ -93,9 +93,6 @@ jobs = Table(
     Column("created_at", Float, nullable=False),
     Column("started_at", Float),
     Column("finished_at", Float),
-    Column(
-        "misses", Integer, nullable=False, server_default="0"
-    ),  # failed attempts at the present single step
     Column("stage_at", Float),  # when the present stage was entered
     Column("moved_at", Float),  # when last something of it got done
     Column("paced_at", Float),  # the pace of tiles is measured from here: when, and how many were done

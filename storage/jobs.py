@@ -137,7 +137,8 @@ def finish(connection: Connection, job: str, finished: Sequence[tuple[int, float
         .where(jobs.c.id == job)
         .values(done=jobs.c.done + len(new), pixels=jobs.c.pixels + pixels, moved_at=time.time())
     )
-    _count(connection, job, tiles=len(new), pixels=pixels, seconds=sum(took for took, _ in ended.values()))
+    seconds = sum(took for tile, (took, _) in ended.items() if tile >= 0)
+    _count(connection, job, tiles=len(new), pixels=pixels, seconds=seconds)
 
 
 def pace(connection: Connection, job: str, after: int) -> bool:
@@ -254,7 +255,7 @@ def retry(connection: Connection, job: str, *, anew: bool = False) -> None:
     if row.state != "failed":
         raise Conflict(f"job {job} is {row.state}; only a failed job can be tried again")
     if anew:
-        connection.execute(delete(tiles).where(tiles.c.job == job, tiles.c.tile >= 0))
+        connection.execute(delete(tiles).where(tiles.c.job == job))
         nothing = {"plan": None, "total": 0, "pixels": 0}
         connection.execute(update(jobs).where(jobs.c.id == job).values(nothing))
     connection.execute(

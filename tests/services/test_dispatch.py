@@ -81,7 +81,7 @@ def test_errors_come_back_and_what_dies_with_its_worker_is_told(
     with Dispatcher(lambda: Client(cluster, set_as_default=False)) as dispatcher:
         while not dispatcher.free:
             time.sleep(0.02)
-        assert dispatcher.free == 2
+        assert dispatcher.free == 1
         dispatcher.submit("recover", task("a", tmp_path), 3)
         assert dispatcher.under_way("a") == 1
         (outcome,) = outcomes(dispatcher, 1)

@@ -4,12 +4,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from sqlalchemy import Connection
+from sqlalchemy import Connection, select
 
 from services.dispatch import Outcome
 from services.drive import LOSSES, Drive
 from storage import captures, jobs, mattes
-from storage.database import open_engine, writing
+from storage.database import open_engine, tiles, totals, writing
 from storage.errors import Corrupt, Unavailable
 from storage.jobs import FINISH, PREPARE
 from workflows.ingest.bundle import Limits
@@ -45,7 +45,7 @@ def told(connection: Connection, drive: Drive, *news: Outcome, under_way: int = 
     for outcome in news:
         if outcome.tile in drive.to_do:
             drive.to_do.remove(outcome.tile)
-    drive.news.extend(news)
+        drive.hear(outcome)
     following = drive.settle(connection, 3, 2, under_way)
     drive.go_on(following)
     return not following.ended
@@ -77,6 +77,19 @@ def test_from_the_first_step_to_the_last(connection: Connection, job: str) -> No
     assert jobs.get(connection, job).state == "succeeded"
     matte = mattes.get(connection, "mat")
     assert (matte.state, matte.figures) == ("ready", {"width": 4})
+    seconds = dict(connection.execute(select(tiles.c.tile, tiles.c.seconds).where(tiles.c.job == job)).all())
+    assert seconds == dict.fromkeys((PREPARE, FINISH, 0, 1, 2), 0.1)
+    assert connection.scalar(select(totals.c.seconds)) == pytest.approx(0.3)  # the tiles'
+
+
+def test_its_share_is_what_it_had_and_what_is_under_way(connection: Connection, job: str) -> None:
+    drive = taken_up(connection, job)
+    drive.start = 5.0
+    assert (drive.used(), drive.used(under_way=2)) == (5.0, 5.0)
+    drive.hear(Outcome(job, 0, done=(0.5, 10)))
+    drive.hear(Outcome(job, 1, error=OSError()))
+    drive.hear(Outcome(job, 2, done=(1.5, 10)))
+    assert (drive.used(), drive.used(under_way=2)) == (7.0, 9.0)
 
 
 def test_it_is_taken_up_where_it_stands(connection: Connection, job: str) -> None:

@@ -1,0 +1,11 @@
+"""The attempts at a job's steps are counted with those at its tiles."""
+
+from alembic import op
+
+revision = "0003"
+down_revision = "0002"
+
+
+def upgrade() -> None:
+    """Drop the column that counted them before."""
+    op.drop_column("jobs", "misses")
