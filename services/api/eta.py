@@ -7,7 +7,7 @@ from sqlalchemy import Connection, Row
 
 from storage import jobs
 
-TYPICAL = 1.7e-7
+TYPICAL = 1.1e-7
 """Seconds of a 2.5 GHz core for a unit of `_survey_of`."""
 
 
@@ -44,4 +44,4 @@ def _finishing(connection: Connection, row: Row[Any]) -> float:
 
 def _survey_of(plan: dict[str, Any]) -> float:
     """How much there is to do for `workflows.ingest.survey`: pixels of its windows in all frames, and of its trial."""
-    return float(plan["frames"] * (min(plan["width"], 384) * min(plan["height"], 384) + 60_000))
+    return float(plan["frames"] * (min(plan["width"], 384) * min(plan["height"], 384) + 100_000))

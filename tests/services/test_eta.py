@@ -13,7 +13,7 @@ from storage.database import open_engine, writing
 from storage.jobs import FINISH
 
 PLAN = {"tiles": 10, "slab": 4, "width": 160, "height": 120, "frames": 40, "notes": []}
-FINISHING = TYPICAL * 40 * (160 * 120 + 60_000)
+FINISHING = TYPICAL * 40 * (160 * 120 + 100_000)
 
 
 @pytest.fixture
