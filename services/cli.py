@@ -19,6 +19,8 @@ from services.progress import Progress
 from services.running import COMMANDS, first_of
 
 F = TypeVar("F", bound=Callable[..., Any])
+KINDS = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".exr": "image/x-exr"}
+"""Of pictures, by the ends of their files' names."""
 
 
 def _remote(command: F) -> F:
@@ -106,16 +108,28 @@ def status(job: str, url: str, key: str | None, as_json: bool) -> None:
 @click.argument("matte")
 @click.argument("backdrop", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 @click.option(
-    "-o", "--output", type=click.Path(dir_okay=False, path_type=Path), required=True, help="PNG to write."
+    "-o",
+    "--output",
+    type=click.Path(dir_okay=False, path_type=Path),
+    required=True,
+    help="PNG, JPEG or EXR to write, by the end of its name.",
 )
 @click.option("--transfer", type=click.Choice(["srgb", "linear"]), default="srgb", show_default=True)
+@click.option("--right", type=float, help="The backdrop's move to the right, in widths of the monitor.")
+@click.option("--down", type=float, help="Its move down, in heights of the monitor.")
+@click.option("--scale", type=float, help="By how much it is larger.")
+@click.option("--angle", type=float, help="By how much it is turned, in degrees, clockwise.")
 @_remote
 def composite(
-    matte: str, backdrop: Path, output: Path, transfer: str, url: str, key: str | None, as_json: bool
+    matte: str, backdrop: Path, output: Path, url: str, key: str | None, as_json: bool, **wanted: Any
 ) -> None:
     """Put a matte in front of a backdrop."""
+    kind = KINDS.get(output.suffix.lower())
+    if kind is None:
+        raise click.BadParameter(f"{output}: its name must end in {', '.join(KINDS)}", param_hint="--output")
+    given = {name: value for name, value in wanted.items() if value is not None}
     with Client(url, key) as client:
-        _write(output, client.composite(matte, backdrop.read_bytes(), transfer=transfer))
+        _write(output, client.composite(matte, backdrop.read_bytes(), kind=kind, **given))
     _say({"output": str(output)}, as_json, "output")
 
 

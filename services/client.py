@@ -182,10 +182,23 @@ class Client:
         """A matte."""
         return self._json("GET", f"/v1/mattes/{matte}")
 
-    def composite(self, matte: str, backdrop: bytes, *, transfer: str = "srgb") -> bytes:
-        """Put a matte before a backdrop, the bytes of an image; returns those of a PNG."""
+    def composite(
+        self, matte: str, backdrop: bytes, *, kind: str = "image/png", **wanted: str | float
+    ) -> bytes:
+        """Put a matte before a backdrop; returns the picture's bytes.
+
+        Parameters
+        ----------
+        backdrop : bytes
+            Of an image: PNG, JPEG, TIFF or EXR.
+        kind : str
+            ``image/png``, ``image/jpeg`` or ``image/x-exr``.
+        **wanted
+            What else the call takes: ``transfer``, ``x``, ``y``, ``width``, ``height``, ``size``, ``scale`` and so on.
+        """
+        headers = {"Accept": kind}
         path = f"/v1/mattes/{matte}/composite"
-        return self._computed("POST", path, params={"transfer": transfer}, content=backdrop)
+        return self._computed("POST", path, params=wanted, content=backdrop, headers=headers)
 
     def layer(self, matte: str, name: str) -> bytes:
         """A layer of a matte, as `confidence.png`."""

@@ -129,6 +129,9 @@ class Settings(ClusterSettings):
     backdrop_bytes: int = Field(
         128 << 20, ge=1, description="Bytes that a backdrop may have, as it is sent and again decoded."
     )
+    matte_memory: int = Field(
+        1 << 30, ge=0, description="Bytes of mattes that a service keeps in memory to composite them again."
+    )
     attempts: int = Field(3, ge=1, description="How often a tile is tried before its job fails.")
 
     @field_validator("keys", mode="before")

@@ -115,6 +115,12 @@ def to_do(connection: Connection, job: str) -> list[int]:
     return list(connection.scalars(query.order_by(tiles.c.tile)))
 
 
+def done(connection: Connection, job: str) -> list[int]:
+    """The tiles of a job that are done."""
+    query = select(tiles.c.tile).where(tiles.c.job == job, tiles.c.tile >= 0, tiles.c.state == "done")
+    return list(connection.scalars(query.order_by(tiles.c.tile)))
+
+
 def finish(connection: Connection, job: str, finished: Sequence[tuple[int, float, int]]) -> None:
     """Write down finished tiles, each (tile, seconds, pixels); one that was done before counts once."""
     query = select(tiles.c.tile, tiles.c.state).where(

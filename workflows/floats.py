@@ -1,6 +1,7 @@
 """Images of float values to arrays: EXR and float TIFF, which hold linear light without an upper end."""
 
 import io
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -55,6 +56,23 @@ def decode(data: bytes, *, memory: int) -> Floats:
         raise
     except Exception as error:  # as above
         raise ImageError(f"the {kind} image is cut off or damaged: {error}") from error
+
+
+def encode_exr(channels: dict[str, Floats], header: dict[str, Any] | None = None) -> bytes:
+    """An EXR of 32-bit float channels, compressed without loss.
+
+    Parameters
+    ----------
+    channels : dict of str to (height, width) or (height, width, 3 or 4) float32
+        By name, as ``alpha`` or ``RGB``.
+    header : dict, optional
+        More attributes.
+    """
+    file = io.BytesIO()
+    attributes = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | (header or {})
+    with OpenEXR.File(attributes, {name: np.ascontiguousarray(v) for name, v in channels.items()}) as image:
+        image.write(file)
+    return file.getvalue()
 
 
 def _exr(data: bytes, memory: int) -> Floats:

@@ -28,7 +28,7 @@ PLAIN = {tifffile.PHOTOMETRIC.MINISWHITE, tifffile.PHOTOMETRIC.MINISBLACK, tifff
 """What the values of a TIFF mean, where they can be taken as they are."""
 
 
-def decode(data: bytes, *, memory: int, formats: tuple[str, ...] = READ) -> Codes:
+def decode(data: bytes, *, memory: int, formats: tuple[str, ...] = READ, alpha: bool = False) -> Codes:
     """Decode an image.
 
     Parameters
@@ -38,11 +38,13 @@ def decode(data: bytes, *, memory: int, formats: tuple[str, ...] = READ) -> Code
         Bytes that the decoded image may take; checked in the header, before anything is decoded.
     formats : tuple of str
         What is taken, out of `READ`.
+    alpha : bool
+        Whether an alpha channel is kept.
 
     Returns
     -------
     (height, width, 1 or 3) uint8 or uint16
-        Grey or RGB; an alpha channel is dropped, a palette looked up.
+        Grey or RGB, a palette looked up; with alpha where that is kept and there, which a palette's is not.
 
     Raises
     ------
@@ -73,7 +75,7 @@ def decode(data: bytes, *, memory: int, formats: tuple[str, ...] = READ) -> Code
             f"this one has {pixels.dtype} values in the shape {pixels.shape}"
         )
     channels = 3 if pixels.shape[2] > 2 else 1
-    return np.ascontiguousarray(pixels[:, :, :channels])
+    return np.ascontiguousarray(pixels if alpha else pixels[:, :, :channels])
 
 
 def _pixels(data: bytes, picture: Image.Image, memory: int) -> NDArray[np.generic]:
@@ -126,6 +128,15 @@ def encode_png(pixels: Codes) -> bytes:
     """A PNG of (height, width, 1 to 4) uint8 or uint16 values."""
     plane = pixels[:, :, 0] if pixels.shape[2] == 1 else pixels
     return bytes(imagecodecs.png_encode(np.ascontiguousarray(plane)))
+
+
+def encode_jpeg(pixels: NDArray[np.uint8], quality: int) -> bytes:
+    """A JPEG of (height, width, 3) values, its colours at full resolution."""
+    return bytes(
+        imagecodecs.jpeg8_encode(
+            np.ascontiguousarray(pixels), level=quality, subsampling="444", optimize=False
+        )
+    )
 
 
 def to_unit(pixels: Codes) -> NDArray[np.float32]:

@@ -10,6 +10,7 @@ from services import tracing
 from services.api import (
     captures,
     cluster,
+    composites,
     errors,
     jobs,
     mattes,
@@ -23,6 +24,7 @@ from services.api import (
 from services.api.context import PROBLEM, WEB, Context
 from services.settings import Settings
 from storage.objects import Objects
+from workflows.composite.cache import Cache
 
 
 def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
@@ -33,7 +35,7 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
         description="Environment mattes of transparent objects, by compressive sensing.",
         responses=PROBLEM,
     )
-    app.state.context = Context(settings, engine, objects)
+    app.state.context = Context(settings, engine, objects, Cache(objects, settings.matte_memory))
     errors.register(app)
     app.add_middleware(tus.Protocol)
     app.add_middleware(tracing.Requests)
@@ -52,6 +54,7 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
         uploads.router,
         jobs.router,
         mattes.router,
+        composites.router,
         programs.router,
         cluster.router,
     ):

@@ -1,9 +1,13 @@
 """What every request handler needs: the settings, the database and the store."""
 
+import tempfile
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import IO, Annotated, Any, TypeVar
 
+import anyio.to_thread
 from anyio import CapacityLimiter
 from fastapi import Depends, Query, Request
 from fastapi.exceptions import RequestValidationError
@@ -13,7 +17,11 @@ from sqlalchemy import Engine
 from services.api.errors import TooLarge
 from services.settings import Settings
 from storage.objects import Objects
+from workflows.composite.cache import Cache
+from workflows.composite.threads import CORES
 
+SPOOLED = 1 << 20
+"""Bytes of a body that are kept in memory while it comes."""
 WEB = Path(__file__).parents[1] / "web"
 """The browser's files."""
 Model = TypeVar("Model", bound=BaseModel)
@@ -26,10 +34,14 @@ class Context:
     settings: Settings
     engine: Engine
     objects: Objects
+    cache: Cache
+    """Blocks of mattes."""
     pictures: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(4))
     """Pictures of programs that are drawn at once, which bounds what they take."""
     films: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(1))
     """Videos of programs that are encoded at once."""
+    composites: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(CORES + 1))
+    """Composites that are made at once, which bounds what they take: one more than there are cores."""
 
 
 def _context(request: Request) -> Context:
@@ -54,10 +66,35 @@ async def read_body(request: Request, limit: int) -> bytes:
     async for part in request.stream():
         body += part
         if len(body) > limit:
-            raise TooLarge(
-                f"the body of this request may have {limit} bytes; send a smaller one", limit=limit
-            )
+            raise _too_large(limit)
     return bytes(body)
+
+
+@asynccontextmanager
+async def spool_body(request: Request, limit: int) -> AsyncIterator[IO[bytes]]:
+    """The body of a request in a temporary file, in memory while it is small: any number may come in slowly.
+
+    Raises
+    ------
+    TooLarge
+        As soon as more than ``limit`` bytes have come.
+    """
+    with tempfile.SpooledTemporaryFile(SPOOLED) as file:
+        size = 0
+        async for part in request.stream():
+            size += len(part)
+            if size > limit:
+                raise _too_large(limit)
+            if size > SPOOLED:
+                await anyio.to_thread.run_sync(file.write, part)
+            else:
+                file.write(part)
+        file.seek(0)
+        yield file
+
+
+def _too_large(limit: int) -> TooLarge:
+    return TooLarge(f"the body of this request may have {limit} bytes; send a smaller one", limit=limit)
 
 
 async def read_json(request: Request, model: type[Model], limit: int) -> Model:

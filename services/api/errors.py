@@ -40,6 +40,10 @@ class NotAcceptable(InvalidInput):
     """An answer asked for in a media type that can't be given."""
 
 
+class NotNeeded(InvalidInput):
+    """An answer that the caller has already, as its If-None-Match says."""
+
+
 class BadHeader(InvalidInput):
     """A header that is missing, or does not say what it should."""
 
@@ -63,6 +67,7 @@ PROBLEMS: dict[type[Exception], tuple[int, str, str]] = {
     TooLarge: (HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too-large", "Too large"),
     WrongMediaType: (HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "wrong-media-type", "Wrong media type"),
     NotAcceptable: (HTTPStatus.NOT_ACCEPTABLE, "not-acceptable", "Not acceptable"),
+    NotNeeded: (HTTPStatus.PRECONDITION_FAILED, "not-needed", "Not needed"),
     BadHeader: (HTTPStatus.BAD_REQUEST, "bad-header", "A header can't be used"),
     WrongVersion: (HTTPStatus.PRECONDITION_FAILED, "wrong-version", "Another version is spoken here"),
     ChecksumMismatch: (460, "checksum-mismatch", "Not what the checksum was made of"),  # of tus

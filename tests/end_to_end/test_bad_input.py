@@ -243,7 +243,7 @@ def test_a_backdrop_that_is_no_image(service: Service, matte: str, body: bytes) 
 
 
 def test_an_answer_that_cannot_be_given(service: Service, matte: str) -> None:
-    answer = service.http.post(f"/v1/mattes/{matte}/composite", headers={"Accept": "image/x-exr"})
+    answer = service.http.post(f"/v1/mattes/{matte}/composite", headers={"Accept": "image/gif"})
     check_problem(answer, 406, "not-acceptable")
 
 

@@ -85,7 +85,7 @@ def test_a_composite_says_where_its_time_went(service: Service, matte: str) -> N
     )
     assert answer.headers["content-type"] == "image/png"
     names = [part.split(";")[0] for part in answer.headers["server-timing"].split(", ")]
-    assert names == ["decode", "open", "composite", "encode"]
+    assert names == ["open", "decode", "composite", "encode"]
 
 
 def test_what_the_mask_left_out_is_transparent(

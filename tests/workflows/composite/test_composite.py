@@ -8,10 +8,11 @@ import pytest
 from numpy.typing import NDArray
 
 from storage import mattes
-from storage.errors import Corrupt
+from storage.errors import Corrupt, OptionError
 from storage.mattes import Block, Matte
 from storage.objects import Objects
 from workflows.composite import composite, confidence
+from workflows.composite.engine import Window, shrink
 from workflows.grids import area_mean
 
 HEIGHT, WIDTH, COLUMNS, ROWS = 20, 35, 36, 5
@@ -95,6 +96,53 @@ def test_cells_are_taken_from_the_top_left(dense: Dense) -> None:
     arrived = rho[..., 2] * (T[..., 2, :] @ share)
     expected = S + arrived[..., np.newaxis] * np.array(CROSSTALK)[:, 2]
     np.testing.assert_allclose(composite(matte, backdrop)[..., :3], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "crop", [(0, 0, 35, 20), (3, 4, 1, 1), (15, 15, 4, 3), (16, 16, 19, 4), (0, 19, 35, 1)]
+)
+def test_a_window_is_a_piece_of_the_whole(dense: Dense, crop: tuple[int, int, int, int]) -> None:
+    backdrop = np.random.default_rng(3).random((9, 7, 3), np.float32)
+    whole = composite(dense[0], backdrop)
+    x, y, width, height = crop
+    for threads in (1, 3):
+        window = Window.of(dense[0], x, y, width, height)
+        seen = composite(dense[0], backdrop, window=window, threads=threads)
+        np.testing.assert_array_equal(seen, whole[y : y + height, x : x + width])
+
+
+@pytest.mark.parametrize(
+    ("crop", "field"),
+    [((35, 0, 1, 1), "x"), ((0, 15, 1, 6), "y"), ((0, 0, 36, 1), "x"), ((0, -1, 1, 1), "y")],
+)
+def test_a_window_lies_in_the_matte(dense: Dense, crop: tuple[int, int, int, int], field: str) -> None:
+    with pytest.raises(OptionError, match="35 x 20") as caught:
+        Window.of(dense[0], *crop)
+    assert caught.value.fields["field"] == field
+
+
+def test_blocks_that_are_not_there_yet_are_left_out(dense: Dense) -> None:
+    matte, *_ = dense
+    backdrop = np.ones((4, 6, 3), np.float32)
+    there = {(0, 0), (1, 2)}
+    seen = composite(matte, backdrop, read=lambda r, c: matte.read(r, c) if (r, c) in there else None)
+    whole = composite(matte, backdrop)
+    for row, column in product(range(2), range(3)):
+        at = matte.span(row, column)
+        np.testing.assert_array_equal(seen[at], whole[at] if (row, column) in there else 0)
+
+
+def test_a_smaller_picture_is_the_mean_of_what_was_recovered() -> None:
+    picture = np.random.default_rng(0).random((40, 60, 4), np.float32)
+    picture[..., 3] = picture[..., 3] < 0.7
+    picture[:4, :4, 3] = 0
+    small = shrink(picture, 15)
+    assert small.shape == (10, 15, 4)
+    cell = picture[8:12, 20:24]
+    np.testing.assert_allclose(small[2, 5, 3], cell[..., 3].mean(), rtol=1e-6)
+    np.testing.assert_allclose(small[2, 5, :3], cell[cell[..., 3] == 1][:, :3].mean(axis=0), rtol=1e-5)
+    assert (small[0, 0] == 0).all()
+    assert shrink(picture, 60) is picture
 
 
 @pytest.mark.parametrize("file", ["S/c/1/2/0", "T/1.2/weight/c/0"])

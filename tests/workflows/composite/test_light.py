@@ -1,0 +1,93 @@
+"""The light of a backdrop at the nodes of T, against what numpy makes of it."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from workflows.composite.light import Backdrop, node_light
+from workflows.composite.placing import Placement
+from workflows.grids import area_mean
+from workflows.recovery.pyramid import Pyramid
+from workflows.tone import table
+
+COLUMNS, ROWS = 80, 60
+MONITOR = (1280, 960)
+
+
+def cells(picture: NDArray[np.float32], **placement: float) -> NDArray[np.float32]:
+    """The light of the first grid."""
+    light = node_light(Backdrop(picture), COLUMNS, ROWS, 2, Placement(**placement), MONITOR)
+    return light[: COLUMNS * ROWS].reshape(ROWS, COLUMNS, 4)[..., :3]
+
+
+@pytest.fixture
+def smooth() -> NDArray[np.float32]:
+    y, x = np.mgrid[0:120, 0:160] / 40
+    return np.stack([0.5 + 0.4 * np.sin(x), 0.5 + 0.4 * np.cos(y), 0.5 + 0.2 * np.sin(x + y)], axis=2).astype(
+        np.float32
+    )
+
+
+@pytest.mark.parametrize("size", [(60, 80), (120, 160), (31, 47), (200, 333), (1, 1), (1, 500), (997, 3)])
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("threads", [1, 3])
+def test_it_is_the_mean_over_cells_and_that_of_coarser_grids(
+    size: tuple[int, int], channels: int, threads: int
+) -> None:
+    picture = np.random.default_rng(0).random((*size, channels), np.float32)
+    found = node_light(Backdrop(picture), COLUMNS, ROWS, threads)
+    expected = Pyramid.over(COLUMNS, ROWS).light(area_mean(picture, COLUMNS, ROWS))
+    np.testing.assert_allclose(found[:, :3], np.broadcast_to(expected, (len(found), 3)), atol=2e-6)
+    assert (found[:, 3] == 0).all()
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_codes_are_looked_up(dtype: type) -> None:
+    codes = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, (30, 40, 3), dtype, endpoint=True)
+    light = table("srgb", np.dtype(dtype))
+    found = node_light(Backdrop(codes, light), COLUMNS, ROWS, 2)
+    np.testing.assert_array_equal(found, node_light(Backdrop(light[codes]), COLUMNS, ROWS, 2))
+
+
+def test_a_backdrop_may_stay_where_it_is(smooth: NDArray[np.float32]) -> None:
+    np.testing.assert_allclose(cells(smooth), area_mean(smooth, COLUMNS, ROWS), atol=0.01)
+
+
+def test_a_backdrop_moves_right_and_down(smooth: NDArray[np.float32]) -> None:
+    there, moved = cells(smooth), cells(smooth, right=0.25, down=0.1)
+    np.testing.assert_allclose(moved[6:, 20:], there[:-6, :-20], atol=0.01)
+    assert (moved[:6] == 0).all()
+    assert (moved[:, :20] == 0).all()
+
+
+def test_a_backdrop_turns_clockwise_on_square_pixels() -> None:
+    picture = np.zeros((96, 128, 1), np.float32)
+    picture[:, 64:] = 1  # the right half of the monitor, turned down to its lower half, as far as it reaches
+    turned = cells(picture, angle=90)[..., 0]
+    middle = turned[:, 10:70]  # a monitor of 4 to 3 on its side is 3/4 as wide as it was
+    assert (middle[32:] == 1).all()
+    assert (middle[:28] == 0).all()
+    assert (turned[:, :9] == 0).all()
+    assert (turned[:, -9:] == 0).all()
+
+
+def test_a_backdrop_shrinks_about_its_centre_without_aliasing() -> None:
+    checker = (np.indices((480, 640)).sum(axis=0) % 2).astype(np.float32)[..., np.newaxis]
+    small = cells(checker, scale=0.5)[..., 0]
+    np.testing.assert_allclose(small[17:43, 22:58], 0.5, atol=0.01)
+    assert (small[:14] == 0).all()
+    assert (small[:, :19] == 0).all()
+    np.testing.assert_allclose(cells(checker, scale=0.5, angle=30)[28:32, 38:42], 0.5, atol=0.02)
+
+
+def test_a_backdrop_grows_about_its_centre(smooth: NDArray[np.float32]) -> None:
+    np.testing.assert_allclose(cells(smooth, scale=2), area_mean(smooth[30:90, 40:120], 80, 60), atol=0.01)
+
+
+@pytest.mark.parametrize("placement", [{}, {"scale": 0.3, "angle": 20}])
+def test_threads_change_nothing(placement: dict[str, float]) -> None:
+    backdrop = Backdrop(np.random.default_rng(0).random((300, 211, 3), np.float32))
+    one, four = (
+        node_light(backdrop, 200, 150, threads, Placement(**placement), MONITOR) for threads in (1, 4)
+    )
+    np.testing.assert_array_equal(one, four)

@@ -1,0 +1,66 @@
+"""Composites: a matte before any backdrop."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.mattes import Block, Matte
+from workflows.composite.engine import Window, compose
+from workflows.composite.light import Backdrop, node_light
+from workflows.composite.placing import Placement
+from workflows.composite.threads import CORES
+
+
+def composite(
+    matte: Matte,
+    backdrop: Backdrop | NDArray[np.float32],
+    *,
+    placement: Placement | None = None,
+    window: Window | None = None,
+    read: Callable[[int, int], Block | None] | None = None,
+    threads: int = CORES,
+) -> NDArray[np.float32]:
+    """Put a matte before a backdrop.
+
+    Parameters
+    ----------
+    matte : Matte
+    backdrop : Backdrop, or (h, w, 1 or 3) float32
+        The latter linear light.
+    placement : Placement, optional
+        Where the backdrop stands.
+    window : Window, optional
+        Of the matte; default all of it.
+    read : callable, optional
+        Where blocks come from, as `compose` says; default the store.
+    threads : int
+        To share the work; the picture is the same.
+
+    Returns
+    -------
+    (height, width, 4) float32
+        Linear light, and in the last channel 1 where the pixel was recovered, 0 where the mask left it out.
+
+    Raises
+    ------
+    Corrupt
+        If a block of the matte is missing.
+    """
+    given = backdrop if isinstance(backdrop, Backdrop) else Backdrop(backdrop)
+    wide, high = matte.attributes["monitor"] if placement else (1, 1)
+    light = node_light(given, matte.columns, matte.rows, threads, placement, (wide, high))
+    return compose(matte, light, window or Window.of(matte), read or matte.read, threads)
+
+
+def confidence(matte: Matte) -> NDArray[np.float32]:
+    """How far a matte can be trusted.
+
+    Returns
+    -------
+    (height, width) float32
+        ``1 / (1 + e / 0.01)``, e the error to expect of a composite in camera units: 1/2 at 40 dB. 0 where nothing was
+        recovered.
+    """
+    trusted = 1 / (1 + matte.layer("error") / np.float32(0.01))
+    return np.where(matte.layer("recovered"), trusted, 0).astype(np.float32)
