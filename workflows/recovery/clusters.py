@@ -33,8 +33,8 @@ def merge_clusters(moments: NDArray[np.float64], count: int, most: int) -> int:
 
     Parameters
     ----------
-    moments : (n, 6) float64
-        Raw moments of the clusters, of positive weight; the first `count` are overwritten.
+    moments : (n, 6 or more) float64
+        Raw moments of the clusters, of positive weight, and whatever else adds up; the first `count` are overwritten.
     count, most : int
         How many there are, and may be.
 
@@ -61,7 +61,7 @@ def merge_clusters(moments: NDArray[np.float64], count: int, most: int) -> int:
                 if cost < least:
                     least, first, second = cost, a, b
         count -= 1
-        for k in range(PARAMETERS):
+        for k in range(moments.shape[1]):
             moments[first, k] += moments[second, k]
             moments[second, k] = moments[count, k]
     return count

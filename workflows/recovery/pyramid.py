@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, Self
+from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+Real = TypeVar("Real", np.float32, np.float64)
 _COARSEST = 32
 """Nodes along the longer side of the coarsest grid, at most."""
 
@@ -95,14 +96,37 @@ class Pyramid:
             parts.append(_halve(_halve(parts[-1], 0), 1))
         return np.concatenate([part.reshape(-1, finest.shape[2]) for part in parts])
 
+    def axis_moments(self, axis: int) -> NDArray[np.float64]:
+        """The means of x and of x squared over the bumps along an axis, in cells of the first grid from its edge.
 
-def _halve(image: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
+        Parameters
+        ----------
+        axis : int
+            0 for x, by the columns of each grid; 1 for y, by the rows.
+
+        Returns
+        -------
+        (columns or rows of all grids, 2) float64
+            Grid by grid. A node's bump is the product of its column's and its row's.
+
+        Notes
+        -----
+        What a node sees of the light x and x squared, so exact at the edges too, where bumps are lopsided.
+        """
+        centre = np.arange(self.grids[0][axis]) + 0.5
+        parts = [np.stack([centre, centre**2 + 1 / 12], axis=1)]
+        for _ in self.grids[1:]:
+            parts.append(_halve(parts[-1], 0))
+        return np.concatenate(parts)
+
+
+def _halve(image: NDArray[Real], axis: int) -> NDArray[Real]:
     """Every second place along an axis, seen with the weights [1, 3, 3, 1] / 8; beyond the edge is the edge."""
     n = image.shape[axis]
     at = 2 * np.arange(-(-n // 2))
     outer = image.take(np.maximum(at - 1, 0), axis) + image.take(np.minimum(at + 2, n - 1), axis)
     inner = image.take(at, axis) + image.take(np.minimum(at + 1, n - 1), axis)
-    halved: NDArray[np.float32] = (outer + 3 * inner) / np.float32(8)
+    halved: NDArray[Real] = (outer + 3 * inner) / np.float32(8)
     return halved
 
 
