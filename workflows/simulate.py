@@ -69,6 +69,7 @@ def glass_ball(
     absorption: float | tuple[float, float, float] = 0.0,
     bounces: int = 4,
     seed: int = 0,
+    distance: float = MONITOR,
 ) -> Scene:
     """Trace a glass ball before a monitor.
 
@@ -89,6 +90,8 @@ def glass_ball(
         Reflections inside the ball that are followed.
     seed : int
         Of the rays' places; the same seed gives the same scene.
+    distance : float
+        From the ball's centre to the monitor, in radii; its size is that of one at `MONITOR`.
 
     Returns
     -------
@@ -111,7 +114,7 @@ def glass_ball(
     indices = index if isinstance(index, tuple) else (index,) * 3
     absorptions = absorption if isinstance(absorption, tuple) else (absorption,) * 3
     glasses = list(zip(indices, absorptions, strict=True))
-    camera = _Camera(width, height, monitor, side, seed)
+    camera = _Camera(width, height, monitor, side, seed, distance)
     traced = {glass: camera.trace(*glass, bounces) for glass in dict.fromkeys(glasses)}
     red, green, blue = (traced[glass][0] for glass in glasses)
     return Scene(width, height, monitor, (red, green, blue), traced[glasses[0]][1])
@@ -126,6 +129,7 @@ class _Camera:
     monitor: tuple[int, int]
     side: int
     seed: int
+    distance: float
 
     def trace(self, index: float, absorption: float, bounces: int) -> tuple[Transport, Floats]:
         """The transport and the coverage of a ball."""
@@ -176,7 +180,7 @@ class _Camera:
         self, ray: NDArray[np.intp], point: Doubles, direction: Doubles, weight: Doubles
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], Doubles]:
         """Of rays from points (3, n): those that meet the monitor, the pixel they meet, and their weight."""
-        steps = (MONITOR - point[2]) / np.where(direction[2] > 0, direction[2], np.nan)
+        steps = (self.distance - point[2]) / np.where(direction[2] > 0, direction[2], np.nan)
         x = (point[0] + steps * direction[0]) / self.half_monitor[0]
         y = (point[1] + steps * direction[1]) / self.half_monitor[1]
         met = (np.abs(x) < 1) & (np.abs(y) < 1) & (weight > 0)

@@ -11,7 +11,7 @@ import anyio.to_thread
 import numpy as np
 from fastapi import APIRouter, Query, Request, Response
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from starlette.datastructures import Headers
 
 from services.api.context import Context, Needs, spool_body
@@ -19,7 +19,7 @@ from services.api.errors import NotAcceptable, NotNeeded, problem_of
 from services.api.errors import answer as problem_answer
 from storage import jobs, mattes
 from storage.database import reading
-from storage.errors import Conflict, Corrupt
+from storage.errors import Conflict, Corrupt, OptionError
 from storage.mattes import Block
 from workflows import floats, images
 from workflows.composite import composite
@@ -28,6 +28,7 @@ from workflows.composite.codes import encode
 from workflows.composite.engine import Window, shrink
 from workflows.composite.light import Backdrop
 from workflows.composite.placing import Placement
+from workflows.composite.rays import Rays, from_one, from_two
 from workflows.composite.threads import CORES
 from workflows.options import parse_options
 from workflows.tiles import cut
@@ -57,6 +58,35 @@ class Wanted(BaseModel):
     down: float = Field(0, ge=-100, le=100, description="The same, in heights.")
     scale: float = Field(1, ge=0.01, le=100, description="By how much the backdrop is larger.")
     angle: float = Field(0, ge=-360, le=360, description="By how much it is turned, in degrees, clockwise.")
+
+    depth: float | None = Field(
+        None, gt=0, description="Distance of the backdrop from the object, if it is not the monitor's."
+    )
+    distance: float | None = Field(
+        None, gt=0, description="That of the monitor in the capture, in the same unit."
+    )
+    camera: float | None = Field(None, gt=0, description="That of the camera from the object.")
+    other: str | None = Field(
+        None, description="Or, in its place, a matte of the same object before a monitor at another distance."
+    )
+    other_distance: float | None = Field(None, gt=0, description="That distance.")
+
+    @model_validator(mode="after")
+    def _told(self) -> "Wanted":
+        given = [
+            name
+            for name in ("distance", "camera", "other", "other_distance")
+            if getattr(self, name) is not None
+        ]
+        enough = given in (["distance", "camera"], ["distance", "other", "other_distance"])
+        if (self.depth is not None) != bool(given) or (given and not enough):
+            raise ValueError(
+                "a backdrop at another depth takes depth, distance and camera, or depth, distance, other and "
+                "other_distance"
+            )
+        if self.other_distance is not None and self.other_distance == self.distance:
+            raise ValueError("the two distances must differ")
+        return self
 
     @property
     def placement(self) -> Placement | None:
@@ -161,14 +191,41 @@ def _answer(
             return context.cache.block(seen.id, row, column)
         return None
 
+    rays = timed("rays", lambda: _rays(context, seen, wanted)) if wanted.depth is not None else None
     picture = timed(
         "composite",
-        lambda: composite(matte, backdrop, placement=wanted.placement, window=window, read=read),
+        lambda: composite(matte, backdrop, placement=wanted.placement, rays=rays, window=window, read=read),
     )
     if wanted.size is not None:
         picture = shrink(picture, wanted.size)
     answer = timed("encode", lambda: _encoded(picture, backdrop, kind, wanted))
     return Response(answer, media_type=kind, headers=told | {"Server-Timing": ", ".join(times)})
+
+
+def _rays(context: Context, seen: Seen, wanted: Wanted) -> Rays:
+    """The rays to a backdrop at the depth that is wanted."""
+    if seen.blocks is not None:
+        raise Conflict(
+            f"matte {seen.id} is still being recovered: a backdrop at another depth takes all of it"
+        )
+    assert wanted.depth is not None  # as `Wanted` has seen to, and the next ones
+    assert wanted.distance is not None
+    places = context.cache.places(seen.id, CORES)
+    if wanted.camera is not None:
+        wide, high = context.cache.matte(seen.id).attributes["monitor"]
+        return from_one(places, high / wide, wanted.distance, wanted.camera, wanted.depth)
+    assert wanted.other is not None
+    assert wanted.other_distance is not None
+    if _seen(context, wanted.other).blocks is not None:
+        raise Conflict(f"matte {wanted.other} is still being recovered")
+    others = context.cache.places(wanted.other, CORES)
+    if others.shape != places.shape:
+        raise OptionError(
+            f"matte {wanted.other} has {others.shape[1]} x {others.shape[0]} pixels, {seen.id} {places.shape[1]} x "
+            f"{places.shape[0]}: both must be of the same camera at the same place",
+            field="other",
+        )
+    return from_two(places, others, (wanted.distance, wanted.other_distance), wanted.depth)
 
 
 def _encoded(picture: NDArray[np.float32], backdrop: Backdrop, kind: str, wanted: Wanted) -> bytes:

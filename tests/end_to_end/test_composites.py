@@ -95,6 +95,20 @@ def test_a_moved_backdrop_is_the_backdrop_moved(service: Service, matte: str) ->
     assert np.abs(moved - decoded(asked(service, matte))).mean() > 10
 
 
+def test_a_backdrop_at_another_depth(service: Service, matte: str) -> None:
+    still = decoded(asked(service, matte)).astype(int)
+    told = {"distance": 3, "camera": 5}
+    same = decoded(asked(service, matte, depth=3, **told)).astype(int)
+    assert np.abs(same - still).mean() < 0.5
+    farther = decoded(asked(service, matte, depth=4, **told)).astype(int)
+    assert np.abs(farther - still).mean() > 5
+    for query in ({"depth": 3}, {"distance": 3}, {"depth": 3, "distance": 3, "other": matte}):
+        found = check_problem(asked(service, matte, **query), 422, "bad-request")
+        assert "depth, distance and camera" in found["detail"]
+    missing = {"depth": 3, "distance": 3, "other": "no-such-id", "other_distance": 4}
+    check_problem(asked(service, matte, **missing), 404, "not-found")
+
+
 def test_what_the_caller_has_is_not_made_again(service: Service, matte: str) -> None:
     url = f"/v1/mattes/{matte}/composite"
     first = service.http.post(url, content=SENT)

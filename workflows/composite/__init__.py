@@ -9,6 +9,7 @@ from storage.mattes import Block, Matte
 from workflows.composite.engine import Window, compose
 from workflows.composite.light import Backdrop, node_light
 from workflows.composite.placing import Placement
+from workflows.composite.rays import Rays
 from workflows.composite.threads import CORES
 
 
@@ -17,6 +18,7 @@ def composite(
     backdrop: Backdrop | NDArray[np.float32],
     *,
     placement: Placement | None = None,
+    rays: Rays | None = None,
     window: Window | None = None,
     read: Callable[[int, int], Block | None] | None = None,
     threads: int = CORES,
@@ -29,7 +31,9 @@ def composite(
     backdrop : Backdrop, or (h, w, 1 or 3) float32
         The latter linear light.
     placement : Placement, optional
-        Where the backdrop stands.
+        Where the backdrop stands before the monitor's place.
+    rays : Rays, optional
+        How far behind it, or before it.
     window : Window, optional
         Of the matte; default all of it.
     read : callable, optional
@@ -50,7 +54,7 @@ def composite(
     given = backdrop if isinstance(backdrop, Backdrop) else Backdrop(backdrop)
     wide, high = matte.attributes["monitor"] if placement else (1, 1)
     light = node_light(given, matte.columns, matte.rows, threads, placement, (wide, high))
-    return compose(matte, light, window or Window.of(matte), read or matte.read, threads)
+    return compose(matte, light, window or Window.of(matte), read or matte.read, threads, rays)
 
 
 def confidence(matte: Matte) -> NDArray[np.float32]:

@@ -7,6 +7,7 @@ from dataclasses import fields
 
 from storage.mattes import Block, Matte
 from storage.objects import Objects
+from workflows.composite.rays import Places, places_of
 
 Key = tuple[str, int, int]
 OPEN = 256
@@ -21,7 +22,7 @@ class Cache:
     objects : Objects
         Where mattes are.
     memory : int
-        Bytes of blocks that are kept. What is in use besides is a block a thread.
+        Bytes of blocks that are kept, and an eighth of it for `places`. What is in use besides is a block a thread.
     """
 
     def __init__(self, objects: Objects, memory: int) -> None:
@@ -30,6 +31,7 @@ class Cache:
         self._lock = threading.Lock()
         self._mattes: OrderedDict[str, Matte] = OrderedDict()
         self._blocks: OrderedDict[Key, Block] = OrderedDict()
+        self._places: OrderedDict[str, Places] = OrderedDict()
         self._reading: dict[Key, Future[Block]] = {}
         self.bytes = 0
         """Of the blocks that are kept."""
@@ -95,10 +97,23 @@ class Cache:
         mine.set_result(block)
         return block
 
+    def places(self, id: str, threads: int) -> Places:
+        """Where the pixels of a matte look, as `places_of` tells; of a few mattes it is kept."""
+        with self._lock:
+            found = self._places.get(id)
+        if found is None:
+            found = places_of(self.matte(id), lambda row, column: self.block(id, row, column), threads)
+            with self._lock:
+                self._places[id] = found
+                while sum(places.nbytes for places in self._places.values()) > self._memory // 8:
+                    self._places.popitem(last=False)
+        return found
+
     def forget(self, id: str) -> None:
         """Keep nothing of a matte that is no more."""
         with self._lock:
             self._mattes.pop(id, None)
+            self._places.pop(id, None)
             for key in [key for key in self._blocks if key[0] == id]:
                 self.bytes -= _size(self._blocks.pop(key))
             for key in [key for key in self._reading if key[0] == id]:

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from storage.errors import OptionError
 from storage.mattes import Block, Matte
+from workflows.composite.rays import Rays, arrived_along
 from workflows.composite.threads import in_parts
 from workflows.grids import area_mean
+from workflows.recovery.pyramid import Pyramid
 
 
 class Window(NamedTuple):
@@ -57,6 +59,7 @@ def compose(
     window: Window,
     read: Callable[[int, int], Block | None],
     threads: int,
+    rays: Rays | None = None,
 ) -> NDArray[np.float32]:
     """Put a window of a matte before a backdrop.
 
@@ -70,6 +73,8 @@ def compose(
         Returns the block in a block row and a block column; None if there is none yet.
     threads : int
         To share the work.
+    rays : Rays, optional
+        Of a backdrop at another depth than the monitor's.
 
     Returns
     -------
@@ -96,6 +101,9 @@ def compose(
         block = read(row, column)
         if block is None:
             return
+        if rays is not None:
+            _compose_along(matte, row, column, block, light, crosstalk, rays, window, picture)
+            return
         _compose(
             block.S,
             block.rho,
@@ -113,6 +121,31 @@ def compose(
 
     in_parts(one, range(len(blocks)), threads)
     return picture
+
+
+def _compose_along(
+    matte: Matte,
+    row: int,
+    column: int,
+    block: Block,
+    light: NDArray[np.float32],
+    crosstalk: NDArray[np.float32],
+    rays: Rays,
+    window: Window,
+    picture: NDArray[np.float32],
+) -> None:
+    """Composite a block before a backdrop at another depth, as far as it lies in the window."""
+    at = matte.span(row, column)
+    arrived = np.empty_like(block.S)
+    grids = Pyramid.over(matte.columns, matte.rows).arrays
+    rows = (block.count, block.shared, block.cell, block.weight)
+    arrived_along(*rows, light, grids, rays.shift[at], rays.scale, arrived)
+    seen = np.concatenate(
+        [block.S + (block.rho * arrived) @ crosstalk.T, block.recovered[..., np.newaxis]], axis=2
+    )
+    top, left = at[0].start - window.y, at[1].start - window.x
+    to = picture[max(top, 0) : top + seen.shape[0], max(left, 0) : left + seen.shape[1]]
+    to[:] = seen[max(-top, 0) :, max(-left, 0) :][: to.shape[0], : to.shape[1]]
 
 
 @njit(nogil=True, cache=True)
