@@ -2,7 +2,7 @@
 
     python -m tests.benchmarks.composites [--bundle NAME=CAPTURE.zip ...] [--large 1.0] [--json FILE]
 
-Recovers, through a real service, a traced glass ball of 640 x 480 pixels, one that is enlarged to so many megapixels, and
+Recovers, through a real service, a traced glass ball of 640 x 480 pixels, one enlarged to so many megapixels, and
 each bundle that is named; then measures in this process and over HTTP. To be run from the root of the repository.
 """
 
@@ -142,7 +142,7 @@ def over_http(url: str, matte: str, seconds: float) -> list[dict[str, Any]]:
         end = time.monotonic() + seconds
         gate = threading.Barrier(clients)
 
-        def ask(number: int, gate: threading.Barrier = gate, times: list[float] = times) -> None:
+        def ask(number: int, gate: Any = gate, times: list[float] = times, end: float = end) -> None:
             with httpx2.Client(base_url=url, timeout=60, headers={"Accept": "image/jpeg"}) as http:
                 http.post(f"/v1/mattes/{matte}/composite", content=sent[0])
                 gate.wait()
