@@ -56,8 +56,8 @@ mattes = Table(
     metadata,
     Column("number", Integer, primary_key=True, autoincrement=True),
     Column("id", String(32), nullable=False, unique=True),
-    Column("capture", String(32), nullable=False),
-    Column("job", String(32), nullable=False),
+    Column("capture", String(32)),  # neither of one that came in an archive
+    Column("job", String(32)),
     Column("state", String(16), nullable=False),
     Column("options", JSON, nullable=False),
     Column("figures", JSON(none_as_null=True)),

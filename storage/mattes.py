@@ -247,6 +247,14 @@ def add(connection: Connection, matte: str, capture: str, job: str, options: dic
     connection.execute(insert(mattes).values(row | {"created_at": time.time()}))
 
 
+def add_imported(
+    connection: Connection, matte: str, options: dict[str, Any], figures: dict[str, Any]
+) -> None:
+    """Write down a matte that came in an archive, and is whole: it has no capture and no job here."""
+    row = {"id": matte, "state": "ready", "options": options, "figures": figures}
+    connection.execute(insert(mattes).values(row | {"created_at": time.time()}))
+
+
 def get(connection: Connection, matte: str) -> Row[Any]:
     """A matte's row; `NotFound` if there is none."""
     return find(connection, mattes, matte)

@@ -22,12 +22,12 @@ TAKEN = ("image/png", "image/jpeg", "image/tiff")
 
 
 class Matte(BaseModel):
-    """A matte."""
+    """A matte; one that came in an archive has no capture and no job."""
 
     id: str
     state: Literal["recovering", "ready", "failed"]
-    capture: str
-    job: str
+    capture: str | None
+    job: str | None
     options: dict[str, Any]
     width: int | None = None
     height: int | None = None

@@ -12,9 +12,9 @@ import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 from sqlalchemy import Connection, Engine, func, insert, inspect, select, text
-from sqlalchemy.exc import DatabaseError
+from sqlalchemy.exc import DatabaseError, IntegrityError
 
-from storage import dialects, jobs, migrations
+from storage import dialects, jobs, mattes, migrations
 from storage.database import coordinator, metadata, open_engine, reading, tiles, totals, writing
 from storage.errors import Conflict
 from tests.postgres import Server
@@ -213,3 +213,25 @@ def test_an_upgrade_is_logged_in_a_line_of_ours(old: str) -> None:
     done = subprocess.run([sys.executable, "-c", LOGGED, old], capture_output=True, text=True, check=True)
     upgraded = f"the database's schema is upgraded from revision none to {migrations.newest()}"
     assert (done.stdout, done.stderr) == ("", f"INFO:storage.migrations:{upgraded}\n")
+
+
+def test_mattes_stay_when_others_without_a_capture_are_let_in(bare: Engine) -> None:
+    with writing(bare) as connection:
+        migrations.upgrade(connection, "0003")
+        connection.execute(
+            text(
+                "INSERT INTO mattes (id, capture, job, state, options, created_at) "
+                "VALUES ('m', 'c', 'j', 'ready', '{}', 1000.5)"
+            )
+        )
+    engine = open_engine(bare.url.render_as_string(hide_password=False))
+    with writing(engine) as connection:
+        assert differences(connection) == []
+        mattes.add_imported(connection, "n", {"method": "lobes"}, {"width": 7})
+        old, new = mattes.get(connection, "m"), mattes.get(connection, "n")
+    assert (old.capture, old.job, old.created_at) == ("c", "j", 1000.5)
+    assert (new.capture, new.job, new.state, new.figures) == (None, None, "ready", {"width": 7})
+    assert new.number > old.number
+    with pytest.raises(IntegrityError), writing(engine) as connection:  # an id is there once, as before
+        mattes.add_imported(connection, "m", {}, {})
+    engine.dispose()
