@@ -1,10 +1,8 @@
 """A bundle: the ZIP of a capture and its capture.json, format envmatte-capture/1, checked as hostile."""
 
-import stat
 import struct
 import tempfile
 import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -13,6 +11,7 @@ from typing import Annotated, BinaryIO, Literal, cast
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from storage import zips
 from storage.errors import CaptureError
 from workflows.clock import Border
 from workflows.program import Images, Program
@@ -21,22 +20,10 @@ from workflows.tone import Response
 MANIFEST = "capture.json"
 MANIFEST_BYTES = 8 << 20
 ENTRIES = 20_000
-DIRECTORY_BYTES = 8 << 20
-"""Of the archive's directory, which is read in one piece."""
 NAME_LENGTH = 26
 """Where an entry's header has the lengths of its name and of the field after it (APPNOTE, sect. 4.3.7)."""
 PIECE = 1 << 20
 """Bytes that are unpacked at once."""
-UNREADABLE = (
-    zipfile.BadZipFile,
-    zlib.error,
-    EOFError,
-    OSError,
-    ArithmeticError,
-    ValueError,
-    RuntimeError,
-)
-"""What zipfile raises on damaged entries."""
 TAGS = {"constant", "bernoulli", "images", "Gamma"}
 """What pydantic adds to the way to a field: which member of a union it took."""
 
@@ -111,17 +98,8 @@ class Bundle:
     def __init__(self, file: BinaryIO, limits: Limits) -> None:
         self._limits = limits
         self._file = file
-        bounded = _Bounded(file)
-        try:
-            self._archive = zipfile.ZipFile(bounded)
-        except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError) as error:
-            raise CaptureError(
-                "this is no ZIP archive, or it is cut off: its directory can't be read. Make it again, and "
-                "see that all of it is sent"
-            ) from error
-        bounded.most = None
-        self._entries: dict[str, zipfile.ZipInfo] = {}
-        self._check_directory()
+        self._archive = zips.opened(file, CaptureError)
+        self._entries = zips.entries(self._archive, ENTRIES, limits.unpacked, CaptureError)
         self.manifest = self._read_manifest()
         self._check_manifest()
 
@@ -136,18 +114,7 @@ class Bundle:
         info = self._entries.get(entry)
         if info is None:
             raise CaptureError(f"{entry} is not in the archive", entry=entry)
-        if info.file_size > self._limits.image:
-            raise CaptureError(
-                f"{entry} unpacks to {info.file_size} bytes, more than the {self._limits.image} allowed for one",
-                entry=entry,
-                limit=self._limits.image,
-            )
-        try:
-            # Not ZipFile.read, which unpacks all there is before it looks at the size that the directory gives.
-            with self._archive.open(info) as file:
-                return file.read(info.file_size)
-        except UNREADABLE as error:
-            raise CaptureError(f"{entry} is damaged in the archive: {error}", entry=entry) from error
+        return zips.read(self._archive, info, self._limits.image, CaptureError)
 
     @contextmanager
     def open(self, entry: str) -> Iterator[BinaryIO]:
@@ -175,38 +142,9 @@ class Bundle:
                         for done in range(0, info.file_size, PIECE):
                             file.write(packed.read(min(PIECE, info.file_size - done)))
                         file.seek(0)
-            except UNREADABLE as error:
+            except zips.UNREADABLE as error:
                 raise CaptureError(f"{entry} is damaged in the archive: {error}", entry=entry) from error
             yield file
-
-    def _check_directory(self) -> None:
-        infos = self._archive.infolist()
-        if len(infos) > ENTRIES:
-            raise CaptureError(f"the archive has {len(infos)} entries, more than {ENTRIES}", limit=ENTRIES)
-        total = 0
-        for info in infos:
-            name = info.filename
-            if name.startswith(("/", "\\")) or ":" in name or ".." in name.replace("\\", "/").split("/"):
-                raise CaptureError(f"{name!r} leaves the archive: use plain relative names", entry=name)
-            if stat.S_ISLNK(info.external_attr >> 16):
-                raise CaptureError(f"{name!r} is a link: put the file itself in the archive", entry=name)
-            if info.flag_bits & 1:
-                raise CaptureError(f"{name!r} is encrypted", entry=name)
-            if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                # bzip2 and LZMA unpack in zipfile without bounds.
-                raise CaptureError(
-                    f"{name!r} is packed by a method other than deflate: store or deflate the entries",
-                    entry=name,
-                )
-            if name in self._entries:
-                raise CaptureError(f"{name!r} is in the archive twice", entry=name)
-            self._entries[name] = info
-            total += info.file_size
-        if total > self._limits.unpacked:
-            raise CaptureError(
-                f"the archive unpacks to {total} bytes, more than the {self._limits.unpacked} allowed",
-                limit=self._limits.unpacked,
-            )
 
     def _read_manifest(self) -> Manifest:
         info = self._entries.get(MANIFEST)
@@ -268,26 +206,6 @@ class Bundle:
                 entry=MANIFEST,
                 field="frames",
             )
-
-
-class _Bounded:
-    """A file of which zipfile, while it opens it, may not read as much at once as a hostile directory says."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-        self.most: int | None = DIRECTORY_BYTES
-        self.seek = file.seek
-        self.tell = file.tell
-        self.seekable = file.seekable
-        self.close = file.close
-
-    def read(self, size: int = -1) -> bytes:
-        if self.most is None:
-            return self._file.read(size)
-        data = self._file.read(min(size, self.most + 1) if size >= 0 else self.most + 1)
-        if len(data) > self.most:
-            raise zipfile.BadZipFile(f"a directory of more than {self.most} bytes")
-        return data
 
 
 class _Window:
