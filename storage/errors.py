@@ -5,6 +5,7 @@
     EnvmatteError
     ├── InvalidInput            what was sent can't be used
     │   ├── CaptureError        a capture's archive or capture.json
+    │   ├── ArchiveError        a matte's archive
     │   ├── ImageError          bytes that should be an image
     │   └── OptionError         an option of recovery
     ├── NotFound                no such capture, job, matte or frame
@@ -54,6 +55,10 @@ class InvalidInput(EnvmatteError):
 
 class CaptureError(InvalidInput):
     """A capture's archive, its capture.json or one of its frames."""
+
+
+class ArchiveError(InvalidInput):
+    """A matte's archive, or one of its entries."""
 
 
 class ImageError(InvalidInput):

@@ -41,6 +41,10 @@ from storage.objects import Objects, together
 FORMAT = "envmatte-matte/1"
 FRAMES = ("S", "rho", "error", "recovered", "shared", "count")
 """The frame-shaped arrays."""
+CHANNELS = ("S", "rho", "count")
+"""Those of them that have channels."""
+FIGURES = ("width", "height", "monitor", "columns", "rows", "block")
+"""The attributes that a matte is listed with."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +103,11 @@ class Matte:
         self.height, self.width, self.columns, self.rows, self.block = (
             int(self.attributes[name]) for name in ("height", "width", "columns", "rows", "block")
         )
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """What a matte is listed with."""
+        return {name: self.attributes[name] for name in FIGURES}
 
     @property
     def block_rows(self) -> int:

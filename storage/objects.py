@@ -199,6 +199,19 @@ class Objects:
         with told():
             obstore.put(self._store, path, data)
 
+    async def get(self, path: str) -> bytes:
+        """The bytes of a small object, for `together`.
+
+        Raises
+        ------
+        FileNotFoundError, Corrupt
+            If there is none; the latter where it is a chunk.
+        """
+        value = await self.zarr.get(path, default_buffer_prototype())
+        if value is None:
+            raise FileNotFoundError(path)
+        return value.to_bytes()
+
     def names(self, folder: str) -> list[str]:
         """What lies directly in a folder, folders and objects, by name."""
         with told():
@@ -208,8 +221,14 @@ class Objects:
 
     def below(self, folder: str) -> set[str]:
         """The paths of all objects below a folder, however deep."""
+        return set(self.sizes(folder))
+
+    def sizes(self, folder: str) -> dict[str, int]:
+        """The bytes of all objects below a folder, however deep, by their paths."""
         with told():
-            return {meta["path"] for batch in obstore.list(self._store, folder) for meta in batch}
+            return {
+                meta["path"]: meta["size"] for batch in obstore.list(self._store, folder) for meta in batch
+            }
 
     def stale(self, folder: str, seconds: float, but: Collection[str] = ()) -> list[str]:
         """What lies directly in a folder and was not written to for some time, by name: for whoever tidies up.

@@ -147,10 +147,7 @@ def _recover_missing(task: Task) -> list[int]:
 
 def _recover_finish(task: Task) -> dict[str, Any]:
     _objects(task.store).sweep(mattes.path(task.matte))
-    matte = mattes.Matte(_objects(task.store), task.matte)
-    return {
-        name: matte.attributes[name] for name in ("width", "height", "monitor", "columns", "rows", "block")
-    }
+    return mattes.Matte(_objects(task.store), task.matte).figures
 
 
 KINDS = {

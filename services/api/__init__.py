@@ -8,6 +8,7 @@ from sqlalchemy import Engine
 
 from services import tracing
 from services.api import (
+    archives,
     captures,
     cluster,
     composites,
@@ -55,6 +56,7 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
         jobs.router,
         mattes.router,
         composites.router,
+        archives.router,
         programs.router,
         cluster.router,
     ):

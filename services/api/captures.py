@@ -168,10 +168,10 @@ async def _from_body(context: Context, request: Request, name: str, key: str | N
     row = await anyio.to_thread.run_sync(_made, context, key)
     if row is not None:
         return row
-    await anyio.to_thread.run_sync(_check_room, context, length)
+    await anyio.to_thread.run_sync(check_room, context, length)
     capture = new_id()
     try:
-        part = Part(ONLY, await _receive(context, capture, request.stream(), limit))
+        part = Part(ONLY, await receive(context, capture, request.stream(), limit))
         row = await anyio.to_thread.run_sync(_register, context, capture, [part], name, key, False)
     except Exception:
         # Not when cancelled, where `_register` may still be at work: the next start sweeps then.
@@ -182,7 +182,8 @@ async def _from_body(context: Context, request: Request, name: str, key: str | N
     return row
 
 
-async def _receive(context: Context, capture: str, body: AsyncIterator[bytes], limit: int) -> int:
+async def receive(context: Context, capture: str, body: AsyncIterator[bytes], limit: int) -> int:
+    """Stream an archive into the store, where `storage.uploads` has it as one part; returns its bytes."""
     size = 0
     async with context.objects.write(uploads.part_path(capture, ONLY)) as file:
         async for part in body:
@@ -236,7 +237,8 @@ def _made(context: Context, key: str | None) -> Row[Any] | None:
         return captures.get(c, made) if made else None
 
 
-def _check_room(context: Context, length: int) -> None:
+def check_room(context: Context, length: int) -> None:
+    """See that the store has room for more bytes."""
     with reading(context.engine) as c:
         uploads.check_room(c, context.objects, length)
 

@@ -42,6 +42,8 @@ class Context:
     """Videos of programs that are encoded at once."""
     composites: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(CORES + 1))
     """Composites that are made at once, which bounds what they take: one more than there are cores."""
+    imports: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(2))
+    """Archives of mattes that are unpacked at once."""
 
 
 def _context(request: Request) -> Context:

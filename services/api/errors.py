@@ -11,6 +11,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
 from storage.errors import (
+    ArchiveError,
     CaptureError,
     Conflict,
     Corrupt,
@@ -62,6 +63,7 @@ class Unauthorized(EnvmatteError):
 
 PROBLEMS: dict[type[Exception], tuple[int, str, str]] = {
     CaptureError: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-capture", "The capture can't be used"),
+    ArchiveError: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-archive", "The archive can't be used"),
     ImageError: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-image", "The image can't be used"),
     OptionError: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-option", "The options can't be used"),
     TooLarge: (HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too-large", "Too large"),

@@ -223,5 +223,5 @@ def _too_long(row: Row[Any]) -> TooLarge:
 def too_large(limit: int) -> TooLarge:
     """An archive over the limit of the settings."""
     return TooLarge(
-        f"an archive may have {limit} bytes; split the capture or raise ENVMATTE_UPLOAD_BYTES", limit=limit
+        f"an archive may have {limit} bytes; send a smaller one or raise ENVMATTE_UPLOAD_BYTES", limit=limit
     )

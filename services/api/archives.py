@@ -1,0 +1,112 @@
+"""Archives of mattes over HTTP: one leaves, and comes back."""
+
+from typing import Any
+
+import anyio.to_thread
+from fastapi import APIRouter, Request, Response
+from fastapi.responses import StreamingResponse
+from sqlalchemy import Row
+from sqlalchemy.exc import IntegrityError
+
+from services.api.captures import ONLY, Key, check_room, receive
+from services.api.context import Context, Needs
+from services.api.errors import WrongMediaType
+from services.api.mattes import Matte
+from services.api.uploads import too_large
+from storage import jobs, mattes, uploads
+from storage.archives import Archive
+from storage.database import new_id, reading, writing
+from storage.errors import Conflict
+from storage.uploads import Part
+from workflows.archive.importing import take_in
+
+router = APIRouter(tags=["mattes"])
+CALL = "POST /v1/mattes"
+ZIP = "application/zip"
+
+
+@router.get(
+    "/mattes/{id}/archive",
+    response_class=StreamingResponse,
+    responses={200: {"content": {ZIP: {}}, "description": "The archive"}},
+)
+def get_archive(context: Needs, id: str) -> StreamingResponse:
+    """All of a matte in one ZIP, which any zarr reader opens, and which `POST /v1/mattes` takes elsewhere.
+
+    The same matte makes the same bytes. Where the matte is deleted meanwhile, the connection ends early.
+    """
+    with reading(context.engine) as c:
+        row = mattes.get(c, id)
+    if row.state != "ready":
+        raise Conflict(f"matte {id} is {row.state}; job {row.job} says more")
+    archive = Archive(context.objects, id)
+    headers = {
+        "Content-Length": str(archive.size),
+        "Content-Disposition": f'attachment; filename="matte-{id}.zip"',
+    }
+    return StreamingResponse(iter(archive), media_type=ZIP, headers=headers)
+
+
+@router.post(
+    "/mattes",
+    status_code=201,
+    openapi_extra={"requestBody": {"content": {ZIP: {"schema": {"type": "string", "format": "binary"}}}}},
+)
+async def post_archive(
+    context: Needs, request: Request, response: Response, idempotency_key: Key = None
+) -> Matte:
+    """Make a matte of an archive: the body is what `GET /v1/mattes/{id}/archive` gave.
+
+    All of it is checked before the answer, which takes some seconds for each 100 MB.
+    """
+    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if media_type != ZIP:
+        raise WrongMediaType(f"send the archive of a matte as {ZIP}, not as {media_type or 'nothing'}")
+    row = await _from_body(context, request, idempotency_key)
+    response.headers["Location"] = f"/v1/mattes/{row.id}"
+    return Matte.of(row)
+
+
+async def _from_body(context: Context, request: Request, key: str | None) -> Row[Any]:
+    """Stream an archive into the store, and make a matte of it; the archive is gone in the end."""
+    limit = context.settings.upload_bytes
+    length = int(request.headers.get("content-length", 0))
+    if length > limit:
+        raise too_large(limit)
+    row = await anyio.to_thread.run_sync(_made, context, key)
+    if row is not None:
+        return row
+    await anyio.to_thread.run_sync(check_room, context, 2 * length)  # the archive, and the matte beside it
+    matte = new_id()
+    try:
+        size = await receive(context, matte, request.stream(), limit)
+        row = await anyio.to_thread.run_sync(_import, context, matte, size, key, limiter=context.imports)
+    finally:
+        # One that a killed server leaves, and half of its matte, are swept: nothing refers to them.
+        await anyio.to_thread.run_sync(uploads.remove, context.objects, matte)
+    return row
+
+
+def _import(context: Context, matte: str, size: int, key: str | None) -> Row[Any]:
+    objects = context.objects
+    uploads.seal(objects, matte, [Part(ONLY, size)])
+    with uploads.read(objects, matte) as file:
+        made = take_in(file, objects, matte, context.settings.limits)
+    try:
+        with writing(context.engine) as c:
+            mattes.add_imported(c, matte, made.attributes["options"], made.figures)
+            if key:
+                jobs.remember(c, key, CALL, matte)
+            return mattes.get(c, matte)
+    except Exception as error:
+        objects.delete(mattes.path(matte))
+        row = _made(context, key) if isinstance(error, IntegrityError) else None
+        if row is None:
+            raise
+        return row  # a repeat with the same key was quicker
+
+
+def _made(context: Context, key: str | None) -> Row[Any] | None:
+    with reading(context.engine) as c:
+        made = jobs.made_by(c, key, CALL) if key else None
+        return mattes.get(c, made) if made else None

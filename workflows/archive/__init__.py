@@ -1,0 +1,1 @@
+"""A matte that comes in an archive: checked as hostile, and written anew."""

@@ -1,0 +1,60 @@
+"""What the JSON of a matte's archive may say."""
+
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from storage.errors import ArchiveError
+
+Model = TypeVar("Model", bound=BaseModel)
+Side = Annotated[int, Field(ge=1, le=16384)]
+Share = Annotated[float, Field(ge=-100, le=100)]
+Name = Annotated[str, Field(max_length=64)]
+Text = Annotated[str, Field(max_length=256)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Attributes(_Strict):
+    """Those of a matte's group."""
+
+    format: Literal["envmatte-matte/1"]
+    height: Annotated[int, Field(ge=1, le=65535)]
+    width: Annotated[int, Field(ge=1, le=65535)]
+    columns: Side
+    rows: Side
+    block: int
+    monitor: Annotated[list[Side], Field(min_length=2, max_length=2)]
+    crosstalk: Annotated[
+        list[Annotated[list[Share], Field(min_length=3, max_length=3)]], Field(min_length=3, max_length=3)
+    ]
+    options: Annotated[dict[Name, bool | int | float | Text | None], Field(max_length=100)]
+
+
+class Member(_Strict):
+    """What the manifest says of an entry."""
+
+    size: Annotated[int, Field(ge=0)]
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+
+
+class Manifest(_Strict):
+    """envmatte.json."""
+
+    format: Literal["envmatte-archive/1"]
+    matte: dict[str, Any]
+    members: dict[str, Member]
+
+
+def valid(model: type[Model], given: Any, entry: str) -> Model:
+    """What an entry says, as a model; `ArchiveError` if it is none."""
+    try:
+        return model.model_validate(given)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        field = ".".join(str(part) for part in first["loc"])
+        raise ArchiveError(
+            f"{entry}: {field + ': ' if field else ''}{first['msg']}", entry=entry, field=field
+        ) from error
