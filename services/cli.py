@@ -134,6 +134,29 @@ def composite(
 
 
 @main.command()
+@click.argument("matte")
+@click.option(
+    "-o", "--output", type=click.Path(dir_okay=False, path_type=Path), required=True, help="ZIP to write."
+)
+@_remote
+def export(matte: str, output: Path, url: str, key: str | None, as_json: bool) -> None:
+    """Write a matte to a file, for `envmatte import` elsewhere or for any zarr reader."""
+    with Client(url, key) as client, Progress("export") as bar:
+        client.export(matte, output, progress=lambda done, size: bar.show(done / size))
+    _say({"output": str(output)}, as_json, "output")
+
+
+@main.command("import")
+@click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@_remote
+def import_(file: Path, url: str, key: str | None, as_json: bool) -> None:
+    """Bring a matte that `envmatte export` wrote; prints its id here."""
+    with Client(url, key) as client, Progress("import") as bar:
+        matte = client.import_matte(file, progress=lambda sent, size: bar.show(sent / size))
+    _say(matte, as_json, "id")
+
+
+@main.command()
 @click.option(
     "-o", "--output", type=click.Path(dir_okay=False, path_type=Path), default=Path("envmatte-demo.png")
 )

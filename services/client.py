@@ -2,13 +2,15 @@
 
 import base64
 import hashlib
+import os
 import secrets
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from http import HTTPStatus
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, BinaryIO, Self
 
 import httpx2
 
@@ -204,6 +206,49 @@ class Client:
         """A layer of a matte, as `confidence.png`."""
         return self._computed("GET", f"/v1/mattes/{matte}/layers/{name}")
 
+    def export(self, matte: str, file: Path, *, progress: Callable[[int, int], None] | None = None) -> None:
+        """Write a matte's archive to a file, whole or not at all.
+
+        Parameters
+        ----------
+        progress : callable, optional
+            Told the bytes that have come, and those there are.
+        """
+        part = file.with_name(file.name + ".part")
+        try:
+            with self._streamed("GET", f"/v1/mattes/{matte}/archive") as answer, part.open("wb") as out:
+                size = int(answer.headers["Content-Length"])
+                for data in answer.iter_bytes():
+                    out.write(data)
+                    if progress:
+                        progress(out.tell(), size)
+            os.replace(part, file)
+        finally:
+            part.unlink(missing_ok=True)
+
+    def import_matte(
+        self, file: Path, *, progress: Callable[[int, int], None] | None = None
+    ) -> dict[str, Any]:
+        """Make a matte of an archive; returns it.
+
+        Parameters
+        ----------
+        progress : callable, optional
+            Told the bytes that were sent, and those there are; the service checks them after the last.
+        """
+        size = file.stat().st_size
+
+        def body(source: BinaryIO) -> Iterator[bytes]:
+            while data := source.read(SMALLEST):
+                yield data
+                if progress:
+                    progress(source.tell(), size)
+
+        headers = {"Content-Type": "application/zip", "Content-Length": str(size)}
+        with file.open("rb") as source:
+            waits = httpx2.Timeout(SILENCE, read=COMPUTING)
+            return self._json("POST", "/v1/mattes", headers=headers, content=body(source), timeout=waits)
+
     def _computed(self, method: str, path: str, **request: Any) -> bytes:
         return self._send(method, path, timeout=httpx2.Timeout(SILENCE, read=COMPUTING), **request).content
 
@@ -225,8 +270,20 @@ class Client:
             pause = min(2 * pause, 5)
 
     def _send(self, method: str, path: str, **request: Any) -> httpx2.Response:
+        with self._streamed(method, path, **request) as answer:
+            answer.read()
+        return answer
+
+    @contextmanager
+    def _streamed(self, method: str, path: str, **request: Any) -> Iterator[httpx2.Response]:
+        """An answer whose body has yet to be read; that of a refusal is."""
         try:
-            answer = self._http.request(method, path, **request)
+            with self._http.stream(method, path, **request) as answer:
+                if not answer.is_success:
+                    answer.read()
+                    raise _refusal(method, answer)
+                yield answer
+                self._answered = True
         except httpx2.TransportError as error:
             url = self._http.base_url
             raise ServiceError(
@@ -236,16 +293,16 @@ class Client:
                     "detail": f"no answer from {url}: {error}; is `envmatte serve` running?",
                 }
             ) from error
-        if answer.is_success:
-            self._answered = True
-            return answer
-        if answer.headers.get("content-type") != "application/problem+json" or not answer.content:
-            # Of a proxy between, or to HEAD.
-            raise ServiceError(
-                {
-                    "title": answer.reason_phrase,
-                    "status": answer.status_code,
-                    "detail": f"{method} {answer.url} was answered with {answer.status_code} {answer.reason_phrase}",
-                }
-            )
-        raise ServiceError(answer.json())
+
+
+def _refusal(method: str, answer: httpx2.Response) -> ServiceError:
+    if answer.headers.get("content-type") == "application/problem+json" and answer.content:
+        return ServiceError(answer.json())
+    # Of a proxy between, or to HEAD.
+    return ServiceError(
+        {
+            "title": answer.reason_phrase,
+            "status": answer.status_code,
+            "detail": f"{method} {answer.url} was answered with {answer.status_code} {answer.reason_phrase}",
+        }
+    )

@@ -98,12 +98,13 @@ def _import(context: Context, matte: str, size: int, key: str | None) -> Row[Any
             if key:
                 jobs.remember(c, key, CALL, matte)
             return mattes.get(c, matte)
-    except Exception as error:
+    # Of any other error it is not known whether the row was written; without one the matte is swept.
+    except IntegrityError:  # a repeat with the same key was quicker
         objects.delete(mattes.path(matte))
-        row = _made(context, key) if isinstance(error, IntegrityError) else None
+        row = _made(context, key)
         if row is None:
             raise
-        return row  # a repeat with the same key was quicker
+        return row
 
 
 def _made(context: Context, key: str | None) -> Row[Any] | None:
