@@ -3,14 +3,19 @@
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from services.settings import Settings
+from storage.mattes import Matte
+from storage.objects import Objects
 from tests.end_to_end.conftest import Service
 from workflows import images, simulate
+from workflows.composite import composite
+from workflows.grids import area_mean
 
 README = (Path(__file__).parents[2] / "README.md").read_text()
 
@@ -30,6 +35,17 @@ def test_the_five_lines_of_curl(service: Service, bundle: Path, tmp_path: Path) 
     (newest,) = service.http.get("/v1/mattes?limit=1").json()["mattes"]
     expected = service.client.composite(newest["id"], (tmp_path / "demo" / "backdrop.png").read_bytes())
     assert (tmp_path / "composite.png").read_bytes() == expected
+
+
+def test_zarr_alone_reads_a_matte_and_composites_it(service: Service, matte: str, tmp_path: Path) -> None:
+    (lines,) = re.findall(r"```python\n(.*?)```", README, re.S)
+    service.client.export(matte, tmp_path / "matte.zip")
+    stored = Matte(Objects((service.data / "store").as_uri()), matte)
+    backdrop = simulate.backdrop(160, 120)
+    np.save(tmp_path / "light.npy", area_mean(backdrop, stored.columns, stored.rows))
+    subprocess.run([sys.executable, "-c", lines], cwd=tmp_path, check=True, timeout=120)
+    expected = composite(stored, backdrop)[..., :3]
+    np.testing.assert_allclose(np.load(tmp_path / "composite.npy"), expected, atol=1e-5)
 
 
 def test_every_setting_is_documented() -> None:
