@@ -10,6 +10,7 @@ import imagecodecs
 import numpy as np
 import zarr
 from numpy.typing import NDArray
+from pydantic_core import from_json
 from zarr.buffer import default_buffer_prototype
 from zarr.storage import MemoryStore
 
@@ -144,8 +145,8 @@ class Reader:
     def _document(self, name: str, most: int) -> Any:
         data = self._read(name, most)
         try:
-            return json.loads(data, parse_constant=_no_number)
-        except (ValueError, RecursionError) as error:
+            return from_json(data, allow_inf_nan=False)
+        except ValueError as error:
             raise refused(name, "it is no JSON") from error
 
     def _read(self, name: str, most: int) -> bytes:
@@ -194,10 +195,6 @@ class Reader:
 def refused(entry: str, what: str) -> ArchiveError:
     """What to raise of an entry."""
     return ArchiveError(f"{entry}: {what}; {AGAIN}", entry=entry)
-
-
-def _no_number(name: str) -> None:
-    raise ValueError(f"{name} is no number of JSON")
 
 
 @cache

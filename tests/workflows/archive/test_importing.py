@@ -259,6 +259,10 @@ MANIFESTS: dict[str, tuple[str, Change]] = {
     "no checksum": ("sha256", documented(MANIFEST, lambda d: d["members"]["S/zarr.json"].update(sha256="x"))),
     "no manifest": ("not in the archive", no_manifest),
     "no JSON": ("no JSON", lambda files: files.update({MANIFEST: b"\xff"})),
+    "half a character": (
+        "no JSON",
+        lambda files: files.update({MANIFEST: files[MANIFEST].replace(b'"S/zarr', b'"\\ud800')}),
+    ),
     "a list": (MANIFEST, lambda files: files.update({MANIFEST: b"[]"})),
 }
 
