@@ -18,15 +18,15 @@ from typing import Any
 
 from sqlalchemy import Connection, Engine, Row
 
-from services.api.errors import problem_of
 from services.dispatch import Dispatcher
 from services.drive import Drive, end_badly
-from services.housekeeping import discard, sweep
+from services.housekeeping import sweep
+from services.kinds import KINDS
 from services.process import about
 from services.settings import Settings
-from storage import captures, jobs, leases, mattes, uploads
+from storage import jobs, leases, uploads
 from storage.database import reading, writing
-from storage.errors import Conflict, EnvmatteError, GaveUp, NoRoom, Unavailable
+from storage.errors import EnvmatteError, GaveUp, NoRoom, Unavailable
 from storage.leases import Superseded
 from storage.objects import Objects
 
@@ -63,8 +63,8 @@ class Coordinator:
         self._name = f"{socket.gethostname()}:{os.getpid()}"
         self._token: int | None = None
         self._drives: dict[str, Drive] = {}
-        self._leaving: deque[tuple[float, str, str, str]] = deque()
-        """When what ended jobs wrote is removed: a time, and a kind, a capture and a matte."""
+        self._leaving: deque[tuple[float, Row[Any]]] = deque()
+        """When what ended jobs wrote is removed: a time, and the job's row."""
         self._troubles: Counter[str] = Counter()
         self._beat_at = self._swept_at = self._settled_at = self._read_at = -1e9
         self._stopped = threading.Event()
@@ -188,13 +188,9 @@ class Coordinator:
                 self._fail(job, GaveUp(f"the coordinator failed at it, last with {error!r}"))
 
     def _take_up(self, row: Row[Any]) -> None:
-        """Begin to drive a job, once its capture is there; one whose capture never will be is ended."""
-        if row.kind != "ingest":
-            with reading(self._engine) as c:
-                capture = captures.get(c, row.capture)
-            if capture.state == "failed":
-                raise Conflict(f"capture {capture.id} could not be ingested: {capture.problem['detail']}")
-            if capture.state != "ready":
+        """Begin to drive a job, once what it needs is there; one for which it never will be is ended."""
+        with reading(self._engine) as c:
+            if not KINDS[row.kind].is_due(c, row):
                 return
         with self._writing() as c:
             jobs.begin(c, row.id)
@@ -232,7 +228,7 @@ class Coordinator:
         drive.go_on(following)
         if following.ended:
             self._drop(drive.job)
-            self._tidy(drive.kind, drive.task.capture)
+            self._tidy(drive.job)
 
     def _drop(self, job: str) -> None:
         """Drive a job no more: what the cluster has of it is cancelled."""
@@ -246,36 +242,30 @@ class Coordinator:
             end_badly(c, row.kind, self._drive_of(c, row).task, error)
         if job in self._drives:
             self._drop(job)
-        self._tidy(row.kind, row.capture)
+        self._tidy(job)
 
-    def _tidy(self, kind: str, capture: str) -> None:
-        """Remove what nobody needs once an ingest has ended: the archive, or all of a capture that can't be used."""
-        if kind != "ingest":
-            return
+    def _tidy(self, job: str) -> None:
+        """Remove what nobody needs once a job has ended: what it was given, or all of what can't be used."""
         with reading(self._engine) as c:
-            row = captures.get(c, capture)
-        if row.state == "ready":
-            self._house.submit(_logged, uploads.remove, self._objects, capture)
-        elif row.state == "failed" and not captures.may_be_retried(row.problem):
-            self._leaving.append((time.monotonic() + DYING, kind, capture, ""))
+            row = jobs.get(c, job)
+        if row.state == "succeeded":
+            self._house.submit(_logged, KINDS[row.kind].tidy, self._objects, row)
+        elif row.state == "failed" and KINDS[row.kind].discards(row.problem):
+            self._leaving.append((time.monotonic() + DYING, row))
 
     def _wind_up(self, row: Row[Any]) -> None:
         """Free what a cancelled job wrote, once nobody works on it."""
         with self._writing() as c:
-            if row.kind == "recover":
-                mattes.forget(c, row.matte)
-            else:
-                problem = problem_of(Conflict("the ingest was cancelled; upload the capture again"))
-                captures.change(c, row.capture, state="failed", problem=problem)
+            KINDS[row.kind].cancelled(c, row)
         dying = DYING if row.started_at else 0
-        self._leaving.append((time.monotonic() + dying, row.kind, row.capture, row.matte or ""))
+        self._leaving.append((time.monotonic() + dying, row))
 
     def _discard(self) -> None:
         """Remove what ended jobs wrote, as soon as no worker works on them any more."""
         now = time.monotonic()
         while self._leaving and self._leaving[0][0] <= now:
-            _, kind, capture, matte = self._leaving.popleft()
-            self._house.submit(_logged, discard, self._objects, kind, capture, matte)
+            _, row = self._leaving.popleft()
+            self._house.submit(_logged, KINDS[row.kind].discard, self._objects, row)
 
     def _submit(self) -> None:
         """Fill the cluster, the job that has had the fewest seconds of it first.

@@ -12,8 +12,9 @@ from sqlalchemy import Connection, Row
 from services import tracing
 from services.api.errors import problem_of
 from services.dispatch import Outcome
+from services.kinds import KINDS as RECORDS
 from services.process import about
-from storage import captures, jobs, mattes
+from storage import jobs
 from storage.errors import EnvmatteError, GaveUp, Unavailable
 from storage.jobs import FINISH, PREPARE
 from workflows.ingest.bundle import Limits
@@ -207,9 +208,7 @@ class Drive:
         jobs.lay_down(connection, self.job, plan)
         row = jobs.get(connection, self.job)
         tracing.waited("queue", row.trace, row.created_at, row.started_at, job=self.job, kind=self.kind)
-        if self.kind == "ingest":
-            found = {name: plan[name] for name in ("width", "height", "frames")}
-            captures.change(connection, self.task.capture, **found)
+        RECORDS[self.kind].prepared(connection, self.task, plan)
         for line in plan.get("notes", ()):
             jobs.note(connection, self.job, line)
         tiles = order(self.kind, range(plan["tiles"]))
@@ -227,10 +226,7 @@ class Drive:
         # Unless it was cancelled at the last moment, and is wound up next.
         elif jobs.end(connection, self.job, "succeeded"):
             logger.info("succeeded")
-            if self.kind == "ingest":
-                captures.change(connection, self.task.capture, state="ready")
-            else:
-                mattes.change(connection, self.task.matte, state="ready", figures=figures)
+            RECORDS[self.kind].succeeded(connection, self.task, figures)
         return Next(self.stage, (), self.task, ended=True)
 
 
@@ -239,9 +235,5 @@ def end_badly(connection: Connection, kind: str, task: Task, error: EnvmatteErro
     problem = problem_of(error)
     with about(task.job):
         logger.warning("failed: %s", problem["detail"])
-    if not jobs.end(connection, task.job, "failed", problem):
-        return
-    if kind == "ingest":
-        captures.change(connection, task.capture, state="failed", problem=problem)
-    else:
-        mattes.change(connection, task.matte, state="failed")
+    if jobs.end(connection, task.job, "failed", problem):
+        RECORDS[kind].failed(connection, task, problem)

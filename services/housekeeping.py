@@ -1,10 +1,11 @@
-"""What the coordinator removes from the store: what ended jobs wrote, and what nothing refers to."""
+"""What the coordinator removes from the store because nothing refers to it."""
 
 import logging
 
 from sqlalchemy import Engine, select
 
-from storage import captures, database, mattes, uploads
+from services.kinds import may_be_retried
+from storage import database, jobs, uploads
 from storage.database import reading
 from storage.objects import Objects
 
@@ -12,15 +13,6 @@ logger = logging.getLogger(__name__)
 
 KEPT = 3600.0
 """Seconds for which what nothing refers to is left alone: someone may be about to write down that it is there."""
-
-
-def discard(objects: Objects, kind: str, capture: str, matte: str) -> None:
-    """Remove what an ended job wrote: a matte, or a capture and the archive it came in."""
-    if kind == "recover":
-        objects.delete(mattes.path(matte))
-    else:
-        objects.delete(captures.path(capture))
-        uploads.remove(objects, capture)
 
 
 def sweep(engine: Engine, objects: Objects, seconds: float = KEPT) -> None:
@@ -33,12 +25,15 @@ def sweep(engine: Engine, objects: Objects, seconds: float = KEPT) -> None:
     """
     with reading(engine) as c:
         rows = c.execute(select(database.captures)).all()
-        kept = [row for row in rows if row.state != "failed" or captures.may_be_retried(row.problem)]
+        kept = [row for row in rows if row.state != "failed" or may_be_retried(row.problem)]
         under_way = {id: uploads.parts_of(c, id) for id in c.scalars(select(database.uploads.c.id))}
         known = {
             "captures": {row.id for row in kept},
             "uploads": {row.id for row in kept if row.state != "ready"} | under_way.keys(),
             "mattes": set(c.scalars(select(database.mattes.c.id))),
+            "composites": {
+                row.id for row in jobs.composites(c) if not row.problem or may_be_retried(row.problem)
+            },
         }
     for folder, names in known.items():
         for name in objects.stale(folder, seconds, but={*names, "zarr.json"}):
@@ -46,5 +41,6 @@ def sweep(engine: Engine, objects: Objects, seconds: float = KEPT) -> None:
             objects.delete(f"{folder}/{name}")
     if not seconds:
         objects.sweep("uploads")
+        objects.sweep("composites")
         for upload, parts in under_way.items():
             uploads.sweep(objects, upload, parts)

@@ -7,6 +7,7 @@
     │   ├── CaptureError        a capture's archive or capture.json
     │   ├── ArchiveError        a matte's archive
     │   ├── ImageError          bytes that should be an image
+    │   ├── ClipError           a clip to be a backdrop
     │   └── OptionError         an option of recovery
     ├── NotFound                no such capture, job, matte or frame
     ├── Conflict                it exists, but not in a state that allows this
@@ -63,6 +64,10 @@ class ArchiveError(InvalidInput):
 
 class ImageError(InvalidInput):
     """Bytes that should be an image."""
+
+
+class ClipError(InvalidInput):
+    """A clip to be a backdrop."""
 
 
 class OptionError(InvalidInput):

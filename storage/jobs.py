@@ -10,7 +10,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import Column, Connection, Row, bindparam, delete, func, insert, or_, select, update
+from sqlalchemy import Column, Connection, Row, bindparam, delete, exists, func, insert, or_, select, update
 
 from storage.database import captures, find, jobs, log, made, mattes, new_id, tiles, totals
 from storage.errors import Conflict
@@ -28,15 +28,18 @@ def add(
     options: dict[str, Any],
     matte: str | None = None,
     trace: str | None = None,
+    job: str | None = None,
 ) -> str:
     """Queue a job; returns its id.
 
     Parameters
     ----------
+    job : str, optional
+        The id, if it has one already: something was stored under it.
     trace : str, optional
         The ``traceparent`` (W3C Trace Context) of the request that asks for it.
     """
-    job = new_id()
+    job = job or new_id()
     row = {
         "id": job,
         "kind": kind,
@@ -65,16 +68,29 @@ def active(connection: Connection) -> Sequence[Row[Any]]:
 
 
 def not_wound_up(connection: Connection) -> Sequence[Row[Any]]:
-    """Jobs that were cancelled, and that have left something: a matte, or a capture, in the making."""
+    """Jobs that were cancelled, and that have left something: a matte, or a capture, in the making, or a composite."""
+    # A composite has no other record: what it left is there for as long as its tiles are, see `clear`.
+    left = (jobs.c.kind == "composite") & exists().where(tiles.c.job == jobs.c.id)
     query = (
         select(jobs)
-        .outerjoin(mattes, mattes.c.id == jobs.c.matte)
+        .outerjoin(mattes, mattes.c.job == jobs.c.id)
         .outerjoin(captures, captures.c.job == jobs.c.id)
         .where(
-            jobs.c.state == "cancelled", or_(mattes.c.state == "recovering", captures.c.state == "ingesting")
+            jobs.c.state == "cancelled",
+            or_(mattes.c.state == "recovering", captures.c.state == "ingesting", left),
         )
     )
     return connection.execute(query).all()
+
+
+def composites(connection: Connection) -> Sequence[Row[Any]]:
+    """The jobs that have, or had, a clip."""
+    return connection.execute(select(jobs).where(jobs.c.kind == "composite")).all()
+
+
+def clear(connection: Connection, job: str) -> None:
+    """Delete the tiles of a job that was cancelled; what is known of it as a whole stays."""
+    connection.execute(delete(tiles).where(tiles.c.job == job))
 
 
 def begin(connection: Connection, job: str) -> None:

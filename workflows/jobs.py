@@ -11,11 +11,11 @@ from functools import lru_cache
 from itertools import product
 from typing import Any
 
-from storage import captures, mattes
+from storage import captures, composites, mattes
 from storage.captures import Stack
 from storage.jobs import FINISH, PREPARE
 from storage.objects import Objects
-from workflows import tiles
+from workflows import clips, tiles
 from workflows.ingest import frames
 from workflows.ingest.bundle import Limits
 from workflows.ingest.measure import measure
@@ -40,7 +40,7 @@ class Task:
     matte : str
         Id of the matte; empty for ingest.
     options : dict
-        Of recovery; empty for ingest.
+        Of recovery, or of a composite (``transfer``); empty for ingest.
     limits : Limits
         What a bundle may cost.
     plan : dict
@@ -150,9 +150,30 @@ def _recover_finish(task: Task) -> dict[str, Any]:
     return mattes.Matte(_objects(task.store), task.matte).figures
 
 
+def _composite_prepare(task: Task) -> dict[str, Any]:
+    return clips.prepare(_objects(task.store), task.job, task.matte, task.limits)
+
+
+def _composite_work(task: Task, tile: int) -> int:
+    transfer = task.options["transfer"]
+    return clips.work(_objects(task.store), task.job, task.matte, transfer, task.limits, task.plan, tile)
+
+
+def _composite_missing(task: Task) -> list[int]:
+    return composites.missing(_objects(task.store), task.job, task.plan["tiles"])
+
+
+def _composite_finish(task: Task) -> dict[str, Any]:
+    clips.finish(_objects(task.store), task.job, task.plan)
+    return {}
+
+
 KINDS = {
     "ingest": Kind("reading", _ingest_prepare, _ingest_work, _ingest_missing, _ingest_finish, False),
     "recover": Kind("recovering", _recover_prepare, _recover_work, _recover_missing, _recover_finish, True),
+    "composite": Kind(
+        "compositing", _composite_prepare, _composite_work, _composite_missing, _composite_finish, False
+    ),
 }
 
 

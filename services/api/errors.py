@@ -13,6 +13,7 @@ from starlette.requests import ClientDisconnect
 from storage.errors import (
     ArchiveError,
     CaptureError,
+    ClipError,
     Conflict,
     Corrupt,
     EnvmatteError,
@@ -65,6 +66,7 @@ PROBLEMS: dict[type[Exception], tuple[int, str, str]] = {
     CaptureError: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-capture", "The capture can't be used"),
     ArchiveError: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-archive", "The archive can't be used"),
     ImageError: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-image", "The image can't be used"),
+    ClipError: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-clip", "The clip can't be used"),
     OptionError: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-option", "The options can't be used"),
     TooLarge: (HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too-large", "Too large"),
     WrongMediaType: (HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "wrong-media-type", "Wrong media type"),

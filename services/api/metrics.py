@@ -18,7 +18,7 @@ from storage.jobs import ACTIVE
 from storage.leases import Sign
 
 router = APIRouter(tags=["system"])
-KINDS = ("ingest", "recover")
+KINDS = ("ingest", "recover", "composite")
 JOB_STATES = ("queued", "running", "succeeded", "failed", "cancelled")
 Labelled = Iterable[tuple[tuple[str, ...], float]]
 
@@ -78,7 +78,7 @@ def _of_work(connection: Connection) -> Iterator[Metric]:
         steps.add_metric(labels, row.tiles, row.seconds)
     yield steps
     for name, column, text in (
-        ("pixels", "pixels", "Pixels done: of frames read, of mattes recovered."),
+        ("pixels", "pixels", "Pixels done: of frames read, of mattes recovered, of frames composited."),
         ("tile_failures", "misses", "Attempts at a tile or a step that failed."),
         ("tile_losses", "losses", "Tiles and steps that were lost, with their worker or in the store."),
     ):

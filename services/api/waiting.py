@@ -38,7 +38,7 @@ def reason(connection: Connection, row: Row[Any], sign: Sign | None) -> str | No
     trouble = trouble_of(sign)
     if trouble is not None:
         return trouble
-    if row.kind != "ingest":
+    if row.kind == "recover":
         state = connection.scalar(select(captures.c.state).where(captures.c.id == row.capture))
         if state == "ingesting":
             return f"its capture {row.capture} is being ingested"

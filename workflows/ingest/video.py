@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import closing
+from fractions import Fraction
 from itertools import chain
 from typing import Any, BinaryIO, NamedTuple
 
@@ -79,6 +80,8 @@ class Clip:
     ----------
     width, height : int
         Upright: after the container's rotation.
+    lost : list of int
+        When frames that could not be decoded were to be shown, in ticks, as far as the video was read.
 
     Raises
     ------
@@ -88,6 +91,7 @@ class Clip:
 
     def __init__(self, file: BinaryIO, entry: str, memory: int) -> None:
         self._entry, self._limit = entry, memory
+        self.lost: list[int] = []
         try:
             self._container: InputContainer = av.open(
                 file, "r", container_options={"format_whitelist": CONTAINERS}, io_open=_refuse
@@ -119,7 +123,39 @@ class Clip:
     @property
     def tick(self) -> float:
         """Seconds of a tick of the container's clock."""
-        return float(self._stream.time_base or 1)
+        return float(self.time_base)
+
+    @property
+    def time_base(self) -> Fraction:
+        """The same, exactly."""
+        return self._stream.time_base or Fraction(1)
+
+    @property
+    def announced(self) -> float:
+        """Seconds that it lasts by what the container says; 0 if it does not say."""
+        if self._stream.duration is not None:
+            return float(self._stream.duration * self.time_base)
+        return (self._container.duration or 0) / av.time_base
+
+    def ticks(self, most: int) -> tuple[NDArray[np.int64], int]:
+        """When each frame is shown, and for how long the last one is, in ticks. Once: it reads the video to its end.
+
+        Raises
+        ------
+        CaptureError
+            If there are more than ``most``.
+        """
+        found, last = [], 0
+        for frame in self._from_start:
+            found.append(_tick(frame))
+            last = int(frame.duration or 0)
+            if len(found) > most:
+                raise CaptureError(
+                    f"{self._entry} has more than {most} frames: cut it into several",
+                    entry=self._entry,
+                    limit=most,
+                )
+        return np.array(found, np.int64), last or (found[-1] - found[-2] if len(found) > 1 else 1)
 
     def signatures(self, most: int, every: float = math.inf) -> tuple[Signatures, NDArray[np.int64], Large]:
         """The frames' signatures, and when each is shown, in ticks. Once: it reads the video to its end.
@@ -256,12 +292,16 @@ class Clip:
                 frames = self._stream.decode(packet)
             except av.FFmpegError:
                 whole = False
+                if packet.pts is not None:
+                    self.lost.append(packet.pts)
                 continue
             for frame in frames:
                 # What was lost goes on from frame to frame until one is coded by itself.
                 whole = not frame.is_corrupt and (whole or frame.key_frame)
                 if whole:
                     yield frame
+                elif frame.pts is not None:
+                    self.lost.append(frame.pts)
 
     def _see_that_it_fits(self, width: int, height: int) -> None:
         if 6 * width * height > self._limit:
