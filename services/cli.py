@@ -7,9 +7,10 @@ import json
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 import click
 
@@ -112,7 +113,7 @@ def status(job: str, url: str, key: str | None, as_json: bool) -> None:
     "--output",
     type=click.Path(dir_okay=False, path_type=Path),
     required=True,
-    help="PNG, JPEG or EXR to write, by the end of its name.",
+    help="PNG, JPEG or EXR to write, or MP4 of a clip, by the end of its name.",
 )
 @click.option("--transfer", type=click.Choice(["srgb", "linear"]), default="srgb", show_default=True)
 @click.option("--right", type=float, help="The backdrop's move to the right, in widths of the monitor.")
@@ -123,14 +124,36 @@ def status(job: str, url: str, key: str | None, as_json: bool) -> None:
 def composite(
     matte: str, backdrop: Path, output: Path, url: str, key: str | None, as_json: bool, **wanted: Any
 ) -> None:
-    """Put a matte in front of a backdrop."""
-    kind = KINDS.get(output.suffix.lower())
-    if kind is None:
-        raise click.BadParameter(f"{output}: its name must end in {', '.join(KINDS)}", param_hint="--output")
+    """Put a matte in front of a backdrop, a picture or a clip.
+
+    A clip, told by its first bytes, is composited by a job, frame by frame, and written once that is done.
+    """
     given = {name: value for name, value in wanted.items() if value is not None}
+    ends = [".mp4"] if _is_clip(backdrop) else list(KINDS)
+    if output.suffix.lower() not in ends:
+        raise click.BadParameter(f"{output}: its name must end in {', '.join(ends)}", param_hint="--output")
     with Client(url, key) as client:
-        _write(output, client.composite(matte, backdrop.read_bytes(), kind=kind, **given))
+        if _is_clip(backdrop):
+            job = client.composite_clip(matte, backdrop, **given)
+            with Progress("composite") as bar:
+                client.wait(job["id"], progress=bar.job)
+            with _whole(output) as file:
+                client.video(job["id"], file)
+        else:
+            kind = KINDS[output.suffix.lower()]
+            _write(output, client.composite(matte, backdrop.read_bytes(), kind=kind, **given))
     _say({"output": str(output)}, as_json, "output")
+
+
+def _is_clip(file: Path) -> bool:
+    """Whether a file begins as MP4 and MOV do, MKV and WebM, or AVI."""
+    with file.open("rb") as source:
+        start = source.read(12)
+    return (
+        start[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free")
+        or start[:4] == b"\x1aE\xdf\xa3"
+        or (start[:4] == b"RIFF" and start[8:] == b"AVI ")
+    )
 
 
 @main.command()
@@ -258,10 +281,20 @@ def _pair(option: str) -> tuple[str, Any]:
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all, so that an interrupt leaves nothing half done."""
+    with _whole(path) as file:
+        file.write(data)
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[BinaryIO]:
+    """A file that is written whole or not at all, so that an interrupt leaves nothing half done."""
     part = path.with_name(path.name + ".part")
-    part.write_bytes(data)
-    os.replace(part, path)
+    try:
+        with part.open("wb") as file:
+            yield file
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def _say(found: dict[str, Any], as_json: bool, *names: str) -> None:

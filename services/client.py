@@ -202,6 +202,22 @@ class Client:
         path = f"/v1/mattes/{matte}/composite"
         return self._computed("POST", path, params=wanted, content=backdrop, headers=headers)
 
+    def composite_clip(self, matte: str, clip: Path, *, transfer: str = "srgb") -> Job:
+        """Queue the composite of a clip, a video file; returns its job, which `video` gets the result of."""
+        headers = {"Content-Type": "video/*", "Idempotency-Key": secrets.token_hex(16)}
+        path = f"/v1/mattes/{matte}/composite"
+        with clip.open("rb") as file:
+            return self._json("POST", path, params={"transfer": transfer}, headers=headers, content=file)
+
+    def video(self, job: str, target: BinaryIO) -> None:
+        """Write the video of a composite job, an MP4, to a file, some megabytes at a time."""
+        at, size = 0, 1
+        while at < size:
+            asked = {"Range": f"bytes={at}-{at + LARGEST - 1}"}
+            answer = self._send("GET", f"/v1/jobs/{job}/video.mp4", headers=asked)
+            at += target.write(answer.content)
+            size = int(answer.headers.get("Content-Range", f"/{at}").rpartition("/")[2])
+
     def layer(self, matte: str, name: str) -> bytes:
         """A layer of a matte, as `confidence.png`."""
         return self._computed("GET", f"/v1/mattes/{matte}/layers/{name}")

@@ -115,7 +115,9 @@ class Settings(ClusterSettings):
     keys: Annotated[tuple[str, ...], NoDecode] = Field(
         (), description="API keys, separated by commas. With none the service is open, and on loopback alone."
     )
-    upload_bytes: int = Field(8 << 30, ge=1, description="Bytes of the largest archive that is taken.")
+    upload_bytes: int = Field(
+        8 << 30, ge=1, description="Bytes of the largest archive or clip that is taken."
+    )
     upload_seconds: int = Field(
         86_400, ge=1, description="How long a resumable upload is kept after the last byte of it came."
     )

@@ -10,6 +10,7 @@ from services import tracing
 from services.api import (
     archives,
     captures,
+    clips,
     cluster,
     composites,
     errors,
@@ -54,6 +55,7 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
         reports.router,
         uploads.router,
         jobs.router,
+        clips.router,
         mattes.router,
         composites.router,
         archives.router,

@@ -12,7 +12,8 @@ from services import tracing
 from services.api.context import After, Limit, Needs, read_json
 from services.api.eta import seconds_left
 from services.api.waiting import reason
-from storage import captures, jobs, leases, mattes
+from services.kinds import KINDS
+from storage import captures, composites, jobs, leases, mattes
 from storage.database import jobs as table
 from storage.database import new_id, page, reading, writing
 from storage.errors import Conflict
@@ -38,7 +39,7 @@ async def _job_request(request: Request) -> JobRequest:
 
 
 class Tiles(BaseModel):
-    """Pieces of a job's work: squares of a matte, or slabs of frames."""
+    """Pieces of a job's work: squares of a matte, slabs of frames, or stretches of a clip."""
 
     total: int
     done: int
@@ -49,7 +50,7 @@ class Job(BaseModel):
     """A job."""
 
     id: str
-    kind: Literal["ingest", "recover"]
+    kind: Literal["ingest", "recover", "composite"]
     state: State
     stage: str
     progress: float
@@ -64,6 +65,7 @@ class Job(BaseModel):
     matte: str | None
     options: dict[str, Any]
     problem: dict[str, Any] | None
+    video: str | None
     created_at: datetime
     started_at: datetime | None
     finished_at: datetime | None
@@ -90,6 +92,9 @@ class Job(BaseModel):
             workers=len(sign.cluster["workers"]) if running and sign else 0,
             options=row.options,
             problem=row.problem,
+            video=f"/v1/jobs/{row.id}/video.mp4"
+            if row.kind == "composite" and row.state == "succeeded"
+            else None,
             created_at=datetime.fromtimestamp(row.created_at, UTC),
             started_at=_time(row.started_at),
             finished_at=_time(row.finished_at),
@@ -211,26 +216,21 @@ def retry_job(context: Needs, id: str) -> Job:
     """Queue a failed job again; the tiles that are done are kept, unless `ENVMATTE_INGEST_MEMORY` has changed."""
     with writing(context.engine) as c:
         row = jobs.get(c, id)
-        capture = captures.get(c, row.capture)
         # Slabs of an ingest are as large as the memory allows, and want to be smaller where that was too much.
         memory = (row.plan or {}).get("memory", context.settings.ingest_memory)
         jobs.retry(c, id, anew=memory != context.settings.ingest_memory)
-        if row.kind == "recover":
-            if capture.state == "failed":
-                raise Conflict(f"capture {capture.id} failed: {capture.problem['detail']}")
-            mattes.change(c, row.matte, state="recovering")
-        elif captures.may_be_retried(capture.problem):
-            captures.change(c, capture.id, state="ingesting", problem=None)
-        else:
-            raise Conflict(f"capture {capture.id} can't be used, and nothing of it was kept; upload it again")
+        KINDS[row.kind].retried(c, row)
         return Job.of(c, jobs.get(c, id))
 
 
 @router.delete("/jobs/{id}", status_code=204)
 def delete_job(context: Needs, id: str) -> None:
-    """Delete a job that has ended, and its log; its matte stays."""
+    """Delete a job that has ended, and its log; its matte stays, the video of a composite goes."""
     with writing(context.engine) as c:
+        kind = jobs.get(c, id).kind
         jobs.forget(c, id)
+    if kind == "composite":
+        context.objects.delete(composites.path(id))
 
 
 def _time(seconds: float | None) -> datetime | None:

@@ -76,8 +76,9 @@ def delete_matte(context: Needs, id: str) -> None:
     """Delete a matte."""
     with writing(context.engine) as c:
         row = mattes.get(c, id)
-        if any(job.id == row.job for job in jobs.active(c)):
-            raise Conflict(f"job {row.job} is recovering matte {id}; cancel it first")
+        busy = [job.id for job in jobs.active(c) if job.matte == row.id]
+        if busy:
+            raise Conflict(f"job {busy[0]} works on matte {id}; cancel it first, or wait for it")
         mattes.forget(c, id)
     context.cache.forget(id)
     context.objects.delete(mattes.path(id))

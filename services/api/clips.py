@@ -1,0 +1,175 @@
+"""Composites of clips over HTTP: a job that makes a video, and the video."""
+
+import re
+from collections.abc import Iterator
+from typing import BinaryIO, Literal
+
+import anyio.to_thread
+from fastapi import APIRouter, Request, Response
+from fastapi.responses import StreamingResponse
+from sqlalchemy import Row
+from sqlalchemy.exc import IntegrityError
+
+from services import tracing
+from services.api.context import Context, Needs
+from services.api.errors import TooLarge
+from services.api.jobs import Job
+from storage import composites, jobs, mattes, uploads
+from storage.database import new_id, reading, writing
+from storage.errors import Conflict, Corrupt
+
+router = APIRouter(tags=["jobs"])
+CALL = "POST /v1/mattes/{id}/composite"
+PIECE = 1 << 20
+"""Bytes of a video that are read at once."""
+RANGE = re.compile(r"bytes=(\d*)-(\d*)")
+
+
+def is_clip(request: Request) -> bool:
+    """Whether a request brings a clip, and not a picture."""
+    return request.headers.get("content-type", "").strip().lower().startswith("video/")
+
+
+async def composite_clip(
+    context: Context, request: Request, matte: str, transfer: Literal["srgb", "linear"]
+) -> Response:
+    """Queue the composite of a clip, the body of a request, which is streamed into the store.
+
+    Raises
+    ------
+    TooLarge
+        Before the first byte if its length is said, else as soon as more than ENVMATTE_UPLOAD_BYTES have come.
+    NoRoom
+        If the store has no room for it.
+    Conflict
+        If the matte is not ready.
+    """
+    limit = context.settings.upload_bytes
+    length = int(request.headers.get("content-length", 0))
+    if length > limit:
+        raise _too_large(limit)
+    key = request.headers.get("idempotency-key", "")[:256]
+    made = await anyio.to_thread.run_sync(_check, context, matte, key, length)
+    job = made or new_id()
+    if made is None:
+        try:
+            await _receive(context, request, job, limit)
+            job = await anyio.to_thread.run_sync(_queue, context, job, matte, transfer, key)
+        except Exception:
+            # Not when cancelled, where `_queue` may still be at work: what has no job the coordinator sweeps.
+            await anyio.to_thread.run_sync(context.objects.delete, composites.path(job))
+            raise
+    answer = await anyio.to_thread.run_sync(_job, context, job)
+    headers = {"Location": f"/v1/jobs/{job}"}
+    return Response(answer.model_dump_json(), 202, headers, media_type="application/json")
+
+
+@router.get(
+    "/jobs/{id}/video.mp4",
+    response_class=Response,
+    responses={
+        200: {"content": {"video/mp4": {}}, "description": "The video"},
+        206: {"content": {"video/mp4": {}}, "description": "A part of it, by `Range`"},
+    },
+)
+def get_video(context: Needs, id: str, request: Request) -> Response:
+    """The video that a composite job has made: H.264 in MP4, with the times of the clip's frames, without sound."""
+    with reading(context.engine) as c:
+        row = jobs.get(c, id)
+    if row.kind != "composite" or row.state != "succeeded":
+        raise Conflict(
+            f"job {id} is {row.state}, and has no video; a composite of a clip has one once it has succeeded"
+        )
+    try:
+        file = context.objects.read(composites.video_path(id))
+    except FileNotFoundError as error:
+        raise Corrupt(f"the video of job {id} is not in the store; composite the clip again") from error
+    size = file.seek(0, 2)
+    start, end = _span(request.headers.get("range", ""), size)
+    if start >= size:
+        file.close()
+        return Response(status_code=416, headers={"Content-Range": f"bytes */{size}"})
+    headers = {"Accept-Ranges": "bytes", "Content-Length": str(end - start)}
+    part = end - start < size
+    if part:
+        headers["Content-Range"] = f"bytes {start}-{end - 1}/{size}"
+    file.seek(start)
+    pieces = _pieces(file, end - start)
+    return StreamingResponse(pieces, 206 if part else 200, headers, media_type="video/mp4")
+
+
+def _check(context: Context, matte: str, key: str, length: int) -> str | None:
+    """See that a clip can be taken; returns the job that a repeat with the same key has made already."""
+    with reading(context.engine) as c:
+        made = jobs.made_by(c, key, CALL) if key else None
+        if made is None:
+            _ready(mattes.get(c, matte))
+            uploads.check_room(c, context.objects, length)
+        return made
+
+
+async def _receive(context: Context, request: Request, job: str, limit: int) -> None:
+    size = 0
+    async with context.objects.write(composites.clip_path(job)) as file:
+        async for part in request.stream():
+            size += len(part)
+            if size > limit:
+                raise _too_large(limit)
+            await file.write(part)
+
+
+def _queue(context: Context, job: str, matte: str, transfer: Literal["srgb", "linear"], key: str) -> str:
+    """Write down the job of a clip that is stored; returns its id, or that of a repeat that was quicker."""
+    try:
+        with writing(context.engine) as c:
+            row = mattes.get(c, matte)
+            _ready(row)
+            options = {"transfer": transfer}
+            jobs.add(c, "composite", row.capture, options, matte, tracing.asked_by(), job)
+            jobs.begin(c, job)  # while it has tiles it has something in the store, see `jobs.not_wound_up`
+            if key:
+                jobs.remember(c, key, CALL, job)
+            return job
+    except IntegrityError:
+        with reading(context.engine) as c:
+            made = jobs.made_by(c, key, CALL) if key else None
+        if made is None:
+            raise
+        context.objects.delete(composites.path(job))
+        return made
+
+
+def _job(context: Context, job: str) -> Job:
+    with reading(context.engine) as c:
+        return Job.of(c, jobs.get(c, job))
+
+
+def _ready(row: Row[object]) -> None:
+    if row.state != "ready":
+        raise Conflict(f"matte {row.id} is {row.state}; job {row.job} says more")
+
+
+def _span(text: str, size: int) -> tuple[int, int]:
+    """The bytes that a Range asks for (RFC 9110, sect. 14.2), from the first up to one past the last.
+
+    All of them where it is none, or of more than one part: an answer may ignore it. Past the end if there are none.
+    """
+    found = RANGE.fullmatch(text.strip())
+    if found is None or not any(found.groups()):
+        return 0, size
+    first, last = found.groups()
+    if not first:
+        return (max(size - int(last), 0), size) if int(last) else (size, size)
+    end = min(int(last) + 1, size) if last else size
+    return (0, size) if last and int(last) < int(first) else (int(first), end)
+
+
+def _pieces(file: BinaryIO, size: int) -> Iterator[bytes]:
+    with file:
+        while size and (data := file.read(min(PIECE, size))):
+            size -= len(data)
+            yield data
+
+
+def _too_large(limit: int) -> TooLarge:
+    return TooLarge(f"a clip may have {limit} bytes; cut it, or raise ENVMATTE_UPLOAD_BYTES", limit=limit)
