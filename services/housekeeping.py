@@ -32,7 +32,9 @@ def sweep(engine: Engine, objects: Objects, seconds: float = KEPT) -> None:
             "uploads": {row.id for row in kept if row.state != "ready"} | under_way.keys(),
             "mattes": set(c.scalars(select(database.mattes.c.id))),
             "composites": {
-                row.id for row in jobs.composites(c) if not row.problem or may_be_retried(row.problem)
+                row.id
+                for row in jobs.composites(c)
+                if row.state != "cancelled" and (row.problem is None or may_be_retried(row.problem))
             },
         }
     for folder, names in known.items():
