@@ -5,7 +5,7 @@ from itertools import pairwise
 import pytest
 from sqlalchemy import Connection, Engine, func, select
 
-from storage import database, jobs
+from storage import database, jobs, mattes
 from storage.database import writing
 from storage.errors import Conflict, NotFound
 
