@@ -202,12 +202,18 @@ class Client:
         path = f"/v1/mattes/{matte}/composite"
         return self._computed("POST", path, params=wanted, content=backdrop, headers=headers)
 
-    def composite_clip(self, matte: str, clip: Path, *, transfer: str = "srgb") -> Job:
-        """Queue the composite of a clip, a video file; returns its job, which `video` gets the result of."""
+    def composite_clip(self, matte: str, clip: Path, **wanted: str | float) -> Job:
+        """Queue the composite of a clip, a video file; returns its job, which `video` gets the result of.
+
+        Parameters
+        ----------
+        **wanted
+            ``transfer``, ``right``, ``down``, ``scale`` and ``angle``, as the call takes them.
+        """
         headers = {"Content-Type": "video/*", "Idempotency-Key": secrets.token_hex(16)}
         path = f"/v1/mattes/{matte}/composite"
         with clip.open("rb") as file:
-            return self._json("POST", path, params={"transfer": transfer}, headers=headers, content=file)
+            return self._json("POST", path, params=wanted, headers=headers, content=file)
 
     def video(self, job: str, target: BinaryIO) -> None:
         """Write the video of a composite job, an MP4, to a file, some megabytes at a time."""

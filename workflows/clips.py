@@ -19,12 +19,18 @@ from storage import composites
 from storage.errors import CaptureError, ClipError, Corrupt
 from storage.mattes import Matte
 from storage.objects import PART, Objects, together
-from workflows import images, segments, tone
+from workflows import segments, tone
 from workflows.composite import composite
+from workflows.composite.cache import Cache
+from workflows.composite.codes import encode
+from workflows.composite.light import Backdrop
+from workflows.composite.placing import Placement
 from workflows.ingest.bundle import Limits
 from workflows.ingest.video import PARTS, Clip, Share, opened
 
 Transfer = Literal["srgb", "linear"]
+KEPT = 1 << 29
+"""Bytes of a matte that a worker keeps from frame to frame."""
 MOST = 1_000_000
 """Frames of a clip, at most: nine hours at 30 a second."""
 SHORTEST, LONGEST = 16, 64
@@ -87,11 +93,19 @@ def work(
     job: str,
     matte: str,
     transfer: Transfer,
+    placement: Placement,
     limits: Limits,
     plan: dict[str, Any],
     tile: int,
 ) -> int:
     """Composite the frames of a tile, and store them as a segment; returns their pixels.
+
+    Parameters
+    ----------
+    placement : Placement
+        Where the clip stands.
+    plan : dict
+        As `prepare` returned it.
 
     Raises
     ------
@@ -100,11 +114,21 @@ def work(
     """
     length = plan["length"]
     ticks = _ticks(objects, job)[tile * length : (tile + 1) * length]
-    put = Matte(objects, matte)
-    light = tone.table(transfer, np.dtype(np.uint16))
+    cache = Cache(objects, KEPT)
+    put, light = cache.matte(matte), tone.table(transfer, np.dtype(np.uint16))
+
+    def shown(frame: NDArray[np.uint16]) -> NDArray[np.uint8]:
+        """An 8 bit picture, black where the mask left the matte out."""
+        backdrop = Backdrop(frame, light)
+        where = None if placement == Placement() else placement
+        picture = composite(
+            put, backdrop, placement=where, read=lambda *at: cache.block(matte, *at), threads=1
+        )
+        return encode(picture, transfer, np.dtype(np.uint8), 1)[..., :3].astype(np.uint8, copy=False)
+
     with _reading(objects, job, limits) as clip:
         frames = clip.means([[Share(tick, PARTS)] for tick in ticks.tolist()])
-        pictures = (_put_before(put, light[frame], transfer) for frame in frames)
+        pictures = (shown(frame) for frame in frames)
         segment = segments.encode(pictures, plan["rate"], length, transfer)
     objects.put(composites.segment_path(job, tile), segment)
     return len(ticks) * put.width * put.height
@@ -118,14 +142,6 @@ def finish(objects: Objects, job: str, plan: dict[str, Any]) -> None:
         segments.join(found, _ticks(objects, job), plan["last"], Fraction(*plan["tick"]), file)
         file.seek(0)
         together(_store(objects, composites.video_path(job), file))
-
-
-def _put_before(matte: Matte, backdrop: NDArray[np.float32], transfer: Transfer) -> NDArray[np.uint8]:
-    """A matte before linear light, as an 8 bit picture; black where the mask left it out."""
-    picture = composite(matte, backdrop)
-    light = np.clip(picture[..., :3], 0, 1) * picture[..., 3:]
-    codes = images.to_integers(tone.from_light(light, transfer), np.dtype(np.uint8))
-    return codes.astype(np.uint8, copy=False)
 
 
 def _losses(clip: Clip, ticks: NDArray[np.int64], last: int) -> Iterator[str]:

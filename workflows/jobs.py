@@ -16,6 +16,7 @@ from storage.captures import Stack
 from storage.jobs import FINISH, PREPARE
 from storage.objects import Objects
 from workflows import clips, tiles
+from workflows.composite.placing import Placement
 from workflows.ingest import frames
 from workflows.ingest.bundle import Limits
 from workflows.ingest.measure import measure
@@ -40,7 +41,7 @@ class Task:
     matte : str
         Id of the matte; empty for ingest.
     options : dict
-        Of recovery, or of a composite (``transfer``); empty for ingest.
+        Of recovery, or of a composite (``transfer``, ``placement``); empty for ingest.
     limits : Limits
         What a bundle may cost.
     plan : dict
@@ -155,8 +156,9 @@ def _composite_prepare(task: Task) -> dict[str, Any]:
 
 
 def _composite_work(task: Task, tile: int) -> int:
-    transfer = task.options["transfer"]
-    return clips.work(_objects(task.store), task.job, task.matte, transfer, task.limits, task.plan, tile)
+    transfer, placement = task.options["transfer"], Placement(**task.options["placement"])
+    objects = _objects(task.store)
+    return clips.work(objects, task.job, task.matte, transfer, placement, task.limits, task.plan, tile)
 
 
 def _composite_missing(task: Task) -> list[int]:

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterator
-from typing import BinaryIO, Literal
+from typing import Any, BinaryIO
 
 import anyio.to_thread
 from fastapi import APIRouter, Request, Response
@@ -30,10 +30,13 @@ def is_clip(request: Request) -> bool:
     return request.headers.get("content-type", "").strip().lower().startswith("video/")
 
 
-async def composite_clip(
-    context: Context, request: Request, matte: str, transfer: Literal["srgb", "linear"]
-) -> Response:
+async def composite_clip(context: Context, request: Request, matte: str, options: dict[str, Any]) -> Response:
     """Queue the composite of a clip, the body of a request, which is streamed into the store.
+
+    Parameters
+    ----------
+    options : dict
+        ``transfer``, and ``placement`` as `Placement` takes it.
 
     Raises
     ------
@@ -54,7 +57,7 @@ async def composite_clip(
     if made is None:
         try:
             await _receive(context, request, job, limit)
-            job = await anyio.to_thread.run_sync(_queue, context, job, matte, transfer, key)
+            job = await anyio.to_thread.run_sync(_queue, context, job, matte, options, key)
         except Exception:
             # Not when cancelled, where `_queue` may still be at work: what has no job the coordinator sweeps.
             await anyio.to_thread.run_sync(context.objects.delete, composites.path(job))
@@ -118,13 +121,12 @@ async def _receive(context: Context, request: Request, job: str, limit: int) -> 
             await file.write(part)
 
 
-def _queue(context: Context, job: str, matte: str, transfer: Literal["srgb", "linear"], key: str) -> str:
+def _queue(context: Context, job: str, matte: str, options: dict[str, Any], key: str) -> str:
     """Write down the job of a clip that is stored; returns its id, or that of a repeat that was quicker."""
     try:
         with writing(context.engine) as c:
             row = mattes.get(c, matte)
             _ready(row)
-            options = {"transfer": transfer}
             jobs.add(c, "composite", row.capture, options, matte, tracing.asked_by(), job)
             jobs.begin(c, job)  # while it has tiles it has something in the store, see `jobs.not_wound_up`
             if key:

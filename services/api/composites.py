@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
-from typing import IO, Annotated, Literal, TypeVar
+from typing import IO, Annotated, Any, Literal, TypeVar
 
 import anyio.to_thread
 import numpy as np
@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from starlette.datastructures import Headers
 
+from services.api import clips
 from services.api.context import Context, Needs, spool_body
 from services.api.errors import NotAcceptable, NotNeeded, problem_of
 from services.api.errors import answer as problem_answer
+from services.api.jobs import Job
 from storage import jobs, mattes
 from storage.database import reading
 from storage.errors import Conflict, Corrupt, OptionError
@@ -94,6 +96,21 @@ class Wanted(BaseModel):
         wanted = Placement(self.right, self.down, self.scale, self.angle)
         return None if wanted == Placement() else wanted
 
+    def of_a_clip(self) -> dict[str, Any]:
+        """The options of a clip's job.
+
+        Raises
+        ------
+        OptionError
+            If what is wanted is only to be had of a still.
+        """
+        placement = {"right": self.right, "down": self.down, "scale": self.scale, "angle": self.angle}
+        for name in self.model_fields_set - placement.keys() - {"transfer"}:
+            raise OptionError(
+                f"{name} is for stills: a clip takes transfer, {', '.join(placement)}", field=name
+            )
+        return {"transfer": self.transfer, "placement": placement}
+
 
 @router.post(
     "/mattes/{id}/composite",
@@ -102,11 +119,14 @@ class Wanted(BaseModel):
         200: {
             "content": {kind: {"schema": {"type": "string", "format": "binary"}} for kind in ANSWERS},
             "description": "The composite",
-        }
+        },
+        202: {"description": "The job that composites a clip", "model": Job},
     },
     openapi_extra={
         "requestBody": {
-            "content": {kind: {"schema": {"type": "string", "format": "binary"}} for kind in TAKEN}
+            "content": {
+                kind: {"schema": {"type": "string", "format": "binary"}} for kind in (*TAKEN, "video/*")
+            }
         }
     },
 )
@@ -119,7 +139,11 @@ async def post_composite(
     black in a JPEG. An EXR is linear light, and may be negative or above 1. A matte that is still being recovered is
     composited as far as it is: `Envmatte-Recovered` tells the share of its blocks. What the caller has already, by
     `If-None-Match`, is not computed again, but answered with 412.
+
+    A video as the body, `Content-Type: video/*`, is answered with 202 and the job that composites its frames.
     """
+    if clips.is_clip(request):
+        return await clips.composite_clip(context, request, id, wanted.of_a_clip())
     kind = _chosen(request.headers.get("accept", "*/*"))
     seen = await anyio.to_thread.run_sync(_seen, context, id)
     async with spool_body(request, context.settings.backdrop_bytes) as body, context.composites:

@@ -136,7 +136,7 @@ def make(objects: Objects, matte: Matte) -> Make:
         data: bytes, job: str = "j", order: Callable[[range], Any] = iter, transfer: str = "srgb"
     ) -> bytes:
         objects.put(composites.clip_path(job), data)
-        task = Task(job, objects.url, "c", "m", {"transfer": transfer}, LIMITS, {})
+        task = Task(job, objects.url, "c", "m", {"transfer": transfer, "placement": {}}, LIMITS, {})
         task = replace(task, plan=run("composite", task, PREPARE)[1])
         for tile in order(range(task.plan["tiles"])):
             assert run("composite", task, tile)[1] % (HEIGHT * WIDTH) == 0
@@ -289,7 +289,7 @@ def test_more_frames_than_are_taken_are_refused(
 def test_a_segment_that_is_missing_is_named_and_done_again(make: Make, objects: Objects) -> None:
     data = clip(pictures(50), even(50))
     whole = make(data)
-    task = Task("j", objects.url, "c", "m", {"transfer": "srgb"}, LIMITS, {})
+    task = Task("j", objects.url, "c", "m", {"transfer": "srgb", "placement": {}}, LIMITS, {})
     task = replace(task, plan=run("composite", task, PREPARE)[1])
     objects.delete(composites.segment_path("j", 1))
     assert run("composite", task, FINISH)[1] == {"missing": [1]}
