@@ -180,6 +180,21 @@ def import_(file: Path, url: str, key: str | None, as_json: bool) -> None:
 
 
 @main.command()
+@click.argument("matte")
+@click.argument("folder", type=click.Path(file_okay=False, path_type=Path))
+@_remote
+def layers(matte: str, folder: Path, url: str, key: str | None, as_json: bool) -> None:
+    """Write the layers of a matte for other tools to FOLDER: all.exr, stmap.exr, and 16-bit PNGs."""
+    names = ("all.exr", "stmap.exr", "S.png", "rho.png", "alpha.png", "confidence.png")
+    with Client(url, key) as client:
+        for name in names:
+            layer = client.layer(matte, name)
+            folder.mkdir(parents=True, exist_ok=True)
+            _write(folder / name, layer)
+    _say({"folder": str(folder), "layers": names}, as_json, "folder")
+
+
+@main.command()
 @click.option(
     "-o", "--output", type=click.Path(dir_okay=False, path_type=Path), default=Path("envmatte-demo.png")
 )

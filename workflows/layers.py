@@ -175,6 +175,8 @@ def _encode(matte: Matte, planes: Planes) -> bytes:
         "comments": _COMMENTS,
     }
     target = io.BytesIO()
-    with OpenEXR.File(header, planes) as file:
+    # The library passes over strides.
+    whole = {name: np.ascontiguousarray(plane) for name, plane in planes.items()}
+    with OpenEXR.File(header, whole) as file:
         file.write(target)
     return target.getvalue()

@@ -47,6 +47,11 @@ class Pixel:
     lobes: NDArray[np.float32]
 
     @property
+    def levels(self) -> NDArray[np.int64]:
+        """(n,) the grid of the pyramid that each cell is on."""
+        return _places(Pyramid.over(self.columns, self.rows), self.node)[0]
+
+    @property
     def cells(self) -> NDArray[np.float64]:
         """(n, 4) u and v of each cell's centre, and the cell's width and height; 0 to 1 over the monitor, v up.
 

@@ -15,6 +15,7 @@ from services.api import (
     composites,
     errors,
     jobs,
+    layers,
     mattes,
     metrics,
     programs,
@@ -59,6 +60,7 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
         mattes.router,
         composites.router,
         archives.router,
+        layers.router,
         programs.router,
         cluster.router,
     ):

@@ -44,6 +44,8 @@ class Context:
     """Composites that are made at once, which bounds what they take: one more than there are cores."""
     imports: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(2))
     """Archives of mattes that are unpacked at once."""
+    layers: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(1))
+    """Layers of mattes that are encoded at once."""
 
 
 def _context(request: Request) -> Context:

@@ -13,8 +13,6 @@ from storage import jobs, mattes
 from storage.database import mattes as table
 from storage.database import page, reading, writing
 from storage.errors import Conflict
-from workflows import images
-from workflows.composite import confidence
 
 router = APIRouter(tags=["mattes"])
 R = TypeVar("R")
@@ -84,22 +82,8 @@ def delete_matte(context: Needs, id: str) -> None:
     context.objects.delete(mattes.path(id))
 
 
-@router.get(
-    "/mattes/{id}/layers/confidence.png",
-    response_class=Response,
-    responses={200: {"content": {"image/png": {}}, "description": "The layer"}},
-)
-def get_confidence(context: Needs, id: str) -> Response:
-    """How far to trust the matte, pixel by pixel: 0, not at all or not recovered, to 1, in 16 bits.
-
-    It is 1 / (1 + e / 0.01), e the error to expect of a composite there, as a share of the camera's full scale.
-    """
-    layer = confidence(mattes.Matte(context.objects, _ready(context, id).id))
-    answer = images.to_integers(layer[..., np.newaxis], np.dtype(np.uint16))
-    return Response(images.encode_png(answer), media_type="image/png")
-
-
-def _ready(context: Context, id: str) -> Row[Any]:
+def ready(context: Context, id: str) -> Row[Any]:
+    """The row of a matte; `Conflict` if it is not recovered."""
     with reading(context.engine) as c:
         row = mattes.get(c, id)
     if row.state != "ready":

@@ -244,7 +244,7 @@ def _cost(
     b: int,
     most: float,
 ) -> float:
-    """Ward's cost of merging two clusters; infinite if they are apart, or if it is more than there is use for."""
+    """Ward's cost of merging two clusters; infinite if they may not, or if it is more than there is use for."""
     dx, dy = about[b, 1] - about[a, 1], about[b, 2] - about[a, 2]
     square = dx * dx + dy * dy
     cost: float = about[a, 0] * about[b, 0] / (about[a, 0] + about[b, 0]) * square
