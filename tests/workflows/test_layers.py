@@ -193,13 +193,5 @@ def test_a_recomposite_from_the_exr_alone_is_as_close_to_the_truth(
 
     held = np.min([channels[f"lobe0.weight.{c}"] for c in "RGB"], axis=0) > 0.95
     one = scene.object_mask & held
-    print(
-        one.sum(),
-        scene.object_mask.sum(),
-        psnr(again, one),
-        psnr(own, one),
-        psnr(again, scene.object_mask),
-        psnr(own, scene.object_mask),
-    )
     assert one.sum() > 0.3 * scene.object_mask.sum()
     assert psnr(again, one) > psnr(own, one) - 1
