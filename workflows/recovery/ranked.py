@@ -21,8 +21,11 @@ _SPACING = 0.5
 _CLUSTERS, _WIDEST = 32, 4.0**6
 """A pixel of more nodes than these has those of two by two places of a grid merged first, which are not apart, and then
 again, so many times at most."""
+_FRINGE, _NO_COLOUR = 0.5, 0.05
+"""Standard deviations that the channels' own centres in a lobe may be apart; one of less of the light has no say."""
 _MOMENTS = 6
-"""Before the weights of the channels: of order 0 to 2, as :func:`~workflows.recovery.clusters.add_moments` has them."""
+"""Of order 0 to 2, as :func:`~workflows.recovery.clusters.add_moments` has them; the weights of the channels come after
+them, and these times x, and times y."""
 
 
 def ranked_lobes(transport: Transport, most: int, aspect: float) -> NDArray[np.float32]:
@@ -61,7 +64,7 @@ def ranked_lobes(transport: Transport, most: int, aspect: float) -> NDArray[np.f
     first the two that cost least (Ward, see :func:`~workflows.recovery.clusters.merge_clusters`) among those that
     are not apart and whose grids are the same or neighbours, for a sharp lobe on a broad one is another; then, if more
     than `most` are left, whichever cost least. The rows of a pixel are one set, so that a lobe has one place and three
-    weights; colours that come from different places are lobes apart.
+    weights; colours that come from different places are lobes apart, even where they touch.
 
     In the monitor's plane, ``(u, v aspect)``, a lobe's covariance is ``R diag(sigma_u^2, sigma_v^2) R^T``, R the
     rotation by theta.
@@ -92,7 +95,7 @@ def ranked_lobes(transport: Transport, most: int, aspect: float) -> NDArray[np.f
         across,
         up,
         (_SPACING * spacing) ** 2,
-        np.empty((room, _MOMENTS + 3)),
+        np.empty((room, _MOMENTS + 9)),
         lobes,
     )
     lobes[..., 1] /= np.float32(aspect)
@@ -130,6 +133,8 @@ def _rank(
                 to = clusters[n]
                 to[_MOMENTS:] = w if shared[i] else 0.0
                 to[_MOMENTS + channel] = w
+                for c in range(_MOMENTS, _MOMENTS + 3):
+                    to[c + 3], to[c + 6] = to[c] * x[0], to[c] * y[0]
                 w = (to[_MOMENTS] + to[_MOMENTS + 1] + to[_MOMENTS + 2]) / 3
                 to[0], to[1], to[2] = w, w * x[0], w * y[0]
                 to[3], to[4], to[5] = w * x[1], w * x[0] * y[0], w * y[1]
@@ -138,7 +143,7 @@ def _rank(
         while n > _CLUSTERS and widening < _WIDEST:
             n = _merge_squares(clusters, node, level, n)
             widening *= 4
-        n = _merge_near(clusters, level, n, least * widening)
+        n = _merge_near(clusters, level, n, least * widening, shared[i])
         n = merge_clusters(clusters, n, lobes.shape[1])
         for k in range(n):
             heaviest = k
@@ -176,7 +181,11 @@ def _merge_squares(
 
 @njit(nogil=True, cache=True)
 def _merge_near(
-    clusters: NDArray[np.float64], level: NDArray[np.int64], n: int, least: NDArray[np.float64]
+    clusters: NDArray[np.float64],
+    level: NDArray[np.int64],
+    n: int,
+    least: NDArray[np.float64],
+    shared: bool,
 ) -> int:
     """Merge clusters that are not apart, cheapest first; returns how many are left, at the front."""
     about = np.empty((n, _MOMENTS))
@@ -186,7 +195,7 @@ def _merge_near(
     for a in range(n):
         _centre(clusters[a], about[a])
     for a in range(n):
-        partner[a], cost[a] = _find_partner(about, level, n, least, alive, a)
+        partner[a], cost[a] = _find_partner(clusters, about, level, n, least, alive, a, shared)
     while True:
         a = -1
         for i in range(n):
@@ -203,10 +212,10 @@ def _merge_near(
             if not alive[i]:
                 continue
             if i == a or partner[i] == a or partner[i] == b:
-                partner[i], cost[i] = _find_partner(about, level, n, least, alive, i)
+                partner[i], cost[i] = _find_partner(clusters, about, level, n, least, alive, i, shared)
             elif i < a:
                 now = _cost(about, level, least, i, a, cost[i])
-                if now < cost[i]:
+                if now < cost[i] and (shared or not _fringes(clusters[i], clusters[a])):
                     partner[i], cost[i] = a, now
     left = 0
     for i in range(n):
@@ -218,19 +227,21 @@ def _merge_near(
 
 @njit(nogil=True, cache=True)
 def _find_partner(
+    clusters: NDArray[np.float64],
     about: NDArray[np.float64],
     level: NDArray[np.int64],
     n: int,
     least: NDArray[np.float64],
     alive: NDArray[np.bool_],
     a: int,
+    shared: bool,
 ) -> tuple[int, float]:
     """Which cluster behind one is the cheapest to merge with it, and at what cost: infinite if none is near."""
     partner, cost = -1, np.inf
     for b in range(a + 1, n):
         if alive[b]:
             now = _cost(about, level, least, a, b, cost)
-            if now < cost:
+            if now < cost and (shared or not _fringes(clusters[a], clusters[b])):
                 partner, cost = b, now
     return partner, cost
 
@@ -257,6 +268,26 @@ def _cost(
         if dx * dx * about[c, 3] + 2 * dx * dy * about[c, 4] + dy * dy * about[c, 5] >= limit:
             return cost
     return np.inf
+
+
+@njit(nogil=True, cache=True)
+def _fringes(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    """Whether the channels would lie apart in the merger of two clusters, which would take the colours off an edge."""
+    w = one[0] + other[0]
+    x, y = (one[1] + other[1]) / w, (one[2] + other[2]) / w
+    xx, yy = (one[3] + other[3]) / w - x * x, (one[5] + other[5]) / w - y * y
+    xy = (one[4] + other[4]) / w - x * y
+    for c in range(_MOMENTS, _MOMENTS + 3):
+        for d in range(c + 1, _MOMENTS + 3):
+            wc, wd = one[c] + other[c], one[d] + other[d]
+            if min(wc, wd) < _NO_COLOUR * 3 * w:
+                continue
+            dx = (one[d + 3] + other[d + 3]) / wd - (one[c + 3] + other[c + 3]) / wc
+            dy = (one[d + 6] + other[d + 6]) / wd - (one[c + 6] + other[c + 6]) / wc
+            square = dx * dx + dy * dy
+            if square * square > _FRINGE**2 * (dx * dx * xx + 2 * dx * dy * xy + dy * dy * yy):
+                return True
+    return False
 
 
 @njit(nogil=True, cache=True)

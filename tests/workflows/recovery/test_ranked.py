@@ -113,13 +113,20 @@ def test_more_than_there_is_room_for_merge_and_lose_no_light() -> None:
     np.testing.assert_allclose(lobes([whole], most=1)[0, 0, 0], mean, rtol=1e-6)
 
 
-def test_channels_have_one_place_and_three_weights() -> None:
-    cell, beside, far = 10 * COLUMNS + 20, 10 * COLUMNS + 21, 30 * COLUMNS + 60
-    found = lobes([{cell: 1.0}, {cell: 0.5, beside: 0.5}, {cell: 0.3, far: 0.7}])[0]
-    np.testing.assert_allclose(found[:2, 2:5], [[1, 1, 0.3], [0, 0, 0.7]], atol=1e-6)
+def test_channels_that_come_from_one_place_have_three_weights() -> None:
+    near, far = gaussian(20, 12, 2, 2, 0, 1.0), gaussian(60, 30, 2, 2, 0, 0.7)
+    green = gaussian(20.2, 12, 2, 2, 0, 1.0)
+    found = lobes([near, green, gaussian(20, 12, 2, 2, 0, 0.3) | far])[0]
+    np.testing.assert_allclose(found[:2, 2:5], [[1, 1, 0.3], [0, 0, 0.7]], atol=1e-5)
     assert not found[2:].any()
-    centre = (1.0 * 20.5 + 0.5 * 20.5 + 0.5 * 21.5 + 0.3 * 20.5) / 2.3 / COLUMNS
-    np.testing.assert_allclose(found[0, 0], centre, rtol=1e-6)
+    np.testing.assert_allclose(found[0, 0] * COLUMNS, (1.3 * 20 + 20.2) / 2.3, atol=0.02)
+
+
+def test_the_fringes_of_a_prism_are_lobes_apart() -> None:
+    found = lobes([gaussian(x, 20, 2.5, 1.5, 0, 1.0) for x in (27, 30, 33)])[0]
+    # each colour keeps its place, as far as four lobes can tell
+    centres = found[:, 2:5].T @ found[:, 0] * COLUMNS
+    np.testing.assert_allclose(centres, [27, 30, 33], atol=0.4)
 
 
 def test_pixels_do_not_depend_on_each_other() -> None:
