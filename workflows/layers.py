@@ -36,7 +36,8 @@ In a node compositor:
 3. Add the lobes up, multiply by ``rho``, apply the crosstalk with a colour matrix, and add ``S``.
 4. Copy ``A`` in as alpha, and put it over the plate.
 
-Step 2 for ``lobe0`` alone, without weight, is the picture a plain STMap gives.
+Step 2 for ``lobe0`` alone, without weight, is the picture a plain STMap gives. The sigmas include the extent of the
+backdrop's own pixels, a variance of 1/12 of a pixel squared along each axis: a filter over its pixels leaves that out.
 """
 
 import io

@@ -179,9 +179,7 @@ def _lines(pixel: Pixel) -> list[str]:
         return ["not recovered: the capture's mask left this pixel out"]
     if not len(pixel.lobes):
         return ["nothing could be recovered here: no cells, no lobes"]
-    lines = [
-        f"{len(pixel.node)} cells in {len(pixel.lobes)} lobes, of each the share of red, green and blue:"
-    ]
+    lines = [f"cells: {len(pixel.node)}; lobes, and the share of red, green and blue of each:"]
     for number, lobe in enumerate(pixel.lobes.tolist(), start=1):
         u, v, red, green, blue, sigma_u, sigma_v, theta = lobe
         lines.append(
