@@ -34,7 +34,7 @@ from sqlalchemy import Connection, Row, delete, insert, update
 from zarr.storage import MemoryStore
 
 from storage.database import find, mattes
-from storage.errors import Corrupt
+from storage.errors import Conflict, Corrupt
 from storage.grid import block_edge
 from storage.objects import Objects, together
 
@@ -267,6 +267,22 @@ def add_imported(
 def get(connection: Connection, matte: str) -> Row[Any]:
     """A matte's row; `NotFound` if there is none."""
     return find(connection, mattes, matte)
+
+
+def get_ready(connection: Connection, matte: str) -> Row[Any]:
+    """The row of a matte that is recovered.
+
+    Raises
+    ------
+    NotFound
+        If there is none.
+    Conflict
+        If it is not ready.
+    """
+    row = get(connection, matte)
+    if row.state != "ready":
+        raise Conflict(f"matte {matte} is {row.state}; job {row.job} says more")
+    return row
 
 
 def change(connection: Connection, matte: str, **values: Any) -> None:

@@ -58,12 +58,12 @@ def decode(data: bytes, *, memory: int) -> Floats:
         raise ImageError(f"the {kind} image is cut off or damaged: {error}") from error
 
 
-def encode_exr(channels: dict[str, Floats], header: dict[str, Any] | None = None) -> bytes:
-    """An EXR of 32-bit float channels, compressed without loss.
+def encode_exr(channels: dict[str, NDArray[Any]], header: dict[str, Any] | None = None) -> bytes:
+    """An EXR of float channels, compressed without loss.
 
     Parameters
     ----------
-    channels : dict of str to (height, width) or (height, width, 3 or 4) float32
+    channels : dict of str to (height, width) or (height, width, 3 or 4) float16 or float32
         By name, as ``alpha`` or ``RGB``.
     header : dict, optional
         More attributes.

@@ -40,18 +40,16 @@ Step 2 for ``lobe0`` alone, without weight, is the picture a plain STMap gives. 
 backdrop's own pixels, a variance of 1/12 of a pixel squared along each axis: a filter over its pixels leaves that out.
 """
 
-import io
 from typing import Any
 
 import numpy as np
-import OpenEXR
 from numpy.typing import NDArray
 
-from storage.mattes import Block, Matte
-from workflows import images
+from storage.mattes import Matte
+from workflows import floats, images
 from workflows.composite import confidence
-from workflows.recovery.ranked import FIELDS, ranked_lobes
-from workflows.recovery.transport import Transport
+from workflows.ranked import lobes_of
+from workflows.recovery.ranked import FIELDS
 
 NAMES = ("S", "rho", "alpha", "confidence")
 """The layers that are files of their own, as PNG and as EXR."""
@@ -153,31 +151,10 @@ def bytes_of_everything(width: int, height: int, lobes: int) -> int:
     return width * height * (11 * 2 + lobes * (2 * 4 + 6 * 2))
 
 
-def lobes_of(matte: Matte, block: Block, most: int) -> NDArray[np.float32]:
-    """(h, w, most, 8) float32: the lobes of a block's pixels, see `ranked_lobes`."""
-    width, height = matte.attributes["monitor"]
-    rows = Transport(
-        matte.columns,
-        matte.rows,
-        block.count.reshape(-1, 3),
-        block.cell,
-        block.weight,
-        block.shared.reshape(-1),
-    )
-    return ranked_lobes(rows, most, height / width).reshape(*block.recovered.shape, most, len(FIELDS))
-
-
 def _encode(matte: Matte, planes: Planes) -> bytes:
     header = {
-        "type": OpenEXR.scanlineimage,
-        "compression": OpenEXR.ZIP_COMPRESSION,
         "crosstalk": np.array(matte.attributes["crosstalk"], np.float32),
         "monitor": tuple(matte.attributes["monitor"]),
         "comments": _COMMENTS,
     }
-    target = io.BytesIO()
-    # The library passes over strides.
-    whole = {name: np.ascontiguousarray(plane) for name, plane in planes.items()}
-    with OpenEXR.File(header, whole) as file:
-        file.write(target)
-    return target.getvalue()
+    return floats.encode_exr(planes, header)

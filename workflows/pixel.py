@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from storage.errors import InvalidInput
 from storage.mattes import Matte
-from workflows.layers import lobes_of
+from workflows.ranked import lobes_of
 from workflows.recovery.pyramid import Pyramid
 
 

@@ -16,7 +16,6 @@ from services.api.uploads import too_large
 from storage import jobs, mattes, uploads
 from storage.archives import Archive
 from storage.database import new_id, reading, writing
-from storage.errors import Conflict
 from storage.uploads import Part
 from workflows.archive.importing import take_in
 
@@ -36,9 +35,7 @@ def get_archive(context: Needs, id: str) -> StreamingResponse:
     The same matte makes the same bytes. Where the matte is deleted meanwhile, the connection ends early.
     """
     with reading(context.engine) as c:
-        row = mattes.get(c, id)
-    if row.state != "ready":
-        raise Conflict(f"matte {id} is {row.state}; job {row.job} says more")
+        mattes.get_ready(c, id)
     archive = Archive(context.objects, id)
     headers = {
         "Content-Length": str(archive.size),

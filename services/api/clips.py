@@ -7,7 +7,6 @@ from typing import Any, BinaryIO
 import anyio.to_thread
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import StreamingResponse
-from sqlalchemy import Row
 from sqlalchemy.exc import IntegrityError
 
 from services import tracing
@@ -106,7 +105,7 @@ def _check(context: Context, matte: str, key: str, length: int) -> str | None:
     with reading(context.engine) as c:
         made = jobs.made_by(c, key, CALL) if key else None
         if made is None:
-            _ready(mattes.get(c, matte))
+            mattes.get_ready(c, matte)
             uploads.check_room(c, context.objects, length)
         return made
 
@@ -125,8 +124,7 @@ def _queue(context: Context, job: str, matte: str, options: dict[str, Any], key:
     """Write down the job of a clip that is stored; returns its id, or that of a repeat that was quicker."""
     try:
         with writing(context.engine) as c:
-            row = mattes.get(c, matte)
-            _ready(row)
+            row = mattes.get_ready(c, matte)
             jobs.add(c, "composite", row.capture, options, matte, tracing.asked_by(), job)
             jobs.begin(c, job)  # while it has tiles it has something in the store, see `jobs.not_wound_up`
             if key:
@@ -144,11 +142,6 @@ def _queue(context: Context, job: str, matte: str, options: dict[str, Any], key:
 def _job(context: Context, job: str) -> Job:
     with reading(context.engine) as c:
         return Job.of(c, jobs.get(c, job))
-
-
-def _ready(row: Row[object]) -> None:
-    if row.state != "ready":
-        raise Conflict(f"matte {row.id} is {row.state}; job {row.job} says more")
 
 
 def _span(text: str, size: int) -> tuple[int, int]:

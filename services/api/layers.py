@@ -5,12 +5,12 @@ from functools import partial
 from typing import Annotated
 
 import anyio.to_thread
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel
 
-from services.api.context import Needs
-from services.api.mattes import ready
+from services.api.context import Context, Needs
 from storage import mattes
+from storage.database import reading
 from storage.errors import InvalidInput, NotFound
 from workflows import layers
 from workflows.pixel import look_into
@@ -75,14 +75,20 @@ class Transport(BaseModel):
     response_class=Response,
     responses={200: {"content": {kind: {} for kind in MEDIA_TYPES.values()}, "description": "The layer"}},
 )
-async def get_layer(context: Needs, id: str, file: str, lobes: Lobes = layers.LOBES) -> Response:
+async def get_layer(
+    context: Needs, id: str, file: str, request: Request, lobes: Lobes = layers.LOBES
+) -> Response:
     """A layer: `S`, `rho`, `alpha` or `confidence`, as `.png` (16 bits, linear, clipped to 0 to 1) or `.exr`;
     `stmap.exr`; or `all.exr`, all of it with the lobes of each pixel."""
     if file not in FILES and file != ALL:
         raise NotFound(f"no layer is called {file}: there are {', '.join([*FILES, ALL])}")
 
+    matte = await anyio.to_thread.run_sync(_matte, context, id)
+    tag = {"ETag": f'"{id}-{file}-{lobes}"'}  # a matte never changes once it is ready
+    if _known(request, tag["ETag"]):
+        return Response(status_code=304, headers=tag)
+
     def encode() -> bytes:
-        matte = mattes.Matte(context.objects, ready(context, id).id)
         if file != ALL:
             return FILES[file](matte)
         much = layers.bytes_of_everything(matte.width, matte.height, lobes)
@@ -96,13 +102,13 @@ async def get_layer(context: Needs, id: str, file: str, lobes: Lobes = layers.LO
         return layers.everything(matte, lobes)
 
     answer = await anyio.to_thread.run_sync(encode, limiter=context.layers)
-    return Response(answer, media_type=MEDIA_TYPES[file.rpartition(".")[2]])
+    return Response(answer, media_type=MEDIA_TYPES[file.rpartition(".")[2]], headers=tag)
 
 
 @router.get("/mattes/{id}/transport")
 def get_transport(context: Needs, id: str, x: X, y: Y, lobes: Lobes = layers.LOBES) -> Transport:
     """Where the light of a pixel comes from: cells of the monitor and their weights by channel, and lobes."""
-    pixel = look_into(mattes.Matte(context.objects, ready(context, id).id), x, y, lobes)
+    pixel = look_into(_matte(context, id), x, y, lobes)
     return Transport(
         x=x,
         y=y,
@@ -132,7 +138,18 @@ async def get_transport_picture(context: Needs, id: str, x: X, y: Y, lobes: Lobe
     """The same as a picture: the monitor, a close-up with the lobes as ellipses, and the channels apart."""
 
     def draw() -> bytes:
-        return picture(look_into(mattes.Matte(context.objects, ready(context, id).id), x, y, lobes))
+        return picture(look_into(_matte(context, id), x, y, lobes))
 
     answer = await anyio.to_thread.run_sync(draw, limiter=context.pictures)
     return Response(answer, media_type="image/png")
+
+
+def _matte(context: Context, id: str) -> mattes.Matte:
+    with reading(context.engine) as c:
+        mattes.get_ready(c, id)
+    return context.cache.matte(id)
+
+
+def _known(request: Request, tag: str) -> bool:
+    """Whether the caller has what a tag stands for (RFC 9110, sect. 13.1.2)."""
+    return tag in [one.strip() for one in request.headers.get("if-none-match", "").split(",")]

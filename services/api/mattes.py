@@ -3,12 +3,11 @@
 from datetime import UTC, datetime
 from typing import Any, Literal, TypeVar
 
-import numpy as np
-from fastapi import APIRouter, Response
+from fastapi import APIRouter
 from pydantic import BaseModel
 from sqlalchemy import Row
 
-from services.api.context import After, Context, Limit, Needs
+from services.api.context import After, Limit, Needs
 from storage import jobs, mattes
 from storage.database import mattes as table
 from storage.database import page, reading, writing
@@ -80,12 +79,3 @@ def delete_matte(context: Needs, id: str) -> None:
         mattes.forget(c, id)
     context.cache.forget(id)
     context.objects.delete(mattes.path(id))
-
-
-def ready(context: Context, id: str) -> Row[Any]:
-    """The row of a matte; `Conflict` if it is not recovered."""
-    with reading(context.engine) as c:
-        row = mattes.get(c, id)
-    if row.state != "ready":
-        raise Conflict(f"matte {id} is {row.state}; job {row.job} says more")
-    return row

@@ -79,7 +79,7 @@ def compose(
     Returns
     -------
     (window's height, width, 4) float32
-        Linear light, and in the last channel 1 where the pixel was recovered, 0 where it was not.
+        Linear light, and in the last channel 1 where the pixel was recovered; 0 in all of them where it was not.
 
     Raises
     ------
@@ -140,9 +140,8 @@ def _compose_along(
     grids = Pyramid.over(matte.columns, matte.rows).arrays
     rows = (block.count, block.shared, block.cell, block.weight)
     arrived_along(*rows, light, grids, rays.shift[at], rays.scale, arrived)
-    seen = np.concatenate(
-        [block.S + (block.rho * arrived) @ crosstalk.T, block.recovered[..., np.newaxis]], axis=2
-    )
+    alpha = block.recovered[..., np.newaxis]
+    seen = np.concatenate([alpha * (block.S + (block.rho * arrived) @ crosstalk.T), alpha], axis=2)
     top, left = at[0].start - window.y, at[1].start - window.x
     to = picture[max(top, 0) : top + seen.shape[0], max(left, 0) : left + seen.shape[1]]
     to[:] = seen[max(-top, 0) :, max(-left, 0) :][: to.shape[0], : to.shape[1]]
@@ -187,7 +186,7 @@ def _compose(
                     blue += weight[entry] * light[cell[entry], 2]
                     entry += 1
             v, u = top + y, left + x
-            if 0 <= v < height and 0 <= u < width:
+            if recovered[y, x] and 0 <= v < height and 0 <= u < width:
                 red *= rho[y, x, 0]
                 green *= rho[y, x, 1]
                 blue *= rho[y, x, 2]
@@ -195,7 +194,7 @@ def _compose(
                     picture[v, u, c] = S[y, x, c] + (
                         crosstalk[c, 0] * red + crosstalk[c, 1] * green + crosstalk[c, 2] * blue
                     )
-                picture[v, u, 3] = recovered[y, x]
+                picture[v, u, 3] = 1
 
 
 def shrink(picture: NDArray[np.float32], size: int) -> NDArray[np.float32]:

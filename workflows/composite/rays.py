@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from storage.errors import Conflict
 from storage.mattes import Block, Matte
 from workflows.composite.threads import in_parts
+from workflows.ranked import lobes_of
 from workflows.recovery.pyramid import Grids
-from workflows.recovery.ranked import ranked_lobes
-from workflows.recovery.transport import Transport
 
 LOBES = 3
 """Of a pixel, of which the heaviest counts."""
@@ -62,22 +61,13 @@ def places_of(matte: Matte, read: Read, threads: int) -> Places:
         share of the light. The last is 0 where nothing was recovered.
     """
     places = np.zeros((matte.height, matte.width, 4), np.float32)
-    wide, high = matte.attributes["monitor"]
     blocks = list(product(range(matte.block_rows), range(matte.block_columns)))
 
     def one(number: int) -> None:
         block = read(*blocks[number])
         if block is None:
             return
-        rows = Transport(
-            matte.columns,
-            matte.rows,
-            block.count.reshape(-1, 3),
-            block.cell,
-            block.weight,
-            block.shared.reshape(-1),
-        )
-        lobe = ranked_lobes(rows, LOBES, high / wide)[:, 0].reshape(*block.recovered.shape, -1)
+        lobe = lobes_of(matte, block, LOBES)[:, :, 0]
         at = places[matte.span(*blocks[number])]
         at[..., 3] = lobe[..., 2:5].mean(axis=2)
         at[..., 0], at[..., 1] = lobe[..., 0], np.where(at[..., 3] > 0, 1 - lobe[..., 1], 0)
