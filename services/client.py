@@ -161,8 +161,9 @@ class Client:
         progress : callable, optional
             Told the job at every look.
         poll : float
-            Seconds between two looks.
+            Seconds between two looks, to begin with; a job that takes long is looked at once a second.
         """
+        begun = time.monotonic()
         while True:
             found = self.job(job)
             if progress:
@@ -174,7 +175,7 @@ class Client:
                 raise ServiceError(
                     found["problem"] or {"title": "Cancelled", "status": 409, "detail": detail}
                 )
-            time.sleep(poll)
+            time.sleep(max(poll, min((time.monotonic() - begun) / 20, 1.0)))
 
     def capture(self, capture: str) -> dict[str, Any]:
         """A capture."""
