@@ -38,7 +38,7 @@ def test_the_five_lines_of_curl(service: Service, bundle: Path, tmp_path: Path) 
 
 
 def test_zarr_alone_reads_a_matte_and_composites_it(service: Service, matte: str, tmp_path: Path) -> None:
-    (lines,) = re.findall(r"```python\n(.*?)```", README, re.S)
+    look, lines = re.findall(r"```python\n(.*?)```", README, re.S)
     service.client.export(matte, tmp_path / "matte.zip")
     stored = Matte(Objects((service.data / "store").as_uri()), matte)
     backdrop = simulate.backdrop(160, 120)
@@ -46,6 +46,13 @@ def test_zarr_alone_reads_a_matte_and_composites_it(service: Service, matte: str
     subprocess.run([sys.executable, "-c", lines], cwd=tmp_path, check=True, timeout=120)
     expected = composite(stored, backdrop)[..., :3]
     np.testing.assert_allclose(np.load(tmp_path / "composite.npy"), expected, atol=1e-5)
+    done = subprocess.run(
+        [sys.executable, "-c", look], cwd=tmp_path, check=True, timeout=120, capture_output=True, text=True
+    )
+    told = service.http.get(f"/v1/mattes/{matte}/transport?x=40&y=30").json()
+    weights = [float(weight) for weight in re.findall(r"float32\(([\d.e-]+)\)\)", done.stdout)]
+    expected_weights = sorted(cell["weight"][0] for cell in told["cells"] if cell["weight"][0])
+    np.testing.assert_allclose(sorted(weights), expected_weights, rtol=1e-5)
 
 
 def test_every_setting_is_documented() -> None:
