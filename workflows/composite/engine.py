@@ -10,10 +10,14 @@ from numpy.typing import NDArray
 
 from storage.errors import OptionError
 from storage.mattes import Block, Matte
+from workflows.composite.prefetch import prefetch
 from workflows.composite.rays import Rays, arrived_along
 from workflows.composite.threads import in_parts
 from workflows.grids import area_mean
 from workflows.recovery.pyramid import Pyramid
+
+AHEAD = 96
+"""Cells of T by which their light is asked for before it is used."""
 
 
 class Window(NamedTuple):
@@ -164,12 +168,15 @@ def _compose(
 ) -> None:
     """Composite a block, whose first pixel is at (top, left) of the picture, as far as it lies in it."""
     height, width, _ = picture.shape
+    values, last = light.reshape(-1), cell.size - 1
     entry = 0
     for y in range(recovered.shape[0]):
         for x in range(recovered.shape[1]):
             red = green = blue = np.float32(0)
             if shared[y, x]:
                 for _ in range(count[y, x, 0]):
+                    # The light of a monitor is larger than a core's cache, and cells are known long before.
+                    prefetch(values, np.intp(cell[min(entry + AHEAD, last)]) * 4)
                     k, w = cell[entry], weight[entry]
                     red += w * light[k, 0]
                     green += w * light[k, 1]
