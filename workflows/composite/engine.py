@@ -70,7 +70,7 @@ def compose(
     Parameters
     ----------
     matte : Matte
-    light : (nodes, 4) float32
+    light : (nodes, 3) float32
         As `node_light` makes it.
     window : Window
     read : callable
@@ -151,7 +151,7 @@ def _compose_along(
     to[:] = seen[max(-top, 0) :, max(-left, 0) :][: to.shape[0], : to.shape[1]]
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, fastmath={"contract"})
 def _compose(
     S: NDArray[np.float32],
     rho: NDArray[np.float32],
@@ -176,7 +176,7 @@ def _compose(
             if shared[y, x]:
                 for _ in range(count[y, x, 0]):
                     # The light of a monitor is larger than a core's cache, and cells are known long before.
-                    prefetch(values, np.intp(cell[min(entry + AHEAD, last)]) * 4)
+                    prefetch(values, np.intp(cell[min(entry + AHEAD, last)]) * 3)
                     k, w = cell[entry], weight[entry]
                     red += w * light[k, 0]
                     green += w * light[k, 1]

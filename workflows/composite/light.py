@@ -62,8 +62,7 @@ def node_light(
 
     Returns
     -------
-    (nodes, 4) float32
-        Red, green, blue, and 0: four are one load of the processor's.
+    (nodes, 3) float32
 
     Notes
     -----
@@ -72,16 +71,16 @@ def node_light(
     sampled between its pixels. Further grids see what `Pyramid` says.
     """
     pyramid = Pyramid.over(columns, rows)
-    light = np.empty((pyramid.nodes, 4), np.float32)
+    light = np.empty((pyramid.nodes, 3), np.float32)
     starts, grids = pyramid.starts, pyramid.grids
-    finest = light[: starts[1]].reshape(rows, columns, 4)
+    finest = light[: starts[1]].reshape(rows, columns, 3)
     if placement is None:
         _resample(backdrop, finest, threads)
     else:
         _place(backdrop, placement, monitor, finest, threads)
     for level in range(1, len(grids)):
-        fine = light[starts[level - 1] : starts[level]].reshape(*grids[level - 1][::-1], 4)
-        coarse = light[starts[level] : starts[level + 1]].reshape(*grids[level][::-1], 4)
+        fine = light[starts[level - 1] : starts[level]].reshape(*grids[level - 1][::-1], 3)
+        coarse = light[starts[level] : starts[level + 1]].reshape(*grids[level][::-1], 3)
 
         def halve(start: int, fine: NDArray[np.float32] = fine, coarse: NDArray[np.float32] = coarse) -> None:
             _halve(fine, start, min(start + ROWS, len(coarse)), coarse)
@@ -91,7 +90,7 @@ def node_light(
 
 
 def _resample(backdrop: Backdrop, cells: NDArray[np.float32], threads: int) -> None:
-    """Stretch a backdrop over cells (rows, columns, 4): each gets the mean over it."""
+    """Stretch a backdrop over cells (rows, columns, 3): each gets the mean over it."""
     rows, (height, width, _) = len(cells), backdrop.pixels.shape
 
     def some(start: int) -> None:
@@ -110,7 +109,7 @@ def _place(
     cells: NDArray[np.float32],
     threads: int,
 ) -> None:
-    """Place a backdrop before cells (rows, columns, 4)."""
+    """Place a backdrop before cells (rows, columns, 3)."""
     rows, columns, _ = cells.shape
     height, width, _ = backdrop.pixels.shape
     steps = np.hypot(*placement.matrix((columns, rows), monitor, (width, height))[:, :2].T)
@@ -118,7 +117,7 @@ def _place(
     if (wide, high) == (width, height):
         picture = backdrop.light(slice(None))
     else:
-        picture = np.empty((high, wide, 4), np.float32)
+        picture = np.empty((high, wide, 3), np.float32)
         _resample(backdrop, picture, threads)
     matrix = placement.matrix((columns, rows), monitor, (wide, high))
     in_parts(
@@ -148,7 +147,7 @@ def _area_mean(
         Of the image.
     start, stop : int
         Rows of the grid.
-    cells : (rows, columns, 4) float32
+    cells : (rows, columns, 3) float32
         Written between `start` and `stop`.
     """
     rows, columns, _ = cells.shape
@@ -170,23 +169,23 @@ def _area_mean(
                 red += share * line[x, 0]
                 green += share * line[x, channels // 2]
                 blue += share * line[x, channels - 1]
-            cells[r, k, 0], cells[r, k, 1], cells[r, k, 2], cells[r, k, 3] = red, green, blue, 0
+            cells[r, k, 0], cells[r, k, 1], cells[r, k, 2] = red, green, blue
 
 
 @njit(nogil=True, cache=True)
 def _halve(fine: NDArray[np.float32], start: int, stop: int, coarse: NDArray[np.float32]) -> None:
     """Some rows of the next grid: every second node seen with the weights [1, 3, 3, 1] / 8 along each axis."""
     rows, columns, _ = fine.shape
-    line = np.empty((columns, 4), np.float32)
+    line = np.empty((columns, 3), np.float32)
     three, eighth = np.float32(3), np.float32(1 / 8)
     for r in range(start, stop):
         above, upper = fine[max(2 * r - 1, 0)], fine[2 * r]
         lower, below = fine[min(2 * r + 1, rows - 1)], fine[min(2 * r + 2, rows - 1)]
         for x in range(columns):
-            for c in range(4):
+            for c in range(3):
                 line[x, c] = eighth * (above[x, c] + below[x, c] + three * (upper[x, c] + lower[x, c]))
         for k in range(coarse.shape[1]):
             a, b = max(2 * k - 1, 0), 2 * k
             d, e = min(2 * k + 1, columns - 1), min(2 * k + 2, columns - 1)
-            for c in range(4):
+            for c in range(3):
                 coarse[r, k, c] = eighth * (line[a, c] + line[e, c] + three * (line[b, c] + line[d, c]))

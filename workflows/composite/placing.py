@@ -75,13 +75,13 @@ def place(
 
     Parameters
     ----------
-    image : (h, w, 1, 3 or 4) float32
+    image : (h, w, 1 or 3) float32
         Of pixels no smaller than cells, about.
     matrix : (2, 3) float64
         From cells to pixels of it.
     start, stop : int
         Rows of the grid.
-    cells : (rows, columns, 4) float32
+    cells : (rows, columns, 3) float32
         Written between `start` and `stop`.
     """
     height, width, channels = image.shape
@@ -105,4 +105,3 @@ def place(
                     sums[c] += upper + b * (lower - upper)
             for c in range(3):
                 cells[r, k, c] = sums[c] / np.float32(4)
-            cells[r, k, 3] = 0
