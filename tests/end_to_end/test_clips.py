@@ -19,6 +19,8 @@ from workflows import images
 
 VIDEO = {"Content-Type": "video/mp4"}
 
+OPTIONS = {"transfer": "srgb", "placement": {"right": 0, "down": 0, "scale": 1, "angle": 0}}
+
 
 def stored(service: Service) -> set[str]:
     return {name for name in service.stored() if name.startswith("composites")}
@@ -45,7 +47,7 @@ def test_a_clip_becomes_a_video_with_its_times(service: Service, matte: str) -> 
     data = clip(shown, ticks, crf="4")
     job = post(service, matte, data, **{"Idempotency-Key": "once"})
     assert post(service, matte, data, **{"Idempotency-Key": "once"})["id"] == job["id"]
-    assert (job["kind"], job["matte"], job["options"]) == ("composite", matte, {"transfer": "srgb"})
+    assert (job["kind"], job["matte"], job["options"]) == ("composite", matte, OPTIONS)
     done = service.client.wait(job["id"])
     assert done["pixels"] == 40 * 96 * 72
     log = service.http.get(f"/v1/jobs/{job['id']}/log").json()["lines"]

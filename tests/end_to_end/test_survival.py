@@ -177,11 +177,12 @@ def test_a_worker_that_is_killed_costs_nothing(service: Service, matte: str, cap
 def test_a_damaged_matte_is_said_to_be_damaged(service: Service, capture: str) -> None:
     job = service.client.wait(service.client.recover(capture, tile=48)["id"])
     folder = service.data / "store" / "mattes" / job["matte"]
-    for name in ("S/c/0/0/0", "count/c/1/1/0", "T/2.2/weight/c/0"):
+    for at, name in ((0, "S/c/0/0/0"), (16, "count/c/1/1/0"), (32, "T/2.2/weight/c/0")):
         data = (folder / name).read_bytes()
         (folder / name).unlink()
         white = png(np.ones((2, 2, 3), np.float32), "srgb", np.uint8)
-        answer = service.http.post(f"/v1/mattes/{job['matte']}/composite", content=white)
+        block = {"x": at, "y": at, "width": 16, "height": 16}  # others would be kept in memory
+        answer = service.http.post(f"/v1/mattes/{job['matte']}/composite", params=block, content=white)
         assert (answer.status_code, answer.json()["type"]) == (500, "urn:envmatte:problem:corrupt")
         (folder / name).write_bytes(data)
 

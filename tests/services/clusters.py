@@ -5,7 +5,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import psutil
@@ -62,7 +62,12 @@ def children(process: subprocess.Popen[str]) -> list[psutil.Process]:
 
 def workers(process: subprocess.Popen[str]) -> list[psutil.Process]:
     """The worker processes of a process."""
-    return [one for one in children(process) if "spawn_main" in " ".join(one.cmdline())]
+    found = []
+    for one in children(process):
+        with suppress(psutil.NoSuchProcess):  # nor one that has just ended
+            if "spawn_main" in " ".join(one.cmdline()):
+                found.append(one)
+    return found
 
 
 def running(processes: list[psutil.Process]) -> list[psutil.Process]:

@@ -27,7 +27,7 @@ def add_moments(moments: NDArray[np.float64], cell: int, columns: int, weight: f
     moments[5] += weight * y * y
 
 
-@njit(nogil=True, cache=True)
+@njit("int64(float64[:, ::1], int64, int64)", nogil=True, cache=True)
 def merge_clusters(moments: NDArray[np.float64], count: int, most: int) -> int:
     """Merge clusters until there are no more than `most`.
 
