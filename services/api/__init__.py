@@ -3,7 +3,6 @@
 import hmac
 
 from fastapi import Depends, FastAPI, Request
-from fastapi.staticfiles import StaticFiles
 from sqlalchemy import Engine
 
 from services import tracing
@@ -24,6 +23,7 @@ from services.api import (
     system,
     tus,
     uploads,
+    web,
 )
 from services.api.context import PROBLEM, WEB, Context
 from services.settings import Settings
@@ -70,5 +70,6 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
     app.include_router(programs.page, prefix="/v1")
     app.include_router(system.router)
     app.include_router(metrics.router)
-    app.mount("/web", StaticFiles(directory=WEB))
+    app.include_router(web.page)
+    app.mount("/web", web.Files(directory=WEB))
     return app

@@ -1,0 +1,49 @@
+"""The web app: a page at `/`, and the browser's files below `/web`."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from fastapi import APIRouter
+from fastapi.responses import FileResponse, Response
+from starlette.staticfiles import StaticFiles
+
+from services.api.context import WEB
+
+page = APIRouter()
+POLICY = "; ".join(
+    (
+        "default-src 'none'",
+        "script-src 'self'",
+        "style-src 'self'",
+        "connect-src 'self'",
+        "img-src 'self' blob:",
+        "base-uri 'none'",
+        "form-action 'none'",
+        "frame-ancestors 'none'",
+    )
+)
+"""What the page may do: run and fetch what this service serves, and show pictures that it made itself (`blob:`)."""
+# Asked for again each time, and answered with 304: after an upgrade no file of the old app is mixed with the new.
+FRESH = {"Cache-Control": "no-cache"}
+
+
+class Files(StaticFiles):
+    """The browser's files."""
+
+    def file_response(self, *args: Any, **options: Any) -> Response:
+        answer = super().file_response(*args, **options)
+        answer.headers.update(FRESH)
+        return answer
+
+
+HEADERS: Mapping[str, str] = FRESH | {
+    "Content-Security-Policy": POLICY,
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+
+
+@page.get("/", include_in_schema=False, response_class=FileResponse)
+def get_app() -> FileResponse:
+    """The app. It holds nothing of the service: asked for without a key, it asks for one."""
+    return FileResponse(WEB / "app" / "index.html", media_type="text/html", headers=HEADERS)

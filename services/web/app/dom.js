@@ -1,0 +1,116 @@
+// Elements, and words for figures.
+
+export function h(tag, attributes = {}, ...children) {
+  const element = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
+    else if (value !== false && value != null) element.setAttribute(name, value === true ? "" : value);
+  }
+  element.append(...children.flat(2).filter((child) => child != null && child !== false));
+  return element;
+}
+
+// A text with `words` in it as code.
+export const prose = (text) => text.split(/`([^`]*)`/).map((part, i) => (i % 2 ? h("code", {}, part) : part));
+
+// An error as the API words it, or as the browser does.
+export const said = (error) =>
+  h("div", { class: "problem", role: "alert" }, h("strong", {}, error.title ?? "Something went wrong in this page"),
+    h("p", {}, prose(error.detail ?? error.message)));
+
+export const empty = (title, text) => h("div", { class: "empty" }, h("strong", {}, title), h("p", {}, text));
+
+const LEVEL = {
+  good: "good", ready: "good", succeeded: "good",
+  warning: "warning", ingesting: "busy", recovering: "busy", running: "busy", queued: "busy",
+  bad: "bad", failed: "bad", cancelled: "off",
+};
+export const badge = (word) => h("span", { class: `badge ${LEVEL[word] ?? "off"}` }, word);
+
+export const facts = (pairs) =>
+  h("dl", { class: "facts" }, Object.entries(pairs).filter(([, value]) => value != null && value !== "")
+    .map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, value))));
+
+export const bytes = (count) => {
+  const units = ["bytes", "kB", "MB", "GB", "TB"];
+  const power = Math.min(units.length - 1, Math.floor(Math.log10(Math.max(count, 1)) / 3));
+  return `${(count / 1000 ** power).toLocaleString("en", { maximumFractionDigits: power ? 1 : 0 })} ${units[power]}`;
+};
+
+export const duration = (seconds) => {
+  if (seconds == null) return null;
+  if (seconds < 10) return `${seconds.toFixed(1)} s`;
+  if (seconds < 100) return `${Math.round(seconds)} s`;
+  if (seconds < 6000) return `${Math.round(seconds / 60)} min`;
+  return `${(seconds / 3600).toFixed(1)} h`;
+};
+
+export const when = (time) =>
+  h("time", { datetime: time }, new Date(time).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "short" }));
+
+export const size = ({ width, height }) => (width ? `${width} × ${height}` : null);
+
+export const pause = (ms, signal) =>
+  new Promise((resolve, reject) => {
+    const stop = () => (clearTimeout(timer), reject(signal.reason));
+    const timer = setTimeout(() => (signal?.removeEventListener("abort", stop), resolve()), ms);
+    signal?.aborted ? stop() : signal?.addEventListener("abort", stop, { once: true });
+  });
+
+// One call at a time; of those that come meanwhile, only the newest.
+export function newest(work) {
+  let next;
+  let busy = false;
+  return async (...given) => {
+    next = given;
+    if (busy) return;
+    busy = true;
+    try {
+      while (next) {
+        const now = next;
+        next = undefined;
+        await work(...now);
+      }
+    } finally {
+      busy = false;
+    }
+  };
+}
+
+// Puts a picture into an `img`, and lets go of the one before.
+export async function show(image, blob) {
+  const url = URL.createObjectURL(blob);
+  const before = image.dataset.url;
+  image.dataset.url = image.src = url;
+  image.hidden = false;
+  await image.decode().catch(() => {});
+  if (before) URL.revokeObjectURL(before);
+}
+
+export function sure(title, text, yes) {
+  const dialog = document.getElementById("sure");
+  document.getElementById("sure-title").textContent = title;
+  document.getElementById("sure-text").textContent = text;
+  document.getElementById("sure-yes").textContent = yes;
+  dialog.returnValue = "no";
+  dialog.showModal();
+  return new Promise((resolve) => dialog.addEventListener("close", () => resolve(dialog.returnValue === "yes"), { once: true }));
+}
+
+// A button whose work may fail: what went wrong is said in `where`, and it can't be pressed twice.
+export function button(text, where, work, kind = "") {
+  return h("button", {
+    type: "button", class: kind,
+    onclick: async ({ currentTarget }) => {
+      currentTarget.disabled = true;
+      where.replaceChildren();
+      try {
+        await work();
+      } catch (error) {
+        if (error.name !== "AbortError") where.replaceChildren(said(error));
+      } finally {
+        currentTarget.disabled = false;
+      }
+    },
+  }, text);
+}

@@ -1,0 +1,43 @@
+// Which view is shown: the part of the URL after `#` says it, so that a reload and the back button keep it.
+import { said } from "./dom.js";
+import { captures } from "./captures.js";
+import { capture } from "./capture.js";
+import { job, jobs } from "./jobs.js";
+import { matte, mattes } from "./mattes.js";
+
+const VIEWS = { captures: [captures, capture], jobs: [jobs, job], mattes: [mattes, matte] };
+const main = document.getElementById("main");
+let leaving = new AbortController();
+
+async function route(moved) {
+  const [, name, id] = /^#\/(\w+)(?:\/([\w-]+))?$/.exec(location.hash) ?? [];
+  if (!VIEWS[name]) {
+    if (location.hash && location.hash !== "#/") return main.focus(); // a link within the page
+    return location.replace("#/captures");
+  }
+  leaving.abort();
+  leaving = new AbortController();
+  const { signal } = leaving;
+  for (const link of document.querySelectorAll("nav a")) {
+    if (link.hash === `#/${name}`) link.setAttribute("aria-current", "page");
+    else link.removeAttribute("aria-current");
+  }
+  main.replaceChildren();
+  main.ariaBusy = "true";
+  try {
+    await VIEWS[name][id ? 1 : 0](main, signal, id);
+  } catch (error) {
+    if (!signal.aborted) main.append(said(error));
+  }
+  if (signal.aborted) return;
+  main.ariaBusy = "false";
+  const title = main.querySelector("h1");
+  document.title = `${title?.textContent ?? "envmatte"} · envmatte`;
+  if (moved) {
+    scrollTo(0, 0);
+    main.focus({ preventScroll: true });
+  }
+}
+
+addEventListener("hashchange", () => route(true));
+route(false);

@@ -1,0 +1,64 @@
+// How far a job is: bar, stage, the time left, what it waits for, and its log.
+import { getJson } from "./api.js";
+import { follow } from "./events.js";
+import { badge, duration, facts, h, newest, pause, said } from "./dom.js";
+
+const LOG_EVERY = 2000; // ms
+
+// Fills `panel`, and follows the job until it has ended: resolves with it. `changed` is called with every state of it.
+export async function follower(panel, id, signal, changed = () => {}) {
+  const bar = h("progress", { max: 1, value: 0, "aria-label": "Progress" });
+  const stage = h("p", { class: "stage", role: "status" }, " ");
+  const waits = h("p", { class: "waits", hidden: true });
+  const about = h("div");
+  const problem = h("div");
+  const lines = h("ol", { class: "log", tabindex: 0, "aria-label": "Log" });
+  const log = h("details", { open: panel.dataset.log != null }, h("summary", {}, "Log"), lines);
+  panel.append(stage, bar, waits, about, problem, log);
+
+  let last = 0;
+  const read = newest(async (ended) => {
+    try {
+      const found = (await getJson(`v1/jobs/${id}/log?after=${last}`, signal)).lines;
+      const atEnd = lines.scrollTop + lines.clientHeight >= lines.scrollHeight - 8;
+      lines.append(...found.map(({ at, text }) => h("li", {}, h("time", { datetime: at }, new Date(at).toLocaleTimeString("en-GB")), " ", text)));
+      last = found.at(-1)?.line ?? last;
+      if (atEnd) lines.scrollTop = lines.scrollHeight;
+      if (!ended) await pause(LOG_EVERY, signal);
+    } catch {} // it is read with the next event
+  });
+
+  const tell = (job) => {
+    const active = ["queued", "running"].includes(job.state);
+    bar.value = job.progress;
+    bar.hidden = !active && job.state !== "failed";
+    stage.replaceChildren(badge(job.state), ` ${words(job)}`);
+    waits.hidden = !job.waits_for;
+    waits.textContent = job.waits_for ? `Waits: ${job.waits_for}` : "";
+    about.replaceChildren(facts({
+      Tiles: job.tiles.total ? `${job.tiles.done} of ${job.tiles.total}` : null,
+      Failed: job.tiles.failed || null,
+      Workers: job.state === "running" ? job.workers : null,
+      Ran: job.run_seconds ? duration(job.run_seconds) : null,
+      Waited: job.queued_seconds >= 1 ? duration(job.queued_seconds) : null,
+    }));
+    problem.replaceChildren(...(job.problem ? [said(job.problem)] : []));
+    read(!active);
+    changed(job);
+  };
+  const lost = (away) => {
+    panel.classList.toggle("lost", away);
+    if (away) stage.textContent = "The service does not answer; it is asked again. Jobs go on where they stood.";
+  };
+  return follow(id, signal, tell, lost);
+}
+
+function words(job) {
+  const percent = `${Math.floor(100 * job.progress)} %`;
+  if (job.state === "running") {
+    const left = job.eta_seconds == null ? "" : `, about ${duration(job.eta_seconds)} left`;
+    return `${job.stage}, ${percent}${left}`;
+  }
+  if (job.state === "succeeded") return `in ${duration(job.run_seconds)}`;
+  return job.state === "queued" ? "" : `at ${percent}`;
+}
