@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from playwright.sync_api import Browser, Page, Route, expect
 
-from tests.end_to_end.conftest import BANDS, Service, serving
+from tests.end_to_end.conftest import BANDS, Service, paused, serving
 from workflows import images, simulate
 from workflows.scene import nested_program, write_capture
 
@@ -184,6 +184,8 @@ def test_a_backdrop_is_moved_by_hand_and_by_keys(tab: Page, service: Service, re
     assert "right=0.25" in asked[-1]
     assert "size=" not in asked[-1]
     assert np.mean(np.abs(shown(tab, ".picture.stage img") - before.astype(float))) > 5
+    tab.mouse.wheel(0, -500)
+    expect(tab.locator("output[for=place-scale]")).to_have_text("165 %")
     stage.focus()
     stage.press("ArrowLeft")
     expect(right).to_have_text("23 %")
@@ -279,6 +281,9 @@ def test_a_reload_and_the_back_button_keep_the_view(
     tab.locator(f'a[href="#/mattes/{matte}"]').click()
     title = tab.get_by_role("heading", name=f"Matte {matte[:8]}")
     expect(title).to_be_visible()
+    tab.get_by_role("link", name="Skip").focus()
+    tab.keyboard.press("Enter")
+    expect(tab.locator("main")).to_be_focused()
     tab.reload()
     expect(title).to_be_visible()
     tab.go_back()
@@ -286,6 +291,21 @@ def test_a_reload_and_the_back_button_keep_the_view(
     tab.goto(f"{service.url}/#/captures/nothing")
     expect(tab.get_by_role("alert")).to_contain_text("Not found")
     assert service.client.capture(capture)
+
+
+def test_a_job_is_cancelled_and_deleted(tab: Page, service: Service, ready: tuple[str, str]) -> None:
+    with paused(service):
+        job = service.client.recover(ready[0])["id"]
+        tab.goto(f"{service.url}/#/jobs/{job}")
+        tab.get_by_role("button", name="Cancel").click()
+        expect(tab.locator(".stage .badge")).to_have_text("cancelled")
+    tab.get_by_role("button", name="Delete", exact=True).click()
+    tab.get_by_role("button", name="Keep it").click()
+    expect(tab.get_by_role("heading", name="Recovery of a matte")).to_be_visible()
+    tab.get_by_role("button", name="Delete", exact=True).click()
+    tab.get_by_role("button", name="Delete it").click()
+    expect(tab).to_have_url(re.compile("#/jobs$"))
+    assert service.http.get(f"/v1/jobs/{job}").status_code == 404
 
 
 def test_a_service_with_keys_that_is_started_again(

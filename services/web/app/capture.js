@@ -21,12 +21,11 @@ export async function capture(main, signal, id) {
       Size: bytes(found.bytes), Added: when(found.created_at), "Read by": h("a", { href: `#/jobs/${found.job}` }, "its ingest job"),
     }),
   );
-  const outcome = h("div", { class: "stack" });
-  main.append(outcome, await recovery(id, found.state, signal));
-  if (found.state === "ready") return outcome.append(...(await turnedOut(found, signal)));
-  if (found.state === "failed") return outcome.append(said(found.problem));
-  const panel = h("section", { class: "panel" }, h("h2", {}, "Reading the frames"));
-  outcome.append(panel);
+  if (found.state === "failed") return main.append(said(found.problem));
+  const [outcome, form] = await Promise.all([found.state === "ready" ? turnedOut(found, signal) : [], recovery(id, found.state, signal)]);
+  const panel = h("section", { class: "panel", hidden: found.state === "ready" }, h("h2", {}, "Reading the frames"));
+  main.append(panel, ...outcome, form);
+  if (found.state === "ready") return;
   follower(panel, found.job, signal).then(
     () => signal.aborted || dispatchEvent(new HashChangeEvent("hashchange")), // it is another view now
     (error) => signal.aborted || panel.append(said(error)),
@@ -66,10 +65,12 @@ function frames(found, signal) {
 }
 
 function sheet(found, signal) {
-  const image = h("img", { alt: "Some of the frames side by side" });
+  const image = h("img", { alt: "Some of the frames side by side", hidden: true });
+  const frame = h("div", { class: "picture whole" }, image);
+  frame.style.aspectRatio = `${2 * found.width} / ${1.1 * found.height}`; // four by two, as most of them are: nothing moves when it comes
   getBlob(`v1/captures/${found.id}/contact-sheet.png`, signal).then((blob) => show(image, blob), (error) => {
     if (!signal.aborted) image.replaceWith(said(error));
   });
-  return h("section", { class: "panel" }, h("h2", {}, "Contact sheet"), h("div", { class: "picture sheet" }, image),
+  return h("section", { class: "panel" }, h("h2", {}, "Contact sheet"), frame,
     h("p", { class: "hint" }, "What is clipped is red at white, and blue at black."));
 }

@@ -92,6 +92,7 @@ export async function compositing(matte, signal) {
     step(name, event.shiftKey && event.key.startsWith("Arrow") ? 5 * by : by);
   };
   stage.addEventListener("wheel", (event) => {
+    if (document.activeElement !== stage && !event.ctrlKey) return; // who only passes by scrolls the page
     event.preventDefault();
     set({ scale: at.scale * Math.exp(-event.deltaY * (event.deltaMode ? 0.03 : 0.001)) });
   }, { passive: false });
@@ -125,7 +126,7 @@ export async function compositing(matte, signal) {
   use(builtIn(NAMES[0], matte.monitor));
   return [
     h("section", { class: "panel composite", "aria-label": "Compositing" },
-      h("div", {}, stage, status, problem),
+      h("div", {}, stage, h("p", { class: "hint" }, "Drag the picture to move the backdrop; then scroll, or pinch, to scale it."), status, problem),
       h("div", { class: "stack" }, choices,
         h("div", { class: "drop small" }, h("label", { for: "backdrop" }, h("strong", {}, "Your own picture"), " drop, paste or choose it",
           h("span", { class: "hint" }, "PNG, JPEG, TIFF or EXR")), file),

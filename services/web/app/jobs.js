@@ -29,7 +29,7 @@ export async function job(main, signal, id) {
   const cancel = button("Cancel", problem, () => call("POST", `v1/jobs/${id}/cancel`));
   const retry = button("Try again", problem, async () => {
     await post(`v1/jobs/${id}/retry`);
-    await watch();
+    watch();
   }, "primary");
   const remove = button("Delete", problem, async () => {
     const lost = found.kind === "composite" ? "Its log and its video are gone then." : "Its log is gone then; what it made stays.";
@@ -48,7 +48,7 @@ export async function job(main, signal, id) {
     facts({ Asked: when(found.created_at), Capture: found.capture && h("a", { href: `#/captures/${found.capture}` }, found.capture.slice(0, 8)), Method: found.options.method, Quality: found.options.quality }),
     links, h("div", { class: preview ? "columns" : "stack" }, preview?.panel, h("div", { class: "stack" }, panel, asked)),
   );
-  watch();
+  watch(found);
 
   function told(now) {
     cancel.hidden = !ACTIVE.includes(now.state);
@@ -63,9 +63,9 @@ export async function job(main, signal, id) {
     preview?.tell(now);
   }
 
-  function watch() {
+  function watch(known) {
     panel.replaceChildren();
-    return follower(panel, id, signal, told).catch((error) => signal.aborted || panel.append(said(error)));
+    return follower(panel, id, signal, told, known).catch((error) => signal.aborted || panel.append(said(error)));
   }
 }
 

@@ -77,5 +77,5 @@ export function layers(matte, signal) {
   choose(FIRST);
   return h("section", { class: "panel", "aria-label": "Layers" }, h("h2", {}, "Layers, and where light comes from"),
     h("div", { class: "columns" }, h("div", { class: "stack" }, names, stage, about, h("p", { class: "row" }, "For other tools:", files)),
-      h("div", { class: "stack" }, told, h("div", { class: "picture sheet light" }, light), problem)));
+      h("div", { class: "stack" }, told, h("div", { class: "picture sheet light", tabindex: 0, role: "group", "aria-label": "Where its light comes from" }, light), problem)));
 }

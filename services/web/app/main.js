@@ -11,10 +11,7 @@ let leaving = new AbortController();
 
 async function route(moved) {
   const [, name, id] = /^#\/(\w+)(?:\/([\w-]+))?$/.exec(location.hash) ?? [];
-  if (!VIEWS[name]) {
-    if (location.hash && location.hash !== "#/") return main.focus(); // a link within the page
-    return location.replace("#/captures");
-  }
+  if (!VIEWS[name]) return location.replace("#/captures");
   leaving.abort();
   leaving = new AbortController();
   const { signal } = leaving;
@@ -39,5 +36,10 @@ async function route(moved) {
   }
 }
 
+// Not by its link, which would take the place of the view in the URL.
+document.querySelector(".skip").onclick = (event) => {
+  event.preventDefault();
+  main.focus();
+};
 addEventListener("hashchange", () => route(true));
 route(false);

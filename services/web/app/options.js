@@ -35,7 +35,6 @@ function chosen(fields, method) {
 }
 
 export async function recovery(capture, state, signal) {
-  if (state === "failed") return h("div");
   const { options } = await getJson("v1/options", signal);
   const fields = options.map(field);
   const choices = fields.filter(({ option }) => option.values);

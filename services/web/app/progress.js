@@ -5,8 +5,8 @@ import { badge, duration, facts, h, newest, pause, said } from "./dom.js";
 
 const LOG_EVERY = 2000; // ms
 
-// Fills `panel`, and follows the job until it has ended: resolves with it. `changed` is called with every state of it.
-export async function follower(panel, id, signal, changed = () => {}) {
+// Fills `panel`, at once if a state is known, and follows the job until it has ended: resolves with it. `changed` is called with every state of it.
+export async function follower(panel, id, signal, changed = () => {}, known = null) {
   const bar = h("progress", { max: 1, value: 0, "aria-label": "Progress" });
   const stage = h("p", { class: "stage", role: "status" }, " ");
   const waits = h("p", { class: "waits", hidden: true });
@@ -46,6 +46,7 @@ export async function follower(panel, id, signal, changed = () => {}) {
     read(!active);
     changed(job);
   };
+  if (known) tell(known);
   const lost = (away) => {
     panel.classList.toggle("lost", away);
     if (away) stage.textContent = "The service does not answer; it is asked again. Jobs go on where they stood.";
