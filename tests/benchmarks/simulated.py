@@ -2,6 +2,7 @@
 
 import time
 
+from services import kinds
 from workflows.jobs import KINDS, Kind
 
 KINDS["simulated"] = Kind(
@@ -12,3 +13,4 @@ KINDS["simulated"] = Kind(
     finish=lambda task: {},
     scattered=True,
 )
+kinds.KINDS["simulated"] = kinds.Kind()
