@@ -8,11 +8,10 @@ from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection, Row
 
-from services import tracing
+from services import kinds, tracing
 from services.api.context import After, Limit, Needs, read_json
 from services.api.eta import seconds_left
 from services.api.waiting import reason
-from services.kinds import KINDS
 from storage import captures, composites, jobs, leases, mattes
 from storage.database import jobs as table
 from storage.database import new_id, page, reading, writing
@@ -219,7 +218,7 @@ def retry_job(context: Needs, id: str) -> Job:
         # Slabs of an ingest are as large as the memory allows, and want to be smaller where that was too much.
         memory = (row.plan or {}).get("memory", context.settings.ingest_memory)
         jobs.retry(c, id, anew=memory != context.settings.ingest_memory)
-        KINDS[row.kind].retried(c, row)
+        kinds.KINDS[row.kind].retried(c, row)
         return Job.of(c, jobs.get(c, id))
 
 
