@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from starlette.datastructures import Headers
 
 from services.api import clips
-from services.api.context import Context, Needs, spool_body
+from services.api.context import Context, Needs, is_known, spool_body
 from services.api.errors import NotAcceptable, NotNeeded, problem_of
 from services.api.errors import answer as problem_answer
 from services.api.jobs import Job
@@ -200,7 +200,7 @@ def _answer(
     made_of = f"{seen.id} {seen.share} {kind} {wanted.model_dump_json()} ".encode()
     tag = f'"{hashlib.blake2b(made_of + hashlib.blake2b(data).digest(), digest_size=16).hexdigest()}"'
     told = {"ETag": tag, "Envmatte-Recovered": f"{seen.share:.4f}"}
-    if tag in [one.strip() for one in headers.get("if-none-match", "").split(",")]:
+    if is_known(headers, tag):
         return problem_answer(
             problem_of(NotNeeded(f"the caller has this composite already: {tag}")), {"ETag": tag}
         )

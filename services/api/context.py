@@ -13,6 +13,7 @@ from fastapi import Depends, Query, Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ValidationError
 from sqlalchemy import Engine
+from starlette.datastructures import Headers
 
 from services.api.errors import TooLarge
 from services.settings import Settings
@@ -95,6 +96,11 @@ async def spool_body(request: Request, limit: int) -> AsyncIterator[IO[bytes]]:
                 file.write(part)
         file.seek(0)
         yield file
+
+
+def is_known(headers: Headers, tag: str) -> bool:
+    """Whether the caller has what a tag stands for (If-None-Match, RFC 9110, sect. 13.1.2)."""
+    return tag in [one.strip() for one in headers.get("if-none-match", "").split(",")]
 
 
 def _too_large(limit: int) -> TooLarge:

@@ -8,7 +8,7 @@ import anyio.to_thread
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel
 
-from services.api.context import Context, Needs
+from services.api.context import Context, Needs, is_known
 from storage import mattes
 from storage.database import reading
 from storage.errors import InvalidInput, NotFound
@@ -85,7 +85,7 @@ async def get_layer(
 
     matte = await anyio.to_thread.run_sync(_matte, context, id)
     tag = {"ETag": f'"{id}-{file}-{lobes}"'}  # a matte never changes once it is ready
-    if _known(request, tag["ETag"]):
+    if is_known(request.headers, tag["ETag"]):
         return Response(status_code=304, headers=tag)
 
     def encode() -> bytes:
@@ -148,8 +148,3 @@ def _matte(context: Context, id: str) -> mattes.Matte:
     with reading(context.engine) as c:
         mattes.get_ready(c, id)
     return context.cache.matte(id)
-
-
-def _known(request: Request, tag: str) -> bool:
-    """Whether the caller has what a tag stands for (RFC 9110, sect. 13.1.2)."""
-    return tag in [one.strip() for one in request.headers.get("if-none-match", "").split(",")]

@@ -1,7 +1,7 @@
-"""Mattes and composites over HTTP."""
+"""Mattes over HTTP."""
 
 from datetime import UTC, datetime
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 from fastapi import APIRouter
 from pydantic import BaseModel
@@ -14,8 +14,6 @@ from storage.database import page, reading, writing
 from storage.errors import Conflict
 
 router = APIRouter(tags=["mattes"])
-R = TypeVar("R")
-TAKEN = ("image/png", "image/jpeg", "image/tiff")
 
 
 class Matte(BaseModel):
