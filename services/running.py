@@ -56,11 +56,16 @@ def serve(**given: Any) -> None:
 
     Every setting is an environment variable ENVMATTE_… too, and a line in .env; an option here wins.
     """
-    from services.server import serve as run
+    from services.cluster import share_start
     from services.settings import Settings
 
     with refusals_told():
-        run(Settings(**_those_given(given)))
+        settings = Settings(**_those_given(given))
+        if settings.coordinate and settings.cluster is None:
+            share_start()  # at the same time as this process imports the rest
+        from services.server import serve as run
+
+        run(settings)
 
 
 @click.command()

@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 from distributed import Nanny
 from distributed.security import Security
 
-from services.cluster import NO_DASHBOARD, PRELOAD, START, reach
+from services.cluster import NO_DASHBOARD, PRELOAD, START, reach, share_start
 from services.process import keep_open, log
 from services.settings import ClusterSettings, is_loopback
 from storage.errors import InvalidInput
@@ -53,6 +53,7 @@ def work(settings: ClusterSettings, host: str | None) -> None:
             f"asked to listen on {host} without TLS, where whoever reaches it may run what he likes: name a scheduler "
             "that speaks TLS with --cluster tls://HOST:PORT, or listen on 127.0.0.1"
         )
+    share_start()
     keep_open(_Workers(settings.cluster, security, settings, host).running())
 
 

@@ -6,7 +6,6 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.optimize import minimize_scalar
 
 
 class Gamma(BaseModel):
@@ -163,6 +162,8 @@ def _varies(values: NDArray[np.float32], usable: NDArray[np.bool_]) -> bool:
 
 
 def _closest(misfit: Callable[[Curve], float]) -> Curve:
+    from scipy.optimize import minimize_scalar  # half a second to import, and who composites never comes here
+
     best = minimize_scalar(lambda gamma: misfit(Gamma(gamma=gamma)), bounds=(0.4, 4.0), method="bounded")
     named: tuple[Curve, ...] = ("linear", "srgb")
     error, curve = min(((misfit(curve), curve) for curve in named), key=lambda pair: pair[0])

@@ -4,8 +4,9 @@ import hashlib
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import psutil
 import pytest
 
 from services.client import Client
+from tests.services.clusters import workers
 from workflows import images, simulate
 from workflows.program import Program
 from workflows.scene import Scene, nested_program, write_capture
@@ -78,17 +80,32 @@ def serving(data: Path, *options: str, **environment: str) -> Iterator[Service]:
 
 @contextmanager
 def paused(service: Service) -> Iterator[None]:
-    """Hold up the workers of a service: what was uploaded stays in the store."""
-    tree = psutil.Process(service.process.pid).children(recursive=True)
-    workers = [process for process in tree if "spawn_main" in " ".join(process.cmdline())]
-    assert workers
-    for worker in workers:
+    """Hold up the workers of a service: what was uploaded stays in the store.
+
+    One that says nothing for half a minute is ended by its scheduler, and another one started: it is held up too.
+    """
+    over = threading.Event()
+
+    def hold() -> None:
+        while not over.wait(0.1):
+            for worker in workers(service.process):
+                with suppress(psutil.NoSuchProcess):
+                    worker.suspend()
+
+    held = workers(service.process)
+    assert held
+    for worker in held:
         worker.suspend()
+    holding = threading.Thread(target=hold)
+    holding.start()
     try:
         yield
     finally:
-        for worker in workers:
-            worker.resume()
+        over.set()
+        holding.join()
+        for worker in workers(service.process):
+            with suppress(psutil.NoSuchProcess):
+                worker.resume()
 
 
 def png(light: np.ndarray, transfer: str, dtype: type) -> bytes:

@@ -14,6 +14,7 @@ import pytest
 from services.client import ServiceError
 from tests.end_to_end.conftest import Service, digests, png, serving
 from tests.end_to_end.test_uploads import begin, create
+from tests.services.clusters import workers
 
 pytestmark = pytest.mark.full
 
@@ -166,10 +167,7 @@ def test_a_worker_that_is_killed_costs_nothing(service: Service, matte: str, cap
     job = service.client.recover(capture)
     while service.client.job(job["id"])["tiles"]["done"] < 3:
         time.sleep(0.01)
-    tree = psutil.Process(service.process.pid).children(recursive=True)
-    workers = [p for p in tree if "spawn_main" in " ".join(p.cmdline())]
-    assert workers
-    workers[-1].kill()
+    workers(service.process)[-1].kill()
     ended = service.client.wait(job["id"])
     assert files_of(service, ended["matte"]) == files_of(service, matte)
 

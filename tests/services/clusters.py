@@ -61,11 +61,11 @@ def children(process: subprocess.Popen[str]) -> list[psutil.Process]:
 
 
 def workers(process: subprocess.Popen[str]) -> list[psutil.Process]:
-    """The worker processes of a process."""
+    """The worker processes of a process: those that its fork server has forked."""
     found = []
     for one in children(process):
         with suppress(psutil.NoSuchProcess):  # nor one that has just ended
-            if "spawn_main" in " ".join(one.cmdline()):
+            if any("forkserver" in argument for argument in psutil.Process(one.ppid()).cmdline()):
                 found.append(one)
     return found
 

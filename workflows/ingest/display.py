@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, find_objects, label
-from scipy.optimize import minimize
 
 from workflows import clock
 from workflows.clock import Border, Box
@@ -147,6 +146,8 @@ def _adjusted(light: Floats, ends: Points, border: Border) -> Doubles:
         return -float(np.abs(pairs[:, ::2] - pairs[:, 1::2]).mean())
 
     simplex = np.concatenate([np.zeros((1, 8)), _SIMPLEX * np.eye(8)])
+    from scipy.optimize import minimize  # half a second to import, and only who ingests a video comes here
+
     best = minimize(
         alike,
         np.zeros(8),

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 # No frame is exact: 16 bits alone leave this much.
 LEAST_READ = 2e-11
@@ -58,6 +57,8 @@ def noise_line(
     """
     if level.size < 10 * _BINS:
         return None
+    from scipy.optimize import nnls  # half a second to import, and who composites never comes here
+
     order = np.argsort(level, kind="stable")
     bins = np.array_split(order, _BINS)
     middle = np.array([level[b].mean() for b in bins])
