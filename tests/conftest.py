@@ -8,7 +8,22 @@ from storage.database import open_engine
 from tests import postgres
 from tests.s3 import s3, s3_server
 
+AT_LENGTH = 3
+"""What `--times` is from which on tests at length are run too."""
 __all__ = ["postgresql", "postgresql_server", "s3", "s3_server"]
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--times", type=int, default=1, help="How often each fault is injected.")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out what is long, before anything is set up for it."""
+    if config.getoption("--times") < AT_LENGTH:
+        why = f"it takes a minute, or does more of what another test does: run with --times {AT_LENGTH} and more"
+        for item in items:
+            if item.get_closest_marker("long"):
+                item.add_marker(pytest.mark.skip(reason=why))
 
 
 @pytest.fixture(scope="session")

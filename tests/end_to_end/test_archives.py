@@ -22,6 +22,8 @@ from tests.end_to_end.test_bad_input import ZIP, check_problem
 from tests.end_to_end.test_cli import envmatte
 from workflows import simulate
 
+pytestmark = pytest.mark.full
+
 
 @pytest.fixture(scope="module")
 def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:

@@ -34,6 +34,7 @@ def decoded(answer: httpx2.Response) -> np.ndarray:
     return images.decode(answer.content, memory=1 << 24)
 
 
+@pytest.mark.full
 def test_the_three_kinds_of_answer_are_one_picture(service: Service, matte: str) -> None:
     exr = asked(service, matte, accept="image/x-exr")
     assert exr.headers["content-type"] == "image/x-exr"
@@ -95,6 +96,7 @@ def test_a_moved_backdrop_is_the_backdrop_moved(service: Service, matte: str) ->
     assert np.abs(moved - decoded(asked(service, matte))).mean() > 10
 
 
+@pytest.mark.full
 def test_a_backdrop_at_another_depth(service: Service, matte: str) -> None:
     still = decoded(asked(service, matte)).astype(int)
     told = {"distance": 3, "camera": 5}

@@ -36,8 +36,9 @@ def in_one_post(service: Service, file: Path) -> dict[str, Any]:
     return dict(answer.json())
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("send", [in_pieces, in_one_patch, in_one_post])
+@pytest.mark.parametrize(
+    "send", [in_pieces, *(pytest.param(one, marks=pytest.mark.long) for one in (in_one_patch, in_one_post))]
+)
 def test_an_upload_of_a_gigabyte_is_streamed(
     bundle: Path, tmp_path: Path, send: Callable[[Service, Path], dict[str, Any]]
 ) -> None:
@@ -67,7 +68,6 @@ def test_an_upload_of_a_gigabyte_is_streamed(
         assert service.client.wait(uploaded["job"])["state"] == "succeeded"
 
 
-@pytest.mark.full
 def test_an_upload_over_the_limit_is_refused_without_being_read(bundle: Path, tmp_path: Path) -> None:
     limit = bundle.stat().st_size - 1
     with serving(tmp_path / "data", "--workers", "1", ENVMATTE_UPLOAD_BYTES=str(limit)) as service:

@@ -28,7 +28,7 @@ from tests.end_to_end.test_uploads import CHUNK, TUS, begin, create, gone, offse
 pytestmark = pytest.mark.full
 
 MB = 1_000_000
-SIZES = [50 * MB, pytest.param(1000 * MB, marks=[pytest.mark.full, pytest.mark.timeout(1800)])]
+SIZES = [50 * MB, pytest.param(1000 * MB, marks=[pytest.mark.long, pytest.mark.timeout(1800)])]
 
 
 def large(bundle: Path, path: Path, size: int) -> Path:

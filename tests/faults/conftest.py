@@ -14,20 +14,12 @@ from workflows.scene import nested_program, write_capture
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--times", type=int, default=1, help="How often each fault is injected.")
     parser.addoption("--table", type=Path, help="A file for the table of faults, as JSON.")
 
 
 @pytest.fixture(scope="session")
 def times(pytestconfig: pytest.Config) -> int:
     return int(pytestconfig.getoption("--times"))
-
-
-@pytest.fixture(scope="session")
-def at_length(times: int) -> None:
-    """For what takes minutes, or as long as one; of the session, so that it comes before what is set up for it."""
-    if times < 3:
-        pytest.skip("it takes a minute or more: run with --times 3 and more")
 
 
 @pytest.fixture(scope="session")

@@ -26,7 +26,7 @@ def hosts(tmp_path_factory: pytest.TempPathFactory, bundle: Path) -> Iterator[Kn
 
 
 @pytest.mark.parametrize("name", ["service0", "scheduler"])
-@pytest.mark.usefixtures("at_length")
+@pytest.mark.long
 def test_the_link_of_another_that_is_cut(hosts: Known, table: list[Row], seldom: int, name: str) -> None:
     cut_off(hosts, table, name, seldom)
 

@@ -42,7 +42,7 @@ def test_a_killed_service_that_drives(known: Known, table: list[Row], times: int
     check(table, row)
 
 
-@pytest.mark.usefixtures("at_length")
+@pytest.mark.long
 def test_a_frozen_worker(known: Known, table: list[Row]) -> None:
     frozen: list[psutil.Process] = []
 

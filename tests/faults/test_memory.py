@@ -37,7 +37,7 @@ def large(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.usefixtures("at_length")
+@pytest.mark.long
 def test_a_worker_out_of_memory(bundle: Path, large: Path, tmp_path: Path, table: list[Row]) -> None:
     memory = {"ENVMATTE_WORKER_MEMORY": str(LIMIT)}
     with serving(

@@ -15,7 +15,7 @@ from tests.faults.conftest import Known, check, prepared
 from tests.faults.rig import Rig, Row
 from tests.s3 import BUCKET, KEYS
 
-pytestmark = [pytest.mark.full, pytest.mark.timeout(3600), pytest.mark.usefixtures("at_length")]
+pytestmark = [pytest.mark.full, pytest.mark.timeout(3600), pytest.mark.long]
 
 AWAY = 10.0
 """Seconds for which the store is away."""

@@ -45,7 +45,7 @@ def deadly(rig: Rig, key: str) -> Iterator[None]:
         watcher.join()
 
 
-@pytest.mark.usefixtures("at_length")
+@pytest.mark.long
 def test_a_tile_that_kills_its_workers(known: Known, table: list[Row], bundle_bytes: bytes) -> None:
     rig = known.rig
     headers = {"Content-Type": "application/zip"}

@@ -96,14 +96,15 @@ def wrong(stack: Stack, made: Film, numbers: list[int]) -> list[tuple[int, int]]
         pytest.param(
             Camera(hold=HOLD, fps=24, exposure=1.0), ASKEW, id="24 frames a second, all of them exposed"
         ),
-        pytest.param(Camera(hold=0.1, fps=60), ASKEW, id="10 patterns a second"),
+        pytest.param(Camera(hold=0.1, fps=60), ASKEW, id="10 patterns a second", marks=pytest.mark.long),
         pytest.param(
             Camera(hold=HOLD, options={"crf": "32"}),
             ((2, 3), (2, 164), (221, 3), (222, 165)),
             id="compressed",
+            marks=pytest.mark.long,
         ),
         pytest.param(Camera(hold=HOLD), ((20, 14), (16, 190), (203, 24), (210, 187)), id="bottom hidden"),
-        pytest.param(Camera(hold=HOLD), ASKEW[::-1], id="upside down"),
+        pytest.param(Camera(hold=HOLD), ASKEW[::-1], id="upside down", marks=pytest.mark.long),
     ],
 )
 def test_every_number_is_read(take: Callable[..., Any], camera: Camera, corners: Any) -> None:

@@ -42,7 +42,9 @@ def take(make_zip: Callable[..., bytes], ingest: Callable[..., Any]) -> Callable
 @pytest.mark.parametrize(
     "camera",
     [
-        pytest.param(Camera(hold=HOLD, jitter=0.0, fps=30), id="a player that keeps time"),
+        pytest.param(
+            Camera(hold=HOLD, jitter=0.0, fps=30), id="a player that keeps time", marks=pytest.mark.long
+        ),
         pytest.param(Camera(hold=HOLD, jitter=0.03, fps=25, exposure=0.9), id="one that does not quite"),
     ],
 )

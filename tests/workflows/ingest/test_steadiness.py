@@ -27,6 +27,8 @@ from workflows.scene import Scene, nested_program, write_capture
 from workflows.simulate import glass_ball
 from workflows.tone import to_light
 
+pytestmark = pytest.mark.full
+
 Floats = NDArray[np.float32]
 Ingest = Callable[..., Stack]
 Digests = Callable[[str], dict[str, str]]
@@ -131,7 +133,11 @@ def test_what_is_steady_is_left_alone(ingest: Ingest, objects: Objects, digests:
 
 @pytest.mark.parametrize(
     ("ball", "pixels", "jumps", "gain"),
-    [("default", 0.3, False, 6), ("default", 0.6, True, 6), ("quick", 1.0, False, 8)],
+    [
+        ("default", 0.3, False, 6),
+        ("default", 0.6, True, 6),
+        pytest.param("quick", 1.0, False, 8, marks=pytest.mark.long),
+    ],
     indirect=["ball"],
 )
 def test_drift_is_found_and_taken_out(
@@ -153,7 +159,9 @@ def test_drift_is_found_and_taken_out(
 
 
 @pytest.mark.parametrize(
-    ("ball", "percent", "gain"), [("default", 3.0, 3), ("quick", 8.0, 6)], indirect=["ball"]
+    ("ball", "percent", "gain"),
+    [pytest.param("default", 3.0, 3, marks=pytest.mark.long), ("quick", 8.0, 6)],
+    indirect=["ball"],
 )
 def test_flicker_is_found_and_taken_out(
     ingest: Ingest, objects: Objects, ball: Ball, percent: float, gain: float

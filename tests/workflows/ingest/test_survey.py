@@ -17,6 +17,8 @@ from workflows.presets import preset
 from workflows.scene import write_capture
 from workflows.simulate import glass_ball
 
+pytestmark = pytest.mark.full
+
 Ingest = Callable[..., Stack]
 
 
