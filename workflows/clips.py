@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from fractions import Fraction
+from functools import partial
 from typing import Any, BinaryIO, Literal
 
 import numpy as np
@@ -121,9 +122,7 @@ def work(
         """An 8 bit picture, black where the mask left the matte out."""
         backdrop = Backdrop(frame, light)
         where = None if placement == Placement() else placement
-        picture = composite(
-            put, backdrop, placement=where, read=lambda *at: cache.block(matte, *at), threads=1
-        )
+        picture = composite(put, backdrop, placement=where, read=partial(cache.strip, matte), threads=1)
         return encode(picture, transfer, np.dtype(np.uint8), 1)[..., :3].astype(np.uint8, copy=False)
 
     with _reading(objects, job, limits) as clip:

@@ -22,7 +22,6 @@ from services.api.jobs import Job
 from storage import jobs, mattes
 from storage.database import reading
 from storage.errors import Conflict, Corrupt, OptionError
-from storage.mattes import Block
 from workflows import floats, images
 from workflows.composite import composite
 from workflows.composite.backdrops import read_backdrop
@@ -31,6 +30,7 @@ from workflows.composite.engine import Window, shrink
 from workflows.composite.light import Backdrop
 from workflows.composite.placing import Placement
 from workflows.composite.rays import Rays, from_one, from_two
+from workflows.composite.strips import Strip
 from workflows.composite.threads import CORES
 from workflows.options import parse_options
 from workflows.tiles import cut
@@ -210,10 +210,8 @@ def _answer(
         "decode", lambda: read_backdrop(data, wanted.transfer, memory=context.settings.backdrop_bytes)
     )
 
-    def read(row: int, column: int) -> Block | None:
-        if seen.blocks is None or (row, column) in seen.blocks:
-            return context.cache.block(seen.id, row, column)
-        return None
+    def read(row: int, number: int) -> Strip:
+        return context.cache.strip(seen.id, row, number, seen.blocks)
 
     rays = timed("rays", lambda: _rays(context, seen, wanted)) if wanted.depth is not None else None
     picture = timed(

@@ -1,15 +1,17 @@
 """Composites: a matte before any backdrop."""
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.mattes import Block, Matte
+from storage.mattes import Matte
 from workflows.composite.engine import Window, compose
 from workflows.composite.light import Backdrop, node_light
 from workflows.composite.placing import Placement
 from workflows.composite.rays import Rays
+from workflows.composite.strips import Strip, read_strip
 from workflows.composite.threads import CORES
 
 
@@ -20,7 +22,7 @@ def composite(
     placement: Placement | None = None,
     rays: Rays | None = None,
     window: Window | None = None,
-    read: Callable[[int, int], Block | None] | None = None,
+    read: Callable[[int, int], Strip] | None = None,
     threads: int = CORES,
 ) -> NDArray[np.float32]:
     """Put a matte before a backdrop.
@@ -37,7 +39,7 @@ def composite(
     window : Window, optional
         Of the matte; default all of it.
     read : callable, optional
-        Where blocks come from, as `compose` says; default the store.
+        Where strips come from, as `compose` says; default the store.
     threads : int
         To share the work; the picture is the same.
 
@@ -54,7 +56,9 @@ def composite(
     given = backdrop if isinstance(backdrop, Backdrop) else Backdrop(backdrop)
     wide, high = matte.attributes["monitor"] if placement else (1, 1)
     light = node_light(given, matte.columns, matte.rows, threads, placement, (wide, high))
-    return compose(matte, light, window or Window.of(matte), read or matte.read, threads, rays)
+    return compose(
+        matte, light, window or Window.of(matte), read or partial(read_strip, matte), threads, rays
+    )
 
 
 def confidence(matte: Matte) -> NDArray[np.float32]:

@@ -3,26 +3,26 @@
 import threading
 from collections import OrderedDict
 from concurrent.futures import Future
-from dataclasses import fields
 
-from storage.mattes import Block, Matte
+from storage.mattes import Matte
 from storage.objects import Objects
 from workflows.composite.rays import Places, places_of
+from workflows.composite.strips import Blocks, Strip, columns_of, read_strip
 
-Key = tuple[str, int, int]
+Key = tuple[str, int, int, tuple[int, ...]]
 OPEN = 256
 """Mattes whose attributes are kept, some kilobytes each."""
 
 
 class Cache:
-    """Blocks of mattes, those that were asked for last; for any number of threads.
+    """Strips of mattes, those that were asked for last; for any number of threads.
 
     Parameters
     ----------
     objects : Objects
         Where mattes are.
     memory : int
-        Bytes of blocks that are kept, and an eighth of it for `places`. What is in use besides is a block a thread.
+        Bytes of strips that are kept, and an eighth of it for `places`. What is in use besides is a strip a thread.
     """
 
     def __init__(self, objects: Objects, memory: int) -> None:
@@ -30,13 +30,13 @@ class Cache:
         self._memory = memory
         self._lock = threading.Lock()
         self._mattes: OrderedDict[str, Matte] = OrderedDict()
-        self._blocks: OrderedDict[Key, Block] = OrderedDict()
+        self._strips: OrderedDict[Key, Strip] = OrderedDict()
         self._places: OrderedDict[str, Places] = OrderedDict()
-        self._reading: dict[Key, Future[Block]] = {}
+        self._reading: dict[Key, Future[Strip]] = {}
         self.bytes = 0
-        """Of the blocks that are kept."""
+        """Of the strips that are kept."""
         self.hits = self.misses = 0
-        """Blocks that were asked for and there; and those that were read."""
+        """Strips that were asked for and there; and those that were read."""
 
     def matte(self, id: str) -> Matte:
         """A matte, opened once.
@@ -58,21 +58,23 @@ class Cache:
                 self._mattes.popitem(last=False)
         return found
 
-    def block(self, id: str, row: int, column: int) -> Block:
-        """A block of a matte, read once however many ask for it at a time.
+    def strip(self, id: str, row: int, number: int, there: Blocks | None = None) -> Strip:
+        """A strip of a matte, as `read_strip` reads it, once however many ask for it at a time.
 
         Raises
         ------
         Corrupt
             If some of it is missing.
         """
-        key = (id, row, column)
+        matte = self.matte(id)
+        columns = columns_of(matte, number)
+        key = (id, row, number, tuple(c for c in columns if there is None or (row, c) in there))
         with self._lock:
-            block = self._blocks.get(key)
-            if block is not None:
-                self._blocks.move_to_end(key)
+            strip = self._strips.get(key)
+            if strip is not None:
+                self._strips.move_to_end(key)
                 self.hits += 1
-                return block
+                return strip
             read = self._reading.get(key)
             if read is None:
                 mine = self._reading[key] = Future()
@@ -80,7 +82,7 @@ class Cache:
         if read is not None:
             return read.result()
         try:
-            block = self.matte(id).read(row, column)
+            strip = read_strip(matte, row, number, there)
         except BaseException as error:
             with self._lock:
                 del self._reading[key]
@@ -89,20 +91,20 @@ class Cache:
         with self._lock:
             # Unless the matte was deleted meanwhile.
             if self._reading.pop(key, None) is mine:
-                self._blocks[key] = block
-                self.bytes += _size(block)
+                self._strips[key] = strip
+                self.bytes += strip.nbytes
                 while self.bytes > self._memory:
-                    _, old = self._blocks.popitem(last=False)
-                    self.bytes -= _size(old)
-        mine.set_result(block)
-        return block
+                    _, old = self._strips.popitem(last=False)
+                    self.bytes -= old.nbytes
+        mine.set_result(strip)
+        return strip
 
     def places(self, id: str, threads: int) -> Places:
         """Where the pixels of a matte look, as `places_of` tells; of a few mattes it is kept."""
         with self._lock:
             found = self._places.get(id)
         if found is None:
-            found = places_of(self.matte(id), lambda row, column: self.block(id, row, column), threads)
+            found = places_of(self.matte(id), threads)
             with self._lock:
                 self._places[id] = found
                 while sum(places.nbytes for places in self._places.values()) > self._memory // 8:
@@ -114,11 +116,7 @@ class Cache:
         with self._lock:
             self._mattes.pop(id, None)
             self._places.pop(id, None)
-            for key in [key for key in self._blocks if key[0] == id]:
-                self.bytes -= _size(self._blocks.pop(key))
+            for key in [key for key in self._strips if key[0] == id]:
+                self.bytes -= self._strips.pop(key).nbytes
             for key in [key for key in self._reading if key[0] == id]:
                 del self._reading[key]
-
-
-def _size(block: Block) -> int:
-    return sum(getattr(block, field.name).nbytes for field in fields(block))

@@ -1,4 +1,4 @@
-"""C = S + X (rho T L) (eq. 5, and the crosstalk X between the monitor's and the camera's channels), block by block."""
+"""C = S + X (rho T L) (eq. 5, and the crosstalk X between the monitor's and the camera's channels), strip by strip."""
 
 from collections.abc import Callable
 from itertools import product
@@ -9,12 +9,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from storage.errors import OptionError
-from storage.mattes import Block, Matte
+from storage.mattes import Matte
 from workflows.composite.prefetch import prefetch
 from workflows.composite.rays import Rays, arrived_along
+from workflows.composite.strips import LENGTH, Strip
 from workflows.composite.threads import in_parts
 from workflows.grids import area_mean
-from workflows.recovery.pyramid import Pyramid
+from workflows.recovery.pyramid import Grids, Pyramid
 
 AHEAD = 96
 """Cells of T by which their light is asked for before it is used."""
@@ -61,7 +62,7 @@ def compose(
     matte: Matte,
     light: NDArray[np.float32],
     window: Window,
-    read: Callable[[int, int], Block | None],
+    read: Callable[[int, int], Strip],
     threads: int,
     rays: Rays | None = None,
 ) -> NDArray[np.float32]:
@@ -74,7 +75,7 @@ def compose(
         As `node_light` makes it.
     window : Window
     read : callable
-        Returns the block in a block row and a block column; None if there is none yet.
+        Returns a strip by its block row and its number in it, as `read_strip` does.
     threads : int
         To share the work.
     rays : Rays, optional
@@ -92,63 +93,57 @@ def compose(
     """
     picture = np.zeros((window.height, window.width, 4), np.float32)
     crosstalk = np.array(matte.attributes["crosstalk"], np.float32)
-    edge = matte.block
-    blocks = list(
+    grids = Pyramid.over(matte.columns, matte.rows).arrays
+    high, wide = matte.block, LENGTH
+    strips = list(
         product(
-            range(window.y // edge, -(-(window.y + window.height) // edge)),
-            range(window.x // edge, -(-(window.x + window.width) // edge)),
+            range(window.y // high, -(-(window.y + window.height) // high)),
+            range(window.x // wide, -(-(window.x + window.width) // wide)),
         )
     )
 
-    def one(number: int) -> None:
-        row, column = blocks[number]
-        block = read(row, column)
-        if block is None:
-            return
+    def one(which: int) -> None:
+        row, number = strips[which]
+        strip = read(row, number)
+        top, left = row * high - window.y, number * wide - window.x
         if rays is not None:
-            _compose_along(matte, row, column, block, light, crosstalk, rays, window, picture)
+            shift = rays.shift[row * high : (row + 1) * high, number * wide : (number + 1) * wide]
+            seen = _seen_along(strip, light, crosstalk, grids, shift, rays.scale)
+            to = picture[max(top, 0) : top + seen.shape[0], max(left, 0) : left + seen.shape[1]]
+            to[:] = seen[max(-top, 0) :, max(-left, 0) :][: to.shape[0], : to.shape[1]]
             return
         _compose(
-            block.S,
-            block.rho,
-            block.recovered,
-            block.shared,
-            block.count,
-            block.cell,
-            block.weight,
+            strip.S,
+            strip.rho,
+            strip.recovered,
+            strip.shared,
+            strip.count,
+            strip.cell,
+            strip.weight,
             light,
             crosstalk,
-            row * edge - window.y,
-            column * edge - window.x,
+            top,
+            left,
             picture,
         )
 
-    in_parts(one, range(len(blocks)), threads)
+    in_parts(one, range(len(strips)), threads)
     return picture
 
 
-def _compose_along(
-    matte: Matte,
-    row: int,
-    column: int,
-    block: Block,
+def _seen_along(
+    strip: Strip,
     light: NDArray[np.float32],
     crosstalk: NDArray[np.float32],
-    rays: Rays,
-    window: Window,
-    picture: NDArray[np.float32],
-) -> None:
-    """Composite a block before a backdrop at another depth, as far as it lies in the window."""
-    at = matte.span(row, column)
-    arrived = np.empty_like(block.S)
-    grids = Pyramid.over(matte.columns, matte.rows).arrays
-    rows = (block.count, block.shared, block.cell, block.weight)
-    arrived_along(*rows, light, grids, rays.shift[at], rays.scale, arrived)
-    alpha = block.recovered[..., np.newaxis]
-    seen = np.concatenate([alpha * (block.S + (block.rho * arrived) @ crosstalk.T), alpha], axis=2)
-    top, left = at[0].start - window.y, at[1].start - window.x
-    to = picture[max(top, 0) : top + seen.shape[0], max(left, 0) : left + seen.shape[1]]
-    to[:] = seen[max(-top, 0) :, max(-left, 0) :][: to.shape[0], : to.shape[1]]
+    grids: Grids,
+    shift: NDArray[np.float32],
+    scale: float,
+) -> NDArray[np.float32]:
+    """A strip before a backdrop at another depth."""
+    arrived = np.empty_like(strip.S)
+    arrived_along(strip.count, strip.shared, strip.cell, strip.weight, light, grids, shift, scale, arrived)
+    alpha = strip.recovered[..., np.newaxis]
+    return np.concatenate([alpha * (strip.S + (strip.rho * arrived) @ crosstalk.T), alpha], axis=2)
 
 
 @njit(nogil=True, cache=True, fastmath={"contract"})
@@ -158,7 +153,7 @@ def _compose(
     recovered: NDArray[np.bool_],
     shared: NDArray[np.bool_],
     count: NDArray[np.uint32],
-    cell: NDArray[np.uint32],
+    cell: NDArray[np.uint16] | NDArray[np.uint32],
     weight: NDArray[np.float32],
     light: NDArray[np.float32],
     crosstalk: NDArray[np.float32],
@@ -166,7 +161,7 @@ def _compose(
     left: int,
     picture: NDArray[np.float32],
 ) -> None:
-    """Composite a block, whose first pixel is at (top, left) of the picture, as far as it lies in it."""
+    """Composite a strip, whose first pixel is at (top, left) of the picture, as far as it lies in it."""
     height, width, _ = picture.shape
     values, last = light.reshape(-1), cell.size - 1
     entry = 0

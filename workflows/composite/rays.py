@@ -6,7 +6,6 @@ the camera's line of sight meets the plane through the object, square to the cam
 thin, and off by what light moves sideways in the object for what is thick.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 
@@ -15,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from storage.errors import Conflict
-from storage.mattes import Block, Matte
+from storage.mattes import Matte
 from workflows.composite.threads import in_parts
 from workflows.ranked import lobes_of
 from workflows.recovery.pyramid import Grids
@@ -31,7 +30,6 @@ STRAY = 0.1
 LEAST = 0.02
 """Share of the recovered pixels that must see the monitor directly, to tell the camera's perspective."""
 Places = NDArray[np.float32]
-Read = Callable[[int, int], Block | None]
 
 
 @dataclass(frozen=True)
@@ -51,7 +49,7 @@ class Rays:
     scale: float
 
 
-def places_of(matte: Matte, read: Read, threads: int) -> Places:
+def places_of(matte: Matte, threads: int) -> Places:
     """The heaviest lobe of every pixel.
 
     Returns
@@ -64,10 +62,7 @@ def places_of(matte: Matte, read: Read, threads: int) -> Places:
     blocks = list(product(range(matte.block_rows), range(matte.block_columns)))
 
     def one(number: int) -> None:
-        block = read(*blocks[number])
-        if block is None:
-            return
-        lobe = lobes_of(matte, block, LOBES)[:, :, 0]
+        lobe = lobes_of(matte, matte.read(*blocks[number]), LOBES)[:, :, 0]
         at = places[matte.span(*blocks[number])]
         at[..., 3] = lobe[..., 2:5].mean(axis=2)
         at[..., 0], at[..., 1] = lobe[..., 0], np.where(at[..., 3] > 0, 1 - lobe[..., 1], 0)
@@ -198,7 +193,7 @@ def _homography(
 def arrived_along(
     count: NDArray[np.uint32],
     shared: NDArray[np.bool_],
-    cell: NDArray[np.uint32],
+    cell: NDArray[np.uint16] | NDArray[np.uint32],
     weight: NDArray[np.float32],
     light: NDArray[np.float32],
     grids: Grids,
@@ -206,18 +201,18 @@ def arrived_along(
     scale: float,
     arrived: NDArray[np.float32],
 ) -> None:
-    """T L of a block, of a backdrop at another depth.
+    """T L of a strip, of a backdrop at another depth.
 
     Parameters
     ----------
     count, shared, cell, weight
-        Of the block.
+        Of the strip.
     light : (nodes, 3) float32
         Of the backdrop, as if it stood where the monitor did.
     grids : Grids
         Of the pyramid.
     shift : (h, w, 2) float32
-        Of `Rays`, for the block's pixels.
+        Of `Rays`, for the strip's pixels.
     scale : float
     arrived : (h, w, 3) float32
         Written.

@@ -1,4 +1,4 @@
-"""Blocks of mattes in memory: bounded, and read once."""
+"""Strips of mattes in memory: bounded, and read once."""
 
 import threading
 import time
@@ -11,51 +11,68 @@ from storage import mattes
 from storage.errors import Corrupt
 from storage.mattes import Block, Matte
 from storage.objects import Objects
-from workflows.composite.cache import Cache, _size
+from workflows.composite.cache import Cache
+from workflows.composite.strips import LENGTH, Strip, read_strip
 
-EDGE = 16
+EDGE = 32
 
 
 @pytest.fixture
 def matte(objects: Objects) -> Matte:
-    """Of 4 x 4 blocks, each with its number in S."""
-    made = mattes.create(objects, "m", height=64, width=64, columns=8, rows=6, crosstalk=np.eye(3).tolist())
+    """Of 4 rows of two strips, of which the second has two blocks; each block with its number in S."""
+    width = LENGTH + 2 * EDGE
+    made = mattes.create(
+        objects, "m", height=128, width=width, columns=8, rows=6, crosstalk=np.eye(3).tolist()
+    )
     assert made.block == EDGE
     for row in range(4):
-        for column in range(4):
+        for column in range(made.block_columns):
             zero = np.zeros((EDGE, EDGE, 3), np.float32)
             flags = np.ones((EDGE, EDGE), bool)
             count = np.zeros((EDGE, EDGE, 3), np.uint32)
             empty = np.zeros(0, np.uint32), np.zeros(0, np.float32)
-            S = zero + 4 * row + column
+            S = zero + 100 * row + column
             made.write(row, column, Block(S, zero, zero[..., 0], flags, ~flags, count, *empty))
     return made
 
 
-def number(block: Block) -> float:
-    return float(block.S[0, 0, 0])
+def number(strip: Strip) -> float:
+    return float(strip.S[0, 0, 0])
 
 
 def test_what_was_asked_for_last_is_kept(objects: Objects, matte: Matte) -> None:
-    one = _size(matte.read(0, 0))
+    one = read_strip(matte, 0, 0).nbytes
     cache = Cache(objects, 3 * one)
-    for column in (0, 1, 2, 0, 3):
-        assert number(cache.block("m", 0, column)) == column
+    for row in (0, 1, 2, 0, 3):
+        assert number(cache.strip("m", row, 0)) == 100 * row
     assert (cache.hits, cache.misses, cache.bytes) == (1, 4, 3 * one)
-    cache.block("m", 0, 0)
+    cache.strip("m", 0, 0)
     assert cache.hits == 2
-    cache.block("m", 0, 1)
+    cache.strip("m", 1, 0)
     assert cache.misses == 5
 
 
 def test_a_matte_of_twice_the_memory_is_read_all_the_same(objects: Objects, matte: Matte) -> None:
-    one = _size(matte.read(0, 0))
-    cache = Cache(objects, 8 * one)
+    memory = 2 * (read_strip(matte, 0, 0).nbytes + read_strip(matte, 0, 1).nbytes)
+    cache = Cache(objects, memory)
     for _ in range(2):
-        found = [number(cache.block("m", row, column)) for row in range(4) for column in range(4)]
-        assert found == list(range(16))
-        assert cache.bytes <= 8 * one
-    assert number(Cache(objects, 0).block("m", 1, 1)) == 5
+        found = [number(cache.strip("m", row, part)) for row in range(4) for part in range(2)]
+        assert found == [0, 8, 100, 108, 200, 208, 300, 308]
+        assert cache.bytes <= memory
+    assert number(Cache(objects, 0).strip("m", 1, 1)) == 108
+
+
+def test_a_matte_in_the_making_is_read_again_when_it_has_grown(objects: Objects, matte: Matte) -> None:
+    cache = Cache(objects, 1 << 30)
+    there = {(0, 0), (0, 2)}
+    for _ in range(2):
+        strip = cache.strip("m", 0, 0, there)
+        assert strip.recovered.all(axis=0).nonzero()[0].tolist() == [*range(EDGE), *range(2 * EDGE, 3 * EDGE)]
+        assert strip.S[:, ~strip.recovered[0]].max() == 0
+    assert cache.misses == 1
+    assert cache.strip("m", 0, 0, there | {(0, column) for column in range(LENGTH // EDGE)}).recovered.all()
+    assert cache.strip("m", 0, 0).recovered.all()
+    assert cache.misses == 2
 
 
 def test_threads_that_ask_for_the_same_read_it_once(
@@ -74,32 +91,32 @@ def test_threads_that_ask_for_the_same_read_it_once(
 
     def ask(_: int) -> float:
         gate.wait()
-        return number(cache.block("m", 2, 3))
+        return number(cache.strip("m", 2, 1))
 
     with ThreadPoolExecutor(8) as threads:
-        assert list(threads.map(ask, range(8))) == [11] * 8
-    assert reads == [(2, 3)]
+        assert list(threads.map(ask, range(8))) == [208] * 8
+    assert reads == [(2, 8), (2, 9)]
 
 
 def test_a_block_that_is_missing_is_told_to_all_and_asked_for_again(objects: Objects) -> None:
     made = mattes.create(objects, "n", height=16, width=16, columns=8, rows=6, crosstalk=np.eye(3).tolist())
     cache = Cache(objects, 1 << 20)
     with ThreadPoolExecutor(4) as threads:
-        for one in [threads.submit(cache.block, "n", 0, 0) for _ in range(4)]:
+        for one in [threads.submit(cache.strip, "n", 0, 0) for _ in range(4)]:
             assert isinstance(one.exception(), Corrupt)
     zero = np.zeros((16, 16, 3), np.float32)
     flags = np.zeros((16, 16), bool)
     count = np.zeros((16, 16, 3), np.uint32)
     empty = np.zeros(0, np.uint32), np.zeros(0, np.float32)
     made.write(0, 0, Block(zero, zero, zero[..., 0], flags, flags, count, *empty))
-    assert number(cache.block("n", 0, 0)) == 0
+    assert number(cache.strip("n", 0, 0)) == 0
 
 
 def test_nothing_is_kept_of_a_matte_that_is_forgotten(objects: Objects, matte: Matte) -> None:
     cache = Cache(objects, 1 << 20)
-    cache.block("m", 0, 0)
+    cache.strip("m", 0, 0)
     cache.forget("m")
     assert cache.bytes == 0
     objects.delete(mattes.path("m"))
     with pytest.raises(Corrupt, match="m is not in the store"):
-        cache.block("m", 0, 0)
+        cache.strip("m", 0, 0)

@@ -81,7 +81,7 @@ def psnr(scene: Scene, seen: np.ndarray, backdrop: np.ndarray, where: np.ndarray
 def test_a_second_matte_tells_the_rays(
     made: dict[float, Matte], scenes: dict[float, Scene], backdrop: np.ndarray
 ) -> None:
-    first, second = (places_of(made[at], made[at].read, CORES) for at in (NEAR, FAR))
+    first, second = (places_of(made[at], CORES) for at in (NEAR, FAR))
     scene, where = scenes[BEYOND], scenes[BEYOND].object_mask
     still = psnr(scene, composite(made[NEAR], backdrop), backdrop, where)
     moved = psnr(
@@ -98,7 +98,7 @@ def test_a_second_matte_tells_the_rays(
 def test_one_matte_tells_them_by_the_camera_s_lines_of_sight(
     made: dict[float, Matte], scenes: dict[float, Scene], backdrop: np.ndarray
 ) -> None:
-    places = places_of(made[NEAR], made[NEAR].read, CORES)
+    places = places_of(made[NEAR], CORES)
     rays = from_one(places, 0.75, NEAR, simulate.CAMERA, BEYOND)
     scene = scenes[BEYOND]
     beside = scene.coverage == 0
@@ -114,9 +114,9 @@ def test_one_matte_tells_them_by_the_camera_s_lines_of_sight(
 
 def test_at_the_monitor_s_own_depth_nothing_moves(made: dict[float, Matte], backdrop: np.ndarray) -> None:
     matte = made[NEAR]
-    places = places_of(matte, matte.read, CORES)
+    places = places_of(matte, CORES)
     still = composite(matte, backdrop)
-    others = places_of(made[FAR], made[FAR].read, CORES)
+    others = places_of(made[FAR], CORES)
     for rays in (from_one(places, 0.75, NEAR, 5.0, NEAR), from_two(places, others, (NEAR, FAR), NEAR)):
         np.testing.assert_allclose(composite(matte, backdrop, rays=rays), still, atol=2e-3)
 
@@ -125,7 +125,7 @@ def test_a_window_at_another_depth_is_a_piece_of_the_whole(
     made: dict[float, Matte], backdrop: np.ndarray
 ) -> None:
     matte = made[NEAR]
-    rays = from_one(places_of(matte, matte.read, 1), 0.75, NEAR, 5.0, 5.0)
+    rays = from_one(places_of(matte, 1), 0.75, NEAR, 5.0, 5.0)
     whole = composite(matte, backdrop, rays=rays)
     window = Window.of(matte, 13, 7, 50, 41)
     np.testing.assert_array_equal(composite(matte, backdrop, rays=rays, window=window), whole[7:48, 13:63])
