@@ -81,7 +81,7 @@ jobs = Table(
     Column("kind", String(16), nullable=False),
     Column("state", String(16), nullable=False, index=True),
     Column("stage", String(16), nullable=False),
-    Column("capture", String(32), nullable=False),
+    Column("capture", String(32), nullable=False),  # empty of a composite of a matte that has none
     Column("matte", String(32)),
     Column("options", JSON, nullable=False),
     Column("plan", JSON(none_as_null=True)),

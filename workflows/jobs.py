@@ -37,7 +37,7 @@ class Task:
     store : str
         URL of the object store.
     capture : str
-        Id of the capture.
+        Id of the capture; empty for a composite of a matte that has none.
     matte : str
         Id of the matte; empty for ingest.
     options : dict

@@ -125,7 +125,7 @@ def _queue(context: Context, job: str, matte: str, options: dict[str, Any], key:
     try:
         with writing(context.engine) as c:
             row = mattes.get_ready(c, matte)
-            jobs.add(c, "composite", row.capture, options, matte, tracing.asked_by(), job)
+            jobs.add(c, "composite", row.capture or "", options, matte, tracing.asked_by(), job)
             jobs.begin(c, job)  # while it has tiles it has something in the store, see `jobs.not_wound_up`
             if key:
                 jobs.remember(c, key, CALL, job)

@@ -60,7 +60,7 @@ class Job(BaseModel):
     queued_seconds: float
     run_seconds: float
     workers: int
-    capture: str
+    capture: str | None
     matte: str | None
     options: dict[str, Any]
     problem: dict[str, Any] | None
@@ -78,10 +78,7 @@ class Job(BaseModel):
         # The step after the last tile counts as one more: only a job that has succeeded is at 1.
         progress = 1.0 if row.state == "succeeded" else row.done / (row.total + 1) if row.total else 0.0
         return cls(
-            **{
-                name: getattr(row, name)
-                for name in ("id", "kind", "state", "stage", "pixels", "capture", "matte")
-            },
+            **{name: getattr(row, name) for name in ("id", "kind", "state", "stage", "pixels", "matte")},
             progress=progress,
             tiles=Tiles(total=row.total, done=row.done, failed=row.failed),
             eta_seconds=seconds_left(connection, row, now) if running else None,
@@ -89,6 +86,7 @@ class Job(BaseModel):
             queued_seconds=(row.started_at or row.finished_at or now) - row.created_at,
             run_seconds=ran,
             workers=len(sign.cluster["workers"]) if running and sign else 0,
+            capture=row.capture or None,
             options=row.options,
             problem=row.problem,
             video=f"/v1/jobs/{row.id}/video.mp4"

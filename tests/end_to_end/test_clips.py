@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from services.client import ServiceError
-from tests.end_to_end.conftest import Service
+from tests.end_to_end.conftest import Service, serving
 from tests.end_to_end.test_cli import envmatte
+from tests.services.clusters import workers
 from tests.workflows.test_clips import TICK, clip, even, frames_of, pictures
 from workflows import images
 
@@ -111,6 +112,34 @@ def test_a_cancelled_job_frees_what_it_had_and_holds_its_matte_no_more(service: 
     until(lambda: stored(service) == before)
     assert service.client.job(job["id"])["state"] == "cancelled"
     assert service.client.matte(matte)["state"] == "ready"
+
+
+@pytest.mark.full
+def test_a_killed_worker_and_a_killed_service_change_no_byte(
+    service: Service, matte: str, tmp_path: Path
+) -> None:
+    data = clip(pictures(450), even(450))
+    undisturbed = service.client.wait(post(service, matte, data)["id"])
+    assert undisturbed["tiles"]["total"] >= 6
+    archive = tmp_path / "matte.zip"
+    service.client.export(matte, archive)
+
+    def done(running: Service) -> int:
+        return int(running.client.job(job["id"])["tiles"]["done"])
+
+    with serving(tmp_path / "data", "--workers", "1") as first:
+        job = post(first, first.client.import_matte(archive)["id"], data)
+        until(lambda: done(first) >= 1)
+        for worker in workers(first.process):
+            worker.kill()
+        until(lambda: done(first) >= 3)
+        first.kill()
+    with serving(tmp_path / "data", "--workers", "1") as second:
+        assert 3 <= done(second) < undisturbed["tiles"]["total"]
+        ended = second.client.wait(job["id"])
+        again = second.http.get(ended["video"]).content
+        until(lambda: stored(second) == {f"composites/{job['id']}/video.mp4"})
+    assert again == service.http.get(undisturbed["video"]).content
 
 
 def test_what_can_not_be_taken_is_refused_before_it_comes(service: Service, matte: str) -> None:

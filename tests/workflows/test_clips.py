@@ -99,7 +99,9 @@ def clip(
     """A clip of pictures, each shown at a tick of 1/600 s."""
     target = io.BytesIO()
     options = {"g": "12", "crf": crf, "mbtree": "0"} if codec == "libx264" else {}
-    with av.open(target, "w", format=container, options={"moov_size": "9999"}) as video:
+    with av.open(
+        target, "w", format=container, options={"moov_size": str(max(9999, 40 * len(shown)))}
+    ) as video:
         stream = video.add_stream(codec, rate=30, options=options)
         stream.height, stream.width = shown[0].shape[:2]
         stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
