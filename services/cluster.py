@@ -29,7 +29,7 @@ START = 60
 PRELOAD = "services.preload"
 """What a worker imports before it takes work."""
 IDLE = 300.0
-"""Seconds without a job after which all workers but one are let go: they hold some 300 MB each."""
+"""Seconds without a job after which all workers but one are let go: they hold 70 MB each, and more while they work."""
 
 CONFIG: dict[str, Any] = {
     # A tile of an innocent job must not be blamed for the workers that died with it: the ledger counts its misses.
