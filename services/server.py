@@ -12,6 +12,7 @@ from sqlalchemy import Engine
 from services import tracing
 from services.api import build_app
 from services.cluster import dispatcher_of
+from services.connections import Connection, allow_many
 from services.coordinator import Coordinator
 from services.process import log
 from services.settings import Settings
@@ -31,12 +32,14 @@ def serve(settings: Settings) -> None:
     Conflict
         If another service has the data folder.
     """
+    allow_many()
     with _opened(settings, "service") as (stack, engine, objects):
         # The port is taken before workers start, so that one in use is told at once.
         config = uvicorn.Config(
             build_app(settings, engine, objects),
             settings.host,
             settings.port,
+            http=Connection,
             log_config=None,
             log_level="warning",
             lifespan="off",
