@@ -11,6 +11,7 @@ from sqlalchemy import Engine
 
 from services import tracing
 from services.api import build_app
+from services.api.access import see_that_it_is_closed
 from services.cluster import dispatcher_of
 from services.connections import Connection, allow_many
 from services.coordinator import Coordinator
@@ -34,6 +35,7 @@ def serve(settings: Settings) -> None:
     """
     allow_many()
     with _opened(settings, "service") as (stack, engine, objects):
+        see_that_it_is_closed(settings, engine)
         # The port is taken before workers start, so that one in use is told at once.
         config = uvicorn.Config(
             build_app(settings, engine, objects),

@@ -113,7 +113,9 @@ class Settings(ClusterSettings):
     host: str = Field("127.0.0.1", description="Address to listen on. Other than loopback only with keys.")
     port: int = Field(8000, ge=0, le=65535, description="Port to listen on; 0 takes a free one.")
     keys: Annotated[tuple[str, ...], NoDecode] = Field(
-        (), description="API keys, separated by commas. With none the service is open, and on loopback alone."
+        (),
+        description="API keys, separated by commas, besides those of `envmatte keys`: of scope admin and the default "
+        "owner. With none at all the service is open, and on loopback alone.",
     )
     upload_bytes: int = Field(
         8 << 30, ge=1, description="Bytes of the largest archive or clip that is taken."
@@ -163,15 +165,6 @@ class Settings(ClusterSettings):
         ):
             raise ValueError(f"{value!r}: give it as s3://BUCKET/PREFIX or file:///FOLDER")
         return value
-
-    @model_validator(mode="after")
-    def _no_open_door(self) -> "Settings":
-        if not self.keys and not is_loopback(self.host):
-            raise ValueError(
-                f"asked to listen on {self.host} without a key, where anyone on the network could use the service: "
-                "set ENVMATTE_KEYS to one or more keys, separated by commas, or listen on 127.0.0.1"
-            )
-        return self
 
     @model_validator(mode="after")
     def _store_shared(self) -> "Settings":

@@ -21,11 +21,13 @@ from sqlalchemy import (
     String,
     Table,
     Text,
+    UniqueConstraint,
+    event,
     select,
 )
 from sqlalchemy.exc import SQLAlchemyError
 
-from storage import dialects
+from storage import dialects, owners
 from storage.dialects import clock as clock
 from storage.errors import NotFound, Unavailable
 
@@ -33,6 +35,13 @@ metadata = MetaData()
 logging.getLogger("alembic").setLevel(
     logging.WARNING
 )  # else it has a line for every step, from its import on
+
+
+def _owner() -> Column[str]:
+    return Column(
+        "owner", String(64), nullable=False, default=owners.owner_of_new, server_default=owners.DEFAULT
+    )
+
 
 captures = Table(
     "captures",
@@ -49,6 +58,10 @@ captures = Table(
     Column("program", JSON, nullable=False),
     Column("problem", JSON(none_as_null=True)),
     Column("created_at", Float, nullable=False),
+    _owner(),
+    Column("expires_at", Float, index=True),
+    Column("stored", BigInteger),  # bytes that it takes in the store; null until they were counted
+    Index("captures_by_owner", "owner", "number"),
 )
 
 mattes = Table(
@@ -62,15 +75,22 @@ mattes = Table(
     Column("options", JSON, nullable=False),
     Column("figures", JSON(none_as_null=True)),
     Column("created_at", Float, nullable=False),
+    _owner(),
+    Column("expires_at", Float, index=True),
+    Column("stored", BigInteger),  # as of a capture
+    Index("mattes_by_owner", "owner", "number"),
 )
 
 programs = Table(
     "programs",
     metadata,
     Column("number", Integer, primary_key=True, autoincrement=True),
-    Column("id", String(32), nullable=False, unique=True),
+    Column("id", String(32), nullable=False),
     Column("program", JSON, nullable=False),
     Column("created_at", Float, nullable=False),
+    _owner(),
+    UniqueConstraint("owner", "id"),  # which is the same of whoever made the same program
+    Index("programs_by_owner", "owner", "number"),
 )
 
 jobs = Table(
@@ -98,6 +118,9 @@ jobs = Table(
     Column("paced_at", Float),  # the pace of tiles is measured from here: when, and how many were done
     Column("paced_done", Integer, nullable=False, server_default="0"),
     Column("trace", String(64)),  # the request's traceparent (W3C)
+    _owner(),
+    Column("stored", BigInteger),  # as of a capture: of a composite, which has no other record
+    Index("jobs_by_owner", "owner", "number"),
 )
 
 tiles = Table(
@@ -149,13 +172,15 @@ uploads = Table(
     "uploads",
     metadata,
     Column("id", String(32), primary_key=True),
-    Column("key", String(256), unique=True),
+    Column("key", String(256)),
     Column("offset", BigInteger, nullable=False),
     Column("length", BigInteger, nullable=False),
     Column("parts", Integer, nullable=False),
     Column("metadata", Text, nullable=False),
     Column("created_at", Float, nullable=False),
     Column("expires_at", Float, nullable=False, index=True),
+    _owner(),
+    UniqueConstraint("owner", "key"),
 )
 
 upload_parts = Table(
@@ -170,11 +195,25 @@ upload_parts = Table(
 made = Table(
     "made",
     metadata,
+    Column("owner", String(64), primary_key=True, default=owners.owner_of_new, server_default=owners.DEFAULT),
     Column("key", String(256), primary_key=True),
     Column("call", String(64), primary_key=True),
     Column("id", String(32), nullable=False),
 )
 """What a POST with an Idempotency-Key made, so that a repeat answers with the same."""
+
+keys = Table(
+    "keys",
+    metadata,
+    Column("number", Integer, primary_key=True, autoincrement=True),
+    Column("name", Text, nullable=False),
+    Column("hash", String(64), nullable=False, unique=True),
+    Column("owner", String(64), nullable=False),
+    Column("scope", String(8), nullable=False),
+    Column("created_at", Float, nullable=False),
+    Column("revoked_at", Float),
+)
+"""API keys, see `storage.keys`."""
 
 
 def open_engine(url: str) -> Engine:
@@ -199,6 +238,7 @@ def open_engine(url: str) -> Engine:
     from storage import migrations  # with alembic, whose import takes a time that no worker should spend
 
     engine = dialects.create(url)
+    event.listen(engine, "before_execute", owners.narrow, retval=True)
     try:
         with reading(engine) as connection:
             current = migrations.revision(connection) == migrations.newest()

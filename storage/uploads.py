@@ -23,6 +23,7 @@ from storage.database import upload_parts as table
 from storage.database import uploads
 from storage.errors import Conflict, Corrupt, NoRoom, NotFound
 from storage.objects import Objects
+from storage.owners import of_all
 
 INDEX = "parts.json"
 MOST_PARTS = 10_000
@@ -163,7 +164,7 @@ def check_room(connection: Connection, objects: Objects, length: int) -> None:
     free = objects.free()
     if free is None:
         return
-    promised = connection.scalar(select(func.sum(uploads.c.length - uploads.c.offset))) or 0
+    promised = connection.scalar(of_all(select(func.sum(uploads.c.length - uploads.c.offset)))) or 0
     missing = length + int(promised) - free
     if missing > 0:
         raise NoRoom(

@@ -1,8 +1,6 @@
 """The HTTP API: `build_app`, and one file a resource."""
 
-import hmac
-
-from fastapi import Depends, FastAPI, Request
+from fastapi import Depends, FastAPI
 from sqlalchemy import Engine
 
 from services import tracing
@@ -25,7 +23,7 @@ from services.api import (
     uploads,
     web,
 )
-from services.api.context import PROBLEM, WEB, Context
+from services.api.context import PROBLEM, WEB, Context, authorized
 from services.settings import Settings
 from storage.objects import Objects
 from workflows.composite.cache import Cache
@@ -44,14 +42,6 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
     app.add_middleware(tus.Protocol)
     app.add_middleware(tracing.Requests)
 
-    def authorize(request: Request) -> None:
-        if not settings.keys:
-            return
-        scheme, _, key = request.headers.get("authorization", "").partition(" ")
-        known = [hmac.compare_digest(key.encode(), one.encode()) for one in settings.keys]
-        if scheme.lower() != "bearer" or not any(known):
-            raise errors.Unauthorized("send a key of this service: `Authorization: Bearer KEY`")
-
     for router in (
         captures.router,
         reports.router,
@@ -66,7 +56,7 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
         programs.router,
         cluster.router,
     ):
-        app.include_router(router, prefix="/v1", dependencies=[Depends(authorize)])
+        app.include_router(router, prefix="/v1", dependencies=[Depends(authorized)])
     app.include_router(programs.page, prefix="/v1")
     app.include_router(system.router)
     app.include_router(metrics.router)

@@ -3,7 +3,7 @@
 from fastapi import APIRouter
 from pydantic import BaseModel, Field
 
-from services.api.context import Needs
+from services.api.context import Whole
 from services.api.waiting import trouble_of
 from storage import counts, leases
 from storage.database import reading
@@ -55,7 +55,7 @@ class Cluster(BaseModel):
 
 
 @router.get("/cluster")
-def get_cluster(context: Needs) -> Cluster:
+def get_cluster(context: Whole) -> Cluster:
     """Workers, threads, memory, the queue, and what is wrong if something is."""
     with reading(context.engine) as c:
         sign = leases.last_sign(c)

@@ -1,9 +1,10 @@
-"""What every request handler needs: the settings, the database and the store."""
+"""What every request handler needs: the settings, the database as the caller may see it, and the store."""
 
 import tempfile
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import IO, Annotated, Any, TypeVar
 
@@ -11,13 +12,16 @@ import anyio.to_thread
 from anyio import CapacityLimiter
 from fastapi import Depends, Query, Request
 from fastapi.exceptions import RequestValidationError
+from fastapi.security import HTTPAuthorizationCredentials
 from pydantic import BaseModel, ValidationError
 from sqlalchemy import Engine
 from starlette.datastructures import Headers
 
+from services.api.access import ADMIN, Caller, bearer, demand, identify, see_that_it_may
 from services.api.errors import TooLarge
 from services.settings import Settings
 from storage.objects import Objects
+from storage.owners import NOBODY, bound
 from workflows.composite.cache import Cache
 from workflows.composite.threads import CORES
 
@@ -30,10 +34,11 @@ Model = TypeVar("Model", bound=BaseModel)
 
 @dataclass(frozen=True)
 class Context:
-    """Built once with the app."""
+    """Built once with the app, and for each request bound to whoever calls, see `Needs`."""
 
     settings: Settings
     engine: Engine
+    """Of the database; of a request, over which no more can be seen than is the caller's, see `storage.owners`."""
     objects: Objects
     cache: Cache
     """Blocks of mattes."""
@@ -47,14 +52,54 @@ class Context:
     """Archives of mattes that are unpacked at once."""
     layers: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(1))
     """Layers of mattes that are encoded at once."""
+    caller: Caller = ADMIN
+    check: Callable[[], object] = lambda: None
+    """Look at the caller's key once more, as `access.identify` does: for what goes on long after its first look."""
 
 
-def _context(request: Request) -> Context:
+Key = Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)]
+
+
+def _unbound(request: Request) -> Context:
     context: Context = request.app.state.context
     return context
 
 
-Needs = Annotated[Context, Depends(_context)]
+def authorized(request: Request, given: Key) -> Context:
+    """The context of a request whose key allows its method, bound to the owner of the key.
+
+    Raises
+    ------
+    Unauthorized, Forbidden
+    """
+    context = _unbound(request)
+    key = given.credentials if given else None
+    caller = identify(context.settings, context.engine, key)
+    see_that_it_may(caller, request)
+    check = partial(identify, context.settings, context.engine, key)
+    return replace(context, engine=bound(context.engine, caller.owner), caller=caller, check=check)
+
+
+Needs = Annotated[Context, Depends(authorized)]
+"""For whoever has a key: what is his."""
+
+
+def _whole(request: Request, context: Needs) -> Context:
+    demand(context.caller, "admin")
+    return _unbound(request)
+
+
+Whole = Annotated[Context, Depends(_whole)]
+"""For admins: the service, with what is anyone's."""
+
+
+def _keyless(request: Request) -> Context:
+    context = _unbound(request)
+    return replace(context, engine=bound(context.engine, NOBODY))
+
+
+Keyless = Annotated[Context, Depends(_keyless)]
+"""For anyone: what is nobody's."""
 Limit = Annotated[int, Query(ge=1, le=1000, description="The most items to list.")]
 After = Annotated[str | None, Query(description="The id of the last item of the page before.")]
 

@@ -62,6 +62,10 @@ class Unauthorized(EnvmatteError):
     """No key, or one that is not known."""
 
 
+class Forbidden(EnvmatteError):
+    """A key that does not allow this."""
+
+
 PROBLEMS: dict[type[Exception], tuple[int, str, str]] = {
     CaptureError: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-capture", "The capture can't be used"),
     ArchiveError: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-archive", "The archive can't be used"),
@@ -77,6 +81,7 @@ PROBLEMS: dict[type[Exception], tuple[int, str, str]] = {
     ChecksumMismatch: (460, "checksum-mismatch", "Not what the checksum was made of"),  # of tus
     InvalidInput: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-request", "The request can't be used"),
     Unauthorized: (HTTPStatus.UNAUTHORIZED, "unauthorized", "A key is needed"),
+    Forbidden: (HTTPStatus.FORBIDDEN, "forbidden", "The key does not allow this"),
     NotFound: (HTTPStatus.NOT_FOUND, "not-found", "Not found"),
     Conflict: (HTTPStatus.CONFLICT, "conflict", "Not in this state"),
     NoRoom: (HTTPStatus.INSUFFICIENT_STORAGE, "no-room", "The store is full"),

@@ -12,6 +12,7 @@ from fastapi.responses import StreamingResponse
 from fastapi.sse import format_sse_event
 
 from services.api.context import Context, Needs
+from services.api.errors import Unauthorized
 from services.api.jobs import Job
 from storage import jobs
 from storage.database import reading
@@ -64,13 +65,14 @@ async def _events(context: Context, job: Job, seen: str | None) -> AsyncIterator
         await anyio.sleep(LOOK)
         try:
             job = await anyio.to_thread.run_sync(_read, context, job.id)
-        except NotFound:  # deleted meanwhile
+        except (NotFound, Unauthorized):  # deleted meanwhile, or the caller's key revoked
             return
         except Unavailable:  # the database is away, and comes back
             continue
 
 
 def _read(context: Context, id: str) -> Job:
+    context.check()
     with reading(context.engine) as c:
         return Job.of(c, jobs.get(c, id))
 

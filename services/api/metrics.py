@@ -10,7 +10,7 @@ from prometheus_client.exposition import choose_encoder
 from prometheus_client.registry import Collector
 from sqlalchemy import Connection
 
-from services.api.context import Needs
+from services.api.context import Whole
 from services.api.waiting import trouble_of
 from storage import counts, leases
 from storage.database import reading
@@ -34,8 +34,8 @@ class _Found(Collector):
 
 
 @router.get("/metrics", response_class=Response)
-def get_metrics(context: Needs, request: Request) -> Response:
-    """Figures for Prometheus, of the whole service; like `/healthz` without a key, for they are no more than counts."""
+def get_metrics(context: Whole, request: Request) -> Response:
+    """Figures for Prometheus, of the whole service."""
     with reading(context.engine) as c:
         found = _Found([*_of_the_queue(c), *_of_work(c), *_of_data(c), *_of_the_cluster(c)])
     registry = CollectorRegistry()

@@ -6,7 +6,7 @@ from typing import Literal
 from fastapi import APIRouter, Response
 from pydantic import BaseModel
 
-from services.api.context import Needs
+from services.api.context import Keyless
 from services.api.waiting import trouble_of
 from storage import leases
 from storage.database import reading, writing
@@ -36,7 +36,7 @@ def health() -> Health:
 
 
 @router.get("/readyz")
-def readiness(context: Needs, response: Response) -> Readiness:
+def readiness(context: Keyless, response: Response) -> Readiness:
     """Whether the database, the store and the cluster can be reached; 503 if not."""
 
     def database() -> str:

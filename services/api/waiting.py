@@ -9,6 +9,7 @@ from storage import jobs
 from storage.database import captures
 from storage.database import jobs as table
 from storage.leases import Sign
+from storage.owners import of_all
 
 SILENCE = 15.0
 """Seconds after which a coordinator that gave no sign of life counts as gone."""
@@ -47,7 +48,8 @@ def reason(connection: Connection, row: Row[Any], sign: Sign | None) -> str | No
     still = time.time() - row.moved_at
     if still > STILL:
         return f"nothing of it was done in the last {still:.0f} s; a tile takes long, or its worker does not answer"
-    others = connection.scalar(select(func.count()).where(table.c.state == "running", table.c.id != row.id))
+    query = select(func.count()).where(table.c.state == "running", table.c.id != row.id)
+    others = connection.scalar(of_all(query))
     if others:
         workers = len(sign.cluster["workers"]) if sign else 0
         return f"it shares {workers} workers with {others} other jobs"

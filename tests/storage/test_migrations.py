@@ -11,12 +11,14 @@ from typing import Any
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
-from sqlalchemy import Connection, Engine, func, insert, inspect, select, text
+from sqlalchemy import Connection, Engine, func, inspect, select, text
 from sqlalchemy.exc import DatabaseError, IntegrityError
 
-from storage import dialects, jobs, mattes, migrations
+from storage import captures, dialects, jobs, mattes, migrations, programs, uploads
 from storage.database import coordinator, metadata, open_engine, reading, tiles, totals, writing
-from storage.errors import Conflict
+from storage.errors import Conflict, NotFound
+from storage.owners import DEFAULT, bound
+from storage.uploads import Part
 from tests.postgres import Server
 
 BEFORE_REVISIONS = Path(__file__).with_name("before_revisions.sql")
@@ -156,17 +158,12 @@ def test_an_upgrade_that_fails_leaves_the_old_schema(bare: Engine) -> None:
     with writing(bare) as connection:
         migrations.upgrade(connection, "0001")
         connection.execute(text("CREATE TABLE totals (in_the_way INTEGER)"))
-        job = jobs.new_id()
-        columns = {
-            "id": job,
-            "kind": "",
-            "state": "",
-            "stage": "",
-            "capture": "",
-            "options": {},
-            "created_at": 0.0,
-        }
-        connection.execute(insert(metadata.tables["jobs"]).values(columns))
+        connection.execute(
+            text(
+                "INSERT INTO jobs (id, kind, state, stage, capture, options, total, done, failed, pixels, created_at) "
+                "VALUES ('j', '', '', '', '', '{}', 0, 0, 0, 0, 0)"
+            )
+        )
     before = schema(bare)
     url = bare.url.render_as_string(hide_password=False)
     with pytest.raises(DatabaseError, match="totals"):
@@ -177,7 +174,7 @@ def test_an_upgrade_that_fails_leaves_the_old_schema(bare: Engine) -> None:
         connection.execute(text("DROP TABLE totals"))
     engine = open_engine(url)
     with reading(engine) as connection:
-        assert jobs.get(connection, job).paced_done == 0
+        assert jobs.get(connection, "j").paced_done == 0
         assert differences(connection) == []
     engine.dispose()
 
@@ -234,4 +231,56 @@ def test_mattes_stay_when_others_without_a_capture_are_let_in(bare: Engine) -> N
     assert new.number > old.number
     with pytest.raises(IntegrityError), writing(engine) as connection:  # an id is there once, as before
         mattes.add_imported(connection, "m", {}, {})
+    engine.dispose()
+
+
+OF_0004 = """
+INSERT INTO captures (id, name, state, job, bytes, frames, program, created_at)
+VALUES ('c', 'ball', 'ready', 'j', 5, 4, '{}', 1000.5);
+INSERT INTO mattes (id, capture, job, state, options, created_at) VALUES ('m', 'c', 'j', 'ready', '{}', 1000.5);
+INSERT INTO programs (id, program, created_at) VALUES ('p', '{}', 1000.5);
+INSERT INTO jobs (id, kind, state, stage, capture, options, total, done, failed, pixels, created_at)
+VALUES ('j', 'recover', 'succeeded', 'succeeded', 'c', '{}', 1, 1, 0, 5, 1000.5);
+INSERT INTO tiles (job, tile, state, attempts) VALUES ('j', 0, 'done', 1);
+INSERT INTO uploads (id, key, "offset", length, parts, metadata, created_at, expires_at)
+VALUES ('u', 'again', 3, 5, 2, '', 1000.5, 1e12);
+INSERT INTO upload_parts (upload, "offset", name, size) VALUES ('u', 0, 'a', 1);
+INSERT INTO upload_parts (upload, "offset", name, size) VALUES ('u', 1, 'b', 2);
+INSERT INTO made (key, call, id) VALUES ('again', 'POST', 'c')
+"""
+
+
+def test_what_was_there_before_owners_is_the_default_owners(bare: Engine) -> None:
+    with writing(bare) as connection:
+        migrations.upgrade(connection, "0004")
+        for statement in OF_0004.split(";"):
+            connection.exec_driver_sql(statement)
+    engine = open_engine(bare.url.render_as_string(hide_password=False))
+    with writing(bound(engine, DEFAULT)) as connection:
+        for get, id in ((captures.get, "c"), (mattes.get, "m"), (programs.get, "p"), (jobs.get, "j")):
+            row = get(connection, id)
+            assert (row.owner, row.created_at, row.number) == (DEFAULT, 1000.5, 1)
+        assert captures.get(connection, "c").expires_at is None
+        assert jobs.done(connection, "j") == [0]
+        assert uploads.by_key(connection, "again") == uploads.get(connection, "u")
+        assert uploads.parts_of(connection, "u") == [Part("a", 1), Part("b", 2)]
+        assert jobs.made_by(connection, "again", "POST") == "c"
+        assert programs.add(connection, {"new": 1}) != "p"
+    with pytest.raises(IntegrityError), writing(bound(engine, DEFAULT)) as connection:
+        jobs.remember(connection, "again", "POST", "d")
+    with pytest.raises(IntegrityError), writing(bound(engine, DEFAULT)) as connection:
+        uploads.add(connection, "v", 1, "", 1, "again")
+    with writing(bound(engine, "alice")) as connection:
+        for get, id in ((captures.get, "c"), (mattes.get, "m"), (programs.get, "p"), (jobs.get, "j")):
+            with pytest.raises(NotFound):
+                get(connection, id)
+        assert uploads.by_key(connection, "again") is None
+        assert uploads.parts_of(connection, "u") == []
+        assert jobs.done(connection, "j") == []
+        assert jobs.made_by(connection, "again", "POST") is None
+        jobs.remember(connection, "again", "POST", "d")
+        uploads.add(connection, "v", 1, "", 1, "again")
+        assert programs.get(connection, programs.add(connection, {"new": 1})).owner == "alice"
+    with reading(engine) as connection:
+        assert differences(connection) == []
     engine.dispose()
