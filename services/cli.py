@@ -15,6 +15,7 @@ from typing import Any, BinaryIO, TypeVar
 import click
 
 from services.client import Client, ServiceError
+from services.keys import keys
 from services.presets import PRESETS
 from services.progress import Progress
 from services.running import COMMANDS, first_of
@@ -47,7 +48,7 @@ def main() -> None:
     """
 
 
-for command in COMMANDS:
+for command in (*COMMANDS, keys):
     main.add_command(command)
 
 

@@ -17,7 +17,8 @@ _certs = click.option(
 )
 
 
-def _those_given(options: dict[str, Any]) -> dict[str, Any]:
+def given_of(options: dict[str, Any]) -> dict[str, Any]:
+    """The options that were given: for all others the environment counts."""
     return {name: value for name, value in options.items() if value is not None}
 
 
@@ -60,7 +61,7 @@ def serve(**given: Any) -> None:
     from services.settings import Settings
 
     with refusals_told():
-        settings = Settings(**_those_given(given))
+        settings = Settings(**given_of(given))
         if settings.coordinate and settings.cluster is None:
             share_start()  # at the same time as this process imports the rest
         from services.server import serve as run
@@ -79,7 +80,7 @@ def coordinator(**given: Any) -> None:
     from services.settings import Settings
 
     with refusals_told():
-        coordinate(Settings(**_those_given(given)))
+        coordinate(Settings(**given_of(given)))
 
 
 @click.command()
@@ -97,7 +98,7 @@ def scheduler(host: str, port: int, **given: Any) -> None:
     from services.settings import ClusterSettings
 
     with refusals_told():
-        schedule(ClusterSettings(**_those_given(given)), host, port)
+        schedule(ClusterSettings(**given_of(given)), host, port)
 
 
 @click.command()
@@ -114,7 +115,7 @@ def worker(host: str | None, **given: Any) -> None:
     from services.worker import work
 
     with refusals_told():
-        work(ClusterSettings(**_those_given(given)), host)
+        work(ClusterSettings(**given_of(given)), host)
 
 
 @click.command()

@@ -85,6 +85,7 @@ async def _from_body(context: Context, request: Request, key: str | None) -> Row
 
 
 def _import(context: Context, matte: str, size: int, key: str | None) -> Row[Any]:
+    context.check()
     objects = context.objects
     uploads.seal(objects, matte, [Part(ONLY, size)])
     with uploads.read(objects, matte) as file:

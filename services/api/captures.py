@@ -247,6 +247,7 @@ def _register(
     context: Context, capture: str, parts: list[Part], name: str, key: str | None, resumable: bool
 ) -> Row[Any]:
     """Check an archive that is complete, and write it down as a capture with its ingest job."""
+    context.check()
     uploads.seal(context.objects, capture, parts)
     with uploads.read(context.objects, capture) as file:
         manifest = Bundle(file, context.settings.limits).manifest

@@ -122,6 +122,7 @@ async def _receive(context: Context, request: Request, job: str, limit: int) -> 
 
 def _queue(context: Context, job: str, matte: str, options: dict[str, Any], key: str) -> str:
     """Write down the job of a clip that is stored; returns its id, or that of a repeat that was quicker."""
+    context.check()
     try:
         with writing(context.engine) as c:
             row = mattes.get_ready(c, matte)

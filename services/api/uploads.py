@@ -162,6 +162,7 @@ async def _heard(body: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
 
 
 def _advance(context: Context, upload: str, offset: int, stored: list[Part]) -> int:
+    context.check()
     with writing(context.engine) as c:
         return uploads.advance(c, upload, offset, stored, context.settings.upload_seconds)
 

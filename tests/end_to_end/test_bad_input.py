@@ -250,7 +250,7 @@ def test_an_answer_that_cannot_be_given(service: Service, matte: str) -> None:
 def test_every_call_answers_an_unknown_id_with_a_problem(service: Service) -> None:
     called = 0
     for path, calls in service.http.get("/openapi.json").json()["paths"].items():
-        if "{id}" not in path:
+        if "{id}" not in path or path.endswith("/play"):  # a page that is the same for all
             continue
         for method in calls:
             url = path.replace("{id}", "no-such-id").replace("{n}", "0")

@@ -171,7 +171,7 @@ def test_a_deleted_program_is_gone_with_all_its_files(service: Service) -> None:
     asked = {"preset": "sketch", "monitor": {"width": 200, "height": 150}}
     url = service.http.post("/v1/programs", json=asked).headers["location"]
     assert service.http.delete(url).status_code == 204
-    for rest in ("", "/program.json", "/patterns.zip", "/patterns.mp4", "/patterns/0.png", "/play"):
+    for rest in ("", "/program.json", "/patterns.zip", "/patterns.mp4", "/patterns/0.png"):
         check_problem(service.http.get(url + rest), 404, "not-found")
     check_problem(service.http.delete(url), 404, "not-found")
     assert service.http.post("/v1/programs", json=asked).headers["location"] == url

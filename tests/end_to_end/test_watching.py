@@ -205,13 +205,14 @@ def _of(collector: Collector, job: str) -> list[Any]:
     return [span for span in list(collector.spans) if span.attributes.get("envmatte.job") == job]
 
 
-def test_keys_are_asked_for_by_the_cluster_and_not_by_the_figures(bundle: Path, tmp_path: Path) -> None:
+def test_keys_are_asked_for_by_the_cluster_and_by_the_figures(bundle: Path, tmp_path: Path) -> None:
     """And in a service that is not asked for traces a caller's goes on all the same; its log is text."""
     with serving(
         tmp_path / "data", "--workers", "1", ENVMATTE_KEYS="a-key", ENVMATTE_LOG_LEVEL="DEBUG"
     ) as service:
         assert service.http.get("/v1/cluster").status_code == 401
-        assert service.http.get("/metrics").status_code == 200
+        assert service.http.get("/metrics").status_code == 401
+        assert service.http.get("/metrics", headers={"Authorization": "Bearer a-key"}).status_code == 200
         job = service.client.upload(bundle)["job"]
         service.client.wait(job)
         end = time.monotonic() + 10

@@ -31,18 +31,6 @@ def test_paths_with_odd_names_make_urls_that_lead_back(tmp_path: Path) -> None:
     assert " " not in settings.store_url
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1", "example.org"])
-def test_a_service_without_keys_stays_on_loopback(host: str) -> None:
-    with pytest.raises(ValidationError, match="ENVMATTE_KEYS"):
-        Settings(host=host)
-    assert Settings(host=host, keys="a-key").host == host
-
-
-@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "::1", "localhost"])
-def test_loopback_needs_no_key(host: str) -> None:
-    assert Settings(host=host).keys == ()
-
-
 @pytest.mark.parametrize(
     "wrong", [{"port": 70000}, {"workers": 0}, {"ingest_memory": 5}, {"attempts": 0}, {"log": "xml"}]
 )

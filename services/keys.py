@@ -1,0 +1,126 @@
+"""`envmatte keys`: for whoever runs the service, who has its database."""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from services.running import given_of, refusals_told
+
+if TYPE_CHECKING:
+    from sqlalchemy import Engine
+
+SCOPES = ("read", "write", "admin")
+_data = click.option("--data", type=click.Path(path_type=Path), help="Folder of the service's data.")
+_database = click.option(
+    "--database", help="Its database, if that is another: postgresql://USER:PASSWORD@HOST/NAME."
+)
+_json = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
+
+
+@contextmanager
+def _opened(given: dict[str, Any]) -> Iterator["Engine"]:
+    from services.settings import Settings
+    from storage.database import open_engine
+
+    with refusals_told():
+        settings = Settings(**given_of(given))
+        if settings.database is None:
+            settings.data.mkdir(parents=True, exist_ok=True)
+        engine = open_engine(settings.database_url)
+        try:
+            yield engine
+        finally:
+            engine.dispose()
+
+
+@click.group()
+def keys() -> None:
+    """Make, list and revoke API keys, in the service's database: while it runs, or before.
+
+    From the first key on, every call takes one.
+    """
+
+
+@keys.command()
+@click.argument("name")
+@click.option("--owner", default="default", show_default=True, help="Whose things the key is for.")
+@click.option(
+    "--scope",
+    type=click.Choice(SCOPES),
+    default="write",
+    show_default=True,
+    help="read: to look; write: to make and delete as well; admin: to see the whole service as well, its cluster and "
+    "figures, but no other owner's things.",
+)
+@_data
+@_database
+@_json
+def make(name: str, owner: str, scope: str, as_json: bool, **given: Any) -> None:
+    """Make a key, and show it: this once, for only a hash of it is kept.
+
+    Example: envmatte keys make lab --owner alice
+    """
+    from storage import keys
+    from storage.database import writing
+
+    with _opened(given) as engine, writing(engine) as connection:
+        key = keys.make(connection, name, owner, scope)
+    made = {"name": name, "owner": owner, "scope": scope, "key": key}
+    click.echo(json.dumps(made, indent=2) if as_json else key)
+
+
+@keys.command("list")
+@_data
+@_database
+@_json
+def list_(as_json: bool, **given: Any) -> None:
+    """List keys, oldest first: name, owner, scope, when they were made and revoked.
+
+    Example: envmatte keys list --json
+    """
+    from storage import keys
+    from storage.database import reading
+
+    with _opened(given) as engine, reading(engine) as connection:
+        rows = keys.listed(connection)
+    found = [
+        {
+            "name": row.name,
+            "owner": row.owner,
+            "scope": row.scope,
+            "created_at": _time(row.created_at),
+            "revoked_at": _time(row.revoked_at),
+        }
+        for row in rows
+    ]
+    if as_json:
+        click.echo(json.dumps({"keys": found}, indent=2))
+        return
+    for one in found:
+        click.echo("\t".join(str(value or "") for value in one.values()).rstrip())
+
+
+@keys.command()
+@click.argument("name")
+@_data
+@_database
+def revoke(name: str, **given: Any) -> None:
+    """Revoke a key: it stops working at once.
+
+    Example: envmatte keys revoke lab
+    """
+    from storage import keys
+    from storage.database import writing
+
+    with _opened(given) as engine, writing(engine) as connection:
+        keys.revoke(connection, name)
+    click.echo(f"{name}: revoked")
+
+
+def _time(seconds: float | None) -> str | None:
+    return None if seconds is None else datetime.fromtimestamp(seconds, UTC).isoformat(timespec="seconds")
