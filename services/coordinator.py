@@ -20,11 +20,11 @@ from sqlalchemy import Connection, Engine, Row
 
 from services.dispatch import Dispatcher
 from services.drive import Drive, end_badly
-from services.housekeeping import sweep
+from services.housekeeping import count, forget_expired, remove, sweep
 from services.kinds import KINDS
 from services.process import about
 from services.settings import Settings
-from storage import jobs, leases, uploads
+from storage import jobs, leases
 from storage.database import reading, writing
 from storage.errors import EnvmatteError, GaveUp, NoRoom, Unavailable
 from storage.leases import Superseded
@@ -117,12 +117,13 @@ class Coordinator:
             logger.info("%s drives the jobs from now on", self._name)
         with self._writing() as c:
             leases.beat(c, self._token, self._dispatcher.cluster)
-            expired = uploads.forget_expired(c)
-        for upload in expired:
-            self._house.submit(_logged, uploads.remove, self._objects, upload)
+            expired = forget_expired(c)
+        for path in expired:
+            self._house.submit(_logged, remove, self._objects, path)
         if now - self._swept_at > SWEEP:
             self._swept_at = now
             self._house.submit(_logged, sweep, self._engine, self._objects)
+            self._house.submit(_logged, count, self._engine, self._objects)
         return True
 
     def _stand_down(self) -> None:
@@ -250,6 +251,7 @@ class Coordinator:
             row = jobs.get(c, job)
         if row.state == "succeeded":
             self._house.submit(_logged, KINDS[row.kind].tidy, self._objects, row)
+            self._house.submit(_logged, count, self._engine, self._objects)
         elif row.state == "failed" and KINDS[row.kind].discards(row.problem):
             self._leaving.append((time.monotonic() + DYING, row))
 

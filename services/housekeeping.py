@@ -1,18 +1,66 @@
-"""What the coordinator removes from the store because nothing refers to it."""
+"""What the coordinator removes from the store: what has expired, and what nothing refers to; and what it counts there."""
 
 import logging
+import time
+from contextlib import suppress
 
-from sqlalchemy import Engine, select
+from sqlalchemy import Connection, Engine, delete, select, update
 
 from services.kinds import may_be_retried
-from storage import database, jobs, uploads
-from storage.database import reading
+from storage import captures, composites, database, jobs, mattes, uploads
+from storage.database import reading, writing
 from storage.objects import Objects
 
 logger = logging.getLogger(__name__)
 
 KEPT = 3600.0
 """Seconds for which what nothing refers to is left alone: someone may be about to write down that it is there."""
+
+
+def forget_expired(connection: Connection) -> list[str]:
+    """Delete the rows of uploads, captures and mattes whose time is over; returns where they lie in the store.
+
+    What an active job works on is kept until that has ended.
+    """
+    gone = [uploads.path(upload) for upload in uploads.forget_expired(connection)]
+    for table, making, where in (
+        (database.captures, "ingesting", (captures.path, uploads.path)),
+        (database.mattes, "recovering", (mattes.path,)),
+    ):
+        over = (table.c.expires_at <= time.time(), table.c.state != making)
+        found = set(connection.scalars(select(table.c.id).where(*over)))
+        if found:
+            busy = database.jobs.c["capture" if table is database.captures else "matte"]
+            found -= set(connection.scalars(select(busy).where(database.jobs.c.state.in_(jobs.ACTIVE))))
+            connection.execute(delete(table).where(table.c.id.in_(found)))
+            gone += [path(one) for one in sorted(found) for path in where]
+    return gone
+
+
+def remove(objects: Objects, path: str) -> None:
+    """Remove what a row that is deleted stood for."""
+    with suppress(OSError):  # someone writes there still: he removes it himself, or a sweep does
+        objects.delete(path)
+
+
+def count(engine: Engine, objects: Objects) -> None:
+    """Count the bytes of what is new in the store, and write them down: limits go by them."""
+    for table, whole, folders in (
+        (database.captures, database.captures.c.state != "ingesting", (captures.path, uploads.path)),
+        (database.mattes, database.mattes.c.state != "recovering", (mattes.path,)),
+        (
+            database.jobs,
+            (database.jobs.c.kind == "composite") & (database.jobs.c.state == "succeeded"),
+            (composites.path,),
+        ),
+    ):
+        with reading(engine) as c:
+            new = c.scalars(select(table.c.id).where(whole, table.c.stored.is_(None))).all()
+        for one in new:
+            stored = sum(sum(objects.sizes(path(one)).values()) for path in folders)
+            with writing(engine) as c:
+                uncounted = (table.c.id == one, whole, table.c.stored.is_(None))
+                c.execute(update(table).where(*uncounted).values(stored=stored))
 
 
 def sweep(engine: Engine, objects: Objects, seconds: float = KEPT) -> None:

@@ -78,17 +78,23 @@ class Ingest(Kind):
         captures.change(connection, task.capture, state="ready")
 
     def failed(self, connection: Connection, task: Task, problem: Problem) -> None:
-        captures.change(connection, task.capture, state="failed", problem=problem)
+        captures.change(
+            connection,
+            task.capture,
+            state="failed",
+            problem=problem,
+            stored=0 if self.discards(problem) else None,
+        )
 
     def cancelled(self, connection: Connection, row: Row[Any]) -> None:
         problem = problem_of(Conflict("the ingest was cancelled; upload the capture again"))
-        captures.change(connection, row.capture, state="failed", problem=problem)
+        captures.change(connection, row.capture, state="failed", problem=problem, stored=0)
 
     def retried(self, connection: Connection, row: Row[Any]) -> None:
         capture = captures.get(connection, row.capture)
         if not may_be_retried(capture.problem):
             raise Conflict(f"capture {capture.id} can't be used, and nothing of it was kept; upload it again")
-        captures.change(connection, capture.id, state="ingesting", problem=None)
+        captures.change(connection, capture.id, state="ingesting", problem=None, stored=None)
 
     def tidy(self, objects: Objects, row: Row[Any]) -> None:
         uploads.remove(objects, row.capture)
@@ -123,7 +129,8 @@ class Recovery(Kind):
         capture = captures.get(connection, row.capture)
         if capture.state == "failed":
             raise Conflict(f"capture {capture.id} failed: {capture.problem['detail']}")
-        mattes.change(connection, row.matte, state="recovering")
+        mattes.get(connection, row.matte)  # it may have expired, or been deleted
+        mattes.change(connection, row.matte, state="recovering", stored=None)
 
     def discard(self, objects: Objects, row: Row[Any]) -> None:
         objects.delete(mattes.path(row.matte))
@@ -132,8 +139,16 @@ class Recovery(Kind):
 class Composite(Kind):
     """Makes a video of a clip and a matte. It has no record but the job's."""
 
+    def succeeded(self, connection: Connection, task: Task, figures: dict[str, Any]) -> None:
+        jobs.change(connection, task.job, stored=None)
+
+    def failed(self, connection: Connection, task: Task, problem: Problem) -> None:
+        if self.discards(problem):
+            jobs.change(connection, task.job, stored=0)
+
     def cancelled(self, connection: Connection, row: Row[Any]) -> None:
         jobs.clear(connection, row.id)
+        jobs.change(connection, row.id, stored=0)
 
     def retried(self, connection: Connection, row: Row[Any]) -> None:
         if self.discards(row.problem):

@@ -123,6 +123,36 @@ class Settings(ClusterSettings):
     upload_seconds: int = Field(
         86_400, ge=1, description="How long a resumable upload is kept after the last byte of it came."
     )
+    capture_seconds: int | None = Field(
+        None,
+        ge=1,
+        description="How long a capture is kept from when it was made. Default: until it is deleted.",
+    )
+    matte_seconds: int | None = Field(
+        None,
+        ge=1,
+        description="How long a matte is kept from when it was asked for. Default: until it is deleted.",
+    )
+    capture_frames: int = Field(20_000, ge=1, description="Frames of a capture.")
+    capture_pixels: int = Field(100_000_000, ge=1, description="Pixels of a frame of a capture.")
+    owner_captures: int | None = Field(
+        None,
+        ge=1,
+        description="Captures that an owner may have, uploads under way among them. Default: no limit.",
+    )
+    owner_jobs: int | None = Field(
+        None,
+        ge=1,
+        description="Jobs of an owner that may be queued or running at once, ingests among them. Default: no limit.",
+    )
+    owner_bytes: int | None = Field(
+        None, ge=1, description="Bytes stored that an owner may have. Default: no limit."
+    )
+    store_bytes: int | None = Field(
+        None,
+        ge=1,
+        description="Bytes stored that all owners together may have. Default: what the disk has room for.",
+    )
     unpacked_bytes: int = Field(64 << 30, ge=1, description="Bytes that an archive may unpack to.")
     ingest_memory: int = Field(
         512 << 20,
@@ -193,7 +223,12 @@ class Settings(ClusterSettings):
     @property
     def limits(self) -> Limits:
         """What a bundle may cost."""
-        return Limits(unpacked=self.unpacked_bytes, memory=self.ingest_memory)
+        return Limits(
+            unpacked=self.unpacked_bytes,
+            memory=self.ingest_memory,
+            frames=self.capture_frames,
+            pixels=self.capture_pixels,
+        )
 
 
 def is_loopback(host: str) -> bool:

@@ -7,7 +7,6 @@ in it what was measured from the frames. The archive that was uploaded lies wher
 frames are in the stack.
 """
 
-import time
 from collections.abc import Coroutine, Sequence
 from itertools import product
 from typing import Any
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, Row, delete, insert, select, update
 from zarr.storage import MemoryStore
 
-from storage.database import captures, find
+from storage.database import captures, find, lifetime
 from storage.errors import Corrupt
 from storage.grid import block_edge
 from storage.objects import EVERY_CHUNK, Objects, together
@@ -219,9 +218,11 @@ class Stack:
         return array
 
 
-def add(connection: Connection, capture: str, job: str, **record: Any) -> None:
-    """Write down a new capture, whose ingest job is queued."""
-    row = {"id": capture, "state": "ingesting", "job": job, "created_at": time.time(), **record}
+def add(
+    connection: Connection, capture: str, job: str, *, seconds: float | None = None, **record: Any
+) -> None:
+    """Write down a new capture, whose ingest job is queued, and that is kept for some time, or until it is deleted."""
+    row = {"id": capture, "state": "ingesting", "job": job, **lifetime(seconds), **record}
     connection.execute(insert(captures).values(row))
 
 

@@ -7,6 +7,7 @@ from sqlalchemy import Connection, Row, func, select
 
 from storage.database import captures, jobs, mattes, tiles, totals, uploads
 from storage.jobs import ACTIVE
+from storage.owners import of_all
 
 
 def of_jobs(connection: Connection) -> Sequence[Row[Any]]:
@@ -58,3 +59,28 @@ def tiles_a_second(connection: Connection) -> float | None:
     )
     paces = [done / seconds for done, seconds in connection.execute(query)]
     return sum(paces) if paces else None
+
+
+def of_captures_to_be(connection: Connection) -> int:
+    """Captures, and the uploads under way that may become some."""
+    return sum(connection.scalar(select(func.count()).select_from(one)) or 0 for one in (captures, uploads))
+
+
+def of_active_jobs(connection: Connection) -> int:
+    """Jobs that are queued or running."""
+    return connection.scalar(select(func.count()).where(jobs.c.state.in_(ACTIVE))) or 0
+
+
+def of_bytes(connection: Connection, *, all_owners: bool = False) -> int:
+    """Bytes in the store: of what is there as they were counted, of what is under way as they were announced.
+
+    A capture that is being ingested counts with its archive, a matte that is being recovered not yet.
+    """
+    sums = [
+        func.sum(func.coalesce(captures.c.stored, captures.c.bytes)),
+        func.sum(mattes.c.stored),
+        func.sum(jobs.c.stored),
+        func.sum(uploads.c.length),
+    ]
+    queries = [select(one) for one in sums]
+    return sum(int(connection.scalar(of_all(query) if all_owners else query) or 0) for query in queries)

@@ -2,6 +2,7 @@
 
 import logging
 import secrets
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -259,6 +260,12 @@ def open_engine(url: str) -> Engine:
 def new_id() -> str:
     """An opaque, URL-safe id that can't be guessed."""
     return secrets.token_hex(10)
+
+
+def lifetime(seconds: float | None) -> dict[str, float | None]:
+    """The times of a row that is made now, and kept for so long, or until it is deleted."""
+    now = time.time()
+    return {"created_at": now, "expires_at": None if seconds is None else now + seconds}
 
 
 def find(connection: Connection, table: Table, id: str) -> Row[Any]:

@@ -5,13 +5,15 @@
     EnvmatteError
     ├── InvalidInput            what was sent can't be used
     │   ├── CaptureError        a capture's archive or capture.json
+    │   │   └── OverLimit       one that is larger than the service takes
     │   ├── ArchiveError        a matte's archive
     │   ├── ImageError          bytes that should be an image
     │   ├── ClipError           a clip to be a backdrop
     │   └── OptionError         an option of recovery
     ├── NotFound                no such capture, job, matte or frame
     ├── Conflict                it exists, but not in a state that allows this
-    ├── NoRoom                  the store has no space for it
+    ├── NoRoom                  the store has no space for it, or its owner no more of it
+    ├── TooMany                 as much is under way as may be at once
     ├── Unavailable             something the service needs can't be reached for now
     ├── Corrupt                 something stored is missing or damaged
     └── GaveUp                  work that failed as often as it may
@@ -58,6 +60,10 @@ class CaptureError(InvalidInput):
     """A capture's archive, its capture.json or one of its frames."""
 
 
+class OverLimit(CaptureError):
+    """A capture that is larger than the service takes."""
+
+
 class ArchiveError(InvalidInput):
     """A matte's archive, or one of its entries."""
 
@@ -83,7 +89,11 @@ class Conflict(EnvmatteError):
 
 
 class NoRoom(EnvmatteError):
-    """The store has no space for it."""
+    """The store has no space for it, or its owner no more of it."""
+
+
+class TooMany(EnvmatteError):
+    """As much is under way as may be at once."""
 
 
 class Unavailable(EnvmatteError):

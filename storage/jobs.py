@@ -29,6 +29,7 @@ def add(
     matte: str | None = None,
     trace: str | None = None,
     job: str | None = None,
+    stored: int | None = None,
 ) -> str:
     """Queue a job; returns its id.
 
@@ -36,6 +37,8 @@ def add(
     ----------
     job : str, optional
         The id, if it has one already: something was stored under it.
+    stored : int, optional
+        How many bytes that is.
     trace : str, optional
         The ``traceparent`` (W3C Trace Context) of the request that asks for it.
     """
@@ -49,6 +52,7 @@ def add(
         "matte": matte,
         "options": options,
         "trace": trace,
+        "stored": stored,
         "created_at": time.time(),
     }
     connection.execute(insert(jobs).values(row))
@@ -99,6 +103,11 @@ def begin(connection: Connection, job: str) -> None:
     rows = [_tile(job, step) for step in (PREPARE, FINISH) if step not in known]
     if rows:
         connection.execute(insert(tiles), rows)
+
+
+def change(connection: Connection, job: str, **values: Any) -> None:
+    """Change a job's row."""
+    connection.execute(update(jobs).where(jobs.c.id == job).values(values))
 
 
 def enter(connection: Connection, job: str, stage: str) -> None:

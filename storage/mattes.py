@@ -22,7 +22,6 @@ A block is a square of ``block`` pixels, and a chunk of the frame-shaped arrays.
 it and nothing else, so blocks can be written in any order, by anyone, and again.
 """
 
-import time
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -33,7 +32,7 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, Row, delete, insert, update
 from zarr.storage import MemoryStore
 
-from storage.database import find, mattes
+from storage.database import find, lifetime, mattes
 from storage.errors import Conflict, Corrupt
 from storage.grid import block_edge
 from storage.objects import Objects, together
@@ -250,18 +249,30 @@ def create(
     return Matte(objects, matte)
 
 
-def add(connection: Connection, matte: str, capture: str, job: str, options: dict[str, Any]) -> None:
-    """Write down a matte that a job is to recover."""
+def add(
+    connection: Connection,
+    matte: str,
+    capture: str,
+    job: str,
+    options: dict[str, Any],
+    seconds: float | None = None,
+) -> None:
+    """Write down a matte that a job is to recover, and that is kept for some time, or until it is deleted."""
     row = {"id": matte, "capture": capture, "job": job, "state": "recovering", "options": options}
-    connection.execute(insert(mattes).values(row | {"created_at": time.time()}))
+    connection.execute(insert(mattes).values(row | lifetime(seconds)))
 
 
 def add_imported(
-    connection: Connection, matte: str, options: dict[str, Any], figures: dict[str, Any]
+    connection: Connection,
+    matte: str,
+    options: dict[str, Any],
+    figures: dict[str, Any],
+    stored: int | None = None,
+    seconds: float | None = None,
 ) -> None:
     """Write down a matte that came in an archive, and is whole: it has no capture and no job here."""
-    row = {"id": matte, "state": "ready", "options": options, "figures": figures}
-    connection.execute(insert(mattes).values(row | {"created_at": time.time()}))
+    row = {"id": matte, "state": "ready", "options": options, "figures": figures, "stored": stored}
+    connection.execute(insert(mattes).values(row | lifetime(seconds)))
 
 
 def get(connection: Connection, matte: str) -> Row[Any]:

@@ -14,6 +14,7 @@ from services.api import (
     events,
     jobs,
     layers,
+    limits,
     mattes,
     metrics,
     programs,
@@ -54,6 +55,7 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
         archives.router,
         layers.router,
         programs.router,
+        limits.router,
         cluster.router,
     ):
         app.include_router(router, prefix="/v1", dependencies=[Depends(authorized)])

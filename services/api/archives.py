@@ -8,14 +8,16 @@ from fastapi.responses import StreamingResponse
 from sqlalchemy import Row
 from sqlalchemy.exc import IntegrityError
 
-from services.api.captures import ONLY, Key, check_room, receive
+from services.api.captures import ONLY, Key, receive
 from services.api.context import Context, Needs
 from services.api.errors import WrongMediaType
 from services.api.mattes import Matte
 from services.api.uploads import too_large
+from services.limits import admit
 from storage import jobs, mattes, uploads
 from storage.archives import Archive
 from storage.database import new_id, reading, writing
+from storage.errors import NoRoom
 from storage.uploads import Part
 from workflows.archive.importing import take_in
 
@@ -69,11 +71,11 @@ async def _from_body(context: Context, request: Request, key: str | None) -> Row
     limit = context.settings.upload_bytes
     length = int(request.headers.get("content-length", 0))
     if length > limit:
-        raise too_large(limit)
+        raise too_large(limit, length)
     row = await anyio.to_thread.run_sync(_made, context, key)
     if row is not None:
         return row
-    await anyio.to_thread.run_sync(check_room, context, 2 * length)  # the archive, and the matte beside it
+    await anyio.to_thread.run_sync(_admit, context, length)
     matte = new_id()
     try:
         size = await receive(context, matte, request.stream(), limit)
@@ -90,19 +92,31 @@ def _import(context: Context, matte: str, size: int, key: str | None) -> Row[Any
     uploads.seal(objects, matte, [Part(ONLY, size)])
     with uploads.read(objects, matte) as file:
         made = take_in(file, objects, matte, context.settings.limits)
+    stored = sum(objects.sizes(mattes.path(matte)).values())
+    kept = context.settings.matte_seconds
     try:
         with writing(context.engine) as c:
-            mattes.add_imported(c, matte, made.attributes["options"], made.figures)
+            admit(c, context.settings, size=stored)
+            mattes.add_imported(c, matte, made.attributes["options"], made.figures, stored, kept)
             if key:
                 jobs.remember(c, key, CALL, matte)
             return mattes.get(c, matte)
     # Of any other error it is not known whether the row was written; without one the matte is swept.
+    except NoRoom:
+        objects.delete(mattes.path(matte))
+        raise
     except IntegrityError:  # a repeat with the same key was quicker
         objects.delete(mattes.path(matte))
         row = _made(context, key)
         if row is None:
             raise
         return row
+
+
+def _admit(context: Context, length: int) -> None:
+    with reading(context.engine) as c:
+        admit(c, context.settings, size=length)
+        uploads.check_room(c, context.objects, 2 * length)  # the archive, and the matte beside it
 
 
 def _made(context: Context, key: str | None) -> Row[Any] | None:

@@ -12,9 +12,10 @@ from sqlalchemy import Row
 from sqlalchemy.exc import IntegrityError
 
 from services import tracing
-from services.api.context import After, Context, Limit, Needs, read_body
+from services.api.context import After, Context, Limit, Needs, read_body, time_of
 from services.api.errors import WrongMediaType
 from services.api.uploads import too_large
+from services.limits import admit, admit_upload
 from storage import captures, jobs, uploads
 from storage.captures import Stack
 from storage.database import captures as table
@@ -58,7 +59,7 @@ class Capture(BaseModel):
             },
             report=f"/v1/captures/{row.id}/report" if row.state == "ready" else None,
             created_at=datetime.fromtimestamp(row.created_at, UTC),
-            expires_at=None,
+            expires_at=time_of(row.expires_at),
         )
 
 
@@ -164,11 +165,11 @@ async def _from_body(context: Context, request: Request, name: str, key: str | N
     limit = context.settings.upload_bytes
     length = int(request.headers.get("content-length", 0))
     if length > limit:
-        raise too_large(limit)
+        raise too_large(limit, length)
     row = await anyio.to_thread.run_sync(_made, context, key)
     if row is not None:
         return row
-    await anyio.to_thread.run_sync(check_room, context, length)
+    await anyio.to_thread.run_sync(_admit, context, length)
     capture = new_id()
     try:
         part = Part(ONLY, await receive(context, capture, request.stream(), limit))
@@ -189,7 +190,7 @@ async def receive(context: Context, capture: str, body: AsyncIterator[bytes], li
         async for part in body:
             size += len(part)
             if size > limit:
-                raise too_large(limit)
+                raise too_large(limit, size)
             await file.write(part)
     return size
 
@@ -237,10 +238,9 @@ def _made(context: Context, key: str | None) -> Row[Any] | None:
         return captures.get(c, made) if made else None
 
 
-def check_room(context: Context, length: int) -> None:
-    """See that the store has room for more bytes."""
+def _admit(context: Context, length: int) -> None:
     with reading(context.engine) as c:
-        uploads.check_room(c, context.objects, length)
+        admit_upload(c, context.settings, context.objects, length, captures=1, jobs=1)
 
 
 def _register(
@@ -255,13 +255,16 @@ def _register(
         with writing(context.engine) as c:
             if resumable and not uploads.forget(c, capture):
                 raise NotFound(f"upload {capture} is gone")
+            size = sum(part.size for part in parts)
+            admit(c, context.settings, captures=1, jobs=1, size=size)
             job = jobs.add(c, "ingest", capture, {}, trace=tracing.asked_by())
             captures.add(
                 c,
                 capture,
                 job,
                 name=name or manifest.name,
-                bytes=sum(part.size for part in parts),
+                seconds=context.settings.capture_seconds,
+                bytes=size,
                 frames=len(manifest.frames) or manifest.program.count,
                 program=manifest.program.model_dump(mode="json"),
             )

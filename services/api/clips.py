@@ -13,7 +13,8 @@ from services import tracing
 from services.api.context import Context, Needs
 from services.api.errors import TooLarge
 from services.api.jobs import Job
-from storage import composites, jobs, mattes, uploads
+from services.limits import admit, admit_upload
+from storage import composites, jobs, mattes
 from storage.database import new_id, reading, writing
 from storage.errors import Conflict, Corrupt
 
@@ -49,14 +50,14 @@ async def composite_clip(context: Context, request: Request, matte: str, options
     limit = context.settings.upload_bytes
     length = int(request.headers.get("content-length", 0))
     if length > limit:
-        raise _too_large(limit)
+        raise _too_large(limit, length)
     key = request.headers.get("idempotency-key", "")[:256]
     made = await anyio.to_thread.run_sync(_check, context, matte, key, length)
     job = made or new_id()
     if made is None:
         try:
-            await _receive(context, request, job, limit)
-            job = await anyio.to_thread.run_sync(_queue, context, job, matte, options, key)
+            size = await _receive(context, request, job, limit)
+            job = await anyio.to_thread.run_sync(_queue, context, job, matte, options, key, size)
         except Exception:
             # Not when cancelled, where `_queue` may still be at work: what has no job the coordinator sweeps.
             await anyio.to_thread.run_sync(context.objects.delete, composites.path(job))
@@ -106,27 +107,29 @@ def _check(context: Context, matte: str, key: str, length: int) -> str | None:
         made = jobs.made_by(c, key, CALL) if key else None
         if made is None:
             mattes.get_ready(c, matte)
-            uploads.check_room(c, context.objects, length)
+            admit_upload(c, context.settings, context.objects, length, jobs=1)
         return made
 
 
-async def _receive(context: Context, request: Request, job: str, limit: int) -> None:
+async def _receive(context: Context, request: Request, job: str, limit: int) -> int:
     size = 0
     async with context.objects.write(composites.clip_path(job)) as file:
         async for part in request.stream():
             size += len(part)
             if size > limit:
-                raise _too_large(limit)
+                raise _too_large(limit, size)
             await file.write(part)
+    return size
 
 
-def _queue(context: Context, job: str, matte: str, options: dict[str, Any], key: str) -> str:
+def _queue(context: Context, job: str, matte: str, options: dict[str, Any], key: str, size: int) -> str:
     """Write down the job of a clip that is stored; returns its id, or that of a repeat that was quicker."""
     context.check()
     try:
         with writing(context.engine) as c:
             row = mattes.get_ready(c, matte)
-            jobs.add(c, "composite", row.capture or "", options, matte, tracing.asked_by(), job)
+            admit(c, context.settings, jobs=1, size=size)
+            jobs.add(c, "composite", row.capture or "", options, matte, tracing.asked_by(), job, size)
             jobs.begin(c, job)  # while it has tiles it has something in the store, see `jobs.not_wound_up`
             if key:
                 jobs.remember(c, key, CALL, job)
@@ -167,5 +170,10 @@ def _pieces(file: BinaryIO, size: int) -> Iterator[bytes]:
             yield data
 
 
-def _too_large(limit: int) -> TooLarge:
-    return TooLarge(f"a clip may have {limit} bytes; cut it, or raise ENVMATTE_UPLOAD_BYTES", limit=limit)
+def _too_large(limit: int, size: int) -> TooLarge:
+    return TooLarge(
+        f"a clip may have {limit} bytes; cut it, or raise ENVMATTE_UPLOAD_BYTES",
+        name="upload_bytes",
+        limit=limit,
+        value=size,
+    )

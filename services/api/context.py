@@ -4,6 +4,7 @@ import tempfile
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import IO, Annotated, Any, TypeVar
@@ -143,6 +144,11 @@ async def spool_body(request: Request, limit: int) -> AsyncIterator[IO[bytes]]:
         yield file
 
 
+def time_of(seconds: float | None) -> datetime | None:
+    """A time of the database as answers have it."""
+    return None if seconds is None else datetime.fromtimestamp(seconds, UTC)
+
+
 def is_known(headers: Headers, tag: str) -> bool:
     """Whether the caller has what a tag stands for (If-None-Match, RFC 9110, sect. 13.1.2)."""
     return tag in [one.strip() for one in headers.get("if-none-match", "").split(",")]
@@ -176,7 +182,9 @@ PROBLEM: dict[int | str, dict[str, Any]] = {
                         "detail": {"type": "string"},
                         "entry": {"type": "string"},
                         "field": {"type": "string"},
+                        "name": {"type": "string", "description": "Of a limit, as `GET /v1/limits` has it."},
                         "limit": {"type": "number"},
+                        "value": {"type": "number", "description": "What would have to be within it."},
                     },
                 }
             }

@@ -23,6 +23,8 @@ from storage.errors import (
     NoRoom,
     NotFound,
     OptionError,
+    OverLimit,
+    TooMany,
     Unavailable,
 )
 
@@ -67,6 +69,7 @@ class Forbidden(EnvmatteError):
 
 
 PROBLEMS: dict[type[Exception], tuple[int, str, str]] = {
+    OverLimit: (HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too-large", "Too large"),
     CaptureError: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-capture", "The capture can't be used"),
     ArchiveError: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-archive", "The archive can't be used"),
     ImageError: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-image", "The image can't be used"),
@@ -84,7 +87,8 @@ PROBLEMS: dict[type[Exception], tuple[int, str, str]] = {
     Forbidden: (HTTPStatus.FORBIDDEN, "forbidden", "The key does not allow this"),
     NotFound: (HTTPStatus.NOT_FOUND, "not-found", "Not found"),
     Conflict: (HTTPStatus.CONFLICT, "conflict", "Not in this state"),
-    NoRoom: (HTTPStatus.INSUFFICIENT_STORAGE, "no-room", "The store is full"),
+    NoRoom: (HTTPStatus.INSUFFICIENT_STORAGE, "no-room", "There is no room for it"),
+    TooMany: (HTTPStatus.TOO_MANY_REQUESTS, "too-many", "Too many at once"),
     Unavailable: (HTTPStatus.SERVICE_UNAVAILABLE, "unavailable", "Out of reach for now"),
     Corrupt: (HTTPStatus.INTERNAL_SERVER_ERROR, "corrupt", "Stored data is missing or damaged"),
     GaveUp: (HTTPStatus.INTERNAL_SERVER_ERROR, "gave-up", "The work failed again and again"),
@@ -94,6 +98,7 @@ PROBLEMS: dict[type[Exception], tuple[int, str, str]] = {
 HEADERS: dict[type[EnvmatteError], dict[str, str]] = {
     Unauthorized: {"WWW-Authenticate": "Bearer"},
     Unavailable: {"Retry-After": "2"},  # seconds
+    TooMany: {"Retry-After": "10"},
 }
 
 

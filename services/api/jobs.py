@@ -9,9 +9,10 @@ from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection, Row
 
 from services import kinds, tracing
-from services.api.context import After, Limit, Needs, read_json
+from services.api.context import After, Limit, Needs, read_json, time_of
 from services.api.eta import seconds_left
 from services.api.waiting import reason
+from services.limits import admit
 from storage import captures, composites, jobs, leases, mattes
 from storage.database import jobs as table
 from storage.database import new_id, page, reading, writing
@@ -93,8 +94,8 @@ class Job(BaseModel):
             if row.kind == "composite" and row.state == "succeeded"
             else None,
             created_at=datetime.fromtimestamp(row.created_at, UTC),
-            started_at=_time(row.started_at),
-            finished_at=_time(row.finished_at),
+            started_at=time_of(row.started_at),
+            finished_at=time_of(row.finished_at),
         )
 
 
@@ -166,10 +167,11 @@ def post_job(
                 raise Conflict(f"capture {capture.id} failed: {capture.problem['detail']}")
             # Grids that do not nest are refused now, and not by the job.
             Program.model_validate(capture.program).bands()
+            admit(c, context.settings, jobs=1)
             matte = new_id()
             chosen = options.model_dump(mode="json")
             job = jobs.add(c, "recover", capture.id, chosen, matte, tracing.asked_by())
-            mattes.add(c, matte, capture.id, job, chosen)
+            mattes.add(c, matte, capture.id, job, chosen, context.settings.matte_seconds)
             if idempotency_key:
                 jobs.remember(c, idempotency_key, CALL, job)
         made = Job.of(c, jobs.get(c, job))
@@ -215,6 +217,8 @@ def retry_job(context: Needs, id: str) -> Job:
         row = jobs.get(c, id)
         # Slabs of an ingest are as large as the memory allows, and want to be smaller where that was too much.
         memory = (row.plan or {}).get("memory", context.settings.ingest_memory)
+        if row.state == "failed":
+            admit(c, context.settings, jobs=1)
         jobs.retry(c, id, anew=memory != context.settings.ingest_memory)
         kinds.KINDS[row.kind].retried(c, row)
         return Job.of(c, jobs.get(c, id))
@@ -228,7 +232,3 @@ def delete_job(context: Needs, id: str) -> None:
         jobs.forget(c, id)
     if kind == "composite":
         context.objects.delete(composites.path(id))
-
-
-def _time(seconds: float | None) -> datetime | None:
-    return None if seconds is None else datetime.fromtimestamp(seconds, UTC)

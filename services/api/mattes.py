@@ -7,7 +7,7 @@ from fastapi import APIRouter
 from pydantic import BaseModel
 from sqlalchemy import Row
 
-from services.api.context import After, Limit, Needs
+from services.api.context import After, Limit, Needs, time_of
 from storage import jobs, mattes
 from storage.database import mattes as table
 from storage.database import page, reading, writing
@@ -30,6 +30,7 @@ class Matte(BaseModel):
     columns: int | None = None
     rows: int | None = None
     created_at: datetime
+    expires_at: datetime | None
 
     @classmethod
     def of(cls, row: Row[Any]) -> "Matte":
@@ -38,6 +39,7 @@ class Matte(BaseModel):
             **{name: getattr(row, name) for name in ("id", "state", "capture", "job", "options")},
             **figures,
             created_at=datetime.fromtimestamp(row.created_at, UTC),
+            expires_at=time_of(row.expires_at),
         )
 
 

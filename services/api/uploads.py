@@ -23,6 +23,7 @@ from services.api.tus import (
     number,
     version_spoken,
 )
+from services.limits import admit_upload
 from storage import captures, uploads
 from storage.database import new_id, reading, writing
 from storage.errors import InvalidInput, NotFound
@@ -54,7 +55,7 @@ async def create_upload(
     """Start an upload of `Upload-Length` bytes; the body may be the first of them."""
     length = number(request, "Upload-Length")
     if length > context.settings.upload_bytes:
-        raise too_large(context.settings.upload_bytes)
+        raise too_large(context.settings.upload_bytes, length)
     checksum = Checksum.of(request)
     with_body = request.headers.get("content-length", "0") != "0" or "transfer-encoding" in request.headers
     if with_body:
@@ -197,7 +198,7 @@ def _create(context: Context, length: int, metadata: str, key: str | None) -> tu
             row = uploads.by_key(c, key) if key else None
             if row is not None:
                 return row, False
-            uploads.check_room(c, context.objects, length)
+            admit_upload(c, context.settings, context.objects, length, captures=1)
             upload = new_id()
             uploads.add(c, upload, length, metadata, context.settings.upload_seconds, key)
             return uploads.get(c, upload), True
@@ -221,8 +222,11 @@ def _too_long(row: Row[Any]) -> TooLarge:
     )
 
 
-def too_large(limit: int) -> TooLarge:
-    """An archive over the limit of the settings."""
+def too_large(limit: int, size: int) -> TooLarge:
+    """An archive over the limit of the settings, of so many bytes or more."""
     return TooLarge(
-        f"an archive may have {limit} bytes; send a smaller one or raise ENVMATTE_UPLOAD_BYTES", limit=limit
+        f"an archive may have {limit} bytes; send a smaller one or raise ENVMATTE_UPLOAD_BYTES",
+        name="upload_bytes",
+        limit=limit,
+        value=size,
     )

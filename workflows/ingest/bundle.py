@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from storage import zips
-from storage.errors import CaptureError
+from storage.errors import CaptureError, OverLimit
 from workflows.clock import Border
 from workflows.program import Images, Program
 from workflows.tone import Response
@@ -69,10 +69,14 @@ class Limits:
         Bytes of all its entries together, and of all its frames once they are decoded.
     memory : int
         Bytes that one reader may hold; an entry, or an image decoded, may take a quarter of it.
+    frames, pixels : int, optional
+        How many frames it may have, and how many pixels one of them; no more limit than the others if None.
     """
 
     unpacked: int
     memory: int
+    frames: int | None = None
+    pixels: int | None = None
 
     @property
     def image(self) -> int:
@@ -175,6 +179,16 @@ class Bundle:
         if manifest.video is None and not manifest.frames:
             raise CaptureError(f"{MANIFEST} names no frames", entry=MANIFEST, field="frames")
         count = manifest.program.count
+        frames = len(manifest.frames) or count
+        if self._limits.frames is not None and frames > self._limits.frames:
+            raise OverLimit(
+                f"{MANIFEST}: a capture may have {self._limits.frames} frames, this one has {frames}; leave some out",
+                entry=MANIFEST,
+                field="frames",
+                name="capture_frames",
+                limit=self._limits.frames,
+                value=frames,
+            )
         files = [(f"frames.{n}.file", frame.file) for n, frame in enumerate(manifest.frames)]
         if manifest.video is not None:
             files.append(("video.file", manifest.video.file))
