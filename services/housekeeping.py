@@ -1,4 +1,4 @@
-"""What the coordinator removes from the store: what has expired, and what nothing refers to; and what it counts there."""
+"""What the coordinator removes from the store: what has expired, and what nothing refers to. And what it counts."""
 
 import logging
 import time
