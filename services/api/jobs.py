@@ -17,6 +17,7 @@ from storage import captures, composites, jobs, leases, mattes
 from storage.database import jobs as table
 from storage.database import new_id, page, reading, writing
 from storage.errors import Conflict
+from storage.leases import Sign
 from workflows.options import describe_options, parse_options
 from workflows.program import Program
 
@@ -71,15 +72,16 @@ class Job(BaseModel):
     finished_at: datetime | None
 
     @classmethod
-    def of(cls, connection: Connection, row: Row[Any]) -> "Job":
+    def of(cls, connection: Connection, row: Row[Any], sign: Sign | None = None) -> "Job":
         now = time.time()
-        sign = leases.last_sign(connection)
+        sign = sign or leases.last_sign(connection)
         ran = ((row.finished_at or now) - row.started_at) if row.started_at else 0.0
         running = row.state == "running"
         # The step after the last tile counts as one more: only a job that has succeeded is at 1.
         progress = 1.0 if row.state == "succeeded" else row.done / (row.total + 1) if row.total else 0.0
         return cls(
             **{name: getattr(row, name) for name in ("id", "kind", "state", "stage", "pixels", "matte")},
+            capture=row.capture or None,  # a composite of a matte that came in an archive has none
             progress=progress,
             tiles=Tiles(total=row.total, done=row.done, failed=row.failed),
             eta_seconds=seconds_left(connection, row, now) if running else None,
@@ -87,7 +89,6 @@ class Job(BaseModel):
             queued_seconds=(row.started_at or row.finished_at or now) - row.created_at,
             run_seconds=ran,
             workers=len(sign.cluster["workers"]) if running and sign else 0,
-            capture=row.capture or None,
             options=row.options,
             problem=row.problem,
             video=f"/v1/jobs/{row.id}/video.mp4"
@@ -183,7 +184,8 @@ def post_job(
 def list_jobs(context: Needs, limit: Limit = 100, after: After = None, state: State | None = None) -> Jobs:
     """Jobs, newest first."""
     with reading(context.engine) as c:
-        return Jobs(jobs=[Job.of(c, row) for row in page(c, table, limit, after, state=state)])
+        sign = leases.last_sign(c)  # once for all of them
+        return Jobs(jobs=[Job.of(c, row, sign) for row in page(c, table, limit, after, state=state)])
 
 
 @router.get("/jobs/{id}")

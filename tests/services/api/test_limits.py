@@ -153,6 +153,8 @@ def test_jobs_of_an_owner(serve: Serve, bundle: bytes, engine: Engine) -> None:
     assert bob.post("/v1/captures", content=bundle, headers=ZIP).status_code == 201
     assert client.post("/v1/jobs", json=wanted).status_code == 202
     refused(client.post(f"/v1/jobs/{job}/retry"), 429, "owner_jobs", 2, 3)
+    clip = serve().post("/v1/mattes/m/composite", content=b"clip", headers=video)
+    assert (clip.status_code, clip.json()["capture"], clip.json()["matte"]) == (202, None, "m")
     with reading(engine) as c:
         assert jobs.get(c, job).state == "failed"
 

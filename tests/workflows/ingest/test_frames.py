@@ -14,11 +14,12 @@ import tifffile
 from numpy.typing import NDArray
 
 from storage.captures import Stack
-from storage.errors import CaptureError, Corrupt
+from storage.errors import CaptureError, Corrupt, OverLimit
 from storage.objects import Objects
 from tests.workflows.ingest import peak
 from workflows.images import encode_png
 from workflows.ingest import frames
+from workflows.ingest.bundle import Limits
 from workflows.recovery.noise import Noise
 from workflows.scene import nested_program, write_capture
 from workflows.simulate import glass_ball
@@ -254,6 +255,17 @@ def test_a_stack_that_takes_more_than_is_allowed_is_refused(make_zip: Zip, inges
     ) as caught:
         ingest("c", make_zip(given, {"0.png": flat}, zipfile.ZIP_DEFLATED), unpacked=1 << 31)
     assert caught.value.fields == {"entry": "capture.json", "field": "frames", "limit": 1 << 31}
+
+
+def test_frames_of_more_pixels_than_are_allowed_are_refused(
+    make_zip: Zip, put: Put, objects: Objects
+) -> None:
+    put("c", bundle_of(make_zip, shots(6, 3, "uint8"), list(range(6))))
+    most = HEIGHT * WIDTH
+    assert frames.prepare(objects, "c", Limits(1 << 30, 1 << 26, pixels=most))["tiles"] >= 1
+    with pytest.raises(OverLimit, match=f"a frame may have {most - 1} pixels") as caught:
+        frames.prepare(objects, "c", Limits(1 << 30, 1 << 26, pixels=most - 1))
+    assert {"name": "capture_pixels", "limit": most - 1, "value": most}.items() <= caught.value.fields.items()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the resident peak is read from Linux's /proc")
