@@ -181,6 +181,12 @@ def test_every_route_with_every_kind_of_key(locked: Locked) -> None:
     document = locked.service.http.get("/openapi.json").json()
     routes = {f"{method.upper()} {path}" for path, calls in document["paths"].items() for method in calls}
     assert routes == set(CALLS), "this test has to know how each route is called, and with what key"
+    told = {
+        f"{method.upper()} {path}": "security" in call
+        for path, calls in document["paths"].items()
+        for method, call in calls.items()
+    }
+    assert told == {route: bool(call.needs) for route, call in CALLS.items()}
     wrong = []
     ordered = sorted(CALLS, key=lambda route: CALLS[route].last)
     refused = [(route, kind) for route in ordered for kind in KINDS if expected(route, kind) is not None]

@@ -32,9 +32,10 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return path.read_bytes()
 
 
-@pytest.fixture
-def engine(tmp_path: Path) -> Iterator[Engine]:
-    opened = open_engine(f"sqlite:///{tmp_path / 'ledger.db'}")
+@pytest.fixture(params=["sqlite", "postgresql"])
+def engine(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Engine]:
+    sqlite = f"sqlite:///{tmp_path / 'ledger.db'}"
+    opened = open_engine(sqlite if request.param == "sqlite" else request.getfixturevalue("postgresql"))
     with writing(opened) as c:
         tmp_path.joinpath("alice").write_text(keys.make(c, "alice", "alice", "write"))
         tmp_path.joinpath("bob").write_text(keys.make(c, "bob", "bob", "admin"))
