@@ -9,6 +9,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
+from starlette.routing import Match, Route
 
 from storage.errors import (
     ArchiveError,
@@ -139,7 +140,10 @@ def register(app: FastAPI) -> None:
         status = HTTPStatus(error.status_code)
         slug = status.phrase.lower().replace(" ", "-")
         detail = f"{request.method} {request.url.path}: {str(error.detail).lower()}; see GET /openapi.json"
-        return answer(_problem(status, slug, status.phrase, detail), dict(error.headers or {}))
+        headers = dict(error.headers or {})
+        if status == HTTPStatus.METHOD_NOT_ALLOWED:
+            headers["Allow"] = ", ".join(sorted(_methods(request)))
+        return answer(_problem(status, slug, status.phrase, detail), headers)
 
     @app.exception_handler(RequestValidationError)
     async def _validation(request: Request, error: RequestValidationError) -> JSONResponse:
@@ -162,3 +166,11 @@ def register(app: FastAPI) -> None:
     async def _unforeseen(request: Request, error: Exception) -> JSONResponse:
         logger.error("%s %s", request.method, request.url.path, exc_info=error)
         return answer(problem_of(error))
+
+
+def _methods(request: Request) -> set[str]:
+    """What can be done with a path, by all of its routes: the framework tells only what the first of them does."""
+    matching = [
+        r for r in request.app.routes if isinstance(r, Route) and r.matches(request.scope)[0] != Match.NONE
+    ]
+    return {method for route in matching for method in route.methods or ()}
