@@ -71,19 +71,18 @@ def run(
             with step("ingest"):
                 bar.show(0.2, "uploading the capture")
                 uploaded = client.upload(capture)
-                client.wait(uploaded["job"])
+                client.wait(uploaded)
             with step("recovery"):
-                job = client.recover(uploaded["id"])
-                found = client.wait(
-                    job["id"],
-                    progress=lambda job: bar.show(0.25 + 0.7 * job["progress"], f"recovery: {job['stage']}"),
+                job = client.wait(
+                    client.recover(uploaded),
+                    progress=lambda job: bar.show(0.25 + 0.7 * job.progress, f"recovery: {job.stage}"),
                 )
             with step("composite"):
                 backdrop = simulate.backdrop()
                 encoded = images.encode_png(
                     images.to_integers(from_light(backdrop, "srgb"), np.dtype(np.uint16))
                 )
-                answer = client.composite(found["matte"], encoded)
+                answer = client.composite(client.matte(job), encoded)
             bar.show(1, "done")
         if keep:
             keep.mkdir(parents=True, exist_ok=True)

@@ -6,6 +6,8 @@ from typing import Any, Self
 
 import click
 
+from services.client import Job
+
 STEP = 0.25
 """How far it goes between two plain lines."""
 
@@ -45,10 +47,10 @@ class Progress:
             self._said = share
             click.echo(f"{self._what}: {share:.0%} {text}".rstrip(), err=True)
 
-    def job(self, job: dict[str, Any]) -> None:
+    def job(self, job: Job) -> None:
         """Show a job of the API."""
-        eta = job["eta_seconds"]
-        left = f", {eta:.0f} s left" if eta else ""
-        tiles = job["tiles"]
-        waits = f"; {job['waits_for']}" if job["waits_for"] else ""
-        self.show(job["progress"], f"{job['stage']}, {tiles['done']} of {tiles['total']} tiles{left}{waits}")
+        left = f", {job.eta_seconds:.0f} s left" if job.eta_seconds else ""
+        waits = f"; {job.waits_for}" if job.waits_for else ""
+        self.show(
+            job.progress, f"{job.stage}, {job.tiles['done']} of {job.tiles['total']} tiles{left}{waits}"
+        )

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from services.told import as_json, example, say
+
 if TYPE_CHECKING:
     from pydantic import ValidationError
 
@@ -43,7 +45,7 @@ def first_of(error: "ValidationError") -> str:
     return f"{'.'.join(map(str, first['loc']))} {first['msg']}".strip()
 
 
-@click.command()
+@click.command(epilog=example("envmatte serve --data data --port 8000"))
 @click.option("--data", type=click.Path(path_type=Path), help="Folder of the database and everything stored.")
 @click.option("--host", help="Address to listen on.")
 @click.option("--port", type=int, help="Port to listen on; 0 takes a free one.")
@@ -69,7 +71,7 @@ def serve(**given: Any) -> None:
         run(settings)
 
 
-@click.command()
+@click.command(epilog=example("envmatte coordinator --cluster tls://HOST:8786 --certs certs"))
 @click.option("--cluster", help="Scheduler to hand work to: tls://HOST:PORT.")
 @_certs
 @click.option("--database", help="Database that the API uses: postgresql://USER:PASSWORD@HOST/NAME.")
@@ -83,7 +85,7 @@ def coordinator(**given: Any) -> None:
         coordinate(Settings(**given_of(given)))
 
 
-@click.command()
+@click.command(epilog=example("envmatte scheduler --host 0.0.0.0 --certs certs"))
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
 @click.option(
     "--port", type=int, default=8786, show_default=True, help="Port to listen on; 0 takes a free one."
@@ -101,7 +103,7 @@ def scheduler(host: str, port: int, **given: Any) -> None:
         schedule(ClusterSettings(**given_of(given)), host, port)
 
 
-@click.command()
+@click.command(epilog=example("envmatte worker --cluster tls://HOST:8786 --certs certs"))
 @click.option("--cluster", help="Scheduler to work for: tls://HOST:PORT, or tcp://127.0.0.1:PORT.")
 @_certs
 @click.option("--workers", type=int, help="Worker processes. Default: one a core.")
@@ -118,9 +120,10 @@ def worker(host: str | None, **given: Any) -> None:
         work(ClusterSettings(**given_of(given)), host)
 
 
-@click.command()
+@click.command(epilog=example("envmatte certs certs"))
 @click.argument("folder", type=click.Path(file_okay=False, path_type=Path), metavar="DIR")
-def certs(folder: Path) -> None:
+@as_json
+def certs(folder: Path, as_json: bool) -> None:
     """Make the certificates of a cluster in DIR.
 
     Every process of the cluster gets a copy with --certs; whoever has one may run what he likes on all of its
@@ -130,7 +133,8 @@ def certs(folder: Path) -> None:
 
     with refusals_told():
         made = make(folder)
-    click.echo(f"{folder}: made, copy it to every host" if made else f"{folder}: there already, and stays")
+    told = f"{folder}: made, copy it to every host" if made else f"{folder}: there already, and stays"
+    say({"folder": str(folder), "made": made, "told": told}, as_json, "told")
 
 
 COMMANDS = (serve, coordinator, scheduler, worker, certs)

@@ -1,0 +1,306 @@
+"""The client's calls."""
+
+import os
+import secrets
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, BinaryIO, Self, overload
+
+from services.client._errors import JobFailed, NotFound
+from services.client._records import Capture, Job, Layers, Matte, Record
+
+if TYPE_CHECKING:
+    from services.client._arrays import Floats
+
+PIECE = 8 << 20
+"""Bytes of a video that are got at once."""
+SENT = 64 << 10
+"""Bytes of an archive that are sent at once."""
+
+
+class Client:
+    """A connection to a service. It may be used by one thread at a time.
+
+    Parameters
+    ----------
+    url : str
+        Of the service, e.g. ``http://127.0.0.1:8000``.
+    key : str, optional
+        API key.
+
+    Raises
+    ------
+    ValueError
+        If the URL is none of HTTP.
+
+    Notes
+    -----
+    Every call raises `ServiceError` where the service answers with a problem, or not at all.
+    """
+
+    def __init__(self, url: str, key: str | None = None) -> None:
+        from services.client._transport import Transport
+
+        self._http = Transport(url, key)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._http.close()
+
+    def upload(
+        self,
+        file: Path | str,
+        *,
+        name: str = "",
+        progress: Callable[[int, int], None] | None = None,
+        webhook: str | None = None,
+    ) -> Capture:
+        """Upload a capture.
+
+        Connections that break and services that are started again are outlived. An upload that was given up is
+        gone on with by calling this again for the same file, until the service has forgotten it.
+
+        Parameters
+        ----------
+        name : str
+            A name for people.
+        progress : callable, optional
+            Told the bytes that the service has, and those there are.
+        webhook : str, optional
+            URL that is told when the capture is ingested.
+        """
+        from services.client import _upload
+
+        body = {"name": name} | ({"webhook": webhook} if webhook else {})
+        return Capture.of(_upload.send(self._http, Path(file), body, progress))
+
+    def recover(self, capture: Capture | str, *, webhook: str | None = None, **options: Any) -> Job:
+        """Queue the recovery of a matte.
+
+        Parameters
+        ----------
+        webhook : str, optional
+            URL that is told when the job has ended.
+        **options
+            As ``GET /v1/options`` lists them.
+        """
+        body = {"capture": _id(capture), "options": options} | ({"webhook": webhook} if webhook else {})
+        return Job.of(self._http.json("POST", Job.path, json=body, headers=_key()))
+
+    def job(self, job: Job | str) -> Job:
+        """A job, as it is now."""
+        return Job.of(self._http.json("GET", _path(Job, job)))
+
+    def cancel(self, job: Job | str) -> Job:
+        """Cancel a job; one that was cancelled stays so."""
+        return Job.of(self._http.json("POST", f"{_path(Job, job)}/cancel", safe=True))
+
+    def wait(
+        self, job: Job | Capture | str, *, progress: Callable[[Job], None] | None = None, poll: float = 0.2
+    ) -> Job:
+        """Wait until a job has ended, or the one that ingests a capture; raises `JobFailed` unless it succeeded.
+
+        A service that is started again meanwhile is outlived.
+
+        Parameters
+        ----------
+        progress : callable, optional
+            Told the job at every look.
+        poll : float
+            Seconds between two looks, to begin with; a job that takes long is looked at once a second.
+        """
+        which = job.job if isinstance(job, Capture) else _id(job)
+        begun = time.monotonic()
+        while True:
+            found = self.job(which)
+            if progress:
+                progress(found)
+            if found.state == "succeeded":
+                return found
+            if found.ended:
+                raise JobFailed(found)
+            time.sleep(max(poll, min((time.monotonic() - begun) / 20, 1.0)))
+
+    def capture(self, capture: Capture | str) -> Capture:
+        """A capture, as it is now."""
+        return Capture.of(self._http.json("GET", _path(Capture, capture)))
+
+    def matte(self, matte: Matte | Job | str) -> Matte:
+        """A matte as it is now, or the one that a job makes."""
+        which = (matte.matte or "") if isinstance(matte, Job) else matte
+        return self._matte(self._http.json("GET", _path(Matte, which)))
+
+    def delete(self, record: Capture | Job | Matte) -> None:
+        """Delete a capture, a job that has ended, or a matte; one that is deleted already stays so."""
+        tried = 0
+
+        def delete() -> None:
+            nonlocal tried
+            tried += 1
+            self._http.once("DELETE", _path(type(record), record))
+
+        try:
+            self._http.patiently(delete)
+        except NotFound:
+            if tried == 1:
+                raise
+
+    @overload
+    def composite(
+        self,
+        matte: Matte | str,
+        backdrop: bytes | Path,
+        *,
+        kind: str = "image/png",
+        **wanted: str | float,
+    ) -> bytes: ...
+
+    @overload
+    def composite(
+        self, matte: Matte | str, backdrop: "Floats", *, kind: str = ..., **wanted: str | float
+    ) -> "Floats": ...
+
+    def composite(
+        self,
+        matte: Matte | str,
+        backdrop: "bytes | Path | Floats",
+        *,
+        kind: str = "image/png",
+        **wanted: str | float,
+    ) -> "bytes | Floats":
+        """Put a matte before a backdrop: an image's file or bytes give an image's bytes, an array an array.
+
+        Parameters
+        ----------
+        backdrop : bytes, Path, or (height, width) or (height, width, 3) float array
+            Of an image, PNG, JPEG, TIFF or EXR; or linear light. It is stretched over the monitor.
+        kind : str
+            Of the bytes: ``image/png``, ``image/jpeg`` or ``image/x-exr``.
+        **wanted
+            What else the call takes: ``transfer``, ``x``, ``y``, ``width``, ``height``, ``size``, ``scale`` and so on.
+
+        Returns
+        -------
+        bytes, or (height, width, 3 or 4) float32
+            In linear light, of the matte's size unless another was wanted; with alpha where the capture has a mask.
+        """
+        if isinstance(backdrop, bytes | Path):
+            data = backdrop.read_bytes() if isinstance(backdrop, Path) else backdrop
+            return self._composite(matte, data, kind, wanted)
+        from services.client import _arrays
+
+        return _arrays.decode(self._composite(matte, _arrays.encode(backdrop), "image/x-exr", wanted))
+
+    def _composite(
+        self, matte: Matte | str, backdrop: bytes, kind: str, wanted: dict[str, str | float]
+    ) -> bytes:
+        return self._http.send(
+            "POST",
+            f"{_path(Matte, matte)}/composite",
+            safe=True,
+            computing=True,
+            params=wanted,
+            content=backdrop,
+            headers={"Accept": kind},
+        ).content
+
+    def composite_clip(self, matte: Matte | str, clip: Path, **wanted: str | float) -> Job:
+        """Queue the composite of a clip, a video file; `video` gets the result of the job.
+
+        Parameters
+        ----------
+        **wanted
+            ``transfer``, ``right``, ``down``, ``scale`` and ``angle``, as the call takes them.
+        """
+        headers = {"Content-Type": "video/*", "Content-Length": str(clip.stat().st_size)} | _key()
+        path = f"{_path(Matte, matte)}/composite"
+        return Job.of(
+            self._http.json("POST", path, params=wanted, headers=headers, content=lambda: _parts(clip))
+        )
+
+    def video(self, job: Job | str, target: BinaryIO) -> None:
+        """Write the video of a composite job, an MP4, to a file, some megabytes at a time."""
+        at, size = 0, 1
+        while at < size:
+            asked = {"Range": f"bytes={at}-{at + PIECE - 1}"}
+            answer = self._http.send("GET", f"{_path(Job, job)}/video.mp4", headers=asked)
+            at += target.write(answer.content)
+            size = int(answer.headers.get("Content-Range", f"/{at}").rpartition("/")[2])
+
+    def layer(self, matte: Matte | str, name: str) -> bytes:
+        """A layer of a matte as a file, as ``confidence.png``; ``Matte.layers`` has them as arrays."""
+        return self._http.send("GET", f"{_path(Matte, matte)}/layers/{name}", computing=True).content
+
+    def export(
+        self, matte: Matte | str, file: Path, *, progress: Callable[[int, int], None] | None = None
+    ) -> None:
+        """Write a matte's archive to a file, whole or not at all.
+
+        Parameters
+        ----------
+        progress : callable, optional
+            Told the bytes that have come, and those there are.
+        """
+        part = file.with_name(file.name + ".part")
+
+        def get() -> None:
+            with self._http.streamed("GET", f"{_path(Matte, matte)}/archive") as answer:
+                size = int(self._http.header(answer, "Content-Length"))
+                with part.open("wb") as out:
+                    for data in answer.iter_bytes():
+                        out.write(data)
+                        if progress:
+                            progress(out.tell(), size)
+
+        try:
+            self._http.patiently(get)
+            os.replace(part, file)
+        finally:
+            part.unlink(missing_ok=True)
+
+    def import_matte(self, file: Path, *, progress: Callable[[int, int], None] | None = None) -> Matte:
+        """Make a matte of an archive.
+
+        Parameters
+        ----------
+        progress : callable, optional
+            Told the bytes that were sent, and those there are; the service checks them after the last.
+        """
+        headers = {"Content-Type": "application/zip", "Content-Length": str(file.stat().st_size)} | _key()
+
+        def body() -> Iterator[bytes]:
+            return _parts(file, progress)
+
+        return self._matte(self._http.json("POST", Matte.path, computing=True, headers=headers, content=body))
+
+    def _matte(self, answer: dict[str, Any]) -> Matte:
+        return Matte.of(answer, layers=Layers(lambda name: self.layer(answer["id"], name)))
+
+
+def _id(record: Record | str) -> str:
+    return record if isinstance(record, str) else record.id
+
+
+def _path(kind: type[Record], record: Record | str) -> str:
+    return f"{kind.path}/{_id(record)}"
+
+
+def _key() -> dict[str, str]:
+    """What makes a repeat of a call answer with what the first one made."""
+    return {"Idempotency-Key": secrets.token_hex(16)}
+
+
+def _parts(file: Path, progress: Callable[[int, int], None] | None = None) -> Iterator[bytes]:
+    """A file, bit by bit."""
+    size = file.stat().st_size
+    with file.open("rb") as source:
+        while data := source.read(SENT):
+            yield data
+            if progress:
+                progress(source.tell(), size)

@@ -1,0 +1,71 @@
+"""What can go wrong for a caller of the service; the tree is drawn in `services.client`."""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from services.client._records import Job
+
+
+class ServiceError(Exception):
+    """The service refused, could not be reached, or a job did not succeed.
+
+    Attributes
+    ----------
+    problem : dict
+        The problem detail (RFC 9457): ``type`` (unless the client or a proxy made it), ``title``, ``status``,
+        ``detail``, and what locates the fault: ``entry``, ``field``, ``limit``.
+    status : int
+        The status of HTTP.
+    retry_after : float or None
+        Seconds after which the service asks to be tried again, if it does.
+    """
+
+    def __init__(self, problem: dict[str, Any], retry_after: float | None = None) -> None:
+        super().__init__(problem.get("detail") or problem.get("title") or str(problem))
+        self.problem = problem
+        self.status = int(problem.get("status", 0))
+        self.retry_after = retry_after
+
+
+class Unreachable(ServiceError):
+    """No answer came, however often the service was asked."""
+
+
+class Busy(ServiceError):
+    """Asked too often, or out of service for now (429, 502, 503, 504): the same may go well later."""
+
+
+class NotAllowed(ServiceError):
+    """No key, or one that may not do this (401, 403)."""
+
+
+class NotFound(ServiceError):
+    """No such capture, job or matte (404)."""
+
+
+class FileChanged(ServiceError):
+    """A file became another one while it was sent."""
+
+    def __init__(self) -> None:
+        detail = "the file has become shorter while it was sent; upload it again"
+        super().__init__({"title": "The file has changed", "status": 400, "detail": detail})
+
+
+class JobFailed(ServiceError):
+    """A job failed or was cancelled: ``job``."""
+
+    def __init__(self, job: "Job") -> None:
+        detail = f"job {job.id} was cancelled"
+        super().__init__(job.problem or {"title": "Cancelled", "status": 409, "detail": detail})
+        self.job = job
+
+
+OF_STATUS: dict[int, type[ServiceError]] = {
+    401: NotAllowed,
+    403: NotAllowed,
+    404: NotFound,
+    429: Busy,
+    502: Busy,
+    503: Busy,
+    504: Busy,
+}

@@ -1,0 +1,122 @@
+"""What the service answers with: captures, jobs and mattes."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+if TYPE_CHECKING:
+    from services.client._arrays import Floats
+
+LAYERS = ("S", "rho", "alpha", "confidence")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record:
+    """Something that the service keeps.
+
+    Attributes
+    ----------
+    answer : mapping
+        All of the service's answer, as JSON has it; ``record["name"]`` is a field of it.
+    """
+
+    path: ClassVar[str]
+    """Where the API has those of its kind."""
+    id: str
+    state: str
+    created_at: str
+    answer: Mapping[str, Any] = field(repr=False)
+
+    @classmethod
+    def of(cls, answer: Mapping[str, Any], **more: Any) -> Self:
+        """A record of an answer; what a newer service tells besides is in `answer` alone."""
+        known = {f.name: answer[f.name] for f in fields(cls) if f.name != "answer" and f.name not in more}
+        return cls(answer=answer, **known, **more)
+
+    def __getitem__(self, name: str) -> Any:
+        return self.answer[name]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Capture(Record):
+    """A capture; ``state`` is ``ingesting``, ``ready`` or ``failed``, ``job`` the id of its ingest job.
+
+    ``width``, ``height`` are in pixels, and None until they are known. Times are RFC 3339, UTC.
+    """
+
+    path = "/v1/captures"
+    name: str
+    job: str
+    width: int | None
+    height: int | None
+    frames: int
+    bytes: int
+    problem: dict[str, Any] | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job(Record):
+    """A job; ``state`` is ``queued``, ``running``, ``succeeded``, ``failed`` or ``cancelled``.
+
+    ``progress`` goes from 0 to 1 and never back; ``tiles`` has ``total``, ``done`` and ``failed``; ``waits_for`` says
+    what keeps the job; ``matte`` is the id of what it makes.
+    """
+
+    path = "/v1/jobs"
+    kind: str
+    stage: str
+    progress: float
+    tiles: dict[str, int]
+    eta_seconds: float | None
+    waits_for: str | None
+    capture: str | None
+    matte: str | None
+    options: dict[str, Any]
+    problem: dict[str, Any] | None
+    finished_at: str | None
+
+    @property
+    def ended(self) -> bool:
+        """Whether it is over, one way or another."""
+        return self.state in ("succeeded", "failed", "cancelled")
+
+
+class Layers(Mapping[str, "Floats"]):
+    """The layers of a matte: ``S``, ``rho``, ``alpha`` and ``confidence``, each got from the service when asked for.
+
+    (height, width, 3), or (height, width) where it has one channel; float32, linear.
+    """
+
+    def __init__(self, get: Callable[[str], bytes]) -> None:
+        self._get = get
+
+    def __getitem__(self, name: str) -> "Floats":
+        from services.client import _arrays
+
+        if name not in LAYERS:
+            raise KeyError(f"{name}: a matte has the layers {', '.join(LAYERS)}")
+        return _arrays.decode(self._get(f"{name}.exr"))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(LAYERS)
+
+    def __len__(self) -> int:
+        return len(LAYERS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Matte(Record):
+    """A matte; ``state`` is ``recovering``, ``ready`` or ``failed``.
+
+    ``width`` and ``height`` are in pixels, ``monitor`` has those of the monitor; None until they are known. One that
+    came in an archive has no ``capture`` and no ``job``.
+    """
+
+    path = "/v1/mattes"
+    capture: str | None
+    job: str | None
+    options: dict[str, Any]
+    width: int | None
+    height: int | None
+    monitor: list[int] | None
+    layers: Layers = field(repr=False, compare=False)

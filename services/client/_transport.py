@@ -1,0 +1,173 @@
+"""Calls over HTTP: what went wrong becomes a `ServiceError`, and what is safe to ask again is."""
+
+import random
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from email.utils import parsedate_to_datetime
+from typing import Any, TypeVar
+
+import httpx2
+
+from services.client._errors import OF_STATUS, Busy, ServiceError, Unreachable
+
+T = TypeVar("T")
+Body = bytes | Callable[[], Iterable[bytes]]
+PATIENCE = 120.0
+"""Seconds without progress after which a call, an upload or a job is given up: a service may be started again."""
+SILENCE = 60.0
+"""Seconds without an answer, or a byte of it, after which a service counts as gone."""
+COMPUTING = 600.0
+"""The same where the service computes the whole answer before its first byte."""
+SAFE = ("GET", "HEAD", "PUT", "DELETE")
+"""Methods of which a repeat does no more than the first (RFC 9110, sect. 9.2.2)."""
+FIRST_PAUSE, LONGEST_PAUSE = 0.1, 5.0
+"""Seconds between two attempts; the pause doubles with each."""
+
+
+class Transport:
+    """A connection to a service.
+
+    Parameters
+    ----------
+    url : str
+        Of the service.
+    key : str, optional
+        API key.
+
+    Raises
+    ------
+    ValueError
+        If the URL is none of HTTP.
+    """
+
+    def __init__(self, url: str, key: str | None) -> None:
+        headers = {"Authorization": f"Bearer {key}"} if key else {}
+        try:
+            base = httpx2.URL(url)
+        except httpx2.InvalidURL:
+            base = httpx2.URL("")
+        if base.scheme not in ("http", "https") or not base.host:
+            raise ValueError(f"{url!r} is no URL of a service: give it as http://HOST:PORT")
+        self._http = httpx2.Client(base_url=base, headers=headers, timeout=SILENCE)
+        self._answered = False
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._http.close()
+
+    def json(self, method: str, path: str, *, safe: bool = False, **request: Any) -> dict[str, Any]:
+        """As `send`; what the answer's JSON says."""
+        answer = self.send(method, path, safe=safe, **request)
+        try:
+            found = answer.json()
+        except ValueError:
+            found = None
+        if not isinstance(found, dict):
+            raise self._foreign()
+        return found
+
+    def send(self, method: str, path: str, *, safe: bool = False, **request: Any) -> httpx2.Response:
+        """Make a call, again if that is safe and the service is away.
+
+        Parameters
+        ----------
+        safe : bool
+            Whether a repeat does no harm, of a method and without an Idempotency-Key that say so.
+        **request
+            As for `once`.
+        """
+        safe = safe or method in SAFE or "Idempotency-Key" in (request.get("headers") or {})
+        return self.patiently(lambda: self.once(method, path, **request), safe=safe)
+
+    def patiently(self, call: Callable[[], T], *, safe: bool = True) -> T:
+        """Make a call until it is answered, for as long as a service that was there is away.
+
+        One that asks to be tried again later is waited for; one that was asked too often (429) did nothing, and so
+        is asked again whatever the call.
+        """
+        give_up, pause = time.monotonic() + PATIENCE, FIRST_PAUSE
+        while True:
+            try:
+                return call()
+            except (Unreachable, Busy) as error:
+                again = error.status == 429 or (safe and (self._answered or error.retry_after is not None))
+                # Not all at the same time, where many clients lost the same service.
+                wait = max(error.retry_after or 0.0, pause * random.uniform(0.5, 1))
+                if not again or time.monotonic() + wait > give_up:
+                    raise
+            time.sleep(wait)
+            pause = min(2 * pause, LONGEST_PAUSE)
+
+    def once(
+        self, method: str, path: str, *, content: Body | None = None, computing: bool = False, **request: Any
+    ) -> httpx2.Response:
+        """Make a call once.
+
+        Parameters
+        ----------
+        content : bytes or callable, optional
+            The body; a function that gives its parts, so that they can be sent again.
+        computing : bool
+            Whether the service computes before its first byte.
+        **request
+            As httpx has it: ``params``, ``headers``, ``json``.
+        """
+        with self.streamed(method, path, content=content, computing=computing, **request) as answer:
+            answer.read()
+        return answer
+
+    @contextmanager
+    def streamed(
+        self, method: str, path: str, *, content: Body | None = None, computing: bool = False, **request: Any
+    ) -> Iterator[httpx2.Response]:
+        """An answer whose body has yet to be read; that of a refusal is."""
+        if computing:
+            request["timeout"] = httpx2.Timeout(SILENCE, read=COMPUTING)
+        if content is not None:
+            request["content"] = content() if callable(content) else content
+        try:
+            with self._http.stream(method, path, **request) as answer:
+                if not answer.is_success:
+                    answer.read()
+                    raise _refusal(method, answer)
+                yield answer
+                self._answered = True
+        except httpx2.TransportError as error:
+            url = self._http.base_url
+            problem = {"title": "No answer", "status": 503}
+            detail = f"no answer from {url}: {error}; is `envmatte serve` running?"
+            raise Unreachable(problem | {"detail": detail}) from error
+
+    def header(self, answer: httpx2.Response, name: str) -> str:
+        """A header that an answer has to have."""
+        if name not in answer.headers:
+            raise self._foreign()
+        return str(answer.headers[name])
+
+    def _foreign(self) -> ServiceError:
+        detail = f"{self._http.base_url} does not answer as an envmatte service; see that the URL is right"
+        return ServiceError({"title": "Another service", "status": 502, "detail": detail})
+
+
+def _refusal(method: str, answer: httpx2.Response) -> ServiceError:
+    kind = OF_STATUS.get(answer.status_code, ServiceError)
+    retry_after = _seconds(answer.headers.get("retry-after", ""))
+    if answer.headers.get("content-type", "").startswith("application/problem+json") and answer.content:
+        return kind(answer.json(), retry_after)
+    # Of a proxy between, or to HEAD.
+    detail = f"{method} {answer.url} was answered with {answer.status_code} {answer.reason_phrase}"
+    problem = {"title": answer.reason_phrase, "status": answer.status_code, "detail": detail}
+    return kind(problem, retry_after)
+
+
+def _seconds(text: str) -> float | None:
+    """The seconds of a Retry-After, which has them or a date (RFC 9110, sect. 10.2.3)."""
+    if text.strip().isdecimal():
+        return float(text)
+    try:
+        then = parsedate_to_datetime(text)
+    except ValueError:
+        return None
+    return max((then.replace(tzinfo=then.tzinfo or UTC) - datetime.now(UTC)).total_seconds(), 0.0)

@@ -1,0 +1,95 @@
+"""Resumable uploads, by tus 1.0."""
+
+import base64
+import hashlib
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+from services.client._errors import FileChanged, NotFound, ServiceError, Unreachable
+
+if TYPE_CHECKING:
+    import httpx2
+
+    from services.client._transport import Transport
+
+TUS = {"Tus-Resumable": "1.0.0"}
+LARGEST, SMALLEST = 8 << 20, 64 << 10
+"""Bytes of a file that are sent at once: half as many after a fault, twice as many after a success."""
+PASSING = (408, 409, 423, 429, 460, 500, 502, 503, 504)
+"""Statuses after which an upload is tried again, from where the service says it stands."""
+
+
+def send(
+    http: "Transport", file: Path, body: dict[str, Any], progress: Callable[[int, int], None] | None
+) -> dict[str, Any]:
+    """Upload a file, and make a capture of it; returns the service's answer.
+
+    Parameters
+    ----------
+    body : dict
+        What else is said about the capture.
+    progress : callable, optional
+        Told the bytes that the service has, and those there are.
+
+    Notes
+    -----
+    The Idempotency-Key is made of the file's path, size and time of change, so that nothing about the upload has to
+    be remembered here.
+    """
+    from services.client import _transport
+
+    state = file.stat()
+    size = state.st_size
+    mark = f"{file.resolve()} {size} {state.st_mtime_ns}"
+    key = hashlib.sha256(mark.encode(errors="surrogateescape")).hexdigest()
+    create = TUS | {"Upload-Length": str(size), "Idempotency-Key": key}
+    where, offset, step, pause = "", -1, LARGEST, _transport.FIRST_PAUSE
+    give_up = time.monotonic() + _transport.PATIENCE
+
+    def reached(answer: "httpx2.Response") -> int:
+        found = int(http.header(answer, "Upload-Offset"))
+        if progress and size and found != offset:
+            progress(found, size)
+        return found
+
+    with file.open("rb") as source:
+        while True:
+            try:
+                if not where:
+                    made = http.once("POST", "/v1/uploads", headers=create)
+                    where = urlsplit(http.header(made, "Location")).path
+                if offset < size:
+                    offset = reached(http.once("HEAD", where, headers=TUS))
+                while offset < size:
+                    source.seek(offset)
+                    offset = reached(_patch(http, where, offset, source.read(step)))
+                    step, pause = min(2 * step, LARGEST), _transport.FIRST_PAUSE
+                    give_up = time.monotonic() + _transport.PATIENCE
+                upload = where.rsplit("/", 1)[-1]
+                return http.json("POST", "/v1/captures", json=body | {"upload": upload})
+            except NotFound:
+                if offset == size or not where:
+                    raise
+                offset = size  # another who sends this file may have finished it: then there is a capture
+            except ServiceError as error:
+                nobody = isinstance(error, Unreachable) and not where
+                wait = max(pause, error.retry_after or 0.0)
+                if nobody or error.status not in PASSING or time.monotonic() + wait > give_up:
+                    raise
+                time.sleep(wait)
+                step, pause = max(step // 2, SMALLEST), min(2 * pause, _transport.LONGEST_PAUSE)
+
+
+def _patch(http: "Transport", where: str, offset: int, data: bytes) -> "httpx2.Response":
+    if not data:
+        raise FileChanged
+    digest = base64.b64encode(hashlib.sha256(data).digest()).decode()
+    headers = TUS | {
+        "Content-Type": "application/offset+octet-stream",
+        "Upload-Offset": str(offset),
+        "Upload-Checksum": f"sha256 {digest}",
+    }
+    return http.once("PATCH", where, headers=headers, content=data)
