@@ -166,6 +166,12 @@ class Settings(ClusterSettings):
     matte_memory: int = Field(
         1 << 30, ge=0, description="Bytes of mattes that a service keeps in memory to composite them again."
     )
+    webhook_secret: str | None = Field(
+        None, min_length=16, description="What webhooks are signed with. Without one none are taken."
+    )
+    webhook_private: bool = Field(
+        False, description="Whether webhooks may be at addresses that are not public, and without TLS."
+    )
     attempts: int = Field(3, ge=1, description="How often a tile is tried before its job fails.")
 
     @field_validator("keys", mode="before")

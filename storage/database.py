@@ -122,6 +122,7 @@ jobs = Table(
     _owner(),
     Column("stored", BigInteger),  # as of a capture: of a composite, which has no other record
     Index("jobs_by_owner", "owner", "number"),
+    Column("webhook", Text),  # the URL that is told when it has ended
 )
 
 tiles = Table(
@@ -192,6 +193,19 @@ upload_parts = Table(
     Column("name", String(32), nullable=False),
     Column("size", BigInteger, nullable=False),
 )
+
+deliveries = Table(
+    "deliveries",
+    metadata,
+    Column("id", String(32), primary_key=True),
+    Column("job", String(32), nullable=False),  # which may be deleted before it is told
+    Column("url", Text, nullable=False),
+    Column("body", Text, nullable=False),
+    Column("attempts", Integer, nullable=False),
+    Column("due_at", Float, nullable=False, index=True),
+    Column("created_at", Float, nullable=False),
+)
+"""What is to be told to webhooks: a row until it is delivered or given up."""
 
 made = Table(
     "made",

@@ -12,6 +12,7 @@ from typing import Any
 
 from sqlalchemy import Column, Connection, Row, bindparam, delete, exists, func, insert, or_, select, update
 
+from storage import deliveries
 from storage.database import captures, find, jobs, log, made, mattes, new_id, tiles, totals
 from storage.errors import Conflict
 
@@ -30,6 +31,7 @@ def add(
     trace: str | None = None,
     job: str | None = None,
     stored: int | None = None,
+    webhook: str | None = None,
 ) -> str:
     """Queue a job; returns its id.
 
@@ -41,6 +43,8 @@ def add(
         How many bytes that is.
     trace : str, optional
         The ``traceparent`` (W3C Trace Context) of the request that asks for it.
+    webhook : str, optional
+        URL that is told whenever it has ended.
     """
     job = job or new_id()
     row = {
@@ -53,6 +57,7 @@ def add(
         "options": options,
         "trace": trace,
         "stored": stored,
+        "webhook": webhook,
         "created_at": time.time(),
     }
     connection.execute(insert(jobs).values(row))
@@ -249,6 +254,9 @@ def end(connection: Connection, job: str, state: str, problem: dict[str, Any] | 
     )
     if result.rowcount:
         note(connection, job, f"{state}: {problem['detail']}" if problem else state)
+        row = get(connection, job)
+        if row.webhook:
+            deliveries.add(connection, row)
     return bool(result.rowcount)
 
 

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from sqlalchemy import Row
 from sqlalchemy.exc import IntegrityError
 
-from services import tracing
+from services import tracing, webhooks
 from services.api.context import After, Context, Limit, Needs, read_body, time_of
 from services.api.errors import WrongMediaType
 from services.api.uploads import too_large
@@ -75,6 +75,7 @@ class FromUpload(BaseModel):
     model_config = ConfigDict(extra="forbid")
     upload: str
     name: str = Field("", max_length=200)
+    webhook: str | None = Field(None, description="URL, https, that is told when the capture is ingested.")
 
 
 Key = Annotated[str | None, Header(alias="Idempotency-Key", max_length=256)]
@@ -205,6 +206,7 @@ def _parse(body: bytes) -> FromUpload:
 def _from_upload(context: Context, wanted: FromUpload, key: str | None) -> Row[Any]:
     """Make a capture from a finished upload, under the same id; a repeat answers with it."""
     upload = wanted.upload
+    webhooks.check(wanted.webhook, context.settings)
     made = _made(context, key)
     if made is not None:
         return made
@@ -219,7 +221,7 @@ def _from_upload(context: Context, wanted: FromUpload, key: str | None) -> Row[A
             offset=row.offset,
         )
     try:
-        return _register(context, upload, parts, wanted.name, key, True)
+        return _register(context, upload, parts, wanted.name, key, True, wanted.webhook)
     except (CaptureError, NotFound, FileNotFoundError) as error:
         with writing(context.engine) as c:
             if captures.exists(c, upload):  # a repeat was quicker
@@ -244,7 +246,13 @@ def _admit(context: Context, length: int) -> None:
 
 
 def _register(
-    context: Context, capture: str, parts: list[Part], name: str, key: str | None, resumable: bool
+    context: Context,
+    capture: str,
+    parts: list[Part],
+    name: str,
+    key: str | None,
+    resumable: bool,
+    webhook: str | None = None,
 ) -> Row[Any]:
     """Check an archive that is complete, and write it down as a capture with its ingest job."""
     context.check()
@@ -257,7 +265,7 @@ def _register(
                 raise NotFound(f"upload {capture} is gone")
             size = sum(part.size for part in parts)
             admit(c, context.settings, captures=1, jobs=1, size=size)
-            job = jobs.add(c, "ingest", capture, {}, trace=tracing.asked_by())
+            job = jobs.add(c, "ingest", capture, {}, trace=tracing.asked_by(), webhook=webhook)
             captures.add(
                 c,
                 capture,

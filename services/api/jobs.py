@@ -8,7 +8,7 @@ from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection, Row
 
-from services import kinds, tracing
+from services import kinds, tracing, webhooks
 from services.api.context import After, Limit, Needs, read_json, time_of
 from services.api.eta import seconds_left
 from services.api.waiting import reason
@@ -33,6 +33,7 @@ class JobRequest(BaseModel):
     model_config = ConfigDict(extra="forbid")
     capture: str
     options: dict[str, Any] = Field(default_factory=dict, description="GET /v1/options lists them.")
+    webhook: str | None = Field(None, description="URL, https, that is told when the job has ended.")
 
 
 async def _job_request(request: Request) -> JobRequest:
@@ -160,6 +161,7 @@ def post_job(
 ) -> Job:
     """Queue the recovery of a matte; the capture may still be ingesting."""
     options = parse_options(request.options)
+    webhooks.check(request.webhook, context.settings)
     with writing(context.engine) as c:
         job = jobs.made_by(c, idempotency_key, CALL) if idempotency_key else None
         if job is None:
@@ -171,7 +173,9 @@ def post_job(
             admit(c, context.settings, jobs=1)
             matte = new_id()
             chosen = options.model_dump(mode="json")
-            job = jobs.add(c, "recover", capture.id, chosen, matte, tracing.asked_by())
+            job = jobs.add(
+                c, "recover", capture.id, chosen, matte, tracing.asked_by(), webhook=request.webhook
+            )
             mattes.add(c, matte, capture.id, job, chosen, context.settings.matte_seconds)
             if idempotency_key:
                 jobs.remember(c, idempotency_key, CALL, job)

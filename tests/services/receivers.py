@@ -1,0 +1,56 @@
+"""Real receivers of webhooks: small web servers that write down what comes."""
+
+import ssl
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+
+@dataclass
+class Receiver:
+    """A receiver: its URL, and headers and bodies of what came."""
+
+    url: str = ""
+    came: list[tuple[dict[str, str], bytes]] = field(default_factory=list)
+    news: threading.Event = field(default_factory=threading.Event)
+
+
+@contextmanager
+def receiver(
+    status: Callable[[int], int], certificate: Path | None = None, **headers: str
+) -> Iterator[Receiver]:
+    """A receiver on a free port of loopback that answers its n-th request so; with a certificate, by TLS."""
+    found = Receiver()
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            body = self.rfile.read(int(self.headers["Content-Length"]))
+            answer = status(len(found.came))
+            found.came.append((dict(self.headers), body))
+            found.news.set()
+            self.send_response(answer)
+            for name, value in ({"Content-Length": "0"} | headers).items():
+                self.send_header(name, value)
+            self.end_headers()
+
+        def log_message(self, *arguments: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        scheme = "http"
+        if certificate:
+            context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+            context.load_cert_chain(certificate)
+            server.socket = context.wrap_socket(server.socket, server_side=True)
+            scheme = "https"
+        found.url = f"{scheme}://127.0.0.1:{server.server_port}/told?by=envmatte"
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield found
+        finally:
+            server.shutdown()
+            thread.join()
