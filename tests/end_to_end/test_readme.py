@@ -38,7 +38,7 @@ def test_the_five_lines_of_curl(service: Service, bundle: Path, tmp_path: Path) 
 
 
 def test_zarr_alone_reads_a_matte_and_composites_it(service: Service, matte: str, tmp_path: Path) -> None:
-    look, lines = re.findall(r"```python\n(.*?)```", README, re.S)
+    look, lines = re.findall(r"```python\n(.*?)```", README.partition("## Taking a matte elsewhere")[2], re.S)
     service.client.export(matte, tmp_path / "matte.zip")
     stored = Matte(Objects((service.data / "store").as_uri()), matte)
     backdrop = simulate.backdrop(160, 120)
