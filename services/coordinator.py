@@ -24,7 +24,6 @@ from services.housekeeping import count, forget_expired, remove, sweep
 from services.kinds import KINDS
 from services.process import about
 from services.settings import Settings
-from services.webhooks import Sender
 from storage import jobs, leases
 from storage.database import reading, writing
 from storage.errors import EnvmatteError, GaveUp, NoRoom, Unavailable
@@ -71,26 +70,26 @@ class Coordinator:
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="coordinator")
         self._house = ThreadPoolExecutor(1, thread_name_prefix="housekeeping")
-        self._webhooks = Sender(settings, engine, lambda: self._token) if settings.webhook_secret else None
 
     def __enter__(self) -> "Coordinator":
         if self._settings.alone:  # and nobody writes to the store yet
             sweep(self._engine, self._objects, seconds=0)
         self._thread.start()
-        if self._webhooks:
-            self._webhooks.__enter__()
         return self
 
     def __exit__(self, *exception: object) -> None:
         self._stopped.set()
         self._dispatcher.news.set()
         self._thread.join()
-        if self._webhooks:
-            self._webhooks.__exit__()
         self._house.shutdown(cancel_futures=True)
         if self._token is not None:
             with suppress(Unavailable, NoRoom), writing(self._engine) as c:
                 leases.give_back(c, self._token)
+
+    @property
+    def token(self) -> int | None:
+        """Of the lease; None while another holds it."""
+        return self._token
 
     def _run(self) -> None:
         while not self._stopped.is_set():

@@ -17,6 +17,7 @@ from services.connections import Connection, allow_many
 from services.coordinator import Coordinator
 from services.process import log
 from services.settings import Settings
+from services.webhooks import Sender
 from storage.database import open_engine
 from storage.errors import Conflict
 from storage.objects import Objects
@@ -49,8 +50,7 @@ def serve(settings: Settings) -> None:
         )
         socket = stack.enter_context(config.bind_socket())
         if settings.coordinate:
-            dispatcher = stack.enter_context(dispatcher_of(settings))
-            stack.enter_context(Coordinator(settings, engine, objects, dispatcher))
+            _drive(stack, settings, engine, objects)
         socket.listen()  # from here on whoever connects is answered, if not yet at once
         host, port = socket.getsockname()[:2]
         where = settings.data if settings.alone else "jobs"
@@ -61,10 +61,17 @@ def serve(settings: Settings) -> None:
 def coordinate(settings: Settings) -> None:
     """Drive jobs, whenever no other coordinator does, until interrupted."""
     with _opened(settings, "coordinator") as (stack, engine, objects):
-        dispatcher = stack.enter_context(dispatcher_of(settings))
-        stack.enter_context(Coordinator(settings, engine, objects, dispatcher))
+        _drive(stack, settings, engine, objects)
         print("envmatte coordinates", flush=True)
         signal.pause()
+
+
+def _drive(stack: ExitStack, settings: Settings, engine: Engine, objects: Objects) -> None:
+    """Drive jobs, and tell webhooks of them, until the stack is unwound."""
+    dispatcher = stack.enter_context(dispatcher_of(settings))
+    coordinator = stack.enter_context(Coordinator(settings, engine, objects, dispatcher))
+    if settings.webhook_secret:
+        stack.enter_context(Sender(settings, engine, lambda: coordinator.token))
 
 
 @contextmanager

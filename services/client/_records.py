@@ -16,7 +16,7 @@ class Record:
 
     Attributes
     ----------
-    answer : mapping
+    answer : dict
         All of the service's answer, as JSON has it; ``record["name"]`` is a field of it.
     """
 
@@ -25,10 +25,10 @@ class Record:
     id: str
     state: str
     created_at: str
-    answer: Mapping[str, Any] = field(repr=False)
+    answer: dict[str, Any] = field(repr=False)
 
     @classmethod
-    def of(cls, answer: Mapping[str, Any], **more: Any) -> Self:
+    def of(cls, answer: dict[str, Any], **more: Any) -> Self:
         """A record of an answer; what a newer service tells besides is in `answer` alone."""
         known = {f.name: answer[f.name] for f in fields(cls) if f.name != "answer" and f.name not in more}
         return cls(answer=answer, **known, **more)

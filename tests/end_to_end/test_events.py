@@ -38,7 +38,7 @@ def test_a_job_is_told_as_it_goes_on_and_to_its_end(service: Service, capture: s
     assert states[-1] == "succeeded"
     assert "running" in states
     assert [data["progress"] for _, data in found] == sorted(data["progress"] for _, data in found)
-    assert found[-1][1] | {"run_seconds": 0} == service.client.job(job) | {"run_seconds": 0}
+    assert found[-1][1] | {"run_seconds": 0} == service.client.job(job).answer | {"run_seconds": 0}
     ids = [id for id, _ in found]
     assert len(set(ids)) == len(ids)
     # Who comes back gets what is new: the end, or nothing, and then asks no more.

@@ -40,7 +40,7 @@ def test_two_services_behind_one_port(known: Known, bundle: Path) -> None:
         job = client.wait(client.recover(uploaded["id"])["id"])
     assert rig.files(job["matte"]) == known.files
     seen = [rig.ask("GET", f"/v1/jobs/{job['id']}", at=url).json() for url in rig.urls]
-    assert seen[0] == seen[1] == job
+    assert seen[0] == seen[1] == job.answer
     backdrop = png(np.full((2, 2, 3), 0.5, np.float32), "srgb", np.uint8)
     path = f"/v1/mattes/{job['matte']}/composite"
     answers = [rig.ask("POST", path, at=url, content=backdrop) for url in rig.urls]

@@ -48,7 +48,7 @@ def test_the_help_of_every_command_has_an_example_that_can_be_typed(
         main.commands[name].make_context(name, arguments[1:])
 
 
-@pytest.mark.parametrize("name", main.commands.keys() - PROCESSES)
+@pytest.mark.parametrize("name", sorted(main.commands.keys() - PROCESSES))
 def test_every_command_that_prints_prints_json(name: str) -> None:
     assert any("--json" in parameter.opts for parameter in main.commands[name].params)
 
