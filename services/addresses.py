@@ -150,6 +150,7 @@ def _split(url: str) -> SplitResult:
     unfit = parts.username is not None or parts.fragment or parts.port == 0
     if unfit or not parts.hostname or "%" in parts.hostname:  # no zone of an address either
         raise ValueError("not of the form https://HOST/…")
+    parts.hostname.encode("idna")  # a ValueError where no name can be looked up so
     return parts
 
 

@@ -12,6 +12,8 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
+from hypothesis import given
+from hypothesis import strategies as st
 
 from services import addresses
 from storage.errors import OptionError
@@ -90,6 +92,9 @@ NO_URL = [
     "https://example.com/ x",
     "https://exämple.com/",
     "https://[::1",
+    "https://a..b/",
+    "https://./",
+    "https://" + "x" * 64 + ".com/",
     "https://[fe80::1%lo]/",
     "https://[fe80::1%25lo]/",
     "https://example.com/" + "x" * 2000,
@@ -203,6 +208,12 @@ def test_whom_it_talks_to_by_tls_has_to_have_a_certificate(
         with pytest.raises(ssl.SSLCertVerificationError):  # of another name
             addresses.post(found.url, b"x", {}, private=True)
     assert len(found.came) == 1
+
+
+@given(st.one_of(st.text(), st.text().map("https://{}/".format), st.text().map("https://[{}]:1/".format)))
+def test_whatever_is_given_is_taken_or_refused(url: str) -> None:
+    with suppress(OptionError):
+        addresses.check(url, private=False)
 
 
 @contextmanager
