@@ -17,12 +17,13 @@ POLICY = "; ".join(
         "style-src 'self'",
         "connect-src 'self'",
         "img-src 'self' blob:",
+        "media-src 'self' blob:",
         "base-uri 'none'",
         "form-action 'none'",
         "frame-ancestors 'none'",
     )
 )
-"""What the page may do: run and fetch what this service serves, and show pictures that it made itself (`blob:`)."""
+"""What the page may do: run and fetch what this service serves, and show pictures and videos of its own (`blob:`)."""
 # Asked for again each time, and answered with 304: after an upgrade no file of the old app is mixed with the new.
 FRESH = {"Cache-Control": "no-cache"}
 

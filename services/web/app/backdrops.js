@@ -1,6 +1,7 @@
 // Backdrops: pictures that are made here, and those that people bring.
 
-const PREVIEW = 640; // pixels of the longer side, of what is sent while a hand moves
+export const PREVIEW = 640; // pixels of the longer side, of what is sent while a hand moves
+const DRAWABLE = 2048; // and of what this browser draws: as fine as monitors
 
 const canvasOf = (width, height) => Object.assign(document.createElement("canvas"), { width, height });
 
@@ -52,26 +53,44 @@ export async function backdrop(name, width, height) {
   return blobOf(canvas);
 }
 
-// One of those above, for a monitor, both for the eye and exact.
+// A backdrop that can be chosen is `{name, exact, quick}`: functions that make what the service gets, whole and while a
+// hand moves. With `picture`, this browser can draw it too; `moving` ones play, and `close` lets go of what they hold.
+
+// One of those above, for a monitor.
 export async function builtIn(name, [wide, high]) {
   const width = Math.min(wide, 1280);
-  const exact = await backdrop(name, width, Math.max(1, Math.round((width * high) / wide)));
-  return { name, exact, quick: exact };
+  const picture = canvasOf(width, Math.max(1, Math.round((width * high) / wide)));
+  DRAWN[name](picture.getContext("2d"), picture.width, picture.height);
+  const blob = await blobOf(picture);
+  return { name, exact: () => blob, quick: () => blob, picture };
 }
 
-// A file that was brought; large ones also small, so that they need not be sent whole while they are moved.
+// A picture that was brought. Of large ones a small copy is sent while they are moved.
 export async function brought(file) {
-  const picture = await createImageBitmap(file).catch(() => null); // the browser reads no TIFF and no EXR: the service does
-  const much = picture ? PREVIEW / Math.max(picture.width, picture.height) : 1;
-  let quick = file;
-  if (much < 1) {
-    const canvas = canvasOf(Math.max(1, Math.round(picture.width * much)), Math.max(1, Math.round(picture.height * much)));
-    const context = canvas.getContext("2d");
-    context.fillRect(0, 0, canvas.width, canvas.height); // what is transparent is black, as the service has it
-    context.imageSmoothingQuality = "high";
-    context.drawImage(picture, 0, 0, canvas.width, canvas.height);
-    quick = await blobOf(canvas, "image/jpeg", 0.9);
+  const exact = () => file;
+  const name = file.name || "Pasted picture";
+  const read = { premultiplyAlpha: "none" };
+  const whole = await createImageBitmap(file, read).catch(() => null); // the browser reads no TIFF and no EXR: the service does
+  if (!whole) return { name, exact, quick: exact };
+  const longer = Math.max(whole.width, whole.height);
+  let picture = whole;
+  if (longer > DRAWABLE) {
+    const resizeWidth = Math.max(1, Math.round((whole.width * DRAWABLE) / longer));
+    picture = await createImageBitmap(whole, { ...read, resizeWidth, resizeHeight: Math.max(1, Math.round((whole.height * DRAWABLE) / longer)), resizeQuality: "high" });
+    whole.close();
   }
-  picture?.close();
-  return { name: file.name || "Pasted picture", exact: file, quick };
+  let small;
+  const quick = async () => (small ??= longer > PREVIEW ? await still(picture, picture.width, picture.height, PREVIEW, "image/jpeg") : file);
+  return { name, exact, quick, picture, close: () => picture.close() };
+}
+
+// What is shown of a picture or a video, no larger than asked for; what is transparent is black, as the service has it.
+export function still(picture, width, height, longest, type) {
+  const much = Math.min(1, longest / Math.max(width, height));
+  const canvas = canvasOf(Math.max(1, Math.round(width * much)), Math.max(1, Math.round(height * much)));
+  const context = canvas.getContext("2d");
+  context.fillRect(0, 0, canvas.width, canvas.height);
+  context.imageSmoothingQuality = "high";
+  context.drawImage(picture, 0, 0, canvas.width, canvas.height);
+  return blobOf(canvas, type, 0.9);
 }

@@ -1,11 +1,17 @@
-// The glass before a backdrop that is chosen, moved, scaled and turned; what is drawn is the service's composite.
+// The glass before a backdrop that is chosen, moved, scaled and turned. While it moves, WebGL2 draws it in this browser,
+// or the service a small picture where it can't; when the hand has stopped, the service's composite is shown.
 import { ask, saveBlob } from "./api.js";
 import { NAMES, brought, builtIn } from "./backdrops.js";
+import { clips } from "./clip.js";
 import { button, h, newest, said, show } from "./dom.js";
+import { glass, lightOf } from "./glass.js";
+import { fetchLive } from "./live.js";
+import { camera, clip } from "./moving.js";
 import { onDrop } from "./upload.js";
 
 const STILL = 300; // ms after which a hand has stopped
 const QUICK = 480; // pixels of the longer side while it moves
+const SLOW = 25; // ms a picture, from which on the backdrop's finest level is left out, three quarters of the work
 const CONTROLS = [
   // name, label, default, minimum, maximum, step of the slider and of the keys
   ["right", "Move right", 0, -2, 2, 0.01],
@@ -22,43 +28,113 @@ export async function compositing(matte, signal) {
   const longer = Math.max(matte.width, matte.height);
   const at = Object.fromEntries(CONTROLS.map(([name, , value]) => [name, value]));
   let source;
+  let painter;
   let timer;
+  let frame = 0;
   let changes = 0;
 
   const image = h("img", { alt: "The glass before the backdrop", width: matte.width, height: matte.height, draggable: "false" });
+  const canvas = h("canvas", { role: "img", "aria-label": "The glass before the backdrop", width: matte.width, height: matte.height, hidden: true });
   const stage = h("div", {
     class: "picture stage", tabindex: 0, role: "group",
     "aria-label": "Composite. Drag to move the backdrop; arrow keys move, plus and minus scale, square brackets turn it.",
-  }, image);
+  }, image, canvas);
   stage.style.aspectRatio = `${matte.width} / ${matte.height}`;
   const status = h("p", { class: "hint", role: "status" }, "Loading");
+  const drawer = h("p", { class: "hint" }, "Until all of the glass is here, the service draws it while you move.");
   const problem = h("div");
+  const fail = (error) => signal.aborted || problem.replaceChildren(said(error));
+  const tell = (how) => {
+    const text = `${source.name}: ${how}`;
+    if (status.textContent !== text) status.textContent = text;
+  };
+  const front = (one) => {
+    image.hidden = one !== image;
+    canvas.hidden = one !== canvas;
+  };
 
   const composite = (body, wanted, accept) => {
     const query = new URLSearchParams({ ...at, ...wanted });
     return ask(`v1/mattes/${matte.id}/composite?${query}`, { method: "POST", headers: { Accept: accept }, body, signal });
   };
+  const playing = () => source.moving && !source.moving.paused;
+  const drawn = () => painter && source.picture;
   const draw = newest(async (exact) => {
-    const drawn = changes;
+    const [was, now] = [source, changes];
     try {
       const wanted = exact ? { quality: 95 } : { quality: 80, size: Math.min(QUICK, longer) };
-      const answer = await composite(exact ? source.exact : source.quick, wanted, "image/jpeg");
-      await show(image, await answer.blob());
-      if (exact && drawn === changes) status.textContent = `${source.name}: exact, ${matte.width} × ${matte.height} pixels`;
+      const answer = await (await composite(await (exact ? was.exact() : was.quick()), wanted, "image/jpeg")).blob();
+      if (was !== source || (drawn() && now !== changes)) return; // what is drawn here is newer
+      await show(image, answer);
+      front(image);
+      if (exact && now === changes) tell(`exact, ${matte.width} × ${matte.height} pixels`);
       problem.replaceChildren();
     } catch (error) {
-      if (!signal.aborted) problem.replaceChildren(said(error));
+      fail(error);
     }
+    if (!exact && playing() && !drawn() && !signal.aborted) draw(false); // the next frame
   });
-  const stop = () => clearTimeout(timer);
-  signal.addEventListener("abort", stop);
-  const moved = () => {
-    stop();
-    changes += 1;
-    status.textContent = `${source.name}: preview`;
-    timer = setTimeout(draw, STILL, true);
-    draw(false);
+  function paint() {
+    frame = 0;
+    if (!drawn()) return;
+    if (playing()) painter.take(source.picture);
+    painter.draw(at);
+    front(canvas);
+    if (playing()) redraw();
+  }
+  function redraw() {
+    frame ||= requestAnimationFrame(paint);
+  }
+  const stop = () => {
+    clearTimeout(timer);
+    cancelAnimationFrame(frame);
+    frame = 0;
   };
+  const moved = () => {
+    clearTimeout(timer);
+    changes += 1;
+    tell(drawn() ? "live" : "preview");
+    if (!playing()) timer = setTimeout(draw, STILL, true);
+    if (drawn()) redraw();
+    else draw(false);
+  };
+  signal.addEventListener("abort", () => {
+    stop();
+    painter?.close();
+    source?.close?.();
+  });
+
+  // Draws in this browser as soon as the matte is here, if it can.
+  async function prepare() {
+    const gl = lightOf(canvas);
+    if (!gl) return (drawer.textContent = "This browser can’t draw the glass itself, for it has no WebGL2: the service draws it while you move.");
+    const lost = () => {
+      painter = undefined;
+      drawer.textContent = "The graphics card has let go of the glass: the service draws it while you move, until this page is loaded anew.";
+      if (source) moved();
+    };
+    canvas.addEventListener("webglcontextlost", lost, { signal });
+    signal.addEventListener("abort", () => gl.getExtension("WEBGL_lose_context")?.loseContext());
+    try {
+      const found = await fetchLive(matte.id, signal);
+      let made = glass(gl, found, matte.monitor);
+      made.draw(at); // the first time takes longer
+      await made.time();
+      made.draw(at);
+      if ((await made.time()) > SLOW) {
+        made.close();
+        made = glass(gl, found, matte.monitor, 1);
+      }
+      if (signal.aborted) return made.close();
+      painter = made;
+      if (source?.picture) painter.take(source.picture);
+      const every = found.step > 1 ? `, each ${found.step}th pixel of it` : "";
+      drawer.textContent = `This browser draws the glass while you move${every}; when you stop, the service does.`;
+      if (source && playing()) moved();
+    } catch (error) {
+      fail(error);
+    }
+  }
 
   // What is set by hand, by sliders and by keys is the same four figures.
   const sliders = Object.fromEntries(CONTROLS.map(([name, , value, min, max, step]) => {
@@ -98,21 +174,43 @@ export async function compositing(matte, signal) {
   }, { passive: false });
   handle(stage, () => at, set);
 
+  // The backdrop that was asked for last; what is slower to come is let go of.
+  let choice = 0;
   async function use(making) {
+    const mine = (choice += 1);
     try {
-      source = await making;
+      const made = await making;
+      if (mine !== choice || signal.aborted) return made.close?.();
+      source?.close?.();
+      source = made;
+      video.choose(made.clip);
+      play.hidden = !made.moving;
+      play.textContent = "Hold it";
+      problem.replaceChildren();
+      if (drawn()) painter.take(made.picture);
       moved();
     } catch (error) {
-      problem.replaceChildren(said(error));
+      if (mine === choice) fail(error);
     }
   }
-  const bring = (files) => {
+  const play = h("button", {
+    type: "button", hidden: true,
+    onclick: async () => {
+      if (playing()) source.moving.pause();
+      else await source.moving.play().catch(fail);
+      play.textContent = playing() ? "Hold it" : "Let it go on";
+      if (drawn()) painter.take(source.picture);
+      moved();
+    },
+  });
+  const bring = ([one]) => {
     for (const choice of choices.querySelectorAll("input")) choice.checked = false;
-    use(brought(files[0]));
+    use(/^video\/|\.(mp4|mov|mkv|webm|avi)$/i.test(one.type || one.name) ? clip(one) : brought(one));
   };
+  const live = h("label", { class: "choice" }, h("input", { type: "radio", name: "backdrop", onchange: () => use(camera()) }), "Camera");
   const choices = h("fieldset", { class: "row" }, h("legend", {}, "Backdrop"), NAMES.map((name, i) =>
-    h("label", { class: "choice" }, h("input", { type: "radio", name: "backdrop", checked: i === 0, onchange: () => use(builtIn(name, matte.monitor)) }), name)));
-  const file = h("input", { type: "file", id: "backdrop", accept: "image/*,.exr,.tif,.tiff" });
+    h("label", { class: "choice" }, h("input", { type: "radio", name: "backdrop", checked: i === 0, onchange: () => use(builtIn(name, matte.monitor)) }), name)), live);
+  const file = h("input", { type: "file", id: "backdrop", accept: "image/*,.exr,.tif,.tiff,video/*" });
   file.onchange = () => {
     if (file.files.length) bring(file.files);
     file.value = "";
@@ -121,19 +219,22 @@ export async function compositing(matte, signal) {
   addEventListener("paste", ({ clipboardData }) => clipboardData?.files.length && bring(clipboardData.files), { signal });
 
   const download = (kind, accept) => button(kind, problem, async () =>
-    saveBlob(await (await composite(source.exact, {}, accept)).blob(), `composite.${kind.toLowerCase()}`));
+    saveBlob(await (await composite(await source.exact(), accept === "image/jpeg" ? { quality: 95 } : {}, accept)).blob(), `composite.${kind.toLowerCase()}`));
+  const video = clips(matte, () => at, signal);
   set({}, true);
+  prepare();
   use(builtIn(NAMES[0], matte.monitor));
   return [
     h("section", { class: "panel composite", "aria-label": "Compositing" },
-      h("div", {}, stage, h("p", { class: "hint" }, "Drag the picture to move the backdrop; then scroll, or pinch, to scale it."), status, problem),
+      h("div", {}, stage, h("p", { class: "hint" }, "Drag the picture to move the backdrop; then scroll, or pinch, to scale it."), status, drawer, problem),
       h("div", { class: "stack" }, choices,
-        h("div", { class: "drop small" }, h("label", { for: "backdrop" }, h("strong", {}, "Your own picture"), " drop, paste or choose it",
-          h("span", { class: "hint" }, "PNG, JPEG, TIFF or EXR")), file),
+        h("div", { class: "drop small" }, h("label", { for: "backdrop" }, h("strong", {}, "Your own picture or clip"), " drop, paste or choose it",
+          h("span", { class: "hint" }, "PNG, JPEG, TIFF, EXR or a video")), file),
         h("div", { class: "sliders" }, CONTROLS.map(([name, label]) =>
           [h("label", { for: `place-${name}` }, label), sliders[name].input, sliders[name].told])),
-        h("p", { class: "row" }, reset),
-        h("div", { class: "row" }, h("span", {}, "Download it as"), download("PNG", "image/png"), download("EXR", "image/x-exr")))),
+        h("p", { class: "row" }, reset, play),
+        h("div", { class: "row" }, h("span", {}, "Download it as"), download("PNG", "image/png"), download("JPEG", "image/jpeg"), download("EXR", "image/x-exr")),
+        video.element)),
   ];
 }
 

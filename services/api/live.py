@@ -1,0 +1,50 @@
+"""Mattes for graphics hardware over HTTP, which the web app draws while a hand moves the backdrop."""
+
+import anyio.to_thread
+from fastapi import APIRouter, Request, Response
+
+from services.api.context import Needs, is_known
+from storage import live as kept
+from storage import mattes
+from storage.database import reading
+from storage.errors import Corrupt
+from workflows.composite import live
+from workflows.composite.threads import CORES
+
+router = APIRouter(tags=["mattes"])
+
+
+@router.get(
+    "/mattes/{id}/live",
+    response_class=Response,
+    responses={
+        200: {"content": {"application/octet-stream": {}}, "description": "The matte, as gzip encodes it"}
+    },
+)
+async def get_live(context: Needs, id: str, request: Request) -> Response:
+    """The matte as a few look-ups a pixel in mip-mapped textures, with S, rho and alpha: what a graphics card draws the
+    glass with before any backdrop. It is made when it is first asked for, and kept."""
+
+    def is_ready() -> None:
+        with reading(context.engine) as c:
+            mattes.get_ready(c, id)
+
+    def find() -> bytes:
+        made = kept.read(context.objects, id, live.FORMAT)
+        if made is None:
+            try:
+                made = live.encode_live(
+                    context.cache.matte(id), lambda row, column: context.cache.block(id, row, column), CORES
+                )
+            except Corrupt:
+                is_ready()  # it may have been deleted meanwhile
+                raise
+            kept.keep(context.objects, id, live.FORMAT, made)
+        return made
+
+    await anyio.to_thread.run_sync(is_ready)
+    tag = {"ETag": f'"{id}-{live.FORMAT}"'}  # a matte never changes once it is ready
+    if is_known(request.headers, tag["ETag"]):
+        return Response(status_code=304, headers=tag)
+    answer = await anyio.to_thread.run_sync(find, limiter=context.layers)
+    return Response(answer, media_type="application/octet-stream", headers=tag | {"Content-Encoding": "gzip"})

@@ -1,0 +1,215 @@
+// The glass drawn by WebGL2: the backdrop's light on a pyramid of textures, then some look-ups in it for each pixel.
+// What is drawn is what `workflows/composite/live.py` describes; light is linear until the last line.
+
+import { pause } from "./dom.js";
+
+const TRIANGLE = `#version 300 es
+void main() { gl_Position = vec4(vec2(gl_VertexID == 1, gl_VertexID == 2) * 4.0 - 1.0, 0, 1); }`;
+
+// The backdrop over the cells of the first level; beyond it is black.
+const PLACE = `#version 300 es
+precision highp float;
+uniform sampler2D picture;
+uniform mat3 placing; // from cells to shares of the picture
+uniform vec2 most; // the last column and row
+uniform vec2 cells; // that are as wide, and as high, as the picture
+uniform float blur; // level of the picture that is as coarse as the cells
+out vec4 light;
+void main() {
+  vec2 at = (placing * vec3(min(floor(gl_FragCoord.xy), most) + 0.5, 1)).xy;
+  vec2 covered = clamp(cells * min(at, 1.0 - at) + 0.5, 0.0, 1.0);
+  vec4 seen = textureLod(picture, at, blur);
+  light = vec4(covered.x * covered.y * seen.a * seen.rgb, 1);
+}`;
+
+// The next level: every second node, seen with the weights [1, 3, 3, 1] / 8 along each axis, two at a time between them.
+const HALVE = `#version 300 es
+precision highp float;
+uniform sampler2D fine;
+uniform vec2 size; // of the finer level, in nodes, with those beyond its edge
+uniform vec2 most; // the last column and row of this one
+out vec4 light;
+void main() {
+  vec2 first = 2.0 * min(floor(gl_FragCoord.xy), most) + 0.25;
+  light = vec4(0);
+  for (int k = 0; k < 4; k++) light += texture(fine, (first + 1.5 * vec2(k & 1, k >> 1)) / size) / 4.0;
+}`;
+
+const GLASS = `#version 300 es
+precision highp float;
+precision highp int;
+precision highp usampler2DArray;
+uniform sampler2D light;
+uniform usampler2DArray lookups; // x, y, level and red, green and blue; the heaviest first
+uniform sampler2D offset; // roots of S, and alpha
+uniform sampler2D absorption; // roots of rho
+uniform float base; // the level of T that is the texture's first
+uniform vec2 tops; // of S and of rho
+uniform mat3 crosstalk;
+uniform int height;
+out vec4 colour;
+void main() {
+  ivec2 pixel = ivec2(gl_FragCoord.x, float(height) - gl_FragCoord.y);
+  int count = textureSize(lookups, 0).z;
+  vec3 sum = vec3(0);
+  for (int k = 0; k < count; k++) {
+    uvec4 lookup = texelFetch(lookups, ivec3(pixel, k), 0);
+    vec3 share = vec3(lookup.z & 255u, lookup.w >> 8, lookup.w & 255u) / 255.0;
+    if (share == vec3(0)) break;
+    sum += share * textureLod(light, vec2(lookup.xy) / 65536.0, max(float(lookup.z >> 8) / 16.0 - base, 0.0)).rgb;
+  }
+  vec4 root = texelFetch(offset, pixel, 0);
+  vec3 rho = texelFetch(absorption, pixel, 0).rgb;
+  vec3 seen = tops.x * root.rgb * root.rgb + crosstalk * (tops.y * rho * rho * sum);
+  seen = clamp(root.a * seen, 0.0, 1.0);
+  colour = vec4(mix(12.92 * seen, 1.055 * pow(seen, vec3(1.0 / 2.4)) - 0.055, greaterThan(seen, vec3(0.0031308))), 1);
+}`;
+
+// A place of the backdrop before the monitor, as `Placement.matrix` has it: from cells to shares of the picture.
+function placing({ right, down, scale, angle }, [columns, rows], [wide, high]) {
+  const turn = (angle * Math.PI) / 180;
+  const [cosine, sine] = [Math.cos(turn) / scale, Math.sin(turn) / scale];
+  const [x, y] = [-wide / 2 - right * wide, -high / 2 - down * high];
+  return [
+    (cosine * wide) / columns / wide, (-sine * wide) / columns / high, 0,
+    (sine * high) / rows / wide, (cosine * high) / rows / high, 0,
+    (cosine * x + sine * y) / wide + 0.5, (-sine * x + cosine * y) / high + 0.5, 1,
+  ];
+}
+
+// WebGL2 on a canvas; null where the browser has none, or can't draw into textures of light.
+export function lightOf(canvas) {
+  const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true });
+  return gl?.getExtension("EXT_color_buffer_float") || gl?.getExtension("EXT_color_buffer_half_float") ? gl : null;
+}
+
+// Draws a decoded matte. The levels before `base` are left out, and what is looked up there is on that one: each makes the
+// work on the backdrop's light a quarter.
+export function glass(gl, matte, monitor, base = 0) {
+  const { width, height } = matte;
+  const levels = matte.levels.slice(base);
+  const texture = matte.texture.map((size) => size >> base);
+  Object.assign(gl.canvas, { width, height });
+  const made = [];
+  const keep = (kind, thing) => (made.push([kind, thing]), thing);
+
+  function program(text) {
+    const one = keep("Program", gl.createProgram());
+    for (const [kind, source] of [[gl.VERTEX_SHADER, TRIANGLE], [gl.FRAGMENT_SHADER, text]]) {
+      const shader = gl.createShader(kind);
+      gl.shaderSource(shader, source);
+      gl.compileShader(shader);
+      gl.attachShader(one, shader);
+      gl.deleteShader(shader); // as soon as the program goes
+    }
+    gl.linkProgram(one);
+    if (!gl.getProgramParameter(one, gl.LINK_STATUS) && !gl.isContextLost()) throw new Error(gl.getProgramInfoLog(one));
+    const places = new Map();
+    const at = (name) => places.get(name) ?? places.set(name, gl.getUniformLocation(one, name)).get(name);
+    return { use: () => gl.useProgram(one), at };
+  }
+  function textureOf(target, unit, filter, min = filter) {
+    const one = keep("Texture", gl.createTexture());
+    gl.activeTexture(gl.TEXTURE0 + unit);
+    gl.bindTexture(target, one);
+    gl.texParameteri(target, gl.TEXTURE_MAG_FILTER, filter);
+    gl.texParameteri(target, gl.TEXTURE_MIN_FILTER, min);
+    gl.texParameteri(target, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
+    gl.texParameteri(target, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
+    return one;
+  }
+  // Each texture stays on a unit of its own.
+  const [LIGHT, LOOKUPS, OFFSET, ABSORPTION, PICTURE] = [0, 1, 2, 3, 4];
+  const [place, halve, seen] = [program(PLACE), program(HALVE), program(GLASS)];
+  gl.bindVertexArray(keep("VertexArray", gl.createVertexArray()));
+  gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+
+  const light = textureOf(gl.TEXTURE_2D, LIGHT, gl.LINEAR, gl.LINEAR_MIPMAP_LINEAR);
+  gl.texStorage2D(gl.TEXTURE_2D, levels.length, gl.RGBA16F, ...texture);
+  const targets = levels.map((_, level) => {
+    const target = keep("Framebuffer", gl.createFramebuffer());
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, light, level);
+    return target;
+  });
+  textureOf(gl.TEXTURE_2D_ARRAY, LOOKUPS, gl.NEAREST);
+  gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.RGBA16UI, width, height, matte.lookups.length);
+  matte.lookups.forEach((layer, k) =>
+    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, k, width, height, 1, gl.RGBA_INTEGER, gl.UNSIGNED_SHORT, layer));
+  for (const [unit, frame] of [[OFFSET, matte.offset], [ABSORPTION, matte.absorption]]) {
+    textureOf(gl.TEXTURE_2D, unit, gl.NEAREST);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, width, height, 0, gl.RGBA, gl.UNSIGNED_BYTE, frame);
+  }
+  textureOf(gl.TEXTURE_2D, PICTURE, gl.LINEAR, gl.LINEAR_MIPMAP_LINEAR);
+  let shown = [1, 1];
+
+  seen.use();
+  gl.uniform1i(seen.at("light"), LIGHT);
+  gl.uniform1i(seen.at("lookups"), LOOKUPS);
+  gl.uniform1i(seen.at("offset"), OFFSET);
+  gl.uniform1i(seen.at("absorption"), ABSORPTION);
+  gl.uniform1f(seen.at("base"), base);
+  gl.uniform2f(seen.at("tops"), matte.S, matte.rho);
+  gl.uniformMatrix3fv(seen.at("crosstalk"), true, matte.crosstalk.flat());
+  gl.uniform1i(seen.at("height"), height);
+  halve.use();
+  gl.uniform1i(halve.at("fine"), LIGHT);
+  place.use();
+  gl.uniform1i(place.at("picture"), PICTURE);
+  gl.uniform2f(place.at("most"), levels[0][0] - 1, levels[0][1] - 1);
+
+  return {
+    // Takes a picture, or the frame of a video that is shown now, as the backdrop.
+    take(picture) {
+      gl.activeTexture(gl.TEXTURE0 + PICTURE);
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.SRGB8_ALPHA8, gl.RGBA, gl.UNSIGNED_BYTE, picture);
+      gl.generateMipmap(gl.TEXTURE_2D);
+      shown = [picture.videoWidth ?? picture.width, picture.videoHeight ?? picture.height];
+    },
+    draw(at) {
+      const cells = levels[0];
+      const matrix = placing(at, cells, monitor);
+      const pixels = Math.sqrt(Math.abs(matrix[0] * matrix[4] - matrix[1] * matrix[3]) * shown[0] * shown[1]);
+      // A picture as it is has its mean over each cell; the service samples one that is moved between pixels as large as
+      // cells, at four places a cell, which blurs it by as much as a pixel an eighth larger does.
+      const moved = at.right || at.down || at.angle || at.scale !== 1;
+      gl.activeTexture(gl.TEXTURE0 + LIGHT);
+      place.use();
+      gl.uniformMatrix3fv(place.at("placing"), false, matrix);
+      gl.uniform2f(place.at("cells"), 1 / Math.hypot(matrix[0], matrix[3]), 1 / Math.hypot(matrix[1], matrix[4]));
+      gl.uniform1f(place.at("blur"), Math.max(0, Math.log2(pixels * (moved ? 1.125 : 1))));
+      levels.forEach((size, level) => {
+        gl.bindFramebuffer(gl.FRAMEBUFFER, targets[level]);
+        gl.viewport(0, 0, texture[0] >> level, texture[1] >> level);
+        if (level) {
+          if (level === 1) halve.use();
+          // Only the finer level may be read while this one is written.
+          gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_BASE_LEVEL, level - 1);
+          gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAX_LEVEL, level - 1);
+          gl.uniform2f(halve.at("size"), texture[0] >> (level - 1), texture[1] >> (level - 1));
+          gl.uniform2f(halve.at("most"), size[0] - 1, size[1] - 1);
+        }
+        gl.drawArrays(gl.TRIANGLES, 0, 3);
+      });
+      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_BASE_LEVEL, 0);
+      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAX_LEVEL, levels.length - 1);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+      gl.viewport(0, 0, width, height);
+      seen.use();
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+    },
+    // Milliseconds that the graphics card takes to draw what it has been told to.
+    async time() {
+      const start = performance.now();
+      const done = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+      gl.flush();
+      while (!gl.isContextLost() && gl.getSyncParameter(done, gl.SYNC_STATUS) !== gl.SIGNALED) await pause(1);
+      gl.deleteSync(done);
+      return performance.now() - start;
+    },
+    // Leaves nothing on the graphics card.
+    close() {
+      for (const [kind, thing] of made.splice(0)) gl[`delete${kind}`](thing);
+    },
+  };
+}
