@@ -9,6 +9,12 @@ from playwright.sync_api import Browser, Page, sync_playwright
 from tests.end_to_end.conftest import Service, serving
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+ARGUMENTS = [
+    "--no-sandbox",  # tests may run as root; the pages are our own
+    "--enable-unsafe-swiftshader",  # WebGL2 without a graphics card, and without a warning
+    "--use-fake-device-for-media-stream",  # a camera that shows a moving picture
+    "--use-fake-ui-for-media-stream",  # and that every page may use
+]
 
 
 @pytest.fixture(scope="session")
@@ -23,8 +29,7 @@ def browser() -> Iterator[Browser]:
     if CHROMIUM is None:
         pytest.skip("pages are tested in Chromium, which is not installed: apt-get install chromium")
     with sync_playwright() as playwright:
-        # Without a sandbox, as tests may run as root; the pages are our own.
-        yield (running := playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"]))
+        yield (running := playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS))
         running.close()
 
 

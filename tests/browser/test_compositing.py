@@ -1,0 +1,229 @@
+"""The glass before a backdrop in a real browser: what it draws itself, beside what the service makes of it."""
+
+import base64
+import io
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
+
+import av
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+from playwright.sync_api import Browser, BrowserContext, Page, Route, expect
+
+from tests.end_to_end.conftest import BANDS, Service, png
+from workflows import simulate
+from workflows.scene import nested_program, write_capture
+
+pytestmark = pytest.mark.full
+
+SIZE = 96, 72
+MINUTE = 60_000
+READY = "This browser draws the glass while you move"
+EXACT = re.compile(rf"exact, {SIZE[0]} × {SIZE[1]} pixels")
+COUNTED = """
+    const made = (window.made = { Texture: 0, Program: 0, Framebuffer: 0, VertexArray: 0, Shader: 0, Sync: 0 });
+    const type = WebGL2RenderingContext.prototype;
+    for (const kind in made) {
+        for (const [name, by] of [[kind === "Sync" ? "fenceSync" : `create${kind}`, 1], [`delete${kind}`, -1]]) {
+            const real = type[name];
+            type[name] = function (...given) { made[kind] += by; return real.apply(this, given); };
+        }
+    }"""
+WITHOUT = """
+    const real = HTMLCanvasElement.prototype.getContext;
+    HTMLCanvasElement.prototype.getContext = function (kind, ...given) {
+        return kind === "webgl2" ? null : real.call(this, kind, ...given);
+    };"""
+KEPT = """
+    const real = navigator.mediaDevices.getUserMedia.bind(navigator.mediaDevices);
+    navigator.mediaDevices.getUserMedia = async (wanted) => (window.stream = await real(wanted));"""
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory: pytest.TempPathFactory, service: Service) -> str:
+    path = tmp_path_factory.mktemp("ball") / "ball.zip"
+    write_capture(simulate.glass_ball(*SIZE, rays=9), nested_program(bands=BANDS, levels=5), path)
+    uploaded = service.client.upload(path)
+    service.client.wait(uploaded["job"])
+    return str(service.client.wait(service.client.recover(uploaded["id"], quality="fast")["id"])["matte"])
+
+
+@pytest.fixture
+def context(browser: Browser) -> Iterator[BrowserContext]:
+    context = browser.new_context(viewport={"width": 1200, "height": 800}, accept_downloads=True)
+    yield context
+    context.close()
+
+
+def opened(context: BrowserContext, service: Service, matte: str) -> Page:
+    """The matte's page, with its first composite there; what it throws is kept."""
+    page = context.new_page()
+    page.on("pageerror", lambda error: pytest.fail(str(error)))
+    page.goto(f"{service.url}/#/mattes/{matte}")
+    expect(page.get_by_text(EXACT)).to_be_visible(timeout=MINUTE)
+    return page
+
+
+def pixels(data: bytes) -> NDArray[np.float64]:
+    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"), float)
+
+
+def drawn(page: Page) -> NDArray[np.float64]:
+    """What the browser has drawn last, (rows, columns, 3)."""
+    url = page.locator(".picture.stage canvas").evaluate("(canvas) => canvas.toDataURL('image/png')")
+    return pixels(base64.b64decode(url.partition(",")[2]))
+
+
+def bring(page: Page, data: bytes, name: str, kind: str) -> None:
+    page.get_by_label("Your own picture or clip").set_input_files(
+        {"name": name, "mimeType": kind, "buffer": data}
+    )
+
+
+def filmed(path: Path, frames: int) -> bytes:
+    """A clip whose picture moves to the side."""
+    still = np.asarray(simulate.backdrop(160, 120) * 255, np.uint8)
+    with av.open(path, "w") as file:
+        stream = file.add_stream("libx264", 10)
+        stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
+        for n in range(frames):
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(np.roll(still, 8 * n, axis=1), "rgb24")))
+        file.mux(stream.encode(None))
+    return path.read_bytes()
+
+
+def test_what_the_browser_draws_agrees_with_the_service(
+    context: BrowserContext, service: Service, ball: str
+) -> None:
+    page = opened(context, service, ball)
+    expect(page.get_by_text(READY)).to_be_visible(timeout=MINUTE)
+    asked: list[str] = []
+    page.on("request", lambda one: asked.append(one.url) if "/composite?" in one.url else None)
+    beach = png(simulate.backdrop(640, 480), "srgb", np.uint8)
+    bring(page, beach, "beach.png", "image/png")
+    expect(page.get_by_text(re.compile("beach.png: exact"))).to_be_visible(timeout=MINUTE)
+    for turned in ({}, {"Move right": "0.15"}, {"Move down": "-0.3", "Turn": "30"}, {"Size": "-0.3"}):
+        for name, value in turned.items():
+            page.get_by_role("slider", name=name).fill(value)
+        expect(page.get_by_text(EXACT)).to_be_visible(timeout=MINUTE)
+        place = {name: value for name, (value,) in parse_qs(urlsplit(asked[-1]).query).items()}
+        del place["quality"]
+        exact = service.http.post(f"/v1/mattes/{ball}/composite", params=place, content=beach)
+        error = np.mean((drawn(page) - pixels(exact.content)) ** 2)
+        assert 10 * np.log10(255**2 / error) > 30, place
+    assert not any("size=" in url for url in asked)
+
+
+def test_it_is_drawn_live_and_then_exactly(context: BrowserContext, service: Service, ball: str) -> None:
+    page = opened(context, service, ball)
+    expect(page.get_by_text(READY)).to_be_visible(timeout=MINUTE)
+    held: list[Route] = []
+    page.route("**/composite?*", lambda route: held.append(route))
+    canvas, image = page.locator(".picture.stage canvas"), page.locator(".picture.stage img")
+    page.get_by_role("group", name="Composite.").press("ArrowRight")
+    expect(page.get_by_text("Checker: live")).to_be_visible()
+    expect(canvas).to_be_visible()
+    expect(image).to_be_hidden()
+    page.wait_for_timeout(500)
+    for route in held:
+        route.continue_()
+    page.unroute("**/composite?*")
+    expect(page.get_by_text(EXACT)).to_be_visible(timeout=MINUTE)
+    expect(image).to_be_visible()
+    expect(canvas).to_be_hidden()
+
+
+def test_the_camera_is_a_backdrop_and_let_go_of(context: BrowserContext, service: Service, ball: str) -> None:
+    context.add_init_script(KEPT)
+    page = opened(context, service, ball)
+    expect(page.get_by_text(READY)).to_be_visible(timeout=MINUTE)
+    page.get_by_role("radio", name="Camera").check()
+    expect(page.get_by_text("Camera: live")).to_be_visible(timeout=MINUTE)
+    before = drawn(page)
+    page.wait_for_timeout(1500)
+    assert np.abs(drawn(page) - before).max() > 10
+    page.get_by_role("button", name="Hold it").click()
+    expect(page.get_by_text(re.compile("Camera: exact"))).to_be_visible(timeout=MINUTE)
+    page.get_by_role("button", name="Let it go on").click()
+    expect(page.get_by_text("Camera: live")).to_be_visible()
+    page.get_by_role("navigation").get_by_role("link", name="Mattes").click()
+    page.wait_for_function("stream.getTracks().every((track) => track.readyState === 'ended')")
+
+
+def test_why_there_is_no_camera(context: BrowserContext, service: Service, ball: str) -> None:
+    context.add_init_script("Object.defineProperty(navigator, 'mediaDevices', { value: undefined })")
+    page = opened(context, service, ball)
+    page.get_by_role("radio", name="Camera").check()
+    expect(page.get_by_role("alert")).to_contain_text("open this page at https")
+
+
+def test_a_clip_from_choice_to_download(
+    context: BrowserContext, service: Service, ball: str, tmp_path: Path
+) -> None:
+    page = opened(context, service, ball)
+    expect(page.get_by_text(READY)).to_be_visible(timeout=MINUTE)
+    page.get_by_role("slider", name="Turn").fill("10")
+    bring(page, filmed(tmp_path / "clip.mp4", 12), "clip.mp4", "video/mp4")
+    expect(page.get_by_text("clip.mp4: live")).to_be_visible(timeout=MINUTE)
+    page.get_by_role("button", name="Make the video").click()
+    save = page.get_by_role("button", name="Download the video")
+    expect(save).to_be_visible(timeout=MINUTE)
+    with page.expect_download() as download:
+        save.click()
+    assert download.value.suggested_filename == "composite.mp4"
+    with av.open(download.value.path()) as file:
+        made = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
+    assert len(made) == 12
+    assert made[0].shape == (SIZE[1], SIZE[0], 3)
+    job = page.get_by_role("link", name="Its job").get_attribute("href")
+    assert job
+    options = service.http.get(f"/v1/jobs/{job.rpartition('/')[2]}").json()["options"]
+    assert options["placement"]["angle"] == 10
+
+
+def test_a_clip_that_the_browser_can_not_play(context: BrowserContext, service: Service, ball: str) -> None:
+    page = opened(context, service, ball)
+    bring(page, b"no clip", "clip.mp4", "video/mp4")
+    expect(page.get_by_role("alert")).to_contain_text("can’t play the clip")
+    page.get_by_role("button", name="Make the video").click()
+    expect(page.get_by_text("failed")).to_be_visible(timeout=MINUTE)
+
+
+def test_without_webgl_the_service_draws(context: BrowserContext, service: Service, ball: str) -> None:
+    context.add_init_script(WITHOUT)
+    asked: list[str] = []
+    page = opened(context, service, ball)
+    expect(page.get_by_text("no WebGL2")).to_be_visible()
+    page.on("request", lambda one: asked.append(one.url))
+    page.get_by_role("group", name="Composite.").press("ArrowRight")
+    expect(page.get_by_text(EXACT)).to_be_visible(timeout=MINUTE)
+    assert f"size={SIZE[0]}" in asked[0]
+    page.get_by_role("radio", name="Camera").check()
+    expect(page.get_by_text("Camera: preview")).to_be_visible(timeout=MINUTE)
+    page.wait_for_function("document.querySelector('.stage img').naturalWidth === 96")
+    assert not any(url.endswith("/live") for url in asked)
+
+
+def test_nothing_is_left_on_the_graphics_card(context: BrowserContext, service: Service, ball: str) -> None:
+    context.add_init_script(COUNTED)
+    page = opened(context, service, ball)
+    expect(page.get_by_text(READY)).to_be_visible(timeout=MINUTE)
+    assert page.evaluate("made.Texture") >= 5
+    page.get_by_role("navigation").get_by_role("link", name="Mattes").click()
+    expect(page.get_by_role("heading", name="Mattes")).to_be_visible()
+    page.wait_for_function("Object.values(made).every((count) => count === 0)")
+
+
+@pytest.mark.parametrize(("kind", "magic"), [("PNG", b"\x89PNG"), ("JPEG", b"\xff\xd8"), ("EXR", b"v/1\x01")])
+def test_a_still_is_saved(
+    context: BrowserContext, service: Service, ball: str, kind: str, magic: bytes
+) -> None:
+    page = opened(context, service, ball)
+    with page.expect_download() as download:
+        page.get_by_role("button", name=kind, exact=True).click()
+    assert download.value.suggested_filename == f"composite.{kind.lower()}"
+    assert download.value.path().read_bytes().startswith(magic)
