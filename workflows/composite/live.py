@@ -127,7 +127,8 @@ def _in_bytes(shares: NDArray[np.float32]) -> NDArray[np.uint8]:
     rounded = np.rint(shares * np.float32(255)).astype(np.int64)
     total = np.rint(shares.sum(axis=0) * np.float32(255)).astype(np.int64)
     rounded[0] += total - rounded.sum(axis=0)
-    return np.clip(rounded, 0, 255).astype(np.uint8)
+    codes: NDArray[np.uint8] = np.clip(rounded, 0, 255).astype(np.uint8)
+    return codes
 
 
 def _packed(

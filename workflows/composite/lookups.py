@@ -197,7 +197,8 @@ def _cost(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
 @njit(nogil=True, cache=True)
 def _variance(level: int) -> float:
     """Of a bump, in cells squared along an axis."""
-    return 1 / 12 + (4.0**level - 1) / 4
+    variance: float = 1 / 12 + (4.0**level - 1) / 4
+    return variance
 
 
 @njit(nogil=True, cache=True)
@@ -206,7 +207,8 @@ def _variance_of_lookup(x: float, y: float, level: int) -> float:
     side = 2.0**level
     f, g = x / side - 0.5, y / side - 0.5
     f, g = f - math.floor(f), g - math.floor(g)
-    return _variance(level) + side * side * (f * (1 - f) + g * (1 - g)) / 2
+    between: float = side * side * (f * (1 - f) + g * (1 - g)) / 2
+    return _variance(level) + between
 
 
 @njit(nogil=True, cache=True)
