@@ -190,8 +190,8 @@ def _cost(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     """How much it moves light to merge two clusters."""
     wa, wb = one[0], other[0]
     dx, dy = one[1] / wa - other[1] / wb, one[2] / wa - other[2] / wb
-    share: float = wa * wb / (wa + wb)
-    return share * (dx * dx + dy * dy)
+    cost: float = wa * wb / (wa + wb) * (dx * dx + dy * dy)
+    return cost
 
 
 @njit(nogil=True, cache=True)
@@ -207,8 +207,8 @@ def _variance_of_lookup(x: float, y: float, level: int) -> float:
     side = 2.0**level
     f, g = x / side - 0.5, y / side - 0.5
     f, g = f - math.floor(f), g - math.floor(g)
-    between: float = side * side * (f * (1 - f) + g * (1 - g)) / 2
-    return _variance(level) + between
+    variance: float = _variance(level) + side * side * (f * (1 - f) + g * (1 - g)) / 2
+    return variance
 
 
 @njit(nogil=True, cache=True)

@@ -11,7 +11,6 @@ import { onDrop } from "./upload.js";
 
 const STILL = 300; // ms after which a hand has stopped
 const QUICK = 480; // pixels of the longer side while it moves
-const SLOW = 25; // ms a picture, from which on the backdrop's finest level is left out, three quarters of the work
 const CONTROLS = [
   // name, label, default, minimum, maximum, step of the slider and of the keys
   ["right", "Move right", 0, -2, 2, 0.01],
@@ -117,16 +116,7 @@ export async function compositing(matte, signal) {
     signal.addEventListener("abort", () => gl.getExtension("WEBGL_lose_context")?.loseContext());
     try {
       const found = await fetchLive(matte.id, signal);
-      let made = glass(gl, found, matte.monitor);
-      made.draw(at); // the first time takes longer
-      await made.time();
-      made.draw(at);
-      if ((await made.time()) > SLOW) {
-        made.close();
-        made = glass(gl, found, matte.monitor, 1);
-      }
-      if (signal.aborted) return made.close();
-      painter = made;
+      painter = glass(gl, found, matte.monitor);
       if (source?.picture) painter.take(source.picture);
       const every = found.step > 1 ? `, each ${found.step}th pixel of it` : "";
       drawer.textContent = `This browser draws the glass while you move${every}; when you stop, the service does.`;

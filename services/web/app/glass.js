@@ -1,15 +1,23 @@
 // The glass drawn by WebGL2: the backdrop's light on a pyramid of textures, then some look-ups in it for each pixel.
 // What is drawn is what `workflows/composite/live.py` describes; light is linear until the last line.
 
-import { pause } from "./dom.js";
-
 const TRIANGLE = `#version 300 es
 void main() { gl_Position = vec4(vec2(gl_VertexID == 1, gl_VertexID == 2) * 4.0 - 1.0, 0, 1); }`;
 
-// The backdrop over the cells of the first level; beyond it is black.
+// The backdrop's light, once a picture: what a software renderer takes longest for is to decode what it samples.
+const DECODE = `#version 300 es
+precision highp float;
+uniform sampler2D picture; // which decodes sRGB
+out vec4 light;
+void main() {
+  vec4 seen = texelFetch(picture, ivec2(gl_FragCoord.xy), 0);
+  light = vec4(seen.a * seen.rgb, 1);
+}`;
+
+// It over the cells of the first level; beyond it is black.
 const PLACE = `#version 300 es
 precision highp float;
-uniform sampler2D picture;
+uniform sampler2D backdrop;
 uniform mat3 placing; // from cells to shares of the picture
 uniform vec2 most; // the last column and row
 uniform vec2 cells; // that are as wide, and as high, as the picture
@@ -18,8 +26,7 @@ out vec4 light;
 void main() {
   vec2 at = (placing * vec3(min(floor(gl_FragCoord.xy), most) + 0.5, 1)).xy;
   vec2 covered = clamp(cells * min(at, 1.0 - at) + 0.5, 0.0, 1.0);
-  vec4 seen = textureLod(picture, at, blur);
-  light = vec4(covered.x * covered.y * seen.a * seen.rgb, 1);
+  light = vec4(covered.x * covered.y * textureLod(backdrop, at, blur).rgb, 1);
 }`;
 
 // The next level: every second node, seen with the weights [1, 3, 3, 1] / 8 along each axis, two at a time between them.
@@ -43,7 +50,6 @@ uniform sampler2D light;
 uniform usampler2DArray lookups; // x, y, level and red, green and blue; the heaviest first
 uniform sampler2D offset; // roots of S, and alpha
 uniform sampler2D absorption; // roots of rho
-uniform float base; // the level of T that is the texture's first
 uniform vec2 tops; // of S and of rho
 uniform mat3 crosstalk;
 uniform int height;
@@ -56,7 +62,7 @@ void main() {
     uvec4 lookup = texelFetch(lookups, ivec3(pixel, k), 0);
     vec3 share = vec3(lookup.z & 255u, lookup.w >> 8, lookup.w & 255u) / 255.0;
     if (share == vec3(0)) break;
-    sum += share * textureLod(light, vec2(lookup.xy) / 65536.0, max(float(lookup.z >> 8) / 16.0 - base, 0.0)).rgb;
+    sum += share * textureLod(light, vec2(lookup.xy) / 65536.0, float(lookup.z >> 8) / 16.0).rgb;
   }
   vec4 root = texelFetch(offset, pixel, 0);
   vec3 rho = texelFetch(absorption, pixel, 0).rgb;
@@ -83,12 +89,9 @@ export function lightOf(canvas) {
   return gl?.getExtension("EXT_color_buffer_float") || gl?.getExtension("EXT_color_buffer_half_float") ? gl : null;
 }
 
-// Draws a decoded matte. The levels before `base` are left out, and what is looked up there is on that one: each makes the
-// work on the backdrop's light a quarter.
-export function glass(gl, matte, monitor, base = 0) {
-  const { width, height } = matte;
-  const levels = matte.levels.slice(base);
-  const texture = matte.texture.map((size) => size >> base);
+// Draws a decoded matte.
+export function glass(gl, matte, monitor) {
+  const { width, height, levels, texture } = matte;
   Object.assign(gl.canvas, { width, height });
   const made = [];
   const keep = (kind, thing) => (made.push([kind, thing]), thing);
@@ -119,19 +122,20 @@ export function glass(gl, matte, monitor, base = 0) {
     return one;
   }
   // Each texture stays on a unit of its own.
-  const [LIGHT, LOOKUPS, OFFSET, ABSORPTION, PICTURE] = [0, 1, 2, 3, 4];
-  const [place, halve, seen] = [program(PLACE), program(HALVE), program(GLASS)];
+  const [LIGHT, LOOKUPS, OFFSET, ABSORPTION, PICTURE, BACKDROP] = [0, 1, 2, 3, 4, 5];
+  const [decode, place, halve, seen] = [program(DECODE), program(PLACE), program(HALVE), program(GLASS)];
   gl.bindVertexArray(keep("VertexArray", gl.createVertexArray()));
   gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
 
   const light = textureOf(gl.TEXTURE_2D, LIGHT, gl.LINEAR, gl.LINEAR_MIPMAP_LINEAR);
   gl.texStorage2D(gl.TEXTURE_2D, levels.length, gl.RGBA16F, ...texture);
-  const targets = levels.map((_, level) => {
+  const targetOn = (texture, level) => {
     const target = keep("Framebuffer", gl.createFramebuffer());
     gl.bindFramebuffer(gl.FRAMEBUFFER, target);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, light, level);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, level);
     return target;
-  });
+  };
+  const targets = levels.map((_, level) => targetOn(light, level));
   textureOf(gl.TEXTURE_2D_ARRAY, LOOKUPS, gl.NEAREST);
   gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.RGBA16UI, width, height, matte.lookups.length);
   matte.lookups.forEach((layer, k) =>
@@ -140,22 +144,24 @@ export function glass(gl, matte, monitor, base = 0) {
     textureOf(gl.TEXTURE_2D, unit, gl.NEAREST);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, width, height, 0, gl.RGBA, gl.UNSIGNED_BYTE, frame);
   }
-  textureOf(gl.TEXTURE_2D, PICTURE, gl.LINEAR, gl.LINEAR_MIPMAP_LINEAR);
-  let shown = [1, 1];
+  textureOf(gl.TEXTURE_2D, PICTURE, gl.NEAREST);
+  const target = targetOn(textureOf(gl.TEXTURE_2D, BACKDROP, gl.LINEAR, gl.LINEAR_MIPMAP_LINEAR), 0);
+  let shown = [0, 0];
 
   seen.use();
   gl.uniform1i(seen.at("light"), LIGHT);
   gl.uniform1i(seen.at("lookups"), LOOKUPS);
   gl.uniform1i(seen.at("offset"), OFFSET);
   gl.uniform1i(seen.at("absorption"), ABSORPTION);
-  gl.uniform1f(seen.at("base"), base);
   gl.uniform2f(seen.at("tops"), matte.S, matte.rho);
   gl.uniformMatrix3fv(seen.at("crosstalk"), true, matte.crosstalk.flat());
   gl.uniform1i(seen.at("height"), height);
   halve.use();
   gl.uniform1i(halve.at("fine"), LIGHT);
+  decode.use();
+  gl.uniform1i(decode.at("picture"), PICTURE);
   place.use();
-  gl.uniform1i(place.at("picture"), PICTURE);
+  gl.uniform1i(place.at("backdrop"), BACKDROP);
   gl.uniform2f(place.at("most"), levels[0][0] - 1, levels[0][1] - 1);
 
   return {
@@ -163,10 +169,20 @@ export function glass(gl, matte, monitor, base = 0) {
     take(picture) {
       gl.activeTexture(gl.TEXTURE0 + PICTURE);
       gl.texImage2D(gl.TEXTURE_2D, 0, gl.SRGB8_ALPHA8, gl.RGBA, gl.UNSIGNED_BYTE, picture);
+      const size = [picture.videoWidth ?? picture.width, picture.videoHeight ?? picture.height];
+      gl.activeTexture(gl.TEXTURE0 + BACKDROP);
+      if (size.some((one, i) => one !== shown[i])) {
+        gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA16F, ...size, 0, gl.RGBA, gl.HALF_FLOAT, null);
+        shown = size;
+      }
+      gl.bindFramebuffer(gl.FRAMEBUFFER, target);
+      gl.viewport(0, 0, ...size);
+      decode.use();
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
       gl.generateMipmap(gl.TEXTURE_2D);
-      shown = [picture.videoWidth ?? picture.width, picture.videoHeight ?? picture.height];
     },
     draw(at) {
+      if (!shown[0]) return;
       const cells = levels[0];
       const matrix = placing(at, cells, monitor);
       const pixels = Math.sqrt(Math.abs(matrix[0] * matrix[4] - matrix[1] * matrix[3]) * shown[0] * shown[1]);
@@ -197,15 +213,6 @@ export function glass(gl, matte, monitor, base = 0) {
       gl.viewport(0, 0, width, height);
       seen.use();
       gl.drawArrays(gl.TRIANGLES, 0, 3);
-    },
-    // Milliseconds that the graphics card takes to draw what it has been told to.
-    async time() {
-      const start = performance.now();
-      const done = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
-      gl.flush();
-      while (!gl.isContextLost() && gl.getSyncParameter(done, gl.SYNC_STATUS) !== gl.SIGNALED) await pause(1);
-      gl.deleteSync(done);
-      return performance.now() - start;
     },
     // Leaves nothing on the graphics card.
     close() {
