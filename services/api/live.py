@@ -1,5 +1,7 @@
 """Mattes for graphics hardware over HTTP, which the web app draws while a hand moves the backdrop."""
 
+from contextlib import suppress
+
 import anyio.to_thread
 from fastapi import APIRouter, Request, Response
 
@@ -7,7 +9,7 @@ from services.api.context import Needs, is_known
 from storage import live as kept
 from storage import mattes
 from storage.database import reading
-from storage.errors import Corrupt
+from storage.errors import Corrupt, NoRoom
 from workflows.composite import live
 from workflows.composite.threads import CORES
 
@@ -39,7 +41,8 @@ async def get_live(context: Needs, id: str, request: Request) -> Response:
             except Corrupt:
                 is_ready()  # it may have been deleted meanwhile
                 raise
-            kept.keep(context.objects, id, live.FORMAT, made)
+            with suppress(NoRoom):  # it is there for this caller, and can be made again
+                kept.keep(context.objects, id, live.FORMAT, made)
         return made
 
     await anyio.to_thread.run_sync(is_ready)

@@ -5,9 +5,9 @@
 KIT is the path of a `kit.py` that makes captures of scenes, SCENES a folder of its scenes (`*.npz`). Recovers each
 through a real service from the program `quick` at the quality `fast`, and a traced glass ball of 640 x 480 pixels;
 draws them in Chromium before the kit's backdrops at several placements; and prints the PSNR of 8-bit sRGB pictures over
-the whole frame, the least of the placements; the milliseconds of a picture, median and 95th percentile, until the graphics card has drawn it, and those of processor
-time, which other work on the machine changes less; and the megabytes that the browser gets, with the seconds that the
-service took to make them. `--renderer` names one of ANGLE's.
+the whole frame, the least of the placements; the milliseconds of a picture, median and 95th percentile, until the
+graphics card has drawn it, and those of processor time, which other work on the machine changes less; and the megabytes
+that the browser gets, with the seconds that the service took to make them. `--renderer` names one of ANGLE's.
 """
 
 import base64

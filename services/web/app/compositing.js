@@ -116,10 +116,13 @@ export async function compositing(matte, signal) {
     signal.addEventListener("abort", () => gl.getExtension("WEBGL_lose_context")?.loseContext());
     try {
       const found = await fetchLive(matte.id, signal);
+      if (Math.max(found.width, found.height, ...found.texture) > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
+        return (drawer.textContent = "This matte is larger than what the graphics card draws: the service draws it while you move.");
+      }
       painter = glass(gl, found, matte.monitor);
       if (source?.picture) painter.take(source.picture);
-      const every = found.step > 1 ? `, each ${found.step}th pixel of it` : "";
-      drawer.textContent = `This browser draws the glass while you move${every}; when you stop, the service does.`;
+      const some = found.step > 1 ? `, one pixel in ${found.step ** 2} of it` : "";
+      drawer.textContent = `This browser draws the glass while you move${some}; when you stop, the service does.`;
       if (source && playing()) moved();
     } catch (error) {
       fail(error);

@@ -39,7 +39,7 @@ out vec4 light;
 void main() {
   vec2 first = 2.0 * min(floor(gl_FragCoord.xy), most) + 0.25;
   light = vec4(0);
-  for (int k = 0; k < 4; k++) light += texture(fine, (first + 1.5 * vec2(k & 1, k >> 1)) / size) / 4.0;
+  for (int k = 0; k < 4; k++) light += textureLod(fine, (first + 1.5 * vec2(k & 1, k >> 1)) / size, 0.0) / 4.0;
 }`;
 
 const GLASS = `#version 300 es
@@ -193,7 +193,8 @@ export function glass(gl, matte, monitor) {
       place.use();
       gl.uniformMatrix3fv(place.at("placing"), false, matrix);
       gl.uniform2f(place.at("cells"), 1 / Math.hypot(matrix[0], matrix[3]), 1 / Math.hypot(matrix[1], matrix[4]));
-      gl.uniform1f(place.at("blur"), Math.max(0, Math.log2(pixels * (moved ? 1.125 : 1))));
+      const blur = Math.log2(pixels * (moved ? 1.125 : 1));
+      gl.uniform1f(place.at("blur"), blur > 0.25 ? blur : 0); // between two levels it takes twice as long
       levels.forEach((size, level) => {
         gl.bindFramebuffer(gl.FRAMEBUFFER, targets[level]);
         gl.viewport(0, 0, texture[0] >> level, texture[1] >> level);

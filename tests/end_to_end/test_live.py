@@ -1,0 +1,38 @@
+"""A matte for graphics hardware, as a browser gets it."""
+
+import json
+
+from tests.end_to_end.conftest import Service
+
+PROBLEM = "application/problem+json"
+
+
+def test_it_is_made_once_and_kept(service: Service, matte: str) -> None:
+    first = service.http.get(f"/v1/mattes/{matte}/live")
+    assert (first.status_code, first.headers["content-encoding"]) == (200, "gzip")
+    start = 4 + int.from_bytes(first.content[:4], "little")
+    header = json.loads(first.content[4:start])
+    assert (header["width"], header["height"], header["step"]) == (96, 72, 1)
+    assert len(first.content) - start == 96 * 72 * (8 * header["lookups"] + 7)
+    assert (service.data / "store" / "mattes" / matte / "live-1" / "zarr.json").exists()
+    again = service.http.get(f"/v1/mattes/{matte}/live")
+    assert again.content == first.content
+    known = {"If-None-Match": first.headers["etag"]}
+    assert service.http.get(f"/v1/mattes/{matte}/live", headers=known).status_code == 304
+
+
+def test_a_matte_that_is_not_there_has_none(service: Service) -> None:
+    answer = service.http.get("/v1/mattes/nothing/live")
+    assert (answer.status_code, answer.headers["content-type"]) == (404, PROBLEM)
+
+
+def test_an_archive_is_the_same_with_it(service: Service, matte: str) -> None:
+    service.http.get(f"/v1/mattes/{matte}/live")
+    archive = service.http.get(f"/v1/mattes/{matte}/archive").content
+    made = service.http.post("/v1/mattes", content=archive, headers={"Content-Type": "application/zip"})
+    assert made.status_code == 201
+    copy = made.json()["id"]
+    answers = [service.http.get(f"/v1/mattes/{one}/live").content for one in (matte, copy)]
+    assert answers[0] == answers[1]
+    assert service.http.delete(f"/v1/mattes/{copy}").status_code == 204
+    assert not (service.data / "store" / "mattes" / copy).exists()
