@@ -30,8 +30,13 @@ UNNAMED = """() => [...document.querySelectorAll("input, select, button, progres
     .filter((e) => !(e.labels?.length || e.ariaLabel || e.textContent.trim()))
     .concat(...document.querySelectorAll("img:not([alt])"))
     .map((e) => e.outerHTML)"""
-SAID = ("the server responded with a status of 4", "net::ERR_CONNECTION_RESET")
-"""What the browser itself says of an answer that is a problem, and of a line that breaks."""
+SAID = (
+    "the server responded with a status of 4",
+    "net::ERR_CONNECTION_RESET",
+    "GPU stall due to ReadPixels",
+)
+"""What the browser itself says of an answer that is a problem, of a line that breaks, and of WebGL that it shows without a
+graphics card."""
 
 
 @pytest.fixture(scope="module")

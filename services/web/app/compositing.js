@@ -195,7 +195,7 @@ export async function compositing(matte, signal) {
       if (drawn()) painter.take(source.picture);
       moved();
     },
-  });
+  }, "Hold it");
   const bring = ([one]) => {
     for (const choice of choices.querySelectorAll("input")) choice.checked = false;
     use(/^video\/|\.(mp4|mov|mkv|webm|avi)$/i.test(one.type || one.name) ? clip(one) : brought(one));
