@@ -35,8 +35,8 @@ SAID = (
     "net::ERR_CONNECTION_RESET",
     "GPU stall due to ReadPixels",
 )
-"""What the browser itself says of an answer that is a problem, of a line that breaks, and of WebGL that it shows without a
-graphics card."""
+"""What the browser itself says of an answer that is a problem, of a line that breaks, and of WebGL without a graphics
+card."""
 
 
 @pytest.fixture(scope="module")
