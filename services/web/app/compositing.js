@@ -90,6 +90,7 @@ export async function compositing(matte, signal) {
     frame = 0;
   };
   const moved = () => {
+    if (!source) return;
     clearTimeout(timer);
     changes += 1;
     tell(drawn() ? "live" : "preview");
@@ -110,7 +111,7 @@ export async function compositing(matte, signal) {
     const lost = () => {
       painter = undefined;
       drawer.textContent = "The graphics card has let go of the glass: the service draws it while you move, until this page is loaded anew.";
-      if (source) moved();
+      moved();
     };
     canvas.addEventListener("webglcontextlost", lost, { signal });
     signal.addEventListener("abort", () => gl.getExtension("WEBGL_lose_context")?.loseContext());
