@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from services.running import given_of, refusals_told
+from services.told import as_json, example
 
 if TYPE_CHECKING:
     from sqlalchemy import Engine
@@ -19,7 +20,6 @@ _data = click.option("--data", type=click.Path(path_type=Path), help="Folder of 
 _database = click.option(
     "--database", help="Its database, if that is another: postgresql://USER:PASSWORD@HOST/NAME."
 )
-_json = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
 
 
 @contextmanager
@@ -38,7 +38,7 @@ def _opened(given: dict[str, Any]) -> Iterator["Engine"]:
             engine.dispose()
 
 
-@click.group()
+@click.group(epilog=example("envmatte keys list"))
 def keys() -> None:
     """Make, list and revoke API keys, in the service's database: while it runs, or before.
 
@@ -46,7 +46,7 @@ def keys() -> None:
     """
 
 
-@keys.command()
+@keys.command(epilog=example("envmatte keys make lab --owner alice"))
 @click.argument("name")
 @click.option("--owner", default="default", show_default=True, help="Whose things the key is for.")
 @click.option(
@@ -59,12 +59,9 @@ def keys() -> None:
 )
 @_data
 @_database
-@_json
+@as_json
 def make(name: str, owner: str, scope: str, as_json: bool, **given: Any) -> None:
-    """Make a key, and show it: this once, for only a hash of it is kept.
-
-    Example: envmatte keys make lab --owner alice
-    """
+    """Make a key, and show it: this once, for only a hash of it is kept."""
     from storage import keys
     from storage.database import writing
 
@@ -74,15 +71,12 @@ def make(name: str, owner: str, scope: str, as_json: bool, **given: Any) -> None
     click.echo(json.dumps(made, indent=2) if as_json else key)
 
 
-@keys.command("list")
+@keys.command("list", epilog=example("envmatte keys list --json"))
 @_data
 @_database
-@_json
+@as_json
 def list_(as_json: bool, **given: Any) -> None:
-    """List keys, oldest first: name, owner, scope, when they were made and revoked.
-
-    Example: envmatte keys list --json
-    """
+    """List keys, oldest first: name, owner, scope, when they were made and revoked."""
     from storage import keys
     from storage.database import reading
 
@@ -105,21 +99,19 @@ def list_(as_json: bool, **given: Any) -> None:
         click.echo("\t".join(str(value or "") for value in one.values()).rstrip())
 
 
-@keys.command()
+@keys.command(epilog=example("envmatte keys revoke lab"))
 @click.argument("name")
 @_data
 @_database
-def revoke(name: str, **given: Any) -> None:
-    """Revoke a key: it stops working at once.
-
-    Example: envmatte keys revoke lab
-    """
+@as_json
+def revoke(name: str, as_json: bool, **given: Any) -> None:
+    """Revoke a key: it stops working at once."""
     from storage import keys
     from storage.database import writing
 
     with _opened(given) as engine, writing(engine) as connection:
         keys.revoke(connection, name)
-    click.echo(f"{name}: revoked")
+    click.echo(json.dumps({"name": name, "revoked": True}, indent=2) if as_json else f"{name}: revoked")
 
 
 def _time(seconds: float | None) -> str | None:

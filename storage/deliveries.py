@@ -23,7 +23,9 @@ ATTEMPT = 60.0
 def add(connection: Connection, job: Row[Any]) -> None:
     """Queue what is told about a job that has just ended."""
     delivery = new_id()
-    told = {name: getattr(job, name) or None for name in ("id", "kind", "state", "capture", "matte", "problem")}
+    told = {
+        name: getattr(job, name) or None for name in ("id", "kind", "state", "capture", "matte", "problem")
+    }
     told |= {name: _time(getattr(job, name)) for name in ("created_at", "finished_at")}
     now = time.time()
     body = json.dumps(

@@ -35,9 +35,7 @@ async def get_live(context: Needs, id: str, request: Request) -> Response:
         made = kept.read(context.objects, id, live.FORMAT)
         if made is None:
             try:
-                made = live.encode_live(
-                    context.cache.matte(id), lambda row, column: context.cache.block(id, row, column), CORES
-                )
+                made = live.encode_live(context.cache.matte(id), CORES)
             except Corrupt:
                 is_ready()  # it may have been deleted meanwhile
                 raise

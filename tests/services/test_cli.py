@@ -9,9 +9,11 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 
+import click
 import pytest
 from click.testing import CliRunner
 
@@ -29,11 +31,22 @@ def envmatte(*arguments: str, **environment: str) -> subprocess.CompletedProcess
     return subprocess.run(command, capture_output=True, text=True, timeout=60, env=os.environ | environment)
 
 
-@pytest.mark.parametrize("name", main.commands)
+def commands(group: click.Group = main, *above: str) -> Iterator[tuple[str, click.Command]]:
+    """Every command and group by its whole name, as `keys make`."""
+    for name, command in group.commands.items():
+        yield " ".join([*above, name]), command
+        if isinstance(command, click.Group):
+            yield from commands(command, *above, name)
+
+
+ALL = dict(commands())
+
+
+@pytest.mark.parametrize("name", ALL)
 def test_the_help_of_every_command_has_an_example_that_can_be_typed(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    said = CliRunner().invoke(main, [name, "--help"]).output
+    said = CliRunner().invoke(main, [*name.split(), "--help"]).output
     lines = re.search(r"Example:\n((?:    .*\n)+)", said)
     assert lines, said
     monkeypatch.chdir(tmp_path)
@@ -43,14 +56,16 @@ def test_the_help_of_every_command_has_an_example_that_can_be_typed(
         assert 'eval "$(envmatte completion bash)"' in lines[1]
         return
     for line in lines[1].splitlines():
-        envmatte, *arguments = shlex.split(line)
-        assert (envmatte, arguments[0]) == ("envmatte", name)
-        main.commands[name].make_context(name, arguments[1:])
+        depth = 1 + len(name.split())
+        words = shlex.split(line)
+        assert words[:depth] == ["envmatte", *name.split()]
+        ALL[name].make_context(name, words[depth:])
 
 
-@pytest.mark.parametrize("name", sorted(main.commands.keys() - PROCESSES))
+@pytest.mark.parametrize("name", sorted(ALL.keys() - PROCESSES))
 def test_every_command_that_prints_prints_json(name: str) -> None:
-    assert any("--json" in parameter.opts for parameter in main.commands[name].params)
+    leaf = not isinstance(ALL[name], click.Group)
+    assert any("--json" in parameter.opts for parameter in ALL[name].params) == leaf
 
 
 def test_the_exit_codes_are_the_same_wherever_they_are_told() -> None:

@@ -19,14 +19,13 @@ Of a large matte every ``step``-th pixel is told.
 import gzip
 import json
 import math
-from collections.abc import Callable
 from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.mattes import Block, Matte
+from storage.mattes import Matte
 from workflows.composite.lookups import FIELDS, fit_lookups
 from workflows.composite.threads import in_parts
 from workflows.recovery.pyramid import Pyramid
@@ -44,16 +43,12 @@ _LEVEL = 6
 """Of gzip: higher ones take twice as long for 1 % less."""
 
 
-def encode_live(
-    matte: Matte, read: Callable[[int, int], Block], threads: int, lookups: int = LOOKUPS
-) -> bytes:
+def encode_live(matte: Matte, threads: int, lookups: int = LOOKUPS) -> bytes:
     """A matte for graphics hardware.
 
     Parameters
     ----------
     matte : Matte
-    read : callable
-        Returns the block in a block row and a block column.
     threads : int
         To share the work; the bytes are the same.
     lookups : int
@@ -62,7 +57,7 @@ def encode_live(
     Raises
     ------
     Corrupt
-        If `read` does.
+        If a block of the matte is missing.
     """
     step = max(math.ceil(math.sqrt(matte.width * matte.height / MOST_PIXELS)), 1)
     ys, xs = (np.arange(step // 2, size, step) for size in (matte.height, matte.width))
@@ -77,7 +72,7 @@ def encode_live(
 
     def one(number: int) -> None:
         row, column = blocks[number]
-        block = read(row, column)
+        block = matte.read(row, column)
         y, x = matte.span(row, column)
         told = [
             np.flatnonzero((places >= part.start) & (places < part.stop))

@@ -2,6 +2,7 @@
 
 import gzip
 import json
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -83,7 +84,7 @@ def drawn(data: bytes, backdrop: NDArray[np.float32]) -> tuple[NDArray[np.float6
 
 def test_it_is_the_composite_where_lookups_suffice(matte: Matte) -> None:
     backdrop = np.random.default_rng(1).random((ROWS, COLUMNS, 3), np.float32)
-    got, header = drawn(encode_live(matte, matte.read, 1), backdrop)
+    got, header = drawn(encode_live(matte, 1), backdrop)
     assert (header["width"], header["height"], header["step"]) == (WIDTH, HEIGHT, 1)
     assert header["levels"] == [[75, 37], [38, 19], [19, 10]]
     assert header["texture"] == [76, 40]
@@ -94,7 +95,7 @@ def test_it_is_the_composite_where_lookups_suffice(matte: Matte) -> None:
 
 
 def test_the_bytes_are_the_same_by_any_threads(matte: Matte) -> None:
-    assert encode_live(matte, matte.read, 3) == encode_live(matte, matte.read, 1)
+    assert encode_live(matte, 3) == encode_live(matte, 1)
 
 
 def test_of_a_large_matte_some_pixels_are_told(objects: Objects) -> None:
@@ -103,15 +104,15 @@ def test_of_a_large_matte_some_pixels_are_told(objects: Objects) -> None:
         objects, "large", height=height, width=width, columns=COLUMNS, rows=ROWS, crosstalk=CROSSTALK
     )
 
-    def read(row: int, column: int) -> Block:
+    for row, column in product(range(large.block_rows), range(large.block_columns)):
         y, x = large.span(row, column)
         shape = y.stop - y.start, x.stop - x.start
         S = np.repeat(np.add.outer(np.arange(y.start, y.stop), np.arange(x.start, x.stop))[..., None], 3, 2)
         rows = np.zeros((*shape, 3), np.uint32), np.zeros(0, np.uint32), np.zeros(0, np.float32)
         whole = np.ones(shape, bool)
-        return Block(S.astype(np.float32), 0 * S.astype(np.float32), whole * 0.0, whole, whole, *rows)
-
-    got, header = drawn(encode_live(large, read, 1), np.zeros((ROWS, COLUMNS, 3), np.float32))
+        S = S.astype(np.float32)
+        large.write(row, column, Block(S, 0 * S, whole.astype(np.float32), whole, whole, *rows))
+    got, header = drawn(encode_live(large, 1), np.zeros((ROWS, COLUMNS, 3), np.float32))
     assert (header["width"], header["height"], header["step"]) == (450, 305, 2)
     assert header["width"] * header["height"] <= MOST_PIXELS
     assert got[..., 3].all()
