@@ -14,7 +14,7 @@ from anyio import CapacityLimiter
 from fastapi import Depends, Query, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.security import HTTPAuthorizationCredentials
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 from sqlalchemy import Engine
 from starlette.datastructures import Headers
 
@@ -101,6 +101,9 @@ def _keyless(request: Request) -> Context:
 
 Keyless = Annotated[Context, Depends(_keyless)]
 """For anyone: what is nobody's."""
+# Lists, and not tuples, whose schema few generators of clients know.
+Pair = Annotated[list[int], Field(min_length=2, max_length=2)]
+Colour = Annotated[list[float], Field(min_length=3, max_length=3)]
 Limit = Annotated[int, Query(ge=1, le=1000, description="The most items to list.")]
 After = Annotated[str | None, Query(description="The id of the last item of the page before.")]
 
@@ -165,6 +168,24 @@ async def read_json(request: Request, model: type[Model], limit: int) -> Model:
     except ValidationError as error:
         found = [detail | {"loc": ("body", *detail["loc"])} for detail in error.errors(include_url=False)]
         raise RequestValidationError(found) from error
+
+
+def schema_of(model: type[BaseModel]) -> dict[str, Any]:
+    """The JSON schema of a body that a handler reads itself, with nothing in it that refers to another place of it."""
+    whole = model.model_json_schema()
+    parts = whole.pop("$defs", {})
+
+    def filled(node: Any) -> Any:
+        if isinstance(node, list):
+            return [filled(one) for one in node]
+        if not isinstance(node, dict):
+            return node
+        if "$ref" in node:
+            return filled(parts[node["$ref"].rpartition("/")[2]])
+        return {name: filled(one) for name, one in node.items() if name != "discriminator"}
+
+    schema: dict[str, Any] = filled(whole)
+    return schema
 
 
 PROBLEM: dict[int | str, dict[str, Any]] = {

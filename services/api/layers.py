@@ -8,7 +8,7 @@ import anyio.to_thread
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel
 
-from services.api.context import Context, Needs, is_known
+from services.api.context import Colour, Context, Needs, Pair, is_known
 from storage import mattes
 from storage.database import reading
 from storage.errors import InvalidInput, NotFound
@@ -42,7 +42,7 @@ class Cell(BaseModel):
     width: float
     height: float
     level: int
-    weight: tuple[float, float, float]
+    weight: Colour
 
 
 class Lobe(BaseModel):
@@ -51,7 +51,7 @@ class Lobe(BaseModel):
 
     u: float
     v: float
-    weight: tuple[float, float, float]
+    weight: Colour
     sigma_u: float
     sigma_v: float
     theta: float
@@ -63,9 +63,9 @@ class Transport(BaseModel):
     x: int
     y: int
     recovered: bool
-    S: tuple[float, float, float]
-    rho: tuple[float, float, float]
-    monitor: tuple[int, int]
+    S: Colour
+    rho: Colour
+    monitor: Pair
     cells: list[Cell]
     lobes: list[Lobe]
 
@@ -113,17 +113,17 @@ def get_transport(context: Needs, id: str, x: X, y: Y, lobes: Lobes = layers.LOB
         x=x,
         y=y,
         recovered=pixel.recovered,
-        S=tuple(pixel.S.tolist()),
-        rho=tuple(pixel.rho.tolist()),
-        monitor=pixel.monitor,
+        S=pixel.S.tolist(),
+        rho=pixel.rho.tolist(),
+        monitor=list(pixel.monitor),
         cells=[
-            Cell(u=u, v=v, width=width, height=height, level=level, weight=tuple(weight))
+            Cell(u=u, v=v, width=width, height=height, level=level, weight=weight)
             for (u, v, width, height), level, weight in zip(
                 pixel.cells.tolist(), pixel.levels.tolist(), pixel.weight.tolist(), strict=True
             )
         ],
         lobes=[
-            Lobe(u=u, v=v, weight=(r, g, b), sigma_u=sigma_u, sigma_v=sigma_v, theta=theta)
+            Lobe(u=u, v=v, weight=[r, g, b], sigma_u=sigma_u, sigma_v=sigma_v, theta=theta)
             for u, v, r, g, b, sigma_u, sigma_v, theta in pixel.lobes.tolist()
         ],
     )

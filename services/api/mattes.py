@@ -7,7 +7,7 @@ from fastapi import APIRouter
 from pydantic import BaseModel
 from sqlalchemy import Row
 
-from services.api.context import After, Limit, Needs, time_of
+from services.api.context import After, Limit, Needs, Pair, time_of
 from storage import jobs, mattes
 from storage.database import mattes as table
 from storage.database import page, reading, writing
@@ -26,7 +26,7 @@ class Matte(BaseModel):
     options: dict[str, Any]
     width: int | None = None
     height: int | None = None
-    monitor: tuple[int, int] | None = None
+    monitor: Pair | None = None
     columns: int | None = None
     rows: int | None = None
     created_at: datetime

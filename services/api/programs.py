@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from sqlalchemy import Row
 
 from services import film
-from services.api.context import WEB, After, Limit, Needs, read_json
+from services.api.context import WEB, After, Limit, Needs, read_json, schema_of
 from services.patterns import archive, fitted, pictures, png, record
 from services.presets import PRESETS
 from storage import programs
@@ -127,9 +127,7 @@ def list_presets() -> Presets:
 @router.post(
     "/programs",
     status_code=201,
-    openapi_extra={
-        "requestBody": {"content": {"application/json": {"schema": ProgramRequest.model_json_schema()}}}
-    },
+    openapi_extra={"requestBody": {"content": {"application/json": {"schema": schema_of(ProgramRequest)}}}},
 )
 def post_program(
     context: Needs, request: Annotated[ProgramRequest, Depends(_request)], response: Response
