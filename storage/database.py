@@ -89,6 +89,7 @@ programs = Table(
     Column("id", String(32), nullable=False),
     Column("program", JSON, nullable=False),
     Column("created_at", Float, nullable=False),
+    Column("showing", JSON(none_as_null=True)),  # what the page that shows it last told, and when
     _owner(),
     UniqueConstraint("owner", "id"),  # which is the same of whoever made the same program
     Index("programs_by_owner", "owner", "number"),

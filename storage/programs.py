@@ -5,7 +5,7 @@ import json
 import time
 from typing import Any
 
-from sqlalchemy import Connection, Row, delete, insert, select
+from sqlalchemy import Connection, Row, delete, insert, select, update
 
 from storage.database import find
 from storage.database import programs as table
@@ -34,3 +34,16 @@ def get(connection: Connection, program: str) -> Row[Any]:
 def forget(connection: Connection, program: str) -> None:
     """Remove a program's row."""
     connection.execute(delete(table).where(table.c.id == program))
+
+
+def show(connection: Connection, program: str, showing: dict[str, Any]) -> None:
+    """Write down how far the showing of a program is, and when that was.
+
+    Raises
+    ------
+    NotFound
+        If there is no such program.
+    """
+    find(connection, table, program)
+    told = showing | {"at": time.time()}
+    connection.execute(update(table).where(table.c.id == program).values(showing=told))

@@ -18,8 +18,10 @@ from services.api import (
     live,
     mattes,
     metrics,
+    network,
     programs,
     reports,
+    showings,
     system,
     tus,
     uploads,
@@ -58,7 +60,9 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
         live.router,
         programs.router,
         limits.router,
+        showings.router,
         cluster.router,
+        network.router,
     ):
         app.include_router(router, prefix="/v1", dependencies=[Depends(authorized)])
     app.include_router(programs.page, prefix="/v1")

@@ -1,15 +1,16 @@
-"""A job followed by server-sent events: each time it has changed, all of it."""
+"""What changes, followed by server-sent events: each time that it has, all of it."""
 
 import hashlib
 import time
-from collections.abc import AsyncIterator
-from typing import Annotated
+from collections.abc import AsyncIterator, Callable
+from typing import Annotated, TypeVar
 
 import anyio
 import anyio.to_thread
 from fastapi import APIRouter, Header, Response
 from fastapi.responses import StreamingResponse
 from fastapi.sse import format_sse_event
+from pydantic import BaseModel
 
 from services.api.context import Context, Needs
 from services.api.errors import Unauthorized
@@ -20,6 +21,7 @@ from storage.errors import NotFound, Unavailable
 
 router = APIRouter(tags=["jobs"])
 MEDIA_TYPE = "text/event-stream"
+T = TypeVar("T", bound=BaseModel)
 LOOK = 0.5
 """Seconds between two looks at a job."""
 ALIVE = 15.0
@@ -44,31 +46,65 @@ async def follow_job(
     With `Last-Event-ID`, which an `EventSource` sends when it comes back, the first event is the first that is new.
     """
     job = await anyio.to_thread.run_sync(_read, context, id)
-    if job.state not in jobs.ACTIVE and _mark(job) == last_event_id:
+    if _is_over(job) and _mark(job) == last_event_id:
         return Response(status_code=204)
-    events = _events(context, job, last_event_id)
-    return StreamingResponse(events, media_type=MEDIA_TYPE, headers={"Cache-Control": "no-store"})
+    return stream(lambda: _read(context, id), job, _mark, last_event_id, _is_over)
 
 
-async def _events(context: Context, job: Job, seen: str | None) -> AsyncIterator[bytes]:
+def stream(
+    read: Callable[[], T],
+    found: T,
+    mark: Callable[[T], str],
+    seen: str | None,
+    is_over: Callable[[T], bool] = lambda found: False,
+) -> StreamingResponse:
+    """Server-sent events of something: an event each time that its mark is another one.
+
+    Parameters
+    ----------
+    read : callable
+        Reads it anew, in a thread.
+    found : pydantic.BaseModel
+        As it was read just now.
+    mark : callable
+        The id of the event that it makes.
+    seen : str, optional
+        The mark that the caller has had.
+    is_over : callable
+        Whether it will not change any more: then the stream ends.
+    """
+    return StreamingResponse(
+        _events(read, found, mark, seen, is_over),
+        media_type=MEDIA_TYPE,
+        headers={"Cache-Control": "no-store"},
+    )
+
+
+async def _events(
+    read: Callable[[], T], found: T, mark: Callable[[T], str], seen: str | None, is_over: Callable[[T], bool]
+) -> AsyncIterator[bytes]:
     sent_at = time.monotonic()
     while True:
-        mark = _mark(job)
-        if mark != seen:
-            yield format_sse_event(data_str=job.model_dump_json(), id=mark)
-            seen, sent_at = mark, time.monotonic()
+        now = mark(found)
+        if now != seen:
+            yield format_sse_event(data_str=found.model_dump_json(), id=now)
+            seen, sent_at = now, time.monotonic()
         elif time.monotonic() - sent_at > ALIVE:
             yield b": nothing new\n\n"
             sent_at = time.monotonic()
-        if job.state not in jobs.ACTIVE:
+        if is_over(found):
             return
         await anyio.sleep(LOOK)
         try:
-            job = await anyio.to_thread.run_sync(_read, context, job.id)
+            found = await anyio.to_thread.run_sync(read)
         except (NotFound, Unauthorized):  # deleted meanwhile, or the caller's key revoked
             return
         except Unavailable:  # the database is away, and comes back
             continue
+
+
+def _is_over(job: Job) -> bool:
+    return job.state not in jobs.ACTIVE
 
 
 def _read(context: Context, id: str) -> Job:

@@ -2,10 +2,11 @@
 
 import os
 import tempfile
+import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import ExitStack
 from datetime import UTC, datetime
-from typing import IO, Annotated, Any
+from typing import IO, Annotated, Any, Literal
 
 import anyio.to_thread
 from fastapi import APIRouter, Depends, Query, Request, Response
@@ -15,6 +16,7 @@ from sqlalchemy import Row
 
 from services import film
 from services.api.context import WEB, After, Limit, Needs, read_json, schema_of
+from services.api.web import HEADERS
 from services.patterns import archive, fitted, pictures, png, record
 from services.presets import PRESETS
 from storage import programs
@@ -77,6 +79,27 @@ class ProgramRequest(BaseModel):
         return self
 
 
+class Told(BaseModel):
+    """How far the page is that shows a program."""
+
+    model_config = ConfigDict(extra="forbid")
+    phase: Literal["countdown", "showing", "shown", "stopped"]
+    patterns_per_second: float = Field(ge=0.01, le=120)
+    seconds: float = Field(0, ge=0, le=3600, description="Until the first pattern comes.")
+    shown: int = Field(0, ge=0, le=MOST, description="Patterns that have been shown.")
+    border: Size | None = Field(
+        None,
+        description="The display's pixels, once they are known: with it, the film's capture.json is complete.",
+    )
+
+
+class Showing(Told):
+    """The same, and when the page told it: pages that are closed or lost tell nothing more."""
+
+    told_at: datetime
+    age_seconds: float
+
+
 class Program(BaseModel):
     """A program; `display` is the screen that its video is made for, if it can have a border."""
 
@@ -86,6 +109,7 @@ class Program(BaseModel):
     display: Size | None
     program: dict[str, Any]
     created_at: datetime
+    showing: Showing | None = Field(description="The last time that its page showed it.")
 
     @classmethod
     def of(cls, row: Row[Any]) -> "Program":
@@ -97,6 +121,7 @@ class Program(BaseModel):
             display=_display(shown.monitor),
             program=row.program,
             created_at=datetime.fromtimestamp(row.created_at, UTC),
+            showing=_showing(row.showing),
         )
 
 
@@ -112,6 +137,14 @@ def _display(monitor: Monitor) -> Size | None:
     except OptionError:
         return None
     return Size(width=border.width, height=border.height)
+
+
+def _showing(told: dict[str, Any] | None) -> Showing | None:
+    if told is None:
+        return None
+    age = max(time.time() - told["at"], 0.0)
+    at = datetime.fromtimestamp(told["at"], UTC)
+    return Showing(**{name: told[name] for name in Told.model_fields}, told_at=at, age_seconds=age)
 
 
 async def _request(request: Request) -> ProgramRequest:
@@ -232,7 +265,7 @@ async def get_film(
 def get_page(id: str) -> FileResponse:
     """A page that shows the program full screen. It holds nothing of it, and knows of none: it fetches what it shows,
     and asks for a key where that takes one."""
-    return FileResponse(WEB / "play.html", media_type="text/html")
+    return FileResponse(WEB / "play.html", media_type="text/html", headers=HEADERS)
 
 
 def _blocks(file: IO[bytes]) -> Iterator[bytes]:

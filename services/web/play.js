@@ -1,68 +1,11 @@
-// Shows a program full screen. Where cells lie, what they show, and what is shown when: as workflows/clock.py has it.
+// Shows a program full screen, and tells the service how far it is, for a phone that follows.
+import { LEAD, LEAD_SECONDS, borderOn, draw, schedule } from "./clock.js";
+import { CHECKS } from "./app/checklist.js";
 
-const BITS = 12;
-const TICKS = 8;
-const LEAD = -1;
-const LEAD_SECONDS = [1, 0.5, 0.5, 0.5, 0.5];
-const LEAST_CELL = 4;
 const COUNTDOWN = 5; // seconds
 const AHEAD = 8; // pictures decoded before they are shown: all of them would fill the memory
 const AT_ONCE = 4; // requests
-
-export function borderOn(width, height) {
-  const thickness = Math.floor(height / 20);
-  const along = (length, pairs) => {
-    const size = Math.floor((length - 2 * thickness) / (2 * pairs));
-    const start = Math.floor((length - 2 * pairs * size) / 2);
-    return Array.from({ length: 2 * pairs }, (_, i) => [start + i * size, size]);
-  };
-  const top = along(width, BITS + 1).map(([x, size]) => [x, 0, size, thickness]);
-  const left = along(height, TICKS).map(([y, size]) => [0, y, thickness, size]);
-  return {
-    width,
-    height,
-    inner: [thickness, thickness, width - 2 * thickness, height - 2 * thickness],
-    top,
-    bottom: top.map(([x, , w, h]) => [x, height - thickness, w, h]).reverse(),
-    left,
-    right: left.map(([, y, w, h]) => [width - thickness, y, w, h]),
-    fits: Math.min(top[0][2], left[0][3]) >= LEAST_CELL,
-  };
-}
-
-const pairs = (bits) => bits.flatMap((bit) => (bit ? [true, false] : [false, true]));
-
-export function code(number) {
-  const gray = (number + 1) ^ ((number + 1) >> 1);
-  const bits = Array.from({ length: BITS }, (_, i) => (gray >> (BITS - 1 - i)) & 1);
-  return pairs([...bits, bits.reduce((sum, bit) => sum ^ bit, 0)]);
-}
-
-export const tick = (number) => pairs(Array(TICKS).fill((number + 1) & 1));
-
-export function schedule(count, rate) {
-  const lead = LEAD_SECONDS.map((seconds, i) => ({ seconds, number: LEAD, white: i % 2 === 1 }));
-  const patterns = Array.from({ length: count }, (_, number) => ({ seconds: 1 / rate, number, white: false }));
-  return [...lead, ...patterns, ...lead];
-}
-
-// Draws a picture, or the lead's black or white where there is none, in the border.
-export function draw(context, border, step, picture) {
-  context.fillStyle = "#000";
-  context.fillRect(0, 0, border.width, border.height);
-  context.fillStyle = "#fff";
-  if (picture) {
-    context.imageSmoothingEnabled = false;
-    context.drawImage(picture, ...border.inner);
-  } else if (step.white) {
-    context.fillRect(...border.inner);
-  }
-  const number = code(step.number);
-  const ticks = tick(step.number);
-  for (const [boxes, lit] of [[border.top, number], [border.bottom, number], [border.left, ticks], [border.right, ticks]]) {
-    boxes.forEach((box, i) => lit[i] && context.fillRect(...box));
-  }
-}
+const TELL = 2000; // ms between two reports of how far it is
 
 // The pictures of a program: all fetched before it starts, the next few of them decoded.
 class Pictures {
@@ -111,7 +54,7 @@ const nextFrame = () => new Promise(requestAnimationFrame);
 // Shows the steps, each for a whole number of the display's refreshes, and none before its picture is there. Where one
 // refresh was missed, the next step makes up for it; where more were, it is as long as any, and the beat starts anew: no
 // step is ever left out. Returns when each of them was first shown.
-async function show(context, border, steps, pictures, refresh, stopped) {
+async function show(context, border, steps, pictures, refresh, stopped, passed) {
   const shown = [];
   let due = -Infinity;
   for (const [i, step] of steps.entries()) {
@@ -124,6 +67,7 @@ async function show(context, border, steps, pictures, refresh, stopped) {
     } while (now < due - refresh / 2 || (step.number !== LEAD && !picture));
     draw(context, border, step, picture);
     shown.push({ number: step.number, white: step.white, at: now });
+    passed(step.number);
     // On time, the next is due by the steady beat; too late, by a new one.
     const start = now < due + 1.5 * refresh ? due : now;
     due = start + Math.max(1, Math.round((step.seconds * 1000) / refresh)) * refresh;
@@ -189,8 +133,13 @@ async function ask(path, options = {}) {
   return answer;
 }
 
+const id = here.pathname.split("/").at(-2);
+
+// What is told is for others to see: the showing goes on without.
+const tell = (told) =>
+  ask("showing", { method: "PUT", body: JSON.stringify(told), headers: { "Content-Type": "application/json" } }).catch(() => {});
+
 async function open() {
-  const id = here.pathname.split("/").at(-2);
   const program = await (await ask(`../${id}`)).json();
   const { display, patterns, monitor } = program;
   $("about").textContent = `${patterns} patterns of ${monitor.width} x ${monitor.height} pixels.`;
@@ -224,7 +173,9 @@ async function play(program, pictures, rate) {
   const { signal } = stop;
   const listen = (target, event, listener) => target.addEventListener(event, listener, { signal });
   const end = (why) => stop.abort(new Error(why));
+  const told = { phase: "countdown", patterns_per_second: rate, seconds: COUNTDOWN + LEAD_SECONDS.reduce((sum, one) => sum + one) };
   let lock;
+  let toldAt = -TELL;
   $("record").hidden = true;
   $("start").disabled = true;
   try {
@@ -236,15 +187,24 @@ async function play(program, pictures, rate) {
     listen(document, "fullscreenchange", () => full && !document.fullscreenElement && end("Stopped."));
     listen(document, "visibilitychange", () => document.hidden && end("Stopped: the page was hidden."));
     await pictures.prepare(0);
+    tell(told);
     const refresh = await countDown($("countdown"), signal);
     await fill(canvas);
     listen(window, "resize", () => end("Stopped: the window changed its size."));
     const border = borderOn(canvas.width, canvas.height);
     if (!border.fits) throw new Error("The window is too small for the border: make it larger.");
     const context = canvas.getContext("2d", { alpha: false });
-    const shown = await show(context, border, schedule(program.patterns, rate), pictures, refresh, signal);
-    finish(program, border, shown, refresh);
+    Object.assign(told, { phase: "showing", seconds: 0, border: { width: border.width, height: border.height } });
+    const passed = (number) => {
+      if (number === LEAD || performance.now() < toldAt + TELL) return;
+      toldAt = performance.now();
+      tell({ ...told, shown: number + 1 });
+    };
+    const shown = await show(context, border, schedule(program.patterns, rate), pictures, refresh, signal, passed);
+    told.patterns_per_second = finish(program, border, shown, refresh);
+    tell({ ...told, phase: "shown", shown: program.patterns });
   } catch (error) {
+    tell({ ...told, phase: "stopped", seconds: 0 });
     say(error.message);
   } finally {
     stop.abort();
@@ -269,6 +229,7 @@ function finish(program, { width, height }, shown, refresh) {
   $("record").hidden = false;
   say(`All ${patterns.length} patterns were shown, ${rate} a second. Stop the film.`);
   document.dispatchEvent(new CustomEvent("played", { detail: { shown, refresh, record } }));
+  return rate;
 }
 
 $("unlock").onsubmit = (event) => {
@@ -277,6 +238,9 @@ $("unlock").onsubmit = (event) => {
   $("unlock").hidden = true;
   start();
 };
+
+$("checks").append(...CHECKS.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
+$("follow").href = new URL(`/#/film/${id}`, here);
 
 const start = () => open().catch((error) => say(error.message));
 start();

@@ -2,11 +2,15 @@
 
 import shutil
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
-from tests.end_to_end.conftest import Service, serving
+from tests.browser.pages import SIZE, opened
+from tests.end_to_end.conftest import BANDS, Service, serving
+from workflows import simulate
+from workflows.scene import nested_program, write_capture
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 ARGUMENTS = [
@@ -31,6 +35,31 @@ def browser() -> Iterator[Browser]:
     with sync_playwright() as playwright:
         yield (running := playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS))
         running.close()
+
+
+@pytest.fixture(scope="session")
+def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("ball") / "ball.zip"
+    write_capture(
+        simulate.glass_ball(*SIZE, rays=9), nested_program(bands=BANDS, levels=5), path, name="a ball"
+    )
+    return path
+
+
+@pytest.fixture(scope="session")
+def ready(service: Service, ball: Path) -> tuple[str, str]:
+    """A capture and its matte, both ready."""
+    uploaded = service.client.upload(ball)
+    service.client.wait(uploaded["job"])
+    recovered = service.client.wait(service.client.recover(uploaded["id"], quality="fast")["id"])
+    return uploaded["id"], str(recovered["matte"])
+
+
+@pytest.fixture
+def desk(browser: Browser) -> Iterator[Page]:
+    """A page of the app, of 1200 x 800 pixels, that has to behave."""
+    with opened(browser, viewport={"width": 1200, "height": 800}) as page:
+        yield page
 
 
 @pytest.fixture

@@ -1,8 +1,9 @@
-// A job by server-sent events, over `fetch`: an EventSource can't send a key.
+// What changes, by server-sent events over `fetch`: an EventSource can't send a key.
 import { ask } from "./api.js";
 import { pause } from "./dom.js";
 
 const SILENCE = 45_000; // ms; the service sends a comment each 15 s, so that a line cut without a word is noticed
+const ASLEEP = 20_000; // ms: more than between two of those comments
 const LONGEST = 15_000; // ms between two attempts
 export const ACTIVE = ["queued", "running"];
 
@@ -37,9 +38,9 @@ export async function* parse(stream, heard = () => {}) {
   }
 }
 
-// Calls `changed(job)` now and whenever the job has changed, until it has ended; returns it then. While the service is
-// away `lost(true)` is called, and it is asked for again, ever less often.
-export async function follow(id, signal, changed, lost = () => {}) {
+// Calls `changed(found)` now and whenever what is at `path` has changed, until it is `over`; returns it then. While the
+// service is away `lost(true)` is called, and it is asked for again, ever less often.
+export async function follow(path, signal, changed, { lost = () => {}, over = () => false } = {}) {
   let seen;
   let wait = 1000;
   for (;;) {
@@ -48,21 +49,27 @@ export async function follow(id, signal, changed, lost = () => {}) {
     const stop = () => cut.abort(signal.reason);
     signal.addEventListener("abort", stop, { once: true });
     let timer;
+    let heardAt;
     const heard = () => {
       clearTimeout(timer);
+      heardAt = Date.now();
       timer = setTimeout(() => cut.abort(), SILENCE);
     };
+    // A laptop that wakes up has a line that is dead, and timers that stood still.
+    const woken = () => !document.hidden && Date.now() - heardAt > ASLEEP && cut.abort();
+    document.addEventListener("visibilitychange", woken);
+    addEventListener("online", woken);
     try {
       heard();
       const headers = { Accept: "text/event-stream", ...(seen && { "Last-Event-ID": seen }) };
-      const answer = await ask(`v1/jobs/${id}/events`, { headers, signal: cut.signal });
+      const answer = await ask(path, { headers, signal: cut.signal });
+      lost(false);
       for await (const event of parse(answer.body, heard)) {
         seen = event.id;
         wait = 1000;
-        lost(false);
-        const job = JSON.parse(event.data);
-        changed(job);
-        if (!ACTIVE.includes(job.state)) return job;
+        const found = JSON.parse(event.data);
+        changed(found);
+        if (over(found)) return found;
       }
     } catch (error) {
       signal.throwIfAborted();
@@ -71,8 +78,12 @@ export async function follow(id, signal, changed, lost = () => {}) {
     } finally {
       clearTimeout(timer);
       signal.removeEventListener("abort", stop);
+      document.removeEventListener("visibilitychange", woken);
+      removeEventListener("online", woken);
     }
-    await pause(wait, signal);
+    await Promise.race([pause(wait, signal), online(signal)]);
     wait = Math.min(2 * wait, LONGEST);
   }
 }
+
+const online = (signal) => new Promise((resolve) => addEventListener("online", resolve, { once: true, signal }));

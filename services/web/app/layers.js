@@ -1,5 +1,5 @@
 // What a matte is made of, and where the light of one of its pixels comes from.
-import { getBlob, save } from "./api.js";
+import { getBlob, getJson, save } from "./api.js";
 import { button, h, newest, pause, said, show } from "./dom.js";
 
 const CALM = 120; // ms that a pointer rests before its pixel is asked for
@@ -23,6 +23,7 @@ export function layers(matte, signal) {
   const problem = h("div");
   const light = h("img", { alt: "", hidden: true });
   const told = h("p", { class: "hint", role: "status" }, "Point at a pixel of the layer.");
+  const figures = h("div");
   const fail = (error) => signal.aborted || problem.replaceChildren(said(error));
 
   const choose = newest(async (name) => {
@@ -42,7 +43,10 @@ export function layers(matte, signal) {
     try {
       await pause(CALM, signal);
       const [x, y] = wanted;
-      await show(light, await getBlob(`v1/mattes/${matte.id}/transport.png?x=${x}&y=${y}`, signal));
+      const path = (end) => `v1/mattes/${matte.id}/transport${end}?x=${x}&y=${y}`;
+      const [found, picture] = await Promise.all([getJson(path(""), signal), getBlob(path(".png"), signal)]);
+      figures.replaceChildren(inFigures(found));
+      await show(light, picture);
       light.alt = `Where on the monitor the light of pixel (${x}, ${y}) comes from`;
       told.textContent = `Pixel (${x}, ${y})`;
       problem.replaceChildren();
@@ -77,5 +81,17 @@ export function layers(matte, signal) {
   choose(FIRST);
   return h("section", { class: "panel", "aria-label": "Layers" }, h("h2", {}, "Layers, and where light comes from"),
     h("div", { class: "columns" }, h("div", { class: "stack" }, names, stage, about, h("p", { class: "row" }, "For other tools:", files)),
-      h("div", { class: "stack" }, told, h("div", { class: "picture sheet light", tabindex: 0, role: "group", "aria-label": "Where its light comes from" }, light), problem)));
+      h("div", { class: "stack" }, told, h("div", { class: "picture sheet light", tabindex: 0, role: "group", "aria-label": "Where its light comes from" }, light), figures, problem)));
+}
+
+// What the picture shows, in words and figures: a lobe's place is in the monitor's pixels from its top left.
+function inFigures({ recovered, S, rho, monitor: [width, height], lobes }) {
+  if (!recovered) return h("p", {}, "The mask left this pixel out.");
+  const percent = (values) => values.map((value) => h("td", {}, `${(100 * value).toFixed(0)} %`));
+  const head = ["", "Red", "Green", "Blue", "Centre", "Spread"].map((name) => h("th", { scope: "col" }, name));
+  const row = (name, values, ...more) => h("tr", {}, h("th", { scope: "row" }, name), percent(values), more.map((text) => h("td", {}, text)));
+  return h("div", { class: "sheet", tabindex: 0, role: "group", "aria-label": "Its figures" },
+    h("table", {}, h("thead", {}, h("tr", {}, head)), h("tbody", {}, row("S", S, "", ""), row("rho", rho, "", ""),
+      lobes.map(({ u, v, weight, sigma_u: a, sigma_v: b }, n) =>
+        row(`Lobe ${n + 1}`, weight, `${Math.round(u * width)}, ${Math.round((1 - v) * height)}`, `${(a * width).toFixed(1)} × ${(b * width).toFixed(1)}`)))));
 }

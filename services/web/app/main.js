@@ -2,10 +2,11 @@
 import { said } from "./dom.js";
 import { captures } from "./captures.js";
 import { capture } from "./capture.js";
+import { filming, program } from "./filming.js";
 import { job, jobs } from "./jobs.js";
 import { matte, mattes } from "./mattes.js";
 
-const VIEWS = { captures: [captures, capture], jobs: [jobs, job], mattes: [mattes, matte] };
+const VIEWS = { film: [filming, program], captures: [captures, capture], jobs: [jobs, job], mattes: [mattes, matte] };
 const main = document.getElementById("main");
 let leaving = new AbortController();
 
@@ -41,5 +42,13 @@ document.querySelector(".skip").onclick = (event) => {
   event.preventDefault();
   main.focus();
 };
+// A file that misses where it is wanted would take the place of the page.
+for (const type of ["dragover", "drop"]) {
+  addEventListener(type, (event) => {
+    if (event.defaultPrevented || !event.dataTransfer.types.includes("Files")) return;
+    event.preventDefault();
+    event.dataTransfer.dropEffect = "none";
+  });
+}
 addEventListener("hashchange", () => route(true));
 route(false);

@@ -1,6 +1,6 @@
 // How far a job is: bar, stage, the time left, what it waits for, and its log.
 import { getJson } from "./api.js";
-import { follow } from "./events.js";
+import { ACTIVE, follow } from "./events.js";
 import { badge, duration, facts, h, newest, pause, said } from "./dom.js";
 
 const LOG_EVERY = 2000; // ms
@@ -29,7 +29,7 @@ export async function follower(panel, id, signal, changed = () => {}, known = nu
   });
 
   const tell = (job) => {
-    const active = ["queued", "running"].includes(job.state);
+    const active = ACTIVE.includes(job.state);
     bar.value = job.progress;
     bar.hidden = !active && job.state !== "failed";
     stage.replaceChildren(badge(job.state), ` ${words(job)}`);
@@ -51,7 +51,7 @@ export async function follower(panel, id, signal, changed = () => {}, known = nu
     panel.classList.toggle("lost", away);
     if (away) stage.textContent = "The service does not answer; it is asked again. Jobs go on where they stood.";
   };
-  return follow(id, signal, tell, lost);
+  return follow(`v1/jobs/${id}/events`, signal, tell, { lost, over: (job) => !ACTIVE.includes(job.state) });
 }
 
 function words(job) {

@@ -1,0 +1,124 @@
+"""Captures in the app: films and ZIPs that are dropped, and frames to leaf through."""
+
+import base64
+import io
+import json
+import zipfile
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.browser.pages import MINUTE, ZIP
+from tests.end_to_end.conftest import BANDS, Service
+from tests.workflows.ingest.camera import Camera, film, lights
+from workflows import simulate
+from workflows.program import Program
+from workflows.scene import nested_program
+
+pytestmark = pytest.mark.full
+
+RATE = 4
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A film of a program without a border."""
+    program = nested_program(bands=BANDS[:1], levels=2)
+    path = tmp_path_factory.mktemp("film") / "IMG 0001.MOV"
+    path.write_bytes(film(lights(simulate.glass_ball(96, 72, rays=4), program), Camera(hold=1 / RATE)).data)
+    path.with_suffix(".json").write_text(
+        json.dumps(
+            {
+                "format": "envmatte-capture/1",
+                "program": program.model_dump(mode="json"),
+                "video": {"file": "film.mp4", "patterns_per_second": RATE},
+            }
+        )
+    )
+    return path
+
+
+def test_a_film_with_its_record_becomes_a_capture(desk: Page, service: Service, clip: Path) -> None:
+    desk.goto(service.url)
+    desk.get_by_label(ZIP).set_input_files(clip)
+    asked = desk.get_by_label("Or the capture.json that came with the program")
+    asked.set_input_files({"name": "holiday.json", "mimeType": "application/json", "buffer": b"{}"})
+    expect(desk.get_by_text("This is no capture.json of a film")).to_be_visible()
+    asked.set_input_files(clip.with_suffix(".json"))
+    expect(desk.get_by_role("heading", name="IMG 0001")).to_be_visible(timeout=MINUTE)
+    expect(desk.get_by_role("heading", name="How it turned out")).to_be_visible(timeout=2 * MINUTE)
+    found = service.client.capture(desk.url.rpartition("/")[2])
+    assert (found["state"], found["width"], found["height"]) == ("ready", 96, 72)
+
+
+def test_a_film_alone_is_asked_for_its_program(desk: Page, service: Service, clip: Path) -> None:
+    made = service.http.post(
+        "/v1/programs", json={"preset": "sketch", "monitor": {"width": 800, "height": 450}, "border": True}
+    ).json()
+    told = {
+        "phase": "shown",
+        "patterns_per_second": 3.5,
+        "shown": 32,
+        "border": {"width": 801, "height": 451},
+    }
+    assert service.http.put(f"/v1/programs/{made['id']}/showing", json=told).status_code == 204
+    desk.goto(service.url)
+    desk.get_by_label(ZIP).set_input_files(clip)
+    expect(desk.get_by_text("Which program does this film show?")).to_be_visible()
+    desk.get_by_label("Program", exact=True).select_option("0")
+    expect(desk.get_by_label("Patterns a second")).to_have_value("3.5")
+    desk.get_by_role("button", name="Upload", exact=True).click()
+    expect(desk.get_by_role("heading", name="IMG 0001")).to_be_visible(timeout=MINUTE)
+    found = service.client.capture(desk.url.rpartition("/")[2])["program"]
+    assert Program.model_validate(found) == Program.model_validate(made["program"])
+
+
+def test_a_film_and_its_record_are_one_zip(desk: Page, service: Service) -> None:
+    desk.goto(service.url)
+    text = desk.evaluate(
+        """async () => {
+            const { bundle, recordOf } = await import("/web/app/film.js");
+            const showing = { border: { width: 641, height: 361 } };
+            const record = recordOf({ program: { parts: [] }, display: { width: 640, height: 360 }, showing }, 3.5);
+            const film = new File([new Uint8Array(9e6).map((_, i) => i % 251)], "Größe.WebM", { type: "video/webm" });
+            const archive = await bundle(film, record);
+            return new Promise((resolve) => {
+                const reader = new FileReader();
+                reader.onload = () => resolve(reader.result);
+                reader.readAsDataURL(archive);
+            });
+        }"""
+    )
+    with zipfile.ZipFile(io.BytesIO(base64.b64decode(text.partition(",")[2]))) as archive:
+        assert archive.testzip() is None
+        assert archive.namelist() == ["capture.json", "film.webm"]
+        assert len(archive.read("film.webm")) == 9_000_000
+        assert json.loads(archive.read("capture.json")) == {
+            "format": "envmatte-capture/1",
+            "name": "Größe",
+            "program": {"parts": []},
+            "video": {
+                "file": "film.webm",
+                "patterns_per_second": 3.5,
+                "border": {"width": 641, "height": 361},
+            },
+        }
+
+
+def test_frames_are_leafed_through_by_keys(desk: Page, service: Service, ready: tuple[str, str]) -> None:
+    desk.goto(f"{service.url}/#/captures/{ready[0]}")
+    frames = service.client.capture(ready[0])["frames"]
+    slider = desk.get_by_role("slider", name="Frame")
+    slider.focus()
+    for key, frame in (
+        ("Home", 1),
+        ("ArrowRight", 2),
+        ("PageUp", None),
+        ("End", frames),
+        ("ArrowLeft", frames - 1),
+    ):
+        slider.press(key)
+        if frame:
+            expect(desk.get_by_text(f"{frame} of {frames}")).to_be_visible()
+            expect(desk.get_by_alt_text(f"Frame {frame}", exact=True)).to_be_visible()

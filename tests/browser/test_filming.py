@@ -1,0 +1,100 @@
+"""Filming: a program is chosen, shown on a monitor, followed on a phone and filmed by a camera of the browser."""
+
+import re
+
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from tests.browser.pages import MINUTE, PHONE, opened
+from tests.end_to_end.conftest import Service
+from workflows.program import Program
+
+pytestmark = pytest.mark.full
+
+SCREEN = {"width": 640, "height": 360}
+SHORT = {
+    "monitor": SCREEN,
+    "parts": [
+        {"kind": "constant", "levels": [0, 1]},
+        {"kind": "bernoulli", "columns": 8, "rows": 6, "count": 10, "seed": 1, "colour": "grey"},
+    ],
+}
+
+
+def test_a_preset_is_made_for_the_screen(desk: Page, service: Service) -> None:
+    desk.goto(f"{service.url}/#/film")
+    expect(desk.get_by_text("where no other device can reach it")).to_be_visible()
+    expect(desk.get_by_label("The monitor’s width")).to_have_value("1200")
+    desk.get_by_role("radio", name="sketch").check()
+    desk.get_by_label("Height").fill("40")
+    desk.get_by_role("button", name="Go on").click()
+    expect(desk.get_by_role("alert")).to_be_visible()
+    desk.get_by_label("Height").fill("800")
+    desk.get_by_role("button", name="Go on").click()
+    expect(desk.get_by_role("heading", name="32 patterns on a screen of 1200 × 800")).to_be_visible()
+    made = service.http.get(f"/v1/programs/{desk.url.rpartition('/')[2]}").json()
+    assert (made["patterns"], made["display"]) == (32, {"width": 1200, "height": 800})
+    desk.get_by_role("link", name="Filming").click()
+    expect(desk.get_by_role("link", name="32 patterns on a screen of 1200 × 800").first).to_be_visible()
+
+
+def test_a_program_is_followed_and_filmed(browser: Browser, desk: Page, service: Service) -> None:
+    made = service.http.post(
+        "/v1/programs", json={"program": SHORT, "monitor": SCREEN, "border": True}
+    ).json()
+    url = f"{service.url}/#/film/{made['id']}"
+    desk.goto(url)
+    with opened(browser, viewport=PHONE, is_mobile=True, has_touch=True) as phone:
+        phone.goto(url)
+        before = phone.get_by_role("checkbox")
+        expect(before).to_have_count(7)
+        phone.get_by_text("Room dark").tap()
+        expect(before.nth(1)).to_be_checked()
+        live = phone.get_by_role("timer")
+        expect(live).to_have_text("Not yet")
+        desk.get_by_role("button", name="Use a camera of this device").click()
+        expect(desk.get_by_role("button", name="Start filming")).to_be_visible()
+        with desk.expect_popup() as popup:
+            desk.get_by_role("link", name="Show it on this screen").click()
+        monitor = popup.value
+        monitor.set_viewport_size({"width": 640, "height": 360})
+        expect(monitor.get_by_role("status")).to_have_text("Ready.", timeout=MINUTE)
+        monitor.get_by_label("Patterns a second").fill("4")
+        monitor.get_by_role("button", name="full screen").press("Enter")
+        expect(live).to_have_text(re.compile(r"Starts in \d"))
+        expect(desk.get_by_role("button", name="Stop filming")).to_be_visible()
+        expect(live).to_have_text(re.compile(r"\d+ of 12"), timeout=MINUTE)
+        expect(live).to_have_text("All shown", timeout=MINUTE)
+        expect(phone.get_by_text("a second. Stop the film")).to_be_visible()
+    # What was filmed goes up by itself, as a film of this program.
+    expect(desk).to_have_url(re.compile(r"#/captures/\w+"), timeout=MINUTE)
+    capture = service.client.capture(desk.url.rpartition("/")[2])
+    assert (capture["name"], capture["frames"]) == ("film", 12)
+    assert Program.model_validate(capture["program"]) == Program.model_validate(made["program"])
+    # Chromium's camera does not look at the monitor: the frames are read, and no program is found in them.
+    expect(desk.get_by_role("alert")).to_contain_text("film.", timeout=2 * MINUTE)
+
+
+def test_what_is_stopped_is_told(desk: Page, service: Service) -> None:
+    made = service.http.post(
+        "/v1/programs", json={"program": SHORT, "monitor": SCREEN, "border": True}
+    ).json()
+    desk.goto(f"{service.url}/#/film/{made['id']}")
+    live = desk.get_by_role("timer")
+    for told, said in (
+        ({"phase": "countdown", "seconds": 12}, re.compile(r"Starts in [1-9]$")),
+        # Once more, by a page that was loaded anew.
+        ({"phase": "countdown", "seconds": 12}, re.compile(r"Starts in 1\d$")),
+        ({"phase": "stopped"}, "Stopped"),
+        ({"phase": "showing", "shown": 5}, re.compile("of 12")),
+    ):
+        body = {"patterns_per_second": 0.1} | told
+        assert service.http.put(f"/v1/programs/{made['id']}/showing", json=body).status_code == 204
+        expect(live).to_contain_text(said)
+    for wrong, status in (({"phase": "dancing"}, 422), ({"phase": "shown", "patterns_per_second": -1}, 422)):
+        assert service.http.put(f"/v1/programs/{made['id']}/showing", json=wrong).status_code == status
+    assert service.http.put("/v1/programs/none/showing", json=body).status_code == 404
+    desk.get_by_label("Choose the film").set_input_files(
+        {"name": "holiday.txt", "mimeType": "text/plain", "buffer": b"twelve bytes"}
+    )
+    expect(desk.get_by_role("alert")).to_contain_text("choose the video that the camera took")

@@ -1,0 +1,126 @@
+"""Jobs in the app: followed, cancelled, tried again, deleted."""
+
+import re
+import socket
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from tests.browser.pages import MINUTE
+from tests.end_to_end.conftest import Service, paused, serving
+
+pytestmark = pytest.mark.full
+
+
+def test_a_wrong_option_is_refused_in_words(desk: Page, service: Service, ready: tuple[str, str]) -> None:
+    desk.goto(f"{service.url}/#/captures/{ready[0]}")
+    known = {option["name"] for option in service.http.get("/v1/options").json()["options"]}
+    desk.get_by_text("All options").click()
+    fields = desk.locator("#recovery [name]")
+    names = {fields.nth(n).get_attribute("name") for n in range(fields.count())}
+    assert names == known
+    # Past the browser's own check, as another version of the service would have other ranges.
+    desk.locator("#recovery").evaluate("(form) => (form.noValidate = true)")
+    desk.get_by_label("most lobes").fill("99")
+    desk.get_by_role("button", name="Start").click()
+    expect(desk.get_by_role("alert")).to_contain_text("'most_lobes': must be a whole number between 1 and 16")
+    expect(desk.get_by_label("most lobes")).to_be_focused()
+
+
+def test_a_job_is_cancelled_and_deleted(desk: Page, service: Service, ready: tuple[str, str]) -> None:
+    with paused(service):
+        job = service.client.recover(ready[0])["id"]
+        desk.goto(f"{service.url}/#/jobs/{job}")
+        desk.get_by_role("button", name="Cancel").click()
+        expect(desk.locator(".stage .badge")).to_have_text("cancelled")
+    desk.get_by_role("button", name="Delete", exact=True).click()
+    desk.get_by_role("button", name="Keep it").click()
+    expect(desk.get_by_role("heading", name="Recovery of a matte")).to_be_visible()
+    desk.get_by_role("button", name="Delete", exact=True).click()
+    desk.get_by_role("button", name="Delete it").click()
+    expect(desk).to_have_url(re.compile("#/jobs$"))
+    assert service.http.get(f"/v1/jobs/{job}").status_code == 404
+
+
+def test_a_failed_job_says_why_and_is_tried_again(
+    desk: Page, service: Service, ball: Path, tmp_path: Path
+) -> None:
+    capture = service.client.upload(ball)
+    service.client.wait(capture["job"])
+    frames = sorted((service.data / "store").glob(f"captures/{capture['id']}/**/c/**/*"))
+    lost = next(path for path in frames if path.is_file())
+    lost.rename(tmp_path / "lost")
+    job = service.client.recover(capture["id"], quality="fast")["id"]
+    desk.goto(f"{service.url}/#/jobs/{job}")
+    expect(desk.get_by_role("alert")).to_contain_text("Stored data is missing or damaged", timeout=MINUTE)
+    (tmp_path / "lost").rename(lost)
+    desk.get_by_role("button", name="Try again").click()
+    expect(desk.get_by_role("link", name="Open the matte")).to_be_visible(timeout=MINUTE)
+    expect(desk.locator(".log")).to_contain_text("succeeded")
+
+
+def test_a_job_that_runs_is_followed_through_a_reload(
+    desk: Page, service: Service, ready: tuple[str, str]
+) -> None:
+    with paused(service):
+        job = service.client.recover(ready[0], quality="fast")["id"]
+        desk.goto(f"{service.url}/#/jobs")
+        card = desk.locator(f'a[href="#/jobs/{job}"]')
+        card.focus()
+        desk.keyboard.press("Enter")
+        expect(desk.get_by_role("button", name="Cancel")).to_be_visible()
+        desk.reload()
+        expect(desk.get_by_role("button", name="Cancel")).to_be_visible()
+        expect(desk.get_by_role("progressbar")).to_be_visible()
+    asked: list[str] = []
+    desk.on("request", lambda request: asked.append(request.url) if request.url.endswith(job) else None)
+    expect(desk.get_by_role("link", name="Open the matte")).to_be_visible(timeout=MINUTE)
+    assert asked == []  # it is told, and does not ask
+
+
+def test_a_laptop_that_slept_takes_the_job_up_again(
+    desk: Page, service: Service, ready: tuple[str, str]
+) -> None:
+    asked: list[str | None] = []
+    desk.on(
+        "request",
+        lambda one: asked.append(one.headers.get("last-event-id")) if one.url.endswith("/events") else None,
+    )
+    desk.clock.install()
+    with paused(service):
+        job = service.client.recover(ready[0], quality="fast")["id"]
+        desk.goto(f"{service.url}/#/jobs/{job}")
+        expect(desk.locator(".stage .badge")).to_have_text("running")
+        assert asked == [None]
+        desk.clock.fast_forward("08:00:00")
+        while len(asked) == 1:
+            desk.wait_for_timeout(100)
+        assert asked[1]  # it goes on behind what it has had
+    expect(desk.get_by_role("link", name="Open the matte")).to_be_visible(timeout=MINUTE)
+
+
+def test_a_service_with_keys_that_is_started_again(
+    browser: Browser, ball: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.mktemp("locked") / "data"
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = str(free.getsockname()[1])
+    settings = ("--workers", "1", "--port", port)
+    with serving(folder, *settings, ENVMATTE_KEYS="secret") as locked:
+        capture = locked.client.upload(ball)
+        locked.client.wait(capture["job"])
+        job = locked.client.recover(capture["id"])["id"]
+        page = browser.new_page()
+        page.goto(f"{locked.url}/#/jobs/{job}")
+        for key in ("wrong", "secret"):
+            page.get_by_label("Key of the service").fill(key)
+            page.keyboard.press("Enter")
+        expect(page.get_by_text(re.compile("running|queued")).first).to_be_visible()
+        locked.kill()
+        expect(page.get_by_text("The service does not answer")).to_be_visible(timeout=MINUTE)
+    with serving(folder, *settings, ENVMATTE_KEYS="secret"):
+        page.get_by_role("link", name="Open the matte").click(timeout=2 * MINUTE)
+        expect(page.get_by_text("exact")).to_be_visible(timeout=MINUTE)
+    assert page.evaluate("Object.keys(localStorage)") == []
+    page.close()

@@ -1,0 +1,132 @@
+"""Every view of the app, in light and dark, on a desk and on a phone: for all people, and without jumps."""
+
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser, Page, expect
+
+from tests.browser.pages import PHONE, is_fitting, opened
+from tests.end_to_end.conftest import Service
+
+pytestmark = pytest.mark.full
+
+WEB = Path(__file__).parents[2] / "services" / "web"
+SERIOUS = ("serious", "critical")
+SHIFTS = """
+    window.shifts = [];
+    new PerformanceObserver((list) => {
+        for (const entry of list.getEntries()) {
+            const nodes = entry.sources.map(({ node }) => node?.className || node?.nodeName);
+            if (!entry.hadRecentInput) window.shifts.push([entry.value, ...nodes]);
+        }
+    }).observe({ type: "layout-shift", buffered: true });
+"""
+MOST_SHIFT = 0.1
+"""Of a page that does not jump, by Core Web Vitals."""
+DEVICES: dict[str, dict[str, Any]] = {
+    "desk": {"viewport": {"width": 1200, "height": 800}},
+    "phone": {"viewport": PHONE, "has_touch": True, "is_mobile": True},
+}
+
+
+@pytest.fixture(scope="module")
+def views(service: Service, ready: tuple[str, str]) -> dict[str, tuple[str, str]]:
+    """What to open, and a heading that is there then, by the name of a view."""
+    capture, matte = ready
+    shown = {"preset": "sketch", "monitor": {"width": 1200, "height": 800}, "border": True}
+    program = service.http.post("/v1/programs", json=shown).json()["id"]
+    return {
+        "film": ("#/film", "Choose a program"),
+        "program": (f"#/film/{program}", "Before you start"),
+        "play": (f"v1/programs/{program}/play", "Show a program"),
+        "captures": ("#/captures", "Captures"),
+        "capture": (f"#/captures/{capture}", "Contact sheet"),
+        "jobs": ("#/jobs", "Jobs"),
+        "job": (f"#/jobs/{service.client.matte(matte)['job']}", "The frame"),
+        "mattes": ("#/mattes", "Mattes"),
+        "matte": (f"#/mattes/{matte}", "Layers"),
+    }
+
+
+def go(page: Page, service: Service, view: tuple[str, str]) -> None:
+    page.goto("about:blank")  # else only the part after `#` is another one, and the page the same
+    page.goto(f"{service.url}/{view[0]}")
+    expect(page.get_by_role("heading", name=view[1]).first).to_be_visible()
+    if view[0].startswith("#/film/"):  # it is told what happens as long as it is open
+        page.wait_for_timeout(500)
+    else:
+        page.wait_for_load_state("networkidle")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("device", DEVICES)
+def test_every_view_has_manners(
+    browser: Browser,
+    service: Service,
+    views: dict[str, tuple[str, str]],
+    device: str,
+    scheme: str,
+    tmp_path: Path,
+) -> None:
+    folder = Path(os.environ.get("CI_ARTIFACTS") or tmp_path) / "app"
+    folder.mkdir(parents=True, exist_ok=True)
+    axe = Axe()
+    with opened(browser, color_scheme=scheme, **DEVICES[device]) as page:
+        page.add_init_script(SHIFTS)
+        for name, view in views.items():
+            go(page, service, view)
+            assert is_fitting(page), name
+            page.screenshot(path=folder / f"{name}-{device}-{scheme}.png", full_page=True)
+            shifts = page.evaluate("window.shifts")
+            assert sum(shift[0] for shift in shifts) < MOST_SHIFT, (name, shifts)
+            found = axe.run(page).response["violations"]
+            wrong = [
+                (one["id"], [node["html"] for node in one["nodes"]])
+                for one in found
+                if one["impact"] in SERIOUS
+            ]
+            assert wrong == [], name
+
+
+def test_the_tabulator_gets_to_everything(
+    desk: Page, service: Service, views: dict[str, tuple[str, str]]
+) -> None:
+    for name, view in views.items():
+        go(desk, service, view)
+        wanted = desk.evaluate(
+            """() => {
+                const seen = (e) => e.checkVisibility({ visibilityProperty: true }) && !e.disabled;
+                return [...document.querySelectorAll("a[href], button, input, select, summary, [tabindex='0']")]
+                    .filter(seen)
+                    .filter((e) => e.type !== "radio" || e.checked).length;
+            }"""
+        )
+        desk.evaluate("document.body.tabIndex = -1, document.body.focus()")
+        reached = set()
+        for _ in range(wanted + 2):
+            desk.keyboard.press("Tab")
+            reached.add(
+                desk.evaluate("""() => [...document.querySelectorAll("*")].indexOf(document.activeElement)""")
+            )
+        assert len(reached) >= wanted, name
+
+
+def test_the_app_is_small_and_its_policy_strict(service: Service, views: dict[str, tuple[str, str]]) -> None:
+    files = [path for path in WEB.rglob("*") if path.is_file()]
+    assert sum(path.stat().st_size for path in files) < 300_000
+    for path in ("/", f"/{views['play'][0]}"):
+        answer = service.http.get(path)
+        policy = answer.headers["content-security-policy"]
+        assert "default-src 'none'" in policy
+        assert "unsafe" not in policy
+        assert "http" not in policy
+        for name in re.findall(r'(?:href|src)="[./]*(web/[^"]*)"', answer.text):
+            file = service.http.get(f"/{name}")
+            assert file.status_code == 200
+            assert file.headers["cache-control"] == "no-cache"
+    named = {path.name for path in files if path.suffix == ".js" and path.parent.name == "app"}
+    assert named == set(re.findall(r"web/app/(\w+\.js)", service.http.get("/").text))

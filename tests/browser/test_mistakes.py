@@ -1,0 +1,234 @@
+"""What goes wrong on the way: wrong files, broken lines, full disks, revoked keys, and what the app says then."""
+
+import io
+import os
+import re
+import shutil
+import socket
+import zipfile
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Page, Route, expect
+
+from tests.browser.pages import MINUTE, ZIP, opened
+from tests.disks import small_disk
+from tests.end_to_end.conftest import Service, serving
+
+pytestmark = pytest.mark.full
+
+DISK = 48 << 20
+
+
+def empty_zip() -> bytes:
+    """What some other program would call its document."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("document.xml", "<document/>")
+    return file.getvalue()
+
+
+def hold(page: Page) -> list[Route]:
+    """Where the parts of uploads that a page sends from now on stay until they are let go."""
+    held: list[Route] = []
+
+    def take(route: Route) -> None:
+        if route.request.method == "PATCH":
+            held.append(route)
+        else:
+            route.continue_()
+
+    page.route("**/v1/uploads/*", take)
+    return held
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "said"),
+    [
+        ("holiday.zip", b"twelve bytes", "neither a ZIP nor a film"),
+        ("holiday.jpg", b"\xff\xd8\xff\xe0 and so on", "neither a ZIP nor a film"),
+        ("holiday.docx", empty_zip(), "there is no capture.json"),
+    ],
+)
+def test_a_wrong_file_is_refused_in_words(
+    desk: Page, service: Service, name: str, data: bytes, said: str
+) -> None:
+    desk.goto(service.url)
+    file = {"name": name, "mimeType": "application/octet-stream", "buffer": data}
+    desk.get_by_label(ZIP).set_input_files(file)  # type: ignore[arg-type]
+    expect(desk.get_by_role("alert")).to_contain_text(said)
+    desk.get_by_role("button", name="Dismiss").click()
+    expect(desk.get_by_role("alert")).to_have_count(0)
+
+
+def test_a_file_that_is_dropped_beside_does_not_take_the_page_s_place(desk: Page, service: Service) -> None:
+    desk.goto(service.url)
+    files = desk.evaluate_handle(
+        """() => {
+            const files = new DataTransfer();
+            files.items.add(new File(["twelve bytes"], "holiday.jpg"));
+            return files;
+        }"""
+    )
+    heard = """() => new Promise((resolve) => {
+        addEventListener("drop", (event) => setTimeout(() => resolve(event.defaultPrevented)), { once: true });
+        document.querySelector("header").dispatchEvent(new DragEvent("drop", {
+            dataTransfer: window.files, bubbles: true, cancelable: true }));
+    })"""
+    desk.evaluate("(files) => { window.files = files; }", files)
+    assert desk.evaluate(heard)
+    expect(desk.get_by_role("heading", name="Captures")).to_be_visible()
+
+
+def test_an_upload_that_breaks_off_goes_on(desk: Page, service: Service, ball: Path) -> None:
+    asked: list[str] = []
+
+    def cut(route: Route) -> None:
+        asked.append(route.request.method)
+        if asked.count("PATCH") == 1 and route.request.method == "PATCH":
+            route.abort("connectionreset")
+        else:
+            route.continue_()
+
+    desk.route("**/v1/uploads/**", cut)
+    desk.goto(service.url)
+    with desk.expect_console_message(lambda said: "ERR_CONNECTION_RESET" in said.text):
+        desk.get_by_label(ZIP).set_input_files(ball)
+    expect(desk.get_by_text("trying again")).to_be_visible()
+    expect(desk).to_have_url(re.compile(r"#/captures/\w+"), timeout=MINUTE)
+    assert asked == ["PATCH", "HEAD", "PATCH"]
+
+
+def test_another_view_and_the_back_button_leave_an_upload_alone(
+    desk: Page, service: Service, ball: Path
+) -> None:
+    held: list[Route] = []
+    desk.route(
+        "**/v1/uploads/*",
+        lambda route: held.append(route) if route.request.method == "PATCH" else route.continue_(),
+    )
+    desk.goto(service.url)
+    desk.get_by_label(ZIP).set_input_files(ball)
+    row = desk.get_by_role("region", name="ball.zip")
+    expect(row).to_be_visible()
+    desk.get_by_role("navigation").get_by_role("link", name="Jobs").click()
+    expect(desk.get_by_role("heading", name="Jobs")).to_be_visible()
+    desk.go_back()
+    expect(row).to_be_visible()
+    desk.go_forward()
+    while not held:
+        desk.wait_for_timeout(50)
+    held.pop().continue_()
+    desk.get_by_role("navigation").get_by_role("link", name="Captures").click()
+    expect(desk.get_by_text("a ball", exact=True).first).to_be_visible(timeout=MINUTE)
+    expect(row).to_have_count(0, timeout=MINUTE)
+    assert desk.evaluate("Object.keys(localStorage)") == []
+
+
+def test_a_file_that_goes_up_in_two_tabs_is_one_capture(desk: Page, service: Service, ball: Path) -> None:
+    before = {one["id"] for one in service.http.get("/v1/captures").json()["captures"]}
+    desk.goto(service.url)
+    second = desk.context.new_page()
+    second.goto(service.url)
+    held: list[Route] = []
+    second.route(
+        "**/v1/uploads/*",
+        lambda route: held.append(route) if route.request.method == "PATCH" else route.continue_(),
+    )
+    desk.route(
+        "**/v1/uploads/*",
+        lambda route: held.append(route) if route.request.method == "PATCH" else route.continue_(),
+    )
+    for page in (desk, second):
+        page.get_by_label(ZIP).set_input_files(ball)
+        number = len(held)
+        while len(held) == number:
+            page.wait_for_timeout(50)
+        expect(page.get_by_role("region", name="ball.zip")).to_be_visible()
+    for route in held:
+        route.continue_()
+    for page in (desk, second):
+        page.unroute("**/v1/uploads/*")
+        expect(page).to_have_url(re.compile(r"#/captures/\w+"), timeout=MINUTE)
+    assert desk.url == second.url
+    made = {one["id"] for one in service.http.get("/v1/captures").json()["captures"]} - before
+    assert made == {desk.url.rpartition("/")[2]}
+
+
+def test_a_reload_and_the_back_button_keep_the_view(
+    desk: Page, service: Service, ready: tuple[str, str]
+) -> None:
+    _, matte = ready
+    desk.goto(service.url)
+    desk.get_by_role("link", name="a ball").first.click()
+    expect(desk.get_by_role("heading", name="a ball")).to_be_visible()
+    desk.get_by_role("navigation").get_by_role("link", name="Mattes").click()
+    desk.locator(f'a[href="#/mattes/{matte}"]').click()
+    title = desk.get_by_role("heading", name=f"Matte {matte[:8]}")
+    expect(title).to_be_visible()
+    desk.get_by_role("link", name="Skip").focus()
+    desk.keyboard.press("Enter")
+    expect(desk.locator("main")).to_be_focused()
+    desk.reload()
+    expect(title).to_be_visible()
+    desk.go_back()
+    expect(desk.get_by_role("heading", name="Mattes")).to_be_visible()
+    desk.goto(f"{service.url}/#/captures/nothing")
+    expect(desk.get_by_role("alert")).to_contain_text("Not found")
+
+
+def test_a_disk_that_is_full_is_said_and_the_upload_goes_on_with_room(
+    browser: Browser, ball: Path, tmp_path: Path
+) -> None:
+    with small_disk(tmp_path / "disk", DISK) as disk, serving(disk / "data", "--workers", "1") as small:
+        ballast = disk / "ballast"
+        with ballast.open("wb") as file:
+            os.posix_fallocate(file.fileno(), 0, shutil.disk_usage(disk).free - (1 << 18))
+        with opened(browser) as page:
+            page.goto(small.url)
+            page.get_by_label(ZIP).set_input_files(ball)
+            expect(page.get_by_role("alert")).to_contain_text("The store is full")
+            expect(page.get_by_role("alert")).to_contain_text(re.compile("delete|room|free"))
+            ballast.unlink()
+            page.get_by_role("button", name="Go on").click()
+            expect(page).to_have_url(re.compile(r"#/captures/\w+"), timeout=MINUTE)
+            expect(page.get_by_role("heading", name="a ball")).to_be_visible()
+
+
+def test_the_server_goes_away_in_an_upload_and_comes_back_with_another_key(
+    browser: Browser, ball: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "data"
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = str(free.getsockname()[1])
+    settings = ("--workers", "1", "--host", "0.0.0.0", "--port", port)
+    with opened(browser) as page:
+        with serving(folder, *settings, ENVMATTE_KEYS="first") as locked:
+            page.goto(f"http://127.0.0.1:{port}")
+            for key in ("wrong", "first"):
+                page.get_by_label("Key of the service").fill(key)
+                page.keyboard.press("Enter")
+            expect(page.get_by_label(ZIP)).to_be_visible()
+            sent: list[str] = []
+
+            def kill(route: Route) -> None:
+                if route.request.method == "PATCH" and not sent:
+                    locked.kill()
+                    sent.append(route.request.method)
+                route.continue_()
+
+            page.route("**/v1/uploads/*", kill)
+            page.get_by_label(ZIP).set_input_files(ball)
+            expect(page.get_by_text("trying again")).to_be_visible(timeout=MINUTE)
+        with serving(folder, *settings, ENVMATTE_KEYS="second"):
+            expect(page.get_by_text("This key is not known to the service")).to_be_visible(timeout=MINUTE)
+            page.get_by_label("Key of the service").fill("second")
+            page.keyboard.press("Enter")
+            expect(page.get_by_role("heading", name="a ball")).to_be_visible(timeout=MINUTE)
+            assert page.evaluate("[Object.keys(localStorage), Object.keys(sessionStorage)]") == [
+                [],
+                ["envmatte-key"],
+            ]
+            page.get_by_role("link", name="Film").click()
+            address = re.compile(rf"^http://[\d.]+:{port}/#/film$|This machine is on no network")
+            expect(page.get_by_text(address)).to_be_visible()
