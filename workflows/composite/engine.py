@@ -153,7 +153,7 @@ def _compose(
     recovered: NDArray[np.bool_],
     shared: NDArray[np.bool_],
     count: NDArray[np.uint32],
-    cell: NDArray[np.uint16] | NDArray[np.uint32],
+    cell: NDArray[np.uint32],
     weight: NDArray[np.float32],
     light: NDArray[np.float32],
     crosstalk: NDArray[np.float32],

@@ -193,7 +193,7 @@ def _homography(
 def arrived_along(
     count: NDArray[np.uint32],
     shared: NDArray[np.bool_],
-    cell: NDArray[np.uint16] | NDArray[np.uint32],
+    cell: NDArray[np.uint32],
     weight: NDArray[np.float32],
     light: NDArray[np.float32],
     grids: Grids,

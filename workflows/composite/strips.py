@@ -24,9 +24,8 @@ class Strip:
     S, rho : (h, w, 3) float32
     recovered, shared : (h, w) bool
     count : (h, w, 3) uint32
-    cell : (count.sum(),) uint16 or uint32
-        In the order (y, x, channel). The smaller where cells have no larger numbers: getting them from memory is what
-        a kernel waits for.
+    cell : (count.sum(),) uint32
+        In the order (y, x, channel).
     weight : (count.sum(),) float32
         In the same order.
     """
@@ -36,7 +35,7 @@ class Strip:
     recovered: NDArray[np.bool_]
     shared: NDArray[np.bool_]
     count: NDArray[np.uint32]
-    cell: NDArray[np.uint16] | NDArray[np.uint32]
+    cell: NDArray[np.uint32]
     weight: NDArray[np.float32]
 
     @property
@@ -82,15 +81,13 @@ def read_strip(matte: Matte, row: int, number: int, there: Blocks | None = None)
         parts = [np.split(getattr(block, name), end) for block, end in zip(blocks, ends, strict=True)]
         return np.concatenate([part for row in zip(*parts, strict=True) for part in row])
 
-    cell = in_rows("cell")
-    small = cell.max(initial=0) <= np.iinfo(np.uint16).max
     return Strip(
         side_by_side("S"),
         side_by_side("rho"),
         side_by_side("recovered"),
         side_by_side("shared"),
         side_by_side("count"),
-        cell.astype(np.uint16) if small else cell,
+        in_rows("cell"),
         in_rows("weight"),
     )
 
