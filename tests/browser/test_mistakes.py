@@ -187,7 +187,7 @@ def test_a_disk_that_is_full_is_said_and_the_upload_goes_on_with_room(
         with opened(browser) as page:
             page.goto(small.url)
             page.get_by_label(ZIP).set_input_files(ball)
-            expect(page.get_by_role("alert")).to_contain_text("The store is full")
+            expect(page.get_by_role("alert")).to_contain_text("There is no room for it")
             expect(page.get_by_role("alert")).to_contain_text(re.compile("delete|room|free"))
             ballast.unlink()
             page.get_by_role("button", name="Go on").click()

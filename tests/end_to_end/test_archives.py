@@ -121,6 +121,7 @@ def test_what_lies_is_refused_and_leaves_nothing(elsewhere: Service, archive: Pa
     assert elsewhere.stored() == set()
 
 
+@pytest.mark.long
 def test_one_that_is_too_large_is_refused_with_the_limit(archive: Path, tmp_path: Path) -> None:
     size = archive.stat().st_size
     with serving(tmp_path / "data", "--workers", "1", ENVMATTE_UPLOAD_BYTES=str(size - 1)) as small:

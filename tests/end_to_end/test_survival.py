@@ -61,6 +61,7 @@ def test_a_killed_server_goes_on_where_it_stood(
         assert files_of(second, ended["matte"]) == files_of(service, matte)
 
 
+@pytest.mark.long
 def test_a_server_killed_during_ingest_goes_on(
     service: Service, matte: str, bundle: Path, tmp_path: Path
 ) -> None:
@@ -145,6 +146,7 @@ def test_an_ingest_that_failed_for_no_fault_of_the_capture_can_be_retried(
         assert service.client.capture(second["id"])["state"] == "ready"
 
 
+@pytest.mark.long
 def test_a_job_cancelled_before_a_kill_leaves_nothing(bundle: Path, tmp_path: Path) -> None:
     data = tmp_path / "data"
     with serving(data, "--workers", "1") as first:

@@ -274,6 +274,7 @@ def test_what_came_before_a_line_broke_is_kept(service: Service) -> None:
     service.http.delete(where, headers=TUS)
 
 
+@pytest.mark.long
 @pytest.mark.full
 def test_who_falls_silent_counts_as_gone(service: Service) -> None:
     where = create(service, 1000)

@@ -37,6 +37,7 @@ def test_a_restarted_server(
     check(table, row)
 
 
+@pytest.mark.long
 def test_a_server_that_stays_away(
     on_postgresql: Known, postgresql_server: Server, table: list[Row], times: int
 ) -> None:
@@ -56,6 +57,7 @@ def test_a_server_that_stays_away(
     assert answers == {503}
 
 
+@pytest.mark.long
 def test_a_late_writer(on_postgresql: Known, table: list[Row], seldom: int) -> None:
     rig = on_postgresql.rig
     told = "another coordinator drives the jobs now"

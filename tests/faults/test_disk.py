@@ -96,6 +96,7 @@ def test_at_ingest(small: Small, bundle: Path, table: list[Row]) -> None:
     check(table, small.row("a full disk at ingest", start, job["matte"]))
 
 
+@pytest.mark.long
 def test_at_tiles(small: Small, table: list[Row]) -> None:
     start = time.monotonic()
     with full(small.store, 256 << 10):
@@ -105,6 +106,7 @@ def test_at_tiles(small: Small, table: list[Row]) -> None:
     check(table, small.row("a full disk at tiles", start, job["matte"]))
 
 
+@pytest.mark.long
 def test_in_sqlite(small: Small, table: list[Row]) -> None:
     service, start = small.service, time.monotonic()
     job = service.client.recover(small.capture)

@@ -31,6 +31,7 @@ def test_the_link_of_another_that_is_cut(hosts: Known, table: list[Row], seldom:
     cut_off(hosts, table, name, seldom)
 
 
+@pytest.mark.long
 def test_the_link_of_a_worker_that_is_cut(hosts: Known, table: list[Row], seldom: int) -> None:
     cut_off(hosts, table, "worker0", seldom)
 

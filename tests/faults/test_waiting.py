@@ -38,6 +38,7 @@ def test_without_workers(known: Known) -> None:
     goes_on(known, job["id"], job["matte"])
 
 
+@pytest.mark.long
 def test_without_a_scheduler(known: Known) -> None:
     rig = known.rig
     job = rig.recover(known.capture)
@@ -60,6 +61,7 @@ def test_without_a_coordinator(known: Known) -> None:
     goes_on(known, job["id"], job["matte"])
 
 
+@pytest.mark.long
 def test_for_its_capture_and_beside_others(known: Known, bundle_bytes: bytes) -> None:
     rig = known.rig
     uploaded = rig.ask(
@@ -73,6 +75,7 @@ def test_for_its_capture_and_beside_others(known: Known, bundle_bytes: bytes) ->
         goes_on(known, one["id"], one["matte"])
 
 
+@pytest.mark.long
 def test_a_client_that_waits_outlives_its_service(known: Known) -> None:
     rig = known.rig
     with Client(rig.urls[0]) as client, ThreadPoolExecutor(1) as pool:

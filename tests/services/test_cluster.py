@@ -250,6 +250,7 @@ def test_workers_die_with_their_nanny(cluster: Cluster, client: Client) -> None:
     wait(lambda: len(client.nthreads()) == WORKERS)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_waiting_workers_end_when_they_are_asked(folder: Path, number: signal.Signals) -> None:
     (folder / "workers.log").write_text("")
@@ -267,6 +268,7 @@ def test_a_scheduler_ends_when_it_is_asked(folder: Path, number: signal.Signals)
         assert process.wait(60) == (0 if number == signal.SIGTERM else 130)
 
 
+@pytest.mark.long
 def test_a_scheduler_without_certificates_is_for_this_machine_alone(tmp_path: Path) -> None:
     data = {"ENVMATTE_DATA": str(tmp_path)}
     with started(tmp_path / "log", "scheduler", "--host", "0.0.0.0", **data) as process:

@@ -94,7 +94,10 @@ def wrong(stack: Stack, made: Film, numbers: list[int]) -> list[tuple[int, int]]
     [
         pytest.param(Camera(hold=HOLD), ASKEW, id="askew"),
         pytest.param(
-            Camera(hold=HOLD, fps=24, exposure=1.0), ASKEW, id="24 frames a second, all of them exposed"
+            Camera(hold=HOLD, fps=24, exposure=1.0),
+            ASKEW,
+            id="24 frames a second, all of them exposed",
+            marks=pytest.mark.long,
         ),
         pytest.param(Camera(hold=0.1, fps=60), ASKEW, id="10 patterns a second", marks=pytest.mark.long),
         pytest.param(

@@ -38,7 +38,7 @@ def take(make_zip: Callable[..., bytes], ingest: Callable[..., Any]) -> Callable
     return run
 
 
-@pytest.mark.parametrize("name", ["default", "quick", "sketch"])
+@pytest.mark.parametrize("name", [pytest.param("default", marks=pytest.mark.long), "quick", "sketch"])
 @pytest.mark.parametrize(
     "camera",
     [
