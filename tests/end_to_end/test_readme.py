@@ -55,6 +55,14 @@ def test_zarr_alone_reads_a_matte_and_composites_it(service: Service, matte: str
     np.testing.assert_allclose(sorted(weights), expected_weights, rtol=1e-5)
 
 
+def test_every_test_that_it_names_is_there() -> None:
+    root = Path(__file__).parents[2]
+    named = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", README)
+    assert len(named) > 10
+    for file, test in named:
+        assert f"\ndef {test}(" in (root / file).read_text(), (file, test)
+
+
 def test_every_setting_is_documented() -> None:
     documented = set(re.findall(r"`ENVMATTE_(\w+)`", README))
     assert documented == {name.upper() for name in Settings.model_fields}
