@@ -114,11 +114,12 @@ def png(light: np.ndarray, transfer: str, dtype: type) -> bytes:
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """A digest of every file below a folder, by its relative name."""
+    """A digest of every file below a folder, by its relative name; not of what is kept of a matte for browsers."""
+    names = {str(path.relative_to(folder)): path for path in sorted(folder.rglob("*")) if path.is_file()}
     return {
-        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
+        name: hashlib.sha256(path.read_bytes()).hexdigest()
+        for name, path in names.items()
+        if not name.startswith("live-")
     }
 
 
