@@ -100,6 +100,7 @@ def test_a_laptop_that_slept_takes_the_job_up_again(
     expect(desk.get_by_role("link", name="Open the matte")).to_be_visible(timeout=MINUTE)
 
 
+@pytest.mark.long
 def test_a_service_with_keys_that_is_started_again(
     browser: Browser, ball: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:

@@ -62,8 +62,14 @@ def go(page: Page, service: Service, view: tuple[str, str]) -> None:
         page.wait_for_load_state("networkidle")
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(
+    ("device", "scheme"),
+    [
+        pytest.param(device, scheme, marks=() if scheme == usual else pytest.mark.long)
+        for device, usual in zip(DEVICES, ("light", "dark"), strict=True)
+        for scheme in ("light", "dark")
+    ],
+)
 def test_every_view_has_manners(
     browser: Browser,
     service: Service,

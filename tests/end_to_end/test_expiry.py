@@ -3,6 +3,8 @@
 import time
 from pathlib import Path
 
+import pytest
+
 from tests.end_to_end.conftest import Service, paused, serving
 from tests.end_to_end.test_bad_input import check_problem
 
@@ -44,6 +46,7 @@ def test_what_has_expired_leaves_the_disk_and_what_a_job_needs_does_not(bundle: 
         assert service.client.job(job["id"])["state"] == "succeeded"  # what is known of it stays
 
 
+@pytest.mark.long
 def test_what_is_deleted_leaves_the_disk(bundle: Path, tmp_path: Path) -> None:
     with serving(tmp_path / "data", "--workers", "1") as service:
         before = disk(service)

@@ -36,9 +36,8 @@ def in_one_post(service: Service, file: Path) -> dict[str, Any]:
     return dict(answer.json())
 
 
-@pytest.mark.parametrize(
-    "send", [in_pieces, *(pytest.param(one, marks=pytest.mark.long) for one in (in_one_patch, in_one_post))]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("send", [in_pieces, in_one_patch, in_one_post])
 def test_an_upload_of_a_gigabyte_is_streamed(
     bundle: Path, tmp_path: Path, send: Callable[[Service, Path], dict[str, Any]]
 ) -> None:

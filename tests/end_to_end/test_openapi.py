@@ -11,7 +11,7 @@ import pytest
 
 from tests.end_to_end.conftest import Service, serving
 
-pytestmark = [pytest.mark.full, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.long, pytest.mark.timeout(900)]
 
 CHECKS = (
     "not_a_server_error",
@@ -39,16 +39,13 @@ parameters = {{ id = "{id}" }}
 """
 
 
-@pytest.mark.parametrize(
-    "known", [pytest.param(True, id="with a key"), pytest.param(False, id="without", marks=pytest.mark.long)]
-)
+@pytest.mark.parametrize("known", [pytest.param(True, id="with a key"), pytest.param(False, id="without")])
 def test_the_service_is_as_its_document_says(
     bundle: Path, tmp_path: Path, known: bool, pytestconfig: pytest.Config
 ) -> None:
     program = shutil.which("schemathesis", path=str(Path(sys.executable).parent))
     assert program, "schemathesis is one of the tests' requirements"
     times = int(pytestconfig.getoption("--times"))
-    phases = "coverage,fuzzing,stateful" if times > 1 else "coverage"
     with serving(tmp_path / "data", "--workers", "1", ENVMATTE_KEYS="secret") as service:
         (tmp_path / "schemathesis.toml").write_text(things_of(service, bundle) if known else "")
         (tmp_path / "hooks.py").write_text(HOOKS)
@@ -56,7 +53,7 @@ def test_the_service_is_as_its_document_says(
         done = subprocess.run(
             [
                 *(program, "run", f"{service.url}/openapi.json", *key, "--checks", ",".join(CHECKS)),
-                *("--phases", phases, "--max-examples", str(3 * times), "--seed", "1"),
+                *("--phases", "coverage,fuzzing,stateful", "--max-examples", str(3 * times), "--seed", "1"),
                 *(
                     "--exclude-path-regex",
                     "/events$",

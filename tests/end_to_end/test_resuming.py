@@ -114,6 +114,7 @@ def test_what_a_hundred_cuts_let_through_is_kept(service: Service, tmp_path: Pat
     assert not [name for name in uploads_of(service) if upload in name]
 
 
+@pytest.mark.long
 def test_a_server_that_is_killed_costs_nothing(bundle: Path, tmp_path: Path) -> None:
     data, file = tmp_path / "data", large(bundle, tmp_path / "large.zip", 50 * MB)
     made: list[dict] = []

@@ -207,6 +207,7 @@ def test_a_tile_that_always_fails_fails_its_job_and_retry_goes_on(
     assert files_of(service, job["matte"]) == files_of(service, matte)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
 def test_a_server_that_is_asked_to_stop_leaves_no_process(
     bundle: Path, tmp_path: Path, number: int, code: int

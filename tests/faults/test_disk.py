@@ -84,6 +84,7 @@ def full(disk: Path, left: int = 0) -> Iterator[None]:
         ballast.unlink()
 
 
+@pytest.mark.long
 def test_at_ingest(small: Small, bundle: Path, table: list[Row]) -> None:
     service, start = small.service, time.monotonic()
     with ExitStack() as filled:

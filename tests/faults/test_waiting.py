@@ -48,6 +48,7 @@ def test_without_a_scheduler(known: Known) -> None:
     goes_on(known, job["id"], job["matte"])
 
 
+@pytest.mark.long
 def test_without_a_coordinator(known: Known) -> None:
     rig = known.rig
     for n in range(2):

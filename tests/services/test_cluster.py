@@ -176,6 +176,7 @@ def test_a_worker_process_that_is_killed_comes_again(cluster: Cluster, client: C
     assert client.submit(sum, [1, 2]).result(60) == 3
 
 
+@pytest.mark.long
 def test_workers_join_a_scheduler_that_was_killed(cluster: Cluster, client: Client) -> None:
     busy = client.submit(time.sleep, 3)
     for _ in range(2):
