@@ -175,6 +175,7 @@ def test_a_matte_deleted_while_it_is_sent_ends_the_connection(
     assert elsewhere.stored() == set()
 
 
+@pytest.mark.long
 def test_a_service_that_is_killed_keeps_the_mattes_that_came_and_nothing_else(
     archive: Path, tmp_path: Path
 ) -> None:

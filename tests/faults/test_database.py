@@ -30,6 +30,7 @@ def on_postgresql(
         yield prepared(rig, bundle)
 
 
+@pytest.mark.long
 def test_a_restarted_server(
     on_postgresql: Known, postgresql_server: Server, table: list[Row], times: int
 ) -> None:

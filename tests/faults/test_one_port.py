@@ -30,6 +30,7 @@ class InTurn(Line):
         pass
 
 
+@pytest.mark.long
 def test_two_services_behind_one_port(known: Known, bundle: Path) -> None:
     rig = known.rig
     size = bundle.stat().st_size

@@ -24,6 +24,7 @@ def goes_on(known: Known, job: str, matte: str) -> None:
     assert known.rig.files(matte) == known.files
 
 
+@pytest.mark.long
 def test_without_workers(known: Known) -> None:
     rig = known.rig
     for n in range(2):

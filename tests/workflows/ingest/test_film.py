@@ -38,7 +38,14 @@ def take(make_zip: Callable[..., bytes], ingest: Callable[..., Any]) -> Callable
     return run
 
 
-@pytest.mark.parametrize("name", [pytest.param("default", marks=pytest.mark.long), "quick", "sketch"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("default", marks=pytest.mark.long),
+        "quick",
+        pytest.param("sketch", marks=pytest.mark.long),
+    ],
+)
 @pytest.mark.parametrize(
     "camera",
     [

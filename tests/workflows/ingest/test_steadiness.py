@@ -134,7 +134,7 @@ def test_what_is_steady_is_left_alone(ingest: Ingest, objects: Objects, digests:
 @pytest.mark.parametrize(
     ("ball", "pixels", "jumps", "gain"),
     [
-        ("default", 0.3, False, 6),
+        pytest.param("default", 0.3, False, 6, marks=pytest.mark.long),
         ("default", 0.6, True, 6),
         pytest.param("quick", 1.0, False, 8, marks=pytest.mark.long),
     ],
