@@ -85,7 +85,8 @@ class Cache:
             strip = read_strip(matte, row, number, there)
         except BaseException as error:
             with self._lock:
-                del self._reading[key]
+                if self._reading.get(key) is mine:  # else the matte was deleted meanwhile, which is often why
+                    del self._reading[key]
             mine.set_exception(error)
             raise
         with self._lock:

@@ -112,6 +112,25 @@ def test_a_block_that_is_missing_is_told_to_all_and_asked_for_again(objects: Obj
     assert number(cache.strip("n", 0, 0)) == 0
 
 
+def test_a_matte_that_is_deleted_while_it_is_read_is_told_to_all(
+    objects: Objects, matte: Matte, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache, gate = Cache(objects, 1 << 20), threading.Event()
+
+    def deleted(self: Matte, row: int, column: int) -> Block:
+        gate.wait(10)
+        cache.forget("m")
+        raise Corrupt("some of it is missing")
+
+    monkeypatch.setattr(Matte, "read", deleted)
+    with ThreadPoolExecutor(4) as threads:
+        asked = [threads.submit(cache.strip, "m", 0, 0) for _ in range(4)]
+        time.sleep(0.1)
+        gate.set()
+        for one in asked:
+            assert isinstance(one.exception(10), Corrupt)
+
+
 def test_nothing_is_kept_of_a_matte_that_is_forgotten(objects: Objects, matte: Matte) -> None:
     cache = Cache(objects, 1 << 20)
     cache.strip("m", 0, 0)
