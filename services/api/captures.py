@@ -12,7 +12,7 @@ from sqlalchemy import Row
 from sqlalchemy.exc import IntegrityError
 
 from services import tracing, webhooks
-from services.api.context import After, Context, Limit, Needs, read_body, time_of
+from services.api.context import After, Context, Limit, Needs, read_body, schema_of, time_of
 from services.api.errors import WrongMediaType
 from services.api.uploads import too_large
 from services.limits import admit, admit_upload
@@ -88,7 +88,7 @@ Key = Annotated[str | None, Header(alias="Idempotency-Key", max_length=256)]
         "requestBody": {
             "content": {
                 "application/zip": {"schema": {"type": "string", "format": "binary"}},
-                "application/json": {"schema": FromUpload.model_json_schema()},
+                "application/json": {"schema": schema_of(FromUpload)},
             }
         }
     },

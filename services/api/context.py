@@ -42,7 +42,7 @@ class Context:
     """Of the database; of a request, over which no more can be seen than is the caller's, see `storage.owners`."""
     objects: Objects
     cache: Cache
-    """Blocks of mattes."""
+    """Strips of mattes."""
     pictures: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(4))
     """Pictures of programs that are drawn at once, which bounds what they take."""
     films: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(1))

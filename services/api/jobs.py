@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection, Row
 
 from services import kinds, tracing, webhooks
-from services.api.context import After, Limit, Needs, read_json, time_of
+from services.api.context import After, Limit, Needs, read_json, schema_of, time_of
 from services.api.eta import seconds_left
 from services.api.waiting import reason
 from services.limits import admit
@@ -149,9 +149,7 @@ def list_options() -> Options:
 @router.post(
     "/jobs",
     status_code=202,
-    openapi_extra={
-        "requestBody": {"content": {"application/json": {"schema": JobRequest.model_json_schema()}}}
-    },
+    openapi_extra={"requestBody": {"content": {"application/json": {"schema": schema_of(JobRequest)}}}},
 )
 def post_job(
     context: Needs,

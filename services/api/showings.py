@@ -7,7 +7,7 @@ import anyio.to_thread
 from fastapi import APIRouter, Depends, Header, Request, Response
 from fastapi.responses import StreamingResponse
 
-from services.api.context import Needs, read_json
+from services.api.context import Needs, read_json, schema_of
 from services.api.events import stream
 from services.api.programs import Program, Told, get_program
 from storage import programs
@@ -25,7 +25,7 @@ async def _told(request: Request) -> Told:
     "/programs/{id}/showing",
     status_code=204,
     dependencies=[Depends(get_program)],  # one that is unknown is told before what is wrong with the body
-    openapi_extra={"requestBody": {"content": {"application/json": {"schema": Told.model_json_schema()}}}},
+    openapi_extra={"requestBody": {"content": {"application/json": {"schema": schema_of(Told)}}}},
 )
 def put_showing(context: Needs, id: str, told: Annotated[Told, Depends(_told)]) -> None:
     """Tell how far the showing of a program is: its page does, for whoever follows it elsewhere."""
