@@ -12,7 +12,7 @@ from storage import database, jobs
 from storage.database import open_engine, writing
 from storage.jobs import FINISH
 
-PLAN = {"tiles": 10, "slab": 4, "width": 160, "height": 120, "frames": 40, "notes": []}
+PLAN = {"tiles": 10, "slab": 4, "width": 160, "height": 120, "frames": 40, "video": False, "notes": []}
 FINISHING = TYPICAL * 40 * (160 * 120 + 100_000)
 
 
@@ -23,21 +23,21 @@ def engine(tmp_path: Path) -> Iterator[Engine]:
     opened.dispose()
 
 
-def running(connection: Connection, kind: str, done: int, **values: Any) -> str:
+def running(connection: Connection, kind: str, done: int, plan: dict[str, Any] = PLAN, **values: Any) -> str:
     """A job of ten tiles, at a second each: its pace is measured from time 0 and tile 0 on."""
     job = jobs.add(connection, kind, "a-capture", {})
     jobs.begin(connection, job)
     jobs.enter(connection, job, "reading")
-    jobs.lay_down(connection, job, PLAN)
+    jobs.lay_down(connection, job, plan)
     jobs.finish(connection, job, [(tile, 1.0, 1) for tile in range(done)])
     values = {"paced_at": 0.0, "paced_done": 0, "moved_at": float(done)} | values
     connection.execute(update(database.jobs).where(database.jobs.c.id == job).values(values))
     return job
 
 
-def ended(connection: Connection, finishing: float) -> None:
+def ended(connection: Connection, finishing: float, plan: dict[str, Any] = PLAN) -> None:
     """An ingest that has succeeded, its last step after some seconds."""
-    job = running(connection, "ingest", 10)
+    job = running(connection, "ingest", 10, plan)
     jobs.finish(connection, job, [(FINISH, finishing, 0)])
     jobs.end(connection, job, "succeeded")
 
@@ -73,4 +73,7 @@ def test_that_step_takes_what_it_took_others(engine: Engine) -> None:
         assert left(c, job, 11.0) == pytest.approx(3.0)
         ended(c, 4.0)
         ended(c, 5.0)
+        assert left(c, job, 11.0) == pytest.approx(4.0)
+        for _ in range(3):
+            ended(c, 20.0, PLAN | {"video": True})
         assert left(c, job, 11.0) == pytest.approx(4.0)

@@ -102,7 +102,7 @@ def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, Any]:
         shares=None if filmed is None else filmed.table,
     )
     notes = [] if filmed is None else filmed.notes
-    size = {"width": width, "height": height, "frames": frames}
+    size = {"width": width, "height": height, "frames": frames, "video": filmed is not None}
     return {"tiles": -(-frames // slab), "slab": slab, "memory": limits.memory, **size, "notes": notes}
 
 
