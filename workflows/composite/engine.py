@@ -10,15 +10,12 @@ from numpy.typing import NDArray
 
 from storage.errors import OptionError
 from storage.mattes import Matte
-from workflows.composite.prefetch import prefetch
+from workflows.composite.gather import gather
 from workflows.composite.rays import Rays, arrived_along
 from workflows.composite.strips import LENGTH, Strip
 from workflows.composite.threads import in_parts
 from workflows.grids import area_mean
 from workflows.recovery.pyramid import Grids, Pyramid
-
-AHEAD = 96
-"""Cells of T by which their light is asked for before it is used."""
 
 
 class Window(NamedTuple):
@@ -71,7 +68,7 @@ def compose(
     Parameters
     ----------
     matte : Matte
-    light : (nodes, 3) float32
+    light : (nodes + 1, 3) float32
         As `node_light` makes it.
     window : Window
     read : callable
@@ -91,9 +88,11 @@ def compose(
     Corrupt
         If `read` does.
     """
+    pyramid = Pyramid.over(matte.columns, matte.rows)
+    assert light.shape == (pyramid.nodes + 1, 3)  # which compiled code reads without looking
     picture = np.zeros((window.height, window.width, 4), np.float32)
     crosstalk = np.array(matte.attributes["crosstalk"], np.float32)
-    grids = Pyramid.over(matte.columns, matte.rows).arrays
+    grids = pyramid.arrays
     high, wide = matte.block, LENGTH
     strips = list(
         product(
@@ -163,30 +162,18 @@ def _compose(
 ) -> None:
     """Composite a strip, whose first pixel is at (top, left) of the picture, as far as it lies in it."""
     height, width, _ = picture.shape
-    values, last = light.reshape(-1), cell.size - 1
-    entry = 0
+    entry = np.intp(0)
     for y in range(recovered.shape[0]):
         for x in range(recovered.shape[1]):
-            red = green = blue = np.float32(0)
-            if shared[y, x]:
-                for _ in range(count[y, x, 0]):
-                    # The light of a monitor is larger than a core's cache, and cells are known long before.
-                    prefetch(values, np.intp(cell[min(entry + AHEAD, last)]) * 3)
-                    k, w = cell[entry], weight[entry]
-                    red += w * light[k, 0]
-                    green += w * light[k, 1]
-                    blue += w * light[k, 2]
-                    entry += 1
-            else:
-                for _ in range(count[y, x, 0]):
-                    red += weight[entry] * light[cell[entry], 0]
-                    entry += 1
-                for _ in range(count[y, x, 1]):
-                    green += weight[entry] * light[cell[entry], 1]
-                    entry += 1
-                for _ in range(count[y, x, 2]):
-                    blue += weight[entry] * light[cell[entry], 2]
-                    entry += 1
+            end = entry + np.intp(count[y, x, 0])
+            red, green, blue = gather(light, cell, weight, entry, end)
+            entry = end
+            if not shared[y, x]:
+                end = entry + np.intp(count[y, x, 1])
+                _, green, _ = gather(light, cell, weight, entry, end)
+                entry, end = end, end + np.intp(count[y, x, 2])
+                _, _, blue = gather(light, cell, weight, entry, end)
+                entry = end
             v, u = top + y, left + x
             if recovered[y, x] and 0 <= v < height and 0 <= u < width:
                 red *= rho[y, x, 0]

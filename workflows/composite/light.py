@@ -62,7 +62,8 @@ def node_light(
 
     Returns
     -------
-    (nodes, 3) float32
+    (nodes + 1, 3) float32
+        Row by row; the last one is 0, and nobody's: `gather` reads past a node's three values.
 
     Notes
     -----
@@ -71,7 +72,8 @@ def node_light(
     sampled between its pixels. Further grids see what `Pyramid` says.
     """
     pyramid = Pyramid.over(columns, rows)
-    light = np.empty((pyramid.nodes, 3), np.float32)
+    light = np.empty((pyramid.nodes + 1, 3), np.float32)
+    light[-1] = 0
     starts, grids = pyramid.starts, pyramid.grids
     finest = light[: starts[1]].reshape(rows, columns, 3)
     if placement is None:

@@ -207,7 +207,7 @@ def arrived_along(
     ----------
     count, shared, cell, weight
         Of the strip.
-    light : (nodes, 3) float32
+    light : (nodes + 1, 3) float32
         Of the backdrop, as if it stood where the monitor did.
     grids : Grids
         Of the pyramid.
