@@ -11,6 +11,8 @@ import { onDrop } from "./upload.js";
 
 const STILL = 300; // ms after which a hand has stopped
 const QUICK = 480; // pixels of the longer side while it moves
+const SLOW = 45; // ms between pictures, from which fewer pixels are drawn
+const COARSEST = 2;
 const CONTROLS = [
   // name, label, default, minimum, maximum, step of the slider and of the keys
   ["right", "Move right", 0, -2, 2, 0.01],
@@ -31,6 +33,9 @@ export async function compositing(matte, signal) {
   let timer;
   let frame = 0;
   let changes = 0;
+  let coarser = 0; // as this device needs it for the glass to follow the hand
+  let paces = []; // ms between the last pictures of a movement
+  let painted;
 
   const image = h("img", { alt: "The glass before the backdrop", width: matte.width, height: matte.height, draggable: "false" });
   const canvas = h("canvas", { role: "img", "aria-label": "The glass before the backdrop", width: matte.width, height: matte.height, hidden: true });
@@ -73,11 +78,18 @@ export async function compositing(matte, signal) {
     }
     if (!exact && playing() && !drawn() && !signal.aborted) draw(false); // the next frame
   });
-  function paint() {
+  function paint(now) {
     frame = 0;
     if (!drawn()) return;
+    if (now - painted < STILL) paces = [...paces.slice(-3), now - painted];
+    else if (coarser) [coarser, paces] = [coarser - 1, []]; // another movement: it may have been busy only then
+    painted = now;
+    if (paces.length === 4 && Math.min(...paces) > SLOW && coarser < COARSEST) {
+      coarser += 1;
+      paces = [];
+    }
     if (playing()) painter.take(source.picture);
-    painter.draw(at);
+    painter.draw(at, coarser);
     front(canvas);
     if (playing()) redraw();
   }

@@ -52,17 +52,19 @@ uniform sampler2D offset; // roots of S, and alpha
 uniform sampler2D absorption; // roots of rho
 uniform vec2 tops; // of S and of rho
 uniform mat3 crosstalk;
+uniform float finest; // level of the light that is there
 uniform int height;
+uniform int every; // pixel that is drawn, along each axis
 out vec4 colour;
 void main() {
-  ivec2 pixel = ivec2(gl_FragCoord.x, float(height) - gl_FragCoord.y);
+  ivec2 pixel = min(every * ivec2(gl_FragCoord.x, float(height) - gl_FragCoord.y) + every / 2, textureSize(offset, 0) - 1);
   int count = textureSize(lookups, 0).z;
   vec3 sum = vec3(0);
   for (int k = 0; k < count; k++) {
     uvec4 lookup = texelFetch(lookups, ivec3(pixel, k), 0);
     vec3 share = vec3(lookup.z & 255u, lookup.w >> 8, lookup.w & 255u) / 255.0;
     if (share == vec3(0)) break;
-    sum += share * textureLod(light, vec2(lookup.xy) / 65536.0, float(lookup.z >> 8) / 16.0).rgb;
+    sum += share * textureLod(light, vec2(lookup.xy) / 65536.0, max(float(lookup.z >> 8) / 16.0 - finest, 0.0)).rgb;
   }
   vec4 root = texelFetch(offset, pixel, 0);
   vec3 rho = texelFetch(absorption, pixel, 0).rgb;
@@ -91,8 +93,7 @@ export function lightOf(canvas) {
 
 // Draws a decoded matte.
 export function glass(gl, matte, monitor) {
-  const { width, height, levels, texture } = matte;
-  Object.assign(gl.canvas, { width, height });
+  const { width, height, levels, texture, finest } = matte;
   const made = [];
   const keep = (kind, thing) => (made.push([kind, thing]), thing);
 
@@ -155,15 +156,12 @@ export function glass(gl, matte, monitor) {
   gl.uniform1i(seen.at("absorption"), ABSORPTION);
   gl.uniform2f(seen.at("tops"), matte.S, matte.rho);
   gl.uniformMatrix3fv(seen.at("crosstalk"), true, matte.crosstalk.flat());
-  gl.uniform1i(seen.at("height"), height);
   halve.use();
   gl.uniform1i(halve.at("fine"), LIGHT);
   decode.use();
   gl.uniform1i(decode.at("picture"), PICTURE);
   place.use();
   gl.uniform1i(place.at("backdrop"), BACKDROP);
-  gl.uniform2f(place.at("most"), levels[0][0] - 1, levels[0][1] - 1);
-
   return {
     // Takes a picture, or the frame of a video that is shown now, as the backdrop.
     take(picture) {
@@ -181,9 +179,14 @@ export function glass(gl, matte, monitor) {
       gl.drawArrays(gl.TRIANGLES, 0, 3);
       gl.generateMipmap(gl.TEXTURE_2D);
     },
-    draw(at) {
+    // `coarser`: of 4 ** coarser pixels one is drawn, from light that is as much coarser.
+    draw(at, coarser = 0) {
       if (!shown[0]) return;
-      const cells = levels[0];
+      const first = Math.min(finest + coarser, levels.length - 1);
+      const every = 2 ** coarser;
+      const size = { width: Math.ceil(width / every), height: Math.ceil(height / every) };
+      if (gl.canvas.width !== size.width || gl.canvas.height !== size.height) Object.assign(gl.canvas, size);
+      const cells = levels[0].map((one) => one / 2 ** first);
       const matrix = placing(at, cells, monitor);
       const pixels = Math.sqrt(Math.abs(matrix[0] * matrix[4] - matrix[1] * matrix[3]) * shown[0] * shown[1]);
       // A picture as it is has its mean over each cell; the service samples one that is moved between pixels as large as
@@ -192,27 +195,31 @@ export function glass(gl, matte, monitor) {
       gl.activeTexture(gl.TEXTURE0 + LIGHT);
       place.use();
       gl.uniformMatrix3fv(place.at("placing"), false, matrix);
+      gl.uniform2f(place.at("most"), levels[first][0] - 1, levels[first][1] - 1);
       gl.uniform2f(place.at("cells"), 1 / Math.hypot(matrix[0], matrix[3]), 1 / Math.hypot(matrix[1], matrix[4]));
       const blur = Math.log2(pixels * (moved ? 1.125 : 1));
       gl.uniform1f(place.at("blur"), blur > 0.25 ? blur : 0); // between two levels it takes twice as long
-      levels.forEach((size, level) => {
+      for (let level = first; level < levels.length; level++) {
         gl.bindFramebuffer(gl.FRAMEBUFFER, targets[level]);
         gl.viewport(0, 0, texture[0] >> level, texture[1] >> level);
-        if (level) {
-          if (level === 1) halve.use();
+        if (level > first) {
+          if (level === first + 1) halve.use();
           // Only the finer level may be read while this one is written.
           gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_BASE_LEVEL, level - 1);
           gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAX_LEVEL, level - 1);
           gl.uniform2f(halve.at("size"), texture[0] >> (level - 1), texture[1] >> (level - 1));
-          gl.uniform2f(halve.at("most"), size[0] - 1, size[1] - 1);
+          gl.uniform2f(halve.at("most"), levels[level][0] - 1, levels[level][1] - 1);
         }
         gl.drawArrays(gl.TRIANGLES, 0, 3);
-      });
-      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_BASE_LEVEL, 0);
+      }
+      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_BASE_LEVEL, first);
       gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAX_LEVEL, levels.length - 1);
       gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-      gl.viewport(0, 0, width, height);
+      gl.viewport(0, 0, size.width, size.height);
       seen.use();
+      gl.uniform1f(seen.at("finest"), first);
+      gl.uniform1i(seen.at("height"), size.height);
+      gl.uniform1i(seen.at("every"), every);
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     },
     // Leaves nothing on the graphics card.

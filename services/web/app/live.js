@@ -2,6 +2,7 @@
 import { ask } from "./api.js";
 
 const PLANES = 8; // of a look-up
+const SPARED = 0.01; // of the light: for so little no finer level of the backdrop is drawn
 
 export async function fetchLive(id, signal) {
   return decode(await (await ask(`v1/mattes/${id}/live`, { signal })).arrayBuffer());
@@ -12,6 +13,7 @@ function decode(buffer) {
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, start - 4)));
   const { width, height } = header;
   const pixels = width * height;
+  const light = new Float64Array(16); // that is looked up in each level
   const plane = (k) => new Uint8Array(buffer, start + k * pixels, pixels);
   const lookups = Array.from({ length: header.lookups }, (_, k) => {
     const [xHigh, xLow, yHigh, yLow, level, red, green, blue] = Array.from({ length: PLANES }, (_, n) => plane(PLANES * k + n));
@@ -25,9 +27,13 @@ function decode(buffer) {
       layer[4 * i + 1] = y;
       layer[4 * i + 2] = 256 * level[i] + red[i];
       layer[4 * i + 3] = 256 * green[i] + blue[i];
+      light[level[i] >> 4] += red[i] + green[i] + blue[i];
     }
     return layer;
   });
+  const all = light.reduce((sum, one) => sum + one, 0);
+  let finest = 0;
+  for (let spared = light[0]; spared <= SPARED * all && finest < header.levels.length - 1; spared += light[finest]) finest++;
   const first = PLANES * header.lookups;
   const together = (...planes) => {
     const frame = new Uint8Array(4 * pixels);
@@ -35,7 +41,7 @@ function decode(buffer) {
     return frame;
   };
   return {
-    ...header, lookups,
+    ...header, lookups, finest,
     offset: together(plane(first), plane(first + 1), plane(first + 2), plane(first + 6)),
     absorption: together(plane(first + 3), plane(first + 4), plane(first + 5)),
   };
