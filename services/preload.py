@@ -25,10 +25,13 @@ LOOK = 0.2
 """Seconds between two looks at what runs."""
 PATIENCE = 0.5
 """Seconds that a task may run on after it was cancelled."""
+NICE = 10
+"""Of workers: a job takes a while anyway, and who asks for a composite beside it, or uses the machine, won't wait."""
 
 
 def dask_setup(worker: Worker) -> None:
     """Log and trace, and watch for tasks that nobody wants any more while they run."""
+    os.nice(NICE)  # of this thread, and those that it starts
     log_as_nanny_does()
     tracing.start("worker")
     since: dict[str, float] = {}
