@@ -28,6 +28,8 @@ START = 60
 """Seconds that a worker may take to start on a busy machine."""
 PRELOAD = "services.preload"
 """What a worker imports before it takes work."""
+DECODING = "services.decoding"
+"""What a decoder of the API does."""
 IDLE = 300.0
 """Seconds without a job after which all workers but one are let go: they hold 70 MB each, and more while they work."""
 
@@ -60,21 +62,21 @@ dask.config.set(
 )  # here, and so before any of them is made in whatever process; nannies hand it on to workers
 
 
-def share_start() -> None:
-    """Have the worker processes of this process forked from one that has imported what they all need.
+def share_start(*modules: str) -> None:
+    """Have the children of this process, workers and decoders, forked from one that has imported what they need.
 
-    Importing it takes each of them two seconds of its own otherwise, and memory.
+    Importing it takes each worker two seconds of its own otherwise, and memory.
     """
     for name, value in dask.config.get("distributed.nanny.pre-spawn-environ").items():
         os.environ[name] = str(value)  # as nannies do, but before libraries that read it are loaded
-    get_mp_context().set_forkserver_preload([PRELOAD])  # after distributed has set what it prefers
+    get_mp_context().set_forkserver_preload([*modules])  # after distributed has set what it prefers
     forkserver.ensure_running()
 
 
 @contextmanager
 def embedded(settings: Settings) -> Iterator[LocalCluster]:
     """Start a scheduler and worker processes on loopback, and end them at the end."""
-    share_start()
+    share_start(PRELOAD)
     with LocalCluster(
         n_workers=settings.workers,
         threads_per_worker=1,

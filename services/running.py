@@ -59,13 +59,15 @@ def serve(**given: Any) -> None:
 
     Every setting is an environment variable ENVMATTE_… too, and a line in .env; an option here wins.
     """
-    from services.cluster import share_start
+    from services.cluster import DECODING, PRELOAD, share_start
     from services.settings import Settings
 
     with refusals_told():
         settings = Settings(**given_of(given))
-        if settings.coordinate and settings.cluster is None:
-            share_start()  # at the same time as this process imports the rest
+        own = settings.coordinate and settings.cluster is None  # a cluster, whose workers are this process's
+        share_start(
+            DECODING, *([PRELOAD] if own else [])
+        )  # at the same time as this process imports the rest
         from services.server import serve as run
 
         run(settings)

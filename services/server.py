@@ -37,9 +37,11 @@ def serve(settings: Settings) -> None:
     allow_many()
     with _opened(settings, "service") as (stack, engine, objects):
         see_that_it_is_closed(settings, engine)
+        app = build_app(settings, engine, objects)
+        stack.callback(app.state.context.decoders.close)
         # The port is taken before workers start, so that one in use is told at once.
         config = uvicorn.Config(
-            build_app(settings, engine, objects),
+            app,
             settings.host,
             settings.port,
             http=Connection,

@@ -53,7 +53,7 @@ def work(settings: ClusterSettings, host: str | None) -> None:
             f"asked to listen on {host} without TLS, where whoever reaches it may run what he likes: name a scheduler "
             "that speaks TLS with --cluster tls://HOST:PORT, or listen on 127.0.0.1"
         )
-    share_start()
+    share_start(PRELOAD)
     keep_open(_Workers(settings.cluster, security, settings, host).running())
 
 

@@ -28,6 +28,7 @@ from services.api import (
     web,
 )
 from services.api.context import PROBLEM, WEB, Context, authorized
+from services.decoding import Decoders
 from services.settings import Settings
 from storage.objects import Objects
 from workflows.composite.cache import Cache
@@ -41,7 +42,13 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
         description="Environment mattes of transparent objects, by compressive sensing.",
         responses=PROBLEM,
     )
-    app.state.context = Context(settings, engine, objects, Cache(objects, settings.matte_memory))
+    app.state.context = Context(
+        settings,
+        engine,
+        objects,
+        Cache(objects, settings.matte_memory),
+        Decoders(settings.backdrop_bytes),
+    )
     errors.register(app)
     app.add_middleware(tus.Protocol)
     app.add_middleware(tracing.Requests)

@@ -24,7 +24,7 @@ from storage.database import reading
 from storage.errors import Conflict, Corrupt, OptionError
 from workflows import floats, images
 from workflows.composite import composite
-from workflows.composite.backdrops import read_backdrop
+from workflows.composite.backdrops import backdrop_of
 from workflows.composite.codes import encode
 from workflows.composite.engine import Window, shrink
 from workflows.composite.light import Backdrop
@@ -206,9 +206,8 @@ def _answer(
         )
     matte = timed("open", lambda: context.cache.matte(seen.id))
     window = Window.of(matte, wanted.x, wanted.y, wanted.width, wanted.height)
-    backdrop = timed(
-        "decode", lambda: read_backdrop(data, wanted.transfer, memory=context.settings.backdrop_bytes)
-    )
+    pixels = timed("decode", lambda: context.decoders.decode(data, wanted.transfer))
+    backdrop = backdrop_of(pixels, wanted.transfer)
 
     def read(row: int, number: int) -> Strip:
         return context.cache.strip(seen.id, row, number, seen.blocks)

@@ -20,6 +20,7 @@ from starlette.datastructures import Headers
 
 from services.api.access import ADMIN, Caller, bearer, demand, identify, see_that_it_may
 from services.api.errors import TooLarge
+from services.decoding import Decoders
 from services.settings import Settings
 from storage.objects import Objects
 from storage.owners import NOBODY, bound
@@ -43,6 +44,8 @@ class Context:
     objects: Objects
     cache: Cache
     """Strips of mattes."""
+    decoders: Decoders
+    """What decodes what strangers send."""
     pictures: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(4))
     """Pictures of programs that are drawn at once, which bounds what they take."""
     films: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(1))

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import psutil
 
+from services.decoding import NAME
+
 
 def wait(until: Callable[[], object], seconds: float = 90) -> None:
     """Wait for something to become true; how long is no matter, but that it does."""
@@ -61,12 +63,21 @@ def children(process: subprocess.Popen[str]) -> list[psutil.Process]:
 
 
 def workers(process: subprocess.Popen[str]) -> list[psutil.Process]:
-    """The worker processes of a process: those that its fork server has forked."""
+    """The worker processes of a process: those that its fork server has forked, and that decode nothing for its API."""
+    return [one for one, name in _forked(process) if name != NAME]
+
+
+def decoders(process: subprocess.Popen[str]) -> list[psutil.Process]:
+    """The processes in which the API of a process has pictures decoded."""
+    return [one for one, name in _forked(process) if name == NAME]
+
+
+def _forked(process: subprocess.Popen[str]) -> list[tuple[psutil.Process, str]]:
     found = []
     for one in children(process):
         with suppress(psutil.NoSuchProcess):  # nor one that has just ended
             if any("forkserver" in argument for argument in psutil.Process(one.ppid()).cmdline()):
-                found.append(one)
+                found.append((one, one.name()))
     return found
 
 

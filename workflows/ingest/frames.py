@@ -14,7 +14,7 @@ from storage.errors import CaptureError, ImageError, OverLimit
 from storage.objects import Objects
 from workflows import images
 from workflows.grids import smallest_grid
-from workflows.ingest import stills
+from workflows.ingest import hangs, stills
 from workflows.ingest.bundle import MANIFEST, Bundle, Limits
 from workflows.ingest.content import lay_out
 from workflows.ingest.display import LOOKS
@@ -190,8 +190,10 @@ def _pixels(bundle: Bundle, stack: Stack, first: int, last: int, limits: Limits)
 
 
 def _decode(bundle: Bundle, entry: str, limits: Limits) -> images.Codes:
+    data = bundle.read(entry)
     try:
-        return images.decode(bundle.read(entry), memory=limits.image)
+        with hangs.ended():
+            return images.decode(data, memory=limits.image)
     except ImageError as error:
         raise CaptureError(f"{entry}: {error.detail}", entry=entry, **error.fields) from error
 

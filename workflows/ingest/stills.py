@@ -9,6 +9,7 @@ from storage.errors import CaptureError, ImageError
 from workflows import floats, images, raw
 from workflows.floats import Floats
 from workflows.images import Codes
+from workflows.ingest import hangs
 from workflows.ingest.bundle import MANIFEST, Bundle, Limits
 from workflows.tone import BLACK
 
@@ -69,11 +70,12 @@ def read(bundle: Bundle, entry: str, limits: Limits) -> Codes | Floats:
     """
     data = bundle.read(entry)
     try:
-        if raw.is_raw(entry):
-            return raw.decode(data, memory=limits.image)
-        if floats.is_float(data):
-            return floats.decode(data, memory=limits.image)
-        return images.decode(data, memory=limits.image)
+        with hangs.ended():
+            if raw.is_raw(entry):
+                return raw.decode(data, memory=limits.image)
+            if floats.is_float(data):
+                return floats.decode(data, memory=limits.image)
+            return images.decode(data, memory=limits.image)
     except ImageError as error:
         raise CaptureError(f"{entry}: {error.detail}", entry=entry, **error.fields) from error
 

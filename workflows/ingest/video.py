@@ -16,6 +16,7 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from storage.errors import CaptureError
+from workflows.ingest import hangs
 
 CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
 """What is probed for. Others, playlists among them, name files and hosts of their own."""
@@ -93,9 +94,10 @@ class Clip:
         self._entry, self._limit = entry, memory
         self.lost: list[int] = []
         try:
-            self._container: InputContainer = av.open(
-                file, "r", container_options={"format_whitelist": CONTAINERS}, io_open=_refuse
-            )
+            with hangs.ended():
+                self._container: InputContainer = av.open(
+                    file, "r", container_options={"format_whitelist": CONTAINERS}, io_open=_refuse
+                )
         except (av.FFmpegError, OSError, ValueError) as error:
             raise CaptureError(
                 f"{entry} can't be read as a video (MP4, MOV, MKV, WebM or AVI): it is of another kind, cut off or "
@@ -284,17 +286,18 @@ class Clip:
     def _decoded(self) -> Iterator[VideoFrame]:
         packets, whole = self._container.demux(self._stream), True
         while True:
-            try:
-                packet = next(packets)
-            except (StopIteration, av.FFmpegError, OSError):
-                return
-            try:
-                frames = self._stream.decode(packet)
-            except av.FFmpegError:
-                whole = False
-                if packet.pts is not None:
-                    self.lost.append(packet.pts)
-                continue
+            with hangs.ended():
+                try:
+                    packet = next(packets)
+                except (StopIteration, av.FFmpegError, OSError):
+                    return
+                try:
+                    frames = self._stream.decode(packet)
+                except av.FFmpegError:
+                    whole = False
+                    if packet.pts is not None:
+                        self.lost.append(packet.pts)
+                    continue
             for frame in frames:
                 # What was lost goes on from frame to frame until one is coded by itself.
                 whole = not frame.is_corrupt and (whole or frame.key_frame)

@@ -10,8 +10,8 @@ import pytest
 from PIL import Image, ImageCms
 
 from storage.errors import ImageError
-from workflows import floats, images
-from workflows.composite.backdrops import read_backdrop
+from workflows import floats, images, pictures
+from workflows.composite.backdrops import backdrop_of
 from workflows.tone import to_light
 
 MEMORY = 1 << 24
@@ -24,7 +24,7 @@ def saved(picture: Image.Image, kind: str = "PNG", **options: object) -> bytes:
 
 
 def light(data: bytes, transfer: str = "srgb") -> np.ndarray:
-    return read_backdrop(data, transfer, memory=MEMORY).light(slice(None))
+    return backdrop_of(pictures.decode(data, transfer, memory=MEMORY), transfer).light(slice(None))
 
 
 @pytest.fixture

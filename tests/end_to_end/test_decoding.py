@@ -1,0 +1,77 @@
+"""Decoders of the API are lost with one request each, and with the service."""
+
+from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor
+from concurrent.futures import wait as wait_for
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx2
+import psutil
+import pytest
+
+from services.decoding import SECONDS
+from tests.end_to_end.conftest import Service, serving
+from tests.end_to_end.test_bad_input import ZIP, check_problem
+from tests.end_to_end.test_composites import SENT, asked
+from tests.services.clusters import children, decoders, running, wait
+from tests.services.plain import archive
+
+pytestmark = pytest.mark.full
+
+
+@contextmanager
+def held(service: Service, matte: str) -> Iterator[tuple[psutil.Process, "Future[httpx2.Response]"]]:
+    """A decoder that is stopped in the middle of a request, and that request; the next is decoded by another one."""
+    for one in decoders(service.process):
+        one.kill()
+    wait(lambda: not decoders(service.process))
+    assert asked(service, matte).status_code == 200
+    (one,) = decoders(service.process)
+    one.suspend()
+    with ThreadPoolExecutor(2) as threads, httpx2.Client(base_url=service.url, timeout=4 * SECONDS) as http:
+        url = f"/v1/mattes/{matte}/composite"
+        both = [threads.submit(http.post, url, content=SENT) for _ in range(2)]
+        done, (left,) = wait_for(both, return_when=FIRST_COMPLETED)
+        assert [answer.result().status_code for answer in done] == [200]
+        yield one, left
+
+
+def test_a_decoder_that_is_killed_costs_one_request(service: Service, matte: str) -> None:
+    expected = asked(service, matte).content
+    with held(service, matte) as (one, answer):
+        one.kill()
+        problem = check_problem(answer.result(), 422, "bad-image")
+    assert "SIGKILL" in problem["detail"]
+    assert asked(service, matte).content == expected
+
+
+def test_a_decoder_that_hangs_is_given_up_and_others_are_answered_meanwhile(
+    service: Service, matte: str
+) -> None:
+    expected = asked(service, matte).content
+    with held(service, matte) as (one, answer):
+        meanwhile = 0
+        while not answer.done():
+            assert asked(service, matte).content == expected
+            assert service.http.get("/healthz").status_code == 200
+            meanwhile += 1
+        problem = check_problem(answer.result(), 422, "bad-image")
+        assert meanwhile > 3
+        assert "takes more than 20 s" in problem["detail"]
+        wait(lambda: not running([one]))
+
+
+@pytest.mark.parametrize("end", ["terminate", "kill"])
+def test_decoders_end_with_the_service(tmp_path: Path, end: str) -> None:
+    before = {path.name for path in Path("/dev/shm").iterdir()}
+    with serving(tmp_path / "data", "--workers", "1") as service:
+        sent = service.http.post("/v1/mattes", content=archive(tmp_path, 40, 30), headers=ZIP)
+        matte = sent.json()["id"]
+        assert asked(service, matte).status_code == 200
+        assert decoders(service.process)
+        tree = children(service.process)
+        getattr(service.process, end)()
+        service.process.wait(30)
+        wait(lambda: not running(tree))
+    assert {path.name for path in Path("/dev/shm").iterdir()} <= before
