@@ -194,7 +194,8 @@ class Drive:
             if jobs.lose(connection, self.job, tile, f"its worker {outcome.died} died", LOSSES):
                 return True
             raise GaveUp(
-                f"{name}: {LOSSES} workers that did it died, for want of memory of their machines perhaps: {REMEDY}"
+                f"{name}: {LOSSES} workers that did it died, of a file that a decoder hangs or crashes at, or for want "
+                f"of memory of their machines, as their logs may tell: send other files, or {REMEDY}"
             )
         return True
 
