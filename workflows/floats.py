@@ -9,7 +9,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from storage.errors import ImageError
-from workflows.images import LOSSLESS, PLAIN
+from workflows.images import LOSSLESS, PLAIN, orientation, upright
 
 Floats = NDArray[np.float32]
 EXR = b"v/1\x01"
@@ -29,7 +29,7 @@ def is_float(data: bytes) -> bool:
         return False
 
 
-def decode(data: bytes, *, memory: int) -> Floats:
+def decode(data: bytes, *, memory: int, turn: int | None = None) -> Floats:
     """Decode an EXR or a float TIFF.
 
     Parameters
@@ -37,6 +37,8 @@ def decode(data: bytes, *, memory: int) -> Floats:
     data : bytes
     memory : int
         Bytes that decoding may take; checked in the header, before anything is decoded.
+    turn : int, optional
+        How a TIFF is turned, see `images.upright`; default as it says itself. An EXR never is.
 
     Returns
     -------
@@ -51,11 +53,14 @@ def decode(data: bytes, *, memory: int) -> Floats:
     """
     kind, read = ("EXR", _exr) if data.startswith(EXR) else ("TIFF", _tiff)
     try:
-        return read(data, memory)
+        pixels = read(data, memory)
     except ImageError:
         raise
     except Exception as error:  # as above
         raise ImageError(f"the {kind} image is cut off or damaged: {error}") from error
+    if kind == "EXR":
+        return pixels
+    return upright(pixels, orientation(data) if turn is None else turn)
 
 
 def encode_exr(channels: dict[str, NDArray[Any]], header: dict[str, Any] | None = None) -> bytes:

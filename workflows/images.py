@@ -2,6 +2,7 @@
 
 import io
 import warnings
+from typing import TypeVar, cast
 
 import imagecodecs
 import numpy as np
@@ -11,9 +12,12 @@ from PIL import Image
 
 from storage.errors import ImageError
 
+T = TypeVar("T", bound=np.generic)
 Codes = NDArray[np.unsignedinteger]
 """Values as a file stores them: uint8 or uint16."""
 READ = ("PNG", "TIFF", "JPEG")
+ORIENTATION = 274
+"""The tag of EXIF that says how a picture is to be turned."""
 LOSSLESS = {
     tifffile.COMPRESSION.NONE,
     tifffile.COMPRESSION.LZW,
@@ -28,7 +32,52 @@ PLAIN = {tifffile.PHOTOMETRIC.MINISWHITE, tifffile.PHOTOMETRIC.MINISBLACK, tifff
 """What the values of a TIFF mean, where they can be taken as they are."""
 
 
-def decode(data: bytes, *, memory: int, formats: tuple[str, ...] = READ, alpha: bool = False) -> Codes:
+def orientation(data: bytes) -> int:
+    """How an image is to be turned to be upright, by its EXIF tag: 1, not at all, to 8, as `upright` takes it.
+
+    1 too if it does not say, or can't be read.
+    """
+    try:
+        if data.startswith((b"II", b"MM")):  # Pillow does not open them all
+            with tifffile.TiffFile(io.BytesIO(data)) as file:
+                found: int = file.pages[0].tags.valueof(ORIENTATION)
+        else:
+            with Image.open(io.BytesIO(data), formats=READ) as picture:
+                return _said_by(picture)
+    except Exception:  # what a parser raises on damaged bytes is not a closed set
+        return 1
+    return int(found) if found in range(1, 9) else 1
+
+
+def upright(pixels: NDArray[T], turn: int) -> NDArray[T]:
+    """Pixels turned as an orientation says.
+
+    Parameters
+    ----------
+    pixels : (h, w, ...)
+    turn : int
+        Of EXIF, tag 274 (CIPA DC-008, sect. 4.6.5): what row and column 0 of the pixels are in the picture. 1: top and
+        left, 2: top, right, 3: bottom, right, 4: bottom, left; 5 to 8 the same, of which the row comes second.
+
+    Returns
+    -------
+    (h, w, ...) or (w, h, ...)
+        In C order.
+    """
+    if turn > 4:
+        pixels = pixels.swapaxes(0, 1)
+    down, across = turn in (3, 4, 7, 8), turn in (2, 3, 6, 7)
+    return np.ascontiguousarray(pixels[:: -1 if down else 1, :: -1 if across else 1])
+
+
+def decode(
+    data: bytes,
+    *,
+    memory: int,
+    formats: tuple[str, ...] = READ,
+    alpha: bool = False,
+    turn: int | None = None,
+) -> Codes:
     """Decode an image.
 
     Parameters
@@ -40,11 +89,13 @@ def decode(data: bytes, *, memory: int, formats: tuple[str, ...] = READ, alpha: 
         What is taken, out of `READ`.
     alpha : bool
         Whether an alpha channel is kept.
+    turn : int, optional
+        How it is turned, see `upright`; default as it says itself, `orientation`.
 
     Returns
     -------
     (height, width, 1 or 3) uint8 or uint16
-        Grey or RGB, a palette looked up; with alpha where that is kept and there, which a palette's is not.
+        Upright. Grey or RGB, a palette looked up; with alpha where that is kept and there, which a palette's is not.
 
     Raises
     ------
@@ -63,6 +114,7 @@ def decode(data: bytes, *, memory: int, formats: tuple[str, ...] = READ, alpha: 
         raise ImageError(f"this is no {' or '.join(formats)} image that can be read") from error
     if picture.format == "PNG" and getattr(picture, "is_animated", False):
         raise ImageError("this PNG is animated: one picture a file")
+    own = _said_by(picture)  # before it is decoded, which takes it from a TIFF
     try:
         pixels = _pixels(data, picture, memory)
     except ImageError:
@@ -74,8 +126,20 @@ def decode(data: bytes, *, memory: int, formats: tuple[str, ...] = READ, alpha: 
             f"{picture.format} images are read as grey or RGB with 8 or 16 bits a channel; "
             f"this one has {pixels.dtype} values in the shape {pixels.shape}"
         )
-    channels = 3 if pixels.shape[2] > 2 else 1
-    return np.ascontiguousarray(pixels if alpha else pixels[:, :, :channels])
+    codes = cast("Codes", pixels if alpha else pixels[:, :, : 3 if pixels.shape[2] > 2 else 1])
+    return upright(codes, own if turn is None else turn)
+
+
+def _said_by(picture: Image.Image) -> int:
+    """The orientation that an image says, none of which is decoded."""
+    # Of a PNG Pillow would decode the pixels, to look behind them.
+    if picture.format == "PNG" and "exif" not in picture.info:
+        return 1
+    try:
+        found: int = picture.getexif().get(ORIENTATION, 1)
+    except Exception:  # as above
+        return 1
+    return int(found) if found in range(1, 9) else 1
 
 
 def _pixels(data: bytes, picture: Image.Image, memory: int) -> NDArray[np.generic]:
@@ -107,12 +171,14 @@ def _tiff(data: bytes, picture: Image.Image, memory: int) -> NDArray[np.generic]
 
 
 def _by_pillow(picture: Image.Image, memory: int) -> NDArray[np.uint8]:
+    turned = _said_by(picture) if picture.format == "TIFF" else 1  # which Pillow turns itself
     if picture.mode not in ("1", "P", "L", "LA", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr"):
         raise ImageError(f"{picture.format} images are not read with values of the kind {picture.mode!r}")
     as_it_is = picture.mode in ("L", "LA", "RGB", "RGBA")
     _see_that_it_fits(picture, len(picture.getbands()) if as_it_is else 3, memory)
     picture.info.pop("transparency", None)  # of a palette: dropped like an alpha channel
-    return np.asarray(picture if as_it_is else picture.convert("RGB"))
+    pixels = np.asarray(picture if as_it_is else picture.convert("RGB"))
+    return upright(pixels, {6: 8, 8: 6}.get(turned, turned))  # back
 
 
 def _see_that_it_fits(picture: Image.Image, pixel: int, memory: int) -> None:

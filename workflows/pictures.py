@@ -31,7 +31,7 @@ def decode(data: bytes, transfer: Transfer, *, memory: int) -> Codes | Floats:
     Returns
     -------
     (height, width, 1 to 4) uint8 or uint16, or (height, width, 1 or 3) float32
-        Grey or RGB; integers with the alpha channel that is there. Float values are linear light.
+        Upright. Grey or RGB; integers with the alpha channel that is there. Float values are linear light.
 
     Raises
     ------

@@ -10,6 +10,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from storage.errors import ImageError
+from workflows.images import upright
 
 SUFFIXES = (
     *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef", ".mos"),
@@ -20,6 +21,7 @@ FULL = 0.99
 """Share of the sensor's range from which it counts as clipped: its elements do not end at one value."""
 _BLOCKS = {2: 2, 6: 3}  # elements along a pixel, by the period of the colour filter: Bayer, X-Trans
 _ELEMENT, _LINEAR = 2 + 4, 8 + 12 + 4  # bytes of work for an element, and for a pixel of three colours
+_TURNS = {3: 3, 5: 8, 6: 6}  # orientations, by how LibRaw has them
 _IMAGES = 16  # of a DNG that are looked at
 
 
@@ -28,7 +30,17 @@ def is_raw(name: str) -> bool:
     return PurePosixPath(name).suffix.lower() in SUFFIXES
 
 
-def decode(data: bytes, *, memory: int) -> NDArray[np.float32]:
+def orientation(data: bytes) -> int:
+    """How a RAW is to be turned to be upright, as `images.upright` takes it; 1, not at all, if it can't be read."""
+    try:
+        with rawpy.RawPy() as raw:
+            raw.open_buffer(io.BytesIO(data))
+            return _TURNS.get(raw.sizes.flip, 1)
+    except Exception:  # as below
+        return 1
+
+
+def decode(data: bytes, *, memory: int, turn: int | None = None) -> NDArray[np.float32]:
     """Decode camera RAW of a Bayer or X-Trans sensor, or a DNG of pixels that are demosaiced already.
 
     Parameters
@@ -36,6 +48,8 @@ def decode(data: bytes, *, memory: int) -> NDArray[np.float32]:
     data : bytes
     memory : int
         Bytes that decoding may take; checked before anything is unpacked.
+    turn : int, optional
+        How it is turned, see `images.upright`; default as it says itself.
 
     Returns
     -------
@@ -75,13 +89,15 @@ def decode(data: bytes, *, memory: int) -> NDArray[np.float32]:
                 )
             raw.unpack()
             if raw.raw_type == rawpy.RawType.Flat:
-                return _superpixels(raw)
-            if linear and raw.num_colors == 3:
-                return _light(raw.raw_image_visible[:, :, :3], raw, [0, 1, 2])
-            raise ImageError(
-                "of RAW images without a colour filter, linear DNGs of three colours are read; develop these frames to "
-                "TIFF of 16 bits with a linear curve"
-            )
+                light = _superpixels(raw)
+            elif linear and raw.num_colors == 3:
+                light = _light(raw.raw_image_visible[:, :, :3], raw, [0, 1, 2])
+            else:
+                raise ImageError(
+                    "of RAW images without a colour filter, linear DNGs of three colours are read; develop these "
+                    "frames to TIFF of 16 bits with a linear curve"
+                )
+            return upright(light, _TURNS.get(raw.sizes.flip, 1) if turn is None else turn)
     except rawpy.LibRawFileUnsupportedError as error:
         raise ImageError(
             "this camera's RAW format is not known here: convert the frames to DNG, compressed without loss and not by "

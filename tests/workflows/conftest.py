@@ -105,12 +105,14 @@ def make_dng() -> Callable[..., bytes]:
         white: int,
         pattern: tuple[int, ...] = (0, 1, 1, 2),
         active: tuple[int, ...] = (),
+        orientation: int = 1,
         **how: Any,
     ) -> bytes:
         period = int(len(pattern) ** 0.5)
         tags = [
             (271, "s", 0, "Acme", True),
             (272, "s", 0, "Box", True),
+            (274, "H", 1, orientation, True),
             (50706, "B", 4, bytes((1, 4, 0, 0)), True),  # the DNG's version
             (50708, "s", 0, "Acme Box", True),
             (50714, "I", 1, black, True),

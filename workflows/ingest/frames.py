@@ -51,13 +51,16 @@ def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, Any]:
                     entry=name,
                     limit=limits.memory // 2,
                 )
+        # Of all frames, for the camera stood still: one that looks down takes itself for turned now this way, now that.
+        turn = 1 if manifest.video is not None else stills.orientation(bundle, manifest.frames[0].file)
         shape, storage, filmed = _look(bundle, patterns, limits)
         mask = None
         if manifest.mask is not None:
             mask = np.any(_decode(bundle, manifest.mask, limits), axis=2)
             if mask.shape != shape[1:3]:
                 raise CaptureError(
-                    f"{manifest.mask} is {_size(mask)}, the frames are {shape[2]} x {shape[1]}",
+                    f"{manifest.mask} is {_size(mask)}, the frames are {shape[2]} x {shape[1]}"
+                    + (", turned upright as the first of them says" if turn > 1 else ""),
                     entry=manifest.mask,
                 )
     frames, height, width, _ = shape
@@ -95,7 +98,7 @@ def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, Any]:
             if filmed is None
             else list(filmed.shares),
             "exposures": [frame.exposure for frame in manifest.frames] or [1.0] * frames,
-            **({} if filmed is None else {"video": filmed.record}),
+            **({"orientation": turn} if filmed is None else {"video": filmed.record}),
         },
         mask=mask,
         images=patterns,
@@ -177,8 +180,9 @@ def _pixels(bundle: Bundle, stack: Stack, first: int, last: int, limits: Limits)
     shape = (stack.height, stack.width, stack.channels)
     storage = stills.Storage(stack.dtype, **stack.attributes["storage"])
     kind = np.dtype(np.float32) if storage.black else stack.dtype
+    turn = stack.attributes.get("orientation", 1)  # which captures did not have before it was looked at
     for frame in bundle.manifest.frames[first:last]:
-        pixels = stills.read(bundle, frame.file, limits)
+        pixels = stills.read(bundle, frame.file, limits, turn)
         if pixels.shape != shape or pixels.dtype != kind:
             raise CaptureError(
                 f"{frame.file} is {_size(pixels)} with {pixels.shape[2]} channels of {pixels.dtype}, the first "

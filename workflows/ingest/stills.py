@@ -55,8 +55,20 @@ class Storage(NamedTuple):
         return codes
 
 
-def read(bundle: Bundle, entry: str, limits: Limits) -> Codes | Floats:
+def orientation(bundle: Bundle, entry: str) -> int:
+    """How a frame says that it is to be turned to be upright, as `images.upright` takes it."""
+    data = bundle.read(entry)
+    with hangs.ended():
+        return raw.orientation(data) if raw.is_raw(entry) else images.orientation(data)
+
+
+def read(bundle: Bundle, entry: str, limits: Limits, turn: int | None = None) -> Codes | Floats:
     """Decode a frame: PNG, TIFF, JPEG, EXR, camera RAW.
+
+    Parameters
+    ----------
+    turn : int, optional
+        How it is turned, whatever it says itself; default as it says.
 
     Returns
     -------
@@ -72,10 +84,10 @@ def read(bundle: Bundle, entry: str, limits: Limits) -> Codes | Floats:
     try:
         with hangs.ended():
             if raw.is_raw(entry):
-                return raw.decode(data, memory=limits.image)
+                return raw.decode(data, memory=limits.image, turn=turn)
             if floats.is_float(data):
-                return floats.decode(data, memory=limits.image)
-            return images.decode(data, memory=limits.image)
+                return floats.decode(data, memory=limits.image, turn=turn)
+            return images.decode(data, memory=limits.image, turn=turn)
     except ImageError as error:
         raise CaptureError(f"{entry}: {error.detail}", entry=entry, **error.fields) from error
 

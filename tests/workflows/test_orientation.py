@@ -1,0 +1,128 @@
+"""Pictures that say how they are to be turned come out upright, as every viewer shows them."""
+
+import io
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+from PIL import Image, ImageCms, ImageOps
+
+from storage.captures import Stack
+from storage.errors import CaptureError
+from workflows import floats, images, pictures, raw
+
+MEMORY = 1 << 20
+TAG = 274
+PIXELS = np.random.default_rng(4).integers(0, 256, (6, 9, 3), np.uint8)
+DEEP = PIXELS.astype(np.uint16) * 257
+Zip = Callable[..., bytes]
+Ingest = Callable[..., Stack]
+
+
+def shown(pixels: NDArray[Any], turn: int) -> NDArray[Any]:
+    """The first channels of pixels as Pillow turns them."""
+    picture = Image.fromarray(pixels)
+    picture.getexif()[TAG] = turn
+    return np.asarray(ImageOps.exif_transpose(picture))
+
+
+def saved(kind: str, turn: int, pixels: NDArray[Any] = PIXELS, **options: Any) -> bytes:
+    exif = Image.Exif()
+    exif[TAG] = turn
+    target = io.BytesIO()
+    Image.fromarray(pixels).save(target, kind, exif=exif, **options)
+    return target.getvalue()
+
+
+def tiff(turn: int, pixels: NDArray[Any]) -> bytes:
+    target = io.BytesIO()
+    tifffile.imwrite(target, pixels, photometric="rgb", extratags=[(TAG, "H", 1, turn, True)])
+    return target.getvalue()
+
+
+@pytest.mark.parametrize("turn", range(1, 9))
+def test_every_orientation_of_every_kind(turn: int) -> None:
+    expected = shown(PIXELS, turn)
+    for data in (saved("PNG", turn), tiff(turn, PIXELS), saved("TIFF", turn, compression="tiff_lzw")):
+        assert images.orientation(data) == turn
+        np.testing.assert_array_equal(images.decode(data, memory=MEMORY), expected)
+        np.testing.assert_array_equal(images.decode(data, memory=MEMORY, turn=1), PIXELS)
+    np.testing.assert_array_equal(images.decode(tiff(turn, DEEP), memory=MEMORY) // 257, expected)
+    np.testing.assert_array_equal(
+        floats.decode(tiff(turn, PIXELS.astype(np.float32)), memory=MEMORY), expected
+    )
+    for data in (
+        saved("JPEG", turn),
+        saved("TIFF", turn, compression="jpeg"),
+    ):  # the latter Pillow turns itself
+        plain = images.decode(data, memory=MEMORY, turn=1)
+        assert plain.shape == PIXELS.shape
+        np.testing.assert_array_equal(images.decode(data, memory=MEMORY), shown(plain, turn))
+
+
+def test_a_backdrop_is_upright_with_its_profile_and_its_transparency() -> None:
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    found = pictures.decode(saved("JPEG", 6, icc_profile=profile), "srgb", memory=MEMORY)
+    assert found.shape == (9, 6, 3)
+    seen = np.dstack([PIXELS, PIXELS[..., :1]])
+    found = pictures.decode(saved("PNG", 3, seen), "srgb", memory=MEMORY)
+    np.testing.assert_array_equal(found, seen[::-1, ::-1])
+
+
+@pytest.mark.parametrize("turn", [0, 9, 65535])
+def test_what_is_no_orientation_turns_nothing(turn: int) -> None:
+    for data in (saved("JPEG", turn), tiff(turn, PIXELS)):
+        assert images.orientation(data) == 1
+        assert images.decode(data, memory=MEMORY).shape == PIXELS.shape
+    assert images.orientation(b"no picture") == raw.orientation(b"no picture") == 1
+
+
+def test_the_limit_of_memory_comes_before_the_orientation() -> None:
+    with pytest.raises(images.ImageError, match="takes more"):
+        images.decode(saved("PNG", 6, np.zeros((600, 900, 3), np.uint8)), memory=MEMORY)
+
+
+@pytest.mark.parametrize(("turn", "quarters"), [(1, 0), (3, 2), (6, 3), (8, 1)])
+def test_camera_raw(make_dng: Callable[..., bytes], turn: int, quarters: int) -> None:
+    counts = np.random.default_rng(8).integers(300, 4000, (40, 60), np.uint16)
+    data = make_dng(counts, 256, 4095, orientation=turn)
+    assert raw.orientation(data) == turn
+    upright = raw.decode(data, memory=MEMORY)
+    np.testing.assert_array_equal(upright, np.rot90(raw.decode(data, memory=MEMORY, turn=1), quarters))
+
+
+def record(**more: Any) -> dict[str, Any]:
+    return {
+        "format": "envmatte-capture/1",
+        "program": {
+            "monitor": {"width": 64, "height": 48},
+            "parts": [
+                {"kind": "constant", "levels": [0, 0.5, 1]},
+                {"kind": "bernoulli", "columns": 4, "rows": 3, "count": 3, "seed": 1},
+            ],
+        },
+        "response": "linear",
+        "frames": [{"file": f"{n}.png", "pattern": n} for n in range(6)],
+    } | more
+
+
+def test_all_frames_are_turned_as_the_first_one_is(make_zip: Zip, ingest: Ingest) -> None:
+    """A camera that looks down on a table may write another orientation from frame to frame."""
+    shots = np.random.default_rng(5).integers(0, 256, (6, 20, 30, 3), np.uint8)
+    files = {f"{n}.png": saved("PNG", turn, shots[n]) for n, turn in enumerate((6, 6, 1, 3, 6, 8))}
+    mask = np.zeros((30, 20, 1), np.uint8)  # drawn over a frame as it is shown
+    mask[5:25, 5:15] = 255
+    stack = ingest("c", make_zip(record(mask="mask.png"), files | {"mask.png": images.encode_png(mask)}))
+    assert (stack.width, stack.height) == (20, 30)
+    np.testing.assert_array_equal(stack.read(), np.rot90(shots, 3, axes=(1, 2)))
+    assert stack.attributes["orientation"] == 6
+
+
+def test_a_mask_that_is_not_turned_with_the_frames_is_told(make_zip: Zip, ingest: Ingest) -> None:
+    shot = np.zeros((20, 30, 3), np.uint8)
+    files = {f"{n}.png": saved("PNG", 6, shot) for n in range(6)}
+    with pytest.raises(CaptureError, match="turned upright as the first of them says"):
+        ingest("c", make_zip(record(mask="mask.png"), files | {"mask.png": images.encode_png(shot)}))
