@@ -12,7 +12,7 @@ from sqlalchemy import Row
 from sqlalchemy.exc import IntegrityError
 
 from services import tracing, webhooks
-from services.api.context import After, Context, Limit, Needs, read_body, schema_of, time_of
+from services.api.context import After, Context, Limit, Needs, answered, read_body, schema_of, time_of
 from services.api.errors import WrongMediaType
 from services.api.uploads import too_large
 from services.limits import admit, admit_upload
@@ -158,7 +158,7 @@ def get_frame(context: Needs, id: str, n: int) -> Response:
     if not 0 <= n < row.frames:
         raise NotFound(f"capture {id} has the frames 0 to {row.frames - 1}", field="n")
     frame = Stack(context.objects, id).read(frames=slice(n, n + 1))[0]
-    return Response(encode_png(frame), media_type="image/png")
+    return answered(encode_png(frame), "image/png")
 
 
 async def _from_body(context: Context, request: Request, name: str, key: str | None) -> Row[Any]:

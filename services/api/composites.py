@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from starlette.datastructures import Headers
 
 from services.api import clips
-from services.api.context import Context, Needs, is_known, spool_body
+from services.api.context import Context, Needs, answered, is_known, spool_body
 from services.api.errors import NotAcceptable, NotNeeded, problem_of
 from services.api.errors import answer as problem_answer
 from services.api.jobs import Job
@@ -220,7 +220,7 @@ def _answer(
     if wanted.size is not None:
         picture = shrink(picture, wanted.size)
     answer = timed("encode", lambda: _encoded(picture, backdrop, kind, wanted))
-    return Response(answer, media_type=kind, headers=told | {"Server-Timing": ", ".join(times)})
+    return answered(answer, kind, told | {"Server-Timing": ", ".join(times)})
 
 
 def _rays(context: Context, seen: Seen, wanted: Wanted) -> Rays:

@@ -2,7 +2,7 @@
 
 import tempfile
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import ExitStack, asynccontextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -11,12 +11,14 @@ from typing import IO, Annotated, Any, TypeVar
 
 import anyio.to_thread
 from anyio import CapacityLimiter
-from fastapi import Depends, Query, Request
+from fastapi import Depends, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
+from fastapi.responses import StreamingResponse
 from fastapi.security import HTTPAuthorizationCredentials
 from pydantic import BaseModel, Field, ValidationError
 from sqlalchemy import Engine
 from starlette.datastructures import Headers
+from starlette.types import Receive, Scope, Send
 
 from services.api.access import ADMIN, Caller, bearer, demand, identify, see_that_it_may
 from services.api.errors import TooLarge
@@ -29,6 +31,8 @@ from workflows.composite.threads import CORES
 
 SPOOLED = 1 << 20
 """Bytes of a body that are kept in memory while it comes."""
+HELD = 1 << 18
+"""Bytes of an answer that are kept in memory while it is taken, and that are read of a file at once."""
 WEB = Path(__file__).parents[1] / "web"
 """The browser's files."""
 Model = TypeVar("Model", bound=BaseModel)
@@ -148,6 +152,37 @@ async def spool_body(request: Request, limit: int) -> AsyncIterator[IO[bytes]]:
                 file.write(part)
         file.seek(0)
         yield file
+
+
+def answered(data: bytes, media_type: str, headers: dict[str, str] | None = None) -> Response:
+    """An answer, a large one from a temporary file: any number may be taken slowly. Not for the loop's thread."""
+    if len(data) <= HELD:
+        return Response(data, headers=headers, media_type=media_type)
+    with ExitStack() as stack:
+        file = stack.enter_context(tempfile.TemporaryFile())
+        file.write(data)
+        file.seek(0)
+        stack.pop_all()  # now it is the answer's to close
+    return FromFile(file, len(data), media_type, headers)
+
+
+class FromFile(StreamingResponse):
+    """The bytes of a file, which is closed whatever becomes of the connection."""
+
+    def __init__(
+        self, file: IO[bytes], size: int, media_type: str, headers: dict[str, str] | None = None
+    ) -> None:
+        length = {"Content-Length": str(size)}
+        super().__init__(
+            iter(partial(file.read, HELD), b""), headers=(headers or {}) | length, media_type=media_type
+        )
+        self._file = file
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self._file.close()
 
 
 def time_of(seconds: float | None) -> datetime | None:

@@ -8,7 +8,7 @@ import anyio.to_thread
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel
 
-from services.api.context import Colour, Context, Needs, Pair, is_known
+from services.api.context import Colour, Context, Needs, Pair, answered, is_known
 from storage import mattes
 from storage.database import reading
 from storage.errors import InvalidInput, NotFound
@@ -88,9 +88,10 @@ async def get_layer(
     if is_known(request.headers, tag["ETag"]):
         return Response(status_code=304, headers=tag)
 
-    def encode() -> bytes:
+    def encode() -> Response:
+        kind = MEDIA_TYPES[file.rpartition(".")[2]]
         if file != ALL:
-            return FILES[file](matte)
+            return answered(FILES[file](matte), kind, tag)
         much = layers.bytes_of_everything(matte.width, matte.height, lobes)
         if much > MOST_BYTES:
             raise InvalidInput(
@@ -99,10 +100,9 @@ async def get_layer(
                 field="lobes",
                 limit=MOST_BYTES,
             )
-        return layers.everything(matte, lobes)
+        return answered(layers.everything(matte, lobes), kind, tag)
 
-    answer = await anyio.to_thread.run_sync(encode, limiter=context.layers)
-    return Response(answer, media_type=MEDIA_TYPES[file.rpartition(".")[2]], headers=tag)
+    return await anyio.to_thread.run_sync(encode, limiter=context.layers)
 
 
 @router.get("/mattes/{id}/transport")

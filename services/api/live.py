@@ -5,7 +5,7 @@ from contextlib import suppress
 import anyio.to_thread
 from fastapi import APIRouter, Request, Response
 
-from services.api.context import Needs, is_known
+from services.api.context import Needs, answered, is_known
 from storage import live as kept
 from storage import mattes
 from storage.database import reading
@@ -31,7 +31,7 @@ async def get_live(context: Needs, id: str, request: Request) -> Response:
         with reading(context.engine) as c:
             mattes.get_ready(c, id)
 
-    def find() -> bytes:
+    def find() -> Response:
         made = kept.read(context.objects, id, live.FORMAT)
         if made is None:
             try:
@@ -41,11 +41,10 @@ async def get_live(context: Needs, id: str, request: Request) -> Response:
                 raise
             with suppress(NoRoom):  # it is there for this caller, and can be made again
                 kept.keep(context.objects, id, live.FORMAT, made)
-        return made
+        return answered(made, "application/octet-stream", tag | {"Content-Encoding": "gzip"})
 
     await anyio.to_thread.run_sync(is_ready)
     tag = {"ETag": f'"{id}-{live.FORMAT}"'}  # a matte never changes once it is ready
     if is_known(request.headers, tag["ETag"]):
         return Response(status_code=304, headers=tag)
-    answer = await anyio.to_thread.run_sync(find, limiter=context.layers)
-    return Response(answer, media_type="application/octet-stream", headers=tag | {"Content-Encoding": "gzip"})
+    return await anyio.to_thread.run_sync(find, limiter=context.layers)

@@ -3,7 +3,7 @@
 import os
 import tempfile
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from typing import IO, Annotated, Any, Literal
@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from sqlalchemy import Row
 
 from services import film
-from services.api.context import WEB, After, Limit, Needs, read_json, schema_of
+from services.api.context import WEB, After, FromFile, Limit, Needs, answered, read_json, schema_of
 from services.api.web import HEADERS
 from services.patterns import archive, fitted, pictures, png, record
 from services.presets import PRESETS
@@ -35,7 +35,6 @@ MOST_PIXELS = 1 << 24
 """Of a monitor: one picture in colour takes 48 MiB, a few times that while it is made."""
 MOST_WORK = 1 << 31
 """Pixels of all patterns of a program: a core encodes some 30 million of them a second."""
-BLOCK = 1 << 20
 
 
 class Preset(BaseModel):
@@ -220,10 +219,10 @@ async def get_pattern(context: Needs, shown: Asked, n: int) -> Response:
     if not 0 <= n < shown.count:
         raise NotFound(f"this program has the patterns 0 to {shown.count - 1}", field="n")
 
-    def draw() -> bytes:
-        return png(next(pictures(shown, n, n + 1)))
+    def draw() -> Response:
+        return answered(png(next(pictures(shown, n, n + 1))), "image/png")
 
-    return Response(await anyio.to_thread.run_sync(draw, limiter=context.pictures), media_type="image/png")
+    return await anyio.to_thread.run_sync(draw, limiter=context.pictures)
 
 
 @router.get("/programs/{id}/patterns.zip", response_class=StreamingResponse)
@@ -258,7 +257,7 @@ async def get_film(
         return file, size
 
     file, size = await anyio.to_thread.run_sync(encode, limiter=context.films)
-    return StreamingResponse(_blocks(file), media_type="video/mp4", headers={"Content-Length": str(size)})
+    return FromFile(file, size, "video/mp4")
 
 
 @page.get("/programs/{id}/play", response_class=FileResponse)
@@ -266,12 +265,6 @@ def get_page(id: str) -> FileResponse:
     """A page that shows the program full screen. It holds nothing of it, and knows of none: it fetches what it shows,
     and asks for a key where that takes one."""
     return FileResponse(WEB / "play.html", media_type="text/html", headers=HEADERS)
-
-
-def _blocks(file: IO[bytes]) -> Iterator[bytes]:
-    with file:
-        while block := file.read(BLOCK):
-            yield block
 
 
 def _see_that_it_is_small(shown: Shown) -> None:

@@ -2,7 +2,7 @@
 
 from fastapi import APIRouter, Response
 
-from services.api.context import Context, Needs
+from services.api.context import Context, Needs, answered
 from storage import captures
 from storage.captures import Stack
 from storage.database import reading
@@ -23,7 +23,7 @@ def get_report(context: Needs, id: str) -> Report:
 @router.get("/captures/{id}/contact-sheet.png", response_class=Response)
 def get_contact_sheet(context: Needs, id: str) -> Response:
     """Some of a capture's frames: what is clipped at white is red, at black blue."""
-    return Response(contact_sheet(_stack(context, id)), media_type="image/png")
+    return answered(contact_sheet(_stack(context, id)), "image/png")
 
 
 def _stack(context: Context, id: str) -> Stack:

@@ -1,11 +1,9 @@
 """Resumable uploads over HTTP: tus 1.0 (https://tus.io/protocols/resumable-upload)."""
 
-from collections.abc import AsyncIterator
 from datetime import UTC, datetime
 from email.utils import format_datetime
 from typing import Annotated, Any
 
-import anyio
 import anyio.to_thread
 from fastapi import APIRouter, Depends, Header, Request, Response
 from sqlalchemy import Row
@@ -31,8 +29,6 @@ from storage.uploads import MOST_PARTS, Part
 
 PART = 64 << 20
 """Bytes after which what has come is written down: what a killed server loses of one PATCH, at most."""
-SILENCE = 60.0
-"""Seconds without a byte after which a sender counts as gone: a connection may be lost without a word."""
 
 router = APIRouter(prefix="/uploads", tags=["uploads"])
 Spoken = Depends(version_spoken)
@@ -110,7 +106,9 @@ async def _append(context: Context, request: Request, row: Row[Any], checksum: C
     room = row.length - row.offset
     if int(request.headers.get("content-length", 0)) > room:
         raise _too_long(row)
-    body = _heard(request.stream())
+    body = (
+        request.stream()
+    )  # from which a client that falls silent is disconnected, see `services.connections`
     stored: list[Part] = []
     offset, more = row.offset, True
     try:
@@ -147,19 +145,6 @@ async def _append(context: Context, request: Request, row: Row[Any], checksum: C
         await anyio.to_thread.run_sync(_take_back, context, row.id, stored)
         raise
     return await anyio.to_thread.run_sync(_get, context, row.id)
-
-
-async def _heard(body: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
-    """A body, from which a client that falls silent counts as disconnected."""
-    while True:
-        try:
-            with anyio.fail_after(SILENCE):
-                data = await anext(body, None)
-        except TimeoutError as error:
-            raise ClientDisconnect from error
-        if data is None:
-            return
-        yield data
 
 
 def _advance(context: Context, upload: str, offset: int, stored: list[Part]) -> int:
