@@ -34,7 +34,8 @@ ZIP = "application/zip"
 def get_archive(context: Needs, id: str) -> StreamingResponse:
     """All of a matte in one ZIP, which any zarr reader opens, and which `POST /v1/mattes` takes elsewhere.
 
-    The same matte makes the same bytes. Where the matte is deleted meanwhile, the connection ends early.
+    The same matte makes the same bytes. Where the matte is deleted or the key revoked meanwhile, the connection ends
+    early.
     """
     with reading(context.engine) as c:
         mattes.get_ready(c, id)
@@ -43,7 +44,7 @@ def get_archive(context: Needs, id: str) -> StreamingResponse:
         "Content-Length": str(archive.size),
         "Content-Disposition": f'attachment; filename="matte-{id}.zip"',
     }
-    return StreamingResponse(iter(archive), media_type=ZIP, headers=headers)
+    return StreamingResponse(context.while_allowed(archive), media_type=ZIP, headers=headers)
 
 
 @router.post(

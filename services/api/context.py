@@ -1,8 +1,9 @@
 """What every request handler needs: the settings, the database as the caller may see it, and the store."""
 
 import tempfile
-from collections.abc import AsyncIterator, Callable
-from contextlib import ExitStack, asynccontextmanager
+import time
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator
+from contextlib import ExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -24,6 +25,7 @@ from services.api.access import ADMIN, Caller, bearer, demand, identify, see_tha
 from services.api.errors import TooLarge
 from services.decoding import Decoders
 from services.settings import Settings
+from storage.errors import Unavailable
 from storage.objects import Objects
 from storage.owners import NOBODY, bound
 from workflows.composite.cache import Cache
@@ -33,6 +35,8 @@ SPOOLED = 1 << 20
 """Bytes of a body that are kept in memory while it comes."""
 HELD = 1 << 18
 """Bytes of an answer that are kept in memory while it is taken, and that are read of a file at once."""
+LOOK = 1.0
+"""Seconds between two looks at the key of whoever downloads."""
 WEB = Path(__file__).parents[1] / "web"
 """The browser's files."""
 Model = TypeVar("Model", bound=BaseModel)
@@ -63,6 +67,22 @@ class Context:
     caller: Caller = ADMIN
     check: Callable[[], object] = lambda: None
     """Look at the caller's key once more, as `access.identify` does: for what goes on long after its first look."""
+
+    def while_allowed(self, pieces: Iterable[bytes]) -> Iterator[bytes]:
+        """Pieces of an answer, as long as the caller's key is good.
+
+        Raises
+        ------
+        Unauthorized
+            Within a second's pieces of its end.
+        """
+        looked_at = time.monotonic()
+        for piece in pieces:
+            if time.monotonic() - looked_at > LOOK:
+                with suppress(Unavailable):  # the database is away, and comes back
+                    self.check()
+                looked_at = time.monotonic()
+            yield piece
 
 
 Key = Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)]

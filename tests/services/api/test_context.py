@@ -1,0 +1,40 @@
+"""What goes on long after a request's key was looked at: against a real database."""
+
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from services.api.access import identify
+from services.api.context import LOOK, Context
+from services.api.errors import Unauthorized
+from services.settings import Settings
+from storage import keys
+from storage.database import open_engine, writing
+from storage.objects import Objects
+from workflows.composite.cache import Cache
+
+
+def test_a_download_ends_with_its_key(tmp_path: Path) -> None:
+    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
+    with writing(engine) as c:
+        key = keys.make(c, "lab", "alice", "read")
+    settings, objects = Settings(data=tmp_path), Objects((tmp_path / "store").as_uri())
+    check = partial(identify, settings, engine, key)
+    context = Context(settings, engine, objects, Cache(objects, 0), check=check)
+
+    def pieces() -> Iterator[bytes]:
+        for n in range(5):
+            if n == 3:
+                with writing(engine) as c:
+                    keys.revoke(c, "lab")
+            time.sleep(1.1 * LOOK)
+            yield bytes([n])
+
+    sent: list[bytes] = []
+    with pytest.raises(Unauthorized):
+        sent.extend(context.while_allowed(pieces()))
+    engine.dispose()
+    assert sent == [b"\0", b"\1", b"\2"]
