@@ -144,6 +144,7 @@ def cancel(job: str, url: str, key: str | None, as_json: bool) -> None:
 @click.option("--down", type=float, help="Its move down, in heights of the monitor.")
 @click.option("--scale", type=float, help="By how much it is larger.")
 @click.option("--angle", type=float, help="By how much it is turned, in degrees, clockwise.")
+@click.option("--webhook", metavar="URL", help="Of a clip: URL that is told when the job has ended.")
 @_remote
 def composite(
     matte: str, backdrop: Path, output: Path, url: str, key: str | None, as_json: bool, **wanted: Any

@@ -98,15 +98,19 @@ async def upload(
     request: Request,
     response: Response,
     name: Annotated[str, Query(max_length=200, description="A name for people.")] = "",
+    webhook: Annotated[str | None, Query(description="URL, https, that is told when it is ingested.")] = None,
     idempotency_key: Key = None,
 ) -> Capture:
-    """Make a capture: the body is its ZIP, format envmatte-capture/1, or names the upload that has brought it."""
+    """Make a capture: the body is its ZIP, format envmatte-capture/1, or names the upload that has brought it.
+
+    `name` and `webhook` of the query are for a ZIP; JSON has its own.
+    """
     media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media_type == "application/json":
         wanted = _parse(await read_body(request, FROM_UPLOAD_BYTES))
         row = await anyio.to_thread.run_sync(_from_upload, context, wanted, idempotency_key)
     elif media_type == "application/zip":
-        row = await _from_body(context, request, name, idempotency_key)
+        row = await _from_body(context, request, name, idempotency_key, webhook)
     else:
         raise WrongMediaType(
             f"send the ZIP of a capture as application/zip, not as {media_type or 'nothing'}, or the id of a finished "
@@ -161,8 +165,11 @@ def get_frame(context: Needs, id: str, n: int) -> Response:
     return answered(encode_png(frame), "image/png")
 
 
-async def _from_body(context: Context, request: Request, name: str, key: str | None) -> Row[Any]:
+async def _from_body(
+    context: Context, request: Request, name: str, key: str | None, webhook: str | None
+) -> Row[Any]:
     """Stream the archive into the store; what is cut off, too large or refused leaves nothing."""
+    await anyio.to_thread.run_sync(webhooks.check, webhook, context.settings)  # which looks its host up
     limit = context.settings.upload_bytes
     length = int(request.headers.get("content-length", 0))
     if length > limit:
@@ -174,7 +181,7 @@ async def _from_body(context: Context, request: Request, name: str, key: str | N
     capture = new_id()
     try:
         part = Part(ONLY, await receive(context, capture, request.stream(), limit))
-        row = await anyio.to_thread.run_sync(_register, context, capture, [part], name, key, False)
+        row = await anyio.to_thread.run_sync(_register, context, capture, [part], name, key, False, webhook)
     except Exception:
         # Not when cancelled, where `_register` may still be at work: the next start sweeps then.
         await anyio.to_thread.run_sync(uploads.remove, context.objects, capture)

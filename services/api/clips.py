@@ -9,7 +9,7 @@ from fastapi import APIRouter, Request, Response
 from fastapi.responses import StreamingResponse
 from sqlalchemy.exc import IntegrityError
 
-from services import tracing
+from services import tracing, webhooks
 from services.api.context import Context, Needs
 from services.api.errors import TooLarge
 from services.api.jobs import Job
@@ -30,13 +30,17 @@ def is_clip(request: Request) -> bool:
     return request.headers.get("content-type", "").strip().lower().startswith("video/")
 
 
-async def composite_clip(context: Context, request: Request, matte: str, options: dict[str, Any]) -> Response:
+async def composite_clip(
+    context: Context, request: Request, matte: str, options: dict[str, Any], webhook: str | None
+) -> Response:
     """Queue the composite of a clip, the body of a request, which is streamed into the store.
 
     Parameters
     ----------
     options : dict
         ``transfer``, and ``placement`` as `Placement` takes it.
+    webhook : str, optional
+        URL that is told when the job has ended.
 
     Raises
     ------
@@ -46,7 +50,10 @@ async def composite_clip(context: Context, request: Request, matte: str, options
         If the store has no room for it.
     Conflict
         If the matte is not ready.
+    OptionError
+        If the URL can't be told.
     """
+    await anyio.to_thread.run_sync(webhooks.check, webhook, context.settings)  # which looks its host up
     limit = context.settings.upload_bytes
     length = int(request.headers.get("content-length", 0))
     if length > limit:
@@ -57,7 +64,7 @@ async def composite_clip(context: Context, request: Request, matte: str, options
     if made is None:
         try:
             size = await _receive(context, request, job, limit)
-            job = await anyio.to_thread.run_sync(_queue, context, job, matte, options, key, size)
+            job = await anyio.to_thread.run_sync(_queue, context, job, matte, options, key, size, webhook)
         except Exception:
             # Not when cancelled, where `_queue` may still be at work: what has no job the coordinator sweeps.
             await anyio.to_thread.run_sync(context.objects.delete, composites.path(job))
@@ -97,7 +104,7 @@ def get_video(context: Needs, id: str, request: Request) -> Response:
     if part:
         headers["Content-Range"] = f"bytes {start}-{end - 1}/{size}"
     file.seek(start)
-    pieces = _pieces(file, end - start)
+    pieces = context.while_allowed(_pieces(file, end - start))
     return StreamingResponse(pieces, 206 if part else 200, headers, media_type="video/mp4")
 
 
@@ -122,14 +129,23 @@ async def _receive(context: Context, request: Request, job: str, limit: int) -> 
     return size
 
 
-def _queue(context: Context, job: str, matte: str, options: dict[str, Any], key: str, size: int) -> str:
+def _queue(
+    context: Context,
+    job: str,
+    matte: str,
+    options: dict[str, Any],
+    key: str,
+    size: int,
+    webhook: str | None,
+) -> str:
     """Write down the job of a clip that is stored; returns its id, or that of a repeat that was quicker."""
     context.check()
     try:
         with writing(context.engine) as c:
             row = mattes.get_ready(c, matte)
             admit(c, context.settings, jobs=1, size=size)
-            jobs.add(c, "composite", row.capture or "", options, matte, tracing.asked_by(), job, size)
+            capture, trace = row.capture or "", tracing.asked_by()
+            jobs.add(c, "composite", capture, options, matte, trace, job, size, webhook)
             jobs.begin(c, job)  # while it has tiles it has something in the store, see `jobs.not_wound_up`
             if key:
                 jobs.remember(c, key, CALL, job)

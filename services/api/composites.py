@@ -72,6 +72,9 @@ class Wanted(BaseModel):
         None, description="Or, in its place, a matte of the same object before a monitor at another distance."
     )
     other_distance: float | None = Field(None, gt=0, description="That distance.")
+    webhook: str | None = Field(
+        None, description="Of a clip: URL, https, that is told when its job has ended."
+    )
 
     @model_validator(mode="after")
     def _told(self) -> "Wanted":
@@ -105,7 +108,7 @@ class Wanted(BaseModel):
             If what is wanted is only to be had of a still.
         """
         placement = {"right": self.right, "down": self.down, "scale": self.scale, "angle": self.angle}
-        for name in self.model_fields_set - placement.keys() - {"transfer"}:
+        for name in self.model_fields_set - placement.keys() - {"transfer", "webhook"}:
             raise OptionError(
                 f"{name} is for stills: a clip takes transfer, {', '.join(placement)}", field=name
             )
@@ -143,7 +146,9 @@ async def post_composite(
     A video as the body, `Content-Type: video/*`, is answered with 202 and the job that composites its frames.
     """
     if clips.is_clip(request):
-        return await clips.composite_clip(context, request, id, wanted.of_a_clip())
+        return await clips.composite_clip(context, request, id, wanted.of_a_clip(), wanted.webhook)
+    if wanted.webhook is not None:
+        raise OptionError("webhook is for clips: a still is in the answer, and has no job", field="webhook")
     kind = _chosen(request.headers.get("accept", "*/*"))
     seen = await anyio.to_thread.run_sync(_seen, context, id)
     async with spool_body(request, context.settings.backdrop_bytes) as body, context.composites:

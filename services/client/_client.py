@@ -210,14 +210,19 @@ class Client:
             headers={"Accept": kind},
         ).content
 
-    def composite_clip(self, matte: Matte | str, clip: Path, **wanted: str | float) -> Job:
+    def composite_clip(
+        self, matte: Matte | str, clip: Path, *, webhook: str | None = None, **wanted: str | float
+    ) -> Job:
         """Queue the composite of a clip, a video file; `video` gets the result of the job.
 
         Parameters
         ----------
+        webhook : str, optional
+            URL that is told when the job has ended.
         **wanted
             ``transfer``, ``right``, ``down``, ``scale`` and ``angle``, as the call takes them.
         """
+        wanted |= {"webhook": webhook} if webhook else {}
         headers = {"Content-Type": "video/*", "Content-Length": str(clip.stat().st_size)} | _key()
         path = f"{_path(Matte, matte)}/composite"
         return Job.of(
