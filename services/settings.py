@@ -21,7 +21,13 @@ from workflows.ingest.bundle import Limits
 class ClusterSettings(BaseSettings):
     """What every process of a cluster is told; each an environment variable ``ENVMATTE_…`` and a line in ``.env``."""
 
-    model_config = SettingsConfigDict(env_prefix="ENVMATTE_", env_file=".env", extra="ignore", frozen=True)
+    model_config = SettingsConfigDict(
+        env_prefix="ENVMATTE_",
+        env_file=".env",
+        env_ignore_empty=True,  # as compose passes on what is not set
+        extra="ignore",
+        frozen=True,
+    )
 
     data: Path = Field(Path("envmatte-data"), description="Folder of the database and of everything stored.")
     cluster: str | None = Field(

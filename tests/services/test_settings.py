@@ -25,6 +25,15 @@ def test_the_environment_and_env_lines_are_read(monkeypatch: pytest.MonkeyPatch)
     assert Settings(workers=1).workers == 1
 
 
+def test_what_is_empty_is_not_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    unset = Settings()
+    Path(".env").write_text("ENVMATTE_STORE=\n")
+    for name in Settings.model_fields:
+        monkeypatch.setenv(f"ENVMATTE_{name.upper()}", "")
+    assert Settings() == unset
+    assert unset.webhook_secret is None
+
+
 def test_paths_with_odd_names_make_urls_that_lead_back(tmp_path: Path) -> None:
     settings = Settings(data=tmp_path / "a folder, 100 % ä")
     assert settings.store_url.startswith("file:///")
