@@ -81,6 +81,14 @@ def demand(caller: Caller, scope: str) -> None:
         )
 
 
+def is_open(settings: Settings, engine: Engine) -> bool:
+    """Whether there is no key, so that anyone may do everything."""
+    if settings.keys:
+        return False
+    with reading(engine) as c:
+        return not keys.any_was_made(c)
+
+
 def see_that_it_is_closed(settings: Settings, engine: Engine) -> None:
     """See that a service without a key listens on loopback alone.
 
@@ -88,11 +96,8 @@ def see_that_it_is_closed(settings: Settings, engine: Engine) -> None:
     ------
     InvalidInput
     """
-    if is_loopback(settings.host) or settings.keys:
+    if is_loopback(settings.host) or not is_open(settings, engine):
         return
-    with reading(engine) as c:
-        if keys.any_was_made(c):
-            return
     raise InvalidInput(
         f"asked to listen on {settings.host} without a key, where anyone on the network could use the service: make "
         "one with `envmatte keys make NAME`, set ENVMATTE_KEYS to one or more keys, separated by commas, or listen on "

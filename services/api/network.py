@@ -5,6 +5,7 @@ import socket
 from fastapi import APIRouter, Request
 from pydantic import BaseModel, Field
 
+from services.api.access import is_open
 from services.api.context import Needs
 from services.settings import is_loopback
 
@@ -26,12 +27,12 @@ def get_network(context: Needs, request: Request) -> Network:
     """The address of the web app for other devices of the local network, or why there is none."""
     host, port = context.settings.host, request.scope["server"][1]
     if is_loopback(host):
-        start = "envmatte serve --host 0.0.0.0"
-        if not context.settings.keys:
-            start = f"ENVMATTE_KEYS=KEY {start}"
+        engine = request.app.state.context.engine  # the caller's shows no keys
+        key = "make a key with `envmatte keys make NAME`, and " if is_open(context.settings, engine) else ""
         return Network(
             url=None,
-            problem=f"The service listens on {host} alone, where no other device can reach it: start it as `{start}`",
+            problem=f"The service listens on {host} alone, where no other device can reach it: {key}start it as "
+            "`envmatte serve --host 0.0.0.0`",
         )
     if host in ANY:
         own = _own_address()
