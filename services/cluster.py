@@ -12,8 +12,9 @@ from multiprocessing import forkserver
 from typing import Any
 
 import dask
-from distributed import Client, LocalCluster
+from distributed import Client, LocalCluster, Scheduler
 from distributed.comm import connect as open_comm
+from distributed.scheduler import DEFAULT_EXTENSIONS
 from distributed.security import Security
 from distributed.utils import get_mp_context
 from tornado.ioloop import IOLoop
@@ -57,6 +58,27 @@ CONFIG: dict[str, Any] = {
 NO_DASHBOARD: dict[str, Any] = {"dashboard": False, "dashboard_address": "127.0.0.1:0"}
 """For whoever starts a scheduler or a worker."""
 
+
+class _NoSpans:
+    """In place of the scheduler's extension for spans, which has a record of every burst of tasks, for ever.
+
+    Workers too count by the span, and so by one alone then.
+    """
+
+    def __init__(self, scheduler: Scheduler) -> None:
+        pass
+
+    def observe_tasks(self, *tasks: object, **about: object) -> dict[str, Any]:
+        """Put tasks into no span: no annotation of theirs changes."""
+        return {}
+
+    def heartbeat(self, worker: object, data: object) -> None:
+        """Leave what a worker has counted uncounted."""
+
+
+SCHEDULER: dict[str, Any] = NO_DASHBOARD | {"extensions": DEFAULT_EXTENSIONS | {"spans": _NoSpans}}
+"""For whoever starts a scheduler."""
+
 dask.config.set(
     CONFIG
 )  # here, and so before any of them is made in whatever process; nannies hand it on to workers
@@ -83,7 +105,7 @@ def embedded(settings: Settings) -> Iterator[LocalCluster]:
         processes=True,
         host="127.0.0.1",
         dashboard_address=None,
-        scheduler_kwargs=NO_DASHBOARD,
+        scheduler_kwargs=SCHEDULER,
         local_directory=str(settings.data.resolve() / "scratch"),
         memory_limit=settings.worker_memory,
         silence_logs=30,

@@ -6,7 +6,7 @@ from contextlib import asynccontextmanager
 from distributed import Scheduler
 
 from services.certs import security_of
-from services.cluster import NO_DASHBOARD
+from services.cluster import SCHEDULER
 from services.process import keep_open, log
 from services.settings import ClusterSettings, is_loopback
 from storage.errors import Conflict, InvalidInput
@@ -50,7 +50,7 @@ def schedule(settings: ClusterSettings, host: str, port: int) -> None:
                 port=port,
                 protocol="tls" if security else "tcp",
                 security=security,
-                **NO_DASHBOARD,
+                **SCHEDULER,
             )
         except RuntimeError as error:
             if not isinstance(error.__cause__, OSError):

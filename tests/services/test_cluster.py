@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 
 import psutil
 import pytest
-from distributed import Client
+from distributed import Client, Scheduler, Worker
 from distributed.comm import connect as open_comm
 from distributed.scheduler import KilledWorker
 from distributed.security import Security
@@ -188,6 +188,31 @@ def test_workers_join_a_scheduler_that_was_killed(cluster: Cluster, client: Clie
             wait(lambda again=again: len(again.nthreads()) == WORKERS)
             assert again.submit(sum, [1, 2]).result(60) == 3
     assert busy.status != "finished"
+
+
+def test_of_tasks_that_are_over_no_more_is_kept_than_a_hundred(cluster: Cluster, client: Client) -> None:
+    """Each alone, as the tiles of a job are that is done last."""
+
+    def kept(dask_scheduler: Scheduler) -> int:
+        import gc
+
+        from distributed.scheduler import TaskGroup
+
+        gc.collect()
+        return sum(type(one) is TaskGroup for one in gc.get_objects())
+
+    def counted(dask_worker: Worker) -> int:
+        return len(dask_worker.digests_total)
+
+    def bursts(number: int) -> None:
+        for _ in range(number):
+            assert client.submit(pow, 2, 3, pure=False).result(timeout=60) == 8
+
+    bursts(1)
+    before = sum(client.run(counted).values())
+    bursts(150)
+    wait(lambda: client.run_on_scheduler(kept) < 110)
+    assert sum(client.run(counted).values()) < before + 50
 
 
 def test_memory_has_an_end_and_a_task_that_takes_it_all_is_blamed_at_once(
