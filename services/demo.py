@@ -1,7 +1,9 @@
 """`envmatte demo`: the whole way of a capture, from a glass ball to a composite, on this machine."""
 
+import ctypes
 import io
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -26,6 +28,8 @@ from workflows.tone import from_light, to_light
 WIDTH, HEIGHT = 240, 180
 PANEL = 480, 360
 ERROR_GAIN = 8
+PARENT_DEATH_SIGNAL = 1
+"""PR_SET_PDEATHSIG of prctl(2)."""
 
 
 def run(
@@ -110,7 +114,9 @@ def service(data: Path, workers: int | None) -> Iterator[str]:
     if workers:
         command += ["--workers", str(workers)]
     with (data.parent / "service.log").open("wb") as log:
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=log, text=True, preexec_fn=_end_with_parent
+        )
         try:
             assert process.stdout is not None
             line = process.stdout.readline()
@@ -120,6 +126,12 @@ def service(data: Path, workers: int | None) -> Iterator[str]:
         finally:
             process.terminate()
             process.wait(30)
+
+
+def _end_with_parent() -> None:
+    """Have this process, which was just forked, end by SIGTERM when its parent is killed, where that can be had."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PARENT_DEATH_SIGNAL, signal.SIGTERM)
 
 
 def _side_by_side(panels: dict[str, NDArray[np.float32]]) -> bytes:

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import psutil
 import pytest
 from PIL import Image
 
@@ -21,3 +22,20 @@ def test_the_demo_leaves_its_picture(tmp_path: Path) -> None:
         assert picture.width > 4 * picture.height
     assert sorted(path.name for path in (tmp_path / "kept").iterdir()) == ["backdrop.png", "glass-ball.zip"]
     assert "done" in done.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends a process with its parent")
+def test_the_service_of_one_that_is_killed_ends(tmp_path: Path) -> None:
+    script = (
+        "import sys, time; from pathlib import Path; from services.demo import service\n"
+        "with service(Path(sys.argv[1], 'data'), 1) as url: print(url, flush=True); time.sleep(300)"
+    )
+    command = [sys.executable, "-c", script, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as demo:
+        assert demo.stdout is not None
+        assert demo.stdout.readline().startswith("http://127.0.0.1:")
+        family = psutil.Process(demo.pid).children(recursive=True)
+        assert len(family) > 1
+        demo.kill()
+    _, alive = psutil.wait_procs(family, timeout=60)
+    assert alive == []
