@@ -4,6 +4,7 @@ import base64
 import io
 import json
 import zipfile
+import zlib
 from pathlib import Path
 
 import pytest
@@ -104,6 +105,35 @@ def test_a_film_and_its_record_are_one_zip(desk: Page, service: Service) -> None
                 "border": {"width": 641, "height": 361},
             },
         }
+
+
+def test_a_film_of_gigabytes_is_a_zip_too(desk: Page, service: Service, tmp_path: Path) -> None:
+    """What is between the heads is left out of the page, and a hole in the file here."""
+    size, record = 5 << 30, b"{}"
+    files = [
+        {"name": "film.mp4", "size": size, "crc": 0},
+        {"name": "capture.json", "size": len(record), "crc": zlib.crc32(record)},
+    ]
+    desk.goto(service.url)
+    parts = desk.evaluate(
+        """async (files) => {
+            const { framed } = await import("/web/app/zip.js");
+            const { heads, end } = framed(files);
+            return Promise.all([...heads, end].map(async (part) => [...new Uint8Array(await part.arrayBuffer())]));
+        }""",
+        files,
+    )
+    with (tmp_path / "film.zip").open("w+b") as file:
+        file.write(bytes(parts[0]))
+        file.seek(size, 1)
+        file.write(bytes(parts[1]) + record + bytes(parts[2]))
+        with zipfile.ZipFile(file) as archive:
+            film, told = archive.infolist()
+            assert (film.filename, film.file_size, film.compress_size) == ("film.mp4", size, size)
+            assert told.header_offset == len(parts[0]) + size
+            assert archive.read("capture.json") == record
+            with archive.open("film.mp4") as entry:
+                assert entry.read(4) == bytes(4)
 
 
 def test_frames_are_leafed_through_by_keys(desk: Page, service: Service, ready: tuple[str, str]) -> None:

@@ -1,9 +1,9 @@
 // A ZIP of files that are stored as they are (APPNOTE, sect. 4.3), put together without being read into memory.
-import { Problem } from "./api.js";
-
 const PIECE = 4 << 20; // bytes that are summed at once
-const MOST = 2 ** 32 - 2 ** 16; // bytes of a file: more takes the 64-bit extension
-const SIGNATURES = { local: 0x04034b50, central: 0x02014b50, end: 0x06054b50 };
+const FULL = 2 ** 32 - 1; // stands for a number that is in the extension of 64 bits
+const SHORT = 20; // the version of the format that it takes to read an entry, in tenths
+const LONG = 45; // with that extension
+const SIGNATURES = { local: 0x04034b50, central: 0x02014b50, end: 0x06054b50, end64: 0x06064b50, locator: 0x07064b50 };
 const FIRST_DAY = 0x21; // 1 January 1980: the same files make the same bytes
 
 const TABLE = Uint32Array.from({ length: 256 }, (_, n) => {
@@ -21,33 +21,60 @@ export async function crc32(blob, signal) {
 }
 
 function record(signature, ...fields) {
-  const view = new DataView(new ArrayBuffer(4 + fields.reduce((sum, [bytes]) => sum + bytes, 0)));
-  let at = 4;
+  const view = new DataView(new ArrayBuffer(4 + sum(fields)));
   view.setUint32(0, signature, true);
+  write(view, 4, fields);
+  return view.buffer;
+}
+
+const sum = (fields) => fields.reduce((all, [bytes]) => all + bytes, 0);
+
+function write(view, at, fields) {
   for (const [bytes, value] of fields) {
     if (bytes === 2) view.setUint16(at, value, true);
-    else view.setUint32(at, value, true);
+    else if (bytes === 4) view.setUint32(at, Math.min(value, FULL), true);
+    else view.setBigUint64(at, BigInt(value), true);
     at += bytes;
   }
+}
+
+// What goes into 64 bits of the numbers that are too large for 32 (APPNOTE, sect. 4.5.3).
+function extension(...values) {
+  const long = values.filter((value) => value >= FULL).map((value) => [8, value]);
+  const fields = [[2, 1], [2, sum(long)], ...long];
+  const view = new DataView(new ArrayBuffer(long.length ? sum(fields) : 0));
+  if (long.length) write(view, 0, fields);
   return view.buffer;
+}
+
+// Of files, with `name`, of ASCII, `size` and `crc`: the heads that stand before each, and the end that follows the last.
+export function framed(files) {
+  const heads = [];
+  const directory = [];
+  let at = 0;
+  for (const { name, size, crc } of files) {
+    const [local, central] = [extension(size, size), extension(size, size, at)];
+    const version = (more) => [2, more.byteLength ? LONG : SHORT];
+    const about = (more) => [version(more), [2, 0], [2, 0], [2, 0], [2, FIRST_DAY], [4, crc], [4, size], [4, size], [2, name.length], [2, more.byteLength]];
+    const head = new Blob([record(SIGNATURES.local, ...about(local)), name, local]);
+    directory.push(record(SIGNATURES.central, version(central), ...about(central), [2, 0], [2, 0], [2, 0], [4, 0], [4, at]), name, central);
+    heads.push(head);
+    at += head.size + size;
+  }
+  const { size } = new Blob(directory);
+  const count = files.length;
+  if (at >= FULL) {
+    directory.push(record(SIGNATURES.end64, [8, 44], [2, LONG], [2, LONG], [4, 0], [4, 0], [8, count], [8, count], [8, size], [8, at]));
+    directory.push(record(SIGNATURES.locator, [4, 0], [8, at + size], [4, 1]));
+  }
+  const end = record(SIGNATURES.end, [2, 0], [2, 0], [2, count], [2, count], [4, size], [4, at], [2, 0]);
+  return { heads, end: new Blob([...directory, end]) };
 }
 
 // `files` are pairs of a name, of ASCII, and a Blob.
 export async function zip(files, signal) {
-  const parts = [];
-  const directory = [];
-  let at = 0;
-  for (const [name, blob] of files) {
-    if (at + blob.size > MOST) {
-      throw new Problem({ status: 413, title: "Too large", detail: "The film has more than 4 GB: make it smaller, or put it into a ZIP with its capture.json by another tool." });
-    }
-    const about = [[2, 0], [2, 0], [2, 0], [2, FIRST_DAY], [4, await crc32(blob, signal)], [4, blob.size], [4, blob.size], [2, name.length], [2, 0]];
-    const head = record(SIGNATURES.local, [2, 20], ...about);
-    parts.push(head, name, blob);
-    directory.push(record(SIGNATURES.central, [2, 20], [2, 20], ...about, [2, 0], [2, 0], [2, 0], [4, 0], [4, at]), name);
-    at += head.byteLength + name.length + blob.size;
-  }
-  const size = new Blob(directory).size;
-  const end = record(SIGNATURES.end, [2, 0], [2, 0], [2, files.length], [2, files.length], [4, size], [4, at], [2, 0]);
-  return new Blob([...parts, ...directory, end], { type: "application/zip" });
+  const told = [];
+  for (const [name, blob] of files) told.push({ name, size: blob.size, crc: await crc32(blob, signal) });
+  const { heads, end } = framed(told);
+  return new Blob([...files.flatMap(([, blob], n) => [heads[n], blob]), end], { type: "application/zip" });
 }
