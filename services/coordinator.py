@@ -20,7 +20,7 @@ from sqlalchemy import Connection, Engine, Row
 
 from services.dispatch import Dispatcher
 from services.drive import Drive, end_badly
-from services.housekeeping import count, forget_expired, remove, sweep
+from services.housekeeping import count, forget_expired, forget_jobs, remove, sweep
 from services.kinds import KINDS
 from services.process import about
 from services.settings import Settings
@@ -40,6 +40,8 @@ SETTLE = 0.25
 """Seconds between two writes of progress, whatever the number of jobs and tiles."""
 DYING = 1.2
 """Seconds after which no worker works on a job any more that was cancelled, see `services.preload`."""
+FORGET = 30.0
+"""Seconds between two looks for jobs that are kept no longer."""
 SWEEP = 3600.0
 """Seconds between two sweeps of the store."""
 
@@ -66,7 +68,7 @@ class Coordinator:
         self._leaving: deque[tuple[float, Row[Any]]] = deque()
         """When what ended jobs wrote is removed: a time, and the job's row."""
         self._troubles: Counter[str] = Counter()
-        self._beat_at = self._swept_at = self._settled_at = self._read_at = -1e9
+        self._beat_at = self._forgot_at = self._swept_at = self._settled_at = self._read_at = -1e9
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="coordinator")
         self._house = ThreadPoolExecutor(1, thread_name_prefix="housekeeping")
@@ -125,6 +127,10 @@ class Coordinator:
             expired = forget_expired(c)
         for path in expired:
             self._house.submit(_logged, remove, self._objects, path)
+        if now - self._forgot_at > FORGET:
+            self._forgot_at = now
+            kept = self._settings.job_seconds
+            self._house.submit(_logged, forget_jobs, self._engine, self._objects, kept)
         if now - self._swept_at > SWEEP:
             self._swept_at = now
             self._house.submit(_logged, sweep, self._engine, self._objects)

@@ -2,9 +2,10 @@
 
 import logging
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 
-from sqlalchemy import Connection, Engine, delete, select, update
+from sqlalchemy import Connection, Engine, delete, exists, select, update
 
 from services.kinds import may_be_retried
 from storage import captures, composites, database, jobs, mattes, uploads
@@ -15,6 +16,8 @@ logger = logging.getLogger(__name__)
 
 KEPT = 3600.0
 """Seconds for which what nothing refers to is left alone: someone may be about to write down that it is there."""
+MOST = 1000
+"""Rows that are deleted in one transaction: others wait for it."""
 
 
 def forget_expired(connection: Connection) -> list[str]:
@@ -35,6 +38,40 @@ def forget_expired(connection: Connection) -> list[str]:
             connection.execute(delete(table).where(table.c.id.in_(found)))
             gone += [path(one) for one in sorted(found) for path in where]
     return gone
+
+
+def forget_jobs(engine: Engine, objects: Objects, seconds: float | None) -> None:
+    """Delete some of the jobs that are kept no longer, and the Idempotency-Keys of what is gone.
+
+    With a job go its tiles and its log, and the video of a composite, of which it is the only record. An ingest stays
+    as long as its capture, a recovery as long as its matte.
+
+    Parameters
+    ----------
+    seconds : float, optional
+        How long jobs are kept after they have ended; for ever if None.
+    """
+    job, key = database.jobs, database.made
+    of_capture = exists().where(database.captures.c.id == job.c.capture)
+    of_matte = exists().where(database.mattes.c.id == job.c.matte)
+    in_use = ((job.c.kind == "ingest") & of_capture) | ((job.c.kind == "recover") & of_matte)
+    made = [exists().where(table.c.id == key.c.id) for table in (database.captures, database.mattes, job)]
+    gone = select(key.c.id).where(*(~one for one in made)).limit(MOST)
+    with reading(engine) as c:  # nobody waits while it looks through all of them
+        keys = c.scalars(gone).all()
+        jobs_over: Sequence[str] = ()
+        over = job.c.finished_at <= time.time() - (seconds or 0)
+        if seconds is not None:
+            jobs_over = c.scalars(select(job.c.id).where(over, ~in_use).limit(MOST)).all()
+    if not (keys or jobs_over):
+        return
+    with writing(engine) as c:
+        c.execute(delete(key).where(key.c.id.in_(keys)))
+        # One that was tried again meanwhile has not ended.
+        deleted = delete(job).where(job.c.id.in_(jobs_over), over).returning(job.c.id, job.c.kind)
+        composed = [row.id for row in c.execute(deleted) if row.kind == "composite"]
+    for one in composed:
+        remove(objects, composites.path(one))
 
 
 def remove(objects: Objects, path: str) -> None:

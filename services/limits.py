@@ -43,6 +43,7 @@ UNITS: dict[str, Unit] = {
     "upload_seconds": "seconds",
     "capture_seconds": "seconds",
     "matte_seconds": "seconds",
+    "job_seconds": "seconds",
 }
 """The settings that are limits."""
 

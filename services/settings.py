@@ -139,6 +139,12 @@ class Settings(ClusterSettings):
         ge=1,
         description="How long a matte is kept from when it was asked for. Default: until it is deleted.",
     )
+    job_seconds: int | None = Field(
+        None,
+        ge=1,
+        description="How long a job is kept after it has ended, with its log, and the video of a composite; that of an "
+        "ingest or a recovery at least as long as the capture or the matte. Default: until it is deleted.",
+    )
     capture_frames: int = Field(20_000, ge=1, description="Frames of a capture.")
     capture_pixels: int = Field(100_000_000, ge=1, description="Pixels of a frame of a capture.")
     owner_captures: int | None = Field(

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from sqlalchemy import Engine, select, update
 
-from services.housekeeping import count, forget_expired
+from services.housekeeping import count, forget_expired, forget_jobs
 from storage import captures, composites, counts, database, jobs, mattes, uploads
 from storage.database import open_engine, reading, writing
 from storage.objects import Objects
@@ -95,6 +95,69 @@ def test_what_is_being_made_or_unmade_stays(engine: Engine) -> None:
         for row in jobs.active(c):
             jobs.cancel(c, row.id)
         assert forget_expired(c) == []
+
+
+def ended_long_ago(engine: Engine) -> None:
+    with writing(engine) as c:
+        for row in c.execute(select(database.jobs)).all():
+            if row.finished_at is not None:
+                jobs.change(c, row.id, finished_at=row.finished_at - 100)
+
+
+def listed(engine: Engine) -> set[str]:
+    with reading(engine) as c:
+        return set(c.scalars(select(database.jobs.c.id)))
+
+
+def test_a_job_leaves_after_a_time_and_not_before_what_it_made(engine: Engine, objects: Objects) -> None:
+    add(engine, "alice", "kept")
+    add(engine, "bob", "gone")
+    with writing(engine) as c:
+        composite = jobs.add(c, "composite", "kept", {}, "kept", job="composite")
+        failed = jobs.add(c, "composite", "kept", {}, "kept", job="failed")
+        queued = jobs.add(c, "recover", "gone", {}, "gone", job="queued")
+        jobs.lay_down(c, composite, {"tiles": 3})
+        jobs.end(c, composite, "succeeded")
+        jobs.end(c, failed, "failed", {"detail": "", "status": 500})
+        captures.forget(c, "gone")
+        mattes.forget(c, "gone")
+    objects.put(composites.video_path(composite), b"video")
+    everything = {"kept-i", "kept-r", "gone-i", "gone-r", composite, failed, queued}
+    ended_long_ago(engine)
+    forget_jobs(engine, objects, None)
+    forget_jobs(engine, objects, 3600)
+    assert listed(engine) == everything
+    with writing(engine) as c:
+        jobs.retry(c, failed)
+    forget_jobs(engine, objects, 60)
+    assert listed(engine) == {"kept-i", "kept-r", failed, queued}
+    assert objects.below("composites") == set()
+    with reading(engine) as c:
+        for table in (database.tiles, database.log):
+            assert set(c.scalars(select(table.c.job))) <= listed(engine)
+
+
+def test_a_key_is_kept_as_long_as_what_it_made(engine: Engine, objects: Objects) -> None:
+    add(engine, "alice", "thing")
+    with writing(bound(engine, "alice")) as c:
+        for key, made in (("capture", "thing"), ("job", "thing-r"), ("gone", "another")):
+            jobs.remember(c, key, "POST", made)
+    forget_jobs(engine, objects, None)
+
+    def known() -> list[str | None]:
+        with reading(bound(engine, "alice")) as c:
+            return [jobs.made_by(c, key, "POST") for key in ("capture", "job", "gone")]
+
+    assert known() == ["thing", "thing-r", None]
+    with writing(engine) as c:
+        jobs.forget(c, "thing-r")
+        captures.forget(c, "thing")
+    forget_jobs(engine, objects, None)
+    assert known() == ["thing", None, None]  # the matte of this name is there
+    with writing(engine) as c:
+        mattes.forget(c, "thing")
+    forget_jobs(engine, objects, None)
+    assert known() == [None, None, None]
 
 
 def test_bytes_are_counted_once_a_thing_is_whole(engine: Engine, objects: Objects) -> None:
