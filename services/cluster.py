@@ -48,6 +48,9 @@ CONFIG: dict[str, Any] = {
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": 0.95,
     "distributed.worker.multiprocessing-method": "forkserver",
+    # The last messages of every connection and the last bursts of tasks, which nobody looks at; a thousand by default.
+    "distributed.admin.low-level-log-length": 100,
+    "distributed.diagnostics.computations.max-history": 10,
     "distributed.comm.timeouts.connect": "10 s",
     "distributed.comm.timeouts.tcp": "15 s",
     # Every scheduler and worker has an HTTP server, which can't be left out and knows no TLS: it serves nothing, and

@@ -15,7 +15,7 @@ from services.api.access import see_that_it_is_closed
 from services.cluster import dispatcher_of
 from services.connections import Connection, allow_many
 from services.coordinator import Coordinator
-from services.process import log
+from services.process import log, share_memory
 from services.settings import Settings
 from services.webhooks import Sender
 from storage.database import open_engine
@@ -81,6 +81,7 @@ def _opened(settings: Settings, role: str) -> Iterator[tuple[ExitStack, Engine, 
     """The database and the store, and a stack that is unwound before they are closed."""
     # uvicorn raises the signal that stopped it once more at its end: what is open here must close before we go.
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))
+    share_memory()
     log(settings.log, settings.log_level, role)
     tracing.start(role)
     settings.data.mkdir(parents=True, exist_ok=True)
