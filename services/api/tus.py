@@ -18,6 +18,8 @@ EXTENSIONS = "creation,creation-with-upload,checksum,expiration,termination"
 ALGORITHMS = ("sha1", "sha256")
 CHUNK = "application/offset+octet-stream"
 METADATA_BYTES = 8192
+DECLARED = ("frames", "width", "height")
+"""Names by which a client may say how many frames a capture has, and of how many pixels."""
 
 
 class Protocol:
@@ -129,6 +131,25 @@ def metadata_of(request: Request) -> str:
     if len({key for key, _, _ in pairs} - {""}) < len(pairs):
         raise BadHeader("Upload-Metadata: a key is empty, or there twice", field="Upload-Metadata")
     return text
+
+
+def declared(metadata: str) -> dict[str, int]:
+    """What an ``Upload-Metadata`` that `metadata_of` has checked says of a capture's frames, by `DECLARED` names.
+
+    Raises
+    ------
+    BadHeader
+        If it is no number from 0 to 10**18 - 1.
+    """
+    pairs = (pair.strip().partition(" ") for pair in metadata.split(","))
+    texts = {name: base64.b64decode(value) for name, _, value in pairs if name in DECLARED}
+    for name, text in texts.items():
+        if not (text.isdigit() and len(text) <= 18):
+            raise BadHeader(
+                f"Upload-Metadata: {name} is {text!r}; send a number, or leave it out",
+                field="Upload-Metadata",
+            )
+    return {name: int(text) for name, text in texts.items()}
 
 
 def _base64(text: str, name: str) -> bytes:

@@ -17,11 +17,12 @@ from services.api.tus import (
     EXTENSIONS,
     Checksum,
     check_media_type,
+    declared,
     metadata_of,
     number,
     version_spoken,
 )
-from services.limits import admit_upload
+from services.limits import admit_upload, see_that_frames_may
 from storage import captures, uploads
 from storage.database import new_id, reading, writing
 from storage.errors import InvalidInput, NotFound
@@ -48,7 +49,11 @@ async def create_upload(
     request: Request,
     idempotency_key: Annotated[str | None, Header(max_length=256)] = None,
 ) -> Response:
-    """Start an upload of `Upload-Length` bytes; the body may be the first of them."""
+    """Start an upload of `Upload-Length` bytes; the body may be the first of them.
+
+    `frames`, `width` and `height` in `Upload-Metadata`, where a client knows them of a capture, are held against the
+    limits before any byte comes. What does come is checked all the same.
+    """
     length = number(request, "Upload-Length")
     if length > context.settings.upload_bytes:
         raise too_large(context.settings.upload_bytes, length)
@@ -57,6 +62,7 @@ async def create_upload(
     if with_body:
         check_media_type(request)
     metadata = metadata_of(request)
+    see_that_frames_may(context.settings, **declared(metadata))
     row, new = await anyio.to_thread.run_sync(_create, context, length, metadata, idempotency_key)
     if with_body and new:
         row = await _append(context, request, row, checksum)

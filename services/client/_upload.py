@@ -40,12 +40,15 @@ def send(
     be remembered here.
     """
     from services.client import _transport
+    from services.client._declared import declared
 
     state = file.stat()
     size = state.st_size
     mark = f"{file.resolve()} {size} {state.st_mtime_ns}"
     key = hashlib.sha256(mark.encode(errors="surrogateescape")).hexdigest()
     create = TUS | {"Upload-Length": str(size), "Idempotency-Key": key}
+    if told := declared(file):
+        create["Upload-Metadata"] = ",".join(f"{name} {_base64(str(one))}" for name, one in told.items())
     where, offset, step, pause = "", -1, LARGEST, _transport.FIRST_PAUSE
     give_up = time.monotonic() + _transport.PATIENCE
 
@@ -93,3 +96,7 @@ def _patch(http: "Transport", where: str, offset: int, data: bytes) -> "httpx2.R
         "Upload-Checksum": f"sha256 {digest}",
     }
     return http.once("PATCH", where, headers=headers, content=data)
+
+
+def _base64(text: str) -> str:
+    return base64.b64encode(text.encode()).decode()

@@ -7,13 +7,14 @@ import zipfile
 import zlib
 from pathlib import Path
 
+import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
 from tests.browser.pages import MINUTE, ZIP
 from tests.end_to_end.conftest import BANDS, Service
 from tests.workflows.ingest.camera import Camera, film, lights
-from workflows import simulate
+from workflows import images, simulate
 from workflows.program import Program
 from workflows.scene import nested_program
 
@@ -134,6 +135,50 @@ def test_a_film_of_gigabytes_is_a_zip_too(desk: Page, service: Service, tmp_path
             assert archive.read("capture.json") == record
             with archive.open("film.mp4") as entry:
                 assert entry.read(4) == bytes(4)
+
+
+def test_what_a_zip_says_of_its_frames_is_told_before_it_is_sent(
+    desk: Page, service: Service, ball: Path, tmp_path: Path
+) -> None:
+    packed, jpeg, film = (tmp_path / name for name in ("packed.zip", "jpeg.zip", "film.zip"))
+    record = {"frames": [{"file": "ä.jpg", "pattern": 0}] * 3}
+    parts = [
+        {"kind": "constant", "levels": [0, 1]},
+        {"kind": "bernoulli", "columns": 8, "rows": 6, "count": 16, "seed": 1},
+    ]
+    filmed = {"program": {"parts": parts}, "video": {"file": "film.mp4"}}
+    with zipfile.ZipFile(ball) as given, zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as made:
+        for name in given.namelist():
+            made.writestr(name, given.read(name))
+    for path, about in ((jpeg, record), (film, filmed)):
+        with zipfile.ZipFile(path, "w") as made:
+            made.writestr("capture.json", json.dumps(about))
+            made.writestr("ä.jpg", images.encode_jpeg(np.zeros((33, 70, 3), np.uint8), 90))
+    (tmp_path / "none.zip").write_bytes(b"PK and nothing more")
+    of_ball = {"frames": len(json.loads(zipfile.ZipFile(ball).read("capture.json"))["frames"])}
+    of_ball |= {"width": 96, "height": 72}
+    desk.goto(service.url)
+    for path, told in (
+        (ball, of_ball),
+        (packed, of_ball),
+        (jpeg, {"frames": 3, "width": 70, "height": 33}),
+        (film, {"frames": 18}),
+        (tmp_path / "none.zip", {}),
+    ):
+        found = desk.evaluate(
+            """async (data) => {
+                const { declared } = await import("/web/app/declared.js");
+                return declared(new Blob([Uint8Array.from(atob(data), (one) => one.charCodeAt(0))]));
+            }""",
+            base64.b64encode(path.read_bytes()).decode(),
+        )
+        assert found == told, path
+    with desk.expect_request(
+        lambda request: request.method == "POST" and request.url.endswith("/uploads")
+    ) as sent:
+        desk.get_by_label(ZIP).set_input_files(packed)
+    said = dict(pair.split(" ") for pair in (sent.value.header_value("upload-metadata") or "").split(","))
+    assert {name: int(base64.b64decode(value)) for name, value in said.items()} == of_ball
 
 
 def test_frames_are_leafed_through_by_keys(desk: Page, service: Service, ready: tuple[str, str]) -> None:

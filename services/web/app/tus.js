@@ -1,5 +1,6 @@
 // Resumable uploads by tus 1.0 (https://tus.io/protocols/resumable-upload).
 import { Problem, ask, authorization } from "./api.js";
+import { declared } from "./declared.js";
 import { pause } from "./dom.js";
 
 const PART = 8 << 20; // bytes of a request: the service takes 10,000 of them
@@ -50,7 +51,9 @@ export async function send(file, remembered, { signal, progress, waiting }) {
     try {
       if (lost) offset = await offsetOf(id, signal);
       if (!id) {
-        const answer = await ask("v1/uploads", { method: "POST", headers: { ...TUS, "Upload-Length": file.size }, signal });
+        const told = Object.entries(await declared(file)).map(([name, value]) => `${name} ${btoa(value)}`);
+        const headers = { ...TUS, "Upload-Length": file.size, ...(told.length && { "Upload-Metadata": told.join(",") }) };
+        const answer = await ask("v1/uploads", { method: "POST", headers, signal });
         id = answer.headers.get("Location").split("/").at(-1);
         localStorage.setItem(remembered, id);
       }

@@ -1,5 +1,6 @@
 """Limits: refused before a byte is taken, and told with their names: the app, a real ledger and a real store."""
 
+import base64
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -194,6 +195,26 @@ def test_frames_of_a_capture(serve: Serve, bundle: bytes, tmp_path: Path) -> Non
     refused(client.post("/v1/captures", json=body), 413, "capture_frames", 17, 18)
     assert files(tmp_path) == []  # it would be refused again
     assert serve(capture_frames=18).post("/v1/captures", content=bundle, headers=ZIP).status_code == 201
+
+
+def test_frames_that_are_declared_are_refused_before_they_come(serve: Serve, tmp_path: Path) -> None:
+    client = serve(capture_frames=17, capture_pixels=384)
+
+    def declaring(**told: object) -> Any:
+        pairs = (f"{name} {base64.b64encode(str(value).encode()).decode()}" for name, value in told.items())
+        return client.post(
+            "/v1/uploads", headers=TUS | {"Upload-Length": "10", "Upload-Metadata": ", ".join(pairs)}
+        )
+
+    refused(declaring(frames=18), 413, "capture_frames", 17, 18)
+    refused(declaring(filename="a.zip", width=25, height=16), 413, "capture_pixels", 384, 400)
+    for wrong in ("many", "", "-1", "9" * 19, "٣"):
+        answer = declaring(frames=wrong)
+        assert (answer.status_code, answer.json()["field"]) == (400, "Upload-Metadata")
+    assert files(tmp_path) == []
+    assert used(client)["owner_captures"] == 0
+    for fine in ({"frames": 17, "width": 24, "height": 16}, {"width": 9999}, {"frame": 99}):
+        assert declaring(**fine).status_code == 201
 
 
 def test_when_it_expires_is_told(serve: Serve, bundle: bytes, engine: Engine) -> None:

@@ -1,0 +1,58 @@
+"""What a capture's archive says of its frames: the service refuses too many, or too large ones, before they come."""
+
+import json
+import struct
+import zipfile
+from pathlib import Path
+from typing import IO, Any
+
+RECORD = "capture.json"
+RECORD_BYTES = 8 << 20
+HEAD = 1 << 16
+"""Bytes of an image in which its size stands; one that is preceded by more is left out."""
+PNG = b"\x89PNG\r\n\x1a\n"
+SIZES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
+"""Markers of JPEG that a frame's size follows (ITU-T T.81, table B.1)."""
+
+
+def declared(file: Path) -> dict[str, int]:
+    """``frames`` of a capture, and ``width`` and ``height`` of the first if that is PNG or JPEG.
+
+    What can't be told is left out: what is wrong with a file the service says better.
+    """
+    found: dict[str, int] = {}
+    try:
+        with zipfile.ZipFile(file) as archive:
+            if archive.getinfo(RECORD).file_size > RECORD_BYTES:
+                return found
+            record = json.loads(archive.read(RECORD))
+            frames = record.get("frames") or []
+            found["frames"] = len(frames) or sum(map(_patterns, record["program"]["parts"]))
+            if frames:
+                with archive.open(frames[0]["file"]) as image:
+                    found |= _size(image)
+    except Exception:
+        pass
+    return found
+
+
+def _patterns(part: dict[str, Any]) -> int:
+    """How many a part of a program has."""
+    for name in ("levels", "colours", "files"):
+        if part.get(name):
+            return len(part[name])
+    return int(part["count"])
+
+
+def _size(image: IO[bytes]) -> dict[str, int]:
+    head = image.read(HEAD)
+    if head.startswith(PNG):
+        width, height = struct.unpack_from(">II", head, 16)
+        return {"width": width, "height": height}
+    if head.startswith(b"\xff\xd8"):
+        at = 2
+        while head[at + 1] not in SIZES:
+            at += 2 + struct.unpack_from(">H", head, at + 2)[0]
+        height, width = struct.unpack_from(">HH", head, at + 5)
+        return {"width": width, "height": height}
+    return {}

@@ -1,0 +1,65 @@
+// What a capture's ZIP says of its frames, for the service to refuse too many or too large ones before they come.
+const END = 0x06054b50; // signatures of APPNOTE, sect. 4.3
+const ENTRY = 0x02014b50;
+const TAIL = 22 + 65535; // bytes in which the end begins
+const FULL = 2 ** 32 - 1; // a number of 64 bits, elsewhere
+const RECORD = "capture.json";
+const MOST = 8 << 20; // bytes of that
+const HEAD = 1 << 16; // bytes of an image in which its size stands
+const PNG = 0x89504e47; // how images begin
+const JPEG = 0xffd8;
+
+const view = async (blob) => new DataView(await blob.arrayBuffer());
+
+// The entries of a ZIP by name; none, of one that goes beyond 32 bits.
+async function entries(file) {
+  const tail = await view(file.slice(-TAIL));
+  let at = tail.byteLength - 22;
+  while (tail.getUint32(at, true) !== END) at -= 1;
+  const start = tail.getUint32(at + 16, true);
+  if (start === FULL) return {};
+  const directory = await view(file.slice(start, start + tail.getUint32(at + 12, true)));
+  const found = {};
+  for (let n = 0; n < directory.byteLength && directory.getUint32(n, true) === ENTRY; ) {
+    const [name, extra, comment] = [28, 30, 32].map((field) => directory.getUint16(n + field, true));
+    const text = new TextDecoder().decode(new Uint8Array(directory.buffer, n + 46, name));
+    found[text] = { method: directory.getUint16(n + 10, true), size: directory.getUint32(n + 20, true), at: directory.getUint32(n + 42, true) };
+    n += 46 + name + extra + comment;
+  }
+  return found;
+}
+
+async function read(file, { method, size, at }) {
+  const head = await view(file.slice(at, at + 30));
+  const start = at + 30 + head.getUint16(26, true) + head.getUint16(28, true);
+  const packed = file.slice(start, start + size);
+  return method ? new Response(packed.stream().pipeThrough(new DecompressionStream("deflate-raw"))).blob() : packed;
+}
+
+const patterns = ({ levels, colours, files, count }) => (levels ?? colours ?? files)?.length ?? count;
+
+// Of an image by its first bytes, PNG or JPEG (ITU-T T.81, table B.1).
+function sizeOf(head) {
+  if (head.getUint32(0) === PNG) return { width: head.getUint32(16), height: head.getUint32(20) };
+  if (head.getUint16(0) !== JPEG) return {};
+  let at = 2;
+  while ((head.getUint8(at + 1) & 0xf0) !== 0xc0 || [0xc4, 0xc8, 0xcc].includes(head.getUint8(at + 1))) at += 2 + head.getUint16(at + 2);
+  return { width: head.getUint16(at + 7), height: head.getUint16(at + 5) };
+}
+
+// `frames`, and `width` and `height` of the first if that is PNG or JPEG. What can't be told is left out: what is wrong
+// with a file the service says better.
+export async function declared(file) {
+  const told = {};
+  try {
+    const found = await entries(file);
+    if (found[RECORD].size > MOST) return told;
+    const record = JSON.parse(await (await read(file, found[RECORD])).text());
+    told.frames = record.frames?.length || record.program.parts.reduce((sum, part) => sum + patterns(part), 0);
+    if (record.frames?.length) {
+      const image = await read(file, found[record.frames[0].file]);
+      Object.assign(told, sizeOf(await view(image.slice(0, HEAD))));
+    }
+  } catch {}
+  return told;
+}
