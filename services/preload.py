@@ -14,7 +14,7 @@ from distributed.core import Status
 from tornado.ioloop import PeriodicCallback
 
 from services import tracing
-from services.process import about, log_as_nanny_does
+from services.process import about, log_as_nanny_does, share_memory
 
 # Importing the kernels, as this does, takes seconds: not out of the first job's time.
 from services.step import read_key
@@ -32,6 +32,7 @@ NICE = 10
 def dask_setup(worker: Worker) -> None:
     """Log and trace, and watch for tasks that nobody wants any more while they run."""
     os.nice(NICE)  # of this thread, and those that it starts
+    share_memory()
     log_as_nanny_does()
     tracing.start("worker")
     since: dict[str, float] = {}

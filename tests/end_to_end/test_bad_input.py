@@ -8,6 +8,7 @@ import zipfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import BinaryIO
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -19,7 +20,7 @@ from workflows import images
 ZIP = {"Content-Type": "application/zip"}
 
 
-def remade(bundle: Path, change: Callable[[dict, dict[str, bytes]], None]) -> bytes:
+def remade(bundle: Path | BinaryIO, change: Callable[[dict, dict[str, bytes]], None]) -> bytes:
     """A bundle with its capture.json and its files changed."""
     with zipfile.ZipFile(bundle) as archive:
         files = {name: archive.read(name) for name in archive.namelist()}
