@@ -123,8 +123,8 @@ def look(service: Running) -> Sample:
         for one in processes:
             with suppress(psutil.NoSuchProcess):
                 names = threads_of(one)
-                stores = names.count(STORE)
-                held.append((one.memory_full_info().uss / MB, one.num_fds(), len(names) - stores, stores))
+                of_store = names.count(STORE)
+                held.append((one.memory_full_info().uss / MB, one.num_fds(), len(names) - of_store, of_store))
         if held:
             memory, files, threads, stores = zip(*held, strict=True)
             found = {"MB": sum(memory) / len(memory), "files": max(files), "threads": max(threads)}
