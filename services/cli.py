@@ -9,7 +9,7 @@ import sys
 import click
 from click.shell_completion import get_completion_class
 
-from services import making, remote, running
+from services import keeping, making, remote, running
 from services.client import Busy, ServiceError, Unreachable
 from services.keys import keys
 from services.told import example
@@ -34,7 +34,7 @@ def completion(shell: str) -> None:
     click.echo(kind(main, {}, "envmatte", "_ENVMATTE_COMPLETE").source())
 
 
-for command in (*running.COMMANDS, keys, *remote.COMMANDS, *making.COMMANDS):
+for command in (*running.COMMANDS, keys, *keeping.COMMANDS, *remote.COMMANDS, *making.COMMANDS):
     main.add_command(command)
 
 

@@ -7,15 +7,13 @@ from contextlib import suppress
 
 from sqlalchemy import Connection, Engine, delete, exists, select, update
 
-from services.kinds import may_be_retried
-from storage import captures, composites, database, jobs, mattes, uploads
+from storage import captures, composites, contents, database, jobs, mattes, uploads
+from storage.contents import KEPT
 from storage.database import reading, writing
 from storage.objects import Objects
 
 logger = logging.getLogger(__name__)
 
-KEPT = 3600.0
-"""Seconds for which what nothing refers to is left alone: someone may be about to write down that it is there."""
 MOST = 1000
 """Rows that are deleted in one transaction: others wait for it."""
 
@@ -109,25 +107,16 @@ def sweep(engine: Engine, objects: Objects, seconds: float = KEPT) -> None:
         For how long it must not have been written to. 0 is for whoever knows that nobody writes.
     """
     with reading(engine) as c:
-        rows = c.execute(select(database.captures)).all()
-        kept = [row for row in rows if row.state != "failed" or may_be_retried(row.problem)]
-        under_way = {id: uploads.parts_of(c, id) for id in c.scalars(select(database.uploads.c.id))}
-        known = {
-            "captures": {row.id for row in kept},
-            "uploads": {row.id for row in kept if row.state != "ready"} | under_way.keys(),
-            "mattes": set(c.scalars(select(database.mattes.c.id))),
-            "composites": {
-                row.id
-                for row in jobs.composites(c)
-                if row.state != "cancelled" and (row.problem is None or may_be_retried(row.problem))
-            },
-        }
-    for folder, names in known.items():
-        for name in objects.stale(folder, seconds, but={*names, "zarr.json"}):
+        things = list(contents.things(c))
+    known = {thing.folder for thing in things}
+    for folder in contents.FOLDERS:
+        kept = {path.removeprefix(f"{folder}/") for path in known}
+        for name in objects.stale(folder, seconds, but={*kept, "zarr.json"}):
             logger.info("removing %s/%s, which nothing refers to", folder, name)
             objects.delete(f"{folder}/{name}")
     if not seconds:
         objects.sweep("uploads")
         objects.sweep("composites")
-        for upload, parts in under_way.items():
-            uploads.sweep(objects, upload, parts)
+        for thing in things:
+            if thing.kind == "upload":
+                uploads.sweep(objects, thing.id, thing.parts)

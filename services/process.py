@@ -2,6 +2,7 @@
 
 import asyncio
 import ctypes
+import fcntl
 import logging
 import os
 import signal
@@ -10,12 +11,14 @@ import threading
 from collections.abc import Iterator
 from contextlib import AbstractAsyncContextManager, contextmanager, suppress
 from contextvars import ContextVar
+from pathlib import Path
 from types import TracebackType
 
 import dask
 from pythonjsonlogger.core import RESERVED_ATTRS
 from pythonjsonlogger.json import JsonFormatter
 
+from storage.errors import Conflict
 from storage.jobs import name_of
 
 logger = logging.getLogger(__name__)
@@ -42,6 +45,25 @@ def about(job: str, tile: int | None = None) -> Iterator[None]:
         yield
     finally:
         _about.reset(token)
+
+
+@contextmanager
+def sole_user(data: Path) -> Iterator[None]:
+    """Hold a data folder's lock: two services on one folder would drive the same jobs.
+
+    Raises
+    ------
+    Conflict
+        If another holds it.
+    """
+    with (data / "lock").open("a") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise Conflict(
+                f"another envmatte serves {data} already; use it, stop it, or name another folder with --data"
+            ) from error
+        yield
 
 
 def log(form: str, level: str, role: str) -> None:

@@ -1,6 +1,5 @@
 """`envmatte serve`: the API, a coordinator and the cluster in one process tree; and `envmatte coordinator` alone."""
 
-import fcntl
 import signal
 import sys
 from collections.abc import Iterator
@@ -15,11 +14,10 @@ from services.api.access import see_that_it_is_closed
 from services.cluster import dispatcher_of
 from services.connections import Connection, allow_many
 from services.coordinator import Coordinator
-from services.process import log, share_memory
+from services.process import log, share_memory, sole_user
 from services.settings import Settings
 from services.webhooks import Sender
 from storage.database import open_engine
-from storage.errors import Conflict
 from storage.objects import Objects
 
 GRACE = 3
@@ -87,20 +85,7 @@ def _opened(settings: Settings, role: str) -> Iterator[tuple[ExitStack, Engine, 
     settings.data.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         if settings.alone:
-            stack.enter_context(_sole_user(settings))
+            stack.enter_context(sole_user(settings.data))
         engine = open_engine(settings.database_url)
         stack.callback(engine.dispose)
         yield stack, engine, Objects(settings.store_url)
-
-
-@contextmanager
-def _sole_user(settings: Settings) -> Iterator[None]:
-    """Hold the data folder's lock: two services on one folder would drive the same jobs."""
-    with (settings.data / "lock").open("a") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise Conflict(
-                f"another envmatte serves {settings.data} already; use it, stop it, or name another folder with --data"
-            ) from error
-        yield

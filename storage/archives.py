@@ -16,6 +16,7 @@ from itertools import accumulate, product
 from typing import IO, Any, cast
 
 from storage import mattes
+from storage.checksums import is_checked, is_intact, unseal
 from storage.errors import Corrupt
 from storage.mattes import CHANNELS, FRAMES, Matte
 from storage.objects import Objects, together
@@ -62,8 +63,8 @@ class Archive:
     Raises
     ------
     Corrupt
-        If something of the matte is missing; while iterating, also if the matte is deleted meanwhile. What has come
-        by then is no archive: it lacks its directory.
+        If something of the matte is missing; while iterating, also if it is damaged, or deleted meanwhile. What has
+        come by then is no archive: it lacks its directory.
     """
 
     def __init__(self, objects: Objects, matte: str) -> None:
@@ -87,10 +88,14 @@ class Archive:
     def __iter__(self) -> Iterator[bytes]:
         written = _Tail()
         digests: dict[str, str] = {}
+        checked: dict[str, bool] = {}
         archive = zipfile.ZipFile(cast(IO[bytes], written), "w")
         for batch in self._batches:
             for name, data in zip(batch, self._read(batch), strict=True):
-                if len(data) != self._sizes[name]:
+                folder, _, inner = name.rpartition("zarr.json" if name.endswith("zarr.json") else "c/")
+                if not inner:  # it comes before the chunks that it describes
+                    checked[folder] = is_checked(unseal(f"{self._path}/{name}", data)[0])
+                if len(data) != self._sizes[name] or (inner and checked[folder] and not is_intact(data)):
                     raise self._corrupt(name)
                 digests[name] = hashlib.sha256(data).hexdigest()
                 archive.writestr(_entry(name), data)

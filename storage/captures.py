@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, Row, delete, insert, select, update
 from zarr.storage import MemoryStore
 
+from storage.checksums import CODECS
 from storage.database import captures, find, lifetime
 from storage.errors import Corrupt
 from storage.grid import block_edge
@@ -84,16 +85,16 @@ def create_stack(
         shape=shape,
         dtype=dtype,
         chunks=(slab, min(edge, height), min(edge, width), channels),
+        compressors=CODECS,
         dimension_names=("frame", "y", "x", "channel"),
     )
+    whole: dict[str, Any] = {"config": EVERY_CHUNK, "compressors": CODECS}
     if mask is not None:
-        group.create_array("mask", data=mask, config=EVERY_CHUNK, dimension_names=("y", "x"))
+        group.create_array("mask", data=mask, dimension_names=("y", "x"), **whole)
     if shares is not None:
-        group.create_array("shares", data=shares, config=EVERY_CHUNK, dimension_names=("share", "column"))
+        group.create_array("shares", data=shares, dimension_names=("share", "column"), **whole)
     for n, image in enumerate(images):
-        group.create_array(
-            f"images/{n}", data=image, config=EVERY_CHUNK, dimension_names=("row", "column", "channel")
-        )
+        group.create_array(f"images/{n}", data=image, dimension_names=("row", "column", "channel"), **whole)
     objects.put_tree(path(capture), layout)
     return slab
 
@@ -125,11 +126,10 @@ class Stack:
             except FileNotFoundError:
                 return None
 
-        self._group: zarr.Group
         self._frames: zarr.Array[Any]
         self._mask: zarr.Array[Any] | None
         try:
-            self._group, self._frames, self._mask, measured = together(
+            group, self._frames, self._mask, measured = together(
                 objects.group(at),
                 objects.array(f"{at}/frames"),
                 if_there(objects.array(f"{at}/mask")),
@@ -139,7 +139,7 @@ class Stack:
             raise Corrupt(f"capture {capture} is not in the store; upload it again") from error
         self._objects, self._path = objects, at
         self._measured: dict[str, Any] = {} if measured is None else dict(measured.attrs)
-        self.attributes: dict[str, Any] = dict(self._group.attrs) | self._measured
+        self.attributes: dict[str, Any] = dict(group.attrs) | self._measured
         self.frames, self.height, self.width, self.channels = self._frames.shape
         self.dtype = self._frames.dtype
 
@@ -179,11 +179,10 @@ class Stack:
 
     def images(self) -> list[NDArray[np.float32]]:
         """The patterns that came as images, each (rows, columns, 1 or 3) float32."""
-        if "images" not in self._group:
-            return []
+        names = self._objects.names(f"{self._path}/images")
         return [
             np.asarray(self._array(f"images/{n}")[:], np.float32)
-            for n in sorted(int(name) for name in self._group["images"])  # type: ignore[union-attr]
+            for n in sorted(int(name) for name in names if name != "zarr.json")
         ]
 
     def shares(self) -> NDArray[np.int64]:
@@ -212,10 +211,12 @@ class Stack:
         together(self._objects.put_group(f"{self._path}/{MEASURED}", self._measured))
 
     def _array(self, name: str) -> zarr.Array[Any]:
-        array = self._group[name]
-        if not isinstance(array, zarr.Array):
-            raise Corrupt(f"{name} is no array")
-        return array
+        try:
+            (array,) = together(self._objects.array(f"{self._path}/{name}"))
+        except FileNotFoundError as error:
+            raise Corrupt(f"{error} of the capture is not in the store; upload it again") from error
+        found: zarr.Array[Any] = array
+        return found
 
 
 def add(

@@ -92,11 +92,6 @@ def not_wound_up(connection: Connection) -> Sequence[Row[Any]]:
     return connection.execute(query).all()
 
 
-def composites(connection: Connection) -> Sequence[Row[Any]]:
-    """The jobs that have, or had, a clip."""
-    return connection.execute(select(jobs).where(jobs.c.kind == "composite")).all()
-
-
 def clear(connection: Connection, job: str) -> None:
     """Delete the tiles of a job that was cancelled; what is known of it as a whole stays."""
     connection.execute(delete(tiles).where(tiles.c.job == job))

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, Row, delete, insert, update
 from zarr.storage import MemoryStore
 
+from storage.checksums import CODECS
 from storage.database import find, lifetime, mattes
 from storage.errors import Conflict, Corrupt
 from storage.grid import block_edge
@@ -227,23 +228,14 @@ def create(
     group = zarr.create_group(made, attributes=layout | attributes)
     frame, chunk = (height, width), (min(edge, height), min(edge, width))
     dims = ("y", "x", "channel")
-    for name in ("S", "rho"):
+    for name, kind in (("S", "float32"), ("rho", "float32"), ("count", "uint32")):
         group.create_array(
-            name,
-            shape=(*frame, 3),
-            chunks=(*chunk, 3),
-            dtype="float32",
-            dimension_names=dims,
+            name, shape=(*frame, 3), chunks=(*chunk, 3), dtype=kind, compressors=CODECS, dimension_names=dims
         )
-    group.create_array(
-        "count",
-        shape=(*frame, 3),
-        chunks=(*chunk, 3),
-        dtype="uint32",
-        dimension_names=dims,
-    )
     for name, kind in (("error", "float32"), ("recovered", "bool"), ("shared", "bool")):
-        group.create_array(name, shape=frame, chunks=chunk, dtype=kind, dimension_names=dims[:2])
+        group.create_array(
+            name, shape=frame, chunks=chunk, dtype=kind, compressors=CODECS, dimension_names=dims[:2]
+        )
     group.create_group("T")
     objects.put_tree(path(matte), made)
     return Matte(objects, matte)

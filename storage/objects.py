@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import io
-import json
 import shutil
 import threading
 import time
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager, contextmanager, suppress
 from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -24,13 +23,15 @@ from zarr.buffer import default_buffer_prototype
 from zarr.storage import MemoryStore, StorePath, WrapperStore
 from zarr.storage import ObjectStore as ZarrStore
 
+from storage import checksums, plain
+from storage.checksums import CODECS, SUFFIX
 from storage.errors import Corrupt
 from storage.outages import REQUESTS, RETRIES, told
+from storage.plain import PART, Writer
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Collection, Coroutine
+    from collections.abc import AsyncIterator, Collection, Coroutine, Iterable, Iterator
 
-    from obstore import AsyncWritableFile, ReadableFile
     from zarr.abc.store import ByteRequest
     from zarr.core.array_spec import ArrayConfigParams
     from zarr.core.buffer import Buffer, BufferPrototype
@@ -39,8 +40,6 @@ EVERY_CHUNK: ArrayConfigParams = {"write_empty_chunks": True}
 """For whoever makes an array: a chunk of zeros is stored like any other, so that one that is missing is damage."""
 METADATA = ("zarr.json", ".zarray", ".zgroup", ".zattrs", ".zmetadata")
 """Objects that zarr looks for to see whether there is an array or a group: they may be missing."""
-PART = 8 << 20
-"""Bytes of one part of a large object: S3 takes parts of 5 MiB and more."""
 
 
 def together(*work: Coroutine[Any, Any, Any]) -> list[Any]:
@@ -104,23 +103,28 @@ class Objects:
 
         Raises
         ------
-        FileNotFoundError
-            If there is none.
+        FileNotFoundError, Corrupt
+            If there is none, or it is damaged.
         """
-        return zarr.Group(await zarr.AsyncGroup.open(StorePath(self.zarr, path), zarr_format=3))
+        document = checksums.unseal(f"{path}/zarr.json", await self._document(path))[0]
+        with _read_as(path):
+            return zarr.Group(zarr.AsyncGroup.from_dict(StorePath(self.zarr, path), document))
 
     async def array(self, path: str) -> zarr.Array[Any]:
         """The zarr array at a path, to read and to write, for `together`.
 
         Raises
         ------
-        FileNotFoundError
-            If there is none.
+        FileNotFoundError, Corrupt
+            If there is none, or it is damaged.
         """
+        return self._array(path, await self._document(path))
+
+    async def _document(self, path: str) -> bytes:
         document = await self.zarr.get(f"{path}/zarr.json", default_buffer_prototype())
         if document is None:
             raise FileNotFoundError(path)
-        return self._array(path, document.to_bytes())
+        return document.to_bytes()
 
     async def put_group(self, path: str, attributes: dict[str, Any] | None = None) -> None:
         """Make a zarr group at a path, for `together`; what is in it already stays."""
@@ -147,7 +151,7 @@ class Objects:
 
     async def _put_metadata(self, path: str, node: zarr.AsyncGroup | zarr.AsyncArray[Any]) -> None:
         for name, document in node.metadata.to_buffer_dict(default_buffer_prototype()).items():
-            await self.zarr.set(f"{path}/{name}", document)
+            await self.zarr.set(f"{path}/{name}", _sealed(name, document))
 
     def put_tree(self, path: str, tree: MemoryStore) -> None:
         """Write what zarr has laid out in memory below a path; what is there besides stays."""
@@ -157,13 +161,13 @@ class Objects:
             async for name in tree.list():
                 value = await tree.get(name, prototype)
                 assert value is not None
-                await self.zarr.set(f"{path}/{name}", value)
+                await self.zarr.set(f"{path}/{name}", _sealed(name, value))
 
         together(copy())
 
     @asynccontextmanager
-    async def write(self, path: str) -> AsyncIterator[AsyncWritableFile]:
-        """A writer that streams into an object; left by an exception it leaves no object.
+    async def write(self, path: str) -> AsyncIterator[Writer]:
+        """A writer that streams into an object, and leaves its checksums; left by an exception it leaves no object.
 
         Raises
         ------
@@ -174,30 +178,62 @@ class Objects:
         writer = obstore.open_writer_async(self._store, path, buffer_size=PART, max_concurrency=2)
         with told():
             async with writer as file:
-                yield file
+                written = Writer(file)
+                yield written
+            with self._gone_without(path):
+                await obstore.put_async(self._store, path + SUFFIX, written.table.to_bytes())
 
     def read(self, path: str) -> BinaryIO:
-        """A seekable file over an object.
+        """A seekable file over an object; reading it is `Corrupt` where it is not what was written.
 
         Raises
         ------
         FileNotFoundError
             If there is none.
         """
-        with told():
-            reader = obstore.open_reader(self._store, path, buffer_size=1 << 20)
-        return io.BufferedReader(_Reader(reader), 1 << 16)
+        return io.BufferedReader(self.reader(path), 1 << 16)
+
+    def reader(self, path: str) -> plain.Reader:
+        """The same without a buffer, for who reads from the start to the end."""
+        return plain.Reader(self._store, path)
+
+    def load(self, path: str) -> bytes:
+        """The bytes of a small object, as they are.
+
+        Raises
+        ------
+        FileNotFoundError
+            If there is none.
+        """
+        return plain.load(self._store, path)
+
+    def store(self, path: str, pieces: Iterable[bytes]) -> None:
+        """Write the pieces of an object one after another, as they are: without checksums of its own."""
+        plain.store(self._store, path, pieces)
 
     def put(self, path: str, data: bytes) -> None:
-        """Write a small object, whole.
+        """Write a small object, whole, and its checksums.
 
         Raises
         ------
         NoRoom
             If the disk is full.
         """
+        table = checksums.Table()
+        table.update(data)
         with told():
             obstore.put(self._store, path, data)
+            with self._gone_without(path):
+                obstore.put(self._store, path + SUFFIX, table.to_bytes())
+
+    @contextmanager
+    def _gone_without(self, path: str) -> Iterator[None]:
+        """Remove an object whose checksums can't be written: it would count as one from before there were any."""
+        try:
+            yield
+        except BaseException:
+            self.delete(path)
+            raise
 
     async def get(self, path: str) -> bytes:
         """The bytes of a small object, for `together`.
@@ -213,18 +249,18 @@ class Objects:
         return value.to_bytes()
 
     def names(self, folder: str) -> list[str]:
-        """What lies directly in a folder, folders and objects, by name."""
+        """What lies directly in a folder, folders and objects, by name; without what holds checksums."""
         with told():
             found = obstore.list_with_delimiter(self._store, folder)
         paths = [*found["common_prefixes"], *(meta["path"] for meta in found["objects"])]
-        return sorted(path.rsplit("/", 1)[-1] for path in paths)
+        return sorted(path.rsplit("/", 1)[-1] for path in paths if not path.endswith(SUFFIX))
 
     def below(self, folder: str) -> set[str]:
-        """The paths of all objects below a folder, however deep."""
-        return set(self.sizes(folder))
+        """The paths of all objects below a folder, however deep; without what holds checksums."""
+        return {path for path in self.sizes(folder) if not path.endswith(SUFFIX)}
 
     def sizes(self, folder: str) -> dict[str, int]:
-        """The bytes of all objects below a folder, however deep, by their paths."""
+        """The bytes of all objects below a folder, however deep, by their paths; with what holds checksums."""
         with told():
             return {
                 meta["path"]: meta["size"] for batch in obstore.list(self._store, folder) for meta in batch
@@ -267,10 +303,14 @@ class Objects:
         """Remove an object, or everything below a folder; nothing there is no error."""
         if self._folder is not None:  # with its folders, and with what was never finished, see `sweep`
             target = self._folder / path
-            shutil.rmtree(target) if target.is_dir() else target.unlink(missing_ok=True)
+            if target.is_dir():
+                shutil.rmtree(target)
+            else:
+                target.unlink(missing_ok=True)
+                target.with_name(target.name + SUFFIX).unlink(missing_ok=True)
             return
         with told():
-            obstore.delete(self._store, path)  # which a bucket does not list below itself
+            obstore.delete(self._store, [path, path + SUFFIX])  # which a bucket does not list below itself
             for batch in obstore.list(self._store, path, chunk_size=500):
                 obstore.delete(self._store, [meta["path"] for meta in batch])
 
@@ -297,14 +337,32 @@ class Objects:
 
 def _array(store: _Whole, path: str, document: bytes) -> zarr.Array[Any]:
     """The array that a ``zarr.json`` describes."""
-    array = zarr.AsyncArray.from_dict(StorePath(store, path), json.loads(document))
+    described, _ = checksums.unseal(f"{path}/zarr.json", document)
+    with _read_as(path):
+        array = zarr.AsyncArray.from_dict(StorePath(store, path), described)
     return zarr.Array(array).with_config(EVERY_CHUNK)
+
+
+@contextmanager
+def _read_as(path: str) -> Iterator[None]:
+    """What describes no array, or group, that zarr knows is `Corrupt`."""
+    try:
+        yield
+    except (ValueError, TypeError, KeyError) as error:
+        raise checksums.damaged(f"{path}/zarr.json") from error
+
+
+def _sealed(name: str, value: Buffer) -> Buffer:
+    """What is stored under a name: a zarr.json gets its checksum."""
+    if not name.endswith("zarr.json"):
+        return value
+    return default_buffer_prototype().buffer.from_bytes(checksums.seal(value.to_bytes()))
 
 
 @cache
 def _metadata(dtype: np.dtype[Any]) -> dict[str, Any]:
     """What zarr writes down about an array of a type, for arrays of any length."""
-    array = zarr.create_array(MemoryStore(), shape=(1,), chunks=(1,), dtype=dtype)
+    array = zarr.create_array(MemoryStore(), shape=(1,), chunks=(1,), dtype=dtype, compressors=CODECS)
     return array.metadata.to_dict()
 
 
@@ -342,28 +400,3 @@ class _Whole(WrapperStore[ZarrStore[ObjectStore]]):
     async def exists(self, key: str) -> bool:
         with told():
             return await self._store.exists(key)
-
-
-class _Reader(io.RawIOBase):
-    """obstore's reader as a raw file of the io module, which zipfile can read."""
-
-    def __init__(self, file: ReadableFile) -> None:
-        self._file = file
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        return self._file.seek(offset, whence)
-
-    def tell(self) -> int:
-        return self._file.tell()
-
-    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
-        with told():
-            data = self._file.read(len(buffer))
-        buffer[: len(data)] = memoryview(data)
-        return len(data)

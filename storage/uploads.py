@@ -195,9 +195,9 @@ def read(objects: Objects, upload: str) -> BinaryIO:
     return io.BufferedReader(_Joined(objects, upload, parts), 1 << 16)
 
 
-def sweep(objects: Objects, upload: str, parts: Sequence[Part]) -> None:
-    """Remove what killed writers have left of an upload that nobody writes to: all but its parts."""
-    known = {f"{part.name}.part" for part in parts}
+def sweep(objects: Objects, upload: str, parts: Sequence[str]) -> None:
+    """Remove what killed writers have left of an upload that nobody writes to: all but its parts, by their names."""
+    known = {f"{part}.part" for part in parts}
     for name in objects.names(path(upload)):
         if name not in known:
             objects.delete(f"{path(upload)}/{name}")

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from storage import composites
 from storage.errors import CaptureError, ClipError, Corrupt
 from storage.mattes import Matte
-from storage.objects import PART, Objects, together
+from storage.objects import Objects, together
+from storage.plain import PART
 from workflows import segments, tone
 from workflows.composite import composite
 from workflows.composite.cache import Cache

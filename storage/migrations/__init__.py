@@ -34,6 +34,27 @@ def newest() -> str:
     return head
 
 
+def check(revision: str, what: str) -> None:
+    """See that a revision is one that this code knows.
+
+    Parameters
+    ----------
+    what : str
+        Has the revision: ``the database`` say.
+
+    Raises
+    ------
+    Conflict
+        If it is newer.
+    """
+    known = {script.revision for script in ScriptDirectory.from_config(_config).walk_revisions()}
+    if revision not in known:
+        raise Conflict(
+            f"{what} is of a newer envmatte: it has revision {revision}, and this one knows those up to "
+            f"{newest()}; install the newer envmatte, or use another {what.split()[-1]}"
+        )
+
+
 def upgrade(connection: Connection, to: str = "head") -> None:
     """Bring a database's schema up to a revision, within the connection's transaction.
 
@@ -43,12 +64,8 @@ def upgrade(connection: Connection, to: str = "head") -> None:
         If the schema is newer than this code.
     """
     before = revision(connection)
-    known = {script.revision for script in ScriptDirectory.from_config(_config).walk_revisions()}
-    if before is not None and before not in known:
-        raise Conflict(
-            f"the database is of a newer envmatte: it has revision {before}, and this one knows those up to "
-            f"{newest()}; install the newer envmatte, or use another database"
-        )
+    if before is not None:
+        check(before, "the database")
     with _one_at_a_time:
         _config.attributes["connection"] = connection
         try:

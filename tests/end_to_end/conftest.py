@@ -16,6 +16,7 @@ import psutil
 import pytest
 
 from services.client import Client
+from storage.checksums import SUFFIX
 from tests.services.clusters import workers
 from workflows import images, simulate
 from workflows.program import Program
@@ -41,13 +42,18 @@ class Service:
         self.process.wait(10)
 
     def stored(self) -> set[str]:
-        """Every file of the store that belongs to an upload, a capture or a matte."""
+        """Every file of the store that belongs to an upload, a capture or a matte; checksums go with their file."""
         store = self.data / "store"
         # os.walk passes over a folder that is deleted meanwhile.
         files = [
             Path(folder, name).relative_to(store) for folder, _, names in os.walk(store) for name in names
         ]
-        return {str(path) for path in files if len(path.parts) > 2 or path.parts[0] == "uploads"}
+        found = {str(path) for path in files if len(path.parts) > 2 or path.parts[0] == "uploads"}
+        return {
+            path
+            for path in found
+            if path.removesuffix(SUFFIX) == path or path.removesuffix(SUFFIX) not in found
+        }
 
 
 @contextmanager

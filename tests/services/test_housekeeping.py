@@ -9,6 +9,7 @@ from sqlalchemy import Engine, select, update
 
 from services.housekeeping import count, forget_expired, forget_jobs
 from storage import captures, composites, counts, database, jobs, mattes, uploads
+from storage.checksums import SUFFIX
 from storage.database import open_engine, reading, writing
 from storage.objects import Objects
 from storage.owners import bound
@@ -179,7 +180,8 @@ def test_bytes_are_counted_once_a_thing_is_whole(engine: Engine, objects: Object
         with reading(bound(engine, owner)) as c:
             return counts.of_bytes(c)
 
-    assert stored("alice") == 7 + 1000 + 20_000 + 300_000
+    each = len(objects.load(f"{mattes.path('a')}/z{SUFFIX}"))  # of the checksums, which count too
+    assert stored("alice") == 7 + 3 * each + 1000 + 20_000 + 300_000
     assert stored("bob") == 0  # the bytes of its archive count until then
     with writing(engine) as c:
         jobs.end(c, clip, "succeeded")
@@ -188,6 +190,6 @@ def test_bytes_are_counted_once_a_thing_is_whole(engine: Engine, objects: Object
         assert counts.of_bytes(c, all_owners=True) == counts.of_bytes(c)
     objects.delete(composites.clip_path(clip))
     objects.put(composites.video_path(clip), bytes(64))
-    assert stored("alice") == 7 + 999 + 20_000 + 64
+    assert stored("alice") == 7 + 999 + 20_000 + 64 + 5 * each
     with reading(bound(engine, "bob")) as c:
-        assert counts.of_bytes(c, all_owners=True) == 7 + 999 + 20_000 + 64
+        assert counts.of_bytes(c, all_owners=True) == 7 + 999 + 20_000 + 64 + 5 * each

@@ -307,4 +307,3 @@ def test_a_cancelled_composite_is_wound_up_until_its_tiles_are_cleared(connectio
     assert [row.id for row in jobs.not_wound_up(connection)] == [job]
     jobs.clear(connection, job)
     assert jobs.not_wound_up(connection) == []
-    assert [row.state for row in jobs.composites(connection)] == ["cancelled"]

@@ -177,7 +177,7 @@ def test_a_part_that_is_cut_short_is_damage(objects: Objects) -> None:
 
 def test_what_killed_writers_left_is_swept(objects: Objects) -> None:
     parts = stored(objects, "u", [b"one", b"two", b"three"])
-    uploads.sweep(objects, "u", parts[:2])
+    uploads.sweep(objects, "u", [part.name for part in parts[:2]])
     assert objects.names("uploads/u") == ["p0.part", "p1.part"]
     uploads.sweep(objects, "u", [])
     assert objects.names("uploads/u") == []

@@ -5,12 +5,12 @@ each block is unpacked within bounds, looked through, and written as one that wa
 exported comes back as the same bytes.
 """
 
-import json
 from itertools import product
 from typing import BinaryIO
 
 from storage import mattes
 from storage.archives import GROUPS
+from storage.checksums import unseal
 from storage.mattes import Matte
 from storage.objects import Objects
 from workflows.archive.reader import Reader
@@ -42,7 +42,7 @@ def take_in(file: BinaryIO, objects: Objects, matte: str, limits: Limits) -> Mat
         made = mattes.create(objects, matte, **layout, **attributes)
         for name in GROUPS:
             with objects.read(f"{mattes.path(matte)}/{name}") as ours:
-                archive.compare(name, json.load(ours))
+                archive.compare(name, unseal(name, ours.read())[0])
         for row, column in product(range(made.block_rows), range(made.block_columns)):
             y, x = made.span(row, column)
             block = archive.block(row, column, y.stop - y.start, x.stop - x.start)

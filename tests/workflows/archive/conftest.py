@@ -8,11 +8,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import imagecodecs
 import numpy as np
 import pytest
 
 from storage import mattes
 from storage.archives import MANIFEST, Archive
+from storage.checksums import SUM, crc32c, unseal
 from storage.mattes import Block, Matte
 from storage.objects import Objects
 from workflows.ingest.bundle import Limits
@@ -112,13 +114,27 @@ def signed(files: Files) -> bytes:
     return packed(files | {MANIFEST: json.dumps(manifest).encode()})
 
 
+def unpack_chunk(data: bytes) -> bytes:
+    return imagecodecs.zstd_decode(data[:-SUM])
+
+
+def pack_chunk(values: bytes) -> bytes:
+    """A chunk as zarr writes it."""
+    return checked(imagecodecs.zstd_encode(values))
+
+
+def checked(data: bytes) -> bytes:
+    """Bytes with their checksum."""
+    return data + crc32c(data).to_bytes(SUM, "little")
+
+
 def documented(name: str, change: Callable[[dict[str, Any]], None]) -> Callable[[Files], None]:
-    """Changes a JSON document among the files."""
+    """Changes a JSON document among the files; a zarr.json has no checksum then."""
 
     def apply(files: Files) -> None:
-        document = json.loads(files[name])
+        document = json.loads(files[name]) if name == MANIFEST else unseal(name, files[name])[0]
         change(document)
-        files[name] = json.dumps(document).encode()
+        files[name] = json.dumps(document, indent=2).encode()
 
     return apply
 

@@ -1,0 +1,127 @@
+"""An installation with one of everything that is stored: rows, and objects as those who store them write them."""
+
+import asyncio
+
+import numpy as np
+from sqlalchemy import Connection, Engine
+
+from storage import captures, composites, jobs, keys, live, mattes, programs, uploads
+from storage.captures import Stack, create_stack, write_slab
+from storage.database import writing
+from storage.objects import Objects
+from storage.uploads import Part
+from tests.storage.test_mattes import block, extent, places
+
+SHAPE = (6, 21, 40, 3)
+ARCHIVE = np.random.default_rng(4).bytes((2 << 20) + 777)
+"""Of three blocks of checksums."""
+AGAIN = {"status": 500, "detail": "gave up"}
+
+
+def furnish(engine: Engine, objects: Objects) -> None:
+    """Fill an installation.
+
+    The capture ``c`` and its matte ``m``; ``i``, the archive of a capture that is ingested; ``u``, an upload under way;
+    composites, of which ``v`` is done, ``w`` waits, and ``x`` has failed and may be tried again; ``l``, a matte that
+    came in an archive; ``r``, one that is recovered.
+    """
+    rng = np.random.default_rng(3)
+    create_stack(
+        objects,
+        "c",
+        SHAPE,
+        np.dtype("uint16"),
+        memory=SHAPE[0] * 21 * 40 * 6,
+        attributes={"patterns": [1, 0], "response": 2.2},
+        mask=rng.random((21, 40)) < 0.5,
+        images=[rng.random((3, 4, 1), np.float32)],
+        shares=np.arange(9).reshape(3, 3),
+    )
+    for first in (0, 3):
+        write_slab(objects, "c", first, rng.integers(0, 65536, (3, *SHAPE[1:]), np.uint16))
+    stack = Stack(objects, "c")
+    stack.annotate(noise={"gain": 0.1})
+    stack.save()
+    for matte in ("m", "l", "r"):
+        given = {"monitor": [8, 6], "crosstalk": np.eye(3).tolist(), "options": {"method": "lobes"}}
+        made = mattes.create(objects, matte, height=21, width=40, columns=4, rows=3, **given)
+        for row, column in places(made)[: 2 if matte == "r" else None]:
+            made.write(row, column, block(*extent(made, row, column), seed=10 * row + column))
+    live.keep(objects, "m", "live-1", rng.bytes(1000))
+    stream(objects, uploads.part_path("i", "all"), ARCHIVE)
+    uploads.seal(objects, "i", [Part("all", len(ARCHIVE))])
+    for part in ("p", "q"):
+        stream(objects, uploads.part_path("u", part), ARCHIVE[:999])
+    stream(objects, composites.video_path("v"), ARCHIVE[:5000])
+    for job in ("w", "x"):
+        stream(objects, composites.clip_path(job), ARCHIVE[:6000])
+        objects.put(composites.ticks_path(job), ARCHIVE[:80])
+        objects.put(composites.segment_path(job, 0), ARCHIVE[:70])
+    with writing(engine) as c:
+        write_down(c)
+        keys.make(c, "lab", "alice", "write")
+
+
+def write_down(c: Connection) -> None:
+    """The rows."""
+    for job, kind, capture, matte in (
+        ("ci", "ingest", "c", None),
+        ("mr", "recover", "c", "m"),
+        ("ii", "ingest", "i", None),
+        ("rr", "recover", "c", "r"),
+        ("v", "composite", "c", "m"),
+        ("w", "composite", "c", "m"),
+        ("x", "composite", "", "l"),
+    ):
+        jobs.add(
+            c,
+            kind,
+            capture,
+            {"é": None},
+            matte,
+            job=job,
+            webhook="https://example.org" if job == "v" else None,
+        )
+        jobs.begin(c, job)
+    for job in ("rr", "ii"):
+        jobs.enter(c, job, "recovering")
+        jobs.lay_down(c, job, {"tiles": 6})
+    jobs.finish(c, "rr", [(0, 0.5, 16), (1, 0.25, 16)])
+    captures.add(c, "c", "ci", name="ball \u2713", bytes=5, frames=6, program={"levels": [0.25, 1e-300]})
+    captures.change(c, "c", state="ready", owner="alice")
+    captures.add(c, "i", "ii", name="", bytes=len(ARCHIVE), frames=6, program={}, seconds=1e6)
+    mattes.add(c, "m", "c", "mr", {"method": "none"})
+    mattes.change(c, "m", state="ready", figures={"width": 40})
+    mattes.add(c, "r", "c", "rr", {})
+    mattes.add_imported(c, "l", {}, {"width": 40}, stored=9)
+    uploads.add(c, "u", 3000, "filename x", 1e6, "once")
+    uploads.advance(c, "u", 0, [Part("p", 999), Part("q", 999)], 1e6)
+    for job in ("ci", "mr", "v"):
+        jobs.end(c, job, "succeeded")
+    jobs.end(c, "x", "failed", AGAIN)
+    jobs.remember(c, "key", "POST /v1/captures", "c")
+    programs.add(c, {"any": 1})
+
+
+def stream(objects: Objects, path: str, data: bytes) -> None:
+    """Write an object as an upload is."""
+
+    async def write() -> None:
+        async with objects.write(path) as file:
+            for at in range(0, len(data), 70_000):
+                await file.write(data[at : at + 70_000])
+
+    asyncio.run(write())
+
+
+def flip(objects: Objects, path: str, at: float = 0.5) -> None:
+    """Flip a bit of an object, as a disk might."""
+    data = bytearray(objects.load(path))
+    data[min(int(len(data) * at), len(data) - 1)] ^= 0x10
+    objects.store(path, iter([bytes(data)]))
+
+
+def contents(objects: Objects) -> dict[str, bytes]:
+    """Every object, by its path."""
+    folders = ("captures", "mattes", "uploads", "composites")
+    return {path: objects.load(path) for folder in folders for path in objects.sizes(folder)}
