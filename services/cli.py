@@ -1,7 +1,8 @@
 """The command `envmatte`.
 
-Exit codes: 0 done; 1 the service refused, the job failed, or a file can't be written; 2 the command line was wrong;
-3 the service can't be reached, or asks to be tried again later; 130 interrupted, and nothing is left half done.
+Exit codes: 0 done; 1 the service refused, the job failed, a file can't be written, or something stored is damaged;
+2 the command line was wrong; 3 the service can't be reached, or asks to be tried again later; 130 interrupted, and
+nothing is left half done.
 """
 
 import sys
@@ -20,8 +21,8 @@ from services.told import example
 def main() -> None:
     """Environment mattes: film glass before a monitor, put it in front of anything.
 
-    Exit codes: 0 done; 1 the service refused, a job failed, or a file can't be written; 2 wrong command line;
-    3 the service can't be reached, or asks to be tried again later; 130 interrupted.
+    Exit codes: 0 done; 1 the service refused, a job failed, a file can't be written, or something stored is damaged;
+    2 wrong command line; 3 the service can't be reached, or asks to be tried again later; 130 interrupted.
     """
 
 

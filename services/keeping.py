@@ -8,6 +8,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 import click
 
@@ -145,10 +146,14 @@ def restore(source: str, as_json: bool, **given: Any) -> None:
     from services.process import sole_user
     from services.settings import Settings
     from storage import dialects
+    from storage.errors import NotFound
     from storage.objects import Objects
     from storage.restoring import restore
 
     with refusals_told():
+        folder = Path(url2pathname(urlsplit(source).path))
+        if source.startswith("file:") and not folder.is_dir():  # which opening would make
+            raise NotFound(f"there is no folder {folder}: name the one that `envmatte backup` wrote to")
         settings = Settings(**given_of(given))
         settings.data.mkdir(parents=True, exist_ok=True)
         engine = dialects.create(settings.database_url)

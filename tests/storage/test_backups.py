@@ -19,7 +19,6 @@ from storage.ledger import open_as_it_is
 from storage.objects import Objects
 from storage.restoring import MARKER, restore
 from storage.verifying import verify
-from tests.postgres import Server
 from tests.storage.furnished import contents, flip, furnish
 
 Bytes = dict[str, bytes]
@@ -93,7 +92,7 @@ def test_from_sqlite_and_a_folder_to_postgresql_and_a_bucket_and_back(
     objects: Objects,
     folder: Path,
     s3: str,
-    postgresql_server: Server,
+    postgresql: str,
     elsewhere: tuple[Engine, Objects],
 ) -> None:
     furnish(engine, objects)
@@ -104,24 +103,23 @@ def test_from_sqlite_and_a_folder_to_postgresql_and_a_bucket_and_back(
     assert made["bytes"] == sum(map(len, contents(objects).values()))
     header = json.loads(lines_of(there)[0])
     assert (header["version"], header["revision"]) == ("1.2.3", migrations.newest())
-    with postgresql_server.database() as database_url:
-        second = dialects.create(database_url)
-        assert restore(there, second, bucket) == made
-        assert rows_of(second) == rows_of(engine)
-        assert contents(bucket) == contents(objects)
-        assert bucket.names("") == ["captures", "composites", "mattes", "uploads"]
-        assert verify(second, bucket).findings == []
-        with writing(second) as c:  # it goes on with its numbers
-            number = c.scalar(select(func.max(database.jobs.c.number)))
-            assert jobs.get(c, jobs.add(c, "ingest", "n", {})).number == number + 1
-            jobs.cancel(c, c.scalar(select(database.jobs.c.id).where(database.jobs.c.capture == "n")))
-        back = Objects((folder.parent / "back").as_uri())
-        again = back_up(second, bucket, back, "1.2.3")
-        assert again["objects"] == made["objects"]
-        restore(back, *elsewhere)
-        assert rows_of(elsewhere[0]) == rows_of(second)
-        assert contents(elsewhere[1]) == contents(objects)
-        second.dispose()
+    second = dialects.create(postgresql)
+    assert restore(there, second, bucket) == made
+    assert rows_of(second) == rows_of(engine)
+    assert contents(bucket) == contents(objects)
+    assert bucket.names("") == ["captures", "composites", "mattes", "uploads"]
+    assert verify(second, bucket).findings == []
+    with writing(second) as c:  # it goes on with its numbers
+        number = c.scalar(select(func.max(database.jobs.c.number)))
+        assert jobs.get(c, jobs.add(c, "ingest", "n", {})).number == number + 1
+        jobs.cancel(c, c.scalar(select(database.jobs.c.id).where(database.jobs.c.capture == "n")))
+    back = Objects((folder.parent / "back").as_uri())
+    again = back_up(second, bucket, back, "1.2.3")
+    assert again["objects"] == made["objects"]
+    restore(back, *elsewhere)
+    assert rows_of(elsewhere[0]) == rows_of(second)
+    assert contents(elsewhere[1]) == contents(objects)
+    second.dispose()
     with reading(elsewhere[0]) as c:
         row = jobs.get(c, "rr")
         assert (row.state, row.done, jobs.to_do(c, "rr")) == ("queued", 2, [2, 3, 4, 5])
