@@ -1,6 +1,7 @@
 """`envmatte verify`, `backup` and `restore`: for whoever runs the service, who has its database and its store."""
 
 import json
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict
@@ -111,7 +112,7 @@ def verify(as_json: bool, **given: Any) -> None:
             )
         click.echo("all is as it was written" if not report.findings else f"{len(report.findings)} found")
     if report.findings:
-        raise click.exceptions.Exit(1)
+        sys.exit(1)
 
 
 @click.command(epilog=example("envmatte backup /mnt/backups/monday --data data"))

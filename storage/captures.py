@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, Row, delete, insert, select, update
 from zarr.storage import MemoryStore
 
+from storage.arrays import EVERY_CHUNK
 from storage.checksums import CODECS
 from storage.database import captures, find, lifetime
 from storage.errors import Corrupt
 from storage.grid import block_edge
-from storage.objects import EVERY_CHUNK, Objects, together
+from storage.objects import Objects, together
 
 MEASURED = "measured"
 CHUNK = 1 << 20

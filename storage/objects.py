@@ -20,26 +20,16 @@ import zarr
 from numpy.typing import NDArray
 from obstore.store import LocalStore, ObjectStore, from_url
 from zarr.buffer import default_buffer_prototype
-from zarr.storage import MemoryStore, StorePath, WrapperStore
+from zarr.storage import MemoryStore, StorePath
 from zarr.storage import ObjectStore as ZarrStore
 
-from storage import checksums, plain
-from storage.checksums import CODECS, SUFFIX
-from storage.errors import Corrupt
+from storage import arrays, checksums, plain
+from storage.checksums import SUFFIX
 from storage.outages import REQUESTS, RETRIES, told
 from storage.plain import PART, Writer
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Collection, Coroutine, Iterable, Iterator
-
-    from zarr.abc.store import ByteRequest
-    from zarr.core.array_spec import ArrayConfigParams
-    from zarr.core.buffer import Buffer, BufferPrototype
-
-EVERY_CHUNK: ArrayConfigParams = {"write_empty_chunks": True}
-"""For whoever makes an array: a chunk of zeros is stored like any other, so that one that is missing is damage."""
-METADATA = ("zarr.json", ".zarray", ".zgroup", ".zattrs", ".zmetadata")
-"""Objects that zarr looks for to see whether there is an array or a group: they may be missing."""
 
 
 def together(*work: Coroutine[Any, Any, Any]) -> list[Any]:
@@ -94,9 +84,9 @@ class Objects:
             self._store = LocalStore.from_url(url, mkdir=True, automatic_cleanup=True)
         else:
             self._store = from_url(url, client_options=REQUESTS, retry_config=RETRIES)
-        self.zarr = _Whole(ZarrStore(self._store))
+        self.zarr = arrays.Whole(ZarrStore(self._store))
         # Every tile opens the same ten arrays anew, to see that they are there; to parse them takes longer.
-        self._array = lru_cache(maxsize=64)(partial(_array, self.zarr))
+        self._array = lru_cache(maxsize=64)(partial(arrays.described, self.zarr))
 
     async def group(self, path: str) -> zarr.Group:
         """The zarr group at a path, for `together`.
@@ -107,7 +97,7 @@ class Objects:
             If there is none, or it is damaged.
         """
         document = checksums.unseal(f"{path}/zarr.json", await self._document(path))[0]
-        with _read_as(path):
+        with arrays.known(path):
             return zarr.Group(zarr.AsyncGroup.from_dict(StorePath(self.zarr, path), document))
 
     async def array(self, path: str) -> zarr.Array[Any]:
@@ -143,15 +133,17 @@ class Objects:
             "shape": (n,),
             "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": (max(n, 1),)}},
         }
-        array = zarr.AsyncArray.from_dict(StorePath(self.zarr, path), _metadata(values.dtype) | shape)
-        array = array.with_config(EVERY_CHUNK)
+        array = zarr.AsyncArray.from_dict(
+            StorePath(self.zarr, path), arrays.metadata_of(values.dtype) | shape
+        )
+        array = array.with_config(arrays.EVERY_CHUNK)
         # Without values there is no chunk.
         chunk = array.setitem(slice(None), values) if n else self.zarr.delete(f"{path}/c/0")
         await _all_of(self._put_metadata(path, array), chunk)
 
     async def _put_metadata(self, path: str, node: zarr.AsyncGroup | zarr.AsyncArray[Any]) -> None:
         for name, document in node.metadata.to_buffer_dict(default_buffer_prototype()).items():
-            await self.zarr.set(f"{path}/{name}", _sealed(name, document))
+            await self.zarr.set(f"{path}/{name}", arrays.sealed(name, document))
 
     def put_tree(self, path: str, tree: MemoryStore) -> None:
         """Write what zarr has laid out in memory below a path; what is there besides stays."""
@@ -161,7 +153,7 @@ class Objects:
             async for name in tree.list():
                 value = await tree.get(name, prototype)
                 assert value is not None
-                await self.zarr.set(f"{path}/{name}", _sealed(name, value))
+                await self.zarr.set(f"{path}/{name}", arrays.sealed(name, value))
 
         together(copy())
 
@@ -197,15 +189,22 @@ class Objects:
         """The same without a buffer, for who reads from the start to the end."""
         return plain.Reader(self._store, path)
 
-    def load(self, path: str) -> bytes:
+    def load(self, path: str, most: int | None = None) -> bytes:
         """The bytes of a small object, as they are.
+
+        Parameters
+        ----------
+        most : int, optional
+            Bytes that it may have.
 
         Raises
         ------
         FileNotFoundError
             If there is none.
+        Corrupt
+            If it has more.
         """
-        return plain.load(self._store, path)
+        return plain.load(self._store, path, most)
 
     def store(self, path: str, pieces: Iterable[bytes]) -> None:
         """Write the pieces of an object one after another, as they are: without checksums of its own."""
@@ -333,70 +332,3 @@ class Objects:
         """Reach the store once; raises whatever it raises when it can't be reached."""
         with told():
             obstore.list_with_delimiter(self._store, None)
-
-
-def _array(store: _Whole, path: str, document: bytes) -> zarr.Array[Any]:
-    """The array that a ``zarr.json`` describes."""
-    described, _ = checksums.unseal(f"{path}/zarr.json", document)
-    with _read_as(path):
-        array = zarr.AsyncArray.from_dict(StorePath(store, path), described)
-    return zarr.Array(array).with_config(EVERY_CHUNK)
-
-
-@contextmanager
-def _read_as(path: str) -> Iterator[None]:
-    """What describes no array, or group, that zarr knows is `Corrupt`."""
-    try:
-        yield
-    except (ValueError, TypeError, KeyError) as error:
-        raise checksums.damaged(f"{path}/zarr.json") from error
-
-
-def _sealed(name: str, value: Buffer) -> Buffer:
-    """What is stored under a name: a zarr.json gets its checksum."""
-    if not name.endswith("zarr.json"):
-        return value
-    return default_buffer_prototype().buffer.from_bytes(checksums.seal(value.to_bytes()))
-
-
-@cache
-def _metadata(dtype: np.dtype[Any]) -> dict[str, Any]:
-    """What zarr writes down about an array of a type, for arrays of any length."""
-    array = zarr.create_array(MemoryStore(), shape=(1,), chunks=(1,), dtype=dtype, compressors=CODECS)
-    return array.metadata.to_dict()
-
-
-class _Whole(WrapperStore[ZarrStore[ObjectStore]]):
-    """A store for zarr in which a missing chunk is an error: zarr reads it as its fill value, without a word.
-
-    What can't be written or reached is told as everywhere here; these are the calls that zarr makes.
-    """
-
-    async def get(
-        self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
-    ) -> Buffer | None:
-        with told():
-            value = await self._store.get(key, prototype, byte_range)
-        if value is None and not key.endswith(METADATA):
-            raise Corrupt(f"{key} is missing in the store: what it belongs to is damaged, make it again")
-        return value
-
-    async def set(self, key: str, value: Buffer) -> None:
-        with told():
-            await self._store.set(key, value)
-
-    async def set_if_not_exists(self, key: str, value: Buffer) -> None:
-        with told():
-            await self._store.set_if_not_exists(key, value)
-
-    async def delete(self, key: str) -> None:
-        with told():
-            await self._store.delete(key)
-
-    async def delete_dir(self, prefix: str) -> None:
-        with told():
-            await self._store.delete_dir(prefix)
-
-    async def exists(self, key: str) -> bool:
-        with told():
-            return await self._store.exists(key)

@@ -93,16 +93,26 @@ class Reader(io.RawIOBase):
         return data
 
 
-def load(store: ObjectStore, path: str) -> bytes:
+def load(store: ObjectStore, path: str, most: int | None = None) -> bytes:
     """The bytes of a small object, as they are.
+
+    Parameters
+    ----------
+    most : int, optional
+        Bytes that it may have.
 
     Raises
     ------
     FileNotFoundError
         If there is none.
+    Corrupt
+        If it has more.
     """
     with told():
-        return obstore.get(store, path).bytes().to_bytes()
+        found = obstore.get(store, path)
+        if most is not None and found.meta["size"] > most:
+            raise damaged(path, f"it has more than {most} bytes")
+        return found.bytes().to_bytes()
 
 
 def store(store: ObjectStore, path: str, pieces: Iterable[bytes]) -> None:

@@ -196,7 +196,7 @@ def _read(source: Objects, path: str, entry: dict[str, Any]) -> Iterator[bytes]:
     """The pieces of something in the backup, see `_checked`."""
     try:
         if entry["size"] <= PART:  # most objects are, and one request then
-            yield from _checked(entry, iter([source.load(path)]))
+            yield from _checked(entry, iter([source.load(path, entry["size"])]))
         else:
             with source.reader(path) as reader:
                 yield from _checked(entry, iter(lambda: reader.read(PART), b""))
@@ -214,6 +214,8 @@ def _checked(entry: dict[str, Any], pieces: Iterator[bytes]) -> Iterator[bytes]:
     for piece in pieces:
         digest.update(piece)
         size += len(piece)
+        if size > entry["size"]:
+            raise _unlike(entry["name"])
         yield piece
     if (size, digest.hexdigest()) != (entry["size"], entry["sha256"]):
         raise _unlike(entry["name"])

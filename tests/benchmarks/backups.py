@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from storage import captures, jobs, mattes, objects
+from storage import arrays, captures, jobs, mattes
 from storage.backups import back_up
 from storage.captures import Stack, create_stack, write_slab
 from storage.checksums import CODECS
@@ -49,9 +49,9 @@ def main() -> None:
 
 
 def _use(codecs: Sequence[object]) -> None:
-    for module in (captures, mattes, objects):
+    for module in (captures, mattes, arrays):
         module.CODECS = codecs
-    objects._metadata.cache_clear()
+    arrays.metadata_of.cache_clear()
 
 
 def _frames() -> np.ndarray:

@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from zarr.storage import MemoryStore
 
 from storage import objects as module
+from storage.arrays import EVERY_CHUNK
 from storage.checksums import CODECS
 from storage.errors import Corrupt, Unavailable
-from storage.objects import EVERY_CHUNK, Objects, together
+from storage.objects import Objects, together
 from storage.plain import PART
 
 
