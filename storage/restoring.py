@@ -15,7 +15,7 @@ from typing import IO, Any
 
 from sqlalchemy import Connection, Engine, MetaData, select
 
-from storage import ledger, migrations
+from storage import dialects, ledger, migrations
 from storage.backups import FORMAT, LEDGER, MANIFEST, OBJECTS
 from storage.contents import FOLDERS
 from storage.database import clock, metadata, reading, writing
@@ -25,7 +25,7 @@ from storage.objects import Objects
 from storage.plain import PART
 
 MARKER = "restoring"
-"""In the store while a backup is being restored."""
+"""In the store while a backup is being restored: names the database that its rows are to come to."""
 LINE = 1 << 16
 """Bytes of a line of the manifest, at most."""
 NAME = re.compile(rf"({'|'.join(FOLDERS)})(/[A-Za-z0-9_-][A-Za-z0-9._-]*)+")
@@ -67,13 +67,14 @@ def restore(
     manifest = Manifest(source)
     with reading(engine) as c:
         _see_that_it_is_empty(c)
-    _see_that_nothing_is_stored(objects)
+    database = dialects.place(engine.url).encode()
+    _see_that_nothing_is_stored(objects, database)
     free = objects.free()
     if free is not None and free < manifest.bytes:
         raise NoRoom(
             f"the backup has {manifest.bytes} bytes, and the disk of the store {free} free: free some"
         )
-    objects.put(MARKER, b"")
+    objects.put(MARKER, database)
     try:
         _copy(source, objects, manifest, progress)
         with tempfile.TemporaryFile() as rows:
@@ -244,9 +245,12 @@ def _see_that_it_is_empty(connection: Connection) -> None:
             raise Conflict("a service runs on the installation: stop it until the backup is restored")
 
 
-def _see_that_nothing_is_stored(objects: Objects) -> None:
-    """See to it that the store is empty; what a restore that was interrupted has left there goes."""
-    if MARKER in objects.names(""):
+def _see_that_nothing_is_stored(objects: Objects, database: bytes) -> None:
+    """See to it that the store is empty; what a restore that was interrupted has left there goes.
+
+    If it was one into the same database, which is empty: what is there with another one may be that one's.
+    """
+    if MARKER in objects.names("") and objects.load(MARKER) == database:
         _clear(objects)
     for folder in FOLDERS:
         there = [name for name in objects.names(folder) if name != "zarr.json"]

@@ -295,6 +295,10 @@ def test_one_that_was_killed_holds_nothing_and_is_done_again(
     assert contents(store)
     assert MARKER in store.names("")
     store.put("mattes/x/left", b"of the first")
+    other = dialects.create(f"{second.url.render_as_string()}.other")
+    with pytest.raises(Conflict, match=r"its store .* has \w+/"):  # it may be in use with the first database
+        restore(target, other, store)
+    other.dispose()
     restore(target, second, store)
     assert contents(store) == contents(furnished)
     assert MARKER not in store.names("")
