@@ -9,7 +9,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from storage.errors import ImageError
-from workflows.images import LOSSLESS, PLAIN, orientation, upright
+from workflows.images import LOSSLESS, PLAIN, orientation, see_that_tiles_fit, upright
 
 Floats = NDArray[np.float32]
 EXR = b"v/1\x01"
@@ -112,6 +112,7 @@ def _exr(data: bytes, memory: int) -> Floats:
 def _tiff(data: bytes, memory: int) -> Floats:
     with tifffile.TiffFile(io.BytesIO(data)) as file:
         page = file.pages[0]
+        see_that_tiles_fit(page, memory)
         if page.compression not in LOSSLESS or page.photometric not in PLAIN - {
             tifffile.PHOTOMETRIC.MINISWHITE
         }:

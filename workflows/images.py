@@ -32,6 +32,11 @@ PLAIN = {tifffile.PHOTOMETRIC.MINISWHITE, tifffile.PHOTOMETRIC.MINISBLACK, tifff
 """What the values of a TIFF mean, where they can be taken as they are."""
 
 
+START_OF_SCAN = b"\xff\xda"
+SCANS = 100
+"""Of a JPEG: each costs the time of a picture, and of some bytes one can be made. Encoders write some ten."""
+
+
 def orientation(data: bytes) -> int:
     """How an image is to be turned to be upright, by its EXIF tag: 1, not at all, to 8, as `upright` takes it.
 
@@ -114,6 +119,8 @@ def decode(
         raise ImageError(f"this is no {' or '.join(formats)} image that can be read") from error
     if picture.format == "PNG" and getattr(picture, "is_animated", False):
         raise ImageError("this PNG is animated: one picture a file")
+    if picture.format in ("JPEG", "MPO") and data.count(START_OF_SCAN) > SCANS:
+        raise ImageError(f"this JPEG has more than {SCANS} scans: save it anew", limit=SCANS)
     own = _said_by(picture)  # before it is decoded, which takes it from a TIFF
     try:
         pixels = _pixels(data, picture, memory)
@@ -156,6 +163,7 @@ def _pixels(data: bytes, picture: Image.Image, memory: int) -> NDArray[np.generi
 def _tiff(data: bytes, picture: Image.Image, memory: int) -> NDArray[np.generic]:
     with tifffile.TiffFile(io.BytesIO(data)) as file:
         page = file.pages[0]
+        see_that_tiles_fit(page, memory)
         if page.compression not in LOSSLESS or page.photometric not in PLAIN or page.bitspersample == 1:
             return _by_pillow(picture, memory)  # knows them all, but halves the 16 bits of the plain ones
         if page.bitspersample not in (8, 16) or page.axes not in ("YX", "YXS", "SYX"):
@@ -168,6 +176,22 @@ def _tiff(data: bytes, picture: Image.Image, memory: int) -> NDArray[np.generic]
         if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
             array = np.invert(array)
         return np.moveaxis(array, 0, -1) if page.axes == "SYX" else array
+
+
+def see_that_tiles_fit(page: tifffile.TiffPage, memory: int) -> None:
+    """See that a tile of a TIFF can be unpacked, which decoders do whole, however little of one the image fills.
+
+    Raises
+    ------
+    ImageError
+    """
+    pixels = page.imagewidth * page.imagelength
+    if page.is_tiled and pixels and page.tilewidth * page.tilelength * max(1, page.nbytes // pixels) > memory:
+        raise ImageError(
+            f"tiles of {page.tilewidth} x {page.tilelength} pixels take more than the {memory} bytes allowed for one: "
+            "write the TIFF with smaller ones",
+            limit=memory,
+        )
 
 
 def _by_pillow(picture: Image.Image, memory: int) -> NDArray[np.uint8]:

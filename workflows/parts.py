@@ -5,13 +5,15 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, FailFast, Field, model_validator
 
 from workflows.grids import area_mean, stretch
 from workflows.tone import Response
 
 MOST_BLOCKS = 4096
 """Of a random grid, along each axis."""
+MOST_PATTERNS = 100_000
+"""Of a part, and of all of a program's together."""
 
 Unit = Annotated[float, Field(ge=0, le=1)]
 
@@ -34,8 +36,8 @@ class Constant(Record):
     """The whole monitor at one level or colour after another (Sect. 4.1)."""
 
     kind: Literal["constant"]
-    levels: tuple[Unit, ...] = ()
-    colours: tuple[tuple[Unit, Unit, Unit], ...] = ()
+    levels: Annotated[tuple[Unit, ...], FailFast(), Field(max_length=MOST_PATTERNS)] = ()
+    colours: Annotated[tuple[tuple[Unit, Unit, Unit], ...], FailFast(), Field(max_length=MOST_PATTERNS)] = ()
 
     @model_validator(mode="after")
     def _one_of_them(self) -> "Constant":
@@ -60,7 +62,7 @@ class Bernoulli(Record):
     kind: Literal["bernoulli"]
     columns: Annotated[int, Field(ge=1, le=MOST_BLOCKS)]
     rows: Annotated[int, Field(ge=1, le=MOST_BLOCKS)]
-    count: Annotated[int, Field(ge=1, le=100_000)]
+    count: Annotated[int, Field(ge=1, le=MOST_PATTERNS)]
     seed: Annotated[int, Field(ge=0, le=2**64 - 1)]
     colour: Literal["grey", "rgb"] = "grey"
     offset: bool = False
@@ -151,7 +153,7 @@ class Images(Record):
     """Patterns from any tool, each an image stretched over the monitor."""
 
     kind: Literal["images"]
-    files: Annotated[tuple[str, ...], Field(min_length=1)]
+    files: Annotated[tuple[str, ...], FailFast(), Field(min_length=1, max_length=MOST_PATTERNS)]
 
     @property
     def count(self) -> int:

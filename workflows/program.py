@@ -6,11 +6,11 @@ from typing import Annotated, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import FailFast, Field, model_validator
 
 from workflows.grids import stretch
 from workflows.levels import Shape, chain, fitting, nested, sense
-from workflows.parts import Bernoulli, Constant, Images, Monitor, Part, Record, Stripes
+from workflows.parts import MOST_PATTERNS, Bernoulli, Constant, Images, Monitor, Part, Record, Stripes
 from workflows.recovery.sensing import Sensing
 from workflows.tone import Curve, to_light
 
@@ -18,6 +18,8 @@ __all__ = ["Bernoulli", "Constant", "Images", "Monitor", "Program", "Stripes"]
 
 Value = TypeVar("Value", bound=np.generic)
 
+MOST_PARTS = 1000
+"""The chain of their grids is found in time in proportion to the square."""
 SENSING_BYTES = 512 << 20
 """The largest sensing matrix that a worker is asked to hold."""
 
@@ -26,10 +28,12 @@ class Program(Record):
     """The patterns that a monitor shows, numbered from 0 through the parts, in order."""
 
     monitor: Monitor
-    parts: Annotated[tuple[Part, ...], Field(min_length=1)]
+    parts: Annotated[tuple[Part, ...], FailFast(), Field(min_length=1, max_length=MOST_PARTS)]
 
     @model_validator(mode="after")
     def _usable(self) -> "Program":
+        if self.count > MOST_PATTERNS:
+            raise ValueError(f"{self.count} patterns, more than the {MOST_PATTERNS} that a program may have")
         for part in self.parts:
             if isinstance(part, Bernoulli) and (
                 part.columns > self.monitor.width or part.rows > self.monitor.height

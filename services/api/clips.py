@@ -22,7 +22,7 @@ router = APIRouter(tags=["jobs"])
 CALL = "POST /v1/mattes/{id}/composite"
 PIECE = 1 << 20
 """Bytes of a video that are read at once."""
-RANGE = re.compile(r"bytes=(\d*)-(\d*)")
+RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 
 
 def is_clip(request: Request) -> bool:
@@ -167,7 +167,8 @@ def _job(context: Context, job: str) -> Job:
 def _span(text: str, size: int) -> tuple[int, int]:
     """The bytes that a Range asks for (RFC 9110, sect. 14.2), from the first up to one past the last.
 
-    All of them where it is none, or of more than one part: an answer may ignore it. Past the end if there are none.
+    All of them where it is none, of more than one part, or beyond 10**18: an answer may ignore it. Past the end if
+    there are none.
     """
     found = RANGE.fullmatch(text.strip())
     if found is None or not any(found.groups()):

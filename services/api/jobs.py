@@ -23,7 +23,7 @@ from workflows.program import Program
 
 router = APIRouter(tags=["jobs"])
 CALL = "POST /v1/jobs"
-REQUEST_BYTES = 1 << 20
+REQUEST_BYTES = 64 << 10
 State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 
 

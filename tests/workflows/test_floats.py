@@ -132,6 +132,17 @@ def test_the_limit_is_checked_in_the_header() -> None:
             decode(bytes(lying), memory=MEMORY)
 
 
+def test_tiles_much_larger_than_the_image_are_refused() -> None:
+    data = bytearray(
+        tiff(np.zeros((16, 16, 3), np.float32), photometric="rgb", tile=(16, 16), compression="zlib")
+    )
+    width = data.index(struct.pack("<HHII", 322, 4, 1, 16))  # TileWidth
+    decode(bytes(data), memory=MEMORY)
+    struct.pack_into("<I", data, width + 8, 1 << 24)
+    with pytest.raises(ImageError, match="tiles of 16777216 x 16 pixels"):
+        decode(bytes(data), memory=MEMORY)
+
+
 @pytest.mark.parametrize("kind", ["exr", "tiff"])
 def test_a_truncated_file_is_refused(kind: str) -> None:
     planes = {name: VALUES[:, :, c] for c, name in enumerate("RGB")}

@@ -291,6 +291,30 @@ def test_a_jpeg_in_a_tiff_that_lies_about_its_size_costs_no_memory() -> None:
         tracemalloc.stop()
 
 
+@pytest.mark.parametrize("compression", ["zlib", "jpeg"])
+def test_tiles_much_larger_than_the_image_are_refused(compression: str) -> None:
+    target = io.BytesIO()
+    pixels = np.zeros((16, 16, 3), np.uint8)
+    tifffile.imwrite(target, pixels, photometric="rgb", tile=(16, 16), compression=compression)
+    data = bytearray(target.getvalue())
+    width = data.index(struct.pack("<HHII", 322, 4, 1, 16))  # TileWidth
+    decode(bytes(data), memory=MEMORY)
+    struct.pack_into("<I", data, width + 8, 1 << 24)
+    with pytest.raises(ImageError, match="tiles of 16777216 x 16 pixels") as caught:
+        decode(bytes(data), memory=MEMORY)
+    assert caught.value.fields == {"limit": MEMORY}
+
+
+def test_a_jpeg_of_many_scans_is_refused() -> None:
+    target = io.BytesIO()
+    Image.fromarray(np.zeros((16, 16, 3), np.uint8)).save(target, "JPEG", progressive=True)
+    data = target.getvalue()
+    decode(data, memory=MEMORY)
+    scan = data[data.rindex(b"\xff\xda") : -2]
+    with pytest.raises(ImageError, match="100 scans"):
+        decode(data[:-2] + scan * 100 + data[-2:], memory=MEMORY)
+
+
 def test_units_and_integers() -> None:
     for dtype in ("uint8", "uint16"):
         codes = np.arange(np.iinfo(dtype).max + 1).astype(dtype).reshape(1, -1, 1)

@@ -103,6 +103,9 @@ def test_patterns_are_numbered_through_the_parts() -> None:
             "finer than the monitor's 72 .* up to 6",
         ),
         ([{"kind": "constant", "levels": [0, 1]}, {"kind": "images", "files": []}], "at least 1 item"),
+        ([{"kind": "constant", "levels": [0, 1]}, *[grid(1, 1)] * 1000], "at most 1000 items"),
+        ([{"kind": "constant", "levels": [0] * 100_001}, grid(4, 3)], "at most 100000 items"),
+        ([{"kind": "constant", "levels": [0, 1]}, grid(1, 1, count=99_999)], "100001 patterns, more than"),
     ],
 )
 def test_programs_that_can_not_work_are_refused(parts: list[dict[str, Any]], why: str) -> None:

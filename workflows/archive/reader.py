@@ -19,7 +19,7 @@ from storage.checksums import CODECS, SUM, is_checked, is_intact, unseal
 from storage.errors import ArchiveError, Corrupt
 from storage.grid import block_edge
 from storage.mattes import CHANNELS, FRAMES, Block
-from workflows.archive.records import Attributes, Manifest, valid
+from workflows.archive.records import Attributes, Manifest, Member, valid
 from workflows.archive.values import faults
 from workflows.ingest.bundle import Limits
 from workflows.recovery.pyramid import Pyramid
@@ -30,6 +30,8 @@ DOCUMENT_BYTES = 1 << 16
 """Of a zarr.json, at most."""
 MEMBER_BYTES = 256
 """Of what the manifest says of one entry, at most."""
+MOST_FIELDS = 20
+"""Of the manifest, and of what it says of one entry."""
 PIXEL_BYTES = 42
 """Of a pixel in the frame-shaped arrays."""
 LIGHT_BYTES = 12
@@ -52,10 +54,7 @@ class Reader:
         self._limits = limits
         self._archive = zips.opened(file, ArchiveError)
         self._entries = zips.entries(self._archive, ENTRIES, limits.unpacked, ArchiveError)
-        manifest = valid(
-            Manifest, self._document(MANIFEST, 4096 + MEMBER_BYTES * len(self._entries)), MANIFEST
-        )
-        self._members = manifest.members
+        self._read_manifest()
         self._check_members()
         self.attributes: dict[str, Any] = self._document("zarr.json", DOCUMENT_BYTES)["attributes"]
         checked = valid(Attributes, self.attributes, "zarr.json")
@@ -65,7 +64,7 @@ class Reader:
             raise refused(
                 "zarr.json", f"blocks of {checked.block} pixels are not those of a frame of this size"
             )
-        if manifest.matte != archives.listed(self.attributes):
+        if self._listed != archives.listed(self.attributes):
             raise refused(MANIFEST, "it lists another matte than the archive holds")
         self._nodes = Pyramid.over(checked.columns, checked.rows).nodes
         self._check_names(-(-checked.height // self._edge), -(-checked.width // self._edge))
@@ -105,6 +104,20 @@ class Reader:
             raise refused(name, "it does not describe what a matte of this size has there")
         if is_checked(found):
             self._checked.add(name.removesuffix("/zarr.json"))
+
+    def _read_manifest(self) -> None:
+        """Read what the entries are, one after another: the list of all faults takes a kilobyte for each."""
+        document = self._document(MANIFEST, 4096 + MEMBER_BYTES * len(self._entries))
+        members = document.get("members") if isinstance(document, dict) else None
+        parts = (document, *members.values()) if isinstance(members, dict) else (document,)
+        if any(isinstance(part, dict) and len(part) > MOST_FIELDS for part in parts):
+            raise refused(MANIFEST, f"a part of it has more than {MOST_FIELDS} fields")
+        manifest = valid(Manifest, document, MANIFEST)
+        self._listed = manifest.matte
+        self._members = {
+            name: valid(Member, given, MANIFEST, f"members.{name}.")
+            for name, given in manifest.members.items()
+        }
 
     def _frame(self, name: str, row: int, column: int) -> NDArray[Any]:
         entry = archives.chunk(name, row, column)

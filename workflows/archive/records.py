@@ -45,16 +45,17 @@ class Manifest(_Strict):
 
     format: Literal["envmatte-archive/1"]
     matte: dict[str, Any]
-    members: dict[str, Member]
+    members: dict[str, Any]
+    """A `Member` each."""
 
 
-def valid(model: type[Model], given: Any, entry: str) -> Model:
-    """What an entry says, as a model; `ArchiveError` if it is none."""
+def valid(model: type[Model], given: Any, entry: str, within: str = "") -> Model:
+    """What an entry, or a part of it, says, as a model; `ArchiveError` if it is none."""
     try:
         return model.model_validate(given)
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-        field = ".".join(str(part) for part in first["loc"])
+        field = within + ".".join(str(part) for part in first["loc"])
         raise ArchiveError(
             f"{entry}: {field + ': ' if field else ''}{first['msg']}", entry=entry, field=field
         ) from error

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Annotated, BinaryIO, Literal, cast
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
 
 from storage import zips
 from storage.errors import CaptureError, OverLimit
@@ -18,7 +18,8 @@ from workflows.program import Images, Program
 from workflows.tone import Response
 
 MANIFEST = "capture.json"
-MANIFEST_BYTES = 8 << 20
+MANIFEST_BYTES = 2 << 20
+"""Of capture.json: 100 for each of the most frames. Of JSON at its worst, a hundredfold is held while it is read."""
 ENTRIES = 20_000
 NAME_LENGTH = 26
 """Where an entry's header has the lengths of its name and of the field after it (APPNOTE, sect. 4.3.7)."""
@@ -54,7 +55,8 @@ class Manifest(BaseModel):
     name: str = Field(default="", max_length=200)
     program: Program
     response: Response = "unknown"
-    frames: tuple[Frame, ...] = ()
+    # One fault is told: a list of all there are takes a kilobyte for each.
+    frames: Annotated[tuple[Frame, ...], FailFast()] = ()
     video: Video | None = None
     mask: str | None = None
 

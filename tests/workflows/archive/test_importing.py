@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from storage.archives import MANIFEST, Archive
 from storage.errors import ArchiveError
@@ -298,6 +299,14 @@ MANIFESTS: dict[str, tuple[str, Change]] = {
         "no JSON",
         lambda files: files.update({MANIFEST: files[MANIFEST].replace(b'"S/zarr', b'"\\ud800')}),
     ),
+    "more than it may say": (
+        "more than 20 fields",
+        documented(MANIFEST, lambda d: d.update({str(n): 0 for n in range(20)})),
+    ),
+    "more of an entry than it may say": (
+        "more than 20 fields",
+        documented(MANIFEST, lambda d: d["members"]["S/zarr.json"].update({str(n): 0 for n in range(20)})),
+    ),
     "a list": (MANIFEST, lambda files: files.update({MANIFEST: b"[]"})),
 }
 
@@ -311,6 +320,14 @@ def test_what_the_manifest_does_not_say_is_refused(objects: Objects, archive: by
         size = len(files["S/c/0/0/0"])
         documented(MANIFEST, lambda d: d["members"]["S/c/0/0/0"].update(size=size))(files)
     assert "entry" in refused(objects, packed(files), match).fields
+
+
+def test_of_many_faults_of_the_manifest_the_first_is_found_alone(objects: Objects, archive: bytes) -> None:
+    files = unpacked(archive)
+    documented(MANIFEST, lambda d: d.update(members={name: {"size": -1} for name in d["members"]}))(files)
+    error = refused(objects, packed(files), "members.*size")
+    assert isinstance(error.__cause__, ValidationError)
+    assert error.__cause__.error_count() == 2  # of one entry
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from storage import uploads
 from storage.errors import CaptureError
@@ -366,3 +367,25 @@ def test_an_entry_larger_than_a_directory_may_be_is_read(make_zip: Zip) -> None:
     large = bytes(range(256)) * (9 << 12)
     bundle = Bundle(io.BytesIO(make_zip(RECORD, FILES | {"large": large})), Limits(1 << 30, 1 << 30))
     assert bundle.read("large") == large
+
+
+@pytest.mark.parametrize(
+    "way", ["frames", "program.parts", "program.parts.0.levels", "program.parts.0.colours"]
+)
+def test_of_many_faults_the_first_is_found_alone(make_zip: Zip, way: str) -> None:
+    record = copy.deepcopy(RECORD)
+    inner: Any = record
+    *names, last = (int(name) if name.isdigit() else name for name in way.split("."))
+    for name in names:
+        inner = inner[name]
+    inner[last] = [{}] * 1000
+    error = refused(make_zip(record, FILES))
+    assert str(error.fields["field"]).startswith(f"{way}.0")
+    assert isinstance(error.__cause__, ValidationError)
+    assert error.__cause__.error_count() < 4  # a list of millions takes gigabytes
+
+
+def test_a_record_larger_than_any_is_refused(make_zip: Zip) -> None:
+    limits = Limits(unpacked=1 << 24, memory=1 << 24)
+    error = refused(make_zip(b" " * ((2 << 20) + 1), FILES, zipfile.ZIP_DEFLATED), limits)
+    assert error.fields == {"entry": "capture.json", "limit": 2 << 20}
