@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import tifffile
-from numpy.typing import NDArray
 
 from storage import captures, uploads
 from storage.captures import Stack
 from storage.objects import Objects
+from tests.workflows.dngs import dng
 from workflows.ingest import frames
 from workflows.ingest.bundle import Limits
 from workflows.ingest.measure import measure
@@ -97,42 +96,8 @@ def ingest(objects: Objects, put: Callable[[str, bytes], None]) -> Ingest:
 
 @pytest.fixture(scope="session")
 def make_dng() -> Callable[..., bytes]:
-    """Makes a DNG of a sensor's counts, or of linear pixels, the least that LibRaw takes for one."""
-
-    def make(
-        counts: NDArray[Any],
-        black: int,
-        white: int,
-        pattern: tuple[int, ...] = (0, 1, 1, 2),
-        active: tuple[int, ...] = (),
-        orientation: int = 1,
-        **how: Any,
-    ) -> bytes:
-        period = int(len(pattern) ** 0.5)
-        tags = [
-            (271, "s", 0, "Acme", True),
-            (272, "s", 0, "Box", True),
-            (274, "H", 1, orientation, True),
-            (50706, "B", 4, bytes((1, 4, 0, 0)), True),  # the DNG's version
-            (50708, "s", 0, "Acme Box", True),
-            (50714, "I", 1, black, True),
-            (50717, "I", 1, white, True),
-            (50721, "2i", 9, tuple(v for n in range(9) for v in (int(n % 4 == 0), 1)), True),  # colour matrix
-            (50728, "2I", 3, (1, 1) * 3, True),  # neutral
-        ]
-        if counts.ndim == 2:  # the colour filter's size, and its colours
-            tags += [(33421, "H", 2, (period, period), True), (33422, "B", period**2, bytes(pattern), True)]
-        if active:  # top, left, bottom, right
-            tags.append((50829, "I", 4, active, True))
-        target = io.BytesIO()
-        if counts.ndim == 2:
-            how["photometric"] = "cfa"
-        else:
-            how |= {"photometric": tifffile.PHOTOMETRIC.LINEAR_RAW, "planarconfig": "contig"}
-        tifffile.imwrite(target, counts, extratags=tags, **how)
-        return target.getvalue()
-
-    return make
+    """Makes a DNG."""
+    return dng
 
 
 @pytest.fixture

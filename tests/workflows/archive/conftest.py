@@ -51,8 +51,7 @@ def random_block(height: int, width: int, seed: int) -> Block:
     )
 
 
-@pytest.fixture
-def matte(objects: Objects) -> Matte:
+def make_matte(objects: Objects) -> Matte:
     """A whole matte, with the id m; one block of it has no rows at all."""
     made = mattes.create(
         objects,
@@ -81,6 +80,12 @@ def matte(objects: Objects) -> Matte:
                 )
             made.write(row, column, block)
     return made
+
+
+@pytest.fixture
+def matte(objects: Objects) -> Matte:
+    """The same."""
+    return make_matte(objects)
 
 
 @pytest.fixture

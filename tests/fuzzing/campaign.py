@@ -1,0 +1,247 @@
+"""Executions of a target in a process that is watched: what crashes, hangs or takes too much memory is counted too.
+
+Input N of a target follows from its name and N alone, so whatever fails can be run again.
+"""
+
+import multiprocessing
+import os
+import resource
+import shutil
+import signal
+import tempfile
+import time
+import traceback
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from pathlib import Path
+from random import Random
+from typing import Any, NamedTuple
+
+CPU_SECONDS, SECONDS = 10.0, 60.0
+"""That one execution may take, of processors and of the clock: this machine may be busy with much else."""
+MEMORY = 128 << 20
+"""Bytes that one execution may take besides what the process had: limits of parsers are set to a few megabytes here."""
+ADDRESSES = 6 << 30
+"""Bytes that the process may ask for besides what it had, so that no execution takes the machine's memory."""
+BATCH = 2000
+"""Executions of one process: what leaks does so in all of them."""
+
+
+class Refused(Exception):
+    """Of an execution, that its input was refused as it should be."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A parser of foreign bytes.
+
+    Attributes
+    ----------
+    name : str
+    make : callable
+        Makes an input, out of whole files.
+    run : callable
+        Reads an input, with an empty folder to work in that is the process'. It returns if the input was taken, and
+        raises `Refused` if it was refused as it is documented; any other error is a failure.
+    whole : callable, optional
+        Makes those: once, and not in the processes that are watched.
+    quick : int
+        Executions that take about a second.
+    """
+
+    name: str
+    make: Callable[[Random, Any], bytes]
+    run: Callable[[bytes, Path], object]
+    whole: Callable[[], Any] = tuple
+    quick: int = 300
+
+    def input(self, seed: int, whole: Any = None) -> bytes:
+        """An input; `whole` are the files it is made of, if they are there already."""
+        return self.make(Random(f"{self.name} {seed}"), whole or self.whole())
+
+
+class Failure(NamedTuple):
+    """An execution that failed: ``kind`` is error, crash, hang or memory."""
+
+    kind: str
+    target: str
+    seed: int
+    what: str
+    file: Path
+
+    def __str__(self) -> str:
+        again = f"python -m tests.benchmarks.fuzzing --target {self.target} --seed {self.seed}"
+        return f"{self.target}: {self.kind}: {self.what}\n  input: {self.file}\n  again: {again}"
+
+
+@dataclass
+class Tally:
+    """What came of the executions of a target."""
+
+    executions: int = 0
+    taken: int = 0
+    refused: int = 0
+    seconds: float = 0.0
+    slowest: float = 0.0
+    failures: list[Failure] = field(default_factory=list)
+
+    def count(self, kind: str) -> int:
+        return sum(failure.kind == kind for failure in self.failures)
+
+
+def run(
+    target: Target,
+    first: int,
+    count: int,
+    keep: Path,
+    *,
+    seconds: float = float("inf"),
+    failures: int = 20,
+    cpu: float = CPU_SECONDS,
+) -> Tally:
+    """Run inputs ``first`` to ``first + count - 1`` of a target.
+
+    Parameters
+    ----------
+    keep : Path
+        Folder for the inputs that fail.
+    seconds : float
+        After which no more is run.
+    failures : int
+        After which no more is run.
+    cpu : float
+        Seconds of processors that one may take.
+    """
+    whole = target.whole()
+    tally, start, seed = Tally(), time.monotonic(), first
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["tests.fuzzing.targets"])
+    while seed < first + count and len(tally.failures) < failures:
+        left = seconds - (time.monotonic() - start)
+        if left <= 0:
+            break
+        with tempfile.TemporaryDirectory() as folder:
+            ours, theirs = context.Pipe(duplex=False)
+            upto = min(first + count, seed + BATCH)
+            process = context.Process(
+                target=_batch, args=(target, whole, seed, upto, left, cpu, folder, theirs)
+            )
+            process.start()
+            theirs.close()
+            seed = _watch(process, ours, target, seed, keep, tally)
+    tally.seconds = time.monotonic() - start
+    return tally
+
+
+def _watch(process: Any, pipe: Connection, target: Target, seed: int, keep: Path, tally: Tally) -> int:
+    """Take what a process tells of its executions; returns the first seed that is still to be run."""
+
+    def failed(kind: str, what: str) -> None:
+        keep.mkdir(parents=True, exist_ok=True)
+        file = keep / f"{target.name}-{seed}.bin"
+        file.write_bytes(target.input(seed))
+        tally.failures.append(Failure(kind, target.name, seed, what, file))
+
+    while True:
+        try:
+            if not pipe.poll(SECONDS):
+                process.kill()
+                raise EOFError
+            told = pipe.recv()
+        except (EOFError, ConnectionError):
+            process.join()
+            code = process.exitcode
+            if code in (-signal.SIGPROF, -signal.SIGKILL):
+                failed("hang", "it did not end")
+            else:
+                failed("crash", signal.Signals(-code).name if code < 0 else f"exit status {code}")
+            tally.executions += 1
+            return seed + 1
+        if told is None:
+            process.join()
+            return seed
+        taken, took, failure = told
+        tally.executions += 1
+        tally.taken += taken and failure is None
+        tally.refused += not taken and failure is None
+        tally.slowest = max(tally.slowest, took)
+        if failure is not None:
+            failed(*failure)
+        seed += 1
+
+
+def _batch(
+    target: Target,
+    whole: Any,
+    first: int,
+    upto: int,
+    seconds: float,
+    cpu: float,
+    folder: str,
+    pipe: Connection,
+) -> None:
+    """What a process does: run, and tell of each execution when it has ended."""
+    warnings.simplefilter("ignore")
+    _be_quiet()
+    _, most = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (_addresses() + ADDRESSES, most))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    give_up = time.monotonic() + seconds
+    for seed in range(first, upto):
+        if time.monotonic() > give_up:
+            break
+        data = target.input(seed, whole)
+        for once_more in (True, False) if seed == first else (False,):
+            began = time.perf_counter()
+            signal.setitimer(signal.ITIMER_PROF, cpu)
+            taken, failure = execute(target, data, Path(folder))
+            signal.setitimer(signal.ITIMER_PROF, 0)
+            if once_more:  # what is loaded then, and kept, is no execution's
+                before = _most_memory()
+        took = time.perf_counter() - began
+        grown = _most_memory() - before
+        if failure is None and grown > MEMORY:
+            failure = "memory", f"it took {grown >> 20} MB"
+        pipe.send((taken, took, failure))
+        if grown > MEMORY:
+            break  # what takes as much again would not show
+    pipe.send(None)
+
+
+def execute(target: Target, data: bytes, folder: Path) -> tuple[bool, tuple[str, str] | None]:
+    """Run an input here: whether it was taken, and what failed."""
+    try:
+        target.run(data, folder)
+    except Refused:
+        return False, None
+    except Exception as error:
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        said = f"{type(error).__name__}: {error}"[:300]
+        return False, ("error", f"{said} ({Path(where.filename).name}:{where.lineno}, {where.name})")
+    finally:
+        for left in folder.iterdir():
+            if left.name != KEPT:
+                shutil.rmtree(left) if left.is_dir() else left.unlink()
+    return True, None
+
+
+KEPT = "kept"
+"""What a target may leave in its folder from one execution to the next."""
+
+
+def _be_quiet() -> None:
+    """Decoders write what they think of an input: nobody reads it."""
+    nothing = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):
+        os.dup2(nothing, stream)
+
+
+def _most_memory() -> int:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
+
+
+def _addresses() -> int:
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    return pages * resource.getpagesize()

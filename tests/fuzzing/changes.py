@@ -1,0 +1,282 @@
+"""Changes of real files, as they are damaged and as liars make them: the same `Random`, the same bytes."""
+
+import io
+import json
+import re
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from random import Random
+from typing import Any
+
+EXTREMES = (0, 1, 2, 0x7F, 0x80, 0xFF, 0x7FFF, 0x8000, 0xFFFF, 0x10000, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)
+"""Where counts and lengths run over."""
+VALUES: tuple[Any, ...] = (
+    *(None, True, False, 0, 1, -1, 2, 17, 4096, 16384, 100_000, 2**31, 2**53, 2**63, 2**64, 10**30),
+    *(0.5, 1e-9, -0.0, 1e308, 1e-320, float("nan"), float("inf")),
+    *(
+        "",
+        "a",
+        "../a",
+        "/",
+        "\0",
+        "é\u0301",
+        "a" * 300,
+        "linear",
+        "unknown",
+        "constant",
+        "bernoulli",
+        "stripes",
+        "images",
+    ),
+    *([], {}, [[]], [0, 1], ["a", "a"], {"gamma": 2.2}, {"": {}}),
+)
+"""What may stand in a JSON document in place of something else."""
+LARGEST = 1 << 18
+"""Bytes, about, of what is repeated."""
+SIGNATURE = b"\x89PNG\r\n\x1a\n"
+TIFF_TYPES = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 16, 17, 18, 0, 255)
+TIFF_TAGS = (
+    *(
+        254,
+        256,
+        257,
+        258,
+        259,
+        262,
+        266,
+        273,
+        274,
+        277,
+        278,
+        279,
+        284,
+        292,
+        317,
+        320,
+        322,
+        323,
+        324,
+        325,
+        330,
+        338,
+    ),
+    *(
+        339,
+        347,
+        513,
+        514,
+        529,
+        530,
+        531,
+        532,
+        33421,
+        33422,
+        34665,
+        34675,
+        50714,
+        50717,
+        50718,
+        50829,
+        51008,
+        52525,
+    ),
+)
+"""That decide how pixels are found and unpacked."""
+
+
+def damaged(random: Random, data: bytes, marks: bytes | None = None, other: bytes = b"") -> bytes:
+    """A file with some bytes changed, more often at its beginning, and perhaps cut, doubled in parts or spliced.
+
+    Parameters
+    ----------
+    marks : bytes, optional
+        A regular expression of what stands before a file's counts and lengths, which are then changed as often as all
+        the rest.
+    other : bytes, optional
+        Another file, whose parts may come in.
+    """
+    out = bytearray(data)
+    places = [match.end() for match in re.finditer(marks, data, re.S)] if marks else []
+    for _ in range(random.choice((1, 1, 1, 2, 3, 6))):
+        if not out:
+            break
+        if places and random.random() < 0.5:
+            at = min(random.choice(places) + random.randrange(48), len(out) - 1)
+        else:
+            at = random.randrange(min(random.choice((64, 600, len(out))), len(out)))
+        random.choice((_bit, _byte, _number, _number, _cut_out, _repeat))(random, out, at)
+    last = random.random()
+    if last < 0.1:
+        del out[random.randrange(len(out) + 1) :]
+    elif last < 0.2 and (source := other or bytes(out)):
+        start, at = random.randrange(len(source)), random.randrange(len(out) + 1)
+        out[at : at + random.choice((0, len(out)))] = source[start : start + random.randrange(len(source))]
+    return bytes(out)
+
+
+def _bit(random: Random, out: bytearray, at: int) -> None:
+    out[at] ^= 1 << random.randrange(8)
+
+
+def _byte(random: Random, out: bytearray, at: int) -> None:
+    out[at] = random.choice((0, 1, 0x7F, 0x80, 0xFF, random.randrange(256)))
+
+
+def _number(random: Random, out: bytearray, at: int) -> None:
+    size, order = random.choice((1, 2, 4, 4, 8)), random.choice(("little", "big"))
+    here = int.from_bytes(out[at : at + size], order)
+    near = here + random.choice((-1, 1, 16, -16)), here * 2, here << 8, len(out)
+    value = random.choice((*EXTREMES, *near)) % (1 << 8 * size)
+    out[at : at + size] = value.to_bytes(size, order)[: len(out) - at]
+
+
+def _cut_out(random: Random, out: bytearray, at: int) -> None:
+    del out[at : at + random.choice((1, 2, 4, 16, 256))]
+
+
+def _repeat(random: Random, out: bytearray, at: int) -> None:
+    piece = bytes(out[at : at + random.choice((1, 4, 16, 256))])
+    out[at:at] = piece * random.choice((1, 2, 20))
+
+
+def other_json(random: Random, document: Any) -> bytes:
+    """A JSON text of a document with other values in some places, or with parts left out, moved, nested or repeated."""
+    text = json.dumps(document).encode()
+    for _ in range(random.choice((1, 1, 2, 3))):
+        if len(text) > LARGEST:
+            break
+        document = json.loads(text)  # nothing in it is there twice
+        ways = [*_ways(document)]
+        way = random.choice(ways)
+        text = json.dumps(_put(document, way, _other_value(random, document, way, ways))).encode()
+    if random.random() < 0.1:
+        text = damaged(random, text)
+    return text
+
+
+def _ways(value: Any, way: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """The ways to everything in a document."""
+    yield way
+    inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, inner in inside:
+        yield from _ways(inner, (*way, key))
+
+
+def _at(document: Any, way: Sequence[Any]) -> Any:
+    for key in way:
+        document = document[key]
+    return document
+
+
+_GONE = object()
+
+
+def _other_value(random: Random, document: Any, way: Sequence[Any], ways: Sequence[Sequence[Any]]) -> Any:
+    here = _at(document, way)
+    what = random.randrange(10)
+    if what == 0:
+        return _GONE
+    if what == 1:
+        return _at(json.loads(json.dumps(document)), random.choice(ways))
+    if what == 2:
+        most = LARGEST // len(json.dumps(here))
+        return [here] * min(random.choice((1, 2, 3, 1000, 20_000)), most)
+    if what == 3:
+        for _ in range(random.choice((1, 30, 190, 300))):
+            here = [here] if random.random() < 0.5 else {"parts": here}
+        return here
+    if what == 4 and isinstance(here, int | float):
+        return here + random.choice((-1, 1, 0.5))
+    return random.choice(VALUES)
+
+
+def _put(document: Any, way: Sequence[Any], value: Any) -> Any:
+    if not way:
+        return {} if value is _GONE else value
+    inner = _at(document, way[:-1])
+    if value is _GONE:
+        del inner[way[-1]]
+    else:
+        inner[way[-1]] = value
+    return document
+
+
+def zipped(files: dict[str, bytes], pack: int = zipfile.ZIP_STORED) -> bytes:
+    """A ZIP whose directory and checksums are right, of files of one date."""
+    target = io.BytesIO()
+    with zipfile.ZipFile(target, "w", pack) as archive:
+        for name, data in files.items():
+            archive.writestr(zipfile.ZipInfo(name), data, pack)
+    return target.getvalue()
+
+
+ZIP_MARKS = rb"PK(?:\x01\x02|\x03\x04|\x05\x06|\x06\x06|\x06\x07)"
+
+
+def damaged_zip(
+    random: Random, files: dict[str, bytes], change: Callable[[Random, str, bytes], bytes]
+) -> bytes:
+    """A ZIP of which either the container is damaged, or an entry was changed before it was packed."""
+    files = dict(files)
+    if random.random() < 0.5:
+        name = random.choice([*files])
+        files[name] = change(random, name, files[name])
+        return zipped(files, random.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)))
+    whole = zipped(files, random.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)))
+    return damaged(random, whole, ZIP_MARKS)
+
+
+def damaged_png(random: Random, data: bytes) -> bytes:
+    """A PNG with some chunks changed, left out, doubled or moved, whose checksums are right."""
+    chunks, at = [], len(SIGNATURE)
+    while at < len(data):
+        (size,) = struct.unpack_from(">I", data, at)
+        chunks.append((data[at + 4 : at + 8], data[at + 8 : at + 8 + size]))
+        at += size + 12
+    for _ in range(random.choice((1, 1, 2))):
+        n = random.randrange(len(chunks))
+        kind, body = chunks[n]
+        what = random.randrange(8)
+        if what == 0 and len(chunks) > 1:
+            del chunks[n]
+        elif what == 1:
+            chunks.insert(random.randrange(len(chunks) + 1), chunks[n])
+        elif what == 2:
+            kinds = (b"IHDR", b"PLTE", b"IDAT", b"tRNS", b"iCCP", b"acTL", b"fcTL", b"zTXt", b"eXIf", b"IEND")
+            chunks[n] = (random.choice(kinds), body)
+        elif kind == b"IDAT" and what < 6:
+            try:
+                rows = zlib.decompress(body)
+            except zlib.error:
+                continue
+            chunks[n] = (kind, zlib.compress(damaged(random, rows)))
+        else:
+            chunks[n] = (kind, damaged(random, body))
+    parts = (struct.pack(">I", len(b)) + k + b + struct.pack(">I", zlib.crc32(k + b)) for k, b in chunks)
+    return SIGNATURE + b"".join(parts)
+
+
+def damaged_tiff(random: Random, data: bytes) -> bytes:
+    """A TIFF, or a camera's RAW made like one, of which some tags say something else."""
+    out = bytearray(data)
+    order = "<" if out.startswith(b"II") else ">"
+    (first,) = struct.unpack_from(order + "I", out, 4)
+    (count,) = struct.unpack_from(order + "H", out, first)
+    for _ in range(random.choice((1, 1, 2, 3))):
+        at = first + 2 + 12 * random.randrange(count)
+        what = random.randrange(6)
+        if what == 0:
+            struct.pack_into(order + "H", out, at, random.choice(TIFF_TAGS))
+        elif what == 1:
+            struct.pack_into(order + "H", out, at + 2, random.choice(TIFF_TYPES))
+        elif what == 2:
+            struct.pack_into(order + "I", out, at + 4, random.choice((*EXTREMES, len(out))))
+        else:
+            value = random.choice((*EXTREMES, *range(16), len(out), random.randrange(len(out))))
+            if random.random() < 0.5:
+                struct.pack_into(order + "HH", out, at + 8, value & 0xFFFF, value >> 16)
+            else:
+                struct.pack_into(order + "I", out, at + 8, value)
+    return bytes(out) if random.random() < 0.8 else damaged(random, bytes(out))
