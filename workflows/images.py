@@ -185,11 +185,15 @@ def see_that_tiles_fit(page: tifffile.TiffPage, memory: int) -> None:
     ------
     ImageError
     """
-    pixels = page.imagewidth * page.imagelength
-    if page.is_tiled and pixels and page.tilewidth * page.tilelength * max(1, page.nbytes // pixels) > memory:
+    if not page.is_tiled:
+        return
+    # A tag may be a text, which times a number is a longer text.
+    width, height = int(page.tilewidth), int(page.tilelength)
+    pixel = -(-page.nbytes // max(int(page.imagewidth) * int(page.imagelength), 1))
+    if width * height * max(pixel, 1) > memory:
         raise ImageError(
-            f"tiles of {page.tilewidth} x {page.tilelength} pixels take more than the {memory} bytes allowed for one: "
-            "write the TIFF with smaller ones",
+            f"tiles of {width} x {height} pixels take more than the {memory} bytes allowed for one: write the TIFF "
+            "with smaller ones",
             limit=memory,
         )
 

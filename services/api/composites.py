@@ -39,6 +39,8 @@ router = APIRouter(tags=["mattes"])
 R = TypeVar("R")
 TAKEN = ("image/png", "image/jpeg", "image/tiff", "image/x-exr")
 ANSWERS = ("image/png", "image/jpeg", "image/x-exr")
+Distance = Annotated[float, Field(ge=1e-6, le=1e6)]
+"""In whatever unit; far beyond it rays are no numbers any more."""
 
 
 class Wanted(BaseModel):
@@ -61,17 +63,17 @@ class Wanted(BaseModel):
     scale: float = Field(1, ge=0.01, le=100, description="By how much the backdrop is larger.")
     angle: float = Field(0, ge=-360, le=360, description="By how much it is turned, in degrees, clockwise.")
 
-    depth: float | None = Field(
-        None, gt=0, description="Distance of the backdrop from the object, if it is not the monitor's."
+    depth: Distance | None = Field(
+        None, description="Distance of the backdrop from the object, if it is not the monitor's."
     )
-    distance: float | None = Field(
-        None, gt=0, description="That of the monitor in the capture, in the same unit."
+    distance: Distance | None = Field(
+        None, description="That of the monitor in the capture, in the same unit."
     )
-    camera: float | None = Field(None, gt=0, description="That of the camera from the object.")
+    camera: Distance | None = Field(None, description="That of the camera from the object.")
     other: str | None = Field(
         None, description="Or, in its place, a matte of the same object before a monitor at another distance."
     )
-    other_distance: float | None = Field(None, gt=0, description="That distance.")
+    other_distance: Distance | None = Field(None, description="That distance.")
     webhook: str | None = Field(
         None, description="Of a clip: URL, https, that is told when its job has ended."
     )

@@ -198,7 +198,9 @@ def get_job(context: Needs, id: str) -> Job:
 
 
 @router.get("/jobs/{id}/log")
-def get_log(context: Needs, id: str, limit: Limit = 1000, after: Annotated[int, Query(ge=0)] = 0) -> Log:
+def get_log(
+    context: Needs, id: str, limit: Limit = 1000, after: Annotated[int, Query(ge=0, lt=1 << 63)] = 0
+) -> Log:
     """What happened to a job, line by line."""
     with reading(context.engine) as c:
         jobs.get(c, id)

@@ -174,7 +174,7 @@ def make(random: Random, whole: object) -> bytes:
     return "\r\n".join(head).encode("latin-1", "replace") + body
 
 
-class _Served:
+class Served:
     """The service, in a folder, as it is for the port: without a cluster, which no request asks for anything."""
 
     def __init__(self, folder: Path) -> None:
@@ -192,19 +192,24 @@ class _Served:
         objects.put(composites.video_path("v"), bytes(1000))
         self.app = build_app(settings, engine, objects)
         self.loop = asyncio.new_event_loop()
+        self._engine = engine
+
+    def close(self) -> None:
+        self._engine.dispose()
+        self.loop.close()
 
 
 @cache
-def _served(folder: Path) -> _Served:
+def served(folder: Path) -> Served:
     folder.mkdir(exist_ok=True)
-    return _Served(folder)
+    return Served(folder)
 
 
 def read(data: bytes, folder: Path) -> None:
     """Answer a request as the port does: whatever is sent, the fault is the sender's, and the answer says so."""
-    served = _served(folder / KEPT)
+    service = served(folder / KEPT)
     connection = h11.Connection(h11.SERVER)
-    connection.receive_data(data.replace(b"PROGRAM", served.program.encode()))
+    connection.receive_data(data.replace(b"PROGRAM", service.program.encode()))
     body = b""
     try:
         request = connection.next_event()
@@ -242,7 +247,7 @@ def read(data: bytes, folder: Path) -> None:
     async def send(message: dict[str, Any]) -> None:
         sent.append(message)
 
-    served.loop.run_until_complete(served.app(scope, receive, send))
+    service.loop.run_until_complete(service.app(scope, receive, send))
     status, headers = sent[0]["status"], dict(sent[0]["headers"])
     answer = h11.Response(status_code=status, headers=[*headers.items()])  # what can be sent
     assert answer.status_code < 500 or answer.status_code == 507, sent

@@ -2,6 +2,7 @@
 
 import io
 import struct
+import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -141,6 +142,20 @@ def test_tiles_much_larger_than_the_image_are_refused() -> None:
     struct.pack_into("<I", data, width + 8, 1 << 24)
     with pytest.raises(ImageError, match="tiles of 16777216 x 16 pixels"):
         decode(bytes(data), memory=MEMORY)
+
+
+def test_a_tiff_whose_width_is_a_text_costs_no_memory() -> None:
+    data = bytearray(tiff(np.zeros((16, 16, 3), np.float32), photometric="rgb", tile=(16, 16)))
+    for tag, kind, value in ((256, 2, ord("$")), (257, 4, 1 << 30)):  # ImageWidth, ImageLength
+        at = data.index(struct.pack("<HHII", tag, 4, 1, 16))
+        struct.pack_into("<HHII", data, at, tag, kind, 1, value)
+    tracemalloc.start()
+    try:
+        with pytest.raises(ImageError):
+            decode(bytes(data), memory=MEMORY)
+        assert tracemalloc.get_traced_memory()[1] < 20 << 20
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize("kind", ["exr", "tiff"])
