@@ -98,3 +98,24 @@ def test_what_is_stopped_is_told(desk: Page, service: Service) -> None:
         {"name": "holiday.txt", "mimeType": "text/plain", "buffer": b"twelve bytes"}
     )
     expect(desk.get_by_role("alert")).to_contain_text("choose the video that the camera took")
+
+
+def test_a_film_that_is_being_taken_is_not_lost_by_a_click(desk: Page, service: Service) -> None:
+    made = service.http.post(
+        "/v1/programs", json={"program": SHORT, "monitor": SCREEN, "border": True}
+    ).json()
+    desk.goto(f"{service.url}/#/film/{made['id']}")
+    desk.get_by_role("button", name="Use a camera of this device").click()
+    desk.get_by_role("button", name="Start filming").click()
+    expect(desk.get_by_role("button", name="Stop filming")).to_be_visible()
+    asked: list[str] = []
+    desk.once("dialog", lambda dialog: (asked.append(dialog.message), dialog.dismiss()))
+    mattes = desk.get_by_role("navigation").get_by_role("link", name="Mattes")
+    mattes.click()
+    assert "A film is being taken" in asked[0]
+    expect(desk.get_by_role("button", name="Stop filming")).to_be_visible()
+    desk.once("dialog", lambda dialog: dialog.accept())
+    mattes.click()
+    expect(desk.get_by_role("heading", name="Mattes")).to_be_visible()
+    desk.get_by_role("navigation").get_by_role("link", name="Jobs").click()  # nothing asks any more
+    expect(desk.get_by_role("heading", name="Jobs")).to_be_visible()

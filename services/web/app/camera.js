@@ -63,6 +63,16 @@ export function camera(signal, filmed) {
     return free;
   }
 
+  // While it films, whoever leaves the view would lose the film.
+  const leave = (event) => {
+    const link = event.target.closest?.("a[href^='#']");
+    if (event.type === "beforeunload" || (link && !confirm("A film is being taken. Leave, and lose it?"))) event.preventDefault();
+  };
+  const guard = (how) => {
+    globalThis[`${how}EventListener`]("beforeunload", leave);
+    document[`${how}EventListener`]("click", leave);
+  };
+
   async function start() {
     if (!stream || recorder) return;
     const type = TYPES.find((one) => MediaRecorder.isTypeSupported(one));
@@ -70,6 +80,7 @@ export function camera(signal, filmed) {
     const mine = (recorder = new MediaRecorder(stream, { mimeType: type, videoBitsPerSecond: BITS }));
     mine.ondataavailable = ({ data }) => parts.push(data);
     mine.onstop = () => {
+      guard("remove");
       recorder = undefined;
       shoot.textContent = "Start filming";
       which.disabled = false;
@@ -83,6 +94,7 @@ export function camera(signal, filmed) {
       filmed(film);
     };
     mine.start(1000);
+    guard("add");
     shoot.textContent = "Stop filming";
     which.disabled = true;
     const free = await lock(stream.getVideoTracks()[0]);
