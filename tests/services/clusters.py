@@ -10,7 +10,7 @@ from pathlib import Path
 
 import psutil
 
-from services.decoding import NAME
+from services.decoder import NAME
 
 
 def wait(until: Callable[[], object], seconds: float = 90) -> None:

@@ -15,8 +15,9 @@ import pytest
 import tifffile
 from PIL import Image
 
-from services import decoding
-from services.decoding import NAME, Decoders
+from services import decoder, decoding
+from services.decoder import NAME
+from services.decoding import Decoders
 from storage.errors import ImageError, Unavailable
 from tests.services.clusters import running, wait
 from workflows import floats, images, pictures
@@ -189,7 +190,8 @@ LIES = [
     ),
     framed(b'{"said": {"height": 30, "width": 40, "channels": 3, "dtype": "uint8"}}') + b"too few",
     framed(b'{"said": {"height": 30, "width": 40, "channels": 4, "dtype": "float32"}}'),
-    framed(b'{"said": {"detail": 3, "fields": {}}}'),
+    framed(b'{"said": {"detail": 3}}'),
+    framed(b'{"said": {"detail": "no", "status": 200}}'),
     b"",
 ]
 
@@ -215,7 +217,7 @@ class Liar:
 def test_what_one_answers_is_not_believed(
     decoders: Decoders, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
-    monkeypatch.setattr(decoding, "_serve", Liar(number))
+    monkeypatch.setattr(decoder, "_serve", Liar(number))
     with pytest.raises(ImageError, match="ended the process"):
         decoders.decode(PNG, "srgb")
 
