@@ -62,9 +62,13 @@ def test_a_decoder_that_hangs_is_given_up_and_others_are_answered_meanwhile(
         wait(lambda: not running([one]))
 
 
-@pytest.mark.parametrize("end", ["terminate", "kill"])
-def test_decoders_end_with_the_service(tmp_path: Path, end: str) -> None:
-    with serving(tmp_path / "data", "--workers", "1") as service:
+@pytest.mark.parametrize(
+    ("end", "environment"),
+    [("terminate", {}), ("kill", {}), ("kill", {"ENVMATTE_COORDINATE": "false"})],
+    ids=["asked", "killed", "killed without workers"],
+)
+def test_decoders_end_with_the_service(tmp_path: Path, end: str, environment: dict[str, str]) -> None:
+    with serving(tmp_path / "data", "--workers", "1", **environment) as service:
         sent = service.http.post("/v1/mattes", content=archive(tmp_path, 40, 30), headers=ZIP)
         matte = sent.json()["id"]
         assert asked(service, matte).status_code == 200
