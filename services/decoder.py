@@ -196,9 +196,8 @@ def _refusal(error: Exception) -> Refused:
 
 def _confine(memory: int) -> None:
     """Take from this process what a decoder does not need."""
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # which a terminal sends to all: the service ends its children
+    # A terminal sends it to all: the service ends its children.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     limits = {resource.RLIMIT_CORE: 0, resource.RLIMIT_FSIZE: 0}
     if sys.platform == "linux":
         Path("/proc/self/comm").write_text(NAME)

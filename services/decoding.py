@@ -83,15 +83,9 @@ class Decoders:
         for child in children:
             child.end()
 
-    def _take(self) -> "Decoder":
+    def _take(self) -> Decoder:
         """A child that has nothing to do."""
-        while True:
-            with self._lock:
-                if self._closed:
-                    raise Unavailable("the service is being stopped; send it again to the next one")
-                child = self._idle.pop() if self._idle else None
-                if child is None:
-                    break
+        while (child := self._idle_one()) is not None:
             if child.is_waiting():
                 return child
             logger.warning("a decoder that had nothing to do is gone: %s", child.end())
@@ -100,4 +94,17 @@ class Decoders:
         child = Decoder(COPIES * self._memory + BESIDES)
         with self._lock:
             self._children.add(child)
+        if self._closed:  # meanwhile
+            child.end()
+            raise _stopping()
         return child
+
+    def _idle_one(self) -> Decoder | None:
+        with self._lock:
+            if self._closed:
+                raise _stopping()
+            return self._idle.pop() if self._idle else None
+
+
+def _stopping() -> Unavailable:
+    return Unavailable("the service is being stopped; send it again to the next one")
