@@ -85,6 +85,7 @@ class Tally:
     refused: int = 0
     seconds: float = 0.0
     slowest: float = 0.0
+    slowest_seed: int = 0
     failures: list[Failure] = field(default_factory=list)
 
     def count(self, kind: str) -> int:
@@ -166,7 +167,8 @@ def _watch(process: Any, pipe: Connection, target: Target, seed: int, keep: Path
         tally.executions += 1
         tally.taken += taken and failure is None
         tally.refused += not taken and failure is None
-        tally.slowest = max(tally.slowest, took)
+        if took > tally.slowest:
+            tally.slowest, tally.slowest_seed = took, seed
         if failure is not None:
             failed(*failure)
         seed += 1

@@ -141,6 +141,17 @@ def _repeat(random: Random, out: bytearray, at: int) -> None:
     out[at:at] = piece * random.choice((1, 2, 20))
 
 
+FLOATS = (0.0, -0.0, -1.0, 2.0, 1e-45, 1e30, -1e30, float("inf"), float("-inf"), float("nan"))
+
+
+def other_float(random: Random, data: bytes) -> bytes:
+    """Values of 32 bits, one of which is another."""
+    out = bytearray(data)
+    if len(out) >= 4:
+        struct.pack_into("<f", out, 4 * random.randrange(len(out) // 4), random.choice(FLOATS))
+    return bytes(out)
+
+
 def other_json(random: Random, document: Any) -> bytes:
     """A JSON text of a document with other values in some places, or with parts left out, moved, nested or repeated."""
     text = json.dumps(document).encode()

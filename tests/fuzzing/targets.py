@@ -156,7 +156,8 @@ def make_archive(random: Random, whole: dict[str, bytes]) -> bytes:
     elif kind == 1:
         files[name] = changes.damaged(random, files[name])
     else:
-        values = changes.damaged(random, imagecodecs.zstd_decode(files[name]))
+        change = random.choice((changes.damaged, changes.other_float))
+        values = change(random, bytes(imagecodecs.zstd_decode(files[name])))
         files[name] = imagecodecs.zstd_encode(values)
     if random.random() < 0.1:
         del files[random.choice([*files])]
