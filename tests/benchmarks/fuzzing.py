@@ -7,11 +7,13 @@ Runs damaged files and requests (`tests/fuzzing/`) through each parser for N sec
 prints what came of them: executions, how many inputs were refused and how many taken, crashes, hangs, errors of another
 kind than the documented, executions over the memory that they may take, and the longest. Inputs that fail are kept in
 the folder. Input N of a target is always the same: with `--seed` it is run alone, here, so that a debugger sees it; the
-next campaign goes on where `--first` says. Exit status 1 if anything failed.
+next campaign goes on where `--first` says. Exit status 1 if anything failed. With `TMPDIR` in memory those that store
+something are twice as fast.
 """
 
 import argparse
 import json
+import os
 import sys
 import tempfile
 from dataclasses import asdict
@@ -77,4 +79,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
+    os.environ.setdefault("SVT_LOG", "1")  # the encoder of a clip tells what it does
     sys.exit(main())

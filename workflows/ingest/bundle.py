@@ -18,8 +18,10 @@ from workflows.program import Images, Program
 from workflows.tone import Response
 
 MANIFEST = "capture.json"
-MANIFEST_BYTES = 2 << 20
-"""Of capture.json: 100 for each of the most frames. Of JSON at its worst, a hundredfold is held while it is read."""
+MANIFEST_BYTES = 4 << 20
+"""Of capture.json: 200 for each of the most frames."""
+MANIFEST_NODES = 50_000
+"""Objects and lists in it: an empty one takes two bytes, and 300 while it is read."""
 ENTRIES = 20_000
 NAME_LENGTH = 26
 """Where an entry's header has the lengths of its name and of the field after it (APPNOTE, sect. 4.3.7)."""
@@ -160,8 +162,15 @@ class Bundle:
             raise CaptureError(
                 f"{MANIFEST} is larger than {MANIFEST_BYTES} bytes", entry=MANIFEST, limit=MANIFEST_BYTES
             )
+        text = self.read(MANIFEST)
+        if text.count(b"{") + text.count(b"[") > MANIFEST_NODES:
+            raise CaptureError(
+                f"{MANIFEST} has more than {MANIFEST_NODES} objects and lists",
+                entry=MANIFEST,
+                limit=MANIFEST_NODES,
+            )
         try:
-            return Manifest.model_validate_json(self.read(MANIFEST))
+            return Manifest.model_validate_json(text)
         except ValidationError as error:
             # Of the errors of a union's members, the one that got furthest into one says most.
             first = max(error.errors(include_url=False, include_context=False), key=lambda e: len(e["loc"]))

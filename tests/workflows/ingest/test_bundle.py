@@ -387,5 +387,12 @@ def test_of_many_faults_the_first_is_found_alone(make_zip: Zip, way: str) -> Non
 
 def test_a_record_larger_than_any_is_refused(make_zip: Zip) -> None:
     limits = Limits(unpacked=1 << 24, memory=1 << 24)
-    error = refused(make_zip(b" " * ((2 << 20) + 1), FILES, zipfile.ZIP_DEFLATED), limits)
-    assert error.fields == {"entry": "capture.json", "limit": 2 << 20}
+    error = refused(make_zip(b" " * ((4 << 20) + 1), FILES, zipfile.ZIP_DEFLATED), limits)
+    assert error.fields == {"entry": "capture.json", "limit": 4 << 20}
+
+
+@pytest.mark.parametrize("piece", [b"[],", b'{"":0},'])
+def test_a_record_of_many_empty_things_is_refused(make_zip: Zip, piece: bytes) -> None:
+    limits = Limits(unpacked=1 << 24, memory=1 << 24)
+    error = refused(make_zip(b'{"more": [' + 60_000 * piece + b"0]}", FILES, zipfile.ZIP_DEFLATED), limits)
+    assert error.fields == {"entry": "capture.json", "limit": 50_000}
