@@ -107,7 +107,8 @@ class Reader:
 
     def _read_manifest(self) -> None:
         """Read what the entries are, one after another: the list of all faults takes a kilobyte for each."""
-        document = self._document(MANIFEST, 4096 + MEMBER_BYTES * len(self._entries))
+        entries = len(self._entries)
+        document = self._document(MANIFEST, 4096 + MEMBER_BYTES * entries, entries + MOST_FIELDS)
         members = document.get("members") if isinstance(document, dict) else None
         parts = (document, *members.values()) if isinstance(members, dict) else (document,)
         if any(isinstance(part, dict) and len(part) > MOST_FIELDS for part in parts):
@@ -161,8 +162,11 @@ class Reader:
             raise refused(name, f"it unpacks to {found} bytes in place of {size}")
         return np.frombuffer(values, dtype)
 
-    def _document(self, name: str, most: int) -> Any:
+    def _document(self, name: str, most: int, parts: int = DOCUMENT_BYTES) -> Any:
+        """The JSON of an entry, of at most so many bytes, and so many objects and lists: those take far more."""
         data = self._read(name, most)
+        if data.count(b"{") + data.count(b"[") > parts:
+            raise refused(name, f"it has more than {parts} parts")
         try:
             document = from_json(data, allow_inf_nan=False)
             return document if name == MANIFEST else unseal(name, data)[0]

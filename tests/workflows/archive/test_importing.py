@@ -307,6 +307,10 @@ MANIFESTS: dict[str, tuple[str, Change]] = {
         "more than 20 fields",
         documented(MANIFEST, lambda d: d["members"]["S/zarr.json"].update({str(n): 0 for n in range(20)})),
     ),
+    "lists of nothing": (
+        "more than .* parts",
+        lambda files: files.update({MANIFEST: b"[" + b"[]," * 500 + b"0]"}),
+    ),
     "a list": (MANIFEST, lambda files: files.update({MANIFEST: b"[]"})),
 }
 
