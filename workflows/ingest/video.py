@@ -120,6 +120,8 @@ class Clip:
 
     def close(self) -> None:
         """Let go of the decoder; the file stays open."""
+        # Which holds this clip, and so would hold the decoder's threads and frames until cycles are collected.
+        self._from_start = chain()
         self._container.close()
 
     @property

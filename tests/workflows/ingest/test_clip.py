@@ -1,11 +1,15 @@
 """Means of a video's frames: the colours that were filmed, whatever system and depth they are coded in."""
 
+import gc
 import io
+from pathlib import Path
 
 import av
 import numpy as np
 import pytest
 
+from storage.errors import CaptureError
+from tests.workflows.test_clips import clip, even, pictures
 from workflows.ingest.video import PARTS, Clip, Share
 
 
@@ -37,10 +41,40 @@ def test_a_mean_has_the_colours_that_were_filmed(
             frame.pts = number
             box.mux(stream.encode(frame))
         box.mux(stream.encode())
-    clip = Clip(io.BytesIO(target.getvalue()), "clip", 1 << 24)
-    _, ticks, _ = clip.signatures(1 << 24)
-    (mean,) = clip.means([[Share(int(ticks[2]), 100), Share(int(ticks[5]), PARTS - 100)]])
-    clip.close()
+    film = Clip(io.BytesIO(target.getvalue()), "clip", 1 << 24)
+    _, ticks, _ = film.signatures(1 << 24)
+    (mean,) = film.means([[Share(int(ticks[2]), 100), Share(int(ticks[5]), PARTS - 100)]])
+    film.close()
     middles = mean[8::16, 8::16]
     np.testing.assert_array_equal(middles[0, :2], [[65535] * 3, [0] * 3])  # to the end of the scale: clipped
     assert np.abs(middles / 257 - codes).max() < off
+
+
+def decoding() -> list[str]:
+    """The threads of this process that decode."""
+    names = [task.read_text() for task in Path("/proc/self/task").glob("*/comm")]
+    return [name for name in names if name.startswith("av:")]
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="threads are looked up in /proc")
+def test_a_decoder_is_gone_when_its_clip_is() -> None:
+    """And not only when the collector of cycles comes by: each has threads, and frames of tens of megabytes."""
+    data = clip(pictures(20), even(20))
+    gc.collect()
+    before = decoding()
+    gc.disable()
+    try:
+        for used in (True, False):
+            opened = Clip(io.BytesIO(data), "clip", 1 << 24)
+            if used:
+                ticks, _ = opened.ticks(99)
+                list(opened.means([[Share(tick, PARTS)] for tick in ticks[:5].tolist()]))
+            assert len(decoding()) > len(before)
+            opened.close()
+            del opened
+            assert decoding() == before
+        with pytest.raises(CaptureError):
+            Clip(io.BytesIO(data), "clip", 1000)
+        assert decoding() == before
+    finally:
+        gc.enable()
