@@ -30,7 +30,7 @@ from tests.benchmarks import users
 from tests.benchmarks.traffic import Traffic
 from tests.benchmarks.trends import Trend, trend
 from tests.faults.rig import free_port, url_of
-from tests.services.clusters import children, started, workers
+from tests.services.clusters import started, workers
 from tests.services.receivers import receiver
 
 WORKERS = 2
@@ -74,10 +74,9 @@ class Running:
         """The processes by what they are."""
         for name, process in self.processes.items():
             yield name, [process]
-        forked = workers(self.workers)
-        yield "worker", forked
-        servers = {one.ppid() for one in forked}
-        yield "fork server", [one for one in children(self.workers) if one.pid in servers]
+        yield "worker", workers(self.workers)
+        own = psutil.Process(self.workers.pid).children()  # which live as long as it does
+        yield "fork server", [one for one in own if any("forkserver" in word for word in one.cmdline())]
 
 
 @contextmanager
