@@ -223,7 +223,7 @@ def test_bodies_that_are_too_large(service: Service, matte: str) -> None:
         yield from (bytes(1 << 20) for _ in range(size >> 20))
 
     answer = service.http.post("/v1/jobs", content=endless(20 << 20))
-    assert check_problem(answer, 413, "too-large")["limit"] == 1 << 20
+    assert check_problem(answer, 413, "too-large")["limit"] == 64 << 10
     answer = service.http.post(f"/v1/mattes/{matte}/composite", content=endless(160 << 20))
     assert check_problem(answer, 413, "too-large")["limit"] == 128 << 20
 

@@ -20,7 +20,7 @@ from workflows.tone import Response
 MANIFEST = "capture.json"
 MANIFEST_BYTES = 4 << 20
 """Of capture.json: 200 for each of the most frames."""
-MANIFEST_NODES = 50_000
+MANIFEST_NODES = 150_000
 """Objects and lists in it: an empty one takes two bytes, and 300 while it is read."""
 ENTRIES = 20_000
 NAME_LENGTH = 26
