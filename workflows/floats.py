@@ -9,6 +9,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from storage.errors import ImageError
+from workflows import lzw
 from workflows.images import LOSSLESS, PLAIN, orientation, see_that_tiles_fit, upright
 
 Floats = NDArray[np.float32]
@@ -123,6 +124,7 @@ def _tiff(data: bytes, memory: int) -> Floats:
         stored = -(-page.nbytes // (width * height))
         channels = 3 if page.samplesperpixel > 2 else 1
         _see_that_it_fits(width, height, stored + 4 * channels, memory)
+        lzw.see_that_it_is_sound(data, page)
         array = np.asarray(page.asarray())
         if array.size != height * width * page.samplesperpixel:
             raise ImageError("the TIFF image is cut off or damaged: its tags contradict each other")

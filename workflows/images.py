@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from storage.errors import ImageError
+from workflows import lzw
 
 T = TypeVar("T", bound=np.generic)
 Codes = NDArray[np.unsignedinteger]
@@ -172,6 +173,7 @@ def _tiff(data: bytes, picture: Image.Image, memory: int) -> NDArray[np.generic]
                 f"this one has {page.bitspersample} bits and the axes {page.axes}"
             )
         _see_that_it_fits(picture, -(-page.nbytes // (picture.width * picture.height)), memory)
+        lzw.see_that_it_is_sound(data, page)
         array = np.asarray(page.asarray())
         if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
             array = np.invert(array)

@@ -33,10 +33,10 @@ from tests.fuzzing import changes, requests, seeds
 from tests.fuzzing.campaign import KEPT, Refused, Target
 from tests.workflows.archive.conftest import make_matte, signed, unpacked
 from tests.workflows.ingest.camera import Camera, capture, film, lights
-from workflows import clips, floats, images, raw
+from workflows import clips, floats, images, pictures, raw
 from workflows.archive.importing import take_in
 from workflows.composite import composite
-from workflows.composite.backdrops import read_backdrop
+from workflows.composite.backdrops import backdrop_of
 from workflows.ingest import frames
 from workflows.ingest.bundle import Bundle, Limits
 from workflows.ingest.video import PARTS, Share, opened
@@ -193,7 +193,7 @@ def read_image(data: bytes, folder: Path) -> None:
 
 
 def read_any_backdrop(data: bytes, folder: Path) -> None:
-    backdrop = read_backdrop(data, "srgb", memory=LIMITS.image)
+    backdrop = backdrop_of(pictures.decode(data, "srgb", memory=LIMITS.image), "srgb")
     pixels = backdrop.pixels
     assert pixels.ndim == 3
     assert 0 < pixels.nbytes <= 4 * LIMITS.image
