@@ -92,7 +92,7 @@ def test_a_file_that_is_there_is_kept(name: str, tmp_path: Path) -> None:
         (GREY, float("nan"), "nan patterns a second"),
         (fitted("sketch", (40, 30), bordered=False), 2.0, "no border can be drawn"),
         (
-            GREY.model_copy(update={"parts": (LEVELS, RANDOM.model_copy(update={"count": 4091}))}),
+            Program(monitor=GREY.monitor, parts=(LEVELS, RANDOM.model_copy(update={"count": 4091}))),
             2.0,
             "4096 patterns",
         ),

@@ -10,6 +10,7 @@ import pytest
 from services.api.access import identify
 from services.api.context import LOOK, Context
 from services.api.errors import Unauthorized
+from services.decoding import Decoders
 from services.settings import Settings
 from storage import keys
 from storage.database import open_engine, writing
@@ -23,7 +24,8 @@ def test_a_download_ends_with_its_key(tmp_path: Path) -> None:
         key = keys.make(c, "lab", "alice", "read")
     settings, objects = Settings(data=tmp_path), Objects((tmp_path / "store").as_uri())
     check = partial(identify, settings, engine, key)
-    context = Context(settings, engine, objects, Cache(objects, 0), check=check)
+    decoders = Decoders(settings.backdrop_bytes)  # which start when they are asked
+    context = Context(settings, engine, objects, Cache(objects, 0), decoders, check=check)
 
     def pieces() -> Iterator[bytes]:
         for n in range(5):

@@ -64,7 +64,7 @@ def test_grids_without_offsets_promise_what_their_finest_blocks_tell() -> None:
 
 def test_patterns_without_offsets_beside_others_are_not_counted() -> None:
     program = preset("default")
-    more = program.model_copy(update={"parts": (*program.parts, *still(96).parts[1:])})
+    more = Program(monitor=program.monitor, parts=(*program.parts, *still(96).parts[1:]))
     assert ends(more) == ends(program)
 
 
