@@ -6,6 +6,7 @@ import json
 import tempfile
 import zipfile
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
 from itertools import islice
@@ -13,7 +14,6 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-import imagecodecs
 import numpy as np
 from PIL import Image
 from starlette.requests import Request
@@ -27,11 +27,12 @@ from services.api.errors import problem_of
 from services.tracing import TRACEPARENT
 from storage import composites, uploads, zips
 from storage.archives import Archive
+from storage.checksums import seal
 from storage.errors import ArchiveError, CaptureError, InvalidInput
 from storage.objects import Objects
 from tests.fuzzing import changes, requests, seeds
 from tests.fuzzing.campaign import KEPT, Refused, Target
-from tests.workflows.archive.conftest import make_matte, signed, unpacked
+from tests.workflows.archive.conftest import make_matte, pack_chunk, signed, unpack_chunk, unpacked
 from tests.workflows.ingest.camera import Camera, capture, film, lights
 from workflows import clips, floats, images, pictures, raw
 from workflows.archive.importing import take_in
@@ -153,12 +154,14 @@ def make_archive(random: Random, whole: dict[str, bytes]) -> bytes:
     name = random.choice([*files])
     if name.endswith(".json"):
         files[name] = changes.other_json(random, json.loads(files[name]))
+        if random.random() < 0.8:  # with the checksum of what it now says, if it still has one
+            with suppress(ValueError, TypeError, AttributeError, RecursionError):
+                files[name] = seal(files[name])
     elif kind == 1:
         files[name] = changes.damaged(random, files[name])
     else:
         change = random.choice((changes.damaged, changes.other_float))
-        values = change(random, bytes(imagecodecs.zstd_decode(files[name])))
-        files[name] = imagecodecs.zstd_encode(values)
+        files[name] = pack_chunk(change(random, unpack_chunk(files[name])))
     if random.random() < 0.1:
         del files[random.choice([*files])]
     try:
