@@ -5,9 +5,9 @@
 A scheduler, two workers and a service in processes of their own, and a town of users (`users`) that uploads, recovers,
 composites, cancels, breaks off and errs. Captures, mattes, uploads and jobs are kept for two to three simulated hours,
 and workers are killed now and then. At the end of each hour memory, open files and threads of every process are looked
-at, the rows of every table, and what lies in the store. From the middle on none of it may grow; of workers, rows and the
-store the last quarter counts, when nobody is killed or cancelled. Then the town goes to bed, and all that expires has to
-be gone.
+at, the rows of every table, and what lies in the store. From the middle on none of it may grow; of workers, rows and
+the store the last quarter counts, when nobody is killed or cancelled. Then the town goes to bed, and all that expires
+has to be gone.
 """
 
 import argparse
@@ -116,7 +116,7 @@ def threads_of(process: psutil.Process) -> list[str]:
 
 
 def memory_of(name: str, process: psutil.Process) -> int:
-    """Bytes that a process has for itself; of the fork server with those that it shares, of which workers make copies."""
+    """Bytes that a process has for itself; of the fork server also those that it shares with workers, or did."""
     return int(process.memory_info().rss if name == "fork server" else process.memory_full_info().uss)
 
 
