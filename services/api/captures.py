@@ -108,7 +108,9 @@ async def upload(
     media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media_type == "application/json":
         wanted = _parse(await read_body(request, FROM_UPLOAD_BYTES))
-        row = await anyio.to_thread.run_sync(_from_upload, context, wanted, idempotency_key)
+        row = await anyio.to_thread.run_sync(
+            _from_upload, context, wanted, idempotency_key, limiter=context.bundles
+        )
     elif media_type == "application/zip":
         row = await _from_body(context, request, name, idempotency_key, webhook)
     else:
@@ -181,7 +183,8 @@ async def _from_body(
     capture = new_id()
     try:
         part = Part(ONLY, await receive(context, capture, request.stream(), limit))
-        row = await anyio.to_thread.run_sync(_register, context, capture, [part], name, key, False, webhook)
+        given = context, capture, [part], name, key, False, webhook
+        row = await anyio.to_thread.run_sync(_register, *given, limiter=context.bundles)
     except Exception:
         # Not when cancelled, where `_register` may still be at work: the next start sweeps then.
         await anyio.to_thread.run_sync(uploads.remove, context.objects, capture)

@@ -60,6 +60,8 @@ class Context:
     """Videos of programs that are encoded at once."""
     composites: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(CORES + 1))
     """Composites that are made at once, which bounds what they take: one more than there are cores."""
+    bundles: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(2))
+    """Bundles whose records are read at once, for one may take 200 MB."""
     imports: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(2))
     """Archives of mattes that are unpacked at once."""
     layers: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(1))
