@@ -8,6 +8,7 @@ import os
 import resource
 import shutil
 import signal
+import sys
 import tempfile
 import time
 import traceback
@@ -19,6 +20,7 @@ from pathlib import Path
 from random import Random
 from typing import Any, NamedTuple
 
+ROOT = str(Path(__file__).parents[2])
 CPU_SECONDS, SECONDS = 10.0, 60.0
 """That one execution may take, of processors and of the clock: this machine may be busy with much else."""
 MEMORY = 128 << 20
@@ -118,7 +120,9 @@ def run(
     whole = target.whole()
     tally, start, seed = Tally(), time.monotonic(), first
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["tests.fuzzing.targets"])
+    context.set_forkserver_preload(["tests.fuzzing.targets"])  # unless one runs already, of other tests
+    if ROOT not in sys.path:  # which those processes take over, and pytest goes without
+        sys.path.append(ROOT)
     while seed < first + count and len(tally.failures) < failures:
         left = seconds - (time.monotonic() - start)
         if left <= 0:
