@@ -7,7 +7,7 @@ from sqlalchemy import Connection
 
 from services.settings import Settings
 from storage import counts, uploads
-from storage.errors import NoRoom, OverLimit, TooMany
+from storage.errors import NoRoom, TooMany
 from storage.objects import Objects
 
 Unit = Literal["bytes", "frames", "pixels", "captures", "jobs", "seconds"]
@@ -144,28 +144,3 @@ def admit_upload(
     """
     admit(connection, settings, captures=captures, jobs=jobs, size=size)
     uploads.check_room(connection, objects, size)
-
-
-def see_that_frames_may(
-    settings: Settings, frames: int | None = None, width: int | None = None, height: int | None = None
-) -> None:
-    """See that a capture may have such frames, as far as they are known before it is sent.
-
-    Raises
-    ------
-    OverLimit
-    """
-    if frames is not None and frames > settings.capture_frames:
-        raise OverLimit(
-            f"a capture may have {settings.capture_frames} frames, this one has {frames}; leave some out",
-            name="capture_frames",
-            limit=settings.capture_frames,
-            value=frames,
-        )
-    if width is not None and height is not None and width * height > settings.capture_pixels:
-        raise OverLimit(
-            f"a frame may have {settings.capture_pixels} pixels, and these have {width} x {height}; make them smaller",
-            name="capture_pixels",
-            limit=settings.capture_pixels,
-            value=width * height,
-        )

@@ -14,7 +14,7 @@ else, an archive into a capture say, the rows are taken anew.
 import hashlib
 import json
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime
 from typing import IO, Any
 
@@ -32,6 +32,26 @@ FORMAT = "envmatte-backup/1"
 MANIFEST = "manifest.jsonl"
 LEDGER = "ledger.jsonl"
 OBJECTS = "objects"
+
+
+class Tally:
+    """The ``size`` in bytes, and the SHA-256, of pieces that have passed through it."""
+
+    def __init__(self) -> None:
+        self._digest = hashlib.sha256()
+        self.size = 0
+
+    def passing(self, pieces: Iterable[bytes]) -> Iterator[bytes]:
+        """The pieces, each counted before it is given."""
+        for piece in pieces:
+            self._digest.update(piece)
+            self.size += len(piece)
+            yield piece
+
+    @property
+    def sha256(self) -> str:
+        """In hexadecimal digits."""
+        return self._digest.hexdigest()
 
 
 def back_up(
@@ -154,17 +174,9 @@ class _Copying:
 
     def take(self, path: str, pieces: Iterator[bytes]) -> None:
         """Copy an object; called by several threads."""
-        digest, size = hashlib.sha256(), 0
-
-        def passing() -> Iterator[bytes]:
-            nonlocal size
-            for piece in pieces:
-                digest.update(piece)
-                size += len(piece)
-                yield piece
-
-        self._target.store(f"{OBJECTS}/{path}", passing())
-        self._of_family.append({"name": path, "size": size, "sha256": digest.hexdigest()})
+        tally = Tally()
+        self._target.store(f"{OBJECTS}/{path}", tally.passing(pieces))
+        self._of_family.append({"name": path, "size": tally.size, "sha256": tally.sha256})
 
     def copy(self, examiner: Examiner, family: str, things: list[Thing]) -> None:
         """Copy what belongs together, as often as it changes meanwhile.
@@ -209,33 +221,26 @@ class _Copying:
 
     def put_ledger(self) -> dict[str, Any]:
         """Write the rows of what was copied; returns what the manifest says of them."""
-        digest, size = hashlib.sha256(), 0
-
-        def passing() -> Iterator[bytes]:
-            nonlocal size
-            for line in self._lines():
-                digest.update(line)
-                size += len(line)
-                self.rows += 1
-                yield line
-
-        self._target.store(LEDGER, passing())
-        return {"rows": self.rows, "size": size, "sha256": digest.hexdigest()}
+        tally = Tally()
+        self._target.store(LEDGER, tally.passing(self._lines()))
+        return {"rows": self.rows, "size": tally.size, "sha256": tally.sha256}
 
     def _lines(self) -> Iterator[bytes]:
-        """All rows: those of families that changed as they were when those were copied."""
+        """All rows, counted: those of families that changed as they were when those were copied."""
         replaced: set[str] = set()
         self._rows.seek(0)
         for line in self._rows:
             if self._anew:
                 name, row = json.loads(line)
-                if ledger.family_of(name, row) in self._anew:
+                if contents.family_of(name, row) in self._anew:
                     if name == "jobs":
                         replaced.add(row["id"])
                     continue
                 if name in ("tiles", "log") and row["job"] in replaced:
                     continue
+            self.rows += 1
             yield line
         for lines in self._anew.values():
             for name, row in lines:
+                self.rows += 1
                 yield ledger.dumped(name, row)

@@ -60,6 +60,20 @@ def things(connection: Connection, tables: Mapping[str, Table] = metadata.tables
             yield from of_row(connection, tables, name, dict(row))
 
 
+def family_of(table: str, row: Mapping[str, Any]) -> str | None:
+    """The family that a row belongs to, see `Thing`; of tiles and log it is their job's."""
+    match table:
+        case "captures" | "uploads":
+            return str(row["id"])
+        case "upload_parts":
+            return str(row["upload"])
+        case "mattes":
+            return str(row["capture"] or row["id"])
+        case "jobs":
+            return str(row["capture"] or row["matte"] or row["id"])
+    return None
+
+
 def of_row(
     connection: Connection, tables: Mapping[str, Table], table: str, row: Mapping[str, Any]
 ) -> Iterator[Thing]:
@@ -72,23 +86,23 @@ def of_row(
     row : mapping
         With `COLUMNS`.
     """
+    family = family_of(table, row) or ""
     if table == "captures" and (row["state"] != "failed" or may_be_retried(row["problem"])):
         id, ready = row["id"], row["state"] == "ready"
         state: Any = {"ready": "whole", "failed": "left"}.get(row["state"], "busy")
-        yield Thing("capture", id, state, captures.path(id), id)
+        yield Thing("capture", id, state, captures.path(id), family)
         if not ready:
-            yield Thing("archive", id, "whole", uploads.path(id), id)
+            yield Thing("archive", id, "whole", uploads.path(id), family)
     elif table == "mattes":
         id = row["id"]
         state = {"ready": "whole", "failed": "left"}.get(row["state"], "busy")
-        yield Thing("matte", id, state, mattes.path(id), row["capture"] or id)
+        yield Thing("matte", id, state, mattes.path(id), family)
     elif table == "uploads":
         id, parts = row["id"], tables["upload_parts"]
         names = tuple(connection.scalars(select(parts.c.name).where(parts.c.upload == id)))
-        yield Thing("upload", id, "whole", uploads.path(id), id, names)
+        yield Thing("upload", id, "whole", uploads.path(id), family, names)
     elif table == "jobs" and row["kind"] == "composite":
         kept = row["problem"] is None or may_be_retried(row["problem"])
         if kept and row["state"] != "cancelled":
             state = {"succeeded": "whole", "failed": "left"}.get(row["state"], "busy")
-            family = row["capture"] or row["matte"] or row["id"]
             yield Thing("composite", row["id"], state, composites.path(row["id"]), family)

@@ -95,20 +95,6 @@ def lines_of_family(connection: Connection, tables: Mapping[str, Table], family:
             yield table.name, dict(row)
 
 
-def family_of(name: str, row: Mapping[str, Any]) -> str | None:
-    """The family that a row belongs to; of tiles and log it is their job's."""
-    match name:
-        case "captures" | "uploads":
-            return str(row["id"])
-        case "upload_parts":
-            return str(row["upload"])
-        case "mattes":
-            return str(row["capture"] or row["id"])
-        case "jobs":
-            return str(row["capture"] or row["matte"] or row["id"])
-    return None
-
-
 def dumped(name: str, row: Mapping[str, Any]) -> bytes:
     """A line."""
     return json.dumps([name, dict(row)], separators=(",", ":")).encode() + b"\n"

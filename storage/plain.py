@@ -94,20 +94,7 @@ class Reader(io.RawIOBase):
 
 
 def load(store: ObjectStore, path: str, most: int | None = None) -> bytes:
-    """The bytes of a small object, as they are.
-
-    Parameters
-    ----------
-    most : int, optional
-        Bytes that it may have.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is none.
-    Corrupt
-        If it has more.
-    """
+    """See `storage.objects.Objects.load`."""
     with told():
         found = obstore.get(store, path)
         if most is not None and found.meta["size"] > most:

@@ -16,7 +16,7 @@ from typing import IO, Any
 from sqlalchemy import Connection, Engine, MetaData, select
 
 from storage import dialects, ledger, migrations
-from storage.backups import FORMAT, LEDGER, MANIFEST, OBJECTS
+from storage.backups import FORMAT, LEDGER, MANIFEST, OBJECTS, Tally
 from storage.contents import FOLDERS
 from storage.database import clock, metadata, reading, writing
 from storage.errors import Conflict, Corrupt, InvalidInput, NoRoom
@@ -149,7 +149,7 @@ class Manifest:
             before = line
         last = {"objects": self.objects, "bytes": self.bytes, "sha256": digest.hexdigest()}
         if _object(before) != last:
-            raise InvalidInput(f"{MANIFEST} of the backup is cut short, or was changed: use another backup")
+            raise _not_whole()
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         for line in islice(self._lines(), 1, self.objects + 1):
@@ -162,8 +162,12 @@ def _object(line: bytes) -> dict[str, Any]:
     except ValueError:
         found = None
     if not isinstance(found, dict):
-        raise InvalidInput(f"{MANIFEST} of the backup is cut short, or was changed: use another backup")
+        raise _not_whole()
     return found
+
+
+def _not_whole() -> InvalidInput:
+    return InvalidInput(f"{MANIFEST} of the backup is cut short, or was changed: use another backup")
 
 
 def _entry(given: Any, *, named: bool = True) -> dict[str, Any]:
@@ -211,14 +215,12 @@ def _read(source: Objects, path: str, entry: dict[str, Any]) -> Iterator[bytes]:
 
 def _checked(entry: dict[str, Any], pieces: Iterator[bytes]) -> Iterator[bytes]:
     """The pieces of an object, after the last of which it is told if they are not what the manifest says."""
-    digest, size = hashlib.sha256(), 0
-    for piece in pieces:
-        digest.update(piece)
-        size += len(piece)
-        if size > entry["size"]:
+    tally = Tally()
+    for piece in tally.passing(pieces):
+        if tally.size > entry["size"]:
             raise _unlike(entry["name"])
         yield piece
-    if (size, digest.hexdigest()) != (entry["size"], entry["sha256"]):
+    if (tally.size, tally.sha256) != (entry["size"], entry["sha256"]):
         raise _unlike(entry["name"])
 
 

@@ -27,7 +27,8 @@ from services.api import (
     uploads,
     web,
 )
-from services.api.context import PROBLEM, WEB, Context, authorized
+from services.api.context import WEB, Context, authorized
+from services.api.errors import PROBLEM
 from services.decoding import Decoders
 from services.settings import Settings
 from storage.objects import Objects

@@ -8,11 +8,11 @@ from fastapi.responses import StreamingResponse
 from sqlalchemy import Row
 from sqlalchemy.exc import IntegrityError
 
-from services.api.captures import ONLY, Key, receive
+from services.api.bodies import announced, store_body
+from services.api.captures import ONLY, Key
 from services.api.context import Context, Needs
 from services.api.errors import WrongMediaType
 from services.api.mattes import Matte
-from services.api.uploads import too_large
 from services.limits import admit
 from storage import jobs, mattes, uploads
 from storage.archives import Archive
@@ -70,16 +70,14 @@ async def post_archive(
 async def _from_body(context: Context, request: Request, key: str | None) -> Row[Any]:
     """Stream an archive into the store, and make a matte of it; the archive is gone in the end."""
     limit = context.settings.upload_bytes
-    length = int(request.headers.get("content-length", 0))
-    if length > limit:
-        raise too_large(limit, length)
+    length = announced(request, limit)
     row = await anyio.to_thread.run_sync(_made, context, key)
     if row is not None:
         return row
     await anyio.to_thread.run_sync(_admit, context, length)
     matte = new_id()
     try:
-        size = await receive(context, matte, request.stream(), limit)
+        size = await store_body(request, context.objects, uploads.part_path(matte, ONLY), limit)
         row = await anyio.to_thread.run_sync(_import, context, matte, size, key, limiter=context.imports)
     finally:
         # One that a killed server leaves, and half of its matte, are swept: nothing refers to them.

@@ -1,6 +1,5 @@
 """Captures over HTTP."""
 
-from collections.abc import AsyncIterator
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
@@ -12,9 +11,9 @@ from sqlalchemy import Row
 from sqlalchemy.exc import IntegrityError
 
 from services import tracing, webhooks
-from services.api.context import After, Context, Limit, Needs, answered, read_body, schema_of, time_of
+from services.api.bodies import announced, read_body, schema_of, store_body
+from services.api.context import After, Context, Limit, Needs, answered, time_of
 from services.api.errors import WrongMediaType
-from services.api.uploads import too_large
 from services.limits import admit, admit_upload
 from storage import captures, jobs, uploads
 from storage.captures import Stack
@@ -173,17 +172,15 @@ async def _from_body(
     """Stream the archive into the store; what is cut off, too large or refused leaves nothing."""
     await anyio.to_thread.run_sync(webhooks.check, webhook, context.settings)  # which looks its host up
     limit = context.settings.upload_bytes
-    length = int(request.headers.get("content-length", 0))
-    if length > limit:
-        raise too_large(limit, length)
+    length = announced(request, limit)
     row = await anyio.to_thread.run_sync(_made, context, key)
     if row is not None:
         return row
     await anyio.to_thread.run_sync(_admit, context, length)
     capture = new_id()
     try:
-        part = Part(ONLY, await receive(context, capture, request.stream(), limit))
-        given = context, capture, [part], name, key, False, webhook
+        size = await store_body(request, context.objects, uploads.part_path(capture, ONLY), limit)
+        given = context, capture, [Part(ONLY, size)], name, key, False, webhook
         row = await anyio.to_thread.run_sync(_register, *given, limiter=context.bundles)
     except Exception:
         # Not when cancelled, where `_register` may still be at work: the next start sweeps then.
@@ -192,18 +189,6 @@ async def _from_body(
     if row.id != capture:  # a repeat with the same key was quicker
         await anyio.to_thread.run_sync(uploads.remove, context.objects, capture)
     return row
-
-
-async def receive(context: Context, capture: str, body: AsyncIterator[bytes], limit: int) -> int:
-    """Stream an archive into the store, where `storage.uploads` has it as one part; returns its bytes."""
-    size = 0
-    async with context.objects.write(uploads.part_path(capture, ONLY)) as file:
-        async for part in body:
-            size += len(part)
-            if size > limit:
-                raise too_large(limit, size)
-            await file.write(part)
-    return size
 
 
 def _parse(body: bytes) -> FromUpload:

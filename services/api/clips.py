@@ -10,8 +10,8 @@ from fastapi.responses import StreamingResponse
 from sqlalchemy.exc import IntegrityError
 
 from services import tracing, webhooks
+from services.api.bodies import announced, store_body
 from services.api.context import Context, Needs
-from services.api.errors import TooLarge
 from services.api.jobs import Job
 from services.limits import admit, admit_upload
 from storage import composites, jobs, mattes
@@ -20,6 +20,7 @@ from storage.errors import Conflict, Corrupt
 
 router = APIRouter(tags=["jobs"])
 CALL = "POST /v1/mattes/{id}/composite"
+CLIP = "a clip"
 PIECE = 1 << 20
 """Bytes of a video that are read at once."""
 RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
@@ -55,15 +56,13 @@ async def composite_clip(
     """
     await anyio.to_thread.run_sync(webhooks.check, webhook, context.settings)  # which looks its host up
     limit = context.settings.upload_bytes
-    length = int(request.headers.get("content-length", 0))
-    if length > limit:
-        raise _too_large(limit, length)
+    length = announced(request, limit, CLIP)
     key = request.headers.get("idempotency-key", "")[:256]
     made = await anyio.to_thread.run_sync(_check, context, matte, key, length)
     job = made or new_id()
     if made is None:
         try:
-            size = await _receive(context, request, job, limit)
+            size = await store_body(request, context.objects, composites.clip_path(job), limit, CLIP)
             job = await anyio.to_thread.run_sync(_queue, context, job, matte, options, key, size, webhook)
         except Exception:
             # Not when cancelled, where `_queue` may still be at work: what has no job the coordinator sweeps.
@@ -116,17 +115,6 @@ def _check(context: Context, matte: str, key: str, length: int) -> str | None:
             mattes.get_ready(c, matte)
             admit_upload(c, context.settings, context.objects, length, jobs=1)
         return made
-
-
-async def _receive(context: Context, request: Request, job: str, limit: int) -> int:
-    size = 0
-    async with context.objects.write(composites.clip_path(job)) as file:
-        async for part in request.stream():
-            size += len(part)
-            if size > limit:
-                raise _too_large(limit, size)
-            await file.write(part)
-    return size
 
 
 def _queue(
@@ -185,12 +173,3 @@ def _pieces(file: BinaryIO, size: int) -> Iterator[bytes]:
         while size and (data := file.read(min(PIECE, size))):
             size -= len(data)
             yield data
-
-
-def _too_large(limit: int, size: int) -> TooLarge:
-    return TooLarge(
-        f"a clip may have {limit} bytes; cut it, or raise ENVMATTE_UPLOAD_BYTES",
-        name="upload_bytes",
-        limit=limit,
-        value=size,
-    )

@@ -15,7 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from starlette.datastructures import Headers
 
 from services.api import clips
-from services.api.context import Context, Needs, answered, is_known, spool_body
+from services.api.bodies import spool_body
+from services.api.context import Context, Needs, answered, is_known
 from services.api.errors import NotAcceptable, NotNeeded, problem_of
 from services.api.errors import answer as problem_answer
 from services.api.jobs import Job

@@ -2,27 +2,24 @@
 
 import tempfile
 import time
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator
-from contextlib import ExitStack, asynccontextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import IO, Annotated, Any, TypeVar
+from typing import IO, Annotated
 
-import anyio.to_thread
 from anyio import CapacityLimiter
 from fastapi import Depends, Query, Request, Response
-from fastapi.exceptions import RequestValidationError
 from fastapi.responses import StreamingResponse
 from fastapi.security import HTTPAuthorizationCredentials
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import Field
 from sqlalchemy import Engine
 from starlette.datastructures import Headers
 from starlette.types import Receive, Scope, Send
 
 from services.api.access import ADMIN, Caller, bearer, demand, identify, see_that_it_may
-from services.api.errors import TooLarge
 from services.decoding import Decoders
 from services.settings import Settings
 from storage.errors import Unavailable
@@ -31,15 +28,12 @@ from storage.owners import NOBODY, bound
 from workflows.composite.cache import Cache
 from workflows.composite.threads import CORES
 
-SPOOLED = 1 << 20
-"""Bytes of a body that are kept in memory while it comes."""
 HELD = 1 << 18
 """Bytes of an answer that are kept in memory while it is taken, and that are read of a file at once."""
 LOOK = 1.0
 """Seconds between two looks at the key of whoever downloads."""
 WEB = Path(__file__).parents[1] / "web"
 """The browser's files."""
-Model = TypeVar("Model", bound=BaseModel)
 
 
 @dataclass(frozen=True)
@@ -137,45 +131,6 @@ Limit = Annotated[int, Query(ge=1, le=1000, description="The most items to list.
 After = Annotated[str | None, Query(description="The id of the last item of the page before.")]
 
 
-async def read_body(request: Request, limit: int) -> bytes:
-    """The body of a request, read whole.
-
-    Raises
-    ------
-    TooLarge
-        As soon as more than ``limit`` bytes have come.
-    """
-    body = bytearray()
-    async for part in request.stream():
-        body += part
-        if len(body) > limit:
-            raise _too_large(limit)
-    return bytes(body)
-
-
-@asynccontextmanager
-async def spool_body(request: Request, limit: int) -> AsyncIterator[IO[bytes]]:
-    """The body of a request in a temporary file, in memory while it is small: any number may come in slowly.
-
-    Raises
-    ------
-    TooLarge
-        As soon as more than ``limit`` bytes have come.
-    """
-    with tempfile.SpooledTemporaryFile(SPOOLED) as file:
-        size = 0
-        async for part in request.stream():
-            size += len(part)
-            if size > limit:
-                raise _too_large(limit)
-            if size > SPOOLED:
-                await anyio.to_thread.run_sync(file.write, part)
-            else:
-                file.write(part)
-        file.seek(0)
-        yield file
-
-
 def answered(data: bytes, media_type: str, headers: dict[str, str] | None = None) -> Response:
     """An answer, a large one from a temporary file: any number may be taken slowly. Not for the loop's thread."""
     if len(data) <= HELD:
@@ -215,60 +170,3 @@ def time_of(seconds: float | None) -> datetime | None:
 def is_known(headers: Headers, tag: str) -> bool:
     """Whether the caller has what a tag stands for (If-None-Match, RFC 9110, sect. 13.1.2)."""
     return tag in [one.strip() for one in headers.get("if-none-match", "").split(",")]
-
-
-def _too_large(limit: int) -> TooLarge:
-    return TooLarge(f"the body of this request may have {limit} bytes; send a smaller one", limit=limit)
-
-
-async def read_json(request: Request, model: type[Model], limit: int) -> Model:
-    """The JSON of a request, not read whole before its size is known, as a framework would."""
-    try:
-        return model.model_validate_json(await read_body(request, limit))
-    except ValidationError as error:
-        found = [detail | {"loc": ("body", *detail["loc"])} for detail in error.errors(include_url=False)]
-        raise RequestValidationError(found) from error
-
-
-def schema_of(model: type[BaseModel]) -> dict[str, Any]:
-    """The JSON schema of a body that a handler reads itself, with nothing in it that refers to another place of it."""
-    whole = model.model_json_schema()
-    parts = whole.pop("$defs", {})
-
-    def filled(node: Any) -> Any:
-        if isinstance(node, list):
-            return [filled(one) for one in node]
-        if not isinstance(node, dict):
-            return node
-        if "$ref" in node:
-            return filled(parts[node["$ref"].rpartition("/")[2]])
-        return {name: filled(one) for name, one in node.items() if name != "discriminator"}
-
-    schema: dict[str, Any] = filled(whole)
-    return schema
-
-
-PROBLEM: dict[int | str, dict[str, Any]] = {
-    "default": {
-        "description": "A problem (RFC 9457)",
-        "content": {
-            "application/problem+json": {
-                "schema": {
-                    "type": "object",
-                    "required": ["type", "title", "status", "detail"],
-                    "properties": {
-                        "type": {"type": "string", "format": "uri"},
-                        "title": {"type": "string"},
-                        "status": {"type": "integer"},
-                        "detail": {"type": "string"},
-                        "entry": {"type": "string"},
-                        "field": {"type": "string"},
-                        "name": {"type": "string", "description": "Of a limit, as `GET /v1/limits` has it."},
-                        "limit": {"type": "number"},
-                        "value": {"type": "number", "description": "What would have to be within it."},
-                    },
-                }
-            }
-        },
-    }
-}

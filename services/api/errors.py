@@ -30,6 +30,30 @@ from storage.errors import (
 )
 
 MEDIA_TYPE = "application/problem+json"
+PROBLEM: dict[int | str, dict[str, Any]] = {
+    "default": {
+        "description": "A problem (RFC 9457)",
+        "content": {
+            MEDIA_TYPE: {
+                "schema": {
+                    "type": "object",
+                    "required": ["type", "title", "status", "detail"],
+                    "properties": {
+                        "type": {"type": "string", "format": "uri"},
+                        "title": {"type": "string"},
+                        "status": {"type": "integer"},
+                        "detail": {"type": "string"},
+                        "entry": {"type": "string"},
+                        "field": {"type": "string"},
+                        "name": {"type": "string", "description": "Of a limit, as `GET /v1/limits` has it."},
+                        "limit": {"type": "number"},
+                        "value": {"type": "number", "description": "What would have to be within it."},
+                    },
+                }
+            }
+        },
+    }
+}
 logger = logging.getLogger(__name__)
 
 

@@ -9,7 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection, Row
 
 from services import kinds, tracing, webhooks
-from services.api.context import After, Limit, Needs, read_json, schema_of, time_of
+from services.api.bodies import read_json, schema_of
+from services.api.context import After, Limit, Needs, time_of
 from services.api.eta import seconds_left
 from services.api.waiting import reason
 from services.limits import admit

@@ -15,7 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from sqlalchemy import Row
 
 from services import film
-from services.api.context import WEB, After, FromFile, Limit, Needs, answered, read_json, schema_of
+from services.api.bodies import read_json, schema_of
+from services.api.context import WEB, After, FromFile, Limit, Needs, answered
 from services.api.web import HEADERS
 from services.patterns import archive, fitted, pictures, png, record
 from services.presets import PRESETS

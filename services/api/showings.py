@@ -7,7 +7,8 @@ import anyio.to_thread
 from fastapi import APIRouter, Depends, Header, Request, Response
 from fastapi.responses import StreamingResponse
 
-from services.api.context import Needs, read_json, schema_of
+from services.api.bodies import read_json, schema_of
+from services.api.context import Needs
 from services.api.events import stream
 from services.api.programs import Program, Told, get_program
 from storage import programs

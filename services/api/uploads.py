@@ -10,6 +10,7 @@ from sqlalchemy import Row
 from sqlalchemy.exc import IntegrityError
 from starlette.requests import ClientDisconnect
 
+from services.api.bodies import too_large
 from services.api.context import Context, Needs
 from services.api.errors import TooLarge
 from services.api.tus import (
@@ -22,7 +23,7 @@ from services.api.tus import (
     number,
     version_spoken,
 )
-from services.limits import admit_upload, see_that_frames_may
+from services.limits import admit_upload
 from storage import captures, uploads
 from storage.database import new_id, reading, writing
 from storage.errors import InvalidInput, NotFound
@@ -62,7 +63,11 @@ async def create_upload(
     if with_body:
         check_media_type(request)
     metadata = metadata_of(request)
-    see_that_frames_may(context.settings, **declared(metadata))
+    known, limits = declared(metadata), context.settings.limits
+    if "frames" in known:
+        limits.see_that_frames_may(known["frames"])
+    if "width" in known and "height" in known:
+        limits.see_that_pixels_may(known["width"], known["height"])
     row, new = await anyio.to_thread.run_sync(_create, context, length, metadata, idempotency_key)
     if with_body and new:
         row = await _append(context, request, row, checksum)
@@ -210,14 +215,4 @@ def _too_long(row: Row[Any]) -> TooLarge:
     return TooLarge(
         f"upload {row.id} was to have {row.length} bytes, and more have come; send no more than the rest",
         limit=row.length,
-    )
-
-
-def too_large(limit: int, size: int) -> TooLarge:
-    """An archive over the limit of the settings, of so many bytes or more."""
-    return TooLarge(
-        f"an archive may have {limit} bytes; send a smaller one or raise ENVMATTE_UPLOAD_BYTES",
-        name="upload_bytes",
-        limit=limit,
-        value=size,
     )

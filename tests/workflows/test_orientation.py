@@ -12,6 +12,7 @@ from PIL import Image, ImageCms, ImageOps
 
 from storage.captures import Stack
 from storage.errors import CaptureError
+from tests.workflows.ingest.records import record
 from workflows import floats, images, pictures, raw
 
 MEMORY = 1 << 20
@@ -94,28 +95,15 @@ def test_camera_raw(make_dng: Callable[..., bytes], turn: int, quarters: int) ->
     np.testing.assert_array_equal(upright, np.rot90(raw.decode(data, memory=MEMORY, turn=1), quarters))
 
 
-def record(**more: Any) -> dict[str, Any]:
-    return {
-        "format": "envmatte-capture/1",
-        "program": {
-            "monitor": {"width": 64, "height": 48},
-            "parts": [
-                {"kind": "constant", "levels": [0, 0.5, 1]},
-                {"kind": "bernoulli", "columns": 4, "rows": 3, "count": 3, "seed": 1},
-            ],
-        },
-        "response": "linear",
-        "frames": [{"file": f"{n}.png", "pattern": n} for n in range(6)],
-    } | more
-
-
 def test_all_frames_are_turned_as_the_first_one_is(make_zip: Zip, ingest: Ingest) -> None:
     """A camera that looks down on a table may write another orientation from frame to frame."""
     shots = np.random.default_rng(5).integers(0, 256, (6, 20, 30, 3), np.uint8)
     files = {f"{n}.png": saved("PNG", turn, shots[n]) for n, turn in enumerate((6, 6, 1, 3, 6, 8))}
     mask = np.zeros((30, 20, 1), np.uint8)  # drawn over a frame as it is shown
     mask[5:25, 5:15] = 255
-    stack = ingest("c", make_zip(record(mask="mask.png"), files | {"mask.png": images.encode_png(mask)}))
+    stack = ingest(
+        "c", make_zip(record(list(range(6)), mask="mask.png"), files | {"mask.png": images.encode_png(mask)})
+    )
     assert (stack.width, stack.height) == (20, 30)
     np.testing.assert_array_equal(stack.read(), np.rot90(shots, 3, axes=(1, 2)))
     assert stack.attributes["orientation"] == 6
@@ -125,4 +113,7 @@ def test_a_mask_that_is_not_turned_with_the_frames_is_told(make_zip: Zip, ingest
     shot = np.zeros((20, 30, 3), np.uint8)
     files = {f"{n}.png": saved("PNG", 6, shot) for n in range(6)}
     with pytest.raises(CaptureError, match="turned upright as the first of them says"):
-        ingest("c", make_zip(record(mask="mask.png"), files | {"mask.png": images.encode_png(shot)}))
+        ingest(
+            "c",
+            make_zip(record(list(range(6)), mask="mask.png"), files | {"mask.png": images.encode_png(shot)}),
+        )

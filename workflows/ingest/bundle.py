@@ -87,6 +87,38 @@ class Limits:
         """Bytes that one entry, and one decoded image, may take."""
         return self.memory // 4
 
+    def see_that_frames_may(self, frames: int, **where: str) -> None:
+        """See that a capture may have so many frames.
+
+        Parameters
+        ----------
+        **where : str
+            ``entry`` that says so, and its ``field``.
+
+        Raises
+        ------
+        OverLimit
+        """
+        if self.frames is not None and frames > self.frames:
+            raise OverLimit(
+                f"a capture may have {self.frames} frames, this one has {frames}; leave some out",
+                **where,
+                name="capture_frames",
+                limit=self.frames,
+                value=frames,
+            )
+
+    def see_that_pixels_may(self, width: int, height: int, **where: str) -> None:
+        """See that frames may be so large; the same."""
+        if self.pixels is not None and width * height > self.pixels:
+            raise OverLimit(
+                f"a frame may have {self.pixels} pixels, and these have {width} x {height}; make them smaller",
+                **where,
+                name="capture_pixels",
+                limit=self.pixels,
+                value=width * height,
+            )
+
 
 class Bundle:
     """An opened bundle.
@@ -191,15 +223,7 @@ class Bundle:
             raise CaptureError(f"{MANIFEST} names no frames", entry=MANIFEST, field="frames")
         count = manifest.program.count
         frames = len(manifest.frames) or count
-        if self._limits.frames is not None and frames > self._limits.frames:
-            raise OverLimit(
-                f"{MANIFEST}: a capture may have {self._limits.frames} frames, this one has {frames}; leave some out",
-                entry=MANIFEST,
-                field="frames",
-                name="capture_frames",
-                limit=self._limits.frames,
-                value=frames,
-            )
+        self._limits.see_that_frames_may(frames, entry=MANIFEST, field="frames")
         files = [(f"frames.{n}.file", frame.file) for n, frame in enumerate(manifest.frames)]
         if manifest.video is not None:
             files.append(("video.file", manifest.video.file))

@@ -10,7 +10,7 @@ from pydantic import TypeAdapter
 
 from storage import uploads
 from storage.captures import Stack, create_stack, write_slab
-from storage.errors import CaptureError, ImageError, OverLimit
+from storage.errors import CaptureError, ImageError
 from storage.objects import Objects
 from workflows import images
 from workflows.grids import smallest_grid
@@ -64,14 +64,8 @@ def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, Any]:
                     entry=manifest.mask,
                 )
     frames, height, width, _ = shape
-    if limits.pixels is not None and height * width > limits.pixels:
-        raise OverLimit(
-            f"a frame may have {limits.pixels} pixels, and these have {width} x {height}; make them smaller",
-            entry=manifest.frames[0].file if manifest.video is None else manifest.video.file,
-            name="capture_pixels",
-            limit=limits.pixels,
-            value=height * width,
-        )
+    shown = manifest.frames[0].file if manifest.video is None else manifest.video.file
+    limits.see_that_pixels_may(width, height, entry=shown)
     taken = math.prod(shape) * storage.dtype.itemsize
     if taken > limits.unpacked:
         raise CaptureError(

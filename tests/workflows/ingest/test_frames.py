@@ -17,6 +17,7 @@ from storage.captures import Stack
 from storage.errors import CaptureError, Corrupt, OverLimit
 from storage.objects import Objects
 from tests.workflows.ingest import peak
+from tests.workflows.ingest.records import record
 from workflows.images import encode_png
 from workflows.ingest import frames
 from workflows.ingest.bundle import Limits
@@ -36,21 +37,6 @@ def tiff(pixels: NDArray[Any]) -> bytes:
     kind = "rgb" if pixels.shape[2] == 3 else "minisblack"
     tifffile.imwrite(target, pixels, photometric=kind, compression="zlib")
     return target.getvalue()
-
-
-def record(patterns: list[int], suffix: str = "png", **more: Any) -> dict[str, Any]:
-    return {
-        "format": "envmatte-capture/1",
-        "program": {
-            "monitor": {"width": 64, "height": 48},
-            "parts": [
-                {"kind": "constant", "levels": [0, 0.5, 1]},
-                {"kind": "bernoulli", "columns": 4, "rows": 3, "count": 3, "seed": 1},
-            ],
-        },
-        "response": "linear",
-        "frames": [{"file": f"{n}.{suffix}", "pattern": p} for n, p in enumerate(patterns)],
-    } | more
 
 
 def shots(count: int, channels: int, dtype: str) -> NDArray[Any]:
