@@ -11,6 +11,7 @@ from sqlalchemy import Engine
 from services import tracing
 from services.api import build_app
 from services.api.access import see_that_it_is_closed
+from services.api.browsers import Careful
 from services.cluster import dispatcher_of
 from services.connections import Connection, allow_many
 from services.coordinator import Coordinator
@@ -39,7 +40,7 @@ def serve(settings: Settings) -> None:
         stack.callback(app.state.context.decoders.close)
         # The port is taken before workers start, so that one in use is told at once.
         config = uvicorn.Config(
-            app,
+            Careful(app),
             settings.host,
             settings.port,
             http=Connection,

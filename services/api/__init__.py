@@ -42,6 +42,8 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
         version="1",
         description="Environment mattes of transparent objects, by compressive sensing.",
         responses=PROBLEM,
+        docs_url=None,
+        redoc_url=None,
     )
     app.state.context = Context(
         settings,
@@ -77,5 +79,6 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
     app.include_router(system.router)
     app.include_router(metrics.router)
     app.include_router(web.page)
+    app.mount("/web/swagger", web.Files(directory=web.SWAGGER))
     app.mount("/web", web.Files(directory=WEB))
     return app

@@ -25,6 +25,8 @@ class Caller:
 
     owner: str
     scope: str
+    known: bool = True
+    """Whether there was a key."""
 
     def may(self, scope: str) -> bool:
         """Whether the key allows what a scope does."""
@@ -32,7 +34,9 @@ class Caller:
 
 
 ADMIN = Caller(DEFAULT, "admin")
-"""Who has a key of the settings; and anyone, while a service has none at all."""
+"""Who has a key of the settings."""
+ANYONE = Caller(DEFAULT, "admin", known=False)
+"""Anyone, while a service has no key at all."""
 
 
 def identify(settings: Settings, engine: Engine, key: str | None) -> Caller:
@@ -52,7 +56,7 @@ def identify(settings: Settings, engine: Engine, key: str | None) -> Caller:
         if row is not None:
             return Caller(row.owner, row.scope)
         if not settings.keys and not keys.any_was_made(c):
-            return ADMIN
+            return ANYONE
     raise Unauthorized("send a key of this service: `Authorization: Bearer KEY`")
 
 

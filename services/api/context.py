@@ -20,6 +20,7 @@ from starlette.datastructures import Headers
 from starlette.types import Receive, Scope, Send
 
 from services.api.access import ADMIN, Caller, bearer, demand, identify, see_that_it_may
+from services.api.browsers import see_that_no_site_asks
 from services.decoding import Decoders
 from services.settings import Settings
 from storage.errors import Unavailable
@@ -94,11 +95,13 @@ def authorized(request: Request, given: Key) -> Context:
 
     Raises
     ------
-    Unauthorized, Forbidden
+    Unauthorized, Forbidden, ForeignSite
     """
     context = _unbound(request)
     key = given.credentials if given else None
     caller = identify(context.settings, context.engine, key)
+    if not caller.known:
+        see_that_no_site_asks(request)
     see_that_it_may(caller, request)
     check = partial(identify, context.settings, context.engine, key)
     return replace(context, engine=bound(context.engine, caller.owner), caller=caller, check=check)

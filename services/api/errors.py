@@ -93,6 +93,10 @@ class Forbidden(EnvmatteError):
     """A key that does not allow this."""
 
 
+class ForeignSite(EnvmatteError):
+    """Asked for by a website of others, of a service without keys."""
+
+
 PROBLEMS: dict[type[Exception], tuple[int, str, str]] = {
     OverLimit: (HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too-large", "Too large"),
     CaptureError: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-capture", "The capture can't be used"),
@@ -110,6 +114,7 @@ PROBLEMS: dict[type[Exception], tuple[int, str, str]] = {
     InvalidInput: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-request", "The request can't be used"),
     Unauthorized: (HTTPStatus.UNAUTHORIZED, "unauthorized", "A key is needed"),
     Forbidden: (HTTPStatus.FORBIDDEN, "forbidden", "The key does not allow this"),
+    ForeignSite: (HTTPStatus.FORBIDDEN, "foreign-site", "Not for other websites"),
     NotFound: (HTTPStatus.NOT_FOUND, "not-found", "Not found"),
     Conflict: (HTTPStatus.CONFLICT, "conflict", "Not in this state"),
     NoRoom: (HTTPStatus.INSUFFICIENT_STORAGE, "no-room", "There is no room for it"),

@@ -1,6 +1,8 @@
-"""The web app: a page at `/`, and the browser's files below `/web`."""
+"""The pages: the web app at `/`, the API's documentation at `/docs`, and the browser's files below `/web`."""
 
 from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 from fastapi import APIRouter
@@ -37,14 +39,20 @@ class Files(StaticFiles):
         return answer
 
 
-HEADERS: Mapping[str, str] = FRESH | {
-    "Content-Security-Policy": POLICY,
-    "Referrer-Policy": "no-referrer",
-    "X-Content-Type-Options": "nosniff",
-}
+HEADERS: Mapping[str, str] = FRESH | {"Content-Security-Policy": POLICY}
+SWAGGER = Path(str(files("fastapi_offline"))) / "static"
+"""Swagger UI, which FastAPI's own page would have fetched from another host, and run among our pages."""
+# Its style sheet has pictures in it.
+DOCS = {**HEADERS, "Content-Security-Policy": POLICY.replace("img-src 'self'", "img-src 'self' data:")}
 
 
 @page.get("/", include_in_schema=False, response_class=FileResponse)
 def get_app() -> FileResponse:
     """The app. It holds nothing of the service: asked for without a key, it asks for one."""
     return FileResponse(WEB / "app" / "index.html", media_type="text/html", headers=HEADERS)
+
+
+@page.get("/docs", include_in_schema=False, response_class=FileResponse)
+def get_docs() -> FileResponse:
+    """The API's documentation, by Swagger UI."""
+    return FileResponse(WEB / "docs" / "index.html", media_type="text/html", headers=DOCS)

@@ -163,7 +163,7 @@ class User:
         where = urlsplit(self.town.url)
         head = [
             f"{method} {path} HTTP/1.1",
-            "Host: x",
+            "Host: localhost",
             *(f"{name}: {text}" for name, text in headers.items()),
         ]
         with socket.create_connection((where.hostname, where.port), timeout=60) as line:

@@ -121,10 +121,18 @@ def test_the_tabulator_gets_to_everything(
         assert len(reached) >= wanted, name
 
 
+def test_the_documentation_is_drawn_from_here(desk: Page, service: Service) -> None:
+    desk.goto(f"{service.url}/docs")
+    calls = sum(len(path) for path in service.http.get("/openapi.json").json()["paths"].values())
+    expect(desk.locator(".opblock")).to_have_count(calls)
+    desk.locator("#operations-captures-get_capture_v1_captures__id__get").get_by_role("button").first.click()
+    expect(desk.locator(".opblock.is-open .parameters")).to_be_visible()
+
+
 def test_the_app_is_small_and_its_policy_strict(service: Service, views: dict[str, tuple[str, str]]) -> None:
     files = [path for path in WEB.rglob("*") if path.is_file()]
     assert sum(path.stat().st_size for path in files) < 300_000
-    for path in ("/", f"/{views['play'][0]}"):
+    for path in ("/", f"/{views['play'][0]}", "/docs"):
         answer = service.http.get(path)
         policy = answer.headers["content-security-policy"]
         assert "default-src 'none'" in policy

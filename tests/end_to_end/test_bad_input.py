@@ -133,7 +133,7 @@ def test_an_upload_that_breaks_off(service: Service, bundle: Path) -> None:
     with socket.create_connection((where.hostname, where.port)) as raw:
         head = [
             "POST /v1/captures HTTP/1.1",
-            "Host: x",
+            "Host: localhost",
             "Content-Type: application/zip",
             "Content-Length: 99999999",
         ]

@@ -64,7 +64,7 @@ def test_thousands_that_say_nothing_keep_nobody_out_and_are_closed(service: Serv
 def test_a_head_that_comes_byte_by_byte_is_not_waited_for(service: Service) -> None:
     begun = time.monotonic()
     with connected(service) as (slow,):
-        slow.sendall(b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")
+        slow.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
         assert slow.recv(1 << 16).startswith(b"HTTP/1.1 200")
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             while time.monotonic() - begun < 2 * connections.HEAD:
@@ -76,11 +76,11 @@ def test_a_head_that_comes_byte_by_byte_is_not_waited_for(service: Service) -> N
 @pytest.mark.parametrize(
     "sent",
     [
-        b"GET / HTTP/1.1\r\nHost: x\r\nLong: " + (1 << 20) * b"x",
-        b"GET /" + (1 << 20) * b"x" + b" HTTP/1.1\r\nHost: x\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: localhost\r\nLong: " + (1 << 20) * b"x",
+        b"GET /" + (1 << 20) * b"x" + b" HTTP/1.1\r\nHost: localhost\r\n\r\n",
         b"no request at all\r\n\r\n",
-        b"POST /v1/jobs HTTP/1.1\r\nHost: x\r\nContent-Length: 5\r\nContent-Length: 6\r\n\r\n{}   ",
-        b"POST /v1/jobs HTTP/1.1\r\nHost: x\r\nContent-Length: 2\r\nTransfer-Encoding: gzip\r\n\r\n{}",
+        b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5\r\nContent-Length: 6\r\n\r\n{}   ",
+        b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 2\r\nTransfer-Encoding: gzip\r\n\r\n{}",
     ],
     ids=["a long header", "a long path", "noise", "two lengths", "an unknown encoding"],
 )
@@ -94,7 +94,7 @@ def test_what_is_no_request_is_refused_and_the_connection_closed(service: Servic
 
 def test_a_half_closed_connection_counts_as_gone(service: Service) -> None:
     """A client that closes looks the same until it is written to, and computing for nobody would cost more."""
-    for sent in (b"GET /v1/jobs HTTP/1.1\r\nHost: x\r\n\r\n", b"GET /healthz HT"):
+    for sent in (b"GET /v1/jobs HTTP/1.1\r\nHost: localhost\r\n\r\n", b"GET /healthz HT"):
         with connected(service) as (half,):
             half.sendall(sent)
             half.shutdown(socket.SHUT_WR)

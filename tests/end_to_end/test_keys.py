@@ -19,6 +19,13 @@ from storage.database import open_engine, writing
 from tests.end_to_end.conftest import Service, paused, png, serving
 from tests.end_to_end.test_bad_input import check_problem
 
+HEADERS = {
+    "content-security-policy",
+    "cross-origin-resource-policy",
+    "referrer-policy",
+    "x-content-type-options",
+}
+"""That every answer has, whatever it answers."""
 TUS = {"Tus-Resumable": "1.0.0"}
 ZIP = {"Content-Type": "application/zip"}
 SCOPES = {"read": "read", "write": "write", "admin": "admin", "other": "write", "other's admin": "admin"}
@@ -207,7 +214,7 @@ def test_every_route_with_every_kind_of_key(locked: Locked) -> None:
         answer = locked.call(route, locked.keys.get(kind))
         status = expected(route, kind)
         good = answer.status_code == status if status else answer.status_code not in (401, 403, 404)
-        if not good or answer.status_code >= 500:
+        if not good or answer.status_code >= 500 or not set(answer.headers) >= HEADERS:
             wrong.append((route, kind, answer.status_code, answer.text[:200]))
         if status and "HEAD" not in route:
             slug = {401: "unauthorized", 403: "forbidden", 404: "not-found"}[status]

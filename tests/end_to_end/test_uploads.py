@@ -306,7 +306,12 @@ def test_what_came_unverified_is_not_kept(service: Service) -> None:
         f"{name}: {value}\r\n"
         for name, value in (
             CHUNK
-            | {"Host": "x", "Upload-Offset": "0", "Content-Length": "1000", "Upload-Checksum": "sha1 AAAA"}
+            | {
+                "Host": "localhost",
+                "Upload-Offset": "0",
+                "Content-Length": "1000",
+                "Upload-Checksum": "sha1 AAAA",
+            }
         ).items()
     )
     with socket.create_connection((host.hostname, host.port)) as raw:

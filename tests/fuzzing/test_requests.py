@@ -17,7 +17,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def ask(folder: Path, line: str, *headers: str, body: bytes = b"") -> None:
-    head = (f"{line} HTTP/1.1", "Host: x", f"Content-Length: {len(body)}", *headers, "", "")
+    head = (f"{line} HTTP/1.1", "Host: localhost", f"Content-Length: {len(body)}", *headers, "", "")
     requests.read("\r\n".join(head).encode() + body, folder)
 
 

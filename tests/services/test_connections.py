@@ -85,7 +85,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 
 
 def get(path: str) -> bytes:
-    return f"GET {path} HTTP/1.1\r\nHost: x\r\n\r\n".encode()
+    return f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode()
 
 
 def rest(connection: socket.socket) -> bytes:
@@ -150,7 +150,7 @@ def test_a_half_closed_connection_that_takes_nothing_is_given_up(served: Served)
 
 
 def head(method: str, path: str, **headers: str) -> bytes:
-    lines = [f"{method} {path} HTTP/1.1", "Host: x", "Content-Length: 1000000"]
+    lines = [f"{method} {path} HTTP/1.1", "Host: localhost", "Content-Length: 1000000"]
     lines += [f"{name.replace('_', '-')}: {value}" for name, value in headers.items()]
     return "\r\n".join([*lines, "", ""]).encode()
 

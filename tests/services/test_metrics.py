@@ -28,7 +28,7 @@ def engine(tmp_path: Path) -> Iterator[Engine]:
 @pytest.fixture
 def client(engine: Engine, tmp_path: Path) -> Iterator[TestClient]:
     app = build_app(Settings(data=tmp_path), engine, Objects((tmp_path / "store").as_uri()))
-    with TestClient(app) as opened:
+    with TestClient(app, "http://localhost") as opened:
         yield opened
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from sqlalchemy import Engine
 
-from services.api.access import ADMIN, Caller, identify, see_that_it_is_closed
+from services.api.access import ADMIN, ANYONE, Caller, identify, see_that_it_is_closed
 from services.api.errors import Unauthorized
 from services.settings import Settings
 from storage import keys
@@ -22,8 +22,8 @@ def engine(tmp_path: Path) -> Iterator[Engine]:
 
 
 def test_a_service_that_never_had_a_key_is_open(engine: Engine, tmp_path: Path) -> None:
-    assert identify(Settings(data=tmp_path), engine, None) == ADMIN
-    assert identify(Settings(data=tmp_path), engine, "any") == ADMIN
+    assert identify(Settings(data=tmp_path), engine, None) == ANYONE
+    assert identify(Settings(data=tmp_path), engine, "any") == ANYONE
 
 
 def test_from_the_first_key_on_it_is_closed_for_good(engine: Engine, tmp_path: Path) -> None:

@@ -21,7 +21,11 @@ def test_on_loopback_it_says_how_to_start_with_a_key(tmp_path: Path, has: str) -
         with writing(engine) as c:
             key = keys.make(c, "lab", "alice", "read")
     app = build_app(settings, engine, Objects((tmp_path / "store").as_uri()))
-    answer = TestClient(app, headers={"Authorization": f"Bearer {key}"}).get("/v1/network").json()
+    answer = (
+        TestClient(app, "http://localhost", headers={"Authorization": f"Bearer {key}"})
+        .get("/v1/network")
+        .json()
+    )
     engine.dispose()
     assert answer["url"] is None
     assert "127.0.0.1 alone" in answer["problem"]

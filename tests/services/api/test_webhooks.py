@@ -39,7 +39,8 @@ def bundle(tmp_path: Path) -> bytes:
 def client(engine: Engine, tmp_path: Path, *, private: bool) -> TestClient:
     """The API of a service without a coordinator: jobs stay queued."""
     settings = Settings(data=tmp_path, webhook_secret=16 * "s", webhook_private=private)
-    return TestClient(build_app(settings, engine, Objects((tmp_path / "store").as_uri())))
+    app = build_app(settings, engine, Objects((tmp_path / "store").as_uri()))
+    return TestClient(app, "http://localhost")
 
 
 def webhook_of(engine: Engine, job: str) -> str | None:
