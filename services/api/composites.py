@@ -205,7 +205,7 @@ def _answer(
         return result
 
     data = body.read()
-    made_of = f"{seen.id} {seen.share} {kind} {wanted.model_dump_json()} ".encode()
+    made_of = f"{seen.id} {sorted(seen.blocks or ())} {kind} {wanted.model_dump_json()} ".encode()
     tag = f'"{hashlib.blake2b(made_of + hashlib.blake2b(data).digest(), digest_size=16).hexdigest()}"'
     told = {"ETag": tag, "Envmatte-Recovered": f"{seen.share:.4f}"}
     if is_known(headers, tag):
