@@ -49,7 +49,13 @@ class Pictures {
   }
 }
 
-const nextFrame = () => new Promise(requestAnimationFrame);
+// A page that is hidden or left has none: what stops it is not waited for in vain.
+const nextFrame = (stopped) =>
+  new Promise((resolve, reject) => {
+    if (stopped.aborted) return reject(stopped.reason);
+    requestAnimationFrame(resolve);
+    stopped.onabort = () => reject(stopped.reason);
+  });
 
 // Shows the steps, each for a whole number of the display's refreshes, and none before its picture is there. Where one
 // refresh was missed, the next step makes up for it; where more were, it is as long as any, and the beat starts anew: no
@@ -61,8 +67,7 @@ async function show(context, border, steps, pictures, refresh, stopped, passed) 
     let now;
     let picture;
     do {
-      now = await nextFrame();
-      stopped.throwIfAborted();
+      now = await nextFrame(stopped);
       picture = pictures.at(step.number);
     } while (now < due - refresh / 2 || (step.number !== LEAD && !picture));
     draw(context, border, step, picture);
@@ -75,19 +80,18 @@ async function show(context, border, steps, pictures, refresh, stopped, passed) 
       pictures.prepare(steps[i + 1].number).catch(() => {}); // a picture that fails is waited for, until Escape
     }
   }
-  while ((await nextFrame()) < due - refresh / 2) stopped.throwIfAborted();
+  while ((await nextFrame(stopped)) < due - refresh / 2);
   return shown;
 }
 
 // Counts down, and measures the refresh of the display meanwhile: the median of its frames' distances, in milliseconds.
 async function countDown(element, stopped) {
-  const begin = await nextFrame();
+  const begin = await nextFrame(stopped);
   const times = [begin];
   while (times.at(-1) < begin + COUNTDOWN * 1000) {
     const left = String(Math.ceil(COUNTDOWN - (times.at(-1) - begin) / 1000));
     if (element.textContent !== left) element.textContent = left;
-    times.push(await nextFrame());
-    stopped.throwIfAborted();
+    times.push(await nextFrame(stopped));
   }
   element.textContent = "";
   const distances = times.slice(1).map((time, i) => time - times[i]).sort((a, b) => a - b);
@@ -135,9 +139,9 @@ async function ask(path, options = {}) {
 
 const id = here.pathname.split("/").at(-2);
 
-// What is told is for others to see: the showing goes on without.
+// What is told is for others to see: the showing goes on without. It gets there from a page that is left, too.
 const tell = (told) =>
-  ask("showing", { method: "PUT", body: JSON.stringify(told), headers: { "Content-Type": "application/json" } }).catch(() => {});
+  ask("showing", { method: "PUT", body: JSON.stringify(told), headers: { "Content-Type": "application/json" }, keepalive: true }).catch(() => {});
 
 async function open() {
   const program = await (await ask(`../${id}`)).json();
@@ -185,6 +189,9 @@ async function play(program, pictures, rate) {
     lock = await navigator.wakeLock?.request("screen").catch(() => undefined);
     listen(document, "keydown", (event) => event.key === "Escape" && end("Stopped."));
     listen(document, "fullscreenchange", () => full && !document.fullscreenElement && end("Stopped."));
+    // The back button ends the showing, and leaves the page with all that it has loaded.
+    if (!history.state?.showing) history.pushState({ showing: true }, "");
+    listen(window, "popstate", () => end("Stopped."));
     listen(document, "visibilitychange", () => document.hidden && end("Stopped: the page was hidden."));
     await pictures.prepare(0);
     tell(told);
@@ -208,6 +215,7 @@ async function play(program, pictures, rate) {
     say(error.message);
   } finally {
     stop.abort();
+    if (history.state?.showing && !document.hidden) history.back();
     lock?.release();
     if (document.fullscreenElement) await document.exitFullscreen();
     canvas.width = canvas.height = 0;

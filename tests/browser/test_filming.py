@@ -1,11 +1,12 @@
 """Filming: a program is chosen, shown on a monitor, followed on a phone and filmed by a camera of the browser."""
 
 import re
+from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
-from tests.browser.pages import MINUTE, PHONE, opened
+from tests.browser.pages import MINUTE, PHONE, ZIP, opened
 from tests.end_to_end.conftest import Service
 from workflows.program import Program
 
@@ -100,22 +101,101 @@ def test_what_is_stopped_is_told(desk: Page, service: Service) -> None:
     expect(desk.get_by_role("alert")).to_contain_text("choose the video that the camera took")
 
 
-def test_a_film_that_is_being_taken_is_not_lost_by_a_click(desk: Page, service: Service) -> None:
+def shown(service: Service, program: str, phase: str) -> None:
+    """Tell of a program what its page would."""
+    told = {"phase": phase, "patterns_per_second": 4, "shown": 12}
+    assert service.http.put(f"/v1/programs/{program}/showing", json=told).status_code == 204
+
+
+def filming(page: Page, service: Service) -> str:
+    """Take a film of a new program, whose id this is."""
     made = service.http.post(
         "/v1/programs", json={"program": SHORT, "monitor": SCREEN, "border": True}
     ).json()
-    desk.goto(f"{service.url}/#/film/{made['id']}")
-    desk.get_by_role("button", name="Use a camera of this device").click()
-    desk.get_by_role("button", name="Start filming").click()
-    expect(desk.get_by_role("button", name="Stop filming")).to_be_visible()
-    asked: list[str] = []
-    desk.once("dialog", lambda dialog: (asked.append(dialog.message), dialog.dismiss()))
-    mattes = desk.get_by_role("navigation").get_by_role("link", name="Mattes")
-    mattes.click()
-    assert "A film is being taken" in asked[0]
-    expect(desk.get_by_role("button", name="Stop filming")).to_be_visible()
-    desk.once("dialog", lambda dialog: dialog.accept())
-    mattes.click()
+    page.goto(f"{service.url}/#/captures")
+    page.goto(f"{service.url}/#/film/{made['id']}")
+    page.get_by_role("button", name="Use a camera of this device").click()
+    page.get_by_role("button", name="Start filming").click()
+    expect(page.get_by_role("button", name="Stop filming")).to_be_visible()
+    return str(made["id"])
+
+
+def asks_before_it_closes(page: Page) -> bool:
+    """Whether a page does, and stays where it is told to."""
+    with page.expect_event("dialog") as asked:
+        page.close(run_before_unload=True)
+    asked.value.dismiss()
+    return asked.value.type == "beforeunload"
+
+
+def test_a_film_goes_on_while_another_view_is_looked_at(desk: Page, service: Service) -> None:
+    program = filming(desk, service)
+    note = desk.get_by_role("link", name="A film is being taken")
+    expect(note).to_be_hidden()
+    desk.go_back()
+    expect(desk.get_by_role("heading", name="Captures")).to_be_visible()
+    desk.get_by_role("navigation").get_by_role("link", name="Mattes").click()
     expect(desk.get_by_role("heading", name="Mattes")).to_be_visible()
-    desk.get_by_role("navigation").get_by_role("link", name="Jobs").click()  # nothing asks any more
+    assert asks_before_it_closes(desk)
+    note.click()
+    expect(desk.get_by_role("button", name="Stop filming")).to_be_visible()
+    expect(desk.get_by_label("Choose the film")).to_be_attached()
+    expect(note).to_be_hidden()
+    assert not desk.get_by_label("What the camera sees").evaluate("(video) => video.paused")
+    desk.get_by_role("navigation").get_by_role("link", name="Jobs").click()
     expect(desk.get_by_role("heading", name="Jobs")).to_be_visible()
+    expect(note).to_be_visible()
+    before = {one["id"] for one in service.http.get("/v1/captures").json()["captures"]}
+    shown(service, program, "shown")
+    expect(note).to_be_hidden(timeout=MINUTE)
+    while not (
+        made := [
+            one for one in service.http.get("/v1/captures").json()["captures"] if one["id"] not in before
+        ]
+    ):
+        desk.wait_for_timeout(100)
+    assert [one["name"] for one in made] == ["film"]
+    expect(desk.get_by_role("heading", name="Jobs")).to_be_visible()
+    desk.go_back()
+    expect(desk.get_by_role("button", name="Use a camera of this device")).to_be_visible()
+
+
+def test_a_film_that_broke_off_is_kept_until_its_fate_is_said(desk: Page, service: Service) -> None:
+    program = filming(desk, service)
+    shown(service, program, "stopped")
+    row = desk.get_by_role("region", name=re.compile("^film\\."))
+    expect(row).to_contain_text("It broke off")
+    desk.go_back()
+    expect(row).to_be_visible()
+    desk.get_by_role("navigation").get_by_role("link", name="Film").click()
+    expect(desk.get_by_role("heading", name="Choose a program")).to_be_visible()
+    expect(row).to_be_visible()
+    assert asks_before_it_closes(desk)
+    row.get_by_role("button", name="Delete").click()
+    desk.get_by_role("button", name="Keep it").click()
+    with desk.expect_download() as download:
+        row.get_by_role("button", name="Save").click()
+    assert download.value.path().stat().st_size > 1000
+    row.get_by_role("button", name="Upload").click()
+    expect(desk).to_have_url(re.compile(r"#/captures/\w+"), timeout=MINUTE)
+    expect(desk.get_by_role("heading", name="film")).to_be_visible()
+
+
+def test_another_upload_does_not_end_a_film(desk: Page, service: Service, ball: Path) -> None:
+    filming(desk, service)
+    held: list[Route] = []
+    desk.route(
+        "**/v1/uploads/*",
+        lambda route: held.append(route) if route.request.method == "PATCH" else route.continue_(),
+    )
+    desk.get_by_role("navigation").get_by_role("link", name="Captures").click()
+    desk.get_by_label(ZIP).set_input_files(ball)
+    row = desk.get_by_role("region", name="ball.zip")
+    while not held:
+        desk.wait_for_timeout(50)
+    desk.go_back()
+    expect(row).to_be_visible()
+    held.pop().continue_()
+    expect(row).to_be_hidden(timeout=MINUTE)
+    desk.wait_for_timeout(500)
+    expect(desk.get_by_role("button", name="Stop filming")).to_be_visible()

@@ -175,6 +175,33 @@ def test_escape_stops_it_and_it_can_be_shown_again(tab: Page, service: Service) 
         expect(start).to_be_focused()
 
 
+def test_the_back_button_ends_it_and_keeps_what_is_loaded(tab: Page, service: Service) -> None:
+    program = posted(service)
+    tab.goto(service.url)
+    url = go(tab, service, program)
+    start = tab.get_by_role("button", name="full screen")
+    for _ in range(2):
+        start.click()
+        expect(tab.locator("#countdown")).to_have_text("4")
+        tab.go_back()
+        expect(tab.locator("#stage")).to_be_hidden()
+        expect(tab.get_by_role("status")).to_have_text("Stopped.")
+        assert tab.url == url
+        expect(start).to_be_enabled()
+    tab.go_back()
+    expect(tab.get_by_role("heading", name="Captures")).to_be_visible()
+
+
+def test_whoever_leaves_it_stops_it(tab: Page, service: Service) -> None:
+    program = posted(service)
+    go(tab, service, program)
+    tab.get_by_role("button", name="full screen").click()
+    expect(tab.locator("#countdown")).to_have_text("4")
+    tab.goto(service.url)
+    while service.http.get(f"/v1/programs/{program['id']}").json()["showing"]["phase"] != "stopped":
+        tab.wait_for_timeout(100)
+
+
 def test_a_program_of_another_size_is_made_for_this_screen(tab: Page, service: Service) -> None:
     first = go(tab, service, posted(service, monitor={"width": 800, "height": 600}))
     expect(tab.get_by_text("made for a screen of 800 x 600 pixels; this one has 640 x 360")).to_be_visible()

@@ -13,18 +13,22 @@ export function noCamera() {
   return null;
 }
 
-// A panel to film with, and its `start` and `stop`; `filmed(file)` is called with every film.
+// The views, by their signals, in which a film is being taken; what changes here is told as an event of the window.
+export const taking = new Set();
+addEventListener("beforeunload", (event) => taking.size && event.preventDefault());
+
+// A panel to film with; `filmed(file, whole)` is called with every film, `again` when the panel is back in the page.
 export function camera(signal, filmed) {
   const picture = h("video", { muted: true, playsinline: true, "aria-label": "What the camera sees" });
   const frame = h("div", { class: "picture", hidden: true }, picture);
   const told = h("p", { class: "hint", role: "status" });
   const problem = h("div");
-  const keep = h("a", { hidden: true }, "Save the film too");
   const which = h("select", { "aria-label": "Camera", hidden: true });
   const open = h("button", { type: "button", onclick: () => use() }, "Use a camera of this device");
   const shoot = h("button", { type: "button", class: "primary", hidden: true, onclick: () => (recorder ? stop() : start()) }, "Start filming");
   let stream;
   let recorder;
+  let whole; // whether it was stopped, and did not break off
 
   async function use(deviceId) {
     problem.replaceChildren();
@@ -63,14 +67,9 @@ export function camera(signal, filmed) {
     return free;
   }
 
-  // While it films, whoever leaves the view would lose the film.
-  const leave = (event) => {
-    const link = event.target.closest?.("a[href^='#']");
-    if (event.type === "beforeunload" || (link && !confirm("A film is being taken. Leave, and lose it?"))) event.preventDefault();
-  };
-  const guard = (how) => {
-    globalThis[`${how}EventListener`]("beforeunload", leave);
-    document[`${how}EventListener`]("click", leave);
+  const tell = (change) => {
+    taking[change](signal);
+    dispatchEvent(new Event("taking"));
   };
 
   async function start() {
@@ -80,41 +79,37 @@ export function camera(signal, filmed) {
     const mine = (recorder = new MediaRecorder(stream, { mimeType: type, videoBitsPerSecond: BITS }));
     mine.ondataavailable = ({ data }) => parts.push(data);
     mine.onstop = () => {
-      guard("remove");
       recorder = undefined;
       shoot.textContent = "Start filming";
       which.disabled = false;
+      told.textContent = "Filmed.";
       const [kind] = mine.mimeType.split(";");
-      if (signal.aborted) return;
-      const film = new File(parts, `film.${kind.endsWith("mp4") ? "mp4" : "webm"}`, { type: kind });
-      URL.revokeObjectURL(keep.href);
-      keep.href = URL.createObjectURL(film);
-      keep.download = film.name;
-      keep.hidden = false;
-      filmed(film);
+      filmed(new File(parts, `film.${kind.endsWith("mp4") ? "mp4" : "webm"}`, { type: kind }), whole);
+      tell("delete");
     };
+    whole = false;
     mine.start(1000);
-    guard("add");
+    tell("add");
     shoot.textContent = "Stop filming";
     which.disabled = true;
     const free = await lock(stream.getVideoTracks()[0]);
     told.textContent = free.length ? `Filming. The browser can’t lock ${free.join(", ")} of this camera: see that nothing changes.` : "Filming.";
   }
 
-  async function stop() {
+  async function stop(ended = true) {
     if (recorder?.state !== "recording") return;
     await pause(AFTER, signal).catch(() => {});
     if (recorder?.state !== "recording") return;
+    whole = ended;
     recorder.stop();
-    told.textContent = "Filmed.";
   }
 
   function close() {
-    if (recorder?.state === "recording") recorder.stop();
     stream?.getTracks().forEach((track) => track.stop());
     stream = undefined;
   }
   signal.addEventListener("abort", close, { once: true });
-  const panel = h("div", { class: "stack" }, h("div", { class: "row" }, open, which, shoot), frame, told, h("p", {}, keep), problem);
-  return { panel, start, stop };
+  const panel = h("div", { class: "stack" }, h("div", { class: "row" }, open, which, shoot), frame, told, problem);
+  const again = () => picture.play().catch(() => {}); // it stands still out of the page, unlike the film
+  return { panel, start, stop, again };
 }

@@ -9,6 +9,7 @@ import { list } from "./list.js";
 import { begin, onDrop, running } from "./upload.js";
 
 const SILENT = 8; // seconds after which a page that shows a program is taken for gone: it tells each 2
+const CUT = "It broke off before the program’s end: this film does not show all of it.";
 const isShown = ({ showing }) => ["countdown", "showing"].includes(showing?.phase) && showing.age_seconds < SILENT + showing.seconds;
 
 export async function filming(main, signal) {
@@ -38,7 +39,7 @@ export async function filming(main, signal) {
   };
   main.append(h("h1", {}, "Filming"),
     h("p", { class: "lead" }, "A monitor behind the glass shows patterns, one after another, and a camera films them."),
-    form, await nearby(signal), h("h2", {}, "Programs there are"));
+    form, running, await nearby(signal), h("h2", {}, "Programs there are"));
   await list(main, signal, {
     page: (after) => getJson(`v1/programs?limit=50${after}`, signal).then((answer) => answer.programs),
     busy: isShown,
@@ -66,9 +67,9 @@ export async function program(main, signal, id) {
   const problem = h("div");
   const live = h("section", { class: "panel" }, h("h2", {}, "On the monitor"), phase, bar, about,
     h("p", { class: "row" }, h("a", { class: "primary", href: `v1/programs/${id}/play`, target: "_blank", rel: "opener" }, "Show it on this screen")));
-  const film = (file) => begin(file, recordOf(found, found.showing?.patterns_per_second ?? 2));
+  const film = (file, about) => begin(file, recordOf(found, found.showing?.patterns_per_second ?? 2), about);
   const why = noCamera();
-  const recorder = why ? null : camera(signal, film);
+  const recorder = why ? null : camera(signal, (file, whole) => film(file, { taken: true, lacks: whole ? "" : CUT }));
   const choose = h("input", { type: "file", accept: "video/*", id: "film" });
   const take = ([file]) => {
     problem.replaceChildren();
@@ -81,6 +82,7 @@ export async function program(main, signal, id) {
   };
   const zone = h("div", { class: "drop small" }, h("label", { for: "film" }, h("strong", {}, "Choose the film"), " that the camera took of this program, or drop it here"), choose);
   onDrop(zone, take);
+  const filmed = h("section", { class: "panel" }, h("h2", {}, "The film"), recorder ? recorder.panel : h("p", {}, why), zone, problem, running);
   main.append(
     h("p", { class: "crumb" }, h("a", { href: "#/film" }, "Filming")),
     h("h1", {}, named(found)),
@@ -88,9 +90,7 @@ export async function program(main, signal, id) {
     h("div", { class: "columns" },
       h("section", { class: "panel" }, h("h2", {}, "Before you start"),
         h("ul", { class: "checks" }, CHECKS.map((text) => h("li", {}, h("label", {}, h("input", { type: "checkbox" }), h("span", {}, text)))))),
-      h("div", { class: "stack" }, live,
-        h("section", { class: "panel" }, h("h2", {}, "The film"), recorder ? recorder.panel : h("p", {}, why),
-          zone, problem, running))),
+      h("div", { class: "stack" }, live, filmed)),
     await nearby(signal),
   );
   let since = performance.now();
@@ -106,7 +106,7 @@ export async function program(main, signal, id) {
     draw();
     const { phase: told } = found.showing ?? {};
     if (told === "countdown" && age() < SILENT) recorder?.start();
-    if (told === "shown" || told === "stopped") recorder?.stop();
+    if (told === "shown" || told === "stopped") recorder?.stop(told === "shown");
   };
   const lost = (away) => away && (about.textContent = "The service does not answer; it is asked again.");
   follow(`v1/programs/${id}/events`, signal, changed, { lost }).catch((error) => signal.aborted || live.append(said(error)));
@@ -116,6 +116,10 @@ export async function program(main, signal, id) {
       await pause(250, signal);
     }
   })().catch(() => {}); // the view was left
+  return () => {
+    filmed.append(running);
+    recorder?.again();
+  };
 }
 
 // What a monitor shows by now, by what it told some seconds ago.

@@ -1,5 +1,6 @@
 // Which view is shown: the part of the URL after `#` says it, so that a reload and the back button keep it.
-import { said } from "./dom.js";
+import { h, said } from "./dom.js";
+import { taking } from "./camera.js";
 import { captures } from "./captures.js";
 import { capture } from "./capture.js";
 import { filming, program } from "./filming.js";
@@ -8,26 +9,50 @@ import { matte, mattes } from "./mattes.js";
 
 const VIEWS = { film: [filming, program], captures: [captures, capture], jobs: [jobs, job], mattes: [mattes, matte] };
 const main = document.getElementById("main");
-let leaving = new AbortController();
+const note = document.getElementById("taking");
+const views = new Map(); // by their part of the URL: the one that is shown, and those in which a film is being taken
+let shown;
+
+// Whoever leaves a view in which a film is being taken does not end the film: the view goes on, to be shown again.
+function tidy() {
+  for (const [hash, view] of views) {
+    if (view === shown || taking.has(view.signal)) continue;
+    view.stop.abort();
+    views.delete(hash);
+  }
+  const [away] = [...views].find(([, view]) => view !== shown) ?? [];
+  note.hidden = !away;
+  if (away) note.hash = away;
+}
+addEventListener("taking", tidy);
+
+function opened(hash) {
+  const stop = new AbortController();
+  const view = { stop, signal: stop.signal, element: h("div", { class: "view" }) };
+  views.get(hash)?.stop.abort();
+  views.set(hash, view);
+  return view;
+}
 
 async function route(moved) {
-  const [, name, id] = /^#\/(\w+)(?:\/([\w-]+))?$/.exec(location.hash) ?? [];
+  const [hash, name, id] = /^#\/(\w+)(?:\/([\w-]+))?$/.exec(location.hash) ?? [];
   if (!VIEWS[name]) return location.replace("#/captures");
-  leaving.abort();
-  leaving = new AbortController();
-  const { signal } = leaving;
+  const before = views.get(hash);
+  const view = (shown = taking.has(before?.signal) ? before : opened(hash));
+  tidy();
   for (const link of document.querySelectorAll("nav a")) {
     if (link.hash === `#/${name}`) link.setAttribute("aria-current", "page");
     else link.removeAttribute("aria-current");
   }
-  main.replaceChildren();
+  main.replaceChildren(view.element);
   main.ariaBusy = "true";
   try {
-    await VIEWS[name][id ? 1 : 0](main, signal, id);
+    if (view === before) view.again();
+    else view.again = await VIEWS[name][id ? 1 : 0](view.element, view.signal, id);
   } catch (error) {
-    if (!signal.aborted) main.append(said(error));
+    if (!view.signal.aborted) view.element.append(said(error));
   }
-  if (signal.aborted) return;
+  if (view !== shown) return;
   main.ariaBusy = "false";
   const title = main.querySelector("h1");
   document.title = `${title?.textContent ?? "envmatte"} · envmatte`;

@@ -1,6 +1,7 @@
 // Uploads: rows that show how far each is, and where files are dropped or chosen.
-import { Problem, post } from "./api.js";
-import { bytes, duration, h, said } from "./dom.js";
+import { Problem, post, saveBlob } from "./api.js";
+import { taking } from "./camera.js";
+import { bytes, duration, h, said, sure } from "./dom.js";
 import { askFor, bundle, isFilm } from "./film.js";
 import { send } from "./tus.js";
 import { crc32 } from "./zip.js";
@@ -9,21 +10,31 @@ const HEAD = 1 << 20; // bytes of an archive in which its record lies
 
 // Uploads live longer than the view that shows them: who looks at something else meanwhile finds them again.
 export const running = h("div", { class: "uploads" });
-let number = 0;
-addEventListener("beforeunload", (event) => number && event.preventDefault());
+const rows = new Set(); // of each, whether it is `busy`, and `only`: of a film that is nowhere but in this page
+addEventListener("beforeunload", (event) => [...rows].some(({ busy, only }) => busy || only) && event.preventDefault());
 
-// Uploads a capture's ZIP, or a film: with its record, or whoever dropped it is asked for what it shows.
-export function begin(file, record) {
+// Uploads a capture's ZIP, or a film: with its record, or whoever dropped it is asked for what it shows. One that was
+// `taken` here can be saved, and is let go of by nobody who was not asked; one that `lacks` something waits for a word.
+export function begin(file, record, { taken = false, lacks = "" } = {}) {
+  const state = { busy: false, only: taken };
   const stop = new AbortController();
   const bar = h("progress", { max: 1, value: 0, "aria-label": `Upload of ${file.name}` });
   const status = h("span", { role: "status" }, "Starting");
   const problem = h("div");
   const asked = h("div");
   const again = h("button", { type: "button", hidden: true, onclick: () => work() }, "Go on");
-  const cancel = h("button", { type: "button", onclick: () => (stop.abort(), row.remove()) }, "Give up");
+  const save = h("button", { type: "button", hidden: !taken, onclick: () => (saveBlob(file, file.name), (state.only = false)) }, "Save the film");
+  const end = () => (rows.delete(state), row.remove());
+  const drop = async () => {
+    if (state.only && !(await sure("Delete this film?", "It is nowhere but in this page: upload it, or save it first.", "Delete it"))) return;
+    stop.abort();
+    end();
+  };
+  const cancel = h("button", { type: "button", onclick: drop }, taken ? "Delete the film" : "Give up");
   const row = h("section", { class: "panel", "aria-label": file.name },
-    h("p", { class: "row spread" }, h("strong", { class: "name" }, file.name), h("span", { class: "row" }, again, cancel)), bar, status, asked, problem);
+    h("p", { class: "row spread" }, h("strong", { class: "name" }, file.name), h("span", { class: "row" }, again, save, cancel)), bar, status, asked, problem);
   running.append(row);
+  rows.add(state);
   let archive = isFilm(file) ? null : file;
   let remembered;
 
@@ -32,7 +43,7 @@ export function begin(file, record) {
     let first;
     again.hidden = true;
     problem.replaceChildren();
-    number += 1;
+    state.busy = true;
     try {
       if (!archive) {
         status.textContent = "A film";
@@ -58,21 +69,25 @@ export function begin(file, record) {
       status.textContent = "Looking into the ZIP";
       const made = await post("v1/captures", { upload }, `capture-of-${upload}`);
       localStorage.removeItem(remembered);
-      row.remove();
-      if (/^#\/(captures|film\/\w+)$/.test(location.hash)) location.hash = `#/captures/${made.id}`;
+      end();
+      if (running.isConnected && !taking.size) location.hash = `#/captures/${made.id}`;
     } catch (error) {
       if (stop.signal.aborted) return;
-      const hopeless = error.status >= 400 && error.status < 500;
+      const hopeless = error.status >= 400 && error.status < 500 && error.status !== 401; // another key may be typed
       if (hopeless) localStorage.removeItem(remembered);
       status.textContent = hopeless ? "Refused" : "Stopped; what has come is kept";
-      cancel.textContent = hopeless ? "Dismiss" : "Give up";
+      if (!taken) cancel.textContent = hopeless ? "Dismiss" : "Give up";
+      again.textContent = "Go on";
       again.hidden = hopeless;
       problem.replaceChildren(said(error));
     } finally {
-      number -= 1;
+      state.busy = false;
     }
   }
-  work();
+  if (!lacks) return work();
+  status.textContent = lacks;
+  again.textContent = "Upload it all the same";
+  again.hidden = false;
 }
 
 const startsAsZip = async (file) => /^PK[\x03\x05]/.test(await file.slice(0, 4).text());
