@@ -1,5 +1,6 @@
 // Shows a program full screen, and tells the service how far it is, for a phone that follows.
 import { LEAD, LEAD_SECONDS, borderOn, draw, schedule } from "./clock.js";
+import { authorization } from "./app/api.js";
 import { CHECKS } from "./app/checklist.js";
 
 const COUNTDOWN = 5; // seconds
@@ -129,9 +130,7 @@ const screenSize = () => ({
 });
 
 async function ask(path, options = {}) {
-  const key = sessionStorage.getItem("envmatte-key");
-  const headers = { ...options.headers, ...(key ? { Authorization: `Bearer ${key}` } : {}) };
-  const answer = await fetch(new URL(path, here), { ...options, headers });
+  const answer = await fetch(new URL(path, here), { ...options, headers: { ...options.headers, ...authorization() } });
   if (answer.status === 401) $("unlock").hidden = false;
   if (!answer.ok) throw new Error((await answer.json()).detail);
   return answer;
@@ -242,7 +241,7 @@ function finish(program, { width, height }, shown, refresh) {
 
 $("unlock").onsubmit = (event) => {
   event.preventDefault();
-  sessionStorage.setItem("envmatte-key", $("key").value);
+  sessionStorage.setItem("envmatte-key", $("key").value.trim());
   $("unlock").hidden = true;
   start();
 };

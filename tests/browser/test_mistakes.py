@@ -5,6 +5,8 @@ import os
 import re
 import shutil
 import socket
+import subprocess
+import sys
 import zipfile
 from pathlib import Path
 
@@ -13,7 +15,7 @@ from playwright.sync_api import Browser, Page, Route, expect
 
 from tests.browser.pages import MINUTE, ZIP, opened
 from tests.disks import small_disk
-from tests.end_to_end.conftest import Service, serving
+from tests.end_to_end.conftest import Service, paused, serving
 
 pytestmark = pytest.mark.full
 
@@ -40,6 +42,11 @@ def hold(page: Page) -> list[Route]:
 
     page.route("**/v1/uploads/*", take)
     return held
+
+
+def envmatte_keys(data: Path, *given: str) -> str:
+    words = [sys.executable, "-m", "services", "keys", *given, "--data", str(data)]
+    return subprocess.run(words, capture_output=True, text=True, check=True).stdout
 
 
 @pytest.mark.parametrize(
@@ -175,6 +182,98 @@ def test_a_reload_and_the_back_button_keep_the_view(
     expect(desk.get_by_role("heading", name="Mattes")).to_be_visible()
     desk.goto(f"{service.url}/#/captures/nothing")
     expect(desk.get_by_role("alert")).to_contain_text("Not found")
+
+
+def test_what_another_tab_has_deleted_is_deleted(desk: Page, service: Service, ball: Path) -> None:
+    capture = service.client.upload(ball)
+    service.client.wait(capture["job"])
+    recovered = service.client.wait(service.client.recover(capture["id"], quality="fast")["id"])
+    for kind, one, title in (
+        ("mattes", recovered["matte"], "Layers"),
+        ("jobs", recovered["id"], "The frame"),
+        ("captures", capture["id"], "Contact sheet"),
+    ):
+        desk.goto(f"{service.url}/#/{kind}/{one}")
+        expect(desk.get_by_role("heading", name=title)).to_be_visible()
+        assert service.http.delete(f"/v1/{kind}/{one}").status_code == 204
+        desk.get_by_role("button", name="Delete", exact=True).click()
+        desk.get_by_role("button", name="Delete it").click()
+        expect(desk).to_have_url(re.compile(f"#/{kind}$"))
+        expect(desk.get_by_role("alert")).to_have_count(0)
+        desk.go_back()  # not to what is gone
+        expect(desk).not_to_have_url(re.compile(one))
+
+
+def test_a_job_that_another_tab_has_deleted_is_gone(
+    desk: Page, service: Service, ready: tuple[str, str]
+) -> None:
+    with paused(service):
+        job = service.client.recover(ready[0])["id"]
+        desk.goto(f"{service.url}/#/jobs/{job}")
+        cancel = desk.get_by_role("button", name="Cancel")
+        expect(cancel).to_be_visible()
+        # As a line that was cut would have it: of the end, nothing is heard.
+        desk.route(f"**/v1/jobs/{job}/events", lambda route: route.abort("connectionreset"))
+        desk.reload()
+        expect(desk.get_by_text("it is asked again")).to_be_visible()
+        service.http.post(f"/v1/jobs/{job}/cancel")
+        while service.http.delete(f"/v1/jobs/{job}").status_code != 204:
+            desk.wait_for_timeout(100)
+        desk.unroute(f"**/v1/jobs/{job}/events")
+        expect(desk.get_by_role("alert")).to_contain_text("Not found", timeout=MINUTE)
+        expect(cancel).to_have_count(0)
+
+
+def test_a_file_that_goes_away_in_an_upload_is_named(desk: Page, service: Service, tmp_path: Path) -> None:
+    film = tmp_path / "card.zip"
+    film.write_bytes(b"PK\x03\x04" + bytes(9 << 20))  # more than one part
+    held = hold(desk)
+    desk.goto(service.url)
+    desk.get_by_label(ZIP).set_input_files(film)
+    while not held:
+        desk.wait_for_timeout(50)
+    film.rename(tmp_path / "elsewhere")
+    held.pop().continue_()
+    expect(desk.get_by_role("alert")).to_contain_text(
+        "card.zip was changed, moved or taken out", timeout=MINUTE
+    )
+    (tmp_path / "elsewhere").rename(film)
+    desk.get_by_role("button", name="Go on").click()
+    while not held:
+        desk.wait_for_timeout(50)
+    assert held[0].request.header_value("upload-offset") == str(8 << 20)
+
+
+def test_a_key_is_typed_wrong_and_another_revoked_in_an_upload(
+    browser: Browser, ball: Path, tmp_path: Path
+) -> None:
+    data = tmp_path / "data"
+    with serving(data, "--workers", "1", ENVMATTE_KEYS="first") as locked, opened(browser) as page:
+        lab = envmatte_keys(data, "make", "lab").split()[-1]
+        page.goto(locked.url)
+        key = page.get_by_label("Key of the service")
+        unknown = page.get_by_text("This key is not known to the service")
+        key.fill("ключ")  # which no header can hold
+        page.keyboard.press("Enter")
+        expect(unknown).to_be_visible()
+        key.fill(lab)
+        page.keyboard.press("Enter")
+        held = hold(page)
+        page.get_by_label(ZIP).set_input_files(ball)
+        while not held:
+            page.wait_for_timeout(50)
+        envmatte_keys(data, "revoke", "lab")
+        held.pop().continue_()
+        expect(unknown).to_be_visible()
+        page.keyboard.press("Escape")
+        row = page.get_by_role("region", name="ball.zip")
+        expect(row).to_contain_text("what has come is kept")
+        expect(unknown).to_be_hidden()
+        page.unroute("**/v1/uploads/*")
+        row.get_by_role("button", name="Go on").click()
+        key.fill("first")
+        page.keyboard.press("Enter")
+        expect(page.get_by_role("heading", name="a ball")).to_be_visible(timeout=MINUTE)
 
 
 def test_a_disk_that_is_full_is_said_and_the_upload_goes_on_with_room(

@@ -222,7 +222,7 @@ def test_a_key_is_asked_for_where_the_service_wants_one(
         program = posted(locked)
         tab.goto(f"{locked.url}/v1/programs/{program['id']}/play")
         key = tab.get_by_label("Key of the service")
-        for text, said in (("wrong", "send a key"), ("secret", "Ready.")):
+        for text, said in (("wrong", "send a key"), ("ключ", "send a key"), ("secret", "Ready.")):
             expect(key).to_be_visible()
             key.fill(text)
             key.press("Enter")

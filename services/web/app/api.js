@@ -17,7 +17,8 @@ const AWAY = {
 
 export const key = () => sessionStorage.getItem(KEY);
 
-export const authorization = () => (key() ? { Authorization: `Bearer ${key()}` } : {});
+// What no header can hold makes another key of it, which is as unknown to the service.
+export const authorization = () => (key() ? { Authorization: `Bearer ${key().replace(/[^\x20-\xff]/g, "?")}` } : {});
 
 let asking;
 
@@ -74,6 +75,11 @@ export async function post(path, body, once = crypto.randomUUID?.() ?? String(Ma
 }
 
 export const call = (method, path) => ask(path, { method });
+
+// What is gone already, by another tab, is deleted too.
+export const remove = (path) => call("DELETE", path).catch((error) => {
+  if (error.status !== 404) throw error;
+});
 
 // Saves what the service answers with. Without a key the browser streams it to the disk by itself.
 export async function save(path, name) {

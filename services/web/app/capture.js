@@ -1,5 +1,5 @@
 // One capture: how it turned out, its frames, and the way to a matte.
-import { call, getBlob, getJson } from "./api.js";
+import { getBlob, getJson, remove } from "./api.js";
 import { badge, button, bytes, facts, h, newest, prose, said, show, size, sure, when } from "./dom.js";
 import { recovery } from "./options.js";
 import { follower } from "./progress.js";
@@ -7,14 +7,14 @@ import { follower } from "./progress.js";
 export async function capture(main, signal, id) {
   const found = await getJson(`v1/captures/${id}`, signal);
   const problem = h("div");
-  const remove = button("Delete", problem, async () => {
+  const drop = button("Delete", problem, async () => {
     if (!(await sure("Delete this capture?", "Its frames are gone then. Mattes that were recovered from it stay.", "Delete it"))) return;
-    await call("DELETE", `v1/captures/${id}`);
-    location.hash = "#/captures";
+    await remove(`v1/captures/${id}`);
+    location.replace("#/captures");
   }, "quiet");
   main.append(
     h("p", { class: "crumb" }, h("a", { href: "#/captures" }, "Captures")),
-    h("div", { class: "row spread" }, h("h1", {}, found.name || `Capture ${id.slice(0, 8)}`), h("span", { class: "row" }, badge(found.state), remove)),
+    h("div", { class: "row spread" }, h("h1", {}, found.name || `Capture ${id.slice(0, 8)}`), h("span", { class: "row" }, badge(found.state), drop)),
     problem,
     facts({
       Frame: found.width && `${size(found)} pixels`, Frames: found.frames, Monitor: `${size(found.program.monitor)} pixels`,

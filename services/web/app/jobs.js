@@ -1,5 +1,5 @@
 // Jobs: all of them, and one while it runs, its frame filling in tile by tile.
-import { ask, call, getJson, post, save } from "./api.js";
+import { ask, call, getJson, post, remove, save } from "./api.js";
 import { backdrop } from "./backdrops.js";
 import { badge, button, empty, facts, h, newest, pause, said, show, sure, when } from "./dom.js";
 import { ACTIVE } from "./events.js";
@@ -31,11 +31,11 @@ export async function job(main, signal, id) {
     await post(`v1/jobs/${id}/retry`);
     watch();
   }, "primary");
-  const remove = button("Delete", problem, async () => {
+  const drop = button("Delete", problem, async () => {
     const lost = found.kind === "composite" ? "Its log and its video are gone then." : "Its log is gone then; what it made stays.";
     if (!(await sure("Delete this job?", lost, "Delete it"))) return;
-    await call("DELETE", `v1/jobs/${id}`);
-    location.hash = "#/jobs";
+    await remove(`v1/jobs/${id}`);
+    location.replace("#/jobs");
   }, "quiet");
   const asked = h("details", { class: "panel", hidden: found.kind !== "recover" }, h("summary", {}, "Options"), facts(found.options));
   const links = h("p", { class: "row" });
@@ -43,7 +43,7 @@ export async function job(main, signal, id) {
   const preview = found.kind === "recover" ? await filling(found, signal) : null;
   main.append(
     h("p", { class: "crumb" }, h("a", { href: "#/jobs" }, "Jobs")),
-    h("div", { class: "row spread" }, h("h1", {}, KINDS[found.kind]), h("span", { class: "row" }, cancel, retry, remove)),
+    h("div", { class: "row spread" }, h("h1", {}, KINDS[found.kind]), h("span", { class: "row" }, cancel, retry, drop)),
     problem,
     facts({ Asked: when(found.created_at), Capture: found.capture && h("a", { href: `#/captures/${found.capture}` }, found.capture.slice(0, 8)), Method: found.options.method, Quality: found.options.quality }),
     links, h("div", { class: preview ? "columns" : "stack" }, preview?.panel, h("div", { class: "stack" }, panel, asked)),
@@ -52,7 +52,7 @@ export async function job(main, signal, id) {
 
   function told(now) {
     cancel.hidden = !ACTIVE.includes(now.state);
-    remove.hidden = ACTIVE.includes(now.state);
+    drop.hidden = ACTIVE.includes(now.state);
     retry.hidden = now.state !== "failed";
     const made = now.state === "succeeded";
     links.replaceChildren(...[
@@ -65,7 +65,11 @@ export async function job(main, signal, id) {
 
   function watch(known) {
     panel.replaceChildren();
-    return follower(panel, id, signal, told, known).catch((error) => signal.aborted || panel.append(said(error)));
+    return follower(panel, id, signal, told, known).catch((error) => {
+      if (signal.aborted) return;
+      if (error.status === 404) dispatchEvent(new HashChangeEvent("hashchange")); // deleted meanwhile: there is nothing to show
+      else panel.append(said(error));
+    });
   }
 }
 

@@ -1,5 +1,5 @@
 // Mattes: all of them, and one to composite and to look into.
-import { ask, call, getJson, save } from "./api.js";
+import { ask, getJson, remove, save } from "./api.js";
 import { backdrop } from "./backdrops.js";
 import { badge, button, empty, facts, h, newest, said, show, size, sure, when } from "./dom.js";
 import { compositing } from "./compositing.js";
@@ -54,16 +54,16 @@ async function thumb(frame, signal) {
 export async function matte(main, signal, id) {
   const found = await getJson(`v1/mattes/${id}`, signal);
   const problem = h("div");
-  const remove = button("Delete", problem, async () => {
+  const drop = button("Delete", problem, async () => {
     if (!(await sure("Delete this matte?", "It has to be recovered anew then, or come from an archive of it.", "Delete it"))) return;
-    await call("DELETE", `v1/mattes/${id}`);
-    location.hash = "#/mattes";
+    await remove(`v1/mattes/${id}`);
+    location.replace("#/mattes");
   }, "quiet");
   const archive = button("Download the matte", problem, () => save(`v1/mattes/${id}/archive`, `matte-${id.slice(0, 8)}.zip`));
   archive.hidden = found.state !== "ready";
   main.append(
     h("p", { class: "crumb" }, h("a", { href: "#/mattes" }, "Mattes")),
-    h("div", { class: "row spread" }, h("h1", {}, `Matte ${id.slice(0, 8)}`), h("span", { class: "row" }, badge(found.state), archive, remove)),
+    h("div", { class: "row spread" }, h("h1", {}, `Matte ${id.slice(0, 8)}`), h("span", { class: "row" }, badge(found.state), archive, drop)),
     problem,
     facts({
       Frame: found.width && `${size(found)} pixels`, Monitor: found.monitor && `${found.monitor.join(" × ")} pixels`,

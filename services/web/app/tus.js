@@ -10,7 +10,7 @@ const TUS = { "Tus-Resumable": "1.0.0" };
 const PASSING = [0, 409, 429, 502, 503, 504];
 
 // A request with the bytes that went out told meanwhile, which `fetch` can't.
-function patch(path, offset, blob, progress, signal) {
+function patch(path, offset, part, progress, signal) {
   return new Promise((resolve, reject) => {
     const request = new XMLHttpRequest();
     const stop = () => request.abort();
@@ -30,7 +30,7 @@ function patch(path, offset, blob, progress, signal) {
     request.onabort = () => reject(signal.reason);
     request.onloadend = () => signal.removeEventListener("abort", stop);
     signal.addEventListener("abort", stop);
-    request.send(blob);
+    request.send(part);
   });
 }
 
@@ -60,13 +60,15 @@ export async function send(file, remembered, { signal, progress, waiting }) {
       lost = false;
       waiting(false);
       while (offset < file.size) {
-        offset = await patch(`v1/uploads/${id}`, offset, file.slice(offset, offset + PART), progress, signal);
+        const part = await file.slice(offset, offset + PART).arrayBuffer(); // a file that went away is no broken line
+        offset = await patch(`v1/uploads/${id}`, offset, part, progress, signal);
         progress(offset);
         wait = 1000;
       }
       return id;
     } catch (error) {
       signal.throwIfAborted();
+      const isPart = id && !lost;
       lost = Boolean(id);
       if (id && [404, 410].includes(error.status)) {
         if (await isCapture(id, signal)) return id; // another tab was quicker
@@ -75,7 +77,7 @@ export async function send(file, remembered, { signal, progress, waiting }) {
         lost = false;
         continue;
       }
-      if (error.status === 401) continue; // `ask` will ask for a key
+      if (error.status === 401 && isPart) continue; // `ask` will ask for a key, and be refused one by whoever has none
       if (!PASSING.includes(error.status)) throw error;
       waiting(true, wait);
       await pause(wait, signal);

@@ -79,7 +79,7 @@ export function begin(file, record, { taken = false, lacks = "" } = {}) {
       if (!taken) cancel.textContent = hopeless ? "Dismiss" : "Give up";
       again.textContent = "Go on";
       again.hidden = hopeless;
-      problem.replaceChildren(said(error));
+      problem.replaceChildren(said(/^Not(Found|Readable)Error$/.test(error.name) ? unreadable(file) : error));
     } finally {
       state.busy = false;
     }
@@ -89,6 +89,11 @@ export function begin(file, record, { taken = false, lacks = "" } = {}) {
   again.textContent = "Upload it all the same";
   again.hidden = false;
 }
+
+const unreadable = ({ name }) => ({
+  title: "The file can’t be read",
+  detail: `${name} was changed, moved or taken out since it was chosen, or is a folder: put it back and go on, or choose it anew.`,
+});
 
 const startsAsZip = async (file) => /^PK[\x03\x05]/.test(await file.slice(0, 4).text());
 
