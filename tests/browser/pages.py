@@ -45,5 +45,13 @@ def opened(browser: Browser, **options: Any) -> Iterator[Page]:
     assert len(hosts - {""}) == 1  # what the page made itself has none
 
 
+def asks_before_it_closes(page: Page) -> bool:
+    """Whether a page does, and stays where it is told to."""
+    with page.expect_event("dialog") as asked:
+        page.close(run_before_unload=True)
+    asked.value.dismiss()
+    return asked.value.type == "beforeunload"
+
+
 def is_fitting(page: Page) -> bool:
     return bool(page.evaluate("document.documentElement.scrollWidth <= innerWidth"))

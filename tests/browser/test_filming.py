@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, Route, expect
 
-from tests.browser.pages import MINUTE, PHONE, ZIP, opened
+from tests.browser.pages import MINUTE, PHONE, ZIP, asks_before_it_closes, opened
 from tests.end_to_end.conftest import Service
 from workflows.program import Program
 
@@ -118,14 +118,6 @@ def filming(page: Page, service: Service) -> str:
     page.get_by_role("button", name="Start filming").click()
     expect(page.get_by_role("button", name="Stop filming")).to_be_visible()
     return str(made["id"])
-
-
-def asks_before_it_closes(page: Page) -> bool:
-    """Whether a page does, and stays where it is told to."""
-    with page.expect_event("dialog") as asked:
-        page.close(run_before_unload=True)
-    asked.value.dismiss()
-    return asked.value.type == "beforeunload"
 
 
 def test_a_film_goes_on_while_another_view_is_looked_at(desk: Page, service: Service) -> None:

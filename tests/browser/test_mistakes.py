@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, Route, expect
 
-from tests.browser.pages import MINUTE, ZIP, opened
+from tests.browser.pages import MINUTE, ZIP, asks_before_it_closes, opened
 from tests.disks import small_disk
 from tests.end_to_end.conftest import Service, paused, serving
 
@@ -125,6 +125,7 @@ def test_another_view_and_the_back_button_leave_an_upload_alone(
     desk.go_forward()
     while not held:
         desk.wait_for_timeout(50)
+    assert asks_before_it_closes(desk)
     held.pop().continue_()
     desk.get_by_role("navigation").get_by_role("link", name="Captures").click()
     expect(desk.get_by_text("a ball", exact=True).first).to_be_visible(timeout=MINUTE)
