@@ -222,6 +222,14 @@ def test_every_kind_of_picture_is_a_backdrop(service: Service, matte: str, body:
     assert decoded(asked(service, matte, body)).shape == (72, 96, 3)
 
 
+def test_a_backdrop_of_8_bits_that_lets_through_is_answered_with_as_many(
+    service: Service, matte: str
+) -> None:
+    codes = (255 * BACKDROP).astype(np.uint8)
+    glassy = np.concatenate([codes, np.full((*codes.shape[:2], 1), 100, np.uint8)], axis=2)
+    assert decoded(asked(service, matte, images.encode_png(glassy))).dtype == np.uint8
+
+
 def test_a_bomb_is_refused_before_it_goes_off(service: Service, matte: str) -> None:
     bomb = saved(Image.new("1", (20_000, 20_000)), "PNG")
     assert len(bomb) < 1 << 20

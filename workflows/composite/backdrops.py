@@ -4,7 +4,6 @@ from typing import cast
 
 import numpy as np
 
-from workflows import images
 from workflows.composite.light import Backdrop
 from workflows.floats import Floats
 from workflows.images import Codes
@@ -30,13 +29,7 @@ def backdrop_of(pixels: Codes | Floats, transfer: Transfer) -> Backdrop:
     """
     if pixels.dtype == np.float32:
         light = cast("Floats", pixels)
-        return Backdrop(np.nan_to_num(light, copy=False, nan=0, posinf=0, neginf=0))
+        light[~np.isfinite(light)] = 0
+        return Backdrop(light)
     codes = cast("Codes", pixels)
-    light_of = table(transfer, codes.dtype)
-    if codes.shape[2] in (1, 3):
-        return Backdrop(codes, light_of)
-    colours, alpha = codes[..., :-1], codes[..., -1:]
-    top = np.iinfo(codes.dtype).max
-    if (alpha == top).all():
-        return Backdrop(colours, light_of)
-    return Backdrop(light_of.take(colours) * images.to_unit(alpha))
+    return Backdrop(codes, table(transfer, codes.dtype))

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 from numba import njit
@@ -13,7 +12,7 @@ from workflows.composite.threads import in_parts
 from workflows.recovery.pyramid import Pyramid
 
 ROWS = 64
-"""Rows of cells that are made at a time: what is held of a large backdrop as float is what they see."""
+"""Rows of cells that a thread makes at a time."""
 
 
 @dataclass(frozen=True)
@@ -22,20 +21,14 @@ class Backdrop:
 
     Attributes
     ----------
-    pixels : (h, w, 1 or 3) uint8, uint16 or float32
+    pixels : (h, w, 1 to 4) uint8 or uint16, or (h, w, 1 or 3) float32
+        With an alpha channel if it has two or four: what is transparent is black, in part in proportion.
     table : (256 or 65536,) float32, optional
         Linear light of every value of an integer type; float values are linear light.
     """
 
     pixels: NDArray[np.integer] | NDArray[np.float32]
     table: NDArray[np.float32] | None = None
-
-    def light(self, rows: slice) -> NDArray[np.float32]:
-        """Linear light of some rows, (h, w, 1 or 3) float32."""
-        values = self.pixels[rows]
-        if self.table is None:
-            return np.asarray(values, np.float32)
-        return self.table.take(cast("NDArray[np.integer]", values))
 
 
 def node_light(
@@ -77,7 +70,7 @@ def node_light(
     starts, grids = pyramid.starts, pyramid.grids
     finest = light[: starts[1]].reshape(rows, columns, 3)
     if placement is None:
-        _resample(backdrop, finest, threads)
+        _resample(backdrop, finest, threads, (rows, columns))
     else:
         _place(backdrop, placement, monitor, finest, threads)
     for level in range(1, len(grids)):
@@ -91,17 +84,24 @@ def node_light(
     return light
 
 
-def _resample(backdrop: Backdrop, cells: NDArray[np.float32], threads: int) -> None:
-    """Stretch a backdrop over cells (rows, columns, 3): each gets the mean over it."""
-    rows, (height, width, _) = len(cells), backdrop.pixels.shape
+def _resample(
+    backdrop: Backdrop,
+    cells: NDArray[np.float32],
+    threads: int,
+    grid: tuple[int, int],
+    corner: tuple[int, int] = (0, 0),
+) -> None:
+    """Stretch a backdrop over a grid of rows and columns: each cell gets the mean over it.
 
-    def some(start: int) -> None:
-        stop = min(start + ROWS, rows)
-        first = start * height // rows
-        seen = backdrop.light(slice(first, -(-stop * height // rows)))
-        _area_mean(seen, first, height, width, start, stop, cells)
-
-    in_parts(some, range(0, rows, ROWS), threads)
+    Made are the cells (rows, columns, 3) from the grid's row and column `corner` on.
+    """
+    in_parts(
+        lambda start: _area_mean(
+            backdrop.pixels, backdrop.table, grid, corner, start, min(start + ROWS, len(cells)), cells
+        ),
+        range(0, len(cells), ROWS),
+        threads,
+    )
 
 
 def _place(
@@ -116,61 +116,101 @@ def _place(
     height, width, _ = backdrop.pixels.shape
     steps = np.hypot(*placement.matrix((columns, rows), monitor, (width, height))[:, :2].T)
     wide, high = (math.ceil(size / max(step, 1.0)) for size, step in zip((width, height), steps, strict=True))
-    if (wide, high) == (width, height):
-        picture = backdrop.light(slice(None))
-    else:
-        picture = np.empty((high, wide, 3), np.float32)
-        _resample(backdrop, picture, threads)
     matrix = placement.matrix((columns, rows), monitor, (wide, high))
+    # No more of it than the cells see: of a backdrop that is much enlarged all pixels would be too many.
+    across, down = _seen(matrix[0], columns, rows, wide), _seen(matrix[1], columns, rows, high)
+    corner = (down.start, across.start)
+    picture = np.empty((len(down), len(across), 3), np.float32)
+    _resample(backdrop, picture, threads, (high, wide), corner)
     in_parts(
-        lambda start: place(picture, matrix, start, min(start + ROWS, rows), cells),
+        lambda start: place(picture, (high, wide), corner, matrix, start, min(start + ROWS, rows), cells),
         range(0, rows, ROWS),
         threads,
     )
 
 
+def _seen(line: NDArray[np.float64], columns: int, rows: int, size: int) -> range:
+    """The pixels along an axis of a picture between which cells sample it, and one more at each end, for rounding.
+
+    Parameters
+    ----------
+    line : (3,) float64
+        The axis' line of a placement's matrix.
+    columns, rows : int
+        Of the grid of cells.
+    size : int
+        Of the picture.
+    """
+    places = [line @ (x, y, 1) for x in (0, columns) for y in (0, rows)]
+    first, end = (min(max(at, 0), size) for at in (math.floor(min(places)) - 2, math.floor(max(places)) + 3))
+    return range(first, end)
+
+
+@njit(nogil=True, cache=True)
+def _light_at(
+    image: NDArray[np.integer] | NDArray[np.float32],
+    table: NDArray[np.float32] | None,
+    y: int,
+    x: int,
+    channel: int,
+) -> np.float32:
+    """The linear light of a colour of a pixel, looked up only here: no backdrop of codes is held as float."""
+    if table is None:
+        value: np.float32 = image[y, x, channel]
+        return value
+    light: np.float32 = table[image[y, x, channel]]
+    last = image.shape[2] - 1
+    if last & 1:  # which is alpha then
+        light *= np.float32(image[y, x, last]) / np.float32(table.size - 1)
+    return light
+
+
 @njit(nogil=True, cache=True)
 def _area_mean(
-    image: NDArray[np.float32],
-    first: int,
-    height: int,
-    width: int,
+    image: NDArray[np.integer] | NDArray[np.float32],
+    table: NDArray[np.float32] | None,
+    grid: tuple[int, int],
+    corner: tuple[int, int],
     start: int,
     stop: int,
     cells: NDArray[np.float32],
 ) -> None:
-    """The mean over each cell of some rows of a grid, of an image that is constant over each of its pixels.
+    """The mean over each cell of a part of a grid, of an image that is constant over each of its pixels.
 
     Parameters
     ----------
-    image : (h, width, 1 or 3) float32
-        Those of its rows that are seen, from `first` on.
-    height, width : int
-        Of the image.
+    image, table
+        A backdrop's.
+    grid : (int, int)
+        Rows and columns of the grid that the image is stretched over.
+    corner : (int, int)
+        Row and column that the part begins with.
     start, stop : int
-        Rows of the grid.
+        Rows of the part.
     cells : (rows, columns, 3) float32
-        Written between `start` and `stop`.
+        The part; written between `start` and `stop`.
     """
-    rows, columns, _ = cells.shape
-    channels = image.shape[2]
-    line = np.empty((width, channels), np.float32)
+    height, width, channels = image.shape
+    rows, columns = grid
+    colours = 3 if channels >= 3 else 1
+    line = np.empty((width // columns + 2, colours), np.float32)  # of the pixels of a cell
     for r in range(start, stop):
-        line[:] = 0
-        top, bottom = r * height / rows, (r + 1) * height / rows
-        for y in range(int(top), min(int(np.ceil(bottom)), height)):
-            share = np.float32((min(bottom, y + 1.0) - max(top, float(y))) / (bottom - top))
-            for x in range(width):
-                for c in range(channels):
-                    line[x, c] += share * image[y - first, x, c]
-        for k in range(columns):
-            left, right = k * width / columns, (k + 1) * width / columns
+        top, bottom = (corner[0] + r) * height / rows, (corner[0] + r + 1) * height / rows
+        for k in range(cells.shape[1]):
+            left, right = (corner[1] + k) * width / columns, (corner[1] + k + 1) * width / columns
+            first, end = int(left), min(int(np.ceil(right)), width)
+            line[: end - first] = 0
+            for y in range(int(top), min(int(np.ceil(bottom)), height)):
+                share = np.float32((min(bottom, y + 1.0) - max(top, float(y))) / (bottom - top))
+                for x in range(first, end):
+                    for c in range(colours):
+                        line[x - first, c] += share * _light_at(image, table, y, x, c)
             red = green = blue = np.float32(0)
-            for x in range(int(left), min(int(np.ceil(right)), width)):
+            for x in range(first, end):
                 share = np.float32((min(right, x + 1.0) - max(left, float(x))) / (right - left))
-                red += share * line[x, 0]
-                green += share * line[x, channels // 2]
-                blue += share * line[x, channels - 1]
+                red += share * line[x - first, 0]
+                green += share * line[x - first, colours // 2]
+                blue += share * line[x - first, colours - 1]
             cells[r, k, 0], cells[r, k, 1], cells[r, k, 2] = red, green, blue
 
 

@@ -66,6 +66,8 @@ class Placement:
 @njit(nogil=True, cache=True)
 def place(
     image: NDArray[np.float32],
+    size: tuple[int, int],
+    corner: tuple[int, int],
     matrix: NDArray[np.float64],
     start: int,
     stop: int,
@@ -75,17 +77,21 @@ def place(
 
     Parameters
     ----------
-    image : (h, w, 1 or 3) float32
-        Of pixels no smaller than cells, about.
+    image : (h, w, 3) float32
+        What the cells see of the picture, of pixels no smaller than cells, about.
+    size : (int, int)
+        Height and width of the picture.
+    corner : (int, int)
+        Its row and column that the image begins with.
     matrix : (2, 3) float64
-        From cells to pixels of it.
+        From cells to pixels of the picture.
     start, stop : int
         Rows of the grid.
     cells : (rows, columns, 3) float32
         Written between `start` and `stop`.
     """
-    height, width, channels = image.shape
-    green, blue = min(channels // 2, 1), min(channels - 1, 2)
+    height, width = size
+    top, left = corner
     for r in range(start, stop):
         for k in range(cells.shape[1]):
             sums = np.zeros(3, np.float32)
@@ -98,10 +104,11 @@ def place(
                 u, v = max(u - 0.5, 0.0), max(v - 0.5, 0.0)
                 i, j = int(u), int(v)
                 a, b = np.float32(u - i), np.float32(v - j)
-                p, q = min(i + 1, width - 1), min(j + 1, height - 1)
-                for c, channel in enumerate((0, green, blue)):
-                    upper = image[j, i, channel] + a * (image[j, p, channel] - image[j, i, channel])
-                    lower = image[q, i, channel] + a * (image[q, p, channel] - image[q, i, channel])
+                p, q = min(i + 1, width - 1) - left, min(j + 1, height - 1) - top
+                i, j = i - left, j - top
+                for c in range(3):
+                    upper = image[j, i, c] + a * (image[j, p, c] - image[j, i, c])
+                    lower = image[q, i, c] + a * (image[q, p, c] - image[q, i, c])
                     sums[c] += upper + b * (lower - upper)
             for c in range(3):
                 cells[r, k, c] = sums[c] / np.float32(4)

@@ -12,6 +12,7 @@ from PIL import Image, ImageCms
 from storage.errors import ImageError
 from workflows import floats, images, pictures
 from workflows.composite.backdrops import backdrop_of
+from workflows.composite.light import node_light
 from workflows.tone import to_light
 
 MEMORY = 1 << 24
@@ -24,7 +25,12 @@ def saved(picture: Image.Image, kind: str = "PNG", **options: object) -> bytes:
 
 
 def light(data: bytes, transfer: str = "srgb") -> np.ndarray:
-    return backdrop_of(pictures.decode(data, transfer, memory=MEMORY), transfer).light(slice(None))
+    """What cells see that are as large as the pixels."""
+    pixels = pictures.decode(data, transfer, memory=MEMORY)
+    height, width, _ = pixels.shape
+    return node_light(backdrop_of(pixels, transfer), width, height, 1)[: height * width].reshape(
+        height, width, 3
+    )
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tests.workflows.composite import peak
 from workflows.composite.light import Backdrop, node_light
 from workflows.composite.placing import Placement
 from workflows.grids import area_mean
@@ -91,3 +92,51 @@ def test_threads_change_nothing(placement: dict[str, float]) -> None:
         node_light(backdrop, 200, 150, threads, Placement(**placement), MONITOR) for threads in (1, 4)
     )
     np.testing.assert_array_equal(one, four)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+@pytest.mark.parametrize(
+    "placement", [{"scale": 1.0}, {"scale": 0.3, "angle": 20}, {"scale": 5, "angle": 20}]
+)
+def test_a_placed_backdrop_of_codes_is_as_one_of_their_light(
+    channels: int, placement: dict[str, float]
+) -> None:
+    codes = np.random.default_rng(0).integers(0, 256, (150, 200, channels), np.uint8)
+    light = table("srgb", np.dtype(np.uint8))
+    picture = light[codes[..., :3]]
+    if channels == 4:
+        picture *= codes[..., 3:] / np.float32(255)
+    found, expected = (
+        node_light(one, COLUMNS, ROWS, 2, Placement(**placement), MONITOR)
+        for one in (Backdrop(codes, light), Backdrop(picture))
+    )
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("placement", [{"scale": 47}, {"scale": 47, "angle": 30, "right": 15, "down": -12}])
+def test_what_is_seen_of_an_enlarged_backdrop_is_as_if_all_of_it_were_held(
+    placement: dict[str, float],
+) -> None:
+    picture = np.random.default_rng(0).random((3000, 4000, 1), np.float32)
+    found = cells(picture, **placement)[..., 0]
+    # of pixels that are as large as cells, about, as it is made first
+    turned = Placement(**placement).matrix((COLUMNS, ROWS), MONITOR, (4000, 3000))
+    steps = np.hypot(*turned[:, :2].T)
+    assert (steps > 1).all()
+    wide, high = (int(np.ceil(size / step)) for size, step in zip((4000, 3000), steps, strict=True))
+    np.testing.assert_allclose(found, cells(area_mean(picture, wide, high), **placement)[..., 0], atol=1e-5)
+    assert found.std() > 0.05
+
+
+@pytest.mark.parametrize(
+    ("shape", "dtype"),
+    [
+        ((3000, 4000, 3), "uint8"),
+        ((3000, 4000, 4), "uint8"),
+        ((2000, 3000, 3), "uint16"),
+        ((2000, 3000, 1), "float32"),
+    ],
+)
+def test_a_large_backdrop_takes_little_memory_beside_its_own(shape: tuple[int, int, int], dtype: str) -> None:
+    size, grown = peak.of_large_after_small(shape, dtype)
+    assert grown < size / 2

@@ -33,7 +33,8 @@ def _ingest(objects: Objects, capture: str, memory: int) -> int:
     return int(plan["tiles"])
 
 
-def _peak() -> int:
+def peak() -> int:
+    """The most bytes that this process has had."""
     found = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
     assert found is not None
     return int(found[1]) << 10
@@ -42,5 +43,5 @@ def _peak() -> int:
 if __name__ == "__main__":
     store = Objects(sys.argv[1])
     _ingest(store, "small", int(sys.argv[2]))
-    before = _peak()
-    print(_ingest(store, "large", int(sys.argv[2])), _peak() - before)
+    before = peak()
+    print(_ingest(store, "large", int(sys.argv[2])), peak() - before)
