@@ -119,7 +119,7 @@ def admit(
             # Of the whole service only what is missing: the rest is other owners' business.
             raise NoRoom(
                 f"{whose} {most} bytes stored, and {value - most} more than that would be; delete captures, mattes, "
-                "videos or uploads first",
+                "videos, uploads or programs first",
                 name=name,
                 limit=most,
                 value=value if name == "owner_bytes" else size,

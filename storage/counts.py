@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import Connection, Row, func, select
+from sqlalchemy import Connection, Row, Text, cast, func, select
 
-from storage.database import captures, jobs, mattes, tiles, totals, uploads
+from storage.database import captures, jobs, mattes, programs, tiles, totals, uploads
 from storage.jobs import ACTIVE
 from storage.owners import of_all
 
@@ -74,6 +74,7 @@ def of_active_jobs(connection: Connection) -> int:
 def of_bytes(connection: Connection, *, all_owners: bool = False) -> int:
     """Bytes in the store: of what is there as they were counted, of what is under way as they were announced.
 
+    Programs count too, though they are rows and nothing more: they are as large as who makes them likes, and stay.
     A capture that is being ingested counts with its archive, a matte that is being recovered not yet.
     """
     sums = [
@@ -81,6 +82,7 @@ def of_bytes(connection: Connection, *, all_owners: bool = False) -> int:
         func.sum(mattes.c.stored),
         func.sum(jobs.c.stored),
         func.sum(uploads.c.length),
+        func.sum(func.length(cast(programs.c.program, Text))),
     ]
     queries = [select(one) for one in sums]
     return sum(int(connection.scalar(of_all(query) if all_owners else query) or 0) for query in queries)

@@ -13,11 +13,21 @@ from storage.database import programs as table
 
 def add(connection: Connection, program: dict[str, Any]) -> str:
     """Write down a program and return its id; the same program has the same id, and is written down once."""
-    text = json.dumps(program, sort_keys=True)
-    id = hashlib.sha256(text.encode()).hexdigest()[:20]
-    if connection.scalar(select(table.c.id).where(table.c.id == id)) is None:
+    id = _id(program)
+    if more(connection, program):
         connection.execute(insert(table).values(id=id, program=program, created_at=time.time()))
     return id
+
+
+def more(connection: Connection, program: dict[str, Any]) -> int:
+    """Bytes that writing down a program takes, as `counts.of_bytes` counts them: none if it is there already."""
+    known = connection.scalar(select(table.c.id).where(table.c.id == _id(program))) is not None
+    return 0 if known else len(json.dumps(program))
+
+
+def _id(program: dict[str, Any]) -> str:
+    text = json.dumps(program, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:20]
 
 
 def get(connection: Connection, program: str) -> Row[Any]:

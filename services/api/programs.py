@@ -18,6 +18,7 @@ from services import film
 from services.api.bodies import read_json, schema_of
 from services.api.context import WEB, After, FromFile, Limit, Needs, answered
 from services.api.web import HEADERS
+from services.limits import admit
 from services.patterns import archive, fitted, pictures, png, record
 from services.presets import PRESETS
 from storage import programs
@@ -169,8 +170,11 @@ def post_program(
     screen = (request.monitor.width, request.monitor.height) if request.monitor else None
     shown = fitted(request.program or request.preset or "", screen, bordered=request.border)
     _see_that_it_is_small(shown)
+    kept = record(shown)
     with writing(context.engine) as c:
-        id = programs.add(c, record(shown))
+        if size := programs.more(c, kept):
+            admit(c, context.settings, size=size)
+        id = programs.add(c, kept)
         row = programs.get(c, id)
     response.headers["Location"] = f"/v1/programs/{id}"
     return Program.of(row)
