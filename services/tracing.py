@@ -18,6 +18,7 @@ from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any
 
 from starlette.datastructures import Headers
+from starlette.routing import compile_path
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 if TYPE_CHECKING:
@@ -28,8 +29,11 @@ logger = logging.getLogger(__name__)
 
 ENDPOINTS = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
 TRACEPARENT = re.compile("00-(?!0{32})[0-9a-f]{32}-(?!0{16})[0-9a-f]{16}-[0-9a-f]{2}")
-TRACED = ("/v1/captures", "/v1/jobs")
-"""Where a POST makes a job."""
+TRACED = {
+    path: compile_path(path)[0]
+    for path in ("/v1/captures", "/v1/jobs", "/v1/jobs/{id}/retry", "/v1/mattes/{id}/composite")
+}
+"""Where a POST makes a job, or queues one again. A composite of a still makes none, and is work enough for a span."""
 
 LAST = 2.0
 """Seconds that a process takes at its end to send what it has not sent yet."""
@@ -109,12 +113,15 @@ class Requests:
         self.app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or scope["method"] != "POST" or scope["path"] not in TRACED:
+        route = None
+        if scope["type"] == "http" and scope["method"] == "POST":
+            route = next((path for path, here in TRACED.items() if here.match(scope["path"])), None)
+        if route is None:
             await self.app(scope, receive, send)
             return
         given = Headers(scope=scope).get("traceparent", "")
         parent = given if TRACEPARENT.fullmatch(given) else None
-        with span(f"POST {scope['path']}", parent) as made:
+        with span(f"POST {route}", parent) as made:
 
             async def send_and_note(message: Message) -> None:
                 if made is not None and message["type"] == "http.response.start":

@@ -270,13 +270,15 @@ def cancel(connection: Connection, job: str) -> None:
         raise Conflict(f"job {job} has {row.state} already and can't be cancelled")
 
 
-def retry(connection: Connection, job: str, *, anew: bool = False) -> None:
+def retry(connection: Connection, job: str, *, anew: bool = False, trace: str | None = None) -> None:
     """Queue a failed job again; the tiles that are done stay done.
 
     Parameters
     ----------
     anew : bool
         Forget its plan and its tiles, because the plan would be another one today.
+    trace : str, optional
+        The ``traceparent`` of the request that asks for it; default that of the one before.
 
     Raises
     ------
@@ -299,6 +301,7 @@ def retry(connection: Connection, job: str, *, anew: bool = False) -> None:
     )
     done = (tiles.c.job == job, tiles.c.tile >= 0, tiles.c.state == "done")
     values = {"state": "queued", "stage": "waiting", "failed": 0, "problem": None, "finished_at": None}
+    values["trace"] = trace or row.trace
     values["done"] = connection.scalar(select(func.count()).where(*done))
     connection.execute(update(jobs).where(jobs.c.id == job).values(values))
     note(connection, job, "queued again")

@@ -226,7 +226,7 @@ def retry_job(context: Needs, id: str) -> Job:
         memory = (row.plan or {}).get("memory", context.settings.ingest_memory)
         if row.state == "failed":
             admit(c, context.settings, jobs=1)
-        jobs.retry(c, id, anew=memory != context.settings.ingest_memory)
+        jobs.retry(c, id, anew=memory != context.settings.ingest_memory, trace=tracing.asked_by())
         kinds.KINDS[row.kind].retried(c, row)
         return Job.of(c, jobs.get(c, id))
 

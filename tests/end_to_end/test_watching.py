@@ -17,6 +17,7 @@ from services.client import ServiceError
 from tests.end_to_end.conftest import Service, paused, serving
 from tests.services.clusters import wait
 from tests.services.collector import Collector, collecting
+from tests.workflows.test_clips import clip, pictures
 
 pytestmark = pytest.mark.full
 
@@ -31,6 +32,7 @@ class Watched:
     collector: Collector
     ingest: str
     recover: str
+    composite: str
     failed: str
     cancelled: str
 
@@ -60,11 +62,17 @@ def watched(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
             "/v1/jobs", json={"capture": uploaded["id"]}, headers={"traceparent": CALLER}
         ).json()
         service.client.wait(asked["id"])
+        composed = service.http.post(
+            f"/v1/mattes/{asked['matte']}/composite",
+            content=clip(pictures(70), list(range(70))),
+            headers={"Content-Type": "video/mp4", "traceparent": CALLER},
+        ).json()
+        service.client.wait(composed["id"])
         failing = _without_frames(service, uploaded["id"])
         with paused(service):
             cancelled = service.client.recover(uploaded["id"])["id"]
             service.client.cancel(cancelled)
-        yield Watched(service, collector, uploaded["job"], asked["id"], failing, cancelled)
+        yield Watched(service, collector, uploaded["job"], asked["id"], composed["id"], failing, cancelled)
 
 
 def _without_frames(service: Service, capture: str) -> str:
@@ -170,20 +178,24 @@ def test_a_failed_tile_is_logged_with_its_traceback(watched: Watched) -> None:
     assert any(line["process"] == "service" and line["level"] == "WARNING" for line in lines)
 
 
-def test_a_trace_leads_from_the_request_to_every_tile(watched: Watched) -> None:
-    collector = watched.collector
-    wait(lambda: any(s.name == "recover finish" for s in _of(collector, watched.recover)))
-    total = watched.service.client.job(watched.recover)["tiles"]["total"]
-    spans = _of(collector, watched.recover)
+@pytest.mark.parametrize(
+    ("kind", "asked_by"), [("recover", "POST /v1/jobs"), ("composite", "POST /v1/mattes/{id}/composite")]
+)
+def test_a_trace_leads_from_the_request_to_every_tile(watched: Watched, kind: str, asked_by: str) -> None:
+    collector, job = watched.collector, getattr(watched, kind)
+    wait(lambda: any(s.name == f"{kind} finish" for s in _of(collector, job)))
+    total = watched.service.client.job(job)["tiles"]["total"]
+    assert total > 1
+    spans = _of(collector, job)
     _, trace, caller, _ = CALLER.split("-")
-    (request,) = [s for s in collector.spans if s.name == "POST /v1/jobs" and s.trace.hex() == trace]
+    (request,) = [s for s in collector.spans if s.name == asked_by and s.trace.hex() == trace]
     assert (request.parent.hex(), request.service) == (caller, "envmatte-service")
     assert request.attributes["http.response.status_code"] == 202
     assert all((s.trace, s.parent) == (request.trace, request.id) for s in spans)
-    tiles = [s for s in spans if s.name == "recover tile"]
+    tiles = [s for s in spans if s.name == f"{kind} tile"]
     assert {s.attributes["envmatte.tile"] for s in tiles} == set(range(total))
-    assert {(s.service, s.attributes["envmatte.kind"]) for s in tiles} == {("envmatte-worker", "recover")}
-    (queue,), (prepare,) = ([s for s in spans if s.name == name] for name in ("queue", "recover prepare"))
+    assert {(s.service, s.attributes["envmatte.kind"]) for s in tiles} == {("envmatte-worker", kind)}
+    (queue,), (prepare,) = ([s for s in spans if s.name == name] for name in ("queue", f"{kind} prepare"))
     assert request.begin <= queue.begin <= queue.end <= prepare.begin
 
 

@@ -5,10 +5,17 @@ import subprocess
 import sys
 import textwrap
 import time
+from pathlib import Path
 
 import pytest
+from fastapi.testclient import TestClient
 
-from services.tracing import TRACEPARENT
+from services.api import build_app
+from services.settings import Settings
+from services.tracing import TRACED, TRACEPARENT
+from storage import jobs, mattes
+from storage.database import open_engine, reading, writing
+from storage.objects import Objects
 from tests.services.collector import Collector, collecting
 
 CALLER = "00-0123456789abcdef0123456789abcdef-0123456789abcdef-01"
@@ -33,6 +40,11 @@ REQUEST = f"""
         await request(headers=[(b"traceparent", b"00-nonsense")])
         await request(method="GET")
         await request(path="/v1/captures")
+        await request(path="/v1/jobs/a-job/cancel")
+        await request(path="/v1/jobs/a-job/retry/")
+        await request(path="/v1/jobs/a-job/retry")
+        await request(path="/v1/mattes/a-matte/composite", headers=[(b"traceparent", b"{CALLER}")])
+        await request(path="/v1/mattes/a-matte/composite", method="GET")
 
     asyncio.run(main())
 """
@@ -55,19 +67,47 @@ def run(script: str, **environment: str) -> str:
 def test_nothing_is_imported_unless_it_is_asked_for() -> None:
     script = REQUEST + "    print(asked, [name for name in sys.modules if 'opentelemetry' in name])"
     # The trace of a caller goes on all the same: workers may be asked for theirs.
-    assert run(script) == f"{[CALLER, None, None, None]} []\n"
+    assert run(script) == f"{[CALLER, *[None] * 6, CALLER, None]} []\n"
 
 
 def test_requests_that_make_jobs_are_spans_of_their_callers_traces() -> None:
     with collecting() as collector:
         printed = run(REQUEST + "    print(*asked)", OTEL_EXPORTER_OTLP_ENDPOINT=collector.url).split()
-    first, second, third = collector.spans
-    assert [span.name for span in collector.spans] == ["POST /v1/jobs"] * 2 + ["POST /v1/captures"]
-    assert f"00-{first.trace.hex()}-{first.parent.hex()}-01" == CALLER
-    assert second.parent == third.parent == b""
+    first, *others, last = collector.spans
+    names = ["/v1/jobs", "/v1/jobs", "/v1/captures", "/v1/jobs/{id}/retry", "/v1/mattes/{id}/composite"]
+    assert [span.name for span in collector.spans] == [f"POST {name}" for name in names]
+    for span in (first, last):
+        assert f"00-{span.trace.hex()}-{span.parent.hex()}-01" == CALLER
+    assert {span.parent for span in others} == {b""}
     said = [f"00-{span.trace.hex()}-{span.id.hex()}" for span in collector.spans]
-    assert [one[:52] for one in printed] == [*said[:2], "None", said[2]]
+    assert [one[:52] for one in printed] == [*said[:2], "None", said[2], "None", "None", *said[3:], "None"]
     assert {span.attributes["http.response.status_code"] for span in collector.spans} == {201}
+
+
+def test_every_request_that_makes_a_job_is_traced(tmp_path: Path) -> None:
+    engine = open_engine(f"sqlite:///{tmp_path / 'ledger.db'}")
+    app = build_app(Settings(data=tmp_path), engine, Objects((tmp_path / "store").as_uri()))
+    engine.dispose()
+    posts = {path: item["post"] for path, item in app.openapi()["paths"].items() if "post" in item}
+    queued = {path for path, post in posts.items() if "202" in post["responses"]}
+    assert TRACED.keys() == queued | {"/v1/captures"}
+
+
+def test_a_job_that_is_tried_again_goes_on_in_the_trace_of_who_asks_for_it(tmp_path: Path) -> None:
+    engine = open_engine(f"sqlite:///{tmp_path / 'ledger.db'}")
+    client = TestClient(build_app(Settings(data=tmp_path), engine, Objects((tmp_path / "store").as_uri())))
+    again = CALLER.replace("0123", "4567")
+    with writing(engine) as c:
+        mattes.add_imported(c, "m", {}, {})
+        job = jobs.add(c, "composite", "", {}, "m", CALLER)
+    for asked in (again, None):  # who has no trace leaves the one that is known
+        with writing(engine) as c:
+            jobs.end(c, job, "failed", {"detail": "", "status": 500})
+        headers = {} if asked is None else {"traceparent": asked}
+        assert client.post(f"/v1/jobs/{job}/retry", headers=headers).status_code == 202
+        with reading(engine) as c:
+            assert jobs.get(c, job).trace == again
+    engine.dispose()
 
 
 def spans(collector: Collector, parent: str | None = None, **environment: str) -> list[str]:
