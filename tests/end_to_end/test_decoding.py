@@ -1,5 +1,8 @@
-"""Decoders of the API are lost with one request each, and with the service."""
+"""Decoders are lost with what they decode, and with the service: nothing else suffers from it."""
 
+import json
+import re
+import sys
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor
 from concurrent.futures import wait as wait_for
@@ -10,12 +13,17 @@ import httpx2
 import psutil
 import pytest
 
+from services.client import ServiceError
 from services.decoding import SECONDS
 from tests.end_to_end.conftest import Service, serving
 from tests.end_to_end.test_bad_input import ZIP, check_problem
 from tests.end_to_end.test_composites import SENT, asked
-from tests.services.clusters import children, decoders, running, wait
+from tests.services.clusters import children, decoders, running, wait, workers
 from tests.services.plain import archive
+from tests.workflows.ingest.camera import capture as filmed
+from tests.workflows.ingest.camera import overstated, zipped
+from tests.workflows.test_clips import clip, even, pictures
+from workflows.program import Program
 
 pytestmark = pytest.mark.full
 
@@ -77,3 +85,40 @@ def test_decoders_end_with_the_service(tmp_path: Path, end: str, environment: di
         getattr(service.process, end)()
         service.process.wait(30)
         wait(lambda: not running(tree))
+
+
+def taken_at_most(one: psutil.Process) -> int:
+    """Bytes that a process has had in memory at once."""
+    found = re.search(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{one.pid}/status").read_text())
+    assert found is not None
+    return int(found[1]) << 10
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="it is Linux that limits what a process takes")
+def test_a_film_that_takes_all_memory_to_decode_fails_alone(
+    bundle: Path, program: Program, tmp_path: Path
+) -> None:
+    data = overstated(clip(pictures(9), even(9)), 40_000_000)  # FFmpeg makes an index of 2.8 GB of it
+    record, files = filmed(program, data, 2.0)
+    bomb = tmp_path / "bomb.zip"
+    bomb.write_bytes(zipped(json.dumps(record).encode(), files))
+    with serving(tmp_path / "data", "--workers", "1", ENVMATTE_INGEST_MEMORY=str(64 << 20)) as service:
+        sent = service.http.post("/v1/mattes", content=archive(tmp_path, 40, 30), headers=ZIP)
+        matte = sent.json()["id"]
+        service.client.wait(service.client.upload(bundle)["job"])
+        (worker,) = workers(service.process)
+        before = taken_at_most(worker)
+
+        uploaded = service.client.upload(bomb)
+        with pytest.raises(ServiceError, match="an index that takes too much memory") as caught:
+            service.client.wait(uploaded["job"])
+        assert caught.value.problem["entry"] == "clip.mp4"
+        job = service.http.post(
+            f"/v1/mattes/{matte}/composite", content=data, headers={"Content-Type": "video/mp4"}
+        ).json()["id"]
+        with pytest.raises(ServiceError, match="an index that takes too much memory"):
+            service.client.wait(job)
+
+        assert workers(service.process) == [worker]
+        assert taken_at_most(worker) - before < 500 << 20
+        service.client.wait(service.client.upload(bundle)["job"])

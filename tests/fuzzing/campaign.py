@@ -25,6 +25,8 @@ CPU_SECONDS, SECONDS = 10.0, 60.0
 """That one execution may take, of processors and of the clock: this machine may be busy with much else."""
 MEMORY = 128 << 20
 """Bytes that one execution may take besides what the process had: limits of parsers are set to a few megabytes here."""
+GUARDED = 384 << 20
+"""The same where a decoder is guarded, which has room for large films however small the limits are."""
 ADDRESSES = 6 << 30
 """Bytes that the process may ask for besides what it had, so that no execution takes the machine's memory."""
 BATCH = 2000
@@ -51,6 +53,8 @@ class Target:
         Makes those: once, and not in the processes that are watched.
     quick : int
         Executions that take about a second.
+    memory : int
+        Bytes that one may take.
     """
 
     name: str
@@ -58,6 +62,7 @@ class Target:
     run: Callable[[bytes, Path], object]
     whole: Callable[[], Any] = tuple
     quick: int = 300
+    memory: int = MEMORY
 
     def input(self, seed: int, whole: Any = None) -> bytes:
         """An input; `whole` are the files it is made of, if they are there already."""
@@ -208,10 +213,10 @@ def _batch(
                 before = _most_memory()
         took = time.perf_counter() - began
         grown = _most_memory() - before
-        if failure is None and grown > MEMORY:
+        if failure is None and grown > target.memory:
             failure = "memory", f"it took {grown >> 20} MB"
         pipe.send((taken, took, failure))
-        if grown > MEMORY:
+        if grown > target.memory:
             break  # what takes as much again would not show
     pipe.send(None)
 

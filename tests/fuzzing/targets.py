@@ -31,9 +31,9 @@ from storage.checksums import seal
 from storage.errors import ArchiveError, CaptureError, InvalidInput
 from storage.objects import Objects
 from tests.fuzzing import changes, requests, seeds
-from tests.fuzzing.campaign import KEPT, Refused, Target
+from tests.fuzzing.campaign import GUARDED, KEPT, MEMORY, Refused, Target
 from tests.workflows.archive.conftest import make_matte, pack_chunk, signed, unpack_chunk, unpacked
-from tests.workflows.ingest.camera import Camera, capture, film, lights
+from tests.workflows.ingest.camera import Camera, capture, film, lights, overstated
 from workflows import clips, floats, images, pictures, raw
 from workflows.archive.importing import take_in
 from workflows.composite import composite
@@ -252,6 +252,13 @@ ELEMENTS = (
 MARKS = b"|".join((BOXES, CHUNKS, ELEMENTS))
 
 
+def damaged_film(random: Random, data: bytes) -> bytes:
+    """A film that is damaged, or an MP4 whose index says that it has many more samples."""
+    if b"stsz" in data and random.random() < 0.1:
+        return overstated(data, int(2 ** random.uniform(4, 32)))
+    return changes.damaged(random, data, MARKS)
+
+
 def read_clip(data: bytes, folder: Path) -> None:
     def clip() -> Any:
         return opened(io.BytesIO(data), "a.mp4", LIMITS.image)
@@ -320,7 +327,7 @@ def make_capture(random: Random, whole: dict[str, Files]) -> bytes:
     if random.random() < 0.3:
         text = changes.other_json(random, record)
     else:
-        files[broken] = changes.damaged(random, one, BOXES if end == ".mp4" else None)
+        files[broken] = damaged_film(random, one) if end == ".mp4" else changes.damaged(random, one)
     return changes.zipped({"capture.json": text, **files})
 
 
@@ -442,8 +449,9 @@ def target(
     read: Callable[[bytes, Path], object],
     whole: Callable[[], Any] = tuple,
     quick: int = 300,
+    memory: int = MEMORY,
 ) -> Target:
-    return Target(name, make, partial(refusing, read), whole, quick)
+    return Target(name, make, partial(refusing, read), whole, quick, memory)
 
 
 ALL = (
@@ -461,8 +469,8 @@ ALL = (
     target("float-tiff", of_files(None, changes.damaged_tiff), read_floats, seeds.float_tiffs),
     target("exr", of_files(ATTRIBUTES), read_floats, seeds.exrs),
     target("raw", make_raw, read_raw, seeds.raws),
-    target("video", of_files(MARKS), read_clip, seeds.clips, quick=60),
-    target("clip", of_files(MARKS), read_backdrop_clip, seeds.clips, quick=20),
+    target("video", of_files(MARKS, damaged_film), read_clip, seeds.clips, quick=60, memory=GUARDED),
+    target("clip", of_files(MARKS, damaged_film), read_backdrop_clip, seeds.clips, quick=20, memory=GUARDED),
     target("archive", make_archive, read_archive, archive_files, quick=15),
-    target("capture", make_capture, read_capture, capture_files, quick=20),
+    target("capture", make_capture, read_capture, capture_files, quick=20, memory=GUARDED),
 )

@@ -14,10 +14,11 @@ from storage.errors import CaptureError, ImageError
 from storage.objects import Objects
 from workflows import images
 from workflows.grids import smallest_grid
-from workflows.ingest import hangs, stills
+from workflows.ingest import stills
 from workflows.ingest.bundle import MANIFEST, Bundle, Limits
 from workflows.ingest.content import lay_out
 from workflows.ingest.display import LOOKS
+from workflows.ingest.guard import Guard
 from workflows.ingest.sorting import MOST_PATTERNS, Sorted, sort
 from workflows.ingest.video import Share, opened
 from workflows.program import Images
@@ -52,7 +53,9 @@ def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, Any]:
                     limit=limits.memory // 2,
                 )
         # Of all frames, for the camera stood still: one that looks down takes itself for turned now this way, now that.
-        turn = 1 if manifest.video is not None else stills.orientation(bundle, manifest.frames[0].file)
+        turn = (
+            1 if manifest.video is not None else stills.orientation(bundle, manifest.frames[0].file, limits)
+        )
         shape, storage, filmed = _look(bundle, patterns, limits)
         mask = None
         if manifest.mask is not None:
@@ -190,7 +193,7 @@ def _pixels(bundle: Bundle, stack: Stack, first: int, last: int, limits: Limits)
 def _decode(bundle: Bundle, entry: str, limits: Limits) -> images.Codes:
     data = bundle.read(entry)
     try:
-        with hangs.ended():
+        with Guard(entry, limits.image).on():
             return images.decode(data, memory=limits.image)
     except ImageError as error:
         raise CaptureError(f"{entry}: {error.detail}", entry=entry, **error.fields) from error

@@ -9,8 +9,8 @@ from storage.errors import CaptureError, ImageError
 from workflows import floats, images, raw
 from workflows.floats import Floats
 from workflows.images import Codes
-from workflows.ingest import hangs
 from workflows.ingest.bundle import MANIFEST, Bundle, Limits
+from workflows.ingest.guard import Guard
 from workflows.tone import BLACK
 
 HEADROOM = 1.05
@@ -55,10 +55,10 @@ class Storage(NamedTuple):
         return codes
 
 
-def orientation(bundle: Bundle, entry: str) -> int:
+def orientation(bundle: Bundle, entry: str, limits: Limits) -> int:
     """How a frame says that it is to be turned to be upright, as `images.upright` takes it."""
     data = bundle.read(entry)
-    with hangs.ended():
+    with Guard(entry, limits.image).on():
         return raw.orientation(data) if raw.is_raw(entry) else images.orientation(data)
 
 
@@ -82,7 +82,7 @@ def read(bundle: Bundle, entry: str, limits: Limits, turn: int | None = None) ->
     """
     data = bundle.read(entry)
     try:
-        with hangs.ended():
+        with Guard(entry, limits.image).on():
             if raw.is_raw(entry):
                 return raw.decode(data, memory=limits.image, turn=turn)
             if floats.is_float(data):

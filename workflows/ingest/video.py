@@ -16,7 +16,7 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from storage.errors import CaptureError
-from workflows.ingest import hangs
+from workflows.ingest.guard import Guard
 
 CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
 """What is probed for. Others, playlists among them, name files and hosts of their own."""
@@ -92,9 +92,10 @@ class Clip:
 
     def __init__(self, file: BinaryIO, entry: str, memory: int) -> None:
         self._entry, self._limit = entry, memory
+        self._guard = Guard(entry, memory)
         self.lost: list[int] = []
         try:
-            with hangs.ended():
+            with self._guard.on():
                 self._container: InputContainer = av.open(
                     file, "r", container_options={"format_whitelist": CONTAINERS}, io_open=_refuse
                 )
@@ -110,7 +111,12 @@ class Clip:
             frames = self._frames()
             first = next(frames, None)
             if first is None:
-                raise CaptureError(f"{entry}: no frame of the video can be decoded", entry=entry)
+                # FFmpeg leaves out an index that it has no memory for, and says nothing.
+                raise CaptureError(
+                    f"{entry}: no frame of the video can be decoded: it is damaged, or has an index that takes too "
+                    "much memory. Copy it anew from the camera",
+                    entry=entry,
+                )
             self._from_start = chain([first], frames)
             self._turn = round(first.rotation / 90) % 4  # quarters, counterclockwise
         except BaseException:
@@ -218,7 +224,8 @@ class Clip:
             If a frame can't be found again.
         """
         try:
-            self._container.seek(plan[0][0].tick, stream=self._stream, backward=True)
+            with self._guard.on():
+                self._container.seek(plan[0][0].tick, stream=self._stream, backward=True)
             frames = self._frames()
         except av.FFmpegError:  # there is no index, or it is damaged
             frames = self._from_start
@@ -288,13 +295,17 @@ class Clip:
     def _decoded(self) -> Iterator[VideoFrame]:
         packets, whole = self._container.demux(self._stream), True
         while True:
-            with hangs.ended():
+            with self._guard.on():
                 try:
                     packet = next(packets)
+                except MemoryError:
+                    raise
                 except (StopIteration, av.FFmpegError, OSError):
                     return
                 try:
                     frames = self._stream.decode(packet)
+                except MemoryError:
+                    raise
                 except av.FFmpegError:
                     whole = False
                     if packet.pts is not None:

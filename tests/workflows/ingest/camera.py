@@ -138,6 +138,20 @@ def turned(video: bytes, matrix: Sequence[int]) -> bytes:
     return video[:at] + np.array(matrix, ">i4").tobytes() + video[at + 36 :]
 
 
+def overstated(video: bytes, samples: int) -> bytes:
+    """An MP4 whose index says that it has many samples, of a byte each (ISO/IEC 14496-12, sect. 8.6.1.2, 8.7)."""
+    made = bytearray(video)
+    for kind, at, value in (
+        (b"stsz", 4, 1),
+        (b"stsz", 8, samples),
+        (b"stts", 8, samples),
+        (b"stsc", 12, samples),
+    ):
+        at += made.index(kind) + 4
+        made[at : at + 4] = value.to_bytes(4, "big")
+    return bytes(made)
+
+
 def boxes(video: bytes) -> Iterator[tuple[str, int, int]]:
     """The boxes at the top of an MP4: kind, start, size."""
     at = 0
