@@ -44,6 +44,8 @@ def run(kind: str, task: Task, tile: int, trace: str | None) -> tuple[float, Any
             seconds, result = jobs.run(kind, task, tile)
         except EnvmatteError as error:
             logger.warning("failed: %s", error.detail, exc_info=True)
+            # It alone is sent back: an error of a library that it comes of may not survive the way, nor it with that.
+            error.__cause__ = error.__context__ = None
             raise
         except Exception:
             logger.exception("failed")

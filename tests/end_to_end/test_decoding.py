@@ -22,6 +22,7 @@ from tests.services.clusters import children, decoders, running, wait, workers
 from tests.services.plain import archive
 from tests.workflows.ingest.camera import capture as filmed
 from tests.workflows.ingest.camera import overstated, zipped
+from tests.workflows.ingest.test_guard import fragmented
 from tests.workflows.test_clips import clip, even, pictures
 from workflows.program import Program
 
@@ -113,6 +114,11 @@ def test_a_film_that_takes_all_memory_to_decode_fails_alone(
         with pytest.raises(ServiceError, match="an index that takes too much memory") as caught:
             service.client.wait(uploaded["job"])
         assert caught.value.problem["entry"] == "clip.mp4"
+        # Another takes it bit by bit, and FFmpeg's own error of that is not one that every process can read.
+        slowly = zipped(json.dumps(record).encode(), {"clip.mp4": fragmented(4_000_000)})
+        job = service.http.post("/v1/captures", content=slowly, headers=ZIP).json()["job"]
+        with pytest.raises(ServiceError, match=r"^decoding clip\.mp4 takes more than the 384 MB"):
+            service.client.wait(job)
         job = service.http.post(
             f"/v1/mattes/{matte}/composite", content=data, headers={"Content-Type": "video/mp4"}
         ).json()["id"]
