@@ -20,6 +20,7 @@ def test_sqlite_is_set_up(sqlite: str) -> None:
     engine = open_engine(sqlite)
     with reading(engine) as connection:
         assert connection.scalar(text("PRAGMA journal_mode")) == "wal"
+        assert connection.scalar(text("PRAGMA synchronous")) == 2  # FULL
         assert connection.scalar(text("PRAGMA foreign_keys")) == 1
         assert connection.scalar(text("PRAGMA busy_timeout")) == 10000
     engine.dispose()
