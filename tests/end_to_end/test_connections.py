@@ -39,26 +39,32 @@ def answer(connection: socket.socket) -> bytes:
 
 def test_thousands_that_say_nothing_keep_nobody_out_and_are_closed(service: Service) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    count = min(10_000, (hard - 1000) // 2)
+    count = min(10_000, hard - 1000)  # of this process, and as many of the service's own
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     process = psutil.Process(service.process.pid)
-    before = process.num_fds()
+    before, most = process.num_fds(), 0
     try:
-        with connected(service, count) as idle:
-            times = []
-            for _ in range(100):
-                start = time.perf_counter()
-                assert service.http.get("/healthz").status_code == 200
-                times.append(time.perf_counter() - start)
-            print(f"{count} idle connections: {1e3 * statistics.quantiles(times, n=100)[98]:.1f} ms at p99")
-            assert process.num_fds() - before > count // 2
-            assert answer(idle[-1]) == b""
+        for _ in range(5):  # a busy machine may take longer to open them all than the first ones are kept
+            with connected(service, count) as idle:
+                times = []
+                for _ in range(100):
+                    most = max(most, process.num_fds() - before)
+                    start = time.perf_counter()
+                    assert service.http.get("/healthz").status_code == 200
+                    times.append(time.perf_counter() - start)
+                assert answer(idle[-1]) == b""
+            give_up = time.monotonic() + 60
+            while process.num_fds() - before > 50:
+                assert time.monotonic() < give_up
+                time.sleep(0.1)
+            slowest = 1e3 * statistics.quantiles(times, n=100)[98]
+            print(f"{most} of {count} idle connections held at once: {slowest:.1f} ms at p99")
+            if most > 0.95 * count:
+                break
+        else:
+            pytest.fail(f"of {count} connections {most} at most were held at once")
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-    give_up = time.monotonic() + 30
-    while process.num_fds() - before > 50:
-        assert time.monotonic() < give_up
-        time.sleep(0.1)
 
 
 def test_a_head_that_comes_byte_by_byte_is_not_waited_for(service: Service) -> None:
