@@ -14,6 +14,7 @@ from PIL import Image
 from tests.end_to_end.conftest import Service, png
 from tests.end_to_end.test_bad_input import check_problem
 from tests.end_to_end.test_cli import envmatte
+from tests.services.clusters import decoders
 from workflows import floats, images
 from workflows.tone import from_light
 
@@ -244,15 +245,34 @@ def test_a_bomb_is_refused_before_it_goes_off(service: Service, matte: str) -> N
     "requests", [600, pytest.param(10_000, marks=[pytest.mark.long, pytest.mark.timeout(3600)])]
 )
 def test_requests_leave_nothing_behind(service: Service, matte: str, requests: int) -> None:
-    process = psutil.Process(service.process.pid)
+    """Neither in the API's process nor in those that decode backdrops for it."""
+    askers = 4
 
     def ask(count: int) -> None:
-        with ThreadPoolExecutor(4) as threads:
+        with ThreadPoolExecutor(askers) as threads:
             list(threads.map(lambda _: asked(service, matte, accept="image/jpeg", size=24), range(count)))
 
+    def held() -> dict[int, np.ndarray]:
+        """Bytes, files and threads of each process."""
+        every = [psutil.Process(service.process.pid), *decoders(service.process)]
+        return {
+            one.pid: np.array([one.memory_full_info().uss, one.num_fds(), one.num_threads()]) for one in every
+        }
+
     ask(requests // 3)  # until every thread has what it keeps
-    memory, files, threads = process.memory_info().rss, process.num_fds(), process.num_threads()
+    before = held()
     ask(requests)
-    assert process.memory_info().rss - memory < 24 << 20
-    assert process.num_fds() - files < 16
-    assert process.num_threads() - threads < 16
+    after = held()
+    assert set(before) <= set(after), "a decoder is gone"
+    assert 1 < len(after) <= 1 + askers
+    same = {pid: after[pid] for pid in before}  # and one more may have been started
+    for when, found in (("before", before), ("after", same)):
+        memory, files, threads = sum(found.values())
+        print(
+            f"{when} {requests} requests: {memory / 1e6:.1f} MB, {files} open files, {threads} threads, "
+            f"in the API's process and {len(found) - 1} decoders"
+        )
+    memory, files, threads = sum(same.values()) - sum(before.values())
+    assert memory < 24 << 20
+    assert files < 16
+    assert threads < 16
