@@ -123,7 +123,6 @@ def free_port() -> int:
         return int(taken.getsockname()[1])
 
 
-@pytest.mark.long
 def test_three_machines(bundle: Path, tmp_path: Path) -> None:
     port = free_port()
     first, others = (
