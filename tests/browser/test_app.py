@@ -3,16 +3,18 @@
 import base64
 import io
 import re
+from datetime import datetime
 from pathlib import Path
+from zoneinfo import ZoneInfo
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Browser, Page, expect
 
-from tests.browser.pages import MINUTE, SIZE
-from tests.end_to_end.conftest import Service
+from tests.browser.pages import MINUTE, SIZE, opened
+from tests.end_to_end.conftest import Service, serving
 from workflows import images
 
 pytestmark = pytest.mark.full
@@ -163,3 +165,27 @@ def test_layers_and_where_light_comes_from(tab: Page, service: Service, ready: t
     expect(figures.get_by_role("row", name="Lobe 1")).to_contain_text(place)
     layer.hover(position={"x": 5, "y": 5})
     expect(tab.get_by_alt_text("pixel (0, 0)")).to_be_visible()
+
+
+def test_what_expires_says_when(
+    browser: Browser, tab: Page, service: Service, ready: tuple[str, str], ball: Path, tmp_path: Path
+) -> None:
+    service.client.export(ready[1], archive := tmp_path / "matte.zip")
+    zone = "Asia/Kathmandu"  # where no server is
+    kept = {"ENVMATTE_CAPTURE_SECONDS": "100000", "ENVMATTE_MATTE_SECONDS": "200000"}
+    with (
+        serving(tmp_path / "data", "--workers", "1", **kept) as forgetful,
+        opened(browser, timezone_id=zone) as page,
+    ):
+        capture = forgetful.client.upload(ball)["id"]
+        matte = forgetful.client.import_matte(archive)["id"]
+        for kind, one in (("captures", capture), ("mattes", matte)):
+            expires = forgetful.http.get(f"/v1/{kind}/{one}").json()["expires_at"]
+            local = datetime.fromisoformat(expires).astimezone(ZoneInfo(zone))
+            page.goto(f"{forgetful.url}/#/{kind}/{one}")
+            told = page.get_by_role("term").filter(has_text="Kept until").locator("+ dd")
+            expect(told).to_have_text(re.compile(rf"^{local.day} .* {local.year}, {local:%H:%M}$"))
+    for kind, one in zip(("captures", "mattes"), ready, strict=True):
+        tab.goto(f"{service.url}/#/{kind}/{one}")
+        expect(tab.get_by_role("term").filter(has_text="Monitor")).to_be_visible()
+        expect(tab.get_by_role("term").filter(has_text="Kept until")).to_have_count(0)

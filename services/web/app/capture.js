@@ -18,7 +18,8 @@ export async function capture(main, signal, id) {
     problem,
     facts({
       Frame: found.width && `${size(found)} pixels`, Frames: found.frames, Monitor: `${size(found.program.monitor)} pixels`,
-      Size: bytes(found.bytes), Added: when(found.created_at), "Read by": h("a", { href: `#/jobs/${found.job}` }, "its ingest job"),
+      Size: bytes(found.bytes), Added: when(found.created_at), "Kept until": found.expires_at && when(found.expires_at),
+      "Read by": h("a", { href: `#/jobs/${found.job}` }, "its ingest job"),
     }),
   );
   if (found.state === "failed") return main.append(said(found.problem));

@@ -67,7 +67,8 @@ export async function matte(main, signal, id) {
     problem,
     facts({
       Frame: found.width && `${size(found)} pixels`, Monitor: found.monitor && `${found.monitor.join(" × ")} pixels`,
-      Made: when(found.created_at), Method: found.options.method, Quality: found.options.quality,
+      Made: when(found.created_at), "Kept until": found.expires_at && when(found.expires_at),
+      Method: found.options.method, Quality: found.options.quality,
       Capture: found.capture && h("a", { href: `#/captures/${found.capture}` }, found.capture.slice(0, 8)),
       Job: found.job && h("a", { href: `#/jobs/${found.job}` }, found.job.slice(0, 8)),
     }),
