@@ -1,6 +1,6 @@
 """The glass as the browser draws it: how far it agrees with the service's composites, and how long a picture takes.
 
-    python tests/benchmarks/live.py KIT SCENES [--renderer default] [--frames 60] [--no-ball] [--json FILE]
+    python -m tests.benchmarks.live KIT SCENES [--renderer default] [--frames 60] [--no-ball] [--json FILE]
 
 KIT is the path of a `kit.py` that makes captures of scenes, SCENES a folder of its scenes (`*.npz`). Recovers each
 through a real service from the program `quick` at the quality `fast`, and a traced glass ball of 640 x 480 pixels;
@@ -24,7 +24,6 @@ from typing import Any
 import httpx2
 import numpy as np
 import psutil
-from kits import load, parser_of, show
 from numpy.typing import NDArray
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
@@ -32,6 +31,7 @@ from playwright.sync_api import Page, sync_playwright
 from services.client import Client
 from services.demo import service
 from services.patterns import write
+from tests.benchmarks.kits import load, parser_of, show
 from workflows import images, simulate
 from workflows.presets import preset
 from workflows.scene import write_capture
@@ -150,16 +150,21 @@ def recover(kit: ModuleType, scenes: Path, ball: bool, client: Client, folder: P
     return mattes
 
 
-def compare(
-    kit: ModuleType, url: str, mattes: dict[str, str], renderer: str, frames: int
-) -> list[dict[str, Any]]:
-    """Draw all mattes and print what comes of it."""
-    backdrops = {
+def backdrops_of(kit: ModuleType) -> dict[str, bytes]:
+    """The kit's backdrops as PNG, by their names."""
+    return {
         name: images.encode_png(
             images.to_integers(from_light(np.clip(light, 0, 1), "srgb"), np.dtype(np.uint8))
         )
         for name, light in kit.backdrops().items()
     }
+
+
+def compare(
+    kit: ModuleType, url: str, mattes: dict[str, str], renderer: str, frames: int
+) -> list[dict[str, Any]]:
+    """Draw all mattes and print what comes of it."""
+    backdrops = backdrops_of(kit)
     arguments = [*BROWSER, *([f"--use-angle={renderer}"] if renderer != "default" else [])]
     rows: list[dict[str, Any]] = []
     with sync_playwright() as playwright, httpx2.Client(base_url=url, timeout=300) as http:

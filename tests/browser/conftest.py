@@ -21,6 +21,15 @@ ARGUMENTS = [
 ]
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--scenes",
+        nargs=2,
+        metavar=("KIT", "SCENES"),
+        help="What the benchmarks take: the path of a kit that films scenes, and a folder of scenes.",
+    )
+
+
 @pytest.fixture(scope="session")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     with serving(tmp_path_factory.mktemp("service") / "data", "--workers", "1") as running:

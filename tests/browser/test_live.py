@@ -1,0 +1,32 @@
+"""The glass that browsers draw, beside the service's composites: traced scenes, which only a kit can film."""
+
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Page
+
+from tests.benchmarks.kits import load
+from tests.benchmarks.live import backdrops_of, measure, recover
+from tests.end_to_end.conftest import Service
+
+pytestmark = [pytest.mark.full, pytest.mark.long]
+
+
+@pytest.fixture(scope="session")
+def given(pytestconfig: pytest.Config) -> tuple[Path, Path]:
+    """A kit and a folder of scenes; without them nothing else is set up."""
+    if not (paths := pytestconfig.getoption("--scenes")):
+        pytest.skip("no scenes are given: --scenes KIT SCENES, as the benchmarks take them")
+    return Path(paths[0]), Path(paths[1])
+
+
+@pytest.mark.timeout(900)
+def test_scenes_are_drawn_as_the_service_does(
+    given: tuple[Path, Path], desk: Page, service: Service, tmp_path: Path
+) -> None:
+    kit = load(given[0])
+    mattes = recover(kit, given[1], False, service.client, tmp_path)
+    assert mattes
+    for title, matte in mattes.items():
+        row, _ = measure(title, matte, backdrops_of(kit), service.http, desk, frames=1)
+        assert all(value > 30 for name, value in row.items() if name.endswith(", dB")), row
