@@ -167,6 +167,41 @@ def test_layers_and_where_light_comes_from(tab: Page, service: Service, ready: t
     expect(tab.get_by_alt_text("pixel (0, 0)")).to_be_visible()
 
 
+def test_layers_for_other_tools_are_saved(tab: Page, service: Service, ready: tuple[str, str]) -> None:
+    tab.goto(f"{service.url}/#/mattes/{ready[1]}")
+    for name in ("all.exr", "stmap.exr"):
+        with tab.expect_download() as download:
+            tab.get_by_role("button", name=name).click()
+        assert download.value.suggested_filename == name
+        wanted = service.http.get(f"/v1/mattes/{ready[1]}/layers/{name}").content
+        assert download.value.path().read_bytes() == wanted
+
+
+def test_a_matte_is_saved_and_what_is_deleted_is_gone(
+    tab: Page, service: Service, ready: tuple[str, str], ball: Path
+) -> None:
+    tab.goto(f"{service.url}/#/mattes/{ready[1]}")
+    with tab.expect_download() as download:
+        tab.get_by_role("button", name="Download the matte").click()
+    assert download.value.suggested_filename == f"matte-{ready[1]}.zip"
+    brought = service.client.import_matte(download.value.path())
+    uploaded = service.client.upload(ball)
+    service.client.wait(uploaded["job"])
+    for kind, one in (("mattes", brought["id"]), ("captures", uploaded["id"])):
+        tab.goto(f"{service.url}/#/{kind}/{one}")
+        drop = tab.get_by_role("button", name="Delete", exact=True)
+        drop.click()
+        tab.get_by_role("button", name="Keep it").click()
+        expect(drop).to_be_enabled()
+        assert service.http.get(f"/v1/{kind}/{one}").status_code == 200
+        drop.click()
+        tab.get_by_role("button", name="Delete it").click()
+        expect(tab).to_have_url(re.compile(f"#/{kind}$"))
+        expect(tab.locator(f'a[href="#/{kind}/{ready[kind == "mattes"]}"]')).to_be_visible()
+        expect(tab.locator(f'a[href="#/{kind}/{one}"]')).to_have_count(0)
+        assert service.http.get(f"/v1/{kind}/{one}").status_code == 404
+
+
 def test_what_expires_says_when(
     browser: Browser, tab: Page, service: Service, ready: tuple[str, str], ball: Path, tmp_path: Path
 ) -> None:

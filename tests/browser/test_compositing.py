@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from playwright.sync_api import Browser, BrowserContext, Page, Route, expect
 
+from tests.browser.pages import PHONE
 from tests.end_to_end.conftest import BANDS, Service, png
 from workflows import simulate
 from workflows.scene import nested_program, write_capture
@@ -49,6 +50,10 @@ COARSER = """async ([id, picture, monitor]) => {
         painter.draw({ right: 0.1, down: 0, scale: 1, angle: 0 }, coarser);
         return gl.canvas.toDataURL("image/png");
     });
+}"""
+COPY = """async (picture) => {
+    const bytes = Uint8Array.from(atob(picture), (one) => one.charCodeAt(0));
+    await navigator.clipboard.write([new ClipboardItem({ "image/png": new Blob([bytes], { type: "image/png" }) })]);
 }"""
 SLOW = """
     const real = requestAnimationFrame;
@@ -235,6 +240,50 @@ def test_a_clip_from_choice_to_download(
     assert job
     options = service.http.get(f"/v1/jobs/{job.rpartition('/')[2]}").json()["options"]
     assert options["placement"]["angle"] == 10
+
+
+def test_a_picture_is_pasted(context: BrowserContext, service: Service, ball: str) -> None:
+    context.grant_permissions(["clipboard-read", "clipboard-write"])
+    page = opened(context, service, ball)
+    before = page.locator(".picture.stage img").get_attribute("src")
+    page.evaluate(COPY, base64.b64encode(png(simulate.backdrop(64, 48), "srgb", np.uint8)).decode())
+    page.keyboard.press("Control+V")
+    expect(page.get_by_text(re.compile(r"image\.png: exact"))).to_be_visible(timeout=MINUTE)
+    expect(page.get_by_role("radio", name="Checker")).not_to_be_checked()
+    expect(page.locator(".picture.stage img")).not_to_have_attribute("src", before or "")
+
+
+def test_two_fingers_move_scale_and_turn(browser: Browser, service: Service, ball: str) -> None:
+    context = browser.new_context(viewport=PHONE, has_touch=True, is_mobile=True)
+    page = opened(context, service, ball)
+    stage = page.get_by_role("group", name="Composite.")
+    stage.scroll_into_view_if_needed()
+    box = stage.bounding_box()
+    assert box
+    touch = context.new_cdp_session(page)
+
+    def fingers(kind: str, points: dict[int, tuple[float, float]]) -> None:
+        """Where which fingers are, or those are that are lifted: in widths of the picture from its middle."""
+        at = [
+            {
+                "id": n,
+                "x": box["x"] + (0.5 + right) * box["width"],
+                "y": box["y"] + 0.5 * box["height"] + down * box["width"],
+            }
+            for n, (right, down) in points.items()
+        ]
+        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": at})
+
+    fingers("touchStart", {0: (-0.1, 0)})
+    fingers("touchStart", {0: (-0.1, 0), 1: (0.1, 0)})
+    fingers("touchMove", {0: (0, -0.2), 1: (0, 0.2)})  # twice as far apart, and a quarter clockwise
+    fingers("touchMove", {0: (0.1, -0.2), 1: (0.1, 0.2)})
+    fingers("touchEnd", {1: (0.1, 0.2)})
+    fingers("touchMove", {0: (0.2, -0.2)})
+    fingers("touchEnd", {0: (0.2, -0.2)})
+    for name, wanted in (("right", "20 %"), ("down", "0 %"), ("scale", "200 %"), ("angle", "90°")):
+        expect(page.locator(f"output[for=place-{name}]")).to_have_text(wanted)
+    context.close()
 
 
 def test_a_clip_that_the_browser_can_not_play(context: BrowserContext, service: Service, ball: str) -> None:

@@ -79,6 +79,22 @@ def test_a_job_that_runs_is_followed_through_a_reload(
     assert asked == []  # it is told, and does not ask
 
 
+def test_a_job_that_runs_says_how_far_it_is(desk: Page, service: Service, ready: tuple[str, str]) -> None:
+    job = service.client.recover(ready[0], most_lobes=16)["id"]
+    while (at := service.client.job(job))["eta_seconds"] is None:
+        desk.wait_for_timeout(20)
+    with paused(service):
+        desk.goto(f"{service.url}/#/jobs/{job}")
+        expect(desk.locator("p.stage")).to_have_text(re.compile(r"running recovering, \d+ %, about .+ left"))
+        facts = {"Tiles": rf"[1-9]\d* of {at['tiles']['total']}", "Workers": "1", "Ran": r".+ (s|min)"}
+        for name, value in facts.items():
+            told = desk.get_by_label("Progress").get_by_role("term").filter(has_text=name).locator("+ dd")
+            expect(told).to_have_text(re.compile(f"^{value}$"))
+        expect(desk.get_by_role("progressbar")).not_to_have_js_property("value", 0)
+        expect(desk.get_by_role("list", name="Log")).to_contain_text("recovering")
+    service.http.post(f"/v1/jobs/{job}/cancel")
+
+
 def test_a_laptop_that_slept_takes_the_job_up_again(
     desk: Page, service: Service, ready: tuple[str, str]
 ) -> None:

@@ -59,7 +59,7 @@ export async function matte(main, signal, id) {
     await remove(`v1/mattes/${id}`);
     location.replace("#/mattes");
   }, "quiet");
-  const archive = button("Download the matte", problem, () => save(`v1/mattes/${id}/archive`, `matte-${id.slice(0, 8)}.zip`));
+  const archive = button("Download the matte", problem, () => save(`v1/mattes/${id}/archive`, `matte-${id}.zip`));
   archive.hidden = found.state !== "ready";
   main.append(
     h("p", { class: "crumb" }, h("a", { href: "#/mattes" }, "Mattes")),
