@@ -20,7 +20,7 @@ def given(pytestconfig: pytest.Config) -> tuple[Path, Path]:
     return Path(paths[0]), Path(paths[1])
 
 
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(1800)
 def test_scenes_are_drawn_as_the_service_does(
     given: tuple[Path, Path], desk: Page, service: Service, tmp_path: Path
 ) -> None:
