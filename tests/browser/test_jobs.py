@@ -108,6 +108,9 @@ def test_a_laptop_that_slept_takes_the_job_up_again(
         job = service.client.recover(ready[0], quality="fast")["id"]
         desk.goto(f"{service.url}/#/jobs/{job}")
         expect(desk.locator(".stage .badge")).to_have_text("running")
+        expect(desk.get_by_label("Progress").get_by_role("term")).not_to_have_count(
+            0
+        )  # which the first event tells
         assert asked == [None]
         desk.clock.fast_forward("08:00:00")
         while len(asked) == 1:

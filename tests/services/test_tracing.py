@@ -95,7 +95,8 @@ def test_every_request_that_makes_a_job_is_traced(tmp_path: Path) -> None:
 
 def test_a_job_that_is_tried_again_goes_on_in_the_trace_of_who_asks_for_it(tmp_path: Path) -> None:
     engine = open_engine(f"sqlite:///{tmp_path / 'ledger.db'}")
-    client = TestClient(build_app(Settings(data=tmp_path), engine, Objects((tmp_path / "store").as_uri())))
+    app = build_app(Settings(data=tmp_path), engine, Objects((tmp_path / "store").as_uri()))
+    client = TestClient(app, "http://localhost")
     again = CALLER.replace("0123", "4567")
     with writing(engine) as c:
         mattes.add_imported(c, "m", {}, {})

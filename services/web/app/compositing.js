@@ -36,6 +36,7 @@ export async function compositing(matte, signal) {
   let coarser = 0; // as this device needs it for the glass to follow the hand
   let paces = []; // ms between the last pictures of a movement
   let painted;
+  let rested = true; // whether the hand has stopped since
 
   const image = h("img", { alt: "The glass before the backdrop", width: matte.width, height: matte.height, draggable: "false" });
   const canvas = h("canvas", { role: "img", "aria-label": "The glass before the backdrop", width: matte.width, height: matte.height, hidden: true });
@@ -81,9 +82,9 @@ export async function compositing(matte, signal) {
   function paint(now) {
     frame = 0;
     if (!drawn()) return;
-    if (now - painted < STILL) paces = [...paces.slice(-3), now - painted];
+    if (!rested) paces = [...paces.slice(-3), now - painted];
     else if (coarser) [coarser, paces] = [coarser - 1, []]; // another movement: it may have been busy only then
-    painted = now;
+    [painted, rested] = [now, false];
     if (paces.length === 4 && Math.min(...paces) > SLOW && coarser < COARSEST) {
       coarser += 1;
       paces = [];
@@ -101,12 +102,16 @@ export async function compositing(matte, signal) {
     cancelAnimationFrame(frame);
     frame = 0;
   };
+  const stopped = () => {
+    rested = true;
+    draw(true);
+  };
   const moved = () => {
     if (!source) return;
     clearTimeout(timer);
     changes += 1;
     tell(drawn() ? "live" : "preview");
-    if (!playing()) timer = setTimeout(draw, STILL, true);
+    if (!playing()) timer = setTimeout(stopped, STILL);
     if (drawn()) redraw();
     else draw(false);
   };
