@@ -98,6 +98,7 @@ def test_at_ingest(small: Small, bundle: Path, table: list[Row]) -> None:
     check(table, small.row("a full disk at ingest", start, job["matte"]))
 
 
+@pytest.mark.long
 def test_at_tiles(small: Small, table: list[Row]) -> None:
     start = time.monotonic()
     with full(small.store, 256 << 10):

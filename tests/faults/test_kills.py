@@ -31,6 +31,7 @@ def test_all_workers_killed(known: Known, table: list[Row], times: int) -> None:
     check(table, known.disturb("SIGKILL of all workers", kill, times))
 
 
+@pytest.mark.long
 def test_a_killed_scheduler(known: Known, table: list[Row], times: int) -> None:
     rig = known.rig
     row = known.disturb("SIGKILL of the scheduler", lambda: rig.restart("scheduler"), times)
