@@ -7,7 +7,6 @@ checked and never unpickled: who takes a decoder over has that process, and not 
 import ctypes
 import gc
 import multiprocessing
-import os
 import resource
 import signal
 import socket
@@ -25,6 +24,7 @@ from storage.errors import ImageError
 from workflows import pictures
 from workflows.floats import Floats
 from workflows.images import Codes
+from workflows.ingest.guard import in_use
 from workflows.pictures import Transfer
 
 SPARE = 5.0
@@ -201,8 +201,7 @@ def _confine(memory: int) -> None:
     limits = {resource.RLIMIT_CORE: 0, resource.RLIMIT_FSIZE: 0}
     if sys.platform == "linux":
         Path("/proc/self/comm").write_text(NAME)
-        pages = int(Path("/proc/self/statm").read_text().split()[5])
-        limits[resource.RLIMIT_DATA] = pages * os.sysconf("SC_PAGE_SIZE") + memory
+        limits[resource.RLIMIT_DATA] = in_use() + memory
     for limit, most in limits.items():
         _, hard = resource.getrlimit(limit)
         most = most if hard == resource.RLIM_INFINITY else min(most, hard)

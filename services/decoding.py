@@ -12,6 +12,7 @@ from services.decoder import AGAIN, Decoder, Refused
 from storage.errors import ImageError, Unavailable
 from workflows.floats import Floats
 from workflows.images import Codes
+from workflows.ingest import guard
 from workflows.pictures import Transfer
 
 logger = logging.getLogger(__name__)
@@ -19,8 +20,6 @@ logger = logging.getLogger(__name__)
 SECONDS = 20.0
 """That decoding a picture may take, if it may have `USUAL` bytes or less; more in proportion."""
 USUAL = 128 << 20
-COPIES, BESIDES = 8, 256 << 20
-"""Pictures of the largest size that a child has room for, one of them as it was sent, and bytes besides."""
 
 
 class Decoders:
@@ -91,7 +90,7 @@ class Decoders:
             logger.warning("a decoder that had nothing to do is gone: %s", child.end())
             with self._lock:
                 self._children.discard(child)
-        child = Decoder(COPIES * self._memory + BESIDES)
+        child = Decoder(guard.room(self._memory))
         with self._lock:
             self._children.add(child)
         if self._closed:  # meanwhile

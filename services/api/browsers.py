@@ -47,13 +47,14 @@ def see_that_no_site_asks(request: Request) -> None:
     ForeignSite
     """
     host, origin = request.headers.get("host", ""), request.headers.get("origin")
-    name = _split(host)[0]
+    called = _split(host)
+    name = called[0]
     if not (is_loopback(name) or name.endswith(".localhost")):
         raise ForeignSite(
             f"a service without keys is asked as localhost or 127.0.0.1, and this was asked as {host!r}: ask it so, or "
             "make a key with `envmatte keys make NAME`"
         )
-    if origin is not None and _split(origin.rpartition("://")[2]) != _split(host):
+    if origin is not None and _split(origin.rpartition("://")[2]) != called:
         raise ForeignSite(
             f"a service without keys takes nothing from other websites, and this is from {origin!r}: make a key with "
             "`envmatte keys make NAME`"

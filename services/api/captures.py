@@ -5,13 +5,12 @@ from typing import Annotated, Any, Literal
 
 import anyio.to_thread
 from fastapi import APIRouter, Header, Query, Request, Response
-from fastapi.exceptions import RequestValidationError
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Row
 from sqlalchemy.exc import IntegrityError
 
 from services import tracing, webhooks
-from services.api.bodies import announced, read_body, schema_of, store_body
+from services.api.bodies import announced, read_json, schema_of, store_body
 from services.api.context import After, Context, Limit, Needs, answered, time_of
 from services.api.errors import WrongMediaType
 from services.limits import admit, admit_upload
@@ -106,7 +105,7 @@ async def upload(
     """
     media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media_type == "application/json":
-        wanted = _parse(await read_body(request, FROM_UPLOAD_BYTES))
+        wanted = await read_json(request, FromUpload, FROM_UPLOAD_BYTES)
         row = await anyio.to_thread.run_sync(
             _from_upload, context, wanted, idempotency_key, limiter=context.bundles
         )
@@ -189,13 +188,6 @@ async def _from_body(
     if row.id != capture:  # a repeat with the same key was quicker
         await anyio.to_thread.run_sync(uploads.remove, context.objects, capture)
     return row
-
-
-def _parse(body: bytes) -> FromUpload:
-    try:
-        return FromUpload.model_validate_json(body)
-    except ValidationError as error:
-        raise RequestValidationError([{**e, "loc": ("body", *e["loc"])} for e in error.errors()]) from error
 
 
 def _from_upload(context: Context, wanted: FromUpload, key: str | None) -> Row[Any]:

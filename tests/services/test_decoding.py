@@ -15,12 +15,13 @@ import pytest
 import tifffile
 from PIL import Image
 
-from services import decoder, decoding
+from services import decoder
 from services.decoder import NAME
 from services.decoding import Decoders
 from storage.errors import ImageError, Unavailable
 from tests.services.clusters import running, wait
 from workflows import floats, images, pictures
+from workflows.ingest import guard
 
 MEMORY = 1 << 24
 PIXELS = np.random.default_rng(0).integers(0, 256, (30, 40, 3), np.uint8)
@@ -142,8 +143,8 @@ def test_one_that_dies_while_it_has_nothing_to_do_costs_nothing(decoders: Decode
 
 
 def test_memory_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(decoding, "COPIES", 0)
-    monkeypatch.setattr(decoding, "BESIDES", 32 << 20)
+    monkeypatch.setattr(guard, "COPIES", 0)
+    monkeypatch.setattr(guard, "BESIDES", 32 << 20)
     confined = Decoders(1 << 30)
     large = saved("PNG", np.zeros((6000, 6000, 3), np.uint8))
     with pytest.raises(ImageError, match="too much memory"):
@@ -231,5 +232,5 @@ def test_a_child_is_confined(decoders: Decoders) -> None:
     (child,) = children()
     assert child.rlimit(psutil.RLIMIT_CORE) == (0, 0)
     assert child.rlimit(psutil.RLIMIT_FSIZE) == (0, 0)
-    room = decoding.COPIES * MEMORY + decoding.BESIDES
+    room = guard.room(MEMORY)
     assert room <= child.rlimit(psutil.RLIMIT_DATA)[1] < room + (4 << 30)

@@ -31,7 +31,7 @@ class Guard:
 
     def __init__(self, entry: str, image: int) -> None:
         self._entry = entry
-        self._memory = COPIES * image + BESIDES
+        self._memory = room(image)
         self._most: float = math.inf
         self._then = 0
 
@@ -74,7 +74,7 @@ class Guard:
         if sys.platform != "linux":  # others have the limit and do not keep to it
             yield
             return
-        now = _memory()
+        now = in_use()
         # What was taken since the last time is not the decoder's; what was given back may be.
         self._most = min(self._most + max(now - self._then, 0), now + self._memory)
         soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
@@ -84,9 +84,14 @@ class Guard:
             yield
         finally:
             resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
-            self._then = _memory()
+            self._then = in_use()
 
 
-def _memory() -> int:
-    """Bytes of this process that count for the limit, used or not."""
+def room(image: int) -> int:
+    """Bytes that a decoder may take, one decoded frame of which may take `image`."""
+    return COPIES * image + BESIDES
+
+
+def in_use() -> int:
+    """Bytes of this process that count for RLIMIT_DATA, used or not; on Linux alone."""
     return int(Path("/proc/self/statm").read_text().split()[5]) * os.sysconf("SC_PAGE_SIZE")

@@ -1,6 +1,7 @@
 """Decoders are bounded: one that hangs ends its process, one that takes too much memory is refused it."""
 
 import mmap
+import re
 import resource
 import subprocess
 import sys
@@ -124,7 +125,7 @@ def test_what_a_decoder_takes_is_added_up_and_what_others_take_is_not(small: Gua
 @linux
 def test_a_lower_limit_of_the_process_holds(small: Guard) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    lower = guard._memory() + 20 * MIB
+    lower = guard.in_use() + 20 * MIB
     resource.setrlimit(resource.RLIMIT_DATA, (lower, hard))
     try:
         with pytest.raises(CaptureError), small.on():
@@ -176,7 +177,8 @@ def fragmented(samples: int) -> bytes:
     ("film", "said"),
     [
         (overstated(clip(pictures(9), even(9)), 40_000_000), "an index that takes too much memory"),
-        (fragmented(4_000_000), "takes more than the 264 MB"),
+        # FFmpeg 9 knows by itself that so many samples can't be in so few bytes.
+        (fragmented(4_000_000), "takes more than the 264 MB|Invalid data found"),
     ],
     ids=["at once", "bit by bit"],
 )
@@ -185,4 +187,4 @@ def test_a_film_of_some_kilobytes_does_not_take_gigabytes(film: bytes, said: str
     ran = subprocess.run([sys.executable, "-c", PEAK], input=film, stdout=subprocess.PIPE, check=True)
     grown, _, detail = ran.stdout.decode().partition(" ")
     assert int(grown) < 300
-    assert said in detail
+    assert re.search(said, detail)
