@@ -51,6 +51,11 @@ CONFIG: dict[str, Any] = {
     # The last messages of every connection and the last bursts of tasks, which nobody looks at; a thousand by default.
     "distributed.admin.low-level-log-length": 100,
     "distributed.diagnostics.computations.max-history": 10,
+    # Stacks by the hundredth of a second, which nobody looks at either, and how late the event loop is by the fiftieth:
+    # two thirds of what a service takes while it has nothing to do.
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "1 s",
+    "distributed.admin.system-monitor.interval": "2 s",
     "distributed.comm.timeouts.connect": "10 s",
     "distributed.comm.timeouts.tcp": "15 s",
     # Every scheduler and worker has an HTTP server, which can't be left out and knows no TLS: it serves nothing, and

@@ -68,6 +68,12 @@ class Known:
         """Do something bad at random moments of jobs, and see what comes of them."""
         return self.rig.disturb(fault, act, self.capture, self.files, times)
 
+    def goes_on(self, job: str, matte: str) -> None:
+        """See that a job ends well, and waits for nothing then."""
+        assert self.rig.ended(job)["state"] == "succeeded"
+        assert self.rig.job(job)["waits_for"] is None
+        assert self.rig.files(matte) == self.files
+
 
 def check(table: list[Row], row: Row) -> None:
     """Add a row to the table, and see that nothing was lost and all is the same to the byte."""

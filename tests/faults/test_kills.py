@@ -1,4 +1,6 @@
-"""Processes are killed and frozen at random moments: no job is lost, and every matte is the same to the byte."""
+"""Processes are killed and frozen at random moments, and jobs cancelled: no job is lost, and every matte is the same to
+the byte.
+"""
 
 import random
 import time
@@ -9,6 +11,7 @@ import pytest
 
 from tests.faults.conftest import Known, check
 from tests.faults.rig import Row, freeze, thaw
+from tests.services.clusters import wait
 
 pytestmark = [pytest.mark.full, pytest.mark.timeout(7200)]
 
@@ -61,3 +64,19 @@ def test_a_frozen_worker(known: Known, table: list[Row]) -> None:
     (matte, *_) = known.rig.ask("GET", "/v1/mattes").json()["mattes"]
     assert known.rig.files(matte["id"]) == known.files
     check(table, row)
+
+
+def test_a_cancelled_job_frees_its_workers_and_what_it_wrote(known: Known) -> None:
+    rig = known.rig
+    # One tile of nn-dgsr that takes minutes.
+    options = {"method": "nn-dgsr", "tile": 1024}
+    job = rig.ask("POST", "/v1/jobs", json={"capture": known.capture, "options": options}).json()
+    wait(lambda: rig.job(job["id"])["stage"] == "recovering")
+    time.sleep(1)
+    cancelled = rig.ask("POST", f"/v1/jobs/{job['id']}/cancel").json()
+    assert cancelled["state"] == "cancelled"
+    wait(lambda: not rig.names(job["matte"]), 10)
+    assert rig.ask("GET", f"/v1/mattes/{job['matte']}").status_code == 404
+    after = rig.recover(known.capture)
+    known.goes_on(after["id"], after["matte"])
+    assert not rig.names(job["matte"])
