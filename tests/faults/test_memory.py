@@ -15,7 +15,7 @@ from tests.services.clusters import wait
 
 pytestmark = [pytest.mark.full, pytest.mark.timeout(1800)]
 
-LARGER = 10
+LARGER = 14
 """How many times wider and higher the frames are."""
 LIMIT = 460 << 20
 """Bytes that a worker may take: enough for small captures."""
@@ -25,7 +25,7 @@ TOO_MUCH, ENOUGH = 4 << 30, 64 << 20
 
 @pytest.fixture(scope="module")
 def large(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The capture with frames of 1.5 Mpixel, all of which are one slab where memory allows."""
+    """The capture with frames of 3 Mpixel, all of which are one slab where memory allows."""
     path = tmp_path_factory.mktemp("large") / "large.zip"
     with zipfile.ZipFile(bundle) as source, zipfile.ZipFile(path, "w") as target:
         manifest = json.loads(source.read("capture.json"))
