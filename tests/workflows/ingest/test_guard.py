@@ -1,7 +1,6 @@
 """Decoders are bounded: one that hangs ends its process, one that takes too much memory is refused it."""
 
 import mmap
-import re
 import resource
 import subprocess
 import sys
@@ -135,6 +134,9 @@ def test_a_lower_limit_of_the_process_holds(small: Guard) -> None:
         resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
 
 
+COUNTS_SAMPLES = av.library_versions["libavformat"] >= (63,)
+"""Whether FFmpeg knows by itself how many samples can be in a fragment at most."""
+
 PEAK = """
 import io, re, sys
 from pathlib import Path
@@ -177,8 +179,7 @@ def fragmented(samples: int) -> bytes:
     ("film", "said"),
     [
         (overstated(clip(pictures(9), even(9)), 40_000_000), "an index that takes too much memory"),
-        # FFmpeg 9 knows by itself that so many samples can't be in so few bytes.
-        (fragmented(4_000_000), "takes more than the 264 MB|Invalid data found"),
+        (fragmented(4_000_000), "Invalid data found" if COUNTS_SAMPLES else "takes more than the 264 MB"),
     ],
     ids=["at once", "bit by bit"],
 )
@@ -187,4 +188,4 @@ def test_a_film_of_some_kilobytes_does_not_take_gigabytes(film: bytes, said: str
     ran = subprocess.run([sys.executable, "-c", PEAK], input=film, stdout=subprocess.PIPE, check=True)
     grown, _, detail = ran.stdout.decode().partition(" ")
     assert int(grown) < 300
-    assert re.search(said, detail)
+    assert said in detail
