@@ -1,5 +1,5 @@
 """`python -m services` is the command `envmatte`, where that is not on the path."""
 
-from services.cli import run
+from services.cli.main import run
 
 run()

@@ -8,18 +8,19 @@ from contextlib import ExitStack, contextmanager
 import uvicorn
 from sqlalchemy import Engine
 
-from services import tracing
-from services.api import build_app
-from services.api.access import see_that_it_is_closed
-from services.api.browsers import Careful
-from services.cluster import dispatcher_of
-from services.connections import Connection, allow_many
-from services.coordinator import Coordinator
-from services.process import log, share_memory, sole_user
+from services.api.app import build_app
+from services.api.auth import see_that_it_is_closed
+from services.api.http.browser_security import Careful
+from services.api.http.slow_clients import Connection, allow_many
+from services.cluster.connect import dispatcher_of
+from services.coordinator.coordinator import Coordinator
+from services.runtime import tracing
+from services.runtime.logs import log
+from services.runtime.process import share_memory, sole_user
 from services.settings import Settings
-from services.webhooks import Sender
-from storage.database import open_engine
-from storage.objects import Objects
+from services.webhooks.sender import Sender
+from storage.database.engine import open_engine
+from storage.objects.store import Objects
 
 GRACE = 3
 """Seconds that requests under way have to end when the service is asked to stop: an upload may take hours."""

@@ -1,6 +1,5 @@
 """The settings of the service: one object, built at the edge and passed in."""
 
-import ipaddress
 import os
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,9 +12,10 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 from sqlalchemy import make_url
 from sqlalchemy.exc import ArgumentError
 
-from services.certs import security_of
+from services.runtime.addresses import is_loopback
+from services.runtime.certificates import security_of
 from storage.errors import InvalidInput
-from workflows.ingest.bundle import Limits
+from workflows.untrusted.limits import Limits
 
 
 class ClusterSettings(BaseSettings):
@@ -230,7 +230,7 @@ class Settings(ClusterSettings):
 
     @property
     def store_url(self) -> str:
-        """Where captures and mattes are, as `storage.objects.Objects` takes it."""
+        """Where captures and mattes are, as `storage.objects.store.Objects` takes it."""
         return self.store or (self.data.resolve() / "store").as_uri()
 
     @property
@@ -247,14 +247,6 @@ class Settings(ClusterSettings):
             frames=self.capture_frames,
             pixels=self.capture_pixels,
         )
-
-
-def is_loopback(host: str) -> bool:
-    """Whether an address or a name is this machine's own."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def _port(netloc: str) -> bool:

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from storage.database import open_engine
+from storage.database.engine import open_engine
 from tests import postgres
 from tests.s3 import s3, s3_server
 

@@ -57,7 +57,7 @@ class Server:
             )
 
     def url(self, database: str) -> str:
-        """The URL of a database, as `storage.database.open_engine` takes it."""
+        """The URL of a database, as `storage.database.engine.open_engine` takes it."""
         return f"postgresql://postgres@/{database}?host={self.folder}"
 
     def start(self) -> None:

@@ -11,17 +11,18 @@ from functools import lru_cache
 from itertools import product
 from typing import Any
 
-from storage import captures, composites, mattes
-from storage.captures import Stack
-from storage.jobs import FINISH, PREPARE
-from storage.objects import Objects
-from workflows import clips, tiles
-from workflows.composite.placing import Placement
-from workflows.ingest import frames
-from workflows.ingest.bundle import Limits
-from workflows.ingest.measure import measure
-from workflows.ingest.survey import survey
-from workflows.options import parse_options
+from storage.layout import captures, composites, mattes
+from storage.layout.captures import Stack
+from storage.objects.store import Objects
+from storage.steps import FINISH, PREPARE
+from workflows.composite.placement import Placement
+from workflows.composite.video import steps as video_steps
+from workflows.ingest import steps as ingest_steps
+from workflows.ingest.report.calibration import measure
+from workflows.ingest.report.survey import survey
+from workflows.mattes import tiles
+from workflows.mattes.options import parse_options
+from workflows.untrusted.limits import Limits
 
 GOLDEN = 0.6180339887498949
 
@@ -88,11 +89,11 @@ class Kind:
 
 
 def _ingest_prepare(task: Task) -> dict[str, Any]:
-    return frames.prepare(_objects(task.store), task.capture, task.limits)
+    return ingest_steps.prepare(_objects(task.store), task.capture, task.limits)
 
 
 def _ingest_work(task: Task, tile: int) -> int:
-    return frames.read_slab(_objects(task.store), task.capture, task.limits, task.plan["slab"], tile)
+    return ingest_steps.read_slab(_objects(task.store), task.capture, task.limits, task.plan["slab"], tile)
 
 
 def _ingest_missing(task: Task) -> list[int]:
@@ -152,13 +153,13 @@ def _recover_finish(task: Task) -> dict[str, Any]:
 
 
 def _composite_prepare(task: Task) -> dict[str, Any]:
-    return clips.prepare(_objects(task.store), task.job, task.matte, task.limits)
+    return video_steps.prepare(_objects(task.store), task.job, task.matte, task.limits)
 
 
 def _composite_work(task: Task, tile: int) -> int:
     transfer, placement = task.options["transfer"], Placement(**task.options["placement"])
     objects = _objects(task.store)
-    return clips.work(objects, task.job, task.matte, transfer, placement, task.limits, task.plan, tile)
+    return video_steps.work(objects, task.job, task.matte, transfer, placement, task.limits, task.plan, tile)
 
 
 def _composite_missing(task: Task) -> list[int]:
@@ -166,7 +167,7 @@ def _composite_missing(task: Task) -> list[int]:
 
 
 def _composite_finish(task: Task) -> dict[str, Any]:
-    clips.finish(_objects(task.store), task.job, task.plan)
+    video_steps.finish(_objects(task.store), task.job, task.plan)
     return {}
 
 

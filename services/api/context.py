@@ -1,36 +1,29 @@
 """What every request handler needs: the settings, the database as the caller may see it, and the store."""
 
-import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import IO, Annotated
+from typing import Annotated
 
 from anyio import CapacityLimiter
-from fastapi import Depends, Query, Request, Response
-from fastapi.responses import StreamingResponse
+from fastapi import Depends, Query, Request
 from fastapi.security import HTTPAuthorizationCredentials
 from pydantic import Field
 from sqlalchemy import Engine
-from starlette.datastructures import Headers
-from starlette.types import Receive, Scope, Send
 
-from services.api.access import ADMIN, Caller, bearer, demand, identify, see_that_it_may
-from services.api.browsers import see_that_no_site_asks
-from services.decoding import Decoders
+from services.api.auth import ADMIN, Caller, bearer, demand, identify, see_that_it_may
+from services.api.http.browser_security import see_that_no_site_asks
+from services.decoding.pool import Decoders
 from services.settings import Settings
+from storage.database.owners import NOBODY, bound
 from storage.errors import Unavailable
-from storage.objects import Objects
-from storage.owners import NOBODY, bound
+from storage.objects.store import Objects
 from workflows.composite.cache import Cache
 from workflows.composite.threads import CORES
 
-HELD = 1 << 18
-"""Bytes of an answer that are kept in memory while it is taken, and that are read of a file at once."""
 LOOK = 1.0
 """Seconds between two looks at the key of whoever downloads."""
 WEB = Path(__file__).parents[1] / "web"
@@ -43,7 +36,7 @@ class Context:
 
     settings: Settings
     engine: Engine
-    """Of the database; of a request, over which no more can be seen than is the caller's, see `storage.owners`."""
+    """Of the database. A request's own shows what belongs to the caller, see `storage.database.owners`."""
     objects: Objects
     cache: Cache
     """Strips of mattes."""
@@ -132,44 +125,3 @@ Pair = Annotated[list[int], Field(min_length=2, max_length=2)]
 Colour = Annotated[list[float], Field(min_length=3, max_length=3)]
 Limit = Annotated[int, Query(ge=1, le=1000, description="The most items to list.")]
 After = Annotated[str | None, Query(description="The id of the last item of the page before.")]
-
-
-def answered(data: bytes, media_type: str, headers: dict[str, str] | None = None) -> Response:
-    """An answer, a large one from a temporary file: any number may be taken slowly. Not for the loop's thread."""
-    if len(data) <= HELD:
-        return Response(data, headers=headers, media_type=media_type)
-    with ExitStack() as stack:
-        file = stack.enter_context(tempfile.TemporaryFile())
-        file.write(data)
-        file.seek(0)
-        stack.pop_all()  # now it is the answer's to close
-    return FromFile(file, len(data), media_type, headers)
-
-
-class FromFile(StreamingResponse):
-    """The bytes of a file, which is closed whatever becomes of the connection."""
-
-    def __init__(
-        self, file: IO[bytes], size: int, media_type: str, headers: dict[str, str] | None = None
-    ) -> None:
-        length = {"Content-Length": str(size)}
-        super().__init__(
-            iter(partial(file.read, HELD), b""), headers=(headers or {}) | length, media_type=media_type
-        )
-        self._file = file
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        try:
-            await super().__call__(scope, receive, send)
-        finally:
-            self._file.close()
-
-
-def time_of(seconds: float | None) -> datetime | None:
-    """A time of the database as answers have it."""
-    return None if seconds is None else datetime.fromtimestamp(seconds, UTC)
-
-
-def is_known(headers: Headers, tag: str) -> bool:
-    """Whether the caller has what a tag stands for (If-None-Match, RFC 9110, sect. 13.1.2)."""
-    return tag in [one.strip() for one in headers.get("if-none-match", "").split(",")]

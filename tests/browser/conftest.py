@@ -9,8 +9,8 @@ from playwright.sync_api import Browser, Page, sync_playwright
 
 from tests.browser.pages import SIZE, opened
 from tests.end_to_end.conftest import BANDS, Service, serving
-from workflows import simulate
-from workflows.scene import nested_program, write_capture
+from workflows.simulation import glass_ball
+from workflows.simulation.scene import nested_program, write_capture
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 ARGUMENTS = [
@@ -50,7 +50,7 @@ def browser() -> Iterator[Browser]:
 def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("ball") / "ball.zip"
     write_capture(
-        simulate.glass_ball(*SIZE, rays=9), nested_program(bands=BANDS, levels=5), path, name="a ball"
+        glass_ball.glass_ball(*SIZE, rays=9), nested_program(bands=BANDS, levels=5), path, name="a ball"
     )
     return path
 

@@ -15,7 +15,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from tests.browser.pages import MINUTE, SIZE, opened
 from tests.end_to_end.conftest import Service, serving
-from workflows import images
+from workflows.images import integer_formats
 
 pytestmark = pytest.mark.full
 
@@ -61,7 +61,7 @@ def drop(page: Page, data: bytes, name: str) -> None:
 def picture(seed: int, width: int, height: int) -> bytes:
     """A backdrop."""
     blocks = np.random.default_rng(seed).integers(0, 256, (6, 8, 3), np.uint8)
-    return images.encode_png(np.kron(blocks, np.ones((height // 6, width // 8, 1), np.uint8)))
+    return integer_formats.encode_png(np.kron(blocks, np.ones((height // 6, width // 8, 1), np.uint8)))
 
 
 def test_from_a_zip_to_a_composite(tab: Page, service: Service, ball: Path) -> None:

@@ -13,10 +13,11 @@ from playwright.sync_api import Page, expect
 
 from tests.browser.pages import MINUTE, ZIP
 from tests.end_to_end.conftest import BANDS, Service
-from tests.workflows.ingest.camera import Camera, film, lights
-from workflows import images, simulate
-from workflows.program import Program
-from workflows.scene import nested_program
+from tests.workflows.ingest.video.camera import Camera, film, lights
+from workflows.images import integer_formats
+from workflows.programs.program import Program
+from workflows.simulation import glass_ball
+from workflows.simulation.scene import nested_program
 
 pytestmark = pytest.mark.full
 
@@ -28,7 +29,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A film of a program without a border."""
     program = nested_program(bands=BANDS[:1], levels=2)
     path = tmp_path_factory.mktemp("film") / "IMG 0001.MOV"
-    path.write_bytes(film(lights(simulate.glass_ball(96, 72, rays=4), program), Camera(hold=1 / RATE)).data)
+    path.write_bytes(film(lights(glass_ball.glass_ball(96, 72, rays=4), program), Camera(hold=1 / RATE)).data)
     path.with_suffix(".json").write_text(
         json.dumps(
             {
@@ -153,7 +154,7 @@ def test_what_a_zip_says_of_its_frames_is_told_before_it_is_sent(
     for path, about in ((jpeg, record), (film, filmed)):
         with zipfile.ZipFile(path, "w") as made:
             made.writestr("capture.json", json.dumps(about))
-            made.writestr("ä.jpg", images.encode_jpeg(np.zeros((33, 70, 3), np.uint8), 90))
+            made.writestr("ä.jpg", integer_formats.encode_jpeg(np.zeros((33, 70, 3), np.uint8), 90))
     (tmp_path / "none.zip").write_bytes(b"PK and nothing more")
     of_ball = {"frames": len(json.loads(zipfile.ZipFile(ball).read("capture.json"))["frames"])}
     of_ball |= {"width": 96, "height": 72}

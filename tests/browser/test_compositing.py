@@ -16,8 +16,8 @@ from playwright.sync_api import Browser, BrowserContext, Page, Route, expect
 
 from tests.browser.pages import PHONE
 from tests.end_to_end.conftest import BANDS, Service, png
-from workflows import simulate
-from workflows.scene import nested_program, write_capture
+from workflows.simulation import glass_ball
+from workflows.simulation.scene import nested_program, write_capture
 
 pytestmark = pytest.mark.full
 
@@ -66,7 +66,7 @@ KEPT = """
 @pytest.fixture(scope="module")
 def ball(tmp_path_factory: pytest.TempPathFactory, service: Service) -> str:
     path = tmp_path_factory.mktemp("ball") / "ball.zip"
-    write_capture(simulate.glass_ball(*SIZE, rays=9), nested_program(bands=BANDS, levels=5), path)
+    write_capture(glass_ball.glass_ball(*SIZE, rays=9), nested_program(bands=BANDS, levels=5), path)
     uploaded = service.client.upload(path)
     service.client.wait(uploaded["job"])
     return str(service.client.wait(service.client.recover(uploaded["id"], quality="fast")["id"])["matte"])
@@ -110,7 +110,7 @@ def bring(page: Page, data: bytes, name: str, kind: str) -> None:
 
 def filmed(path: Path, frames: int) -> bytes:
     """A clip whose picture moves to the side."""
-    still = np.asarray(simulate.backdrop(160, 120) * 255, np.uint8)
+    still = np.asarray(glass_ball.backdrop(160, 120) * 255, np.uint8)
     with av.open(path, "w") as file:
         stream = file.add_stream("libx264", 10)
         stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
@@ -127,7 +127,7 @@ def test_what_the_browser_draws_agrees_with_the_service(
     expect(page.get_by_text(READY)).to_be_visible(timeout=MINUTE)
     asked: list[str] = []
     page.on("request", lambda one: asked.append(one.url) if "/composite?" in one.url else None)
-    beach = png(simulate.backdrop(640, 480), "srgb", np.uint8)
+    beach = png(glass_ball.backdrop(640, 480), "srgb", np.uint8)
     bring(page, beach, "beach.png", "image/png")
     expect(page.get_by_text(re.compile("beach.png: exact"))).to_be_visible(timeout=MINUTE)
     for turned in ({}, {"Move right": "0.15"}, {"Move down": "-0.3", "Turn": "30"}, {"Size": "-0.3"}):
@@ -146,7 +146,7 @@ def test_fewer_pixels_of_coarser_light_agree_too(
     context: BrowserContext, service: Service, ball: str
 ) -> None:
     page = opened(context, service, ball)
-    beach = png(simulate.backdrop(640, 480), "srgb", np.uint8)
+    beach = png(glass_ball.backdrop(640, 480), "srgb", np.uint8)
     monitor = service.http.get(f"/v1/mattes/{ball}").json()["monitor"]
     sent = base64.b64encode(beach).decode()
     exact = pixels(
@@ -246,7 +246,7 @@ def test_a_picture_is_pasted(context: BrowserContext, service: Service, ball: st
     context.grant_permissions(["clipboard-read", "clipboard-write"])
     page = opened(context, service, ball)
     before = page.locator(".picture.stage img").get_attribute("src")
-    page.evaluate(COPY, base64.b64encode(png(simulate.backdrop(64, 48), "srgb", np.uint8)).decode())
+    page.evaluate(COPY, base64.b64encode(png(glass_ball.backdrop(64, 48), "srgb", np.uint8)).decode())
     page.keyboard.press("Control+V")
     expect(page.get_by_text(re.compile(r"image\.png: exact"))).to_be_visible(timeout=MINUTE)
     expect(page.get_by_role("radio", name="Checker")).not_to_be_checked()

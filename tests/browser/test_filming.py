@@ -8,7 +8,7 @@ from playwright.sync_api import Browser, Page, Route, expect
 
 from tests.browser.pages import MINUTE, PHONE, ZIP, asks_before_it_closes, opened
 from tests.end_to_end.conftest import Service
-from workflows.program import Program
+from workflows.programs.program import Program
 
 pytestmark = pytest.mark.full
 

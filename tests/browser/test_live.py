@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page
 
-from tests.benchmarks.kits import load
-from tests.benchmarks.live import backdrops_of, measure, recover
+from tests.benchmarks.compositing.live import backdrops_of, measure, recover
+from tests.benchmarks.recovery.kits import load
 from tests.end_to_end.conftest import Service
 
 pytestmark = [pytest.mark.full, pytest.mark.long]

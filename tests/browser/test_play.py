@@ -1,4 +1,4 @@
-"""The page that shows a program, in a real browser: its rules are those of `workflows.clock`, and it keeps time."""
+"""The page that plays a program, in a real browser: its border is that of `workflows.programs.border`."""
 
 import base64
 import io
@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from PIL import Image
 from playwright.sync_api import Page, expect
 
-from services.patterns import pictures
 from tests.end_to_end.conftest import Service, serving
-from workflows import clock
-from workflows.program import Program
+from workflows.programs import border as program_border
+from workflows.programs.files import pictures
+from workflows.programs.program import Program
 
 pytestmark = pytest.mark.full
 
 SCREEN = {"width": 640, "height": 360}
 DISPLAYS = [(640, 360), (1920, 1080), (1080, 1920), (3440, 1440), (161, 121), (90, 60), (200, 5000)]
-NUMBERS = [clock.LEAD, 0, 1, 62, 63, 64, 1023, clock.MOST - 1]
+NUMBERS = [program_border.LEAD, 0, 1, 62, 63, 64, 1023, program_border.MOST - 1]
 
 
 def posted(service: Service, **asked: Any) -> dict[str, Any]:
@@ -73,16 +73,16 @@ def test_the_page_has_the_rules_of_the_clock(tab: Page, service: Service) -> Non
     )
     for (width, height), found in zip(DISPLAYS, rules["borders"], strict=True):
         try:
-            border = clock.Border(width=width, height=height)
+            border = program_border.Border(width=width, height=height)
         except ValueError:
             assert not found["fits"]
             continue
         assert found["fits"]
         for name in ("inner", "top", "bottom", "left", "right"):
             assert np.array_equal(found[name], getattr(border, name))
-    assert np.array_equal(rules["codes"], [clock.code(number) for number in NUMBERS])
-    assert np.array_equal(rules["ticks"], [clock.tick(number) for number in NUMBERS])
-    expected = [(step.seconds, step.number, step.white) for step in clock.schedule(7, 4)]
+    assert np.array_equal(rules["codes"], [program_border.code(number) for number in NUMBERS])
+    assert np.array_equal(rules["ticks"], [program_border.tick(number) for number in NUMBERS])
+    expected = [(step.seconds, step.number, step.white) for step in program_border.schedule(7, 4)]
     assert [(step["seconds"], step["number"], step["white"]) for step in rules["schedule"]] == expected
 
 
@@ -90,14 +90,16 @@ def test_the_page_draws_what_the_clock_draws(tab: Page, service: Service) -> Non
     program = posted(service)
     go(tab, service, program)
     shown = Program.model_validate(program["program"])
-    border = clock.Border(**SCREEN)
+    border = program_border.Border(**SCREEN)
     for white in (False, True):
         level = np.full((1, 1, 3), 255 * white, np.uint8)
-        np.testing.assert_array_equal(drawn(tab, program, -1, white), clock.draw(level, -1, border))
+        np.testing.assert_array_equal(drawn(tab, program, -1, white), program_border.draw(level, -1, border))
     every = list(pictures(shown))
     for number in (0, 6, 20, 31):
         picture = np.broadcast_to(every[number], (*every[number].shape[:2], 3))
-        np.testing.assert_array_equal(drawn(tab, program, number, False), clock.draw(picture, number, border))
+        np.testing.assert_array_equal(
+            drawn(tab, program, number, False), program_border.draw(picture, number, border)
+        )
 
 
 def test_every_pattern_is_shown_in_order_for_its_time(tab: Page, service: Service) -> None:
@@ -120,26 +122,26 @@ def test_every_pattern_is_shown_in_order_for_its_time(tab: Page, service: Servic
             };
             requestAnimationFrame(look);
         }""",
-        clock.Border(**SCREEN).top,
+        program_border.Border(**SCREEN).top,
     )
     tab.get_by_label("Patterns a second").fill("10")
     tab.get_by_role("button", name="full screen").press("Enter")
     played = tab.evaluate("window.played")
     seen = tab.evaluate("window.seen")
     refresh = played["refresh"]
-    steps = clock.schedule(32, 10)
+    steps = program_border.schedule(32, 10)
     assert [(s["number"], s["white"]) for s in played["shown"]] == [(s.number, s.white) for s in steps]
 
     # The numbers as a reader sees them, and black and white of the lead.
-    numbers, certain = clock.read(np.array([cells for *_, cells in seen], float))
+    numbers, certain = program_border.read(np.array([cells for *_, cells in seen], float))
     at = np.array([now for now, *_ in seen])
     states = [
-        (int(number), middle > 127 if number == clock.LEAD else None)
+        (int(number), middle > 127 if number == program_border.LEAD else None)
         for number, (_, middle, _), sure in zip(numbers, seen, certain, strict=True)
         if sure
     ]
     times = at[certain]
-    expected = [(s.number, s.white if s.number == clock.LEAD else None) for s in steps]
+    expected = [(s.number, s.white if s.number == program_border.LEAD else None) for s in steps]
     runs = [(state, [i for i, _ in group]) for state, group in groupby(enumerate(states), key=lambda e: e[1])]
     assert [state for state, _ in runs] == expected
     # Each is there for its number of refreshes, to one; frames that this machine had no time for are made up for.

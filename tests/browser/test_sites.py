@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page
 
+from tests.end_to_end.captures.test_bad_input import check_problem
 from tests.end_to_end.conftest import Service
-from tests.end_to_end.test_bad_input import check_problem
 
 pytestmark = pytest.mark.full
 

@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 
 from services.client import Client
-from workflows import images, simulate
-from workflows.presets import preset
-from workflows.scene import write_capture
-from workflows.tone import from_light
+from workflows.images import integer_formats
+from workflows.images.tone_curves import from_light
+from workflows.programs.presets import preset
+from workflows.simulation import glass_ball
+from workflows.simulation.scene import write_capture
 
 pytestmark = [pytest.mark.full, pytest.mark.timeout(900)]
 
@@ -124,15 +125,15 @@ def client(cluster: Cluster) -> Iterator[Client]:
 def capture(client: Client, tmp_path_factory: pytest.TempPathFactory) -> str:
     """A capture in the cluster, ingested."""
     path = tmp_path_factory.mktemp("capture") / "ball.zip"
-    write_capture(simulate.glass_ball(96, 72, rays=16), preset("quick"), path, name="ball")
+    write_capture(glass_ball.glass_ball(96, 72, rays=16), preset("quick"), path, name="ball")
     uploaded = client.upload(path)
     client.wait(uploaded["job"])
     return str(uploaded["id"])
 
 
 def composite(client: Client, matte: str) -> bytes:
-    backdrop = images.to_integers(from_light(simulate.backdrop(), "srgb"), np.dtype(np.uint8))
-    return client.composite(matte, images.encode_png(backdrop))
+    backdrop = integer_formats.to_integers(from_light(glass_ball.backdrop(), "srgb"), np.dtype(np.uint8))
+    return client.composite(matte, integer_formats.encode_png(backdrop))
 
 
 def test_every_process_has_no_more_rights_than_it_needs(cluster: Cluster, client: Client) -> None:

@@ -12,9 +12,9 @@ import kubernetes_validate
 import pytest
 import yaml
 
-from services.certs import make
+from services.runtime.certificates import make
 from services.settings import Settings
-from tests.services.clusters import address, started, wait
+from tests.services.cluster.clusters import address, started, wait
 
 MANIFEST = Path(__file__).parents[2] / "docker" / "kubernetes.yaml"
 OLDEST = "1.25"

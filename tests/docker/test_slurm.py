@@ -12,13 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from services.certs import make
 from services.client import Client
+from services.runtime.certificates import make
 from tests.end_to_end.conftest import Service, digests, serving
-from tests.services.clusters import address, started, wait
-from workflows import simulate
-from workflows.presets import preset
-from workflows.scene import write_capture
+from tests.services.cluster.clusters import address, started, wait
+from workflows.programs.presets import preset
+from workflows.simulation import glass_ball
+from workflows.simulation.scene import write_capture
 
 pytestmark = [pytest.mark.full, pytest.mark.timeout(600)]
 
@@ -143,7 +143,7 @@ def test_a_job_outlives_workers_that_are_cancelled(slurm: Slurm, service: Servic
     wait(lambda: len(workers(service)) == 2)
     assert {one["memory_limit_bytes"] for one in workers(service)} == {900_000_000}
     path = tmp_path / "ball.zip"
-    write_capture(simulate.glass_ball(96, 72, rays=16), preset("quick"), path, name="ball")
+    write_capture(glass_ball.glass_ball(96, 72, rays=16), preset("quick"), path, name="ball")
     capture = service.client.upload(path)
     service.client.wait(capture["job"])
     undisturbed = recovered(service.client, capture["id"])

@@ -16,12 +16,13 @@ import psutil
 import pytest
 
 from services.client import Client
-from storage.checksums import SUFFIX
-from tests.services.clusters import workers
-from workflows import images, simulate
-from workflows.program import Program
-from workflows.scene import Scene, nested_program, write_capture
-from workflows.tone import from_light
+from storage.objects.checksums import SUFFIX
+from tests.services.cluster.clusters import workers
+from workflows.images import integer_formats
+from workflows.images.tone_curves import from_light
+from workflows.programs.program import Program
+from workflows.simulation import glass_ball
+from workflows.simulation.scene import Scene, nested_program, write_capture
 
 BANDS = ((8, 6, 16), (16, 12, 16), (32, 24, 20))
 
@@ -116,7 +117,9 @@ def paused(service: Service) -> Iterator[None]:
 
 def png(light: np.ndarray, transfer: str, dtype: type) -> bytes:
     """A backdrop of linear light as it is sent."""
-    return images.encode_png(images.to_integers(from_light(light, transfer), np.dtype(dtype)))
+    return integer_formats.encode_png(
+        integer_formats.to_integers(from_light(light, transfer), np.dtype(dtype))
+    )
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -136,7 +139,7 @@ def program() -> Program:
 
 @pytest.fixture(scope="session")
 def scene() -> Scene:
-    return simulate.glass_ball(96, 72, rays=16)
+    return glass_ball.glass_ball(96, 72, rays=16)
 
 
 @pytest.fixture(scope="session")

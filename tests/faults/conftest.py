@@ -9,8 +9,8 @@ import pytest
 
 from tests.end_to_end.conftest import BANDS
 from tests.faults.rig import Rig, Row
-from workflows import simulate
-from workflows.scene import nested_program, write_capture
+from workflows.simulation import glass_ball
+from workflows.simulation.scene import nested_program, write_capture
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -47,7 +47,7 @@ def table(pytestconfig: pytest.Config) -> Iterator[list[Row]]:
 def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A capture of a glass ball, of 60 tiles."""
     path = tmp_path_factory.mktemp("bundle") / "ball.zip"
-    write_capture(simulate.glass_ball(160, 96, rays=9), nested_program(bands=BANDS, levels=5), path)
+    write_capture(glass_ball.glass_ball(160, 96, rays=9), nested_program(bands=BANDS, levels=5), path)
     return path
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import httpx2
 import pytest
 
-from services import certs
+from services.runtime import certificates
 from tests.faults.rig import Rig, free_port, url_of
 
 HOSTS = ("scheduler", "service0", "worker0", "worker1")
@@ -89,7 +89,7 @@ class Hosts(Rig):
             ThreadPoolExecutor(1, initializer=_enter, initargs=(self.network.namespace("service0"),))
         )
         self._inside = inside
-        certs.make(self.folder / "certs")
+        certificates.make(self.folder / "certs")
         trusted = ("--certs", str(self.folder / "certs"))
         port = free_port()
         self.cluster = f"tls://{self.network.address('scheduler')}:{port}"

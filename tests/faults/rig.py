@@ -16,9 +16,9 @@ from typing import Any, Self
 import httpx2
 import psutil
 
-from storage import mattes
-from storage.objects import Objects
-from tests.services.clusters import started, workers
+from storage.layout import mattes
+from storage.objects.store import Objects
+from tests.services.cluster.clusters import started, workers
 
 STUCK = 240.0
 """Seconds after which a job that has not ended counts as lost."""

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from storage import mattes
-from storage.objects import Objects
+from storage.layout import mattes
+from storage.objects.store import Objects
 from tests.disks import small_disk
 from tests.end_to_end.conftest import Service, paused, serving
 from tests.faults.conftest import check
 from tests.faults.rig import Row, stored
-from tests.services.clusters import wait
+from tests.services.cluster.clusters import wait
 
 pytestmark = [pytest.mark.full, pytest.mark.timeout(900)]
 

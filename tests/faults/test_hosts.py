@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from storage import leases
-from storage.database import open_engine, reading
+from storage.database.engine import open_engine, reading
+from storage.records import leases
 from tests.faults.conftest import Known, check, prepared
 from tests.faults.hosts import Hosts
 from tests.faults.rig import Row
-from tests.services.clusters import wait
+from tests.services.cluster.clusters import wait
 
 pytestmark = [pytest.mark.full, pytest.mark.timeout(3600)]
 

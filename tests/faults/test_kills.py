@@ -11,7 +11,7 @@ import pytest
 
 from tests.faults.conftest import Known, check
 from tests.faults.rig import Row, freeze, thaw
-from tests.services.clusters import wait
+from tests.services.cluster.clusters import wait
 
 pytestmark = [pytest.mark.full, pytest.mark.timeout(7200)]
 

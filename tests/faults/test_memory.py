@@ -11,7 +11,7 @@ import pytest
 from tests.end_to_end.conftest import digests, serving
 from tests.faults.conftest import check
 from tests.faults.rig import Row
-from tests.services.clusters import wait
+from tests.services.cluster.clusters import wait
 
 pytestmark = [pytest.mark.full, pytest.mark.timeout(1800)]
 

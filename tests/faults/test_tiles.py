@@ -10,10 +10,10 @@ from urllib.parse import urlsplit
 import pytest
 from distributed import Client
 
-from services.drive import LOSSES
+from services.coordinator.job_run import LOSSES
 from tests.faults.conftest import Known, check
 from tests.faults.rig import Rig, Row
-from tests.services.clusters import listening
+from tests.services.cluster.clusters import listening
 
 pytestmark = [pytest.mark.full, pytest.mark.timeout(900)]
 

@@ -8,7 +8,7 @@ import pytest
 from services.client import Client
 from tests.faults.conftest import Known
 from tests.faults.rig import Rig
-from tests.services.clusters import wait
+from tests.services.cluster.clusters import wait
 
 pytestmark = [pytest.mark.full, pytest.mark.long, pytest.mark.timeout(900)]
 

@@ -79,7 +79,7 @@ class Failure(NamedTuple):
     file: Path
 
     def __str__(self) -> str:
-        again = f"python -m tests.benchmarks.fuzzing --target {self.target} --seed {self.seed}"
+        again = f"python -m tests.benchmarks.service.fuzzing --target {self.target} --seed {self.seed}"
         return f"{self.target}: {self.kind}: {self.what}\n  input: {self.file}\n  again: {again}"
 
 

@@ -9,15 +9,16 @@ from urllib.parse import unquote
 
 import h11
 
-from services.api import build_app
+from services.api.app import build_app
 from services.settings import Settings
-from storage import composites, jobs, mattes, programs, uploads
-from storage.database import open_engine, writing
-from storage.objects import Objects
+from storage.database.engine import open_engine, writing
+from storage.layout import composites
+from storage.objects.store import Objects
+from storage.records import job_log, jobs, mattes, programs, tiles, uploads
 from tests.fuzzing import changes, seeds
 from tests.fuzzing.campaign import KEPT, Refused
-from tests.workflows.archive.conftest import make_matte
-from workflows.images import encode_png
+from tests.workflows.mattes.imports.conftest import make_matte
+from workflows.images.integer_formats import encode_png
 
 SPECIAL = (
     *(
@@ -184,8 +185,8 @@ class Served:
         with writing(engine) as c:
             mattes.add_imported(c, "m", matte.attributes["options"], matte.figures, 1000, None)
             jobs.add(c, "composite", "", {}, "m", None, "v", 1000)
-            jobs.begin(c, "v")
-            jobs.note(c, "v", "a line")
+            tiles.begin(c, "v")
+            job_log.note(c, "v", "a line")
             jobs.end(c, "v", "succeeded")
             self.program = programs.add(c, BODIES[JSON[2]]["program"])
             uploads.add(c, "u", 100, "", 1e6, None)

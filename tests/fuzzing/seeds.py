@@ -14,8 +14,8 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
-from tests.workflows.dngs import dng
-from workflows.images import encode_png
+from tests.workflows.images.dngs import dng
+from workflows.images.integer_formats import encode_png
 
 PIXELS = np.random.default_rng(9).integers(0, 255, (24, 36, 3), np.uint8)
 LIGHT = (PIXELS / 255).astype(np.float32)

@@ -18,33 +18,37 @@ import numpy as np
 from PIL import Image
 from starlette.requests import Request
 
-from services import addresses
-from services.api import clips as clips_api
-from services.api import composites as composites_api
-from services.api import tus
-from services.api.context import is_known
-from services.api.errors import problem_of
-from services.tracing import TRACEPARENT
-from storage import composites, uploads, zips
-from storage.archives import Archive
-from storage.checksums import seal
+from services.api.captures import tus
+from services.api.http.responses import is_known
+from services.api.mattes import clips as clips_api
+from services.api.mattes import composites as composites_api
+from services.runtime.problems import problem_of
+from services.runtime.tracing import TRACEPARENT
+from services.webhooks import safe_http
 from storage.errors import ArchiveError, CaptureError, InvalidInput
-from storage.objects import Objects
+from storage.layout import composites as stored_composites
+from storage.layout import uploads
+from storage.layout.matte_archive import Archive
+from storage.objects.checksums import seal
+from storage.objects.store import Objects
 from tests.fuzzing import changes, requests, seeds
 from tests.fuzzing.campaign import GUARDED, KEPT, MEMORY, Refused, Target
-from tests.workflows.archive.conftest import make_matte, pack_chunk, signed, unpack_chunk, unpacked
-from tests.workflows.ingest.camera import Camera, capture, film, lights, overstated
-from workflows import clips, floats, images, pictures, raw
-from workflows.archive.importing import take_in
+from tests.workflows.ingest.video.camera import Camera, capture, film, lights, overstated
+from tests.workflows.mattes.imports.conftest import make_matte, pack_chunk, signed, unpack_chunk, unpacked
 from workflows.composite import composite
-from workflows.composite.backdrops import backdrop_of
-from workflows.ingest import frames
-from workflows.ingest.bundle import Bundle, Limits
-from workflows.ingest.video import PARTS, Share, opened
-from workflows.options import parse_options
-from workflows.program import Program
-from workflows.scene import nested_program
-from workflows.simulate import glass_ball
+from workflows.composite.backdrop import backdrop_of
+from workflows.composite.video import steps as video_steps
+from workflows.images import camera_raw, decode, float_formats, integer_formats
+from workflows.ingest import steps as ingest_steps
+from workflows.ingest.bundle import Bundle
+from workflows.ingest.video.decoder import PARTS, Share, opened
+from workflows.mattes.imports.importing import take_in
+from workflows.mattes.options import parse_options
+from workflows.programs.program import Program
+from workflows.simulation.glass_ball import glass_ball
+from workflows.simulation.scene import nested_program
+from workflows.untrusted import zip_files
+from workflows.untrusted.limits import Limits
 
 LIMITS = Limits(unpacked=1 << 22, memory=1 << 22, frames=20_000, pixels=1 << 20)
 Files = tuple[bytes, ...]
@@ -87,9 +91,9 @@ def make_zip(random: Random, whole: Files) -> bytes:
 
 
 def read_zip(data: bytes, folder: Path) -> None:
-    archive = zips.opened(io.BytesIO(data), CaptureError)
-    for info in zips.entries(archive, 100, LIMITS.unpacked, CaptureError).values():
-        assert len(zips.read(archive, info, 1 << 16, CaptureError)) <= info.file_size
+    archive = zip_files.opened(io.BytesIO(data), CaptureError)
+    for info in zip_files.entries(archive, 100, LIMITS.unpacked, CaptureError).values():
+        assert len(zip_files.read(archive, info, 1 << 16, CaptureError)) <= info.file_size
 
 
 def make_bundle(random: Random, whole: Files) -> bytes:
@@ -188,7 +192,7 @@ def read_archive(data: bytes, folder: Path) -> None:
 
 
 def read_image(data: bytes, folder: Path) -> None:
-    pixels = images.decode(data, memory=LIMITS.image)
+    pixels = integer_formats.decode(data, memory=LIMITS.image)
     assert pixels.dtype in (np.uint8, np.uint16)
     assert pixels.ndim == 3
     assert pixels.shape[2] in (1, 3)
@@ -196,7 +200,7 @@ def read_image(data: bytes, folder: Path) -> None:
 
 
 def read_any_backdrop(data: bytes, folder: Path) -> None:
-    backdrop = backdrop_of(pictures.decode(data, "srgb", memory=LIMITS.image), "srgb")
+    backdrop = backdrop_of(decode.decode(data, "srgb", memory=LIMITS.image), "srgb")
     pixels = backdrop.pixels
     assert pixels.ndim == 3
     assert 0 < pixels.nbytes <= 4 * LIMITS.image
@@ -204,9 +208,9 @@ def read_any_backdrop(data: bytes, folder: Path) -> None:
 
 
 def read_floats(data: bytes, folder: Path) -> None:
-    if not floats.is_float(data):
+    if not float_formats.is_float(data):
         raise Refused
-    light = floats.decode(data, memory=LIMITS.image)
+    light = float_formats.decode(data, memory=LIMITS.image)
     assert light.dtype == np.float32
     assert light.ndim == 3
     assert light.shape[2] in (1, 3)
@@ -214,7 +218,7 @@ def read_floats(data: bytes, folder: Path) -> None:
 
 
 def read_raw(data: bytes, folder: Path) -> None:
-    light = raw.decode(data, memory=LIMITS.image)
+    light = camera_raw.decode(data, memory=LIMITS.image)
     assert light.dtype == np.float32
     assert light.ndim == 3
     assert light.shape[2] == 3
@@ -284,13 +288,13 @@ def store(folder: Path) -> Objects:
 
 def read_backdrop_clip(data: bytes, folder: Path) -> None:
     objects = store(folder)
-    objects.put(composites.clip_path("j"), data)
+    objects.put(stored_composites.clip_path("j"), data)
     try:
-        plan = clips.prepare(objects, "j", "m", LIMITS)
+        plan = video_steps.prepare(objects, "j", "m", LIMITS)
         json.dumps(plan, allow_nan=False)
-        clips.work(objects, "j", "m", "srgb", clips.Placement(), LIMITS, plan, 0)
+        video_steps.work(objects, "j", "m", "srgb", video_steps.Placement(), LIMITS, plan, 0)
     finally:
-        objects.delete(composites.path("j"))
+        objects.delete(stored_composites.path("j"))
 
 
 PROGRAM = nested_program((64, 48), ((4, 3, 10),), levels=3)
@@ -341,10 +345,10 @@ def read_capture(data: bytes, folder: Path) -> None:
     asyncio.run(put())
     uploads.seal(objects, "c", [uploads.Part("all", len(data))])
     try:
-        plan = frames.prepare(objects, "c", LIMITS)
+        plan = ingest_steps.prepare(objects, "c", LIMITS)
         json.dumps(plan, allow_nan=False)
         for tile in range(plan["tiles"]):
-            frames.read_slab(objects, "c", LIMITS, plan["slab"], tile)
+            ingest_steps.read_slab(objects, "c", LIMITS, plan["slab"], tile)
     except CaptureError as error:
         if not error.fields["entry"]:
             raise AssertionError("a capture's error names no entry") from error
@@ -440,7 +444,7 @@ def make_url(random: Random, whole: Files) -> bytes:
 
 
 def read_url(data: bytes, folder: Path) -> None:
-    addresses.check(data.decode("utf-8", "replace"), private=bool(data and data[0] & 1))
+    safe_http.check(data.decode("utf-8", "replace"), private=bool(data and data[0] & 1))
 
 
 def target(

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from services import certs
+from services.runtime import certificates as certificate_files
 from services.settings import ClusterSettings, Settings
 
 
@@ -51,7 +51,7 @@ def test_what_is_out_of_range_is_refused(wrong: dict[str, int]) -> None:
 @pytest.fixture(scope="module")
 def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("certs") / "certs"
-    certs.make(folder)
+    certificate_files.make(folder)
     return folder
 
 

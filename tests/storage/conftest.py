@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from sqlalchemy import Engine
 
-from storage.database import open_engine
-from storage.objects import Objects
+from storage.database.engine import open_engine
+from storage.objects.store import Objects
 
 
 @pytest.fixture

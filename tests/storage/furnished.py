@@ -5,12 +5,15 @@ import asyncio
 import numpy as np
 from sqlalchemy import Connection, Engine
 
-from storage import captures, composites, jobs, keys, live, mattes, programs, uploads
-from storage.captures import Stack, create_stack, write_slab
-from storage.database import writing
-from storage.objects import Objects
-from storage.uploads import Part
-from tests.storage.test_mattes import block, extent, places
+from storage.database.engine import writing
+from storage.layout import composites, live
+from storage.layout import mattes as stored_mattes
+from storage.layout import uploads as stored_uploads
+from storage.layout.captures import Stack, create_stack, write_slab
+from storage.layout.uploads import Part
+from storage.objects.store import Objects
+from storage.records import api_keys, captures, idempotency, jobs, mattes, programs, tiles, uploads
+from tests.storage.layout.test_mattes import block, extent, places
 
 SHAPE = (6, 21, 40, 3)
 ARCHIVE = np.random.default_rng(4).bytes((2 << 20) + 777)
@@ -44,14 +47,14 @@ def furnish(engine: Engine, objects: Objects) -> None:
     stack.save()
     for matte in ("m", "l", "r"):
         given = {"monitor": [8, 6], "crosstalk": np.eye(3).tolist(), "options": {"method": "lobes"}}
-        made = mattes.create(objects, matte, height=21, width=40, columns=4, rows=3, **given)
+        made = stored_mattes.create(objects, matte, height=21, width=40, columns=4, rows=3, **given)
         for row, column in places(made)[: 2 if matte == "r" else None]:
             made.write(row, column, block(*extent(made, row, column), seed=10 * row + column))
     live.keep(objects, "m", "live-1", rng.bytes(1000))
-    stream(objects, uploads.part_path("i", "all"), ARCHIVE)
-    uploads.seal(objects, "i", [Part("all", len(ARCHIVE))])
+    stream(objects, stored_uploads.part_path("i", "all"), ARCHIVE)
+    stored_uploads.seal(objects, "i", [Part("all", len(ARCHIVE))])
     for part in ("p", "q"):
-        stream(objects, uploads.part_path("u", part), ARCHIVE[:999])
+        stream(objects, stored_uploads.part_path("u", part), ARCHIVE[:999])
     stream(objects, composites.video_path("v"), ARCHIVE[:5000])
     for job in ("w", "x"):
         stream(objects, composites.clip_path(job), ARCHIVE[:6000])
@@ -59,7 +62,7 @@ def furnish(engine: Engine, objects: Objects) -> None:
         objects.put(composites.segment_path(job, 0), ARCHIVE[:70])
     with writing(engine) as c:
         write_down(c)
-        keys.make(c, "lab", "alice", "write")
+        api_keys.make(c, "lab", "alice", "write")
 
 
 def write_down(c: Connection) -> None:
@@ -82,11 +85,11 @@ def write_down(c: Connection) -> None:
             job=job,
             webhook="https://example.org" if job == "v" else None,
         )
-        jobs.begin(c, job)
+        tiles.begin(c, job)
     for job in ("rr", "ii"):
         jobs.enter(c, job, "recovering")
-        jobs.lay_down(c, job, {"tiles": 6})
-    jobs.finish(c, "rr", [(0, 0.5, 16), (1, 0.25, 16)])
+        tiles.lay_down(c, job, {"tiles": 6})
+    tiles.finish(c, "rr", [(0, 0.5, 16), (1, 0.25, 16)])
     captures.add(c, "c", "ci", name="ball \u2713", bytes=5, frames=6, program={"levels": [0.25, 1e-300]})
     captures.change(c, "c", state="ready", owner="alice")
     captures.add(c, "i", "ii", name="", bytes=len(ARCHIVE), frames=6, program={}, seconds=1e6)
@@ -99,7 +102,7 @@ def write_down(c: Connection) -> None:
     for job in ("ci", "mr", "v"):
         jobs.end(c, job, "succeeded")
     jobs.end(c, "x", "failed", AGAIN)
-    jobs.remember(c, "key", "POST /v1/captures", "c")
+    idempotency.remember(c, "key", "POST /v1/captures", "c")
     programs.add(c, {"any": 1})
 
 

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import zarr
 
-from storage import uploads
-from storage.database import open_engine, writing
+from storage.database.engine import open_engine, writing
 from storage.errors import NoRoom
-from storage.objects import Objects
+from storage.objects.store import Objects
+from storage.records import uploads
 from tests.disks import small_disk
 from tests.postgres import TEMPLATE, Server
-from tests.services.clusters import wait
+from tests.services.cluster.clusters import wait
 
 SIZE = 12 << 20
 

@@ -11,14 +11,14 @@ from typing import Any
 
 import pytest
 
-from storage import captures, uploads
-from storage.captures import Stack
-from storage.objects import Objects
-from tests.workflows.dngs import dng
-from workflows.ingest import frames
-from workflows.ingest.bundle import Limits
-from workflows.ingest.measure import measure
-from workflows.ingest.survey import survey
+from storage.layout import captures, uploads
+from storage.layout.captures import Stack
+from storage.objects.store import Objects
+from tests.workflows.images.dngs import dng
+from workflows.ingest import steps as ingest_steps
+from workflows.ingest.report.calibration import measure
+from workflows.ingest.report.survey import survey
+from workflows.untrusted.limits import Limits
 
 Zip = Callable[..., bytes]
 Ingest = Callable[..., Stack]
@@ -82,9 +82,9 @@ def ingest(objects: Objects, put: Callable[[str, bytes], None]) -> Ingest:
         objects.delete(captures.path(capture))  # nothing of an earlier one
         put(capture, data)
         limits = Limits(unpacked=unpacked, memory=memory)
-        plan = frames.prepare(objects, capture, limits)
+        plan = ingest_steps.prepare(objects, capture, limits)
         for index in order(range(plan["tiles"])):
-            frames.read_slab(objects, capture, limits, plan["slab"], index)
+            ingest_steps.read_slab(objects, capture, limits, plan["slab"], index)
         stack = Stack(objects, capture)
         measure(stack)
         survey(stack)

@@ -10,10 +10,10 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image, ImageCms, ImageOps
 
-from storage.captures import Stack
 from storage.errors import CaptureError
+from storage.layout.captures import Stack
 from tests.workflows.ingest.records import record
-from workflows import floats, images, pictures, raw
+from workflows.images import camera_raw, decode, float_formats, integer_formats
 
 MEMORY = 1 << 20
 TAG = 274
@@ -48,51 +48,51 @@ def tiff(turn: int, pixels: NDArray[Any]) -> bytes:
 def test_every_orientation_of_every_kind(turn: int) -> None:
     expected = shown(PIXELS, turn)
     for data in (saved("PNG", turn), tiff(turn, PIXELS), saved("TIFF", turn, compression="tiff_lzw")):
-        assert images.orientation(data) == turn
-        np.testing.assert_array_equal(images.decode(data, memory=MEMORY), expected)
-        np.testing.assert_array_equal(images.decode(data, memory=MEMORY, turn=1), PIXELS)
-    np.testing.assert_array_equal(images.decode(tiff(turn, DEEP), memory=MEMORY) // 257, expected)
+        assert integer_formats.orientation(data) == turn
+        np.testing.assert_array_equal(integer_formats.decode(data, memory=MEMORY), expected)
+        np.testing.assert_array_equal(integer_formats.decode(data, memory=MEMORY, turn=1), PIXELS)
+    np.testing.assert_array_equal(integer_formats.decode(tiff(turn, DEEP), memory=MEMORY) // 257, expected)
     np.testing.assert_array_equal(
-        floats.decode(tiff(turn, PIXELS.astype(np.float32)), memory=MEMORY), expected
+        float_formats.decode(tiff(turn, PIXELS.astype(np.float32)), memory=MEMORY), expected
     )
     for data in (
         saved("JPEG", turn),
         saved("TIFF", turn, compression="jpeg"),
     ):  # the latter Pillow turns itself
-        plain = images.decode(data, memory=MEMORY, turn=1)
+        plain = integer_formats.decode(data, memory=MEMORY, turn=1)
         assert plain.shape == PIXELS.shape
-        np.testing.assert_array_equal(images.decode(data, memory=MEMORY), shown(plain, turn))
+        np.testing.assert_array_equal(integer_formats.decode(data, memory=MEMORY), shown(plain, turn))
 
 
 def test_a_backdrop_is_upright_with_its_profile_and_its_transparency() -> None:
     profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
-    found = pictures.decode(saved("JPEG", 6, icc_profile=profile), "srgb", memory=MEMORY)
+    found = decode.decode(saved("JPEG", 6, icc_profile=profile), "srgb", memory=MEMORY)
     assert found.shape == (9, 6, 3)
     seen = np.dstack([PIXELS, PIXELS[..., :1]])
-    found = pictures.decode(saved("PNG", 3, seen), "srgb", memory=MEMORY)
+    found = decode.decode(saved("PNG", 3, seen), "srgb", memory=MEMORY)
     np.testing.assert_array_equal(found, seen[::-1, ::-1])
 
 
 @pytest.mark.parametrize("turn", [0, 9, 65535])
 def test_what_is_no_orientation_turns_nothing(turn: int) -> None:
     for data in (saved("JPEG", turn), tiff(turn, PIXELS)):
-        assert images.orientation(data) == 1
-        assert images.decode(data, memory=MEMORY).shape == PIXELS.shape
-    assert images.orientation(b"no picture") == raw.orientation(b"no picture") == 1
+        assert integer_formats.orientation(data) == 1
+        assert integer_formats.decode(data, memory=MEMORY).shape == PIXELS.shape
+    assert integer_formats.orientation(b"no picture") == camera_raw.orientation(b"no picture") == 1
 
 
 def test_the_limit_of_memory_comes_before_the_orientation() -> None:
-    with pytest.raises(images.ImageError, match="takes more"):
-        images.decode(saved("PNG", 6, np.zeros((600, 900, 3), np.uint8)), memory=MEMORY)
+    with pytest.raises(integer_formats.ImageError, match="takes more"):
+        integer_formats.decode(saved("PNG", 6, np.zeros((600, 900, 3), np.uint8)), memory=MEMORY)
 
 
 @pytest.mark.parametrize(("turn", "quarters"), [(1, 0), (3, 2), (6, 3), (8, 1)])
 def test_camera_raw(make_dng: Callable[..., bytes], turn: int, quarters: int) -> None:
     counts = np.random.default_rng(8).integers(300, 4000, (40, 60), np.uint16)
     data = make_dng(counts, 256, 4095, orientation=turn)
-    assert raw.orientation(data) == turn
-    upright = raw.decode(data, memory=MEMORY)
-    np.testing.assert_array_equal(upright, np.rot90(raw.decode(data, memory=MEMORY, turn=1), quarters))
+    assert camera_raw.orientation(data) == turn
+    upright = camera_raw.decode(data, memory=MEMORY)
+    np.testing.assert_array_equal(upright, np.rot90(camera_raw.decode(data, memory=MEMORY, turn=1), quarters))
 
 
 def test_all_frames_are_turned_as_the_first_one_is(make_zip: Zip, ingest: Ingest) -> None:
@@ -102,7 +102,10 @@ def test_all_frames_are_turned_as_the_first_one_is(make_zip: Zip, ingest: Ingest
     mask = np.zeros((30, 20, 1), np.uint8)  # drawn over a frame as it is shown
     mask[5:25, 5:15] = 255
     stack = ingest(
-        "c", make_zip(record(list(range(6)), mask="mask.png"), files | {"mask.png": images.encode_png(mask)})
+        "c",
+        make_zip(
+            record(list(range(6)), mask="mask.png"), files | {"mask.png": integer_formats.encode_png(mask)}
+        ),
     )
     assert (stack.width, stack.height) == (20, 30)
     np.testing.assert_array_equal(stack.read(), np.rot90(shots, 3, axes=(1, 2)))
@@ -115,5 +118,8 @@ def test_a_mask_that_is_not_turned_with_the_frames_is_told(make_zip: Zip, ingest
     with pytest.raises(CaptureError, match="turned upright as the first of them says"):
         ingest(
             "c",
-            make_zip(record(list(range(6)), mask="mask.png"), files | {"mask.png": images.encode_png(shot)}),
+            make_zip(
+                record(list(range(6)), mask="mask.png"),
+                files | {"mask.png": integer_formats.encode_png(shot)},
+            ),
         )

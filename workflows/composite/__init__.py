@@ -6,11 +6,11 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.mattes import Matte
+from storage.layout.mattes import Matte
+from workflows.composite.backdrop import Backdrop, node_light
+from workflows.composite.depth import Rays
 from workflows.composite.engine import Window, compose
-from workflows.composite.light import Backdrop, node_light
-from workflows.composite.placing import Placement
-from workflows.composite.rays import Rays
+from workflows.composite.placement import Placement
 from workflows.composite.strips import Strip, read_strip
 from workflows.composite.threads import CORES
 
@@ -59,16 +59,3 @@ def composite(
     return compose(
         matte, light, window or Window.of(matte), read or partial(read_strip, matte), threads, rays
     )
-
-
-def confidence(matte: Matte) -> NDArray[np.float32]:
-    """How far a matte can be trusted.
-
-    Returns
-    -------
-    (height, width) float32
-        ``1 / (1 + e / 0.01)``, e the error to expect of a composite in camera units: 1/2 at 40 dB. 0 where nothing was
-        recovered.
-    """
-    trusted = 1 / (1 + matte.layer("error") / np.float32(0.01))
-    return np.where(matte.layer("recovered"), trusted, 0).astype(np.float32)

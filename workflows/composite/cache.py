@@ -4,9 +4,9 @@ import threading
 from collections import OrderedDict
 from concurrent.futures import Future
 
-from storage.mattes import Matte
-from storage.objects import Objects
-from workflows.composite.rays import Places, places_of
+from storage.layout.mattes import Matte
+from storage.objects.store import Objects
+from workflows.composite.depth import Places, places_of
 from workflows.composite.strips import Blocks, Strip, columns_of, read_strip
 
 Key = tuple[str, int, int, tuple[int, ...]]

@@ -9,12 +9,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from storage.errors import OptionError
-from storage.mattes import Matte
+from storage.layout.mattes import Matte
+from workflows.composite.depth import Rays, arrived_along
 from workflows.composite.gather import gather
-from workflows.composite.rays import Rays, arrived_along
 from workflows.composite.strips import LENGTH, Strip
 from workflows.composite.threads import in_parts
-from workflows.grids import area_mean
+from workflows.images.resample import area_mean
 from workflows.recovery.pyramid import Grids, Pyramid
 
 

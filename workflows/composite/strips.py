@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.mattes import Block, Matte
+from storage.layout.mattes import Block, Matte
 
 LENGTH = 256
 """Pixels of a strip from left to right; the last one of a row may have fewer."""

@@ -5,17 +5,17 @@ import tempfile
 import zipfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from typing import Annotated, BinaryIO, Literal, cast
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
 
-from storage import zips
-from storage.errors import CaptureError, OverLimit
-from workflows.clock import Border
-from workflows.program import Images, Program
-from workflows.tone import Response
+from storage.errors import CaptureError
+from workflows.images.tone_curves import Response
+from workflows.programs.border import Border
+from workflows.programs.program import Images, Program
+from workflows.untrusted import zip_files
+from workflows.untrusted.limits import Limits
 
 MANIFEST = "capture.json"
 MANIFEST_BYTES = 4 << 20
@@ -63,63 +63,6 @@ class Manifest(BaseModel):
     mask: str | None = None
 
 
-@dataclass(frozen=True)
-class Limits:
-    """What a bundle may cost whoever reads it.
-
-    Attributes
-    ----------
-    unpacked : int
-        Bytes of all its entries together, and of all its frames once they are decoded.
-    memory : int
-        Bytes that one reader may hold; an entry, or an image decoded, may take a quarter of it.
-    frames, pixels : int, optional
-        How many frames it may have, and how many pixels one of them; no more limit than the others if None.
-    """
-
-    unpacked: int
-    memory: int
-    frames: int | None = None
-    pixels: int | None = None
-
-    @property
-    def image(self) -> int:
-        """Bytes that one entry, and one decoded image, may take."""
-        return self.memory // 4
-
-    def see_that_frames_may(self, frames: int, **where: str) -> None:
-        """See that a capture may have so many frames.
-
-        Parameters
-        ----------
-        **where : str
-            ``entry`` that says so, and its ``field``.
-
-        Raises
-        ------
-        OverLimit
-        """
-        if self.frames is not None and frames > self.frames:
-            raise OverLimit(
-                f"a capture may have {self.frames} frames, this one has {frames}; leave some out",
-                **where,
-                name="capture_frames",
-                limit=self.frames,
-                value=frames,
-            )
-
-    def see_that_pixels_may(self, width: int, height: int, **where: str) -> None:
-        """See that frames may be so large; the same."""
-        if self.pixels is not None and width * height > self.pixels:
-            raise OverLimit(
-                f"a frame may have {self.pixels} pixels, and these have {width} x {height}; make them smaller",
-                **where,
-                name="capture_pixels",
-                limit=self.pixels,
-                value=width * height,
-            )
-
-
 class Bundle:
     """An opened bundle.
 
@@ -138,8 +81,8 @@ class Bundle:
     def __init__(self, file: BinaryIO, limits: Limits) -> None:
         self._limits = limits
         self._file = file
-        self._archive = zips.opened(file, CaptureError)
-        self._entries = zips.entries(self._archive, ENTRIES, limits.unpacked, CaptureError)
+        self._archive = zip_files.opened(file, CaptureError)
+        self._entries = zip_files.entries(self._archive, ENTRIES, limits.unpacked, CaptureError)
         self.manifest = self._read_manifest()
         self._check_manifest()
 
@@ -154,7 +97,7 @@ class Bundle:
         info = self._entries.get(entry)
         if info is None:
             raise CaptureError(f"{entry} is not in the archive", entry=entry)
-        return zips.read(self._archive, info, self._limits.image, CaptureError)
+        return zip_files.read(self._archive, info, self._limits.image, CaptureError)
 
     @contextmanager
     def open(self, entry: str) -> Iterator[BinaryIO]:
@@ -182,7 +125,7 @@ class Bundle:
                         for done in range(0, info.file_size, PIECE):
                             file.write(packed.read(min(PIECE, info.file_size - done)))
                         file.seek(0)
-            except zips.UNREADABLE as error:
+            except zip_files.UNREADABLE as error:
                 raise CaptureError(f"{entry} is damaged in the archive: {error}", entry=entry) from error
             yield file
 

@@ -6,12 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.errors import CaptureError, ImageError
-from workflows import floats, images, raw
-from workflows.floats import Floats
-from workflows.images import Codes
-from workflows.ingest.bundle import MANIFEST, Bundle, Limits
-from workflows.ingest.guard import Guard
-from workflows.tone import BLACK
+from workflows.images import camera_raw, float_formats, integer_formats
+from workflows.images.float_formats import Floats
+from workflows.images.integer_formats import Codes
+from workflows.images.tone_curves import BLACK
+from workflows.ingest.bundle import MANIFEST, Bundle
+from workflows.untrusted.decoder_guard import Guard
+from workflows.untrusted.limits import Limits
 
 HEADROOM = 1.05
 """Full scale over the largest value of the white frame, for noise."""
@@ -59,7 +60,7 @@ def orientation(bundle: Bundle, entry: str, limits: Limits) -> int:
     """How a frame says that it is to be turned to be upright, as `images.upright` takes it."""
     data = bundle.read(entry)
     with Guard(entry, limits.image).on():
-        return raw.orientation(data) if raw.is_raw(entry) else images.orientation(data)
+        return camera_raw.orientation(data) if camera_raw.is_raw(entry) else integer_formats.orientation(data)
 
 
 def read(bundle: Bundle, entry: str, limits: Limits, turn: int | None = None) -> Codes | Floats:
@@ -83,11 +84,11 @@ def read(bundle: Bundle, entry: str, limits: Limits, turn: int | None = None) ->
     data = bundle.read(entry)
     try:
         with Guard(entry, limits.image).on():
-            if raw.is_raw(entry):
-                return raw.decode(data, memory=limits.image, turn=turn)
-            if floats.is_float(data):
-                return floats.decode(data, memory=limits.image, turn=turn)
-            return images.decode(data, memory=limits.image, turn=turn)
+            if camera_raw.is_raw(entry):
+                return camera_raw.decode(data, memory=limits.image, turn=turn)
+            if float_formats.is_float(data):
+                return float_formats.decode(data, memory=limits.image, turn=turn)
+            return integer_formats.decode(data, memory=limits.image, turn=turn)
     except ImageError as error:
         raise CaptureError(f"{entry}: {error.detail}", entry=entry, **error.fields) from error
 
@@ -118,7 +119,7 @@ def storage_of(bundle: Bundle, first: NDArray[np.generic], limits: Limits) -> St
     white = int(numbers[np.argmax(sent.sum(axis=1))])
     frames = [frame for frame in manifest.frames if frame.pattern == white]
     entry = max(frames, key=lambda frame: frame.exposure).file
-    full, bounded = 1.0, raw.is_raw(entry)
+    full, bounded = 1.0, camera_raw.is_raw(entry)
     if not bounded:
         values = read(bundle, entry, limits)
         finite = values[np.isfinite(values)]

@@ -1,11 +1,11 @@
 // Which view is shown: the part of the URL after `#` says it, so that a reload and the back button keep it.
-import { h, said } from "./dom.js";
-import { taking } from "./camera.js";
-import { captures } from "./captures.js";
-import { capture } from "./capture.js";
-import { filming, program } from "./filming.js";
-import { job, jobs } from "./jobs.js";
-import { matte, mattes } from "./mattes.js";
+import { h, said } from "./lib/dom.js";
+import { taking } from "./film/recorder.js";
+import { captures } from "./views/captures.js";
+import { capture } from "./views/capture.js";
+import { filming, program } from "./film/program.js";
+import { job, jobs } from "./views/jobs.js";
+import { matte, mattes } from "./views/mattes.js";
 
 const VIEWS = { film: [filming, program], captures: [captures, capture], jobs: [jobs, job], mattes: [mattes, matte] };
 const main = document.getElementById("main");

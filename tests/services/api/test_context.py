@@ -7,21 +7,21 @@ from pathlib import Path
 
 import pytest
 
-from services.api.access import identify
+from services.api.auth import identify
 from services.api.context import LOOK, Context
-from services.api.errors import Unauthorized
-from services.decoding import Decoders
+from services.decoding.pool import Decoders
+from services.runtime.problems import Unauthorized
 from services.settings import Settings
-from storage import keys
-from storage.database import open_engine, writing
-from storage.objects import Objects
+from storage.database.engine import open_engine, writing
+from storage.objects.store import Objects
+from storage.records import api_keys
 from workflows.composite.cache import Cache
 
 
 def test_a_download_ends_with_its_key(tmp_path: Path) -> None:
     engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
     with writing(engine) as c:
-        key = keys.make(c, "lab", "alice", "read")
+        key = api_keys.make(c, "lab", "alice", "read")
     settings, objects = Settings(data=tmp_path), Objects((tmp_path / "store").as_uri())
     check = partial(identify, settings, engine, key)
     decoders = Decoders(settings.backdrop_bytes)  # which start when they are asked
@@ -31,7 +31,7 @@ def test_a_download_ends_with_its_key(tmp_path: Path) -> None:
         for n in range(5):
             if n == 3:
                 with writing(engine) as c:
-                    keys.revoke(c, "lab")
+                    api_keys.revoke(c, "lab")
             time.sleep(1.1 * LOOK)
             yield bytes([n])
 

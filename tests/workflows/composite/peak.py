@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from tests.workflows.ingest.peak import peak
-from workflows.composite.backdrops import backdrop_of
-from workflows.composite.light import node_light
-from workflows.composite.placing import Placement
+from workflows.composite.backdrop import backdrop_of, node_light
+from workflows.composite.placement import Placement
 
 PLACEMENTS = (
     None,

@@ -7,10 +7,10 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from storage import mattes
 from storage.errors import Corrupt
-from storage.mattes import Block, Matte
-from storage.objects import Objects
+from storage.layout import mattes
+from storage.layout.mattes import Block, Matte
+from storage.objects.store import Objects
 from workflows.composite.cache import Cache
 from workflows.composite.strips import LENGTH, Strip, read_strip
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from storage import mattes
-from storage.mattes import Block, Matte
-from storage.objects import Objects
+from storage.layout import mattes
+from storage.layout.mattes import Block, Matte
+from storage.objects.store import Objects
 from workflows.composite import composite
 from workflows.composite.engine import Window
 from workflows.composite.strips import LENGTH, columns_of, read_strip

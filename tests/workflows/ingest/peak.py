@@ -9,11 +9,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-from storage.captures import Stack
-from storage.objects import Objects
-from workflows.ingest import frames
-from workflows.ingest.bundle import Limits
-from workflows.ingest.measure import measure
+from storage.layout.captures import Stack
+from storage.objects.store import Objects
+from workflows.ingest import steps as ingest_steps
+from workflows.ingest.report.calibration import measure
+from workflows.untrusted.limits import Limits
 
 
 def of_large_after_small(objects: Objects, memory: int) -> tuple[int, int]:
@@ -26,9 +26,9 @@ def of_large_after_small(objects: Objects, memory: int) -> tuple[int, int]:
 
 def _ingest(objects: Objects, capture: str, memory: int) -> int:
     limits = Limits(1 << 30, memory)
-    plan = frames.prepare(objects, capture, limits)
+    plan = ingest_steps.prepare(objects, capture, limits)
     for index in range(plan["tiles"]):
-        frames.read_slab(objects, capture, limits, plan["slab"], index)
+        ingest_steps.read_slab(objects, capture, limits, plan["slab"], index)
     measure(Stack(objects, capture))
     return int(plan["tiles"])
 

@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from storage import uploads
 from storage.errors import CaptureError
-from storage.objects import Objects
-from workflows.ingest.bundle import Bundle, Limits
+from storage.layout import uploads
+from storage.objects.store import Objects
+from workflows.ingest.bundle import Bundle
+from workflows.untrusted.limits import Limits
 
 Zip = Callable[..., bytes]
 LIMITS = Limits(unpacked=1 << 20, memory=1 << 20)

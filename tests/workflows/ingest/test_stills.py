@@ -10,10 +10,10 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
-from storage.captures import Stack
 from storage.errors import CaptureError
-from workflows.images import encode_png
-from workflows.tone import BLACK, table
+from storage.layout.captures import Stack
+from workflows.images.integer_formats import encode_png
+from workflows.images.tone_curves import BLACK, table
 
 Zip = Callable[..., bytes]
 Ingest = Callable[..., Stack]

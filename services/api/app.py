@@ -1,0 +1,67 @@
+"""The HTTP API: `build_app`, and one file a resource."""
+
+from fastapi import Depends, FastAPI
+from sqlalchemy import Engine
+
+from services.api import errors
+from services.api.captures import captures, reports, tus, uploads
+from services.api.context import WEB, Context, authorized
+from services.api.errors import PROBLEM
+from services.api.jobs import events, jobs
+from services.api.mattes import archives, clips, composites, layers, live, mattes
+from services.api.programs import playback, programs
+from services.api.system import cluster, health, limits, metrics, network, pages
+from services.decoding.pool import Decoders
+from services.runtime import tracing
+from services.settings import Settings
+from storage.objects.store import Objects
+from workflows.composite.cache import Cache
+
+
+def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
+    """Build the app: it holds no state of its own, so any number of them may serve one database and store."""
+    app = FastAPI(
+        title="envmatte",
+        version="1",
+        description="Environment mattes of transparent objects, by compressive sensing.",
+        responses=PROBLEM,
+        docs_url=None,
+        redoc_url=None,
+    )
+    app.state.context = Context(
+        settings,
+        engine,
+        objects,
+        Cache(objects, settings.matte_memory),
+        Decoders(settings.backdrop_bytes),
+    )
+    errors.register(app)
+    app.add_middleware(tus.Protocol)
+    app.add_middleware(tracing.Requests)
+
+    for router in (
+        captures.router,
+        reports.router,
+        uploads.router,
+        jobs.router,
+        events.router,
+        clips.router,
+        mattes.router,
+        composites.router,
+        archives.router,
+        layers.router,
+        live.router,
+        programs.router,
+        limits.router,
+        playback.router,
+        cluster.router,
+        network.router,
+    ):
+        app.include_router(router, prefix="/v1", dependencies=[Depends(authorized)])
+    app.include_router(programs.page, prefix="/v1")
+    app.include_router(health.router)
+    app.include_router(metrics.router)
+    app.include_router(pages.page)
+    app.mount("/web/swagger", pages.Files(directory=pages.SWAGGER))
+    app.mount("/web", pages.Files(directory=WEB))
+    return app

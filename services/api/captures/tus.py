@@ -1,0 +1,171 @@
+"""What tus 1.0 says about headers: which are sent with every answer, and how those of a request are read."""
+
+import base64
+import binascii
+import hashlib
+from typing import TYPE_CHECKING, Annotated
+
+from fastapi import Header, Request
+from starlette.datastructures import Headers, MutableHeaders
+
+from services.runtime.problems import BadHeader, ChecksumMismatch, WrongMediaType, WrongVersion
+
+if TYPE_CHECKING:
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+VERSION = "1.0.0"
+EXTENSIONS = "creation,creation-with-upload,checksum,expiration,termination"
+ALGORITHMS = ("sha1", "sha256")
+CHUNK = "application/offset+octet-stream"
+METADATA_BYTES = 8192
+DECLARED = ("frames", "width", "height")
+"""Names by which a client may say how many frames a capture has, and of how many pixels."""
+
+
+class Protocol:
+    """What tus asks of every exchange, an answer with a problem included."""
+
+    def __init__(self, app: "ASGIApp") -> None:
+        self._app = app
+
+    async def __call__(self, scope: "Scope", receive: "Receive", send: "Send") -> None:
+        if scope["type"] != "http" or not scope["path"].startswith("/v1/uploads"):
+            await self._app(scope, receive, send)
+            return
+
+        async def tell(message: "Message") -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                headers["Tus-Resumable"] = headers["Tus-Version"] = VERSION
+            await send(message)
+
+        # For clients whose surroundings let only GET and POST through.
+        method = Headers(scope=scope).get("x-http-method-override", scope["method"])
+        await self._app({**scope, "method": method.upper()}, receive, tell)
+
+
+def version_spoken(
+    tus_resumable: Annotated[str | None, Header(description="The version of tus that is spoken.")] = None,
+) -> None:
+    """Refuse another version than the one spoken here.
+
+    Raises
+    ------
+    WrongVersion
+    """
+    if tus_resumable != VERSION:
+        raise WrongVersion(f"send `Tus-Resumable: {VERSION}`, the version of tus spoken here")
+
+
+class Checksum:
+    """What a body should hash to, as an ``Upload-Checksum`` header says."""
+
+    def __init__(self, algorithm: str, digest: bytes) -> None:
+        self._hash = hashlib.new(algorithm, usedforsecurity=False)
+        self._digest = digest
+        self.update = self._hash.update
+
+    @classmethod
+    def of(cls, request: Request) -> "Checksum | None":
+        """The checksum of a request, if it has one.
+
+        Raises
+        ------
+        BadHeader
+        """
+        header = request.headers.get("upload-checksum")
+        if header is None:
+            return None
+        algorithm, _, text = header.partition(" ")
+        if algorithm not in ALGORITHMS:
+            raise BadHeader(
+                f"Upload-Checksum: {algorithm!r} is not taken; use {' or '.join(ALGORITHMS)}",
+                field="Upload-Checksum",
+            )
+        return cls(algorithm, _base64(text, "Upload-Checksum"))
+
+    def check(self) -> None:
+        """Compare it with what has come.
+
+        Raises
+        ------
+        ChecksumMismatch
+        """
+        if self._hash.digest() != self._digest:
+            raise ChecksumMismatch(
+                "the bytes that came are not those that the checksum was made of; none was kept, send them again"
+            )
+
+
+def number(request: Request, name: str) -> int:
+    """The bytes that a header of a request gives.
+
+    Raises
+    ------
+    BadHeader
+        If it is missing, or no number from 0 to 10**18 - 1.
+    """
+    text = request.headers.get(name, "")
+    if not (text.isascii() and text.isdigit() and len(text) <= 18):
+        raise BadHeader(f"{name}: {text or 'nothing'!r} is no number of bytes; send one", field=name)
+    return int(text)
+
+
+def metadata_of(request: Request) -> str:
+    """The ``Upload-Metadata`` of a request: pairs of a key and, in Base64, a value, checked and kept as they are.
+
+    Raises
+    ------
+    BadHeader
+    """
+    text = request.headers.get("upload-metadata", "")
+    if len(text) > METADATA_BYTES:
+        raise BadHeader(
+            f"Upload-Metadata may have {METADATA_BYTES} bytes", field="Upload-Metadata", limit=METADATA_BYTES
+        )
+    pairs = [pair.strip().partition(" ") for pair in text.split(",")] if text else []
+    for key, _, value in pairs:
+        _base64(value, "Upload-Metadata")
+        if not key.isascii():
+            raise BadHeader(f"Upload-Metadata: {key!r} is not ASCII", field="Upload-Metadata")
+    if len({key for key, _, _ in pairs} - {""}) < len(pairs):
+        raise BadHeader("Upload-Metadata: a key is empty, or there twice", field="Upload-Metadata")
+    return text
+
+
+def declared(metadata: str) -> dict[str, int]:
+    """What an ``Upload-Metadata`` that `metadata_of` has checked says of a capture's frames, by `DECLARED` names.
+
+    Raises
+    ------
+    BadHeader
+        If it is no number from 0 to 10**18 - 1.
+    """
+    pairs = (pair.strip().partition(" ") for pair in metadata.split(","))
+    texts = {name: base64.b64decode(value) for name, _, value in pairs if name in DECLARED}
+    for name, text in texts.items():
+        if not (text.isdigit() and len(text) <= 18):
+            raise BadHeader(
+                f"Upload-Metadata: {name} is {text!r}; send a number, or leave it out",
+                field="Upload-Metadata",
+            )
+    return {name: int(text) for name, text in texts.items()}
+
+
+def _base64(text: str, name: str) -> bytes:
+    try:
+        return base64.b64decode(text, validate=True)
+    except (binascii.Error, ValueError) as error:
+        raise BadHeader(f"{name}: {text!r} is not Base64", field=name) from error
+
+
+def check_media_type(request: Request) -> None:
+    """See that a body is a stretch of an upload.
+
+    Raises
+    ------
+    WrongMediaType
+    """
+    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if media_type != CHUNK:
+        raise WrongMediaType(f"send the bytes of an upload as {CHUNK}, not as {media_type or 'nothing'}")

@@ -1,0 +1,221 @@
+"""Resumable uploads over HTTP: tus 1.0 (https://tus.io/protocols/resumable-upload)."""
+
+from datetime import UTC, datetime
+from email.utils import format_datetime
+from typing import Annotated, Any
+
+import anyio.to_thread
+from fastapi import APIRouter, Depends, Header, Request, Response
+from sqlalchemy import Row
+from sqlalchemy.exc import IntegrityError
+from starlette.requests import ClientDisconnect
+
+from services.api.captures.tus import (
+    ALGORITHMS,
+    EXTENSIONS,
+    Checksum,
+    check_media_type,
+    declared,
+    metadata_of,
+    number,
+    version_spoken,
+)
+from services.api.context import Context, Needs
+from services.api.http.bodies import too_large
+from services.api.quotas import admit_upload
+from services.runtime.problems import TooLarge
+from storage.database.engine import reading, writing
+from storage.database.rows import new_id
+from storage.errors import InvalidInput, NotFound
+from storage.layout import uploads as stored_uploads
+from storage.layout.uploads import Part
+from storage.records import captures, uploads
+from storage.records.uploads import MOST_PARTS
+
+PART = 64 << 20
+"""Bytes after which what has come is written down: what a killed server loses of one PATCH, at most."""
+
+router = APIRouter(prefix="/uploads", tags=["uploads"])
+Spoken = Depends(version_spoken)
+
+
+@router.options("", status_code=204, response_class=Response)
+def get_protocol(context: Needs, response: Response) -> None:
+    """What is spoken here: version, extensions, and the bytes of the largest upload."""
+    response.headers["Tus-Extension"] = EXTENSIONS
+    response.headers["Tus-Checksum-Algorithm"] = ",".join(ALGORITHMS)
+    response.headers["Tus-Max-Size"] = str(context.settings.upload_bytes)
+
+
+@router.post("", status_code=201, dependencies=[Spoken], response_class=Response)
+async def create_upload(
+    context: Needs,
+    request: Request,
+    idempotency_key: Annotated[str | None, Header(max_length=256)] = None,
+) -> Response:
+    """Start an upload of `Upload-Length` bytes; the body may be the first of them.
+
+    `frames`, `width` and `height` in `Upload-Metadata`, where a client knows them of a capture, are held against the
+    limits before any byte comes. What does come is checked all the same.
+    """
+    length = number(request, "Upload-Length")
+    if length > context.settings.upload_bytes:
+        raise too_large(context.settings.upload_bytes, length)
+    checksum = Checksum.of(request)
+    with_body = request.headers.get("content-length", "0") != "0" or "transfer-encoding" in request.headers
+    if with_body:
+        check_media_type(request)
+    metadata = metadata_of(request)
+    known, limits = declared(metadata), context.settings.limits
+    if "frames" in known:
+        limits.see_that_frames_may(known["frames"])
+    if "width" in known and "height" in known:
+        limits.see_that_pixels_may(known["width"], known["height"])
+    row, new = await anyio.to_thread.run_sync(_create, context, length, metadata, idempotency_key)
+    if with_body and new:
+        row = await _append(context, request, row, checksum)
+    return Response(status_code=201, headers={"Location": f"/v1/uploads/{row.id}"} | _headers(row))
+
+
+@router.head("/{id}", dependencies=[Spoken], response_class=Response)
+def get_upload(context: Needs, id: str) -> Response:
+    """How far an upload is: `Upload-Offset` of `Upload-Length` bytes."""
+    with reading(context.engine) as c:
+        row = uploads.get(c, id)
+    headers = {"Upload-Length": str(row.length), "Cache-Control": "no-store"} | _headers(row)
+    return Response(headers=headers | ({"Upload-Metadata": row.metadata} if row.metadata else {}))
+
+
+@router.patch("/{id}", status_code=204, dependencies=[Spoken], response_class=Response)
+async def append(context: Needs, request: Request, id: str) -> Response:
+    """Send the bytes of an upload from `Upload-Offset` on.
+
+    What has come of a body that breaks off is kept, unless it has an `Upload-Checksum`: then it is kept
+    whole or not at all.
+    """
+    row = await anyio.to_thread.run_sync(_get, context, id)
+    check_media_type(request)
+    checksum = Checksum.of(request)
+    uploads.check_offset(row, number(request, "Upload-Offset"))
+    if row.parts >= MOST_PARTS:
+        raise InvalidInput(
+            f"upload {id} came in {row.parts} pieces, the most there may be; start again with larger ones",
+            limit=MOST_PARTS,
+        )
+    row = await _append(context, request, row, checksum)
+    return Response(status_code=204, headers=_headers(row))
+
+
+@router.delete("/{id}", status_code=204, dependencies=[Spoken], response_class=Response)
+def delete_upload(context: Needs, id: str) -> None:
+    """Give an upload up."""
+    with writing(context.engine) as c:
+        uploads.get(c, id)
+        uploads.forget(c, id)
+    stored_uploads.remove(context.objects, id)
+
+
+async def _append(context: Context, request: Request, row: Row[Any], checksum: Checksum | None) -> Row[Any]:
+    """Store a body from an upload's offset on; returns the row as it is then."""
+    room = row.length - row.offset
+    if int(request.headers.get("content-length", 0)) > room:
+        raise _too_long(row)
+    body = (
+        request.stream()
+    )  # from which a client that falls silent is disconnected, see `services.api.http.slow_clients`
+    stored: list[Part] = []
+    offset, more = row.offset, True
+    try:
+        while more:
+            name, size, more = new_id(), 0, False
+            async with context.objects.write(stored_uploads.part_path(row.id, name)) as file:
+                stored.append(Part(name, 0))
+                try:
+                    async for data in body:
+                        size += len(data)
+                        room -= len(data)
+                        if room < 0:
+                            raise _too_long(row)
+                        if checksum:
+                            checksum.update(data)
+                        await file.write(data)
+                        if size >= PART:
+                            more = True
+                            break
+                except ClientDisconnect:
+                    if checksum:
+                        raise
+            stored[-1] = Part(name, size)
+            if not size:
+                nothing = stored_uploads.part_path(row.id, stored.pop().name)
+                await anyio.to_thread.run_sync(context.objects.delete, nothing)
+            if not checksum:
+                offset = await anyio.to_thread.run_sync(_advance, context, row.id, offset, stored)
+                stored = []
+        if checksum:
+            checksum.check()
+            await anyio.to_thread.run_sync(_advance, context, row.id, offset, stored)
+    except Exception:  # not when cancelled, where `_advance` may still be at work: the next start sweeps then
+        await anyio.to_thread.run_sync(_take_back, context, row.id, stored)
+        raise
+    return await anyio.to_thread.run_sync(_get, context, row.id)
+
+
+def _advance(context: Context, upload: str, offset: int, stored: list[Part]) -> int:
+    context.check()
+    with writing(context.engine) as c:
+        return uploads.advance(c, upload, offset, stored, context.settings.upload_seconds)
+
+
+def _take_back(context: Context, upload: str, stored: list[Part]) -> None:
+    """Remove parts that were not written down; all there is, if their upload was deleted meanwhile."""
+    for part in stored:
+        context.objects.delete(stored_uploads.part_path(upload, part.name))
+    try:
+        _get(context, upload)
+    except NotFound:
+        with reading(context.engine) as c:
+            is_capture = captures.exists(c, upload)
+        if not is_capture:
+            stored_uploads.remove(context.objects, upload)
+        raise
+
+
+def _get(context: Context, upload: str) -> Row[Any]:
+    with reading(context.engine) as c:
+        return uploads.get(c, upload)
+
+
+def _create(context: Context, length: int, metadata: str, key: str | None) -> tuple[Row[Any], bool]:
+    """The upload to send to, and whether it is new: a repeat with the same key goes on with the first one's."""
+    with writing(context.engine) as c:
+        expired = uploads.forget_expired(c)
+    for upload in expired:
+        stored_uploads.remove(context.objects, upload)
+    try:
+        with writing(context.engine) as c:
+            row = uploads.by_key(c, key) if key else None
+            if row is not None:
+                return row, False
+            admit_upload(c, context.settings, context.objects, length, captures=1)
+            upload = new_id()
+            uploads.add(c, upload, length, metadata, context.settings.upload_seconds, key)
+            return uploads.get(c, upload), True
+    except IntegrityError:  # the repeat came at the same time
+        with reading(context.engine) as c:
+            row = uploads.by_key(c, key) if key else None
+        if row is None:
+            raise
+        return row, False
+
+
+def _headers(row: Row[Any]) -> dict[str, str]:
+    expires = format_datetime(datetime.fromtimestamp(row.expires_at, UTC), usegmt=True)
+    return {"Upload-Offset": str(row.offset), "Upload-Expires": expires}
+
+
+def _too_long(row: Row[Any]) -> TooLarge:
+    return TooLarge(
+        f"upload {row.id} was to have {row.length} bytes, and more have come; send no more than the rest",
+        limit=row.length,
+    )

@@ -1,0 +1,1 @@
+"""HTTP itself: bodies, responses, idempotency, browsers, slow clients."""

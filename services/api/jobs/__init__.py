@@ -1,0 +1,1 @@
+"""Jobs over HTTP: their state, events, ETA and what they wait for."""

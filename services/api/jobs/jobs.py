@@ -1,0 +1,247 @@
+"""Jobs over HTTP."""
+
+import time
+from datetime import UTC, datetime
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
+from pydantic import BaseModel, ConfigDict, Field
+from sqlalchemy import Connection, Row
+
+from services.api.context import After, Limit, Needs
+from services.api.http.bodies import read_json, schema_of
+from services.api.http.responses import time_of
+from services.api.jobs.eta import seconds_left
+from services.api.jobs.wait_reason import reason
+from services.api.quotas import admit
+from services.coordinator import job_kinds
+from services.runtime import tracing
+from services.webhooks import sender
+from storage.database.engine import reading, writing
+from storage.database.rows import new_id, page
+from storage.database.tables import jobs as table
+from storage.errors import Conflict
+from storage.layout import composites
+from storage.records import captures, idempotency, job_log, jobs, leases, mattes
+from storage.records import tiles as tile_records
+from storage.records.leases import Sign
+from workflows.mattes.options import describe_options, parse_options
+from workflows.programs.program import Program
+
+router = APIRouter(tags=["jobs"])
+CALL = "POST /v1/jobs"
+REQUEST_BYTES = 64 << 10
+State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
+
+
+class JobRequest(BaseModel):
+    """What to recover, and how."""
+
+    model_config = ConfigDict(extra="forbid")
+    capture: str
+    options: dict[str, Any] = Field(default_factory=dict, description="GET /v1/options lists them.")
+    webhook: str | None = Field(None, description="URL, https, that is told when the job has ended.")
+
+
+async def _job_request(request: Request) -> JobRequest:
+    return await read_json(request, JobRequest, REQUEST_BYTES)
+
+
+class Tiles(BaseModel):
+    """Pieces of a job's work: squares of a matte, slabs of frames, or stretches of a clip."""
+
+    total: int
+    done: int
+    failed: int
+
+
+class Job(BaseModel):
+    """A job."""
+
+    id: str
+    kind: Literal["ingest", "recover", "composite"]
+    state: State
+    stage: str
+    progress: float
+    tiles: Tiles
+    pixels: int
+    eta_seconds: float | None
+    waits_for: str | None
+    queued_seconds: float
+    run_seconds: float
+    workers: int
+    capture: str | None
+    matte: str | None
+    options: dict[str, Any]
+    problem: dict[str, Any] | None
+    video: str | None
+    created_at: datetime
+    started_at: datetime | None
+    finished_at: datetime | None
+
+    @classmethod
+    def of(cls, connection: Connection, row: Row[Any], sign: Sign | None = None) -> "Job":
+        now = time.time()
+        sign = sign or leases.last_sign(connection)
+        ran = ((row.finished_at or now) - row.started_at) if row.started_at else 0.0
+        running = row.state == "running"
+        # The step after the last tile counts as one more: only a job that has succeeded is at 1.
+        progress = 1.0 if row.state == "succeeded" else row.done / (row.total + 1) if row.total else 0.0
+        return cls(
+            **{name: getattr(row, name) for name in ("id", "kind", "state", "stage", "pixels", "matte")},
+            capture=row.capture or None,  # a composite of a matte that came in an archive has none
+            progress=progress,
+            tiles=Tiles(total=row.total, done=row.done, failed=row.failed),
+            eta_seconds=seconds_left(connection, row, now) if running else None,
+            waits_for=reason(connection, row, sign),
+            queued_seconds=(row.started_at or row.finished_at or now) - row.created_at,
+            run_seconds=ran,
+            workers=len(sign.cluster["workers"]) if running and sign else 0,
+            options=row.options,
+            problem=row.problem,
+            video=f"/v1/jobs/{row.id}/video.mp4"
+            if row.kind == "composite" and row.state == "succeeded"
+            else None,
+            created_at=datetime.fromtimestamp(row.created_at, UTC),
+            started_at=time_of(row.started_at),
+            finished_at=time_of(row.finished_at),
+        )
+
+
+class Jobs(BaseModel):
+    """A page of jobs, newest first."""
+
+    jobs: list[Job]
+
+
+class Option(BaseModel):
+    """An option of recovery; `method` is null if it is one of every method's."""
+
+    name: str
+    method: str | None
+    type: str
+    default: str | int | float | bool | None
+    values: list[str] | None
+    minimum: float | None
+    maximum: float | None
+    description: str
+
+
+class Options(BaseModel):
+    """Every option of recovery."""
+
+    options: list[Option]
+
+
+class Line(BaseModel):
+    """A line of a job's log."""
+
+    line: int
+    at: datetime
+    text: str
+
+
+class Log(BaseModel):
+    """Lines of a job's log, oldest first."""
+
+    lines: list[Line]
+
+
+@router.get("/options")
+def list_options() -> Options:
+    """Every option of recovery."""
+    return Options.model_validate({"options": describe_options()})
+
+
+@router.post(
+    "/jobs",
+    status_code=202,
+    openapi_extra={"requestBody": {"content": {"application/json": {"schema": schema_of(JobRequest)}}}},
+)
+def post_job(
+    context: Needs,
+    request: Annotated[JobRequest, Depends(_job_request)],
+    response: Response,
+    idempotency_key: Annotated[str | None, Header(alias="Idempotency-Key", max_length=256)] = None,
+) -> Job:
+    """Queue the recovery of a matte; the capture may still be ingesting."""
+    options = parse_options(request.options)
+    sender.check(request.webhook, context.settings)
+    with writing(context.engine) as c:
+        job = idempotency.made_by(c, idempotency_key, CALL) if idempotency_key else None
+        if job is None:
+            capture = captures.get(c, request.capture)
+            if capture.state == "failed":
+                raise Conflict(f"capture {capture.id} failed: {capture.problem['detail']}")
+            # Grids that do not nest are refused now, and not by the job.
+            Program.model_validate(capture.program).bands()
+            admit(c, context.settings, jobs=1)
+            matte = new_id()
+            chosen = options.model_dump(mode="json")
+            job = jobs.add(
+                c, "recover", capture.id, chosen, matte, tracing.asked_by(), webhook=request.webhook
+            )
+            mattes.add(c, matte, capture.id, job, chosen, context.settings.matte_seconds)
+            if idempotency_key:
+                idempotency.remember(c, idempotency_key, CALL, job)
+        made = Job.of(c, jobs.get(c, job))
+    response.headers["Location"] = f"/v1/jobs/{job}"
+    return made
+
+
+@router.get("/jobs")
+def list_jobs(context: Needs, limit: Limit = 100, after: After = None, state: State | None = None) -> Jobs:
+    """Jobs, newest first."""
+    with reading(context.engine) as c:
+        sign = leases.last_sign(c)  # once for all of them
+        return Jobs(jobs=[Job.of(c, row, sign) for row in page(c, table, limit, after, state=state)])
+
+
+@router.get("/jobs/{id}")
+def get_job(context: Needs, id: str) -> Job:
+    """A job."""
+    with reading(context.engine) as c:
+        return Job.of(c, jobs.get(c, id))
+
+
+@router.get("/jobs/{id}/log")
+def get_log(
+    context: Needs, id: str, limit: Limit = 1000, after: Annotated[int, Query(ge=0, lt=1 << 63)] = 0
+) -> Log:
+    """What happened to a job, line by line."""
+    with reading(context.engine) as c:
+        jobs.get(c, id)
+        rows = job_log.notes(c, id, after, limit)
+    return Log(lines=[Line(line=r.line, at=datetime.fromtimestamp(r.at, UTC), text=r.text) for r in rows])
+
+
+@router.post("/jobs/{id}/cancel")
+def cancel_job(context: Needs, id: str) -> Job:
+    """Cancel a job; what it wrote is removed as soon as its running tasks have ended."""
+    with writing(context.engine) as c:
+        jobs.cancel(c, id)
+        return Job.of(c, jobs.get(c, id))
+
+
+@router.post("/jobs/{id}/retry", status_code=202)
+def retry_job(context: Needs, id: str) -> Job:
+    """Queue a failed job again; the tiles that are done are kept, unless `ENVMATTE_INGEST_MEMORY` has changed."""
+    with writing(context.engine) as c:
+        row = jobs.get(c, id)
+        # Slabs of an ingest are as large as the memory allows, and want to be smaller where that was too much.
+        memory = (row.plan or {}).get("memory", context.settings.ingest_memory)
+        if row.state == "failed":
+            admit(c, context.settings, jobs=1)
+        tile_records.retry(c, id, anew=memory != context.settings.ingest_memory, trace=tracing.asked_by())
+        job_kinds.KINDS[row.kind].retried(c, row)
+        return Job.of(c, jobs.get(c, id))
+
+
+@router.delete("/jobs/{id}", status_code=204)
+def delete_job(context: Needs, id: str) -> None:
+    """Delete a job that has ended, and its log; its matte stays, the video of a composite goes."""
+    with writing(context.engine) as c:
+        kind = jobs.get(c, id).kind
+        jobs.forget(c, id)
+    if kind == "composite":
+        context.objects.delete(composites.path(id))

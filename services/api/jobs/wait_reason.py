@@ -1,0 +1,56 @@
+"""What a job waits for, in words: nothing waits in silence."""
+
+import time
+from typing import Any
+
+from sqlalchemy import Connection, Row, func, select
+
+from storage.database.owners import of_all
+from storage.database.tables import captures
+from storage.database.tables import jobs as table
+from storage.records import jobs
+from storage.records.leases import Sign
+
+SILENCE = 15.0
+"""Seconds after which a coordinator that gave no sign of life counts as gone."""
+STILL = 30.0
+"""Seconds without anything done after which a job says so."""
+
+
+def trouble_of(sign: Sign | None) -> str | None:
+    """What is wrong with the coordinator or its cluster, if something is."""
+    if sign is None:
+        return (
+            "no coordinator has ever given a sign of life; start `envmatte serve` or `envmatte coordinator`"
+        )
+    if sign.seconds > SILENCE or sign.holder is None:
+        return (
+            f"no coordinator has given a sign of life for {sign.seconds:.0f} s; start `envmatte serve` or "
+            "`envmatte coordinator`, or see what keeps it from the database"
+        )
+    problem: str | None = sign.cluster["problem"]
+    return problem
+
+
+def reason(connection: Connection, row: Row[Any], sign: Sign | None) -> str | None:
+    """What an active job waits for; None while it has what it needs, or has ended."""
+    if row.state not in jobs.ACTIVE:
+        return None
+    trouble = trouble_of(sign)
+    if trouble is not None:
+        return trouble
+    if row.kind == "recover":
+        state = connection.scalar(select(captures.c.state).where(captures.c.id == row.capture))
+        if state == "ingesting":
+            return f"its capture {row.capture} is being ingested"
+    if row.state == "queued":
+        return "the coordinator takes it up within a second"
+    still = time.time() - row.moved_at
+    if still > STILL:
+        return f"nothing of it was done in the last {still:.0f} s; a tile takes long, or its worker does not answer"
+    query = select(func.count()).where(table.c.state == "running", table.c.id != row.id)
+    others = connection.scalar(of_all(query))
+    if others:
+        workers = len(sign.cluster["workers"]) if sign else 0
+        return f"it shares {workers} workers with {others} other jobs"
+    return None

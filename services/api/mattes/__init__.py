@@ -1,0 +1,1 @@
+"""Mattes over HTTP: composites, clips, layers, archives."""

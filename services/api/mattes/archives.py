@@ -1,0 +1,127 @@
+"""Archives of mattes over HTTP: one leaves, and comes back."""
+
+from typing import Any
+
+import anyio.to_thread
+from fastapi import APIRouter, Request, Response
+from fastapi.responses import StreamingResponse
+from sqlalchemy import Row
+from sqlalchemy.exc import IntegrityError
+
+from services.api.captures.captures import ONLY, Key
+from services.api.context import Context, Needs
+from services.api.http.bodies import announced, store_body
+from services.api.mattes.mattes import Matte
+from services.api.quotas import admit
+from services.runtime.problems import WrongMediaType
+from storage.database.engine import reading, writing
+from storage.database.rows import new_id
+from storage.errors import NoRoom
+from storage.layout import mattes as stored_mattes
+from storage.layout import uploads as stored_uploads
+from storage.layout.matte_archive import Archive
+from storage.layout.uploads import Part
+from storage.records import idempotency, mattes, uploads
+from workflows.mattes.imports.importing import take_in
+
+router = APIRouter(tags=["mattes"])
+CALL = "POST /v1/mattes"
+ZIP = "application/zip"
+
+
+@router.get(
+    "/mattes/{id}/archive",
+    response_class=StreamingResponse,
+    responses={200: {"content": {ZIP: {}}, "description": "The archive"}},
+)
+def get_archive(context: Needs, id: str) -> StreamingResponse:
+    """All of a matte in one ZIP, which any zarr reader opens, and which `POST /v1/mattes` takes elsewhere.
+
+    The same matte makes the same bytes. Where the matte is deleted or the key revoked meanwhile, the connection ends
+    early.
+    """
+    with reading(context.engine) as c:
+        mattes.get_ready(c, id)
+    archive = Archive(context.objects, id)
+    headers = {
+        "Content-Length": str(archive.size),
+        "Content-Disposition": f'attachment; filename="matte-{id}.zip"',
+    }
+    return StreamingResponse(context.while_allowed(archive), media_type=ZIP, headers=headers)
+
+
+@router.post(
+    "/mattes",
+    status_code=201,
+    openapi_extra={"requestBody": {"content": {ZIP: {"schema": {"type": "string", "format": "binary"}}}}},
+)
+async def post_archive(
+    context: Needs, request: Request, response: Response, idempotency_key: Key = None
+) -> Matte:
+    """Make a matte of an archive: the body is what `GET /v1/mattes/{id}/archive` gave.
+
+    All of it is checked before the answer, which takes some seconds for each 100 MB.
+    """
+    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if media_type != ZIP:
+        raise WrongMediaType(f"send the archive of a matte as {ZIP}, not as {media_type or 'nothing'}")
+    row = await _from_body(context, request, idempotency_key)
+    response.headers["Location"] = f"/v1/mattes/{row.id}"
+    return Matte.of(row)
+
+
+async def _from_body(context: Context, request: Request, key: str | None) -> Row[Any]:
+    """Stream an archive into the store, and make a matte of it; the archive is gone in the end."""
+    limit = context.settings.upload_bytes
+    length = announced(request, limit)
+    row = await anyio.to_thread.run_sync(_made, context, key)
+    if row is not None:
+        return row
+    await anyio.to_thread.run_sync(_admit, context, length)
+    matte = new_id()
+    try:
+        size = await store_body(request, context.objects, stored_uploads.part_path(matte, ONLY), limit)
+        row = await anyio.to_thread.run_sync(_import, context, matte, size, key, limiter=context.imports)
+    finally:
+        # One that a killed server leaves, and half of its matte, are swept: nothing refers to them.
+        await anyio.to_thread.run_sync(stored_uploads.remove, context.objects, matte)
+    return row
+
+
+def _import(context: Context, matte: str, size: int, key: str | None) -> Row[Any]:
+    context.check()
+    objects = context.objects
+    stored_uploads.seal(objects, matte, [Part(ONLY, size)])
+    with stored_uploads.read(objects, matte) as file:
+        made = take_in(file, objects, matte, context.settings.limits)
+    stored = sum(objects.sizes(stored_mattes.path(matte)).values())
+    kept = context.settings.matte_seconds
+    try:
+        with writing(context.engine) as c:
+            admit(c, context.settings, size=stored)
+            mattes.add_imported(c, matte, made.attributes["options"], made.figures, stored, kept)
+            if key:
+                idempotency.remember(c, key, CALL, matte)
+            return mattes.get(c, matte)
+    # Of any other error it is not known whether the row was written; without one the matte is swept.
+    except NoRoom:
+        objects.delete(stored_mattes.path(matte))
+        raise
+    except IntegrityError:  # a repeat with the same key was quicker
+        objects.delete(stored_mattes.path(matte))
+        row = _made(context, key)
+        if row is None:
+            raise
+        return row
+
+
+def _admit(context: Context, length: int) -> None:
+    with reading(context.engine) as c:
+        admit(c, context.settings, size=length)
+        uploads.check_room(c, context.objects, 2 * length)  # the archive, and the matte beside it
+
+
+def _made(context: Context, key: str | None) -> Row[Any] | None:
+    with reading(context.engine) as c:
+        made = idempotency.made_by(c, key, CALL) if key else None
+        return mattes.get(c, made) if made else None

@@ -1,0 +1,178 @@
+"""Composites of clips over HTTP: a job that makes a video, and the video."""
+
+import re
+from collections.abc import Iterator
+from typing import Any, BinaryIO
+
+import anyio.to_thread
+from fastapi import APIRouter, Request, Response
+from fastapi.responses import StreamingResponse
+from sqlalchemy.exc import IntegrityError
+
+from services.api.context import Context, Needs
+from services.api.http.bodies import announced, store_body
+from services.api.jobs.jobs import Job
+from services.api.quotas import admit, admit_upload
+from services.runtime import tracing
+from services.webhooks import sender
+from storage.database.engine import reading, writing
+from storage.database.rows import new_id
+from storage.errors import Conflict, Corrupt
+from storage.layout import composites
+from storage.records import idempotency, jobs, mattes, tiles
+
+router = APIRouter(tags=["jobs"])
+CALL = "POST /v1/mattes/{id}/composite"
+CLIP = "a clip"
+PIECE = 1 << 20
+"""Bytes of a video that are read at once."""
+RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
+
+
+def is_clip(request: Request) -> bool:
+    """Whether a request brings a clip, and not a picture."""
+    return request.headers.get("content-type", "").strip().lower().startswith("video/")
+
+
+async def composite_clip(
+    context: Context, request: Request, matte: str, options: dict[str, Any], webhook: str | None
+) -> Response:
+    """Queue the composite of a clip, the body of a request, which is streamed into the store.
+
+    Parameters
+    ----------
+    options : dict
+        ``transfer``, and ``placement`` as `Placement` takes it.
+    webhook : str, optional
+        URL that is told when the job has ended.
+
+    Raises
+    ------
+    TooLarge
+        Before the first byte if its length is said, else as soon as more than ENVMATTE_UPLOAD_BYTES have come.
+    NoRoom
+        If the store has no room for it.
+    Conflict
+        If the matte is not ready.
+    OptionError
+        If the URL can't be told.
+    """
+    await anyio.to_thread.run_sync(sender.check, webhook, context.settings)  # which looks its host up
+    limit = context.settings.upload_bytes
+    length = announced(request, limit, CLIP)
+    key = request.headers.get("idempotency-key", "")[:256]
+    made = await anyio.to_thread.run_sync(_check, context, matte, key, length)
+    job = made or new_id()
+    if made is None:
+        try:
+            size = await store_body(request, context.objects, composites.clip_path(job), limit, CLIP)
+            job = await anyio.to_thread.run_sync(_queue, context, job, matte, options, key, size, webhook)
+        except Exception:
+            # Not when cancelled, where `_queue` may still be at work: what has no job the coordinator sweeps.
+            await anyio.to_thread.run_sync(context.objects.delete, composites.path(job))
+            raise
+    answer = await anyio.to_thread.run_sync(_job, context, job)
+    headers = {"Location": f"/v1/jobs/{job}"}
+    return Response(answer.model_dump_json(), 202, headers, media_type="application/json")
+
+
+@router.get(
+    "/jobs/{id}/video.mp4",
+    response_class=Response,
+    responses={
+        200: {"content": {"video/mp4": {}}, "description": "The video"},
+        206: {"content": {"video/mp4": {}}, "description": "A part of it, by `Range`"},
+    },
+)
+def get_video(context: Needs, id: str, request: Request) -> Response:
+    """The video that a composite job has made: H.264 in MP4, with the times of the clip's frames, without sound."""
+    with reading(context.engine) as c:
+        row = jobs.get(c, id)
+    if row.kind != "composite" or row.state != "succeeded":
+        raise Conflict(
+            f"job {id} is {row.state}, and has no video; a composite of a clip has one once it has succeeded"
+        )
+    try:
+        file = context.objects.read(composites.video_path(id))
+    except FileNotFoundError as error:
+        raise Corrupt(f"the video of job {id} is not in the store; composite the clip again") from error
+    size = file.seek(0, 2)
+    start, end = _span(request.headers.get("range", ""), size)
+    if start >= size:
+        file.close()
+        return Response(status_code=416, headers={"Content-Range": f"bytes */{size}"})
+    headers = {"Accept-Ranges": "bytes", "Content-Length": str(end - start)}
+    part = end - start < size
+    if part:
+        headers["Content-Range"] = f"bytes {start}-{end - 1}/{size}"
+    file.seek(start)
+    pieces = context.while_allowed(_pieces(file, end - start))
+    return StreamingResponse(pieces, 206 if part else 200, headers, media_type="video/mp4")
+
+
+def _check(context: Context, matte: str, key: str, length: int) -> str | None:
+    """See that a clip can be taken; returns the job that a repeat with the same key has made already."""
+    with reading(context.engine) as c:
+        made = idempotency.made_by(c, key, CALL) if key else None
+        if made is None:
+            mattes.get_ready(c, matte)
+            admit_upload(c, context.settings, context.objects, length, jobs=1)
+        return made
+
+
+def _queue(
+    context: Context,
+    job: str,
+    matte: str,
+    options: dict[str, Any],
+    key: str,
+    size: int,
+    webhook: str | None,
+) -> str:
+    """Write down the job of a clip that is stored; returns its id, or that of a repeat that was quicker."""
+    context.check()
+    try:
+        with writing(context.engine) as c:
+            row = mattes.get_ready(c, matte)
+            admit(c, context.settings, jobs=1, size=size)
+            capture, trace = row.capture or "", tracing.asked_by()
+            jobs.add(c, "composite", capture, options, matte, trace, job, size, webhook)
+            tiles.begin(c, job)  # while it has tiles it has something in the store, see `jobs.not_wound_up`
+            if key:
+                idempotency.remember(c, key, CALL, job)
+            return job
+    except IntegrityError:
+        with reading(context.engine) as c:
+            made = idempotency.made_by(c, key, CALL) if key else None
+        if made is None:
+            raise
+        context.objects.delete(composites.path(job))
+        return made
+
+
+def _job(context: Context, job: str) -> Job:
+    with reading(context.engine) as c:
+        return Job.of(c, jobs.get(c, job))
+
+
+def _span(text: str, size: int) -> tuple[int, int]:
+    """The bytes that a Range asks for (RFC 9110, sect. 14.2), from the first up to one past the last.
+
+    All of them where it is none, of more than one part, or beyond 10**18: an answer may ignore it. Past the end if
+    there are none.
+    """
+    found = RANGE.fullmatch(text.strip())
+    if found is None or not any(found.groups()):
+        return 0, size
+    first, last = found.groups()
+    if not first:
+        return (max(size - int(last), 0), size) if int(last) else (size, size)
+    end = min(int(last) + 1, size) if last else size
+    return (0, size) if last and int(last) < int(first) else (int(first), end)
+
+
+def _pieces(file: BinaryIO, size: int) -> Iterator[bytes]:
+    with file:
+        while size and (data := file.read(min(PIECE, size))):
+            size -= len(data)
+            yield data

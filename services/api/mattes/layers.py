@@ -1,0 +1,152 @@
+"""Layers of mattes for other tools, and single pixels looked into, over HTTP."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Annotated
+
+import anyio.to_thread
+from fastapi import APIRouter, Query, Request, Response
+from pydantic import BaseModel
+
+from services.api.context import Colour, Context, Needs, Pair
+from services.api.http.responses import answered, is_known
+from storage.database.engine import reading
+from storage.errors import InvalidInput, NotFound
+from storage.layout import mattes as stored_mattes
+from storage.records import mattes
+from workflows.mattes import layers
+from workflows.mattes.pixel import look_into
+from workflows.mattes.pixel_picture import picture
+
+router = APIRouter(tags=["mattes"])
+MOST_BYTES = 1 << 30
+"""Of the values of all layers of a matte, which are in memory at once."""
+MEDIA_TYPES = {"png": "image/png", "exr": "image/x-exr"}
+FILES: dict[str, Callable[[stored_mattes.Matte], bytes]] = {
+    f"{name}.{kind}": partial(make, name=name)
+    for name in layers.NAMES
+    for kind, make in (("png", layers.png), ("exr", layers.exr))
+} | {"stmap.exr": layers.stmap}
+ALL = "all.exr"
+Lobes = Annotated[
+    int, Query(ge=1, le=layers.MOST_LOBES, description="Lobes of a pixel; more are merged into these.")
+]
+X = Annotated[int, Query(description="The pixel's column, from 0 at the left.")]
+Y = Annotated[int, Query(description="The pixel's row, from 0 at the top.")]
+
+
+class Cell(BaseModel):
+    """A cell that light comes from, by its centre on the monitor, 0 to 1, v up; the middle of a smooth bump three times
+    as large if ``level`` is not 0."""
+
+    u: float
+    v: float
+    width: float
+    height: float
+    level: int
+    weight: Colour
+
+
+class Lobe(BaseModel):
+    """A Gaussian: centre as of a cell, standard deviations along its axes in widths of the monitor, and the angle of
+    the first of them, in radians counter-clockwise from the u axis."""
+
+    u: float
+    v: float
+    weight: Colour
+    sigma_u: float
+    sigma_v: float
+    theta: float
+
+
+class Transport(BaseModel):
+    """Where the light of a pixel comes from, cells and lobes heaviest first; without any if it was not recovered."""
+
+    x: int
+    y: int
+    recovered: bool
+    S: Colour
+    rho: Colour
+    monitor: Pair
+    cells: list[Cell]
+    lobes: list[Lobe]
+
+
+@router.get(
+    "/mattes/{id}/layers/{file}",
+    response_class=Response,
+    responses={200: {"content": {kind: {} for kind in MEDIA_TYPES.values()}, "description": "The layer"}},
+)
+async def get_layer(
+    context: Needs, id: str, file: str, request: Request, lobes: Lobes = layers.LOBES
+) -> Response:
+    """A layer: `S`, `rho`, `alpha` or `confidence`, as `.png` (16 bits, linear, clipped to 0 to 1) or `.exr`;
+    `stmap.exr`; or `all.exr`, all of it with the lobes of each pixel."""
+    if file not in FILES and file != ALL:
+        raise NotFound(f"no layer is called {file}: there are {', '.join([*FILES, ALL])}")
+
+    matte = await anyio.to_thread.run_sync(_matte, context, id)
+    tag = {"ETag": f'"{id}-{file}-{lobes}"'}  # a matte never changes once it is ready
+    if is_known(request.headers, tag["ETag"]):
+        return Response(status_code=304, headers=tag)
+
+    def encode() -> Response:
+        kind = MEDIA_TYPES[file.rpartition(".")[2]]
+        if file != ALL:
+            return answered(FILES[file](matte), kind, tag)
+        much = layers.bytes_of_everything(matte.width, matte.height, lobes)
+        if much > MOST_BYTES:
+            raise InvalidInput(
+                f"all layers with {lobes} lobes take {much} bytes, and may take {MOST_BYTES}: ask for fewer lobes, "
+                "or for the layers one by one",
+                field="lobes",
+                limit=MOST_BYTES,
+            )
+        return answered(layers.everything(matte, lobes), kind, tag)
+
+    return await anyio.to_thread.run_sync(encode, limiter=context.layers)
+
+
+@router.get("/mattes/{id}/transport")
+def get_transport(context: Needs, id: str, x: X, y: Y, lobes: Lobes = layers.LOBES) -> Transport:
+    """Where the light of a pixel comes from: cells of the monitor and their weights by channel, and lobes."""
+    pixel = look_into(_matte(context, id), x, y, lobes)
+    return Transport(
+        x=x,
+        y=y,
+        recovered=pixel.recovered,
+        S=pixel.S.tolist(),
+        rho=pixel.rho.tolist(),
+        monitor=list(pixel.monitor),
+        cells=[
+            Cell(u=u, v=v, width=width, height=height, level=level, weight=weight)
+            for (u, v, width, height), level, weight in zip(
+                pixel.cells.tolist(), pixel.levels.tolist(), pixel.weight.tolist(), strict=True
+            )
+        ],
+        lobes=[
+            Lobe(u=u, v=v, weight=[r, g, b], sigma_u=sigma_u, sigma_v=sigma_v, theta=theta)
+            for u, v, r, g, b, sigma_u, sigma_v, theta in pixel.lobes.tolist()
+        ],
+    )
+
+
+@router.get(
+    "/mattes/{id}/transport.png",
+    response_class=Response,
+    responses={200: {"content": {"image/png": {}}, "description": "The picture"}},
+)
+async def get_transport_picture(context: Needs, id: str, x: X, y: Y, lobes: Lobes = layers.LOBES) -> Response:
+    """The same as a picture: the monitor, a close-up with the lobes as ellipses, and the channels apart."""
+
+    def draw() -> bytes:
+        return picture(look_into(_matte(context, id), x, y, lobes))
+
+    answer = await anyio.to_thread.run_sync(draw, limiter=context.pictures)
+    return Response(answer, media_type="image/png")
+
+
+def _matte(context: Context, id: str) -> stored_mattes.Matte:
+    with reading(context.engine) as c:
+        mattes.get_ready(c, id)
+    return context.cache.matte(id)

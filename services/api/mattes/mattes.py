@@ -1,0 +1,84 @@
+"""Mattes over HTTP."""
+
+from datetime import UTC, datetime
+from typing import Any, Literal
+
+from fastapi import APIRouter
+from pydantic import BaseModel
+from sqlalchemy import Row
+
+from services.api.context import After, Limit, Needs, Pair
+from services.api.http.responses import time_of
+from storage.database.engine import reading, writing
+from storage.database.rows import page
+from storage.database.tables import mattes as table
+from storage.errors import Conflict
+from storage.layout import mattes as stored_mattes
+from storage.records import jobs, mattes
+
+router = APIRouter(tags=["mattes"])
+
+
+class Matte(BaseModel):
+    """A matte; one that came in an archive has no capture and no job."""
+
+    id: str
+    state: Literal["recovering", "ready", "failed"]
+    capture: str | None
+    job: str | None
+    options: dict[str, Any]
+    width: int | None = None
+    height: int | None = None
+    monitor: Pair | None = None
+    columns: int | None = None
+    rows: int | None = None
+    created_at: datetime
+    expires_at: datetime | None
+
+    @classmethod
+    def of(cls, row: Row[Any]) -> "Matte":
+        figures = {name: value for name, value in (row.figures or {}).items() if name in cls.model_fields}
+        return cls(
+            **{name: getattr(row, name) for name in ("id", "state", "capture", "job", "options")},
+            **figures,
+            created_at=datetime.fromtimestamp(row.created_at, UTC),
+            expires_at=time_of(row.expires_at),
+        )
+
+
+class Mattes(BaseModel):
+    """A page of mattes, newest first."""
+
+    mattes: list[Matte]
+
+
+@router.get("/mattes")
+def list_mattes(
+    context: Needs,
+    limit: Limit = 100,
+    after: After = None,
+    state: Literal["recovering", "ready", "failed"] | None = None,
+) -> Mattes:
+    """Mattes, newest first."""
+    with reading(context.engine) as c:
+        return Mattes(mattes=[Matte.of(row) for row in page(c, table, limit, after, state=state)])
+
+
+@router.get("/mattes/{id}")
+def get_matte(context: Needs, id: str) -> Matte:
+    """A matte."""
+    with reading(context.engine) as c:
+        return Matte.of(mattes.get(c, id))
+
+
+@router.delete("/mattes/{id}", status_code=204)
+def delete_matte(context: Needs, id: str) -> None:
+    """Delete a matte."""
+    with writing(context.engine) as c:
+        row = mattes.get(c, id)
+        busy = [job.id for job in jobs.active(c) if job.matte == row.id]
+        if busy:
+            raise Conflict(f"job {busy[0]} works on matte {id}; cancel it first, or wait for it")
+        mattes.forget(c, id)
+    context.cache.forget(id)
+    context.objects.delete(stored_mattes.path(id))

@@ -1,0 +1,1 @@
+"""Pattern programs over HTTP, and the page that plays them."""

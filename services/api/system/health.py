@@ -1,0 +1,66 @@
+"""Whether the service lives, and whether it can work."""
+
+from collections.abc import Callable
+from typing import Literal
+
+from fastapi import APIRouter, Response
+from pydantic import BaseModel
+
+from services.api.context import Keyless
+from services.api.jobs.wait_reason import trouble_of
+from storage.database.engine import reading, writing
+from storage.records import leases
+
+router = APIRouter(tags=["system"])
+
+
+class Health(BaseModel):
+    """The service lives."""
+
+    status: Literal["alive"] = "alive"
+
+
+class Readiness(BaseModel):
+    """What the service needs, each ``ok`` or what is wrong with it."""
+
+    ready: bool
+    database: str
+    store: str
+    cluster: str
+
+
+@router.get("/healthz")
+def health() -> Health:
+    """Whether the service lives."""
+    return Health()
+
+
+@router.get("/readyz")
+def readiness(context: Keyless, response: Response) -> Readiness:
+    """Whether the database, the store and the cluster can be reached; 503 if not."""
+
+    def database() -> str:
+        with writing(context.engine) as c:  # one that is full can still be read
+            leases.touch(c)
+        return "ok"
+
+    def store() -> str:
+        context.objects.check()
+        return "ok"
+
+    def cluster() -> str:
+        with reading(context.engine) as c:
+            sign = leases.last_sign(c)
+        return trouble_of(sign) or "ok"
+
+    found = {check.__name__: _try(check) for check in (database, store, cluster)}
+    ready = all(value == "ok" for value in found.values())
+    response.status_code = 200 if ready else 503
+    return Readiness(ready=ready, **found)
+
+
+def _try(check: Callable[[], str]) -> str:
+    try:
+        return check()
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"

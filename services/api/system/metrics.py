@@ -1,0 +1,141 @@
+"""Figures for Prometheus, from the database: whichever process of the service is asked, they are the same."""
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from fastapi import APIRouter, Request, Response
+from prometheus_client import CollectorRegistry, Metric
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, SummaryMetricFamily
+from prometheus_client.exposition import choose_encoder
+from prometheus_client.registry import Collector
+from sqlalchemy import Connection
+
+from services.api.context import Whole
+from services.api.jobs.wait_reason import trouble_of
+from storage.database.engine import reading
+from storage.records import leases, statistics
+from storage.records.jobs import ACTIVE
+from storage.records.leases import Sign
+
+router = APIRouter(tags=["system"])
+KINDS = ("ingest", "recover", "composite")
+JOB_STATES = ("queued", "running", "succeeded", "failed", "cancelled")
+Labelled = Iterable[tuple[tuple[str, ...], float]]
+
+
+class _Found(Collector):
+    """Metrics that were found already."""
+
+    def __init__(self, metrics: list[Metric]) -> None:
+        self._metrics = metrics
+
+    def collect(self) -> list[Metric]:
+        return self._metrics
+
+
+@router.get("/metrics", response_class=Response)
+def get_metrics(context: Whole, request: Request) -> Response:
+    """Figures for Prometheus, of the whole service."""
+    with reading(context.engine) as c:
+        found = _Found([*_of_the_queue(c), *_of_work(c), *_of_data(c), *_of_the_cluster(c)])
+    registry = CollectorRegistry()
+    registry.register(found)
+    encode, media_type = choose_encoder(request.headers.get("accept", ""))
+    return Response(encode(registry), headers={"Content-Type": media_type})
+
+
+def _of_the_queue(connection: Connection) -> Iterator[Metric]:
+    """Jobs, and the tiles of those that are active."""
+    rows = {(row.kind, row.state): row for row in statistics.of_jobs(connection)}
+    numbers = {(kind, state): 0 for kind in KINDS for state in JOB_STATES}
+    numbers |= {labels: row.number for labels, row in rows.items()}
+    yield _gauge("jobs", "Jobs there are, by kind and state.", ("kind", "state"), numbers.items())
+    missing = statistics.of_missing(connection)
+    states: dict[tuple[str, ...], int] = {}
+    for kind in KINDS:
+        active = [row for (one, state), row in rows.items() if one == kind and state in ACTIVE]
+        total, done, failed = (
+            sum(getattr(row, name) for row in active) for name in ("total", "done", "failed")
+        )
+        again = missing.get(kind, 0)  # which count as done otherwise: progress never goes back
+        by_state = {"queued": total - done - failed, "done": done - again, "failed": failed, "missing": again}
+        states |= {(kind, state): number for state, number in by_state.items()}
+    yield _gauge(
+        "tiles",
+        "Tiles of queued and running jobs. Missing: done, not to be found in the store, done again.",
+        ("kind", "state"),
+        states.items(),
+    )
+
+
+def _of_work(connection: Connection) -> Iterator[Metric]:
+    """What has ever been done."""
+    rows = {(row.kind,): row for row in statistics.of_work(connection)}
+    steps = SummaryMetricFamily(
+        "envmatte_tile_seconds", "Seconds that workers spent on tiles, those that are done.", labels=["kind"]
+    )
+    for labels, row in rows.items():
+        steps.add_metric(labels, row.tiles, row.seconds)
+    yield steps
+    for name, column, text in (
+        ("pixels", "pixels", "Pixels done: of frames read, of mattes recovered, of frames composited."),
+        ("tile_failures", "misses", "Attempts at a tile or a step that failed."),
+        ("tile_losses", "losses", "Tiles and steps that were lost, with their worker or in the store."),
+    ):
+        yield _counter(
+            name, text, ("kind",), {key: getattr(row, column) for key, row in rows.items()}.items()
+        )
+
+
+def _of_data(connection: Connection) -> Iterator[Metric]:
+    """Captures, mattes, uploads."""
+    rows = statistics.of_captures(connection)
+    yield _gauge("captures", "Captures there are.", ("state",), (((r.state,), r.number) for r in rows))
+    text = "Bytes of the archives of captures, as they were uploaded."
+    yield _gauge("capture_bytes", text, ("state",), (((r.state,), r.bytes) for r in rows))
+    found = statistics.of_mattes(connection)
+    yield _gauge("mattes", "Mattes there are.", ("state",), (((k,), n) for k, n in found.items()))
+    uploads = statistics.of_uploads(connection)
+    yield _one("uploads", "Resumable uploads under way.", uploads.number)
+    yield _one("upload_bytes", "Bytes of them that have come.", uploads.come)
+    yield _one("upload_length_bytes", "Bytes that they will have.", uploads.length)
+
+
+def _of_the_cluster(connection: Connection) -> Iterator[Metric]:
+    """As its coordinator last saw it."""
+    sign = leases.last_sign(connection)
+    yield _one("trouble", "1 if nothing can go on, as GET /v1/cluster says in words.", bool(trouble_of(sign)))
+    cluster = (sign or Sign(None, 0, leases.NOBODY)).cluster
+    workers = cluster["workers"]
+    yield _one("workers", "Worker processes.", len(workers))
+    yield _one("threads", "Threads of theirs.", _sum(workers, "threads"))
+    yield _one("workers_memory_bytes", "Memory of all workers.", _sum(workers, "memory_bytes"))
+    text = "What they may take before they are ended, together; 0 if there is no limit."
+    yield _one("workers_memory_limit_bytes", text, _sum(workers, "memory_limit_bytes"))
+    yield _one("tiles_under_way", "Tiles and steps that the cluster has.", cluster.get("under_way", 0))
+    if sign is not None:
+        text = "Seconds since a coordinator gave a sign of life."
+        yield _one("coordinator_last_sign_seconds", text, sign.seconds)
+
+
+def _sum(workers: list[dict[str, Any]], name: str) -> int:
+    return sum(worker[name] or 0 for worker in workers)
+
+
+def _gauge(name: str, text: str, labels: tuple[str, ...], found: Labelled) -> Metric:
+    return _filled(GaugeMetricFamily(f"envmatte_{name}", text, labels=labels), found)
+
+
+def _counter(name: str, text: str, labels: tuple[str, ...], found: Labelled) -> Metric:
+    return _filled(CounterMetricFamily(f"envmatte_{name}", text, labels=labels), found)
+
+
+def _filled(family: Any, found: Labelled) -> Metric:
+    for labels, value in found:
+        family.add_metric(labels, value)
+    metric: Metric = family
+    return metric
+
+
+def _one(name: str, text: str, value: float) -> Metric:
+    return GaugeMetricFamily(f"envmatte_{name}", text, value=value)

@@ -1,0 +1,1 @@
+"""The command `envmatte`, one file for each group of commands."""

@@ -1,0 +1,1 @@
+"""The dask cluster: scheduler, workers, and what hands tasks to them."""

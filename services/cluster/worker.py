@@ -1,0 +1,156 @@
+"""`envmatte worker`: worker processes of this machine, for a scheduler that may come and go."""
+
+import asyncio
+import logging
+import multiprocessing
+import socket
+import tempfile
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from urllib.parse import urlsplit
+
+from distributed import Nanny
+from distributed.security import Security
+
+from services.cluster.connect import NO_DASHBOARD, PRELOAD, START, reach, share_start
+from services.runtime.addresses import is_loopback
+from services.runtime.logs import log
+from services.runtime.process import keep_open
+from services.settings import ClusterSettings
+from storage.errors import InvalidInput
+
+logger = logging.getLogger(__name__)
+
+PAUSE = 1.0
+"""Seconds between two tries to join, and between two looks whether a worker process is there."""
+SAY = 30.0
+"""Seconds between two words about a scheduler that does not answer."""
+
+
+def work(settings: ClusterSettings, host: str | None) -> None:
+    """Work for a scheduler until SIGTERM, however often it goes away.
+
+    Parameters
+    ----------
+    settings : ClusterSettings
+    host : str, optional
+        Address to listen on, for the scheduler and other workers. Default: that by which the scheduler is reached.
+
+    Raises
+    ------
+    InvalidInput
+        If no cluster is named, or it should listen on other than loopback without TLS.
+    KeyboardInterrupt
+        At SIGINT.
+    """
+    log(settings.log, settings.log_level, "nanny")
+    if settings.cluster is None:
+        raise InvalidInput(
+            "name the scheduler to work for with --cluster tls://HOST:PORT, or ENVMATTE_CLUSTER"
+        )
+    security = settings.security()
+    if security is None and not is_loopback(host or "127.0.0.1"):
+        raise InvalidInput(
+            f"asked to listen on {host} without TLS, where whoever reaches it may run what he likes: name a scheduler "
+            "that speaks TLS with --cluster tls://HOST:PORT, or listen on 127.0.0.1"
+        )
+    share_start(PRELOAD)
+    keep_open(_Workers(settings.cluster, security, settings, host).running())
+
+
+class _Workers:
+    """Nannies in this process, each with a worker process of its own that it starts again when it dies."""
+
+    def __init__(
+        self, scheduler: str, security: Security | None, settings: ClusterSettings, host: str | None
+    ) -> None:
+        self._scheduler = scheduler
+        self._security = security or Security()
+        self._settings = settings
+        self._host = host
+        self._looking = asyncio.Lock()
+        self._said_at = -SAY
+        self._ending = False
+
+    @asynccontextmanager
+    async def running(self) -> AsyncIterator[None]:
+        with tempfile.TemporaryDirectory(prefix="envmatte-worker-", ignore_cleanup_errors=True) as scratch:
+            kept = [asyncio.create_task(self._keep(scratch)) for _ in range(self._settings.workers)]
+            try:
+                yield
+            finally:
+                self._ending = True
+                for task in kept:
+                    task.cancel()
+                await asyncio.gather(*kept, return_exceptions=True)
+                for process in multiprocessing.active_children():
+                    process.kill()  # a nanny that has not started yet can't end its own
+
+    async def _keep(self, scratch: str) -> None:
+        """Have one nanny, and another one whenever it ends, as it does with its scheduler."""
+        while not self._ending:
+            await self._find_scheduler()
+            try:
+                await self._have_nanny(scratch)
+            except Exception as error:
+                if (
+                    self._ending
+                ):  # closing a nanny that has not started fails, and takes the place of the cancellation
+                    return
+                logger.warning("a worker could not join %s: %r; trying again", self._scheduler, error)
+            await asyncio.sleep(PAUSE)
+
+    async def _find_scheduler(self) -> None:
+        """Wait until the scheduler answers, for ever."""
+        async with self._looking:  # one after another, so that it is said once
+            while True:
+                try:
+                    await reach(self._scheduler, self._security, "worker")
+                except OSError as error:
+                    if time.monotonic() - self._said_at >= SAY:
+                        logger.warning("waiting for the scheduler at %s: %s", self._scheduler, error)
+                        self._said_at = time.monotonic()
+                    await asyncio.sleep(PAUSE)
+                else:
+                    if self._said_at > 0:
+                        logger.info("the scheduler at %s answers", self._scheduler)
+                        self._said_at = -SAY
+                    return
+
+    async def _have_nanny(self, scratch: str) -> None:
+        nanny = Nanny(
+            self._scheduler,
+            nthreads=1,
+            # Without one it would listen on every address that the machine has.
+            host=self._host or _address_towards(self._scheduler),
+            security=self._security,
+            memory_limit=self._settings.worker_memory,
+            local_directory=scratch,
+            preload=PRELOAD,
+            death_timeout=START,
+            silence_logs=logging.WARNING,
+            **NO_DASHBOARD,
+        )
+        try:
+            await nanny
+            logger.info("worker %s has joined %s", nanny.worker_address, self._scheduler)
+            finished = asyncio.create_task(nanny.finished())
+            alive_at = time.monotonic()
+            # A nanny that could not start its process again goes on without one, and would do so for ever.
+            while not finished.done() and time.monotonic() - alive_at < 2 * START:
+                await asyncio.wait([finished], timeout=PAUSE)
+                if nanny.is_alive():
+                    alive_at = time.monotonic()
+            logger.info("worker of %s has ended", self._scheduler)
+        finally:
+            await nanny.close()
+
+
+def _address_towards(address: str) -> str:
+    """The address of this machine by which it reaches another; no byte is sent."""
+    url = urlsplit(address)
+    family, kind, protocol, _, there = socket.getaddrinfo(url.hostname, url.port, type=socket.SOCK_DGRAM)[0]
+    with socket.socket(family, kind, protocol) as towards:
+        towards.connect(there)
+        return str(towards.getsockname()[0])

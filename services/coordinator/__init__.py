@@ -1,0 +1,1 @@
+"""The coordinator: takes queued jobs and runs their steps on the cluster."""

@@ -1,0 +1,171 @@
+"""What each kind of job means to the ledger and to the store, besides its steps: one class a kind."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from sqlalchemy import Connection, Row
+
+from services.runtime.problems import problem_of
+from storage.errors import Conflict
+from storage.layout import captures as stored_captures
+from storage.layout import composites, uploads
+from storage.layout import mattes as stored_mattes
+from storage.objects.store import Objects
+from storage.records import captures, jobs, mattes, tiles
+from workflows.jobs import Task
+
+Problem = dict[str, Any]
+
+
+def may_be_retried(problem: Problem) -> bool:
+    """Whether a job that failed with a problem may be tried again: what it had is kept then."""
+    return captures.may_be_retried(problem)
+
+
+class Kind:
+    """A kind of job: what is written down, and what is removed, as a job of it goes on.
+
+    What takes a connection is part of a transaction; what takes the store comes after it, and may be repeated.
+    """
+
+    def is_due(self, connection: Connection, row: Row[Any]) -> bool:
+        """Whether a queued job may begin.
+
+        Raises
+        ------
+        EnvmatteError
+            If it never will.
+        """
+        return True
+
+    def prepared(self, connection: Connection, task: Task, plan: dict[str, Any]) -> None:
+        """Its plan is made."""
+
+    def succeeded(self, connection: Connection, task: Task, figures: dict[str, Any]) -> None:
+        """It has succeeded."""
+
+    def failed(self, connection: Connection, task: Task, problem: Problem) -> None:
+        """It has failed."""
+
+    def cancelled(self, connection: Connection, row: Row[Any]) -> None:
+        """It was cancelled: nothing is left of what `storage.records.jobs.not_wound_up` goes by."""
+
+    def retried(self, connection: Connection, row: Row[Any]) -> None:
+        """It is queued again, having failed.
+
+        Raises
+        ------
+        EnvmatteError
+            If it can't be.
+        """
+
+    def tidy(self, objects: Objects, row: Row[Any]) -> None:
+        """Remove what nobody needs once it has succeeded."""
+
+    def discard(self, objects: Objects, row: Row[Any]) -> None:
+        """Remove all that it wrote, and what it was given."""
+
+    def discards(self, problem: Problem) -> bool:
+        """Whether a job that failed leaves nothing that may be of use."""
+        return False
+
+
+class Ingest(Kind):
+    """Makes a capture of an archive."""
+
+    def prepared(self, connection: Connection, task: Task, plan: dict[str, Any]) -> None:
+        found = {name: plan[name] for name in ("width", "height", "frames")}
+        captures.change(connection, task.capture, **found)
+
+    def succeeded(self, connection: Connection, task: Task, figures: dict[str, Any]) -> None:
+        captures.change(connection, task.capture, state="ready")
+
+    def failed(self, connection: Connection, task: Task, problem: Problem) -> None:
+        captures.change(
+            connection,
+            task.capture,
+            state="failed",
+            problem=problem,
+            stored=0 if self.discards(problem) else None,
+        )
+
+    def cancelled(self, connection: Connection, row: Row[Any]) -> None:
+        problem = problem_of(Conflict("the ingest was cancelled; upload the capture again"))
+        captures.change(connection, row.capture, state="failed", problem=problem, stored=0)
+
+    def retried(self, connection: Connection, row: Row[Any]) -> None:
+        capture = captures.get(connection, row.capture)
+        if not may_be_retried(capture.problem):
+            raise Conflict(f"capture {capture.id} can't be used, and nothing of it was kept; upload it again")
+        captures.change(connection, capture.id, state="ingesting", problem=None, stored=None)
+
+    def tidy(self, objects: Objects, row: Row[Any]) -> None:
+        uploads.remove(objects, row.capture)
+
+    def discard(self, objects: Objects, row: Row[Any]) -> None:
+        objects.delete(stored_captures.path(row.capture))
+        uploads.remove(objects, row.capture)
+
+    def discards(self, problem: Problem) -> bool:
+        return not may_be_retried(problem)
+
+
+class Recovery(Kind):
+    """Makes a matte of a capture, once that is ingested."""
+
+    def is_due(self, connection: Connection, row: Row[Any]) -> bool:
+        capture = captures.get(connection, row.capture)
+        if capture.state == "failed":
+            raise Conflict(f"capture {capture.id} could not be ingested: {capture.problem['detail']}")
+        return bool(capture.state == "ready")
+
+    def succeeded(self, connection: Connection, task: Task, figures: dict[str, Any]) -> None:
+        mattes.change(connection, task.matte, state="ready", figures=figures)
+
+    def failed(self, connection: Connection, task: Task, problem: Problem) -> None:
+        mattes.change(connection, task.matte, state="failed")
+
+    def cancelled(self, connection: Connection, row: Row[Any]) -> None:
+        mattes.forget(connection, row.matte)
+
+    def retried(self, connection: Connection, row: Row[Any]) -> None:
+        capture = captures.get(connection, row.capture)
+        if capture.state == "failed":
+            raise Conflict(f"capture {capture.id} failed: {capture.problem['detail']}")
+        mattes.get(connection, row.matte)  # it may have expired, or been deleted
+        mattes.change(connection, row.matte, state="recovering", stored=None)
+
+    def discard(self, objects: Objects, row: Row[Any]) -> None:
+        objects.delete(stored_mattes.path(row.matte))
+
+
+class Composite(Kind):
+    """Makes a video of a clip and a matte. It has no record but the job's."""
+
+    def succeeded(self, connection: Connection, task: Task, figures: dict[str, Any]) -> None:
+        jobs.change(connection, task.job, stored=None)
+
+    def failed(self, connection: Connection, task: Task, problem: Problem) -> None:
+        if self.discards(problem):
+            jobs.change(connection, task.job, stored=0)
+
+    def cancelled(self, connection: Connection, row: Row[Any]) -> None:
+        tiles.clear(connection, row.id)
+        jobs.change(connection, row.id, stored=0)
+
+    def retried(self, connection: Connection, row: Row[Any]) -> None:
+        if self.discards(row.problem):
+            raise Conflict(f"the clip of job {row.id} can't be used, and was not kept; send another one")
+        mattes.get(connection, row.matte)
+
+    def tidy(self, objects: Objects, row: Row[Any]) -> None:
+        composites.tidy(objects, row.id)
+
+    def discard(self, objects: Objects, row: Row[Any]) -> None:
+        objects.delete(composites.path(row.id))
+
+    def discards(self, problem: Problem) -> bool:
+        return not may_be_retried(problem)
+
+
+KINDS: Mapping[str, Kind] = {"ingest": Ingest(), "recover": Recovery(), "composite": Composite()}

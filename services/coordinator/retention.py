@@ -1,0 +1,126 @@
+"""What the coordinator removes from the store: what has expired, and what nothing refers to. And what it counts."""
+
+import logging
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+
+from sqlalchemy import Connection, Engine, delete, exists, select, update
+
+from storage.database import tables
+from storage.database.engine import reading, writing
+from storage.layout import captures, composites, mattes
+from storage.layout import uploads as stored_uploads
+from storage.maintenance import inventory
+from storage.maintenance.inventory import KEPT
+from storage.objects.store import Objects
+from storage.records import jobs, uploads
+
+logger = logging.getLogger(__name__)
+
+MOST = 1000
+"""Rows that are deleted in one transaction: others wait for it."""
+
+
+def forget_expired(connection: Connection) -> list[str]:
+    """Delete the rows of uploads, captures and mattes whose time is over; returns where they lie in the store.
+
+    What an active job works on is kept until that has ended.
+    """
+    gone = [stored_uploads.path(upload) for upload in uploads.forget_expired(connection)]
+    for table, making, where in (
+        (tables.captures, "ingesting", (captures.path, stored_uploads.path)),
+        (tables.mattes, "recovering", (mattes.path,)),
+    ):
+        over = (table.c.expires_at <= time.time(), table.c.state != making)
+        found = set(connection.scalars(select(table.c.id).where(*over)))
+        if found:
+            busy = tables.jobs.c["capture" if table is tables.captures else "matte"]
+            found -= set(connection.scalars(select(busy).where(tables.jobs.c.state.in_(jobs.ACTIVE))))
+            connection.execute(delete(table).where(table.c.id.in_(found)))
+            gone += [path(one) for one in sorted(found) for path in where]
+    return gone
+
+
+def forget_jobs(engine: Engine, objects: Objects, seconds: float | None) -> None:
+    """Delete some of the jobs that are kept no longer, and the Idempotency-Keys of what is gone.
+
+    With a job go its tiles and its log, and the video of a composite, of which it is the only record. An ingest stays
+    as long as its capture, a recovery as long as its matte.
+
+    Parameters
+    ----------
+    seconds : float, optional
+        How long jobs are kept after they have ended; for ever if None.
+    """
+    job, key = tables.jobs, tables.made
+    of_capture = exists().where(tables.captures.c.id == job.c.capture)
+    of_matte = exists().where(tables.mattes.c.id == job.c.matte)
+    in_use = ((job.c.kind == "ingest") & of_capture) | ((job.c.kind == "recover") & of_matte)
+    made = [exists().where(table.c.id == key.c.id) for table in (tables.captures, tables.mattes, job)]
+    gone = select(key.c.id).where(*(~one for one in made)).limit(MOST)
+    with reading(engine) as c:  # nobody waits while it looks through all of them
+        keys = c.scalars(gone).all()
+        jobs_over: Sequence[str] = ()
+        over = job.c.finished_at <= time.time() - (seconds or 0)
+        if seconds is not None:
+            jobs_over = c.scalars(select(job.c.id).where(over, ~in_use).limit(MOST)).all()
+    if not (keys or jobs_over):
+        return
+    with writing(engine) as c:
+        c.execute(delete(key).where(key.c.id.in_(keys)))
+        # One that was tried again meanwhile has not ended.
+        deleted = delete(job).where(job.c.id.in_(jobs_over), over).returning(job.c.id, job.c.kind)
+        composed = [row.id for row in c.execute(deleted) if row.kind == "composite"]
+    for one in composed:
+        remove(objects, composites.path(one))
+
+
+def remove(objects: Objects, path: str) -> None:
+    """Remove what a row that is deleted stood for."""
+    with suppress(OSError):  # someone writes there still: he removes it himself, or a sweep does
+        objects.delete(path)
+
+
+def count(engine: Engine, objects: Objects) -> None:
+    """Count the bytes of what is new in the store, and write them down: limits go by them."""
+    for table, whole, folders in (
+        (tables.captures, tables.captures.c.state != "ingesting", (captures.path, stored_uploads.path)),
+        (tables.mattes, tables.mattes.c.state != "recovering", (mattes.path,)),
+        (
+            tables.jobs,
+            (tables.jobs.c.kind == "composite") & (tables.jobs.c.state == "succeeded"),
+            (composites.path,),
+        ),
+    ):
+        with reading(engine) as c:
+            new = c.scalars(select(table.c.id).where(whole, table.c.stored.is_(None))).all()
+        for one in new:
+            stored = sum(sum(objects.sizes(path(one)).values()) for path in folders)
+            with writing(engine) as c:
+                uncounted = (table.c.id == one, whole, table.c.stored.is_(None))
+                c.execute(update(table).where(*uncounted).values(stored=stored))
+
+
+def sweep(engine: Engine, objects: Objects, seconds: float = KEPT) -> None:
+    """Remove what has no row in the database: what killed processes left.
+
+    Parameters
+    ----------
+    seconds : float
+        For how long it must not have been written to. 0 is for whoever knows that nobody writes.
+    """
+    with reading(engine) as c:
+        things = list(inventory.things(c))
+    known = {thing.folder for thing in things}
+    for folder in inventory.FOLDERS:
+        kept = {path.removeprefix(f"{folder}/") for path in known}
+        for name in objects.stale(folder, seconds, but={*kept, "zarr.json"}):
+            logger.info("removing %s/%s, which nothing refers to", folder, name)
+            objects.delete(f"{folder}/{name}")
+    if not seconds:
+        objects.sweep("uploads")
+        objects.sweep("composites")
+        for thing in things:
+            if thing.kind == "upload":
+                stored_uploads.sweep(objects, thing.id, thing.parts)

@@ -1,0 +1,136 @@
+// Filming: a program to choose, and one while a monitor shows it: what to see to, how far it is, and the film of it.
+import { getJson, post } from "../lib/api.js";
+import { camera, noCamera } from "./recorder.js";
+import { CHECKS } from "./checklist.js";
+import { badge, duration, empty, facts, h, pause, prose, said, size, when } from "../lib/dom.js";
+import { follow } from "../lib/events.js";
+import { isFilm, named, recordOf } from "../upload/film_bundle.js";
+import { list } from "../lib/list.js";
+import { begin, onDrop, running } from "../upload/upload.js";
+
+const SILENT = 8; // seconds after which a page that shows a program is taken for gone: it tells each 2
+const CUT = "It broke off before the program’s end: this film does not show all of it.";
+const isShown = ({ showing }) => ["countdown", "showing"].includes(showing?.phase) && showing.age_seconds < SILENT + showing.seconds;
+
+export async function filming(main, signal) {
+  const { presets } = await getJson("v1/presets", signal);
+  const problem = h("div");
+  const number = (value) => h("input", { type: "number", min: 1, max: 16384, step: 1, required: true, value: Math.round(value * devicePixelRatio) });
+  const [width, height] = [number(screen.width), number(screen.height)];
+  const choices = presets.map(({ name, description }, n) => {
+    const about = h("span", { class: "hint", id: `preset-${name}` }, description);
+    return h("p", {}, h("label", { class: "choice" }, h("input", { type: "radio", name: "preset", value: name, checked: n === 0, "aria-describedby": about.id }), name), " ", about);
+  });
+  const form = h("form", { class: "panel" }, h("h2", {}, "Choose a program"),
+    h("fieldset", { class: "stack" }, h("legend", {}, "What the monitor shows"), choices),
+    h("div", { class: "row" }, h("label", {}, "The monitor’s width", width), h("label", {}, "Height", height), "pixels"),
+    h("p", { class: "hint" }, "As this screen has them. Put in those of another one if the program is shown there."),
+    problem, h("p", { class: "row" }, h("button", { class: "primary" }, "Go on")));
+  form.onsubmit = async (event) => {
+    event.preventDefault();
+    problem.replaceChildren();
+    try {
+      const monitor = { width: width.valueAsNumber, height: height.valueAsNumber };
+      const made = await post("v1/programs", { preset: form.elements.preset.value, monitor, border: true });
+      location.hash = `#/film/${made.id}`;
+    } catch (error) {
+      problem.replaceChildren(said(error));
+    }
+  };
+  main.append(h("h1", {}, "Filming"),
+    h("p", { class: "lead" }, "A monitor behind the glass shows patterns, one after another, and a camera films them."),
+    form, running, await nearby(signal), h("h2", {}, "Programs there are"));
+  await list(main, signal, {
+    page: (after) => getJson(`v1/programs?limit=50${after}`, signal).then((answer) => answer.programs),
+    busy: isShown,
+    none: () => empty("None yet", "Choose one above."),
+    item: (one) => h("a", { class: "card", href: `#/film/${one.id}` }, h("span", { class: "name" }, named(one)), isShown(one) ? badge("running") : h("span"),
+      h("span", { class: "about" }, one.id), when(one.created_at)),
+  });
+}
+
+// Where a phone finds this page, to be read off the screen.
+async function nearby(signal) {
+  const isOwn = /^(localhost|127\.|\[::1\]$)/.test(location.hostname);
+  const { url, problem } = isOwn ? await getJson("v1/network", signal) : { url: location.origin };
+  return h("section", { class: "panel" }, h("h2", {}, "On a phone"),
+    url ? [h("p", {}, "A phone in the same network follows along, and uploads its film, at"), h("p", { class: "address" }, `${url}/#/film`),
+        h("p", { class: "hint" }, "There it chooses the program that is shown, the newest first.")]
+      : h("p", {}, prose(problem), "."));
+}
+
+export async function program(main, signal, id) {
+  let found = await getJson(`v1/programs/${id}`, signal);
+  const phase = h("p", { class: "phase", role: "timer", "aria-label": "On the monitor" });
+  const bar = h("progress", { max: found.patterns, value: 0, "aria-label": "Patterns shown" });
+  const about = h("p", { class: "hint" });
+  const problem = h("div");
+  const live = h("section", { class: "panel" }, h("h2", {}, "On the monitor"), phase, bar, about,
+    h("p", { class: "row" }, h("a", { class: "primary", href: `v1/programs/${id}/play`, target: "_blank", rel: "opener" }, "Show it on this screen")));
+  const film = (file, about) => begin(file, recordOf(found, found.showing?.patterns_per_second ?? 2), about);
+  const why = noCamera();
+  const recorder = why ? null : camera(signal, (file, whole) => film(file, { taken: true, lacks: whole ? "" : CUT }));
+  const choose = h("input", { type: "file", accept: "video/*", id: "film" });
+  const take = ([file]) => {
+    problem.replaceChildren();
+    if (file && isFilm(file)) film(file);
+    else if (file) problem.replaceChildren(said({ title: "This is no film", detail: `${file.name} is of the kind ${file.type || "unknown"}: choose the video that the camera took.` }));
+  };
+  choose.onchange = () => {
+    take(choose.files);
+    choose.value = "";
+  };
+  const zone = h("div", { class: "drop small" }, h("label", { for: "film" }, h("strong", {}, "Choose the film"), " that the camera took of this program, or drop it here"), choose);
+  onDrop(zone, take);
+  const filmed = h("section", { class: "panel" }, h("h2", {}, "The film"), recorder ? recorder.panel : h("p", {}, why), zone, problem, running);
+  main.append(
+    h("p", { class: "crumb" }, h("a", { href: "#/film" }, "Filming")),
+    h("h1", {}, named(found)),
+    facts({ Patterns: `${size(found.monitor)} pixels`, "At 2 a second": duration(found.patterns / 2), Made: when(found.created_at) }),
+    h("div", { class: "columns" },
+      h("section", { class: "panel" }, h("h2", {}, "Before you start"),
+        h("ul", { class: "checks" }, CHECKS.map((text) => h("li", {}, h("label", {}, h("input", { type: "checkbox" }), h("span", {}, text)))))),
+      h("div", { class: "stack" }, live, filmed)),
+    await nearby(signal),
+  );
+  let since = performance.now();
+  const age = () => (found.showing?.age_seconds ?? 0) + (performance.now() - since) / 1000;
+  const draw = () => {
+    const words = told(found, age());
+    if (phase.textContent !== words.phase) phase.textContent = words.phase;
+    about.textContent = words.about;
+    bar.value = words.shown;
+  };
+  const changed = (now) => {
+    [found, since] = [now, performance.now()];
+    draw();
+    const { phase: told } = found.showing ?? {};
+    if (told === "countdown" && age() < SILENT) recorder?.start();
+    if (told === "shown" || told === "stopped") recorder?.stop(told === "shown");
+  };
+  const lost = (away) => away && (about.textContent = "The service does not answer; it is asked again.");
+  follow(`v1/programs/${id}/events`, signal, changed, { lost }).catch((error) => signal.aborted || live.append(said(error)));
+  (async () => {
+    for (;;) {
+      draw();
+      await pause(250, signal);
+    }
+  })().catch(() => {}); // the view was left
+  return () => {
+    filmed.append(running);
+    recorder?.again();
+  };
+}
+
+// What a monitor shows by now, by what it told some seconds ago.
+function told({ showing, patterns }, age) {
+  if (!showing) return { phase: "Not yet", about: "It starts when the page that shows it is opened on the monitor.", shown: 0 };
+  const { phase, seconds, shown, patterns_per_second: rate } = showing;
+  if (phase === "shown") return { phase: "All shown", about: `${patterns} patterns, ${rate} a second. Stop the film.`, shown: patterns };
+  if (phase === "stopped") return { phase: "Stopped", about: "It was stopped before its end: start both again, the film first.", shown: 0 };
+  if (age > SILENT + seconds + 1 / rate) return { phase: "Out of sight", about: `The page that shows it has told nothing for ${duration(age)}.`, shown };
+  const ahead = Math.max(seconds - age, 0);
+  if (ahead) return { phase: `Starts in ${Math.ceil(ahead)}`, about: "Let the camera run by now.", shown: 0 };
+  const now = Math.min(patterns, Math.floor(shown + Math.max(age - seconds, 0) * rate));
+  return { phase: `${now} of ${patterns}`, about: `About ${duration((patterns - now) / rate)} left. Touch nothing.`, shown: now };
+}

@@ -1,0 +1,87 @@
+// Resumable uploads by tus 1.0 (https://tus.io/protocols/resumable-upload).
+import { Problem, ask, authorization } from "../lib/api.js";
+import { declared } from "./archive_info.js";
+import { pause } from "../lib/dom.js";
+
+const PART = 8 << 20; // bytes of a request: the service takes 10,000 of them
+const LONGEST = 30_000; // ms between two attempts
+const TUS = { "Tus-Resumable": "1.0.0" };
+// The service has more than was thought, is full of requests, or is away: what helps is to look how far it is.
+const PASSING = [0, 409, 429, 502, 503, 504];
+
+// A request with the bytes that went out told meanwhile, which `fetch` can't.
+function patch(path, offset, part, progress, signal) {
+  return new Promise((resolve, reject) => {
+    const request = new XMLHttpRequest();
+    const stop = () => request.abort();
+    request.open("PATCH", path);
+    const type = { "Content-Type": "application/offset+octet-stream", "Upload-Offset": offset };
+    for (const [name, value] of Object.entries({ ...TUS, ...type, ...authorization() })) request.setRequestHeader(name, value);
+    request.upload.onprogress = (event) => progress(offset + event.loaded);
+    request.onload = () => {
+      if (request.status === 204) return resolve(Number(request.getResponseHeader("Upload-Offset")));
+      const about = { title: "Refused", detail: `The service answered with ${request.status}.`, status: request.status };
+      try {
+        Object.assign(about, JSON.parse(request.responseText));
+      } catch {} // of something between that is no part of the service
+      reject(new Problem(about));
+    };
+    request.onerror = () => reject(new Problem({ status: 0, title: "The connection broke" }));
+    request.onabort = () => reject(signal.reason);
+    request.onloadend = () => signal.removeEventListener("abort", stop);
+    signal.addEventListener("abort", stop);
+    request.send(part);
+  });
+}
+
+async function offsetOf(id, signal) {
+  const answer = await ask(`v1/uploads/${id}`, { method: "HEAD", headers: TUS, signal });
+  return Number(answer.headers.get("Upload-Offset"));
+}
+
+const isCapture = (id, signal) => ask(`v1/captures/${id}`, { signal }).then(() => true, () => false);
+
+// Sends a file, going on where an upload of it stood; returns the upload's id.
+export async function send(file, remembered, { signal, progress, waiting }) {
+  let id = localStorage.getItem(remembered);
+  let offset = 0;
+  let wait = 1000;
+  let lost = Boolean(id);
+  for (;;) {
+    try {
+      if (lost) offset = await offsetOf(id, signal);
+      if (!id) {
+        const told = Object.entries(await declared(file)).map(([name, value]) => `${name} ${btoa(value)}`);
+        const headers = { ...TUS, "Upload-Length": file.size, ...(told.length && { "Upload-Metadata": told.join(",") }) };
+        const answer = await ask("v1/uploads", { method: "POST", headers, signal });
+        id = answer.headers.get("Location").split("/").at(-1);
+        localStorage.setItem(remembered, id);
+      }
+      lost = false;
+      waiting(false);
+      while (offset < file.size) {
+        const part = await file.slice(offset, offset + PART).arrayBuffer(); // a file that went away is no broken line
+        offset = await patch(`v1/uploads/${id}`, offset, part, progress, signal);
+        progress(offset);
+        wait = 1000;
+      }
+      return id;
+    } catch (error) {
+      signal.throwIfAborted();
+      const isPart = id && !lost;
+      lost = Boolean(id);
+      if (id && [404, 410].includes(error.status)) {
+        if (await isCapture(id, signal)) return id; // another tab was quicker
+        id = null; // expired: from the start
+        offset = 0;
+        lost = false;
+        continue;
+      }
+      if (error.status === 401 && isPart) continue; // `ask` will ask for a key, and be refused one by whoever has none
+      if (!PASSING.includes(error.status)) throw error;
+      waiting(true, wait);
+      await pause(wait, signal);
+      wait = Math.min(2 * wait, LONGEST);
+    }
+  }
+}

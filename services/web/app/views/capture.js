@@ -1,0 +1,77 @@
+// One capture: how it turned out, its frames, and the way to a matte.
+import { getBlob, getJson, remove } from "../lib/api.js";
+import { badge, button, bytes, facts, h, newest, prose, said, show, size, sure, when } from "../lib/dom.js";
+import { recovery } from "./recovery_form.js";
+import { follower } from "../lib/job_progress.js";
+
+export async function capture(main, signal, id) {
+  const found = await getJson(`v1/captures/${id}`, signal);
+  const problem = h("div");
+  const drop = button("Delete", problem, async () => {
+    if (!(await sure("Delete this capture?", "Its frames are gone then. Mattes that were recovered from it stay.", "Delete it"))) return;
+    await remove(`v1/captures/${id}`);
+    location.replace("#/captures");
+  }, "quiet");
+  main.append(
+    h("p", { class: "crumb" }, h("a", { href: "#/captures" }, "Captures")),
+    h("div", { class: "row spread" }, h("h1", {}, found.name || `Capture ${id.slice(0, 8)}`), h("span", { class: "row" }, badge(found.state), drop)),
+    problem,
+    facts({
+      Frame: found.width && `${size(found)} pixels`, Frames: found.frames, Monitor: `${size(found.program.monitor)} pixels`,
+      Size: bytes(found.bytes), Added: when(found.created_at), "Kept until": found.expires_at && when(found.expires_at),
+      "Read by": h("a", { href: `#/jobs/${found.job}` }, "its ingest job"),
+    }),
+  );
+  if (found.state === "failed") return main.append(said(found.problem));
+  const [outcome, form] = await Promise.all([found.state === "ready" ? turnedOut(found, signal) : [], recovery(id, found.state, signal)]);
+  const panel = h("section", { class: "panel", hidden: found.state === "ready" }, h("h2", {}, "Reading the frames"));
+  main.append(panel, ...outcome, form);
+  if (found.state === "ready") return;
+  follower(panel, found.job, signal).then(
+    () => signal.aborted || dispatchEvent(new HashChangeEvent("hashchange")), // it is another view now
+    (error) => signal.aborted || panel.append(said(error)),
+  );
+}
+
+async function turnedOut(found, signal) {
+  const report = await getJson(found.report.slice(1), signal);
+  const findings = h("section", { class: "panel" }, h("div", { class: "row" }, h("h2", {}, "How it turned out"), badge(report.level)),
+    h("ul", { class: "findings" }, report.findings.map((one) =>
+      h("li", {}, badge(one.level), h("div", {}, h("p", {}, prose(one.message)), one.remedy && h("p", { class: "remedy" }, prose(one.remedy)))))));
+  return [findings, h("div", { class: "columns" }, frames(found, signal), sheet(found, signal))];
+}
+
+function frames(found, signal) {
+  const middle = found.frames >> 1; // the first ones are black and white
+  const image = h("img", { alt: `Frame ${middle + 1}`, width: found.width, height: found.height });
+  const number = h("input", { type: "range", id: "frame", min: 0, max: found.frames - 1, value: middle });
+  const told = h("output", { for: "frame" }, `${middle + 1} of ${found.frames}`);
+  const problem = h("div");
+  const look = newest(async () => {
+    try {
+      await show(image, await getBlob(`v1/captures/${found.id}/frames/${number.value}.png`, signal));
+      image.alt = `Frame ${Number(number.value) + 1}`;
+      problem.replaceChildren();
+    } catch (error) {
+      if (!signal.aborted) problem.replaceChildren(said(error));
+    }
+  });
+  number.oninput = () => {
+    told.textContent = `${Number(number.value) + 1} of ${found.frames}`;
+    look();
+  };
+  look();
+  return h("section", { class: "panel" }, h("h2", {}, "Frames"), h("div", { class: "picture" }, image),
+    h("div", { class: "row" }, h("label", { for: "frame" }, "Frame"), number, told), problem);
+}
+
+function sheet(found, signal) {
+  const image = h("img", { alt: "Some of the frames side by side", hidden: true });
+  const frame = h("div", { class: "picture whole" }, image);
+  frame.style.aspectRatio = `${2 * found.width} / ${1.1 * found.height}`; // four by two, as most of them are: nothing moves when it comes
+  getBlob(`v1/captures/${found.id}/contact-sheet.png`, signal).then((blob) => show(image, blob), (error) => {
+    if (!signal.aborted) image.replaceWith(said(error));
+  });
+  return h("section", { class: "panel" }, h("h2", {}, "Contact sheet"), frame,
+    h("p", { class: "hint" }, "What is clipped is red at white, and blue at black."));
+}

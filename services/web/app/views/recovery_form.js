@@ -1,0 +1,78 @@
+// The start of a recovery. What can be asked for, and what it does, is all from GET /v1/options.
+import { getJson, post } from "../lib/api.js";
+import { h, prose, said } from "../lib/dom.js";
+
+function field(option) {
+  const id = `option-${option.method ?? "any"}-${option.name}`; // two methods may have one of the same name
+  const attributes = { id, name: option.name, "aria-describedby": `${id}-about` };
+  let input;
+  if (option.values) {
+    input = h("select", attributes, option.values.map((value) => h("option", { value, selected: value === option.default }, value)));
+  } else if (option.type === "boolean") {
+    input = h("input", { ...attributes, type: "checkbox", checked: option.default });
+  } else {
+    const whole = option.type === "integer";
+    input = h("input", {
+      ...attributes, type: "number", min: option.minimum, max: option.maximum, step: whole ? 1 : "any",
+      placeholder: option.default ?? "", inputmode: whole ? "numeric" : "decimal",
+    });
+  }
+  const range = !option.values && option.minimum != null ? ` ${option.minimum} to ${option.maximum}.` : "";
+  const about = h("p", { class: "hint", id: `${id}-about` }, prose(option.description), range);
+  const row = h("div", { class: "option" }, h("label", { for: id }, option.name.replaceAll("_", " ")), input, about);
+  return { option, input, row };
+}
+
+// What was chosen, and nothing of what was left as it is.
+function chosen(fields, method) {
+  const options = {};
+  for (const { option, input } of fields) {
+    if (option.method && option.method !== method) continue;
+    const value = input.type === "checkbox" ? input.checked : input.type === "number" ? input.value && Number(input.value) : input.value;
+    if (value !== "" && value !== option.default) options[option.name] = value;
+  }
+  return options;
+}
+
+export async function recovery(capture, state, signal) {
+  const { options } = await getJson("v1/options", signal);
+  const fields = options.map(field);
+  const choices = fields.filter(({ option }) => option.values);
+  const constants = fields.filter(({ option }) => !option.values);
+  const method = fields.find(({ option }) => option.name === "method").input;
+  const problem = h("div");
+  const form = h("form", { class: "panel", id: "recovery" }, h("h2", {}, "Recover a matte"),
+    h("p", {}, "For each pixel, from where on the monitor its light comes. ",
+      state === "ingesting" && "It may be asked for now, and begins when the frames are read."),
+    h("div", { class: "options" }, choices.map(({ row }) => row)),
+    h("details", {}, h("summary", {}, "All options"), h("p", { class: "hint" }, "What is left empty is as the grey figure says, or as the choices above have it."),
+      h("div", { class: "options" }, constants.map(({ row }) => row))),
+    problem, h("p", { class: "row" }, h("button", { class: "primary" }, "Start")));
+  const sort = () => fields.forEach(({ option, row, input }) => {
+    row.hidden = Boolean(option.method) && option.method !== method.value;
+    input.disabled = row.hidden;
+  });
+  method.onchange = sort;
+  sort();
+  form.onsubmit = async (event) => {
+    event.preventDefault();
+    const submit = form.querySelector("button.primary");
+    submit.disabled = true;
+    problem.replaceChildren();
+    fields.forEach(({ input }) => input.removeAttribute("aria-invalid"));
+    try {
+      const job = await post("v1/jobs", { capture, options: chosen(fields, method.value) });
+      location.hash = `#/jobs/${job.id}`;
+    } catch (error) {
+      problem.replaceChildren(said(error));
+      const wrong = fields.find(({ option, input }) => option.name === error.field && !input.disabled)?.input;
+      wrong?.setAttribute("aria-invalid", "true");
+      wrong?.focus();
+    } finally {
+      submit.disabled = false;
+    }
+  };
+  // A field out of its range in a closed disclosure could not be shown to be wrong.
+  form.addEventListener("invalid", () => (form.querySelector("details").open = true), true);
+  return form;
+}

@@ -1,0 +1,253 @@
+// Shows a program full screen, and tells the service how far it is, for a phone that follows.
+import { LEAD, LEAD_SECONDS, borderOn, draw, schedule } from "./border.js";
+import { authorization } from "../app/lib/api.js";
+import { CHECKS } from "../app/film/checklist.js";
+
+const COUNTDOWN = 5; // seconds
+const AHEAD = 8; // pictures decoded before they are shown: all of them would fill the memory
+const AT_ONCE = 4; // requests
+const TELL = 2000; // ms between two reports of how far it is
+
+// The pictures of a program: all fetched before it starts, the next few of them decoded.
+class Pictures {
+  #blobs = [];
+  #decoded = new Map();
+
+  async load(count, fetched, progress) {
+    let next = 0;
+    let done = 0;
+    const work = async () => {
+      while (next < count) {
+        const n = next++;
+        this.#blobs[n] = await (await fetched(`patterns/${n}.png`)).blob();
+        progress(++done / count);
+      }
+    };
+    await Promise.all(Array.from({ length: AT_ONCE }, work));
+  }
+
+  // Decodes from a number on, and lets go of what is before it.
+  async prepare(first) {
+    for (const [n, entry] of this.#decoded) {
+      if (n < first) {
+        this.#decoded.delete(n);
+        entry.then((picture) => picture.close(), () => {});
+      }
+    }
+    for (let n = first; n < Math.min(first + AHEAD, this.#blobs.length); n++) {
+      if (!this.#decoded.has(n)) {
+        const entry = createImageBitmap(this.#blobs[n], { colorSpaceConversion: "none" });
+        entry.then((picture) => (entry.picture = picture), () => {});
+        this.#decoded.set(n, entry);
+      }
+    }
+    await Promise.all(this.#decoded.values());
+  }
+
+  // The picture of a number if it is decoded.
+  at(n) {
+    return this.#decoded.get(n)?.picture;
+  }
+}
+
+// A page that is hidden or left has none: what stops it is not waited for in vain.
+const nextFrame = (stopped) =>
+  new Promise((resolve, reject) => {
+    if (stopped.aborted) return reject(stopped.reason);
+    requestAnimationFrame(resolve);
+    stopped.onabort = () => reject(stopped.reason);
+  });
+
+// Shows the steps, each for a whole number of the display's refreshes, and none before its picture is there. Where one
+// refresh was missed, the next step makes up for it; where more were, it is as long as any, and the beat starts anew: no
+// step is ever left out. Returns when each of them was first shown.
+async function show(context, border, steps, pictures, refresh, stopped, passed) {
+  const shown = [];
+  let due = -Infinity;
+  for (const [i, step] of steps.entries()) {
+    let now;
+    let picture;
+    do {
+      now = await nextFrame(stopped);
+      picture = pictures.at(step.number);
+    } while (now < due - refresh / 2 || (step.number !== LEAD && !picture));
+    draw(context, border, step, picture);
+    shown.push({ number: step.number, white: step.white, at: now });
+    passed(step.number);
+    // On time, the next is due by the steady beat; too late, by a new one.
+    const start = now < due + 1.5 * refresh ? due : now;
+    due = start + Math.max(1, Math.round((step.seconds * 1000) / refresh)) * refresh;
+    if (i + 1 < steps.length && steps[i + 1].number !== LEAD) {
+      pictures.prepare(steps[i + 1].number).catch(() => {}); // a picture that fails is waited for, until Escape
+    }
+  }
+  while ((await nextFrame(stopped)) < due - refresh / 2);
+  return shown;
+}
+
+// Counts down, and measures the refresh of the display meanwhile: the median of its frames' distances, in milliseconds.
+async function countDown(element, stopped) {
+  const begin = await nextFrame(stopped);
+  const times = [begin];
+  while (times.at(-1) < begin + COUNTDOWN * 1000) {
+    const left = String(Math.ceil(COUNTDOWN - (times.at(-1) - begin) / 1000));
+    if (element.textContent !== left) element.textContent = left;
+    times.push(await nextFrame(stopped));
+  }
+  element.textContent = "";
+  const distances = times.slice(1).map((time, i) => time - times[i]).sort((a, b) => a - b);
+  return distances[Math.floor(distances.length / 2)];
+}
+
+// Gives a canvas as many pixels as the display has under it.
+async function fill(canvas) {
+  const [width, height] = await new Promise((resolve) => {
+    const observer = new ResizeObserver(([entry]) => {
+      observer.disconnect();
+      const exact = entry.devicePixelContentBoxSize?.[0];
+      const rounded = (length) => Math.round(length * devicePixelRatio);
+      resolve(
+        exact
+          ? [exact.inlineSize, exact.blockSize]
+          : [rounded(entry.contentRect.width), rounded(entry.contentRect.height)],
+      );
+    });
+    try {
+      observer.observe(canvas, { box: "device-pixel-content-box" });
+    } catch {
+      observer.observe(canvas); // Safari knows CSS pixels alone
+    }
+  });
+  [canvas.width, canvas.height] = [width, height];
+}
+
+const $ = (id) => document.getElementById(id);
+const say = (text) => ($("status").textContent = text);
+const here = new URL(".", location.href);
+const screenSize = () => ({
+  width: Math.round(screen.width * devicePixelRatio),
+  height: Math.round(screen.height * devicePixelRatio),
+});
+
+async function ask(path, options = {}) {
+  const answer = await fetch(new URL(path, here), { ...options, headers: { ...options.headers, ...authorization() } });
+  if (answer.status === 401) $("unlock").hidden = false;
+  if (!answer.ok) throw new Error((await answer.json()).detail);
+  return answer;
+}
+
+const id = here.pathname.split("/").at(-2);
+
+// What is told is for others to see: the showing goes on without. It gets there from a page that is left, too.
+const tell = (told) =>
+  ask("showing", { method: "PUT", body: JSON.stringify(told), headers: { "Content-Type": "application/json" }, keepalive: true }).catch(() => {});
+
+async function open() {
+  const program = await (await ask(`../${id}`)).json();
+  const { display, patterns, monitor } = program;
+  $("about").textContent = `${patterns} patterns of ${monitor.width} x ${monitor.height} pixels.`;
+  const size = screenSize();
+  if (display?.width !== size.width || display?.height !== size.height) {
+    const made = display ? `It is made for a screen of ${display.width} x ${display.height} pixels` : "It has no room";
+    $("misfit").textContent = `${made}; this one has ${size.width} x ${size.height}, so it is stretched and less sharp.`;
+    $("fit").hidden = false;
+    $("refit").onclick = () => refit(program.program, size).catch((error) => say(error.message));
+  }
+  const pictures = new Pictures();
+  say("Loading the patterns.");
+  await pictures.load(patterns, ask, (share) => ($("loaded").value = share));
+  say("Ready.");
+  $("start").disabled = false;
+  $("settings").onsubmit = (event) => {
+    event.preventDefault();
+    play(program, pictures, Number($("rate").value));
+  };
+}
+
+async function refit(program, monitor) {
+  const body = JSON.stringify({ program, monitor, border: true });
+  const answer = await ask("../../programs", { method: "POST", body, headers: { "Content-Type": "application/json" } });
+  location.assign(new URL(`../${(await answer.json()).id}/play`, here));
+}
+
+async function play(program, pictures, rate) {
+  const [stage, canvas] = [$("stage"), $("canvas")];
+  const stop = new AbortController();
+  const { signal } = stop;
+  const listen = (target, event, listener) => target.addEventListener(event, listener, { signal });
+  const end = (why) => stop.abort(new Error(why));
+  const told = { phase: "countdown", patterns_per_second: rate, seconds: COUNTDOWN + LEAD_SECONDS.reduce((sum, one) => sum + one) };
+  let lock;
+  let toldAt = -TELL;
+  $("record").hidden = true;
+  $("start").disabled = true;
+  try {
+    stage.hidden = false;
+    // Where there is no full screen for elements, the stage fills the window.
+    const full = await stage.requestFullscreen?.({ navigationUI: "hide" }).then(() => true, () => false);
+    lock = await navigator.wakeLock?.request("screen").catch(() => undefined);
+    listen(document, "keydown", (event) => event.key === "Escape" && end("Stopped."));
+    listen(document, "fullscreenchange", () => full && !document.fullscreenElement && end("Stopped."));
+    // The back button ends the showing, and leaves the page with all that it has loaded.
+    if (!history.state?.showing) history.pushState({ showing: true }, "");
+    listen(window, "popstate", () => end("Stopped."));
+    listen(document, "visibilitychange", () => document.hidden && end("Stopped: the page was hidden."));
+    await pictures.prepare(0);
+    tell(told);
+    const refresh = await countDown($("countdown"), signal);
+    await fill(canvas);
+    listen(window, "resize", () => end("Stopped: the window changed its size."));
+    const border = borderOn(canvas.width, canvas.height);
+    if (!border.fits) throw new Error("The window is too small for the border: make it larger.");
+    const context = canvas.getContext("2d", { alpha: false });
+    Object.assign(told, { phase: "showing", seconds: 0, border: { width: border.width, height: border.height } });
+    const passed = (number) => {
+      if (number === LEAD || performance.now() < toldAt + TELL) return;
+      toldAt = performance.now();
+      tell({ ...told, shown: number + 1 });
+    };
+    const shown = await show(context, border, schedule(program.patterns, rate), pictures, refresh, signal, passed);
+    told.patterns_per_second = finish(program, border, shown, refresh);
+    tell({ ...told, phase: "shown", shown: program.patterns });
+  } catch (error) {
+    tell({ ...told, phase: "stopped", seconds: 0 });
+    say(error.message);
+  } finally {
+    stop.abort();
+    if (history.state?.showing && !document.hidden) history.back();
+    lock?.release();
+    if (document.fullscreenElement) await document.exitFullscreen();
+    canvas.width = canvas.height = 0;
+    $("countdown").textContent = "";
+    stage.hidden = true;
+    $("start").disabled = false;
+    $("start").focus();
+  }
+}
+
+function finish(program, { width, height }, shown, refresh) {
+  const patterns = shown.filter((step) => step.number !== LEAD);
+  const seconds = (patterns.at(-1).at - patterns[0].at) / 1000;
+  const rate = Number(((patterns.length - 1) / seconds).toFixed(4));
+  const video = { file: "film.mp4", patterns_per_second: rate, border: { width, height } };
+  const record = { format: "envmatte-capture/1", program: program.program, video };
+  URL.revokeObjectURL($("capture").href);
+  $("capture").href = URL.createObjectURL(new Blob([JSON.stringify(record, null, 1)], { type: "application/json" }));
+  $("record").hidden = false;
+  say(`All ${patterns.length} patterns were shown, ${rate} a second. Stop the film.`);
+  document.dispatchEvent(new CustomEvent("played", { detail: { shown, refresh, record } }));
+  return rate;
+}
+
+$("unlock").onsubmit = (event) => {
+  event.preventDefault();
+  sessionStorage.setItem("envmatte-key", $("key").value.trim());
+  $("unlock").hidden = true;
+  start();
+};
+
+$("checks").append(...CHECKS.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
+$("follow").href = new URL(`/#/film/${id}`, here);
+
+const start = () => open().catch((error) => say(error.message));
+start();

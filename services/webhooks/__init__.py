@@ -1,0 +1,1 @@
+"""Webhooks: who sends them, and which addresses they may reach."""

@@ -1,0 +1,220 @@
+"""The database: its tables, and the engine that opens it."""
+
+import logging
+
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    Column,
+    Float,
+    ForeignKey,
+    Index,
+    Integer,
+    MetaData,
+    String,
+    Table,
+    Text,
+    UniqueConstraint,
+)
+
+from storage.database import owners
+from storage.database.dialects import clock as clock
+
+metadata = MetaData()
+logging.getLogger("alembic").setLevel(
+    logging.WARNING
+)  # else it has a line for every step, from its import on
+
+
+def _owner() -> Column[str]:
+    return Column(
+        "owner", String(64), nullable=False, default=owners.owner_of_new, server_default=owners.DEFAULT
+    )
+
+
+captures = Table(
+    "captures",
+    metadata,
+    Column("number", Integer, primary_key=True, autoincrement=True),
+    Column("id", String(32), nullable=False, unique=True),
+    Column("name", Text, nullable=False),
+    Column("state", String(16), nullable=False),
+    Column("job", String(32), nullable=False),
+    Column("bytes", BigInteger, nullable=False),
+    Column("width", Integer),
+    Column("height", Integer),
+    Column("frames", Integer, nullable=False),
+    Column("program", JSON, nullable=False),
+    Column("problem", JSON(none_as_null=True)),
+    Column("created_at", Float, nullable=False),
+    _owner(),
+    Column("expires_at", Float, index=True),
+    Column("stored", BigInteger),  # bytes that it takes in the store; null until they were counted
+    Index("captures_by_owner", "owner", "number"),
+)
+
+mattes = Table(
+    "mattes",
+    metadata,
+    Column("number", Integer, primary_key=True, autoincrement=True),
+    Column("id", String(32), nullable=False, unique=True),
+    Column("capture", String(32)),  # neither of one that came in an archive
+    Column("job", String(32)),
+    Column("state", String(16), nullable=False),
+    Column("options", JSON, nullable=False),
+    Column("figures", JSON(none_as_null=True)),
+    Column("created_at", Float, nullable=False),
+    _owner(),
+    Column("expires_at", Float, index=True),
+    Column("stored", BigInteger),  # as of a capture
+    Index("mattes_by_owner", "owner", "number"),
+)
+
+programs = Table(
+    "programs",
+    metadata,
+    Column("number", Integer, primary_key=True, autoincrement=True),
+    Column("id", String(32), nullable=False),
+    Column("program", JSON, nullable=False),
+    Column("created_at", Float, nullable=False),
+    Column("showing", JSON(none_as_null=True)),  # what the page that shows it last told, and when
+    _owner(),
+    UniqueConstraint("owner", "id"),  # which is the same of whoever made the same program
+    Index("programs_by_owner", "owner", "number"),
+)
+
+jobs = Table(
+    "jobs",
+    metadata,
+    Column("number", Integer, primary_key=True, autoincrement=True),
+    Column("id", String(32), nullable=False, unique=True),
+    Column("kind", String(16), nullable=False),
+    Column("state", String(16), nullable=False, index=True),
+    Column("stage", String(16), nullable=False),
+    Column("capture", String(32), nullable=False),  # empty of a composite of a matte that has none
+    Column("matte", String(32)),
+    Column("options", JSON, nullable=False),
+    Column("plan", JSON(none_as_null=True)),
+    Column("total", Integer, nullable=False, default=0),
+    Column("done", Integer, nullable=False, default=0),
+    Column("failed", Integer, nullable=False, default=0),
+    Column("pixels", BigInteger, nullable=False, default=0),
+    Column("problem", JSON(none_as_null=True)),
+    Column("created_at", Float, nullable=False),
+    Column("started_at", Float),
+    Column("finished_at", Float),
+    Column("stage_at", Float),  # when the present stage was entered
+    Column("moved_at", Float),  # when last something of it got done
+    Column("paced_at", Float),  # the pace of tiles is measured from here: when, and how many were done
+    Column("paced_done", Integer, nullable=False, server_default="0"),
+    Column("trace", String(64)),  # the request's traceparent (W3C)
+    _owner(),
+    Column("stored", BigInteger),  # as of a capture: of a composite, which has no other record
+    Index("jobs_by_owner", "owner", "number"),
+    Column("webhook", Text),  # the URL that is told when it has ended
+)
+
+tiles = Table(
+    "tiles",
+    metadata,
+    Column("job", ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True),
+    Column("tile", Integer, primary_key=True),
+    Column("state", String(16), nullable=False),
+    Column("attempts", Integer, nullable=False),
+    Column("seconds", Float),
+    Column("losses", Integer, nullable=False, server_default="0"),  # how often its worker died
+    Index("tiles_by_state", "job", "state"),
+)
+
+log = Table(
+    "log",
+    metadata,
+    Column("line", Integer, primary_key=True, autoincrement=True),
+    Column("job", ForeignKey("jobs.id", ondelete="CASCADE"), nullable=False, index=True),
+    Column("at", Float, nullable=False),
+    Column("text", Text, nullable=False),
+)
+
+coordinator = Table(
+    "coordinator",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("token", Integer, nullable=False),  # grows by one at each takeover
+    Column("holder", String(64)),  # the process that drives
+    Column("expires_at", Float, nullable=False),
+    Column("beat_at", Float, nullable=False),
+    Column("cluster", JSON, nullable=False),  # what the holder last saw: workers, problem
+)
+"""One row: the lease of the coordinator. Its times are by the database's clock."""
+
+totals = Table(
+    "totals",
+    metadata,
+    Column("kind", String(16), primary_key=True),
+    Column("tiles", BigInteger, nullable=False),
+    Column("misses", BigInteger, nullable=False),
+    Column("losses", BigInteger, nullable=False),
+    Column("pixels", BigInteger, nullable=False),
+    Column("seconds", Float, nullable=False),
+)
+"""What has ever been done by each kind of job, also by those that are deleted: for metrics."""
+
+uploads = Table(
+    "uploads",
+    metadata,
+    Column("id", String(32), primary_key=True),
+    Column("key", String(256)),
+    Column("offset", BigInteger, nullable=False),
+    Column("length", BigInteger, nullable=False),
+    Column("parts", Integer, nullable=False),
+    Column("metadata", Text, nullable=False),
+    Column("created_at", Float, nullable=False),
+    Column("expires_at", Float, nullable=False, index=True),
+    _owner(),
+    UniqueConstraint("owner", "key"),
+)
+
+upload_parts = Table(
+    "upload_parts",
+    metadata,
+    Column("upload", ForeignKey("uploads.id", ondelete="CASCADE"), primary_key=True),
+    Column("offset", BigInteger, primary_key=True),
+    Column("name", String(32), nullable=False),
+    Column("size", BigInteger, nullable=False),
+)
+
+deliveries = Table(
+    "deliveries",
+    metadata,
+    Column("id", String(32), primary_key=True),
+    Column("job", String(32), nullable=False),  # which may be deleted before it is told
+    Column("url", Text, nullable=False),
+    Column("body", Text, nullable=False),
+    Column("attempts", Integer, nullable=False),
+    Column("due_at", Float, nullable=False, index=True),
+    Column("created_at", Float, nullable=False),
+)
+"""What is to be told to webhooks: a row until it is delivered or given up."""
+
+made = Table(
+    "made",
+    metadata,
+    Column("owner", String(64), primary_key=True, default=owners.owner_of_new, server_default=owners.DEFAULT),
+    Column("key", String(256), primary_key=True),
+    Column("call", String(64), primary_key=True),
+    Column("id", String(32), nullable=False),
+)
+"""What a POST with an Idempotency-Key made, so that a repeat answers with the same."""
+
+keys = Table(
+    "keys",
+    metadata,
+    Column("number", Integer, primary_key=True, autoincrement=True),
+    Column("name", Text, nullable=False),
+    Column("hash", String(64), nullable=False, unique=True),
+    Column("owner", String(64), nullable=False),
+    Column("scope", String(8), nullable=False),
+    Column("created_at", Float, nullable=False),
+    Column("revoked_at", Float),
+)
+"""API keys, see `storage.records.api_keys`."""

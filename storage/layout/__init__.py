@@ -1,0 +1,1 @@
+"""How captures, mattes and composites are laid out as arrays and bytes."""

@@ -1,0 +1,218 @@
+"""A capture: the frame stack, and its record.
+
+In the store, under ``captures/ID``, a zarr group: ``frames`` (frame, y, x, channel), the optional ``mask`` (y, x) and
+``images/N`` (row, column, channel), the patterns that came as images; of a video also ``shares`` (share, column),
+which of its frames make up each frame of the stack. Its attributes hold the manifest, those of the group ``measured``
+in it what was measured from the frames. The archive that was uploaded lies where `storage.layout.uploads` puts it until
+its frames are in the stack.
+"""
+
+from collections.abc import Coroutine, Sequence
+from itertools import product
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+from zarr.storage import MemoryStore
+
+from storage.errors import Corrupt
+from storage.layout.blocks import block_edge
+from storage.objects.checksums import CODECS
+from storage.objects.store import Objects, together
+from storage.objects.zarr_store import EVERY_CHUNK
+
+MEASURED = "measured"
+CHUNK = 1 << 20
+"""Bytes of a chunk of the stack, about: small enough that a tile reads little more than its own."""
+
+
+def path(capture: str) -> str:
+    """Where a capture lies in the store."""
+    return f"captures/{capture}"
+
+
+def create_stack(
+    objects: Objects,
+    capture: str,
+    shape: tuple[int, int, int, int],
+    dtype: np.dtype[np.generic],
+    *,
+    memory: int,
+    attributes: dict[str, Any],
+    mask: NDArray[np.bool_] | None,
+    images: Sequence[NDArray[np.float32]],
+    shares: NDArray[np.int64] | None = None,
+) -> int:
+    """Make the empty stack of a capture; a repeat writes the same, and touches nothing that was written since.
+
+    Parameters
+    ----------
+    shape : (frames, height, width, channels)
+    memory : int
+        Bytes that whoever writes it may hold at once: a slab of whole frames, and the chunk of it that is
+        being compressed.
+    attributes : dict
+        The manifest, as JSON.
+    mask : (height, width) bool, optional
+    images : sequence of (rows, columns, 1 or 3) float32
+    shares : (k, 3) int64, optional
+        What a video's frames go into: a frame of the stack, a time in ticks, and a weight, in this order.
+
+    Returns
+    -------
+    int
+        Frames of a slab: what is written at once, and the length of a chunk. A slab is all that one writer
+        touches, so that slabs can be written in any order, by anyone, and again.
+
+    Notes
+    -----
+    A slab holds as many frames as the memory allows. A chunk is a slab's frames over a square of pixels; the
+    square doubles from the block's edge (`block_edge`) until the chunk has about `CHUNK` bytes, so that a
+    tile reads few chunks and few bytes that it does not need.
+    """
+    frames, height, width, channels = shape
+    pixel = channels * dtype.itemsize
+    slab = int(min(frames, max(1, memory // (2 * height * width * pixel))))
+    edge = block_edge(height, width)
+    while edge < max(height, width) and 2 * slab * edge * edge * pixel <= CHUNK:
+        edge *= 2
+    layout = MemoryStore()
+    group = zarr.create_group(layout, attributes=attributes)
+    group.create_array(
+        "frames",
+        shape=shape,
+        dtype=dtype,
+        chunks=(slab, min(edge, height), min(edge, width), channels),
+        compressors=CODECS,
+        dimension_names=("frame", "y", "x", "channel"),
+    )
+    whole: dict[str, Any] = {"config": EVERY_CHUNK, "compressors": CODECS}
+    if mask is not None:
+        group.create_array("mask", data=mask, dimension_names=("y", "x"), **whole)
+    if shares is not None:
+        group.create_array("shares", data=shares, dimension_names=("share", "column"), **whole)
+    for n, image in enumerate(images):
+        group.create_array(f"images/{n}", data=image, dimension_names=("row", "column", "channel"), **whole)
+    objects.put_tree(path(capture), layout)
+    return slab
+
+
+def write_slab(objects: Objects, capture: str, first: int, frames: NDArray[np.generic]) -> None:
+    """Write a slab of whole frames, from frame ``first`` on."""
+    (stack,) = together(objects.array(f"{path(capture)}/frames"))
+    stack[first : first + len(frames)] = frames
+
+
+class Stack:
+    """An ingested capture, open for reading.
+
+    Attributes
+    ----------
+    attributes : dict
+        The manifest and what was measured, as JSON.
+    frames, height, width : int
+    dtype : numpy.dtype
+        Of the values: uint8 or uint16.
+    """
+
+    def __init__(self, objects: Objects, capture: str) -> None:
+        at = path(capture)
+
+        async def if_there(found: Coroutine[Any, Any, Any]) -> Any:
+            try:
+                return await found
+            except FileNotFoundError:
+                return None
+
+        self._frames: zarr.Array[Any]
+        self._mask: zarr.Array[Any] | None
+        try:
+            group, self._frames, self._mask, measured = together(
+                objects.group(at),
+                objects.array(f"{at}/frames"),
+                if_there(objects.array(f"{at}/mask")),
+                if_there(objects.group(f"{at}/{MEASURED}")),
+            )
+        except FileNotFoundError as error:
+            raise Corrupt(f"capture {capture} is not in the store; upload it again") from error
+        self._objects, self._path = objects, at
+        self._measured: dict[str, Any] = {} if measured is None else dict(measured.attrs)
+        self.attributes: dict[str, Any] = dict(group.attrs) | self._measured
+        self.frames, self.height, self.width, self.channels = self._frames.shape
+        self.dtype = self._frames.dtype
+
+    def read(
+        self, rows: slice = slice(None), columns: slice = slice(None), frames: slice = slice(None)
+    ) -> NDArray[Any]:
+        """(frame, y, x, channel) values of a rectangle of pixels.
+
+        Raises
+        ------
+        Corrupt
+            If a chunk of it is missing.
+        """
+        return np.asarray(self._frames[frames, rows, columns])
+
+    def pick(self, frames: list[int], rows: slice, columns: slice) -> NDArray[Any]:
+        """As `read`, of any frames in any order."""
+        return np.asarray(self._frames.oindex[np.array(frames), rows, columns])
+
+    def read_masked(
+        self, rows: slice = slice(None), columns: slice = slice(None)
+    ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+        """As `read`, and (y, x) bool: the pixels to recover."""
+        if self._mask is None:
+            return self.read(rows, columns), self.recovered(rows, columns)
+        values, mask = together(
+            self._frames.async_array.getitem((slice(None), rows, columns)),
+            self._mask.async_array.getitem((rows, columns)),
+        )
+        return values, mask
+
+    def recovered(self, rows: slice = slice(None), columns: slice = slice(None)) -> NDArray[np.bool_]:
+        """(y, x) bool: the pixels of a rectangle that are to be recovered."""
+        if self._mask is None:
+            return np.ones((self.height, self.width), bool)[rows, columns]
+        return np.asarray(self._mask[rows, columns])
+
+    def images(self) -> list[NDArray[np.float32]]:
+        """The patterns that came as images, each (rows, columns, 1 or 3) float32."""
+        names = self._objects.names(f"{self._path}/images")
+        return [
+            np.asarray(self._array(f"images/{n}")[:], np.float32)
+            for n in sorted(int(name) for name in names if name != "zarr.json")
+        ]
+
+    def shares(self) -> NDArray[np.int64]:
+        """What the frames of a video go into, as given to `create_stack`."""
+        return np.asarray(self._array("shares")[:], np.int64)
+
+    def missing(self) -> list[int]:
+        """The slabs of which a chunk is not there, ascending; nothing is read."""
+        stored = self._objects.below(f"{self._path}/frames")
+        grid = [
+            range(-(-size // chunk))
+            for size, chunk in zip(self._frames.shape, self._frames.chunks, strict=True)
+        ]
+        chunks = product(*grid)
+        return sorted(
+            {at[0] for at in chunks if f"{self._path}/frames/c/{'/'.join(map(str, at))}" not in stored}
+        )
+
+    def annotate(self, **attributes: Any) -> None:
+        """Add to the attributes what was measured from the frames; `save` stores it."""
+        self._measured |= attributes
+        self.attributes |= attributes
+
+    def save(self) -> None:
+        """Store what was measured, all at once: nobody ever reads half of it."""
+        together(self._objects.put_group(f"{self._path}/{MEASURED}", self._measured))
+
+    def _array(self, name: str) -> zarr.Array[Any]:
+        try:
+            (array,) = together(self._objects.array(f"{self._path}/{name}"))
+        except FileNotFoundError as error:
+            raise Corrupt(f"{error} of the capture is not in the store; upload it again") from error
+        found: zarr.Array[Any] = array
+        return found

@@ -1,0 +1,172 @@
+"""An archive of a matte: one ZIP, to take it elsewhere.
+
+Its root is the matte's zarr group, laid out as in the store (see `storage.layout.mattes`), so any zarr reader opens
+it: ``zarr.open_group(zarr.storage.ZipStore("matte.zip"))``. Entries are stored, for the chunks are compressed
+already; their dates are fixed, and they come block by block: the same matte makes the same bytes. The last one,
+``envmatte.json``, is the manifest: ``format``; ``matte``, the figures and options to list it by; ``members``, the
+size and SHA-256 of every other entry.
+"""
+
+import hashlib
+import io
+import json
+import zipfile
+from collections.abc import Iterator
+from itertools import accumulate, product
+from typing import IO, Any, cast
+
+from storage.errors import Corrupt
+from storage.layout import mattes
+from storage.layout.mattes import CHANNELS, FRAMES, Matte
+from storage.objects.checksums import is_checked, is_intact, unseal
+from storage.objects.store import Objects, together
+
+FORMAT = "envmatte-archive/1"
+MANIFEST = "envmatte.json"
+GROUPS = ("zarr.json", "T/zarr.json", *(f"{name}/zarr.json" for name in FRAMES))
+"""The entries that belong to no block."""
+DATE = (1980, 1, 1, 0, 0, 0)
+ZIP64 = (1 << 31) - 1
+"""Offsets above this are written in more bytes, by zipfile."""
+
+
+def listed(attributes: dict[str, Any]) -> dict[str, Any]:
+    """What a manifest says of a matte with these attributes."""
+    return {name: attributes[name] for name in (*mattes.FIGURES, "options")}
+
+
+def chunk(name: str, row: int, column: int) -> str:
+    """The entry of a block of a frame-shaped array."""
+    return f"{name}/c/{row}/{column}" + ("/0" if name in CHANNELS else "")
+
+
+def rows(row: int, column: int) -> str:
+    """The folder of a block's rows T."""
+    return f"T/{row}.{column}"
+
+
+def of_block(row: int, column: int) -> list[str]:
+    """The entries of a block; the chunks of rows are not there if all of its rows are empty."""
+    T = rows(row, column)
+    arrays = (f"{T}/{name}/{part}" for name in ("cell", "weight") for part in ("zarr.json", "c/0"))
+    return [*(chunk(name, row, column) for name in FRAMES), f"{T}/zarr.json", *arrays]
+
+
+class Archive:
+    """The archive of a matte in the store; iterating over it gives its bytes, a block's at a time.
+
+    Attributes
+    ----------
+    size : int
+        Its bytes.
+
+    Raises
+    ------
+    Corrupt
+        If something of the matte is missing; while iterating, also if it is damaged, or deleted meanwhile. What has
+        come by then is no archive: it lacks its directory.
+    """
+
+    def __init__(self, objects: Objects, matte: str) -> None:
+        opened = Matte(objects, matte)
+        self._objects, self._path = objects, mattes.path(matte)
+        self._record = listed(opened.attributes)
+        sizes = objects.sizes(self._path)
+        blocks = product(range(opened.block_rows), range(opened.block_columns))
+        self._batches = [list(GROUPS), *(of_block(*block) for block in blocks)]
+        for batch in self._batches:
+            may_lack = {name for name in batch if name.startswith("T/") and name.endswith("/c/0")}
+            missing = {name for name in batch if f"{self._path}/{name}" not in sizes}
+            if missing and missing != may_lack:
+                raise self._corrupt(min(missing - may_lack or missing))
+            batch[:] = (name for name in batch if name not in missing)
+        self._sizes = {name: sizes[f"{self._path}/{name}"] for batch in self._batches for name in batch}
+        digest = "0" * hashlib.sha256().digest_size * 2
+        manifest = len(self._manifest(dict.fromkeys(self._sizes, digest)))
+        self.size = zip_size(self._sizes | {MANIFEST: manifest})
+
+    def __iter__(self) -> Iterator[bytes]:
+        written = _Tail()
+        digests: dict[str, str] = {}
+        checked: dict[str, bool] = {}
+        archive = zipfile.ZipFile(cast(IO[bytes], written), "w")
+        for batch in self._batches:
+            for name, data in zip(batch, self._read(batch), strict=True):
+                folder, _, inner = name.rpartition("zarr.json" if name.endswith("zarr.json") else "c/")
+                if not inner:  # it comes before the chunks that it describes
+                    checked[folder] = is_checked(unseal(f"{self._path}/{name}", data)[0])
+                if len(data) != self._sizes[name] or (inner and checked[folder] and not is_intact(data)):
+                    raise self._corrupt(name)
+                digests[name] = hashlib.sha256(data).hexdigest()
+                archive.writestr(_entry(name), data)
+            yield written.take()
+        archive.writestr(_entry(MANIFEST), self._manifest(digests))
+        archive.close()
+        yield written.take()
+
+    def _read(self, names: list[str]) -> list[bytes]:
+        try:
+            return together(*(self._objects.get(f"{self._path}/{name}") for name in names))
+        except FileNotFoundError as error:
+            raise self._corrupt(str(error)) from error
+
+    def _manifest(self, digests: dict[str, str]) -> bytes:
+        members = {
+            name: {"size": self._sizes[name], "sha256": digest} for name, digest in sorted(digests.items())
+        }
+        return json.dumps({"format": FORMAT, "matte": self._record, "members": members}).encode()
+
+    def _corrupt(self, name: str) -> Corrupt:
+        return Corrupt(f"{name} of the matte is missing or damaged; recover it again")
+
+
+def zip_size(sizes: dict[str, int]) -> int:
+    """Bytes of a ZIP of stored entries, as zipfile writes it.
+
+    Parameters
+    ----------
+    sizes : dict of str to int
+        The bytes of its entries, by names in ASCII, in order.
+
+    Notes
+    -----
+    APPNOTE sect. 4.3: an entry has a local header of 30 bytes and one in the directory of 46, each with its name, and
+    12 more there where it lies beyond 2 GiB. The directory ends with 22 bytes, and 76 more if it is large.
+    """
+    starts = list(accumulate((30 + len(name) + size for name, size in sizes.items()), initial=0))
+    directory = sum(46 + len(name) for name in sizes) + 12 * sum(start > ZIP64 for start in starts[:-1])
+    large = len(sizes) > 0xFFFF or starts[-1] > ZIP64 or directory > ZIP64
+    return starts[-1] + directory + 22 + (76 if large else 0)
+
+
+def _entry(name: str) -> zipfile.ZipInfo:
+    info = zipfile.ZipInfo(name, DATE)
+    info.create_system, info.external_attr = 3, 0o644 << 16  # a plain file of Unix, on whatever machine
+    return info
+
+
+class _Tail:
+    """A file of which only the end is held: zipfile goes back no further than to the entry that it is writing."""
+
+    def __init__(self) -> None:
+        self._taken = 0
+        self._held = io.BytesIO()
+
+    def write(self, data: bytes) -> int:
+        return self._held.write(data)
+
+    def tell(self) -> int:
+        return self._taken + self._held.tell()
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        return self._taken + self._held.seek(offset - self._taken, whence)
+
+    def flush(self) -> None:
+        pass
+
+    def take(self) -> bytes:
+        """What was written since."""
+        data = self._held.getvalue()
+        self._taken += len(data)
+        self._held = io.BytesIO()
+        return data

@@ -1,0 +1,239 @@
+"""A matte: S, rho and T, laid out in zarr so that any zarr reader can read it.
+
+In the store, under ``mattes/ID``, a zarr group with the attributes ``width``, ``height``, ``columns``, ``rows`` (the
+first grid of T's cells), ``block``, ``crosstalk`` (X of ``C = S + X (rho T L)``: row the camera's channel, column the
+monitor's) and what the matte was made from; and in it
+
+- ``S``, ``rho`` (y, x, channel) float32;
+- ``count`` (y, x, channel) uint32: how many cells the row T of a pixel and channel has;
+- ``shared`` (y, x) bool: whether a pixel's first row is the T of all its channels; the others are empty then;
+- ``error`` (y, x) float32: root of the mean squared error to expect of a composite there, in camera units; infinite
+  where nothing could be recovered;
+- ``recovered`` (y, x) bool: false where the capture's mask left a pixel out;
+- ``T/R.C/cell`` and ``T/R.C/weight``, one-dimensional, for the block in block row R and block column C: the
+  cells and weights of its rows T one after another, in the order (y, x, channel).
+
+Cells are numbered ``row * columns + column``, row 0 at the top, through a first grid laid over the monitor, then
+through one of half as many columns and rows (rounded up), and so on. A cell of the first grid sees the mean light over
+it; one of a further grid sees sixteen of the grid before, 2 column - 1 to 2 column + 2 and the same in rows, with the
+weights [1, 3, 3, 1] / 8 along each axis, beyond the edge the cells at the edge.
+
+A block is a square of ``block`` pixels, and a chunk of the frame-shaped arrays. Whoever recovers a block writes all of
+it and nothing else, so blocks can be written in any order, by anyone, and again.
+"""
+
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+from zarr.storage import MemoryStore
+
+from storage.errors import Corrupt
+from storage.layout.blocks import block_edge
+from storage.objects.checksums import CODECS
+from storage.objects.store import Objects, together
+
+FORMAT = "envmatte-matte/1"
+FRAMES = ("S", "rho", "error", "recovered", "shared", "count")
+"""The frame-shaped arrays."""
+CHANNELS = ("S", "rho", "count")
+"""Those of them that have channels."""
+FIGURES = ("width", "height", "monitor", "columns", "rows", "block")
+"""The attributes that a matte is listed with."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """One block of a matte, h x w pixels.
+
+    Attributes
+    ----------
+    S, rho : (h, w, 3) float32
+    error : (h, w) float32
+    recovered, shared : (h, w) bool
+    count : (h, w, 3) uint32
+    cell : (count.sum(),) uint32
+    weight : (count.sum(),) float32
+    """
+
+    S: NDArray[np.float32]
+    rho: NDArray[np.float32]
+    error: NDArray[np.float32]
+    recovered: NDArray[np.bool_]
+    shared: NDArray[np.bool_]
+    count: NDArray[np.uint32]
+    cell: NDArray[np.uint32]
+    weight: NDArray[np.float32]
+
+
+def path(matte: str) -> str:
+    """Where a matte lies in the store."""
+    return f"mattes/{matte}"
+
+
+class Matte:
+    """A matte in the store.
+
+    Attributes
+    ----------
+    attributes : dict
+    height, width : int
+        Of the frame, in pixels.
+    columns, rows : int
+        The first grid of T's cells.
+    block : int
+        Edge of a block, in pixels.
+    """
+
+    def __init__(self, objects: Objects, matte: str) -> None:
+        at = path(matte)
+        try:
+            group, *frames = together(objects.group(at), *(objects.array(f"{at}/{name}") for name in FRAMES))
+        except FileNotFoundError as error:
+            raise Corrupt(f"matte {matte} is not in the store; recover it again") from error
+        self._objects = objects
+        self._path = at
+        self._frames: dict[str, zarr.Array[Any]] = dict(zip(FRAMES, frames, strict=True))
+        self.attributes: dict[str, Any] = dict(group.attrs)
+        self.height, self.width, self.columns, self.rows, self.block = (
+            int(self.attributes[name]) for name in ("height", "width", "columns", "rows", "block")
+        )
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """What a matte is listed with."""
+        return {name: self.attributes[name] for name in FIGURES}
+
+    @property
+    def block_rows(self) -> int:
+        """Blocks from top to bottom."""
+        return -(-self.height // self.block)
+
+    @property
+    def block_columns(self) -> int:
+        """Blocks from left to right."""
+        return -(-self.width // self.block)
+
+    def span(self, row: int, column: int) -> tuple[slice, slice]:
+        """The pixels of a block: rows and columns of the frame."""
+        y, x = row * self.block, column * self.block
+        return slice(y, min(y + self.block, self.height)), slice(x, min(x + self.block, self.width))
+
+    def write(self, row: int, column: int, block: Block) -> None:
+        """Write a block, in place of an earlier one."""
+        span, rows = self.span(row, column), f"{self._path}/T/{row}.{column}"
+
+        async def write(name: str) -> None:
+            await self._frames[name].async_array.setitem(span, getattr(block, name))
+
+        together(
+            self._objects.put_group(rows),
+            self._objects.put_array(f"{rows}/cell", block.cell),
+            self._objects.put_array(f"{rows}/weight", block.weight),
+            *(write(name) for name in FRAMES if name != "count"),
+        )
+        # ``count`` comes last: a block is written once its counts are there.
+        together(write("count"))
+
+    def read(self, row: int, column: int) -> Block:
+        """Read a block.
+
+        Raises
+        ------
+        Corrupt
+            If some of it is missing.
+        """
+        span = self.span(row, column)
+
+        async def of_rows(name: str) -> Any:
+            array = await self._objects.array(f"{self._path}/T/{row}.{column}/{name}")
+            return await array.async_array.getitem(slice(None))
+
+        try:
+            cell, weight, *values = together(
+                of_rows("cell"),
+                of_rows("weight"),
+                *(array.async_array.getitem(span) for array in self._frames.values()),
+            )
+        except FileNotFoundError as error:
+            raise self._corrupt(row, column) from error
+        frames = dict(zip(self._frames, values, strict=True))
+        if not len(cell) == len(weight) == frames["count"].sum():
+            raise self._corrupt(row, column)
+        return Block(**frames, cell=cell, weight=weight)
+
+    def layer(self, name: str) -> NDArray[Any]:
+        """A frame-shaped array, whole.
+
+        Raises
+        ------
+        Corrupt
+            If some of it is missing.
+        """
+        return np.asarray(self._frames[name][:])
+
+    def missing(self) -> set[tuple[int, int]]:
+        """Rows and columns of the blocks of which something is not there; nothing is read."""
+        stored = self._objects.below(self._path)
+
+        def is_there(row: int, column: int) -> bool:
+            chunks = (
+                f"{self._path}/{name}/c/{row}/{column}" + "/0" * (array.ndim - 2)
+                for name, array in self._frames.items()
+            )
+            rows = [f"{self._path}/T/{row}.{column}/{name}" for name in ("cell", "weight")]
+            # A block whose rows are all empty has no chunk in either.
+            return (
+                all(chunk in stored for chunk in chunks)
+                and all(f"{array}/zarr.json" in stored for array in rows)
+                and len({f"{array}/c/0" in stored for array in rows}) == 1
+            )
+
+        blocks = product(range(self.block_rows), range(self.block_columns))
+        return {block for block in blocks if not is_there(*block)}
+
+    def _corrupt(self, row: int, column: int) -> Corrupt:
+        return Corrupt(f"block {row}.{column} of the matte is missing or damaged; recover it again")
+
+
+def create(
+    objects: Objects, matte: str, *, height: int, width: int, columns: int, rows: int, **attributes: Any
+) -> Matte:
+    """Make an empty matte; a repeat writes the same, and touches nothing that was written since.
+
+    Parameters
+    ----------
+    height, width : int
+        Of the frame, in pixels.
+    columns, rows : int
+        The first grid of T's cells.
+    **attributes
+        What it is made from, as JSON. No times and no ids: the same input makes the same bytes.
+    """
+    edge = block_edge(height, width)
+    layout = {
+        "format": FORMAT,
+        "height": height,
+        "width": width,
+        "columns": columns,
+        "rows": rows,
+        "block": edge,
+    }
+    made = MemoryStore()
+    group = zarr.create_group(made, attributes=layout | attributes)
+    frame, chunk = (height, width), (min(edge, height), min(edge, width))
+    dims = ("y", "x", "channel")
+    for name, kind in (("S", "float32"), ("rho", "float32"), ("count", "uint32")):
+        group.create_array(
+            name, shape=(*frame, 3), chunks=(*chunk, 3), dtype=kind, compressors=CODECS, dimension_names=dims
+        )
+    for name, kind in (("error", "float32"), ("recovered", "bool"), ("shared", "bool")):
+        group.create_array(
+            name, shape=frame, chunks=chunk, dtype=kind, compressors=CODECS, dimension_names=dims[:2]
+        )
+    group.create_group("T")
+    objects.put_tree(path(matte), made)
+    return Matte(objects, matte)

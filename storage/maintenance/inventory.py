@@ -1,0 +1,108 @@
+"""What the store has to hold, by what the database says: for whoever tidies up, checks it, or takes it elsewhere."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from sqlalchemy import Connection, Table, select
+
+from storage.database.tables import metadata
+from storage.layout import captures, composites, mattes, uploads
+from storage.records.captures import may_be_retried
+
+FOLDERS = ("captures", "mattes", "uploads", "composites")
+"""All that there is at the top of the store."""
+KEPT = 3600.0
+"""Seconds for which what nothing refers to is left alone: someone may be about to write down that it is there."""
+COLUMNS = {
+    "captures": ("id", "state", "problem"),
+    "mattes": ("id", "state", "capture"),
+    "uploads": ("id",),
+    "jobs": ("id", "state", "problem", "kind", "capture", "matte"),
+}
+"""Of the tables whose rows stand for something in the store: what tells it."""
+
+
+@dataclass(frozen=True)
+class Thing:
+    """What a row stands for in the store.
+
+    Attributes
+    ----------
+    kind : str
+        An ``archive`` is what a capture was uploaded as, until it is ingested.
+    id : str
+    state : str
+        ``whole``; ``busy``, being written; or ``left``, by a job that failed and may be tried again.
+    folder : str
+        Where it lies.
+    family : str
+        The same of all that is deleted with, or made of, one another: the id of a capture, or of a matte without one.
+    parts : tuple of str
+        Names of the parts of an upload under way.
+    """
+
+    kind: Literal["capture", "archive", "matte", "upload", "composite"]
+    id: str
+    state: Literal["whole", "busy", "left"]
+    folder: str
+    family: str
+    parts: tuple[str, ...] = ()
+
+
+def things(connection: Connection, tables: Mapping[str, Table] = metadata.tables) -> Iterator[Thing]:
+    """All that there is by the database."""
+    for name, columns in COLUMNS.items():
+        query = select(*(tables[name].c[column] for column in columns))
+        if name == "jobs":
+            query = query.where(tables[name].c.kind == "composite")
+        for row in connection.execute(query).mappings():
+            yield from of_row(connection, tables, name, dict(row))
+
+
+def family_of(table: str, row: Mapping[str, Any]) -> str | None:
+    """The family that a row belongs to, see `Thing`; of tiles and log it is their job's."""
+    match table:
+        case "captures" | "uploads":
+            return str(row["id"])
+        case "upload_parts":
+            return str(row["upload"])
+        case "mattes":
+            return str(row["capture"] or row["id"])
+        case "jobs":
+            return str(row["capture"] or row["matte"] or row["id"])
+    return None
+
+
+def of_row(
+    connection: Connection, tables: Mapping[str, Table], table: str, row: Mapping[str, Any]
+) -> Iterator[Thing]:
+    """What a row stands for in the store; nothing, of most tables.
+
+    Parameters
+    ----------
+    tables : mapping of str to Table
+        As the database has them, which may be of an earlier revision.
+    row : mapping
+        With `COLUMNS`.
+    """
+    family = family_of(table, row) or ""
+    if table == "captures" and (row["state"] != "failed" or may_be_retried(row["problem"])):
+        id, ready = row["id"], row["state"] == "ready"
+        state: Any = {"ready": "whole", "failed": "left"}.get(row["state"], "busy")
+        yield Thing("capture", id, state, captures.path(id), family)
+        if not ready:
+            yield Thing("archive", id, "whole", uploads.path(id), family)
+    elif table == "mattes":
+        id = row["id"]
+        state = {"ready": "whole", "failed": "left"}.get(row["state"], "busy")
+        yield Thing("matte", id, state, mattes.path(id), family)
+    elif table == "uploads":
+        id, parts = row["id"], tables["upload_parts"]
+        names = tuple(connection.scalars(select(parts.c.name).where(parts.c.upload == id)))
+        yield Thing("upload", id, "whole", uploads.path(id), family, names)
+    elif table == "jobs" and row["kind"] == "composite":
+        kept = row["problem"] is None or may_be_retried(row["problem"])
+        if kept and row["state"] != "cancelled":
+            state = {"succeeded": "whole", "failed": "left"}.get(row["state"], "busy")
+            yield Thing("composite", row["id"], state, composites.path(row["id"]), family)

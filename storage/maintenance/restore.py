@@ -1,0 +1,282 @@
+"""A backup comes back, into an installation that holds nothing: all of it, or nothing.
+
+Every byte is held against the manifest on its way in. Objects come first, and the rows last, in one transaction; until
+then a marker in the store says that what is there belongs to nothing, and whoever restores again clears it away.
+"""
+
+import hashlib
+import json
+import re
+import tempfile
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
+from typing import IO, Any
+
+from sqlalchemy import Connection, Engine, MetaData, select
+
+from storage.database import dialects, migrations
+from storage.database.engine import reading, writing
+from storage.database.tables import clock, metadata
+from storage.errors import Conflict, Corrupt, InvalidInput, NoRoom
+from storage.maintenance import row_dump
+from storage.maintenance.backup import FORMAT, LEDGER, MANIFEST, OBJECTS, Tally
+from storage.maintenance.integrity import THREADS
+from storage.maintenance.inventory import FOLDERS
+from storage.objects.byte_objects import PART
+from storage.objects.store import Objects
+
+MARKER = "restoring"
+"""In the store while a backup is being restored: names the database that its rows are to come to."""
+LINE = 1 << 16
+"""Bytes of a line of the manifest, at most."""
+NAME = re.compile(rf"({'|'.join(FOLDERS)})(/[A-Za-z0-9_-][A-Za-z0-9._-]*)+")
+"""Of an object: none leaves its folder."""
+SHA256 = re.compile("[0-9a-f]{64}")
+
+
+def restore(
+    source: Objects,
+    engine: Engine,
+    objects: Objects,
+    progress: Callable[[float, int], None] = lambda share, size: None,
+) -> dict[str, int]:
+    """Restore a backup.
+
+    Parameters
+    ----------
+    engine : sqlalchemy.Engine
+        Of a database that has no rows, and may have no tables.
+    objects : Objects
+        A store that has none.
+    progress : callable
+        Gets the share of the bytes that were restored, and their number.
+
+    Returns
+    -------
+    dict of str to int
+        ``objects``, ``bytes`` and ``rows`` that came.
+
+    Raises
+    ------
+    Conflict
+        If there is no backup, or one of a newer envmatte; if the installation holds something, or a service runs on it.
+    InvalidInput
+        If something of the backup is not what its manifest says.
+    NoRoom
+        If the store has too little.
+    """
+    manifest = Manifest(source)
+    with reading(engine) as c:
+        _see_that_it_is_empty(c)
+    database = dialects.place(engine.url).encode()
+    _see_that_nothing_is_stored(objects, database)
+    free = objects.free()
+    if free is not None and free < manifest.bytes:
+        raise NoRoom(
+            f"the backup has {manifest.bytes} bytes, and the disk of the store {free} free: free some"
+        )
+    objects.put(MARKER, database)
+    try:
+        _copy(source, objects, manifest, progress)
+        with tempfile.TemporaryFile() as rows:
+            rows.writelines(_read(source, LEDGER, manifest.ledger))
+            rows.seek(0)
+            with writing(engine) as c:
+                _see_that_it_is_empty(c)
+                count = _read_in(c, manifest.revision, rows)
+    except BaseException:
+        with reading(engine) as c:
+            came = row_dump.counts(c, row_dump.tables_of(c))
+        if not came:  # else it is whole, and only that was not heard of
+            _clear(objects)
+        raise
+    objects.delete(MARKER)
+    return {"objects": manifest.objects, "bytes": manifest.bytes, "rows": count}
+
+
+class Manifest:
+    """The manifest of a backup; iterating over it gives what it says of each object.
+
+    Attributes
+    ----------
+    revision : str
+    ledger : dict
+        ``size`` and ``sha256`` of the rows.
+    objects, bytes : int
+
+    Raises
+    ------
+    Conflict
+        If there is none, or a newer envmatte has written it.
+    InvalidInput
+        If it is not whole, or says what none says.
+    """
+
+    def __init__(self, source: Objects) -> None:
+        self._source = source
+        try:
+            lines = self._lines()
+            header = _object(next(lines, b""))
+            if header.get("format") != FORMAT:
+                raise Conflict(
+                    f"the backup has the format {header.get('format')!r}, and this envmatte knows {FORMAT!r}: "
+                    "install the envmatte that made it"
+                )
+            self.revision, self.ledger = (
+                str(header.get("revision")),
+                _entry(header.get("ledger"), named=False),
+            )
+            migrations.check(self.revision, "the backup")
+            self._see_that_it_is_whole()
+        except FileNotFoundError as error:
+            raise Conflict(
+                f"{source.url} has no {MANIFEST}: there is no backup, or one that was never finished"
+            ) from error
+
+    def _lines(self) -> Iterator[bytes]:
+        with self._source.read(MANIFEST) as file:
+            while line := file.readline(LINE):
+                yield line
+
+    def _see_that_it_is_whole(self) -> None:
+        digest, before = hashlib.sha256(), b""
+        self.objects, self.bytes = -1, 0
+        for line in self._lines():
+            if before:
+                digest.update(before)
+                if self.objects >= 0:
+                    self.bytes += _entry(_object(before))["size"]
+                self.objects += 1
+            before = line
+        last = {"objects": self.objects, "bytes": self.bytes, "sha256": digest.hexdigest()}
+        if _object(before) != last:
+            raise _not_whole()
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        for line in islice(self._lines(), 1, self.objects + 1):
+            yield _entry(_object(line))
+
+
+def _object(line: bytes) -> dict[str, Any]:
+    try:
+        found = json.loads(line)
+    except ValueError:
+        found = None
+    if not isinstance(found, dict):
+        raise _not_whole()
+    return found
+
+
+def _not_whole() -> InvalidInput:
+    return InvalidInput(f"{MANIFEST} of the backup is cut short, or was changed: use another backup")
+
+
+def _entry(given: Any, *, named: bool = True) -> dict[str, Any]:
+    """What a manifest says of an object, or of the rows, if it says that."""
+    name, size, digest = (
+        (given.get(key) for key in ("name", "size", "sha256")) if isinstance(given, dict) else (None,) * 3
+    )
+    if named and not (isinstance(name, str) and NAME.fullmatch(name)):
+        raise InvalidInput(f"{MANIFEST} of the backup names {name!r}, which is no object of a store")
+    if not (isinstance(size, int) and size >= 0 and isinstance(digest, str) and SHA256.fullmatch(digest)):
+        raise InvalidInput(f"{MANIFEST} of the backup has no size and checksum of {name or LEDGER}")
+    return {"name": name or LEDGER, "size": size, "sha256": digest}
+
+
+def _copy(
+    source: Objects, objects: Objects, manifest: Manifest, progress: Callable[[float, int], None]
+) -> None:
+    def one(entry: dict[str, Any]) -> int:
+        objects.store(entry["name"], _read(source, f"{OBJECTS}/{entry['name']}", entry))
+        return int(entry["size"])
+
+    done, entries = 0, iter(manifest)
+    with ThreadPoolExecutor(THREADS, thread_name_prefix="restoring") as pool:
+        while some := list(islice(entries, 4 * THREADS)):
+            for size in pool.map(one, some):
+                done += size
+            progress(done / max(manifest.bytes, 1), done)
+
+
+def _read(source: Objects, path: str, entry: dict[str, Any]) -> Iterator[bytes]:
+    """The pieces of something in the backup, see `_checked`."""
+    try:
+        if entry["size"] <= PART:  # most objects are, and one request then
+            yield from _checked(entry, iter([source.load(path, entry["size"])]))
+        else:
+            with source.reader(path) as reader:
+                yield from _checked(entry, iter(lambda: reader.read(PART), b""))
+    except FileNotFoundError as error:
+        raise InvalidInput(
+            f"{entry['name']} is missing in the backup: use another", entry=entry["name"]
+        ) from error
+    except Corrupt as error:
+        raise _unlike(entry["name"]) from error
+
+
+def _checked(entry: dict[str, Any], pieces: Iterator[bytes]) -> Iterator[bytes]:
+    """The pieces of an object, after the last of which it is told if they are not what the manifest says."""
+    tally = Tally()
+    for piece in tally.passing(pieces):
+        if tally.size > entry["size"]:
+            raise _unlike(entry["name"])
+        yield piece
+    if (tally.size, tally.sha256) != (entry["size"], entry["sha256"]):
+        raise _unlike(entry["name"])
+
+
+def _unlike(name: str) -> InvalidInput:
+    return InvalidInput(
+        f"{name} in the backup is not what {MANIFEST} says: it is damaged; use another backup", entry=name
+    )
+
+
+def _see_that_it_is_empty(connection: Connection) -> None:
+    tables = row_dump.tables_of(connection)
+    found = row_dump.counts(connection, tables)
+    if found:
+        rows = ", ".join(f"{count} of {name}" for name, count in found.items())
+        raise Conflict(
+            f"the installation is not empty, its database has rows: {rows}. A backup is restored into an empty one: "
+            "name another folder, database and store"
+        )
+    if "coordinator" in tables and "holder" in tables["coordinator"].c:
+        lease = tables["coordinator"].c
+        if connection.scalar(
+            select(lease.holder).where(lease.holder.is_not(None), lease.expires_at > clock())
+        ):
+            raise Conflict("a service runs on the installation: stop it until the backup is restored")
+
+
+def _see_that_nothing_is_stored(objects: Objects, database: bytes) -> None:
+    """See to it that the store is empty; what a restore that was interrupted has left there goes.
+
+    If it was one into the same database, which is empty: what is there with another one may be that one's.
+    """
+    if MARKER in objects.names("") and objects.load(MARKER) == database:
+        _clear(objects)
+    for folder in FOLDERS:
+        there = [name for name in objects.names(folder) if name != "zarr.json"]
+        if there:
+            raise Conflict(
+                f"the installation is not empty, its store {objects.url} has {folder}/{there[0]}. A backup is restored "
+                "into an empty one: name another folder, or another prefix of the bucket"
+            )
+
+
+def _clear(objects: Objects) -> None:
+    for what in (*FOLDERS, MARKER):
+        objects.delete(what)
+
+
+def _read_in(connection: Connection, revision: str, rows: IO[bytes]) -> int:
+    """Make the tables as they were when the backup was made, fill them, and bring them up to date."""
+    there = MetaData()
+    there.reflect(connection, only=lambda name, _: name in metadata.tables or name == "alembic_version")
+    there.drop_all(connection)
+    migrations.upgrade(connection, revision)
+    count = row_dump.read_in(connection, rows)
+    migrations.upgrade(connection)
+    row_dump.number_on(connection)
+    return count

@@ -1,0 +1,164 @@
+"""The rows of a database of any revision: opened without an upgrade, and as lines of JSON.
+
+A line is a list of two, the name of a table and a row of it. Not among them are who drives the jobs, for nobody does
+yet where they are restored, and what is to be told to webhooks, for the service that has it here tells it.
+"""
+
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import groupby, islice
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import JSON, Connection, Engine, MetaData, Table, func, insert, inspect, or_, select
+
+from storage.database import dialects, migrations
+from storage.database.engine import reading
+from storage.database.tables import metadata
+from storage.errors import Conflict, InvalidInput
+
+LEFT_OUT = ("coordinator", "deliveries")
+AT_ONCE = 500
+"""Rows that are held."""
+Line = tuple[str, Mapping[str, Any]]
+
+
+def open_as_it_is(url: str) -> Engine:
+    """Open a database that a service uses, or used, and leave its schema alone.
+
+    Raises
+    ------
+    Conflict
+        If there is none, or a newer envmatte has used it.
+    InvalidInput, Unavailable
+        As of `storage.database.engine.open_engine`.
+    """
+    engine = dialects.create(url)
+    where = dialects.place(engine.url)
+    file = engine.url.database
+    if engine.dialect.name == "sqlite" and not (file and Path(file).is_file()):  # which opening would make
+        raise Conflict(
+            f"there is no database {where}: name the one of the service, with --data or --database"
+        )
+    try:
+        with reading(engine) as c:
+            revision = migrations.revision(c)
+        if revision is None:
+            raise Conflict(
+                f"the database {where} has no tables of envmatte, or those of a very old one: name the one of the "
+                "service, or start `envmatte serve` on it once"
+            )
+        migrations.check(revision, "the database")
+    except BaseException:
+        engine.dispose()
+        raise
+    return engine
+
+
+def tables_of(connection: Connection) -> Mapping[str, Table]:
+    """The tables as the database has them, by name, those first to which others refer."""
+    found = MetaData()
+    there = metadata.tables.keys() & set(inspect(connection).get_table_names())
+    found.reflect(connection, only=sorted(there))
+    for table in found.tables.values():
+        for column in table.columns:
+            if isinstance(column.type, JSON):
+                column.type.none_as_null = True  # as all of ours
+    return {table.name: table for table in found.sorted_tables}
+
+
+def lines(connection: Connection, tables: Mapping[str, Table]) -> Iterator[Line]:
+    """All rows, as the transaction sees them; few of them are held."""
+    for name, table in tables.items():
+        if name not in LEFT_OUT:
+            streamed = connection.execution_options(yield_per=AT_ONCE)
+            for row in streamed.execute(select(table)).mappings():
+                yield name, dict(row)
+
+
+def lines_of_family(connection: Connection, tables: Mapping[str, Table], family: str) -> Iterator[Line]:
+    """The rows of what is deleted with, or made of, one another, see `storage.maintenance.inventory.Thing`."""
+    captures, mattes, jobs = (tables[name] for name in ("captures", "mattes", "jobs"))
+    uploads, parts = tables["uploads"], tables["upload_parts"]
+    of_jobs = or_(jobs.c.capture == family, (jobs.c.capture == "") & (jobs.c.matte == family))
+    for table, which in (
+        (captures, captures.c.id == family),
+        (mattes, or_(mattes.c.capture == family, mattes.c.id == family)),
+        (uploads, uploads.c.id == family),
+        (parts, parts.c.upload == family),
+        (jobs, of_jobs),
+        *(
+            (tables[name], tables[name].c.job.in_(select(jobs.c.id).where(of_jobs)))
+            for name in ("tiles", "log")
+        ),
+    ):
+        for row in connection.execute(select(table).where(which)).mappings():
+            yield table.name, dict(row)
+
+
+def dumped(name: str, row: Mapping[str, Any]) -> bytes:
+    """A line."""
+    return json.dumps([name, dict(row)], separators=(",", ":")).encode() + b"\n"
+
+
+def counts(connection: Connection, tables: Mapping[str, Table]) -> dict[str, int]:
+    """Rows by table, where there are any; without the coordinator's, which every service has."""
+    found = {
+        name: connection.scalar(select(func.count()).select_from(table)) or 0
+        for name, table in tables.items()
+        if name != "coordinator"
+    }
+    return {name: count for name, count in found.items() if count}
+
+
+def read_in(connection: Connection, source: Iterable[bytes]) -> int:
+    """Insert rows into empty tables of the revision that they are of; returns how many.
+
+    Jobs that ran are queued: their tiles say how far they were.
+
+    Raises
+    ------
+    InvalidInput
+        If a line is none, or of another schema.
+    """
+    tables = tables_of(connection)
+    read = 0
+    for name, group in groupby(map(_loaded, source), key=lambda line: line[0]):
+        if name not in tables or name in LEFT_OUT:
+            raise InvalidInput(f"the backup's ledger has rows of a table {name!r}, and there is none")
+        table = tables[name]
+        rows = (row for _, row in group)
+        while some := list(islice(rows, AT_ONCE)):
+            for row in some:
+                if row.keys() != set(table.columns.keys()):
+                    raise InvalidInput(
+                        f"the backup's ledger has a row of {name} with other columns than that has"
+                    )
+                if name == "jobs" and row["state"] == "running":
+                    row |= {"state": "queued", "stage": "waiting"}
+            connection.execute(insert(table), some)
+            read += len(some)
+    return read
+
+
+def _loaded(line: bytes) -> tuple[str, dict[str, Any]]:
+    try:
+        name, row = json.loads(line)
+    except ValueError as error:
+        raise InvalidInput("the backup's ledger has a line that is no row") from error
+    if not (isinstance(name, str) and isinstance(row, dict)):
+        raise InvalidInput("the backup's ledger has a line that is no row")
+    return name, row
+
+
+def number_on(connection: Connection) -> None:
+    """Have rows that are new numbered after those that were read in; SQLite does so by itself."""
+    if connection.dialect.name != "postgresql":
+        return
+    for table in metadata.sorted_tables:
+        column = table.autoincrement_column
+        if column is not None:
+            last = connection.scalar(select(func.max(column)))
+            sequence = func.pg_get_serial_sequence(table.name, column.name)
+            if last is not None:
+                connection.execute(select(func.setval(sequence, last)))

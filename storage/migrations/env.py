@@ -1,6 +1,0 @@
-"""What alembic runs to migrate; see `storage.migrations.upgrade`."""
-
-from alembic import context
-
-context.configure(connection=context.config.attributes["connection"])
-context.run_migrations()

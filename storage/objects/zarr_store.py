@@ -1,0 +1,98 @@
+"""What zarr is told, and tells, about arrays in the store."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import zarr
+from obstore.store import ObjectStore
+from zarr.buffer import default_buffer_prototype
+from zarr.storage import MemoryStore, StorePath, WrapperStore
+from zarr.storage import ObjectStore as ZarrStore
+
+from storage.errors import Corrupt
+from storage.objects import checksums
+from storage.objects.checksums import CODECS
+from storage.objects.retries import told
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from zarr.abc.store import ByteRequest
+    from zarr.core.array_spec import ArrayConfigParams
+    from zarr.core.buffer import Buffer, BufferPrototype
+
+EVERY_CHUNK: ArrayConfigParams = {"write_empty_chunks": True}
+"""For whoever makes an array: a chunk of zeros is stored like any other, so that one that is missing is damage."""
+METADATA = ("zarr.json", ".zarray", ".zgroup", ".zattrs", ".zmetadata")
+"""Objects that zarr looks for to see whether there is an array or a group: they may be missing."""
+
+
+def described(store: Whole, path: str, data: bytes) -> zarr.Array[Any]:
+    """The array that a ``zarr.json`` describes."""
+    document, _ = checksums.unseal(f"{path}/zarr.json", data)
+    with known(path):
+        array = zarr.AsyncArray.from_dict(StorePath(store, path), document)
+    return zarr.Array(array).with_config(EVERY_CHUNK)
+
+
+@contextmanager
+def known(path: str) -> Iterator[None]:
+    """What describes no array, or group, that zarr knows is `Corrupt`."""
+    try:
+        yield
+    except (ValueError, TypeError, KeyError) as error:
+        raise checksums.damaged(f"{path}/zarr.json") from error
+
+
+def sealed(name: str, value: Buffer) -> Buffer:
+    """What is stored under a name: a zarr.json gets its checksum."""
+    if not name.endswith("zarr.json"):
+        return value
+    return default_buffer_prototype().buffer.from_bytes(checksums.seal(value.to_bytes()))
+
+
+@cache
+def metadata_of(dtype: np.dtype[Any]) -> dict[str, Any]:
+    """What zarr writes down about an array of a type, for arrays of any length."""
+    array = zarr.create_array(MemoryStore(), shape=(1,), chunks=(1,), dtype=dtype, compressors=CODECS)
+    return array.metadata.to_dict()
+
+
+class Whole(WrapperStore[ZarrStore[ObjectStore]]):
+    """A store for zarr in which a missing chunk is an error: zarr reads it as its fill value, without a word.
+
+    What can't be written or reached is told as everywhere here; these are the calls that zarr makes.
+    """
+
+    async def get(
+        self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
+    ) -> Buffer | None:
+        with told():
+            value = await self._store.get(key, prototype, byte_range)
+        if value is None and not key.endswith(METADATA):
+            raise Corrupt(f"{key} is missing in the store: what it belongs to is damaged, make it again")
+        return value
+
+    async def set(self, key: str, value: Buffer) -> None:
+        with told():
+            await self._store.set(key, value)
+
+    async def set_if_not_exists(self, key: str, value: Buffer) -> None:
+        with told():
+            await self._store.set_if_not_exists(key, value)
+
+    async def delete(self, key: str) -> None:
+        with told():
+            await self._store.delete(key)
+
+    async def delete_dir(self, prefix: str) -> None:
+        with told():
+            await self._store.delete_dir(prefix)
+
+    async def exists(self, key: str) -> bool:
+        with told():
+            return await self._store.exists(key)

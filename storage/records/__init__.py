@@ -1,0 +1,1 @@
+"""Rows of the database, one file for each kind of record."""

@@ -1,0 +1,154 @@
+"""The ledger: jobs, their tiles and their log. The one truth about progress.
+
+A job is ``queued``, ``running``, and then one of ``succeeded``, ``failed`` and ``cancelled``. Its work is cut into
+tiles (frames of a capture by slabs, pixels of a matte by rectangles), each ``queued``, ``done`` or ``failed``; a tile
+is done when what it writes is stored and its row here says so. One that is done here, and then not to be found in the
+store, is ``missing`` until it is done again.
+"""
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from sqlalchemy import Connection, Row, delete, exists, insert, or_, select, update
+
+from storage.database.rows import find, new_id
+from storage.database.tables import captures, jobs, mattes, tiles
+from storage.errors import Conflict
+from storage.records import webhook_deliveries
+from storage.records.job_log import note
+
+ACTIVE = ("queued", "running")
+
+
+def add(
+    connection: Connection,
+    kind: str,
+    capture: str,
+    options: dict[str, Any],
+    matte: str | None = None,
+    trace: str | None = None,
+    job: str | None = None,
+    stored: int | None = None,
+    webhook: str | None = None,
+) -> str:
+    """Queue a job; returns its id.
+
+    Parameters
+    ----------
+    job : str, optional
+        The id, if it has one already: something was stored under it.
+    stored : int, optional
+        How many bytes that is.
+    trace : str, optional
+        The ``traceparent`` (W3C Trace Context) of the request that asks for it.
+    webhook : str, optional
+        URL that is told whenever it has ended.
+    """
+    job = job or new_id()
+    row = {
+        "id": job,
+        "kind": kind,
+        "state": "queued",
+        "stage": "waiting",
+        "capture": capture,
+        "matte": matte,
+        "options": options,
+        "trace": trace,
+        "stored": stored,
+        "webhook": webhook,
+        "created_at": time.time(),
+    }
+    connection.execute(insert(jobs).values(row))
+    note(connection, job, "queued")
+    return job
+
+
+def get(connection: Connection, job: str) -> Row[Any]:
+    """A job's row; `NotFound` if there is none."""
+    return find(connection, jobs, job)
+
+
+def active(connection: Connection) -> Sequence[Row[Any]]:
+    """Jobs that are queued or running, oldest first."""
+    query = select(jobs).where(jobs.c.state.in_(ACTIVE)).order_by(jobs.c.number)
+    return connection.execute(query).all()
+
+
+def not_wound_up(connection: Connection) -> Sequence[Row[Any]]:
+    """Jobs that were cancelled, and that have left something: a matte, or a capture, in the making, or a composite."""
+    # A composite has no other record: what it left is there for as long as its tiles are, see `clear`.
+    left = (jobs.c.kind == "composite") & exists().where(tiles.c.job == jobs.c.id)
+    query = (
+        select(jobs)
+        .outerjoin(mattes, mattes.c.job == jobs.c.id)
+        .outerjoin(captures, captures.c.job == jobs.c.id)
+        .where(
+            jobs.c.state == "cancelled",
+            or_(mattes.c.state == "recovering", captures.c.state == "ingesting", left),
+        )
+    )
+    return connection.execute(query).all()
+
+
+def change(connection: Connection, job: str, **values: Any) -> None:
+    """Change a job's row."""
+    connection.execute(update(jobs).where(jobs.c.id == job).values(values))
+
+
+def enter(connection: Connection, job: str, stage: str) -> None:
+    """Put an active job into a stage; the first one starts it."""
+    row = get(connection, job)
+    if row.state not in ACTIVE:
+        return
+    now = time.time()
+    values = {"state": "running", "stage": stage, "started_at": row.started_at or now, "stage_at": now}
+    values |= {"moved_at": now, "paced_at": None}
+    connection.execute(update(jobs).where(jobs.c.id == job).values(values))
+    note(connection, job, stage)
+
+
+def end(connection: Connection, job: str, state: str, problem: dict[str, Any] | None = None) -> bool:
+    """End an active job; false, and nothing changed, if it had ended before."""
+    result = connection.execute(
+        update(jobs)
+        .where(jobs.c.id == job, jobs.c.state.in_(ACTIVE))
+        .values(state=state, stage=state, problem=problem, finished_at=time.time())
+    )
+    if result.rowcount:
+        note(connection, job, f"{state}: {problem['detail']}" if problem else state)
+        row = get(connection, job)
+        if row.webhook:
+            webhook_deliveries.add(connection, row)
+    return bool(result.rowcount)
+
+
+def cancel(connection: Connection, job: str) -> None:
+    """Cancel an active job; a cancelled one stays so.
+
+    Raises
+    ------
+    NotFound
+        If there is none.
+    Conflict
+        If it has ended otherwise.
+    """
+    row = get(connection, job)
+    if not end(connection, job, "cancelled") and row.state != "cancelled":
+        raise Conflict(f"job {job} has {row.state} already and can't be cancelled")
+
+
+def forget(connection: Connection, job: str) -> None:
+    """Delete a job that has ended, its tiles and its log.
+
+    Raises
+    ------
+    NotFound
+        If there is none.
+    Conflict
+        If it is active.
+    """
+    row = get(connection, job)
+    if row.state in ACTIVE:
+        raise Conflict(f"job {job} is {row.state}; cancel it first")
+    connection.execute(delete(jobs).where(jobs.c.id == job))

@@ -1,0 +1,132 @@
+"""Recovers captures of traced scenes through the service, and scores the composites against the truth.
+
+    python -m tests.benchmarks.recovery.figures KIT SCENES [--case default] [--film="--noise 4"] [--workers 1]
+        [--json FILE]
+
+KIT is the path of a `kit.py` that makes captures of scenes and scores composites, SCENES a folder of its scenes
+(`*.npz`). For each case and scene it films the case's program with a mask, uploads the capture, recovers its matte,
+requests composites over the kit's backdrops, and prints the PSNR over the object's pixels, the share of the squared
+error in the 5 % of least confidence (and in the worst 5 %, the most there can be), the rank correlation of confidence
+and error, and the seconds of work for 1,000 pixels. Options in `--film` go to the kit's `capture`.
+"""
+
+import json
+import shlex
+import sqlite3
+from contextlib import redirect_stdout
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+from kits import load, parser_of, served, show
+from numpy.typing import NDArray
+from scipy.stats import spearmanr
+
+from services.client import Client
+from workflows.images import integer_formats
+from workflows.programs.files import write
+from workflows.programs.presets import preset
+
+
+class Case(NamedTuple):
+    """A program, a preset's or the kit's bands, and the options of recovery."""
+
+    program: str
+    options: dict[str, Any]
+
+
+NESTED = "16x12:24,32x24:20,64x48:20,128x96:20,256x192:20,512x384:20"
+CASES = {
+    "default": Case("default", {}),
+    "fast": Case("default", {"quality": "fast"}),
+    "quick": Case("quick", {}),
+    "sketch": Case("sketch", {}),
+    "nested": Case(NESTED, {}),
+    "nn-dgsr": Case("16x12:24,128x96:250", {"method": "nn-dgsr"}),
+}
+
+
+def measure(
+    kit: ModuleType, scene: Path, case: Case, film: list[str], client: Client, folder: Path
+) -> dict[str, Any]:
+    """Film, upload, recover, composite, score."""
+    bundle = folder / "capture.zip"
+    if ":" in case.program:
+        program = ["--bands", case.program]
+    else:
+        patterns = folder / case.program
+        if not patterns.exists():
+            write(preset(case.program), patterns, lambda *_: None)
+        program = ["--program", str(patterns)]
+    with redirect_stdout(None):
+        kit.main(["capture", str(scene), str(bundle), *program, "--mask", *film])
+    uploaded = client.upload(bundle, name=scene.stem)
+    job = client.wait(client.recover(uploaded["id"], **case.options)["id"])
+    with sqlite3.connect(folder / "data" / "envmatte.db") as ledger:
+        (seconds,) = ledger.execute("select sum(seconds) from tiles where job = ?", (job["id"],)).fetchone()
+    truth = kit.Scene.load(scene)
+    crosstalk = float(film[film.index("--crosstalk") + 1]) if "--crosstalk" in film else 0.0
+    scores, squares = {}, []
+    for name, backdrop in kit.backdrops().items():
+        # 16 bits, so that the matte is scored and not the answer's rounding.
+        sent = integer_formats.to_integers(backdrop, np.dtype(np.uint16))
+        answer = client.composite(job["matte"], integer_formats.encode_png(sent), transfer="linear")
+        pixels = integer_formats.to_unit(integer_formats.decode(answer, memory=1 << 28))
+        scores[name] = kit.score(truth, integer_formats.to_unit(sent), pixels[..., :3], crosstalk=crosstalk)
+        mix = (1 - 3 * crosstalk) * np.eye(3) + crosstalk
+        true = 0.02 + 0.9 * truth.composite(integer_formats.to_unit(sent)) @ mix
+        squares.append(((pixels[..., :3] - true)[truth.object_pixels] ** 2).mean(axis=1))
+    error = np.mean(squares, axis=0)
+    doubt = -integer_formats.to_unit(
+        integer_formats.decode(client.layer(job["matte"], "confidence.png"), memory=1 << 28)
+    )[truth.object_pixels, 0]
+    worst = -(len(error) // -20)
+    return {
+        "scene": scene.stem,
+        "frames": uploaded["frames"],
+        "pixels": job["pixels"],
+        **{name: round(score, 2) for name, score in scores.items()},
+        "mean": round(sum(scores.values()) / len(scores), 2),
+        "worst_5_hold": share(error, doubt, worst),
+        "at_best": share(error, error, worst),
+        "rank": round(float(spearmanr(doubt, error).statistic), 2),
+        "seconds_per_1000_pixels": round(seconds / job["pixels"] * 1000, 2),
+        "run_seconds": round(job["run_seconds"], 1),
+    }
+
+
+def share(error: NDArray[np.floating], doubt: NDArray[np.floating], worst: int) -> float:
+    """The share of the squared error that the most doubtful pixels hold."""
+    return round(float(error[np.argsort(-doubt, kind="stable")[:worst]].sum() / error.sum()), 2)
+
+
+def main() -> None:
+    parser = parser_of(__doc__)
+    parser.add_argument("--case", choices=CASES, action="append")
+    parser.add_argument("--film", default="", help="Options of the kit's capture.")
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    kit = load(given.kit)
+    rows: list[dict[str, Any]] = []
+    with served(given.workers) as (client, folder):
+        for case in given.case or CASES:
+            found = []
+            for scene in sorted(given.scenes.glob("*.npz")):
+                row = measure(kit, scene, CASES[case], shlex.split(given.film), client, folder)
+                found.append({"case": case, **row})
+                if not rows and len(found) == 1:
+                    print("  ".join(f"{name:>8}" for name in found[0]))
+                show(found[-1])
+            rows += found
+            means = {
+                name: round(float(np.mean([row[name] for row in found])), 2) for name in list(found[0])[4:]
+            }
+            show({"case": case, "scene": "mean", "frames": "", "pixels": "", **means})
+    if given.json:
+        given.json.write_text(json.dumps(rows, indent=2))
+
+
+if __name__ == "__main__":
+    main()

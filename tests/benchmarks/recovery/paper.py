@@ -1,0 +1,344 @@
+"""Reruns the paper's own comparisons on traced scenes, and sets its method beside others.
+
+    python tests/benchmarks/recovery/paper.py KIT SCENES [--pixels N] [--json FILE]
+
+KIT is the path of a `kit.py` that films scenes and scores composites, SCENES a folder of its scenes (`*.npz`). The
+recovery functions run on a pseudo-random sample of each object's pixels, always the same, filmed in memory with
+8 levels and the bands 16x12:24,128x96:N at 8 bits; composites over the kit's backdrops are scored against the truth.
+
+1. Fig. 4 and 5: with and without the Gaussian prior at 100 to 400 fine images, the channels apart.
+2. Table 2: hierarchical and direct, at 400 images.
+3. Methods at equal frames, libraries' own solvers among them. The rivals get the measurements of each channel in the
+   +-1 form and go from level to level as NN-DGSR does, or solve directly for all cells. Orthogonal matching pursuit
+   ends at the noise's own residual, or at a fifth of the measurements (at a coarse level, as many); the non-negative
+   lasso's penalty is the noise's ``sigma sqrt(2 ln s / m)``; orthogonal matching pursuit and non-negative least
+   squares get a row that asks T to sum to one, as heavy as all measurements together. Negative weights are cut off,
+   and each T is normalised.
+
+Times are of one core, errors the mean over the backdrops. "grid" is what the true T on the same grid scores.
+Rivals need scikit-learn (``pip install envmatte[bench]``).
+"""
+
+import json
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from kits import load, parser_of
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.linear_model import Lasso, orthogonal_mp
+
+from workflows.images.resample import area_mean
+from workflows.programs.program import Program
+from workflows.programs.pyramid_light import lay_out
+from workflows.recovery.dgsr import recover as dgsr
+from workflows.recovery.dgsr.groups import Rows
+from workflows.recovery.lobes import recover as lobes
+from workflows.recovery.noise import Noise
+from workflows.recovery.normalise import normalise
+from workflows.recovery.photometry import Photometry, estimate_noise, fit_photometry
+from workflows.recovery.pyramid import Pyramid
+from workflows.recovery.sensing import Patterns, Sensing
+from workflows.recovery.transport import Transport
+
+LEVELS, SEED, NOISE, DEPTH = 8, 7, 1.0, 8
+COARSE, FINE = (16, 12, 24), (128, 96)
+IMAGES = (100, 200, 300, 400)
+FRAMES = (132, 282)
+
+Recover = Callable[[NDArray[np.float32], Photometry, Sensing, Noise], Transport]
+Solve = Callable[[NDArray[np.float64], NDArray[np.float64], float, int], NDArray[np.float64]]
+
+
+@dataclass
+class Take:
+    """Some pixels of a scene, filmed: what a recovery gets, and the scene to score its composites by."""
+
+    scene: Any
+    measurements: NDArray[np.float32]
+    photometry: Photometry
+    sensing: Sensing
+    noise: Noise
+    program: Program
+
+
+def sample(kit: ModuleType, path: Path, count: int) -> Any:
+    """A scene of nothing but `count` pixels of the object."""
+    whole = kit.Scene.load(path)
+    pixels = np.flatnonzero(whole.object_pixels)
+    chosen = np.sort(np.random.default_rng(0).permutation(pixels)[:count])
+    transport = [channel[chosen] for channel in whole.transport]
+    return kit.Scene((len(chosen), 1), whole.monitor, transport, whole.coverage.reshape(1, -1)[:, chosen])
+
+
+def film(kit: ModuleType, scene: Any, bands: list[tuple[int, int, int]]) -> Take:
+    """Film a program of the given bands."""
+    described = kit.program_of(scene, LEVELS, bands, SEED, False)
+    rng = np.random.default_rng(SEED)
+    frames = [kit.sensor(light, rng, NOISE, "linear", DEPTH)[0] for light in kit.light(scene, described)]
+    codes = np.stack(frames, axis=1)
+    top = np.iinfo(codes.dtype).max
+    values, usable = codes.astype(np.float32) / np.float32(top), (codes > 0) & (codes < top)
+    program = Program.model_validate(described)
+    numbers, levels = program.constants
+    noise = estimate_noise(values[:, numbers], levels, usable[:, numbers], 1 / top)
+    once = np.ones(len(numbers), int)
+    photometry = fit_photometry(values[:, numbers], levels, usable[:, numbers], noise, once)
+    measurements = np.ascontiguousarray(values[:, program.measured])
+    return Take(scene, measurements, photometry, program.sensing("linear"), noise, program)
+
+
+def measure(kit: ModuleType, take: Take, recover: Recover) -> dict[str, float]:
+    """Recover, composite over every backdrop, score."""
+    start = time.process_time()
+    T = recover(take.measurements, take.photometry, take.sensing, take.noise)
+    seconds = time.process_time() - start
+    errors = _errors(
+        kit,
+        take.scene,
+        lambda light: take.photometry.S + take.photometry.rho * T.apply(light),
+        T.columns,
+        T.rows,
+    )
+    return errors | {"seconds": seconds / len(take.measurements) * 1000}
+
+
+def grid_errors(kit: ModuleType, scene: Any) -> dict[str, float]:
+    """What the true T on the finest grid scores."""
+    blocks = scene.blocks(*FINE)
+    return _errors(
+        kit,
+        scene,
+        lambda light: (
+            0.02
+            + 0.9 * np.stack([block @ light[: block.shape[1], c] for c, block in enumerate(blocks)], axis=-1)
+        ),
+        *FINE,
+    )
+
+
+def _errors(
+    kit: ModuleType,
+    scene: Any,
+    composite: Callable[[NDArray[np.float32]], NDArray[np.float32]],
+    columns: int,
+    rows: int,
+) -> dict[str, float]:
+    """Mean squared error and mean PSNR over the backdrops."""
+    scores = []
+    for backdrop in _backdrops(kit):
+        light = Pyramid.over(columns, rows).light(area_mean(backdrop, columns, rows))
+        scores.append(kit.score(scene, backdrop, composite(light)[np.newaxis]))
+    return {"mse": float(np.mean(10 ** (-np.array(scores) / 10))), "psnr": float(np.mean(scores))}
+
+
+@cache
+def _backdrops(kit: ModuleType) -> list[NDArray[np.float32]]:
+    return list(kit.backdrops().values())
+
+
+def rival(solve: Solve, levels: str) -> Recover:
+    """A method that solves for the T of each pixel and channel by itself."""
+
+    def recover(
+        measurements: NDArray[np.float32], photometry: Photometry, sensing: Sensing, noise: Noise
+    ) -> Transport:
+        measured = normalise(measurements, photometry, noise, 3.0)
+        index = np.arange(3 * len(measurements)).reshape(-1, 3)
+        used = sensing.levels if levels == "hierarchical" else sensing.levels[-1:]
+        rows = Rows.whole(index.size, used[0])
+        for i, level in enumerate(used):
+            if i > 0:
+                rows = rows.split(used[i - 1], level, 0.02, reach=0)
+            most = level.patterns.size // (5 if level is used[-1] else 1)
+            matrix = 2 * level.light[0].T.astype(np.float64) - 1
+            for (p, c), row in np.ndenumerate(index):
+                own = slice(rows.begin[row], rows.begin[row + 1])
+                sigma = float(np.sqrt(measured.variance[p, c, level.patterns].mean()))
+                if rows.cell[own].size and np.isfinite(sigma):
+                    target = measured.value[p, c, level.patterns].astype(np.float64)
+                    rows.weight[own] = np.maximum(solve(matrix[:, rows.cell[own]], target, sigma, most), 0)
+        return rows.transport(used[-1], index)
+
+    return recover
+
+
+def _with_sum(matrix: NDArray[np.float64], target: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    heavy = np.sqrt(len(target))
+    return np.vstack([matrix, np.full(matrix.shape[1], heavy)]), np.append(target, heavy)
+
+
+def pursuit(
+    matrix: NDArray[np.float64], target: NDArray[np.float64], sigma: float, most: int
+) -> NDArray[np.float64]:
+    m = len(target)
+    matrix, target = _with_sum(matrix, target)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # it says when it ends for linear dependence
+        path = orthogonal_mp(matrix, target, n_nonzero_coefs=min(most, matrix.shape[1]), return_path=True)
+    path = path.reshape(matrix.shape[1], -1)
+    left = ((target[:, None] - matrix @ path) ** 2).sum(axis=0)
+    quiet = np.flatnonzero(left <= m * sigma**2)
+    answer: NDArray[np.float64] = path[:, quiet[0] if quiet.size else -1]
+    return answer
+
+
+def lasso(
+    matrix: NDArray[np.float64], target: NDArray[np.float64], sigma: float, most: int
+) -> NDArray[np.float64]:
+    m, s = matrix.shape
+    model = Lasso(
+        sigma * np.sqrt(2 * np.log(max(s, 2)) / m), fit_intercept=False, positive=True, max_iter=2000
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        answer: NDArray[np.float64] = model.fit(np.asfortranarray(matrix), target).coef_
+    return answer
+
+
+def least_squares(
+    matrix: NDArray[np.float64], target: NDArray[np.float64], sigma: float, most: int
+) -> NDArray[np.float64]:
+    answer: NDArray[np.float64] = nnls(*_with_sum(matrix, target), maxiter=20 * matrix.shape[1])[0]
+    return answer
+
+
+def figures_4_and_5(kit: ModuleType, scenes: dict[str, Any]) -> list[dict[str, Any]]:
+    """With and without the Gaussian prior."""
+    rows = []
+    for images in IMAGES:
+        of_images = []
+        for name, scene in scenes.items():
+            take = film(kit, scene, [COARSE, (*FINE, images)])
+            plain = measure(kit, take, partial(dgsr.recover, prior="none"))
+            filtered = measure(kit, take, dgsr.recover)
+            of_images.append({"grid": grid_errors(kit, scene), "none": plain, "gaussian": filtered})
+            rows.append({"images": images, "scene": name} | _compared(of_images[-1:]))
+        rows.append({"images": images, "scene": "all"} | _compared(of_images))
+    return rows
+
+
+def _compared(found: list[dict[str, dict[str, float]]]) -> dict[str, Any]:
+    """The means over scenes, and what the prior takes off the squared error: of all of it, and above the grid's."""
+    grid, plain, filtered = (
+        float(np.mean([f[kind]["mse"] for f in found])) for kind in ("grid", "none", "gaussian")
+    )
+    return {
+        "grid mse": grid,
+        "none mse": plain,
+        "gaussian mse": filtered,
+        "less %": 100 * (1 - filtered / plain),
+        "less above grid %": 100 * (1 - (filtered - grid) / (plain - grid)),
+        "grid psnr": float(np.mean([f["grid"]["psnr"] for f in found])),
+        "none psnr": float(np.mean([f["none"]["psnr"] for f in found])),
+        "gaussian psnr": float(np.mean([f["gaussian"]["psnr"] for f in found])),
+    }
+
+
+def table_2(kit: ModuleType, scenes: dict[str, Any]) -> list[dict[str, Any]]:
+    """Hierarchical and direct."""
+    takes = {name: film(kit, scene, [COARSE, (*FINE, IMAGES[-1])]) for name, scene in scenes.items()}
+    rows = []
+    for prior in ("none", "gaussian"):
+        for name, take in takes.items():
+            row: dict[str, Any] = {"prior": prior, "scene": name}
+            for levels in ("hierarchical", "direct"):
+                recover = partial(dgsr.recover, prior=prior, levels=levels)  # type: ignore[arg-type]
+                found = measure(kit, take, recover)
+                row |= {f"{levels} s / 1,000": found["seconds"], f"{levels} mse": found["mse"]}
+            rows.append(row)
+    return rows
+
+
+def _lobes(
+    patterns: Patterns,
+    measurements: NDArray[np.float32],
+    photometry: Photometry,
+    sensing: Sensing,
+    noise: Noise,
+) -> Transport:
+    return lobes.recover(measurements, photometry, patterns, noise).transport
+
+
+def methods(kit: ModuleType, scenes: dict[str, Any]) -> list[dict[str, Any]]:
+    """All methods on the same frames."""
+    runs: dict[str, tuple[str, Recover]] = {
+        "nn-dgsr, no prior, apart": ("hierarchical", partial(dgsr.recover, prior="none")),
+        "nn-dgsr, no prior, joint": ("hierarchical", partial(dgsr.recover, prior="none", channels="joint")),
+        "nn-dgsr, gaussian, apart": ("hierarchical", dgsr.recover),
+        "nn-dgsr, gaussian, joint": ("hierarchical", partial(dgsr.recover, channels="joint")),
+        "matching pursuit (scikit-learn)": ("hierarchical", rival(pursuit, "hierarchical")),
+        "matching pursuit (scikit-learn) ": ("direct", rival(pursuit, "direct")),
+        "non-negative lasso (scikit-learn)": ("hierarchical", rival(lasso, "hierarchical")),
+        "non-negative least squares (scipy)": ("hierarchical", rival(least_squares, "hierarchical")),
+    }
+    rows = []
+    for frames in FRAMES:
+        bands = [COARSE, (*FINE, frames - LEVELS - COARSE[2])]
+        takes = {name: film(kit, scene, bands) for name, scene in scenes.items()}
+        patterns = lay_out(next(iter(takes.values())).program, "linear")
+        own = partial(_lobes, patterns)
+        for name, (levels, recover) in ({"lobes": ("the monitor's pixels", own)} | runs).items():
+            found = {scene: measure(kit, take, recover) for scene, take in takes.items()}
+            row: dict[str, Any] = {"frames": frames, "method": name.strip(), "levels": levels}
+            row |= {f"{scene} psnr": figures["psnr"] for scene, figures in found.items()}
+            row["mean psnr"] = float(np.mean([figures["psnr"] for figures in found.values()]))
+            row["mean mse"] = float(np.mean([figures["mse"] for figures in found.values()]))
+            row["s / 1,000"] = float(np.mean([figures["seconds"] for figures in found.values()]))
+            rows.append(row)
+    return rows
+
+
+def show(title: str, rows: list[dict[str, Any]]) -> None:
+    """Print a table; squared errors in units of 1e-4."""
+
+    def text(name: str, value: Any) -> str:
+        if isinstance(value, float):
+            return f"{value * 1e4:.3f}" if name.endswith("mse") else f"{value:.2f}"
+        return str(value)
+
+    cells = [[f"{name} e-4" if name.endswith("mse") else name for name in rows[0]]]
+    cells += [[text(name, value) for name, value in row.items()] for row in rows]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(rows[0]))]
+    print(f"\n{title}")
+    for row in cells:
+        print("  ".join(value.rjust(width) for value, width in zip(row, widths, strict=True)), flush=True)
+
+
+def main() -> None:
+    parser = parser_of(__doc__)
+    parser.add_argument("--pixels", type=int, default=150, help="pixels of each scene; table 2 takes a tenth")
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    kit = load(given.kit)
+    scenes = {path.stem: sample(kit, path, given.pixels) for path in sorted(given.scenes.glob("*.npz"))}
+    few = {
+        path.stem: sample(kit, path, max(given.pixels // 10, 1))
+        for path in sorted(given.scenes.glob("*.npz"))
+    }
+    # Compile before the clock starts.
+    take = film(kit, next(iter(few.values())), [COARSE, (*FINE, 20)])
+    dgsr.recover(take.measurements, take.photometry, take.sensing, take.noise)
+    measure(kit, take, partial(_lobes, lay_out(take.program, "linear")))
+    tables = {}
+    for name, title, run, of in (
+        ("figures 4 and 5", "Fig. 4 and 5: the Gaussian prior, channels apart", figures_4_and_5, scenes),
+        ("table 2", f"Table 2: hierarchical and direct, {IMAGES[-1]} images, channels apart", table_2, few),
+        ("methods", "Methods at equal frames, on 128 x 96 cells", methods, scenes),
+    ):
+        tables[name] = run(kit, of)
+        show(title, tables[name])
+    if given.json:
+        given.json.write_text(json.dumps(tables, indent=2))
+
+
+if __name__ == "__main__":
+    main()

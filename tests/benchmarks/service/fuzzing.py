@@ -1,0 +1,83 @@
+"""Fuzzing of every parser of foreign bytes: `python -m tests.benchmarks.service.fuzzing`.
+
+    [--target NAME] … [--seconds N] [--first N] [--json FILE] [--keep FOLDER]
+    --target NAME --seed N
+
+Runs damaged files and requests (`tests/fuzzing/`) through each parser for N seconds, in processes that are watched, and
+prints what came of them: executions, how many inputs were refused and how many taken, crashes, hangs, errors of another
+kind than the documented, executions over the memory that they may take, and the longest. Inputs that fail are kept in
+the folder. Input N of a target is always the same: with `--seed` it is run alone, here, so that a debugger sees it; the
+next campaign goes on where `--first` says. Exit status 1 if anything failed. With `TMPDIR` in memory those that store
+something are twice as fast.
+"""
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+from dataclasses import asdict
+from pathlib import Path
+
+from tests.fuzzing import campaign
+from tests.fuzzing.targets import ALL
+
+COLUMNS = (
+    "target",
+    "executions",
+    "a second",
+    "refused",
+    "taken",
+    "crashes",
+    "hangs",
+    "errors",
+    "memory",
+    "slowest s",
+)
+
+
+def main() -> int:
+    targets = {target.name: target for target in ALL}
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--target", action="append", choices=targets, default=[])
+    parser.add_argument("--seconds", type=float, default=30, help="for each target")
+    parser.add_argument("--first", type=int, default=0, help="the first input")
+    parser.add_argument("--seed", type=int, help="this input alone")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--keep", type=Path, default=Path(tempfile.gettempdir(), "envmatte-fuzzing"))
+    asked = parser.parse_args()
+    chosen = [targets[name] for name in asked.target] or list(ALL)
+    if asked.seed is not None:
+        for target in chosen:
+            with tempfile.TemporaryDirectory() as folder:
+                target.run(target.input(asked.seed), Path(folder))
+        return 0
+    print("  ".join(f"{name:>10}" for name in COLUMNS), flush=True)
+    told = {}
+    for target in chosen:
+        tally = campaign.run(target, asked.first, sys.maxsize, asked.keep, seconds=asked.seconds)
+        kinds = [tally.count(kind) for kind in ("crash", "hang", "error", "memory")]
+        row = (
+            *(
+                target.name,
+                tally.executions,
+                round(tally.executions / tally.seconds),
+                tally.refused,
+                tally.taken,
+            ),
+            *(*kinds, f"{tally.slowest:.2f}"),
+        )
+        print("  ".join(f"{value:>10}" for value in row), flush=True)
+        for failure in tally.failures:
+            print(failure, flush=True)
+        told[target.name] = asdict(tally)
+    if asked.json:
+        asked.json.write_text(json.dumps(told, default=str, indent=1))
+    return int(any(tally["failures"] for tally in told.values()))
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("SVT_LOG", "1")  # the encoder of a clip tells what it does
+    sys.exit(main())

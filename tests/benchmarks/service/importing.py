@@ -1,0 +1,25 @@
+"""How long importing the client takes: `python -m tests.benchmarks.service.importing`.
+
+Each in a new interpreter, from files that were read before, less what an interpreter takes that imports nothing.
+"""
+
+import subprocess
+import sys
+from statistics import median
+
+RUNS = 21
+SCRIPT = "import time; start = time.process_time(); {}; print(time.process_time() - start)"
+
+
+def seconds(statement: str) -> list[float]:
+    """Seconds of CPU that a statement takes, in some interpreters."""
+    command = [sys.executable, "-c", SCRIPT.format(statement)]
+    return [float(subprocess.check_output(command)) for _ in range(RUNS + 1)][1:]
+
+
+for what, statement in (
+    ("import services.client", "import services.client"),
+    ("the same, and the first Client", "import services.client as c; c.Client('http://127.0.0.1:9')"),
+):
+    taken = seconds(statement)
+    print(f"{what}: median {median(taken) * 1e3:.0f} ms, longest {max(taken) * 1e3:.0f} ms, of {RUNS}")

@@ -1,0 +1,189 @@
+"""Users of a service, each a thread that goes on until all is over, and what they send; `users` has what they do.
+
+All by HTTP on loopback. What an answer may be is said with each request, besides 404 and 409: things expire, are
+deleted and end under everyone's hands here.
+"""
+
+import base64
+import io
+import random
+import socket
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import httpx2
+import numpy as np
+
+from services.client import Client
+from tests.end_to_end.conftest import png
+from tests.workflows.composite.video.test_steps import clip, even, pictures
+from workflows.images import float_formats
+from workflows.images.integer_formats import encode_jpeg
+from workflows.simulation import glass_ball
+from workflows.simulation.scene import nested_program, write_capture
+
+ZIP = {"Content-Type": "application/zip"}
+TUS = {"Tus-Resumable": "1.0.0"}
+CHUNK = TUS | {"Content-Type": "application/offset+octet-stream"}
+VIDEO = {"Content-Type": "video/mp4"}
+PASSING = (404, 409)
+"""What may always be answered: it was there a moment ago."""
+
+
+class Traffic:
+    """Users of a service.
+
+    Parameters
+    ----------
+    url : str
+        Of the service.
+    webhook : str
+        A URL that jobs are to tell.
+    folder : Path
+        For files that are sent.
+    doings : sequence of callable
+        What each of them does, again and again; told the user.
+    pause : float
+        Seconds between two things that a user does, on average.
+    seed : int
+
+    Attributes
+    ----------
+    done : Counter
+        What was done, and how often.
+    wrong : list of str
+        Answers that should not have been.
+    gentle : bool
+        Whether to leave the workers alive from now on: nobody cancels what runs.
+    """
+
+    def __init__(
+        self, url: str, webhook: str, folder: Path, doings: "Sequence[Doing]", *, pause: float, seed: int
+    ) -> None:
+        self.url, self.webhook, self.folder, self.pause = url, webhook, folder, pause
+        self.done: Counter[str] = Counter()
+        self.wrong: list[str] = []
+        self.gentle = False
+        self.captures: deque[str] = deque(maxlen=12)
+        self.mattes: deque[str] = deque(maxlen=12)
+        self.over = threading.Event()
+        target = io.BytesIO()
+        program = nested_program(bands=((8, 6, 12), (16, 12, 8)), levels=3)
+        write_capture(glass_ball.glass_ball(36, 24, rays=4), program, target, name="a ball")
+        self.bundle = target.getvalue()
+        light = glass_ball.backdrop(64, 48)
+        self.backdrops = (
+            png(light, "srgb", np.uint8),
+            png(light, "srgb", np.uint16),
+            encode_jpeg((np.clip(light, 0, 1) * 255).astype(np.uint8), 90),
+            float_formats.encode_exr({"RGB": light}),
+        )
+        self.clip = clip(pictures(6), even(6))
+        self._threads = [
+            threading.Thread(target=self._go_on, args=(User(self, f"{seed} {n}"), do), name=do.__name__)
+            for n, do in enumerate(doings)
+        ]
+
+    def __enter__(self) -> "Traffic":
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.over.set()
+        for thread in self._threads:
+            thread.join()
+
+    def _go_on(self, user: "User", do: "Doing") -> None:
+        with user:
+            while not self.over.wait(user.random.uniform(0, 2 * self.pause)):
+                try:
+                    do(user)
+                except Exception as error:
+                    self.wrong.append(f"{do.__name__}: {error!r}")
+
+
+class User:
+    """Somebody with a connection to the service."""
+
+    def __init__(self, town: Traffic, seed: str) -> None:
+        self.town = town
+        self.random = random.Random(seed)
+        self.client = Client(town.url)
+        self.http = httpx2.Client(base_url=town.url, timeout=120)
+
+    def __enter__(self) -> "User":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.http.close()
+        self.client.__exit__(None, None, None)
+
+    def ask(self, what: str, method: str, path: str, *fine: int, **request: Any) -> httpx2.Response:
+        """Ask for something, and note an answer that is not as it should be."""
+        answer = self.http.request(method, path, **request)
+        self.note(what, answer, fine)
+        return answer
+
+    def note(self, what: str, answer: httpx2.Response, fine: Sequence[int] = ()) -> None:
+        """Note what was done, and an answer that should not have been."""
+        self.town.done[what] += 1
+        if answer.status_code not in (*(fine or (200, 201, 202, 204)), *PASSING):
+            self.town.wrong.append(f"{what}: {answer.status_code} {answer.text[:300]}")
+
+    def pick(self, found: Sequence[str]) -> str:
+        """One of those that were there lately."""
+        return self.random.choice(list(found) or ["none-yet"])
+
+    def ended(self, job: str) -> dict[str, Any]:
+        """Poll a job until it has ended or is gone."""
+        while True:
+            answer = self.ask("poll", "GET", f"/v1/jobs/{job}")
+            found: dict[str, Any] = answer.json()
+            if answer.status_code == 404 or found["state"] not in ("queued", "running"):
+                return found
+            time.sleep(0.2)
+
+    def followed(self, job: str, most: int = 1000) -> None:
+        """Follow a job's events to the end, or leave after some of them."""
+        with self.http.stream("GET", f"/v1/jobs/{job}/events") as answer:
+            if answer.status_code != 200:
+                answer.read()
+            self.note("follow a job", answer)
+            for n, _ in enumerate(answer.iter_lines()):
+                if n >= most:
+                    return
+
+    def break_off(self, what: str, method: str, path: str, headers: dict[str, str], body: bytes) -> None:
+        """Begin a request, and hang up."""
+        where = urlsplit(self.town.url)
+        head = [
+            f"{method} {path} HTTP/1.1",
+            "Host: localhost",
+            *(f"{name}: {text}" for name, text in headers.items()),
+        ]
+        with socket.create_connection((where.hostname, where.port), timeout=60) as line:
+            line.sendall("\r\n".join([*head, "", ""]).encode() + body)
+            time.sleep(self.random.uniform(0, 0.2))
+        self.town.done[what] += 1
+
+    def upload(self, data: bytes, **metadata: str) -> str:
+        """Send bytes in pieces, with a pause between them; returns the upload's id."""
+        told = ",".join(
+            f"{name} {base64.b64encode(text.encode()).decode()}" for name, text in metadata.items()
+        )
+        create = TUS | {"Upload-Length": str(len(data)), "Upload-Metadata": told}
+        where = self.ask("create an upload", "POST", "/v1/uploads", headers=create).headers["location"]
+        step = len(data) // self.random.randint(1, 4) + 1
+        for at in range(0, len(data), step):
+            piece = CHUNK | {"Upload-Offset": str(at)}
+            self.ask("send a piece", "PATCH", where, headers=piece, content=data[at : at + step])
+        return str(where.rsplit("/", 1)[1])
+
+
+Doing = Callable[[User], None]

@@ -1,0 +1,298 @@
+"""What people and machines do to a service all day, the careless among them: each function is one thing."""
+
+import io
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import httpx2
+
+from tests.benchmarks.service.traffic import CHUNK, TUS, VIDEO, ZIP, User
+from tests.end_to_end.captures import test_bad_input as bad
+
+OPTIONS: Sequence[dict[str, Any]] = (
+    {"quality": "fast"},
+    {"quality": "fast", "tile": 16},
+    {},
+    {"method": "nn-dgsr", "prior": "none"},
+)
+REFUSED = (
+    bad.no_manifest,
+    bad.other_format,
+    bad.frame_not_there,
+    bad.pattern_without_frame,
+    bad.one_level,
+    bad.leaves,
+    bad.monitor_of_nothing,
+    bad.program_too_large,
+)
+FAILING = (bad.no_image, bad.bomb)
+
+
+def film(user: User) -> None:
+    """Somebody uploads a capture one way or another, recovers its matte, and may tidy up afterwards."""
+    random, town = user.random, user.town
+    way = random.choice(("one body", "pieces", "client"))
+    if way == "one body":
+        key = {"Idempotency-Key": f"{random.random()}"}
+        made = [
+            user.ask("upload in one go", "POST", "/v1/captures", content=town.bundle, headers=ZIP | key)
+            for _ in range(random.randint(1, 2))
+        ][-1].json()
+    elif way == "pieces":
+        asked = {"upload": user.upload(town.bundle, filename="ball.zip"), "webhook": town.webhook}
+        made = user.ask("upload in pieces", "POST", "/v1/captures", json=asked).json()
+    else:
+        file = town.folder / f"{random.random()}.zip"
+        file.write_bytes(town.bundle)
+        made = user.client.upload(file, name="by the client").answer
+        file.unlink()
+        town.done["upload by the client"] += 1
+    if random.random() < 0.5:
+        user.ended(made["job"])
+    told = {"webhook": town.webhook} if random.random() < 0.5 else {}
+    asked = {"capture": made["id"], "options": random.choice(OPTIONS)} | told
+    answer = user.ask(
+        "recover", "POST", "/v1/jobs", json=asked, headers={"Idempotency-Key": f"{random.random()}"}
+    )
+    if answer.status_code != 202:
+        return
+    job = answer.json()
+    town.captures.append(made["id"])
+    if random.random() < 0.5:
+        user.followed(job["id"])
+    if user.ended(job["id"]).get("state") == "succeeded":
+        town.mattes.append(job["matte"])
+    for path, chance in (
+        ("captures/" + made["id"], 0.2),
+        ("mattes/" + job["matte"], 0.1),
+        ("jobs/" + job["id"], 0.1),
+    ):
+        if random.random() < chance:
+            user.ask("delete", "DELETE", f"/v1/{path}")
+
+
+def composite(user: User) -> None:
+    """Somebody looks at a matte, and puts it before something."""
+    random, town = user.random, user.town
+    matte = f"/v1/mattes/{user.pick(town.mattes)}"
+    backdrop = random.choice(town.backdrops)
+    kind = {"Accept": random.choice(("image/png", "image/jpeg", "image/x-exr"))}
+
+    def still(what: str, **wanted: Any) -> httpx2.Response:
+        return user.ask(what, "POST", f"{matte}/composite", params=wanted, content=backdrop, headers=kind)
+
+    def again() -> None:
+        tag = still("composite").headers.get("etag")
+        if tag:
+            known = kind | {"If-None-Match": tag}
+            user.ask(
+                "ask again for a composite",
+                "POST",
+                f"{matte}/composite",
+                412,
+                content=backdrop,
+                headers=known,
+            )
+
+    def move() -> None:
+        video = VIDEO | {"Idempotency-Key": f"{random.random()}"}
+        answer = user.ask("composite a clip", "POST", f"{matte}/composite", content=town.clip, headers=video)
+        if answer.status_code == 202:
+            job = answer.json()["id"]
+            if user.ended(job).get("state") == "succeeded":
+                user.ask("fetch a video", "GET", f"/v1/jobs/{job}/video.mp4")
+                part = {"Range": "bytes=10-99"}
+                user.ask("fetch a part of a video", "GET", f"/v1/jobs/{job}/video.mp4", 206, headers=part)
+            if random.random() < 0.3:
+                user.ask("delete", "DELETE", f"/v1/jobs/{job}")
+
+    def carry() -> None:
+        try:
+            archive = user.ask("fetch an archive", "GET", f"{matte}/archive")
+        except httpx2.RemoteProtocolError:  # it was deleted meanwhile
+            return
+        if archive.status_code == 200:
+            key = ZIP | {"Idempotency-Key": f"{random.random()}"}
+            come = user.ask("bring an archive", "POST", "/v1/mattes", content=archive.content, headers=key)
+            town.mattes.append(come.json()["id"])
+            user.ask("bring an archive again", "POST", "/v1/mattes", content=archive.content, headers=key)
+
+    def look() -> None:
+        names = ("S.png", "rho.exr", "alpha.png", "confidence.png", "stmap.exr", "all.exr")
+        user.ask("fetch a layer", "GET", f"{matte}/layers/{random.choice(names)}")
+        user.ask("fetch for WebGL", "GET", f"{matte}/live")
+        at = {"x": random.randrange(36), "y": random.randrange(24)}
+        user.ask("ask for a pixel's transport", "GET", f"{matte}/transport", params=at)
+        user.ask("draw a pixel's transport", "GET", f"{matte}/transport.png", params=at)
+
+    crop = {"x": 5, "y": 4, "width": 20, "height": 10, "size": 12}
+    moved = {"right": 0.2, "scale": 1.5, "angle": 30}
+    random.choice(
+        (
+            lambda: still("composite a crop", **crop),
+            lambda: still("composite moved", **moved),
+            again,
+            move,
+            carry,
+            look,
+        )
+    )()
+
+
+def change_mind(user: User) -> None:
+    """Somebody cancels: in the queue, while it runs, and what is over already."""
+    random, town = user.random, user.town
+
+    def ingest() -> None:
+        made = user.ask("upload in one go", "POST", "/v1/captures", content=town.bundle, headers=ZIP).json()
+        user.ask("cancel an ingest", "POST", f"/v1/jobs/{made['job']}/cancel")
+        user.ask("delete", "DELETE", f"/v1/captures/{made['id']}")
+
+    def queued() -> None:
+        jobs = [recover() for _ in range(4)]
+        for job in jobs[::-1]:
+            user.ask("cancel in the queue", "POST", f"/v1/jobs/{job}/cancel")
+        user.ask("retry what was cancelled", "POST", f"/v1/jobs/{jobs[0]}/retry")
+
+    def running() -> None:
+        job = recover({"method": "nn-dgsr"})
+        while user.ask("poll", "GET", f"/v1/jobs/{job}").json().get("state") == "queued":
+            time.sleep(0.1)
+        user.ask("cancel while it runs", "POST", f"/v1/jobs/{job}/cancel")
+
+    def recover(options: dict[str, Any] | None = None) -> str:
+        asked = {"capture": user.pick(town.captures), "options": options or {}, "webhook": town.webhook}
+        return str(user.ask("recover", "POST", "/v1/jobs", json=asked).json().get("id", "none"))
+
+    if town.gentle:  # a task that runs on after it was cancelled takes its worker with it
+        user.ended(recover())
+    else:
+        random.choice((ingest, queued, running))()
+
+
+def break_off(user: User) -> None:
+    """Somebody's line breaks, or nobody goes on with what was begun."""
+    random, town = user.random, user.town
+    half = town.bundle[: len(town.bundle) // 2]
+    size = {"Content-Length": str(len(town.bundle))}
+
+    def piece() -> None:
+        create = TUS | {"Upload-Length": str(len(town.bundle))}
+        where = user.ask("create an upload", "POST", "/v1/uploads", headers=create).headers["location"]
+        user.break_off("break off a piece", "PATCH", where, CHUNK | size | {"Upload-Offset": "0"}, half)
+        if random.random() < 0.3:
+            user.ask("delete an upload", "DELETE", where, headers=TUS)
+
+    def whole() -> None:
+        user.break_off("break off an upload", "POST", "/v1/captures", ZIP | size, half)
+
+    def archive() -> None:
+        user.break_off("break off an archive", "POST", "/v1/mattes", ZIP | size, half)
+
+    def video() -> None:
+        path = f"/v1/mattes/{user.pick(town.mattes)}/composite"
+        user.break_off("break off a clip", "POST", path, VIDEO | {"Content-Length": "99999"}, town.clip[:900])
+
+    def head() -> None:
+        user.break_off("break off a head", "GET", "/v1/jobs", {"X-Half": "a"}, b"X-")
+
+    def download() -> None:
+        path = f"/v1/mattes/{user.pick(town.mattes)}/archive"
+        user.break_off("break off a download", "GET", path, {}, b"")
+
+    random.choice((piece, piece, whole, archive, video, head, download))()
+
+
+def mistake(user: User) -> None:
+    """Somebody sends what can't be used."""
+    random, town = user.random, user.town
+
+    def bundle() -> None:
+        data = bad.remade(io.BytesIO(town.bundle), random.choice(REFUSED))
+        user.ask("send a wrong capture", "POST", "/v1/captures", 422, content=data, headers=ZIP)
+
+    def frame() -> None:
+        data = bad.remade(io.BytesIO(town.bundle), random.choice(FAILING))
+        made = user.ask("send a wrong frame", "POST", "/v1/captures", content=data, headers=ZIP).json()
+        user.ended(made["job"])
+
+    def cut() -> None:
+        data = town.bundle[: random.randrange(len(town.bundle))]
+        if random.random() < 0.5:
+            asked = {"upload": user.upload(data)}
+            user.ask("upload half a capture in pieces", "POST", "/v1/captures", 422, json=asked)
+        else:
+            user.ask("send half a capture", "POST", "/v1/captures", 422, content=data, headers=ZIP)
+
+    def checksum() -> None:
+        create = TUS | {"Upload-Length": "10"}
+        where = user.ask("create an upload", "POST", "/v1/uploads", headers=create).headers["location"]
+        piece = CHUNK | {"Upload-Offset": "0", "Upload-Checksum": "sha1 AAAA"}
+        user.ask("send a wrong piece", "PATCH", where, 460, headers=piece, content=b"12345")
+
+    def options() -> None:
+        asked = {"capture": user.pick(town.captures), "options": {"speed": 11}}
+        user.ask("ask for a wrong option", "POST", "/v1/jobs", 422, json=asked)
+
+    def backdrop() -> None:
+        path = f"/v1/mattes/{user.pick(town.mattes)}/composite"
+        user.ask("send a wrong backdrop", "POST", path, 422, content=b"no image at all")
+
+    def video() -> None:
+        path = f"/v1/mattes/{user.pick(town.mattes)}/composite"
+        answer = user.ask("send a wrong clip", "POST", path, content=b"no clip" * 99, headers=VIDEO)
+        if answer.status_code == 202:
+            user.ended(answer.json()["id"])
+
+    def others() -> None:
+        user.ask("send a wrong archive", "POST", "/v1/mattes", 422, content=b"no archive", headers=ZIP)
+        user.ask(
+            "send another type", "POST", "/v1/captures", 415, content=b"x", headers={"Content-Type": "a/b"}
+        )
+        user.ask("ask for nothing there", "GET", "/v1/mattes/none")
+        user.ask("send no JSON", "POST", "/v1/jobs", 422, content=b"{")
+        user.ask("speak another tus", "POST", "/v1/uploads", 412, headers={"Upload-Length": "1"})
+
+    random.choice((bundle, frame, cut, checksum, options, backdrop, video, others))()
+
+
+def watch(user: User) -> None:
+    """A dashboard, a browser, Prometheus."""
+    random, town = user.random, user.town
+
+    def pages() -> None:
+        for path in ("captures", "jobs", "mattes", "programs", "limits", "cluster", "options", "network"):
+            user.ask("look around", "GET", f"/v1/{path}")
+        for path in ("/metrics", "/healthz", "/", "/web/app/main.js", "/openapi.json"):
+            user.ask("look around", "GET", path)
+        user.ask("look around", "GET", "/readyz", 200, 503)  # while a killed worker is replaced
+
+    def capture() -> None:
+        at = f"/v1/captures/{user.pick(town.captures)}"
+        for path in ("report", "contact-sheet.png", f"frames/{random.randrange(20)}.png"):
+            user.ask("look at a capture", "GET", f"{at}/{path}")
+
+    def events() -> None:
+        for job in user.ask("look around", "GET", "/v1/jobs?limit=3").json()["jobs"]:
+            user.followed(job["id"], most=random.randrange(4))
+            user.ask("read a log", "GET", f"/v1/jobs/{job['id']}/log")
+
+    def program() -> None:
+        monitor = {"width": random.randrange(200, 400), "height": random.randrange(150, 300)}
+        asked = {"preset": "sketch", "monitor": monitor}
+        made = user.ask("make a program", "POST", "/v1/programs", json=asked).json()["id"]
+        at = f"/v1/programs/{made}"
+        told = {"phase": "shown", "patterns_per_second": 2}
+        user.ask("show a program", "PUT", f"{at}/showing", json=told)
+        user.ask("fetch a pattern", "GET", f"{at}/patterns/{random.randrange(32)}.png")
+        with user.http.stream("GET", f"{at}/events") as answer:
+            user.note("follow a program", answer)
+            next(answer.iter_lines())
+        user.ask("delete", "DELETE", at)
+
+    random.choice((pages, capture, events, program))()
+
+
+ALL = (film, film, composite, composite, change_mind, break_off, mistake, watch)
+"""Of a town: who does what."""

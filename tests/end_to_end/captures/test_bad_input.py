@@ -1,0 +1,281 @@
+"""Bad input over HTTP: a clear problem each, nothing left behind, and the service lives on."""
+
+import io
+import json
+import socket
+import time
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import BinaryIO
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+
+from tests.end_to_end.conftest import Service
+from workflows.images import integer_formats
+
+ZIP = {"Content-Type": "application/zip"}
+
+
+def remade(bundle: Path | BinaryIO, change: Callable[[dict, dict[str, bytes]], None]) -> bytes:
+    """A bundle with its capture.json and its files changed."""
+    with zipfile.ZipFile(bundle) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    manifest = json.loads(files["capture.json"])
+    change(manifest, files)
+    if "capture.json" in files:
+        files["capture.json"] = json.dumps(manifest).encode()
+    target = io.BytesIO()
+    with zipfile.ZipFile(target, "w") as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    return target.getvalue()
+
+
+def check_problem(answer, status: int, slug: str) -> dict:
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    problem = answer.json()
+    assert problem["status"] == status
+    assert problem["type"] == f"urn:envmatte:problem:{slug}"
+    assert problem["title"]
+    assert len(problem["detail"]) > 15
+    return problem
+
+
+def no_manifest(manifest: dict, files: dict[str, bytes]) -> None:
+    del files["capture.json"]
+
+
+def other_format(manifest: dict, files: dict[str, bytes]) -> None:
+    manifest["format"] = "envmatte-capture/9"
+
+
+def frame_not_there(manifest: dict, files: dict[str, bytes]) -> None:
+    manifest["frames"][3]["file"] = "frames/nowhere.png"
+
+
+def pattern_without_frame(manifest: dict, files: dict[str, bytes]) -> None:
+    del manifest["frames"][7]
+
+
+def pattern_out_of_range(manifest: dict, files: dict[str, bytes]) -> None:
+    manifest["frames"][7]["pattern"] = 5000
+
+
+def one_level(manifest: dict, files: dict[str, bytes]) -> None:
+    manifest["program"]["parts"][0]["levels"] = [0.5] * 5
+
+
+def leaves(manifest: dict, files: dict[str, bytes]) -> None:
+    files["../evil.png"] = b"x"
+
+
+def monitor_of_nothing(manifest: dict, files: dict[str, bytes]) -> None:
+    manifest["program"]["monitor"]["width"] = 0
+
+
+def exposure_of_nothing(manifest: dict, files: dict[str, bytes]) -> None:
+    manifest["frames"][2]["exposure"] = 0
+
+
+def program_too_large(manifest: dict, files: dict[str, bytes]) -> None:
+    manifest["program"]["parts"][1] |= {"columns": 1280, "rows": 960, "count": 100_000}
+
+
+def a_video(manifest: dict, files: dict[str, bytes]) -> None:
+    manifest["frames"] = []
+    manifest["video"] = {"file": "clip.mp4", "patterns_per_second": 2.0}
+
+
+@pytest.mark.parametrize(
+    ("change", "entry", "field"),
+    [
+        (no_manifest, "capture.json", None),
+        (other_format, "capture.json", "format"),
+        (frame_not_there, "frames/nowhere.png", "frames.3.file"),
+        (pattern_without_frame, "capture.json", "frames"),
+        (pattern_out_of_range, "frames/00007.png", "frames.7.pattern"),
+        (one_level, "capture.json", "program"),
+        (leaves, "../evil.png", None),
+        (monitor_of_nothing, "capture.json", "program.monitor.width"),
+        (exposure_of_nothing, "capture.json", "frames.2.exposure"),
+        (program_too_large, "capture.json", "program"),
+        (a_video, "clip.mp4", "video.file"),
+    ],
+)
+def test_a_bundle_that_is_refused_at_once(
+    service: Service, bundle: Path, change, entry: str, field: str | None
+) -> None:
+    before = service.stored()
+    answer = service.http.post("/v1/captures", content=remade(bundle, change), headers=ZIP)
+    problem = check_problem(answer, 422, "bad-capture")
+    assert problem["entry"] == entry
+    assert problem.get("field") == field
+    assert service.stored() == before
+
+
+@pytest.mark.parametrize("share", [0, 0.3, 0.99])
+def test_a_zip_that_is_cut_off(service: Service, bundle: Path, share: float) -> None:
+    before = service.stored()
+    data = bundle.read_bytes()
+    answer = service.http.post("/v1/captures", content=data[: int(len(data) * share)], headers=ZIP)
+    check_problem(answer, 422, "bad-capture")
+    assert service.stored() == before
+
+
+def test_an_upload_that_breaks_off(service: Service, bundle: Path) -> None:
+    before, captures = service.stored(), service.http.get("/v1/captures").json()
+    where = urlsplit(service.url)
+    with socket.create_connection((where.hostname, where.port)) as raw:
+        head = [
+            "POST /v1/captures HTTP/1.1",
+            "Host: localhost",
+            "Content-Type: application/zip",
+            "Content-Length: 99999999",
+        ]
+        raw.sendall("\r\n".join([*head, "", ""]).encode() + bundle.read_bytes()[:100_000])
+    check_problem(service.http.get("/v1/captures/nothing"), 404, "not-found")
+    assert service.stored() == before
+    assert service.http.get("/v1/captures").json() == captures
+
+
+def of_another_size(manifest: dict, files: dict[str, bytes]) -> None:
+    files["frames/00009.png"] = integer_formats.encode_png(np.zeros((72, 95, 3), np.uint8))
+
+
+def of_another_kind(manifest: dict, files: dict[str, bytes]) -> None:
+    files["frames/00009.png"] = integer_formats.encode_png(np.zeros((72, 96, 3), np.uint16))
+
+
+def no_image(manifest: dict, files: dict[str, bytes]) -> None:
+    files["frames/00009.png"] = b"this is no image"
+
+
+def cut_off(manifest: dict, files: dict[str, bytes]) -> None:
+    files["frames/00009.png"] = files["frames/00009.png"][:1000]
+
+
+def bomb(manifest: dict, files: dict[str, bytes]) -> None:
+    # A real PNG whose header claims 60,000 x 60,000 pixels.
+    data = bytearray(files["frames/00009.png"])
+    data[16:24] = (60_000).to_bytes(4, "big") * 2
+    data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")
+    files["frames/00009.png"] = bytes(data)
+
+
+def unknown_camera(manifest: dict, files: dict[str, bytes]) -> None:
+    manifest["frames"][9]["file"] = "frames/00009.nef"
+    files["frames/00009.nef"] = bytes(9000)
+
+
+@pytest.mark.parametrize(
+    "change", [of_another_size, of_another_kind, no_image, cut_off, bomb, unknown_camera]
+)
+def test_a_frame_that_is_refused_by_the_ingest(service: Service, bundle: Path, change) -> None:
+    before = service.stored()
+    answer = service.http.post("/v1/captures", content=remade(bundle, change), headers=ZIP)
+    assert answer.status_code == 201
+    made = answer.json()
+    waiting = service.client.recover(made["id"])
+    while (found := service.client.capture(made["id"]))["state"] == "ingesting":
+        pass
+    assert found["state"] == "failed"
+    assert found["problem"]["type"] == "urn:envmatte:problem:bad-capture"
+    entry = found["problem"]["entry"]
+    assert entry in ("frames/00009.png", "frames/00009.nef")
+    assert service.client.job(made["job"])["problem"] == found["problem"]
+    while (job := service.client.job(waiting["id"]))["state"] in ("queued", "running"):
+        pass
+    assert job["state"] == "failed"
+    assert entry in job["problem"]["detail"]
+    check_problem(service.http.post("/v1/jobs", json={"capture": made["id"]}), 409, "conflict")
+    while service.stored() != before:  # the failure is written down first, and what there was is deleted then
+        time.sleep(0.05)
+
+
+def test_a_body_of_another_type(service: Service, bundle: Path) -> None:
+    answer = service.http.post(
+        "/v1/captures", content=bundle.read_bytes(), headers={"Content-Type": "text/plain"}
+    )
+    check_problem(answer, 415, "wrong-media-type")
+
+
+def test_an_unknown_option(service: Service, capture: str) -> None:
+    before = service.http.get("/v1/mattes").json()
+    for options, field in (({"speed": 11}, "speed"), ({"method": "magic"}, "method"), ({"tile": 1}, "tile")):
+        answer = service.http.post("/v1/jobs", json={"capture": capture, "options": options})
+        assert check_problem(answer, 422, "bad-option")["field"] == field
+    assert service.http.get("/v1/mattes").json() == before
+
+
+@pytest.mark.parametrize("body", [b"", b"{", b'{"capture": 3}', b'{"capture": "x", "more": 1}', b"[1]"])
+def test_a_job_that_is_no_job(service: Service, body: bytes) -> None:
+    answer = service.http.post("/v1/jobs", content=body, headers={"Content-Type": "application/json"})
+    check_problem(answer, 422, "bad-request")
+
+
+def test_bodies_that_are_too_large(service: Service, matte: str) -> None:
+    def endless(size: int):
+        yield from (bytes(1 << 20) for _ in range(size >> 20))
+
+    answer = service.http.post("/v1/jobs", content=endless(20 << 20))
+    assert check_problem(answer, 413, "too-large")["limit"] == 64 << 10
+    answer = service.http.post(f"/v1/mattes/{matte}/composite", content=endless(160 << 20))
+    assert check_problem(answer, 413, "too-large")["limit"] == 128 << 20
+
+
+def test_a_program_whose_grids_do_not_nest(service: Service, bundle: Path) -> None:
+    def not_nested(manifest: dict, files: dict[str, bytes]) -> None:
+        manifest["program"]["parts"][2] |= {"columns": 20, "rows": 15}
+
+    made = service.http.post("/v1/captures", content=remade(bundle, not_nested), headers=ZIP).json()
+    service.client.wait(made["job"])
+    problem = check_problem(service.http.post("/v1/jobs", json={"capture": made["id"]}), 422, "bad-option")
+    assert "20 x 15" in problem["detail"]
+
+
+@pytest.mark.parametrize("body", [b"", b"no image at all", b"\x89PNG\r\n\x1a\n" + b"\0" * 50])
+def test_a_backdrop_that_is_no_image(service: Service, matte: str, body: bytes) -> None:
+    check_problem(service.http.post(f"/v1/mattes/{matte}/composite", content=body), 422, "bad-image")
+
+
+def test_an_answer_that_cannot_be_given(service: Service, matte: str) -> None:
+    answer = service.http.post(f"/v1/mattes/{matte}/composite", headers={"Accept": "image/gif"})
+    check_problem(answer, 406, "not-acceptable")
+
+
+def test_every_call_answers_an_unknown_id_with_a_problem(service: Service) -> None:
+    called = 0
+    for path, calls in service.http.get("/openapi.json").json()["paths"].items():
+        if "{id}" not in path or path.endswith("/play"):  # a page that is the same for all
+            continue
+        for method in calls:
+            url = path.replace("{id}", "no-such-id").replace("{n}", "0")
+            answer = service.http.request(method, f"{url}?x=0&y=0", headers={"Tus-Resumable": "1.0.0"})
+            if method == "head":  # which has no body
+                assert answer.status_code == 404
+            else:
+                check_problem(answer, 404, "not-found")
+            called += 1
+    assert called >= 11
+    check_problem(service.http.post("/v1/jobs", json={"capture": "no-such-id"}), 404, "not-found")
+    check_problem(service.http.get("/v1/captures?after=no-such-id"), 404, "not-found")
+    check_problem(service.http.get("/v2/nothing"), 404, "not-found")
+    check_problem(service.http.put("/v1/jobs"), 405, "method-not-allowed")
+    check_problem(service.http.get("/v1/jobs?limit=many"), 422, "bad-request")
+
+
+def test_calls_out_of_turn(service: Service, capture: str, matte: str) -> None:
+    job = service.http.get(f"/v1/mattes/{matte}").json()["job"]
+    check_problem(service.http.post(f"/v1/jobs/{job}/cancel"), 409, "conflict")
+    check_problem(service.http.post(f"/v1/jobs/{job}/retry"), 409, "conflict")
+    check_problem(service.http.get(f"/v1/captures/{capture}/frames/57.png"), 404, "not-found")
+
+
+def test_the_service_lives_on(service: Service, bundle: Path) -> None:
+    assert service.client.wait(service.client.upload(bundle)["job"])["state"] == "succeeded"
+    assert service.process.poll() is None

@@ -1,0 +1,130 @@
+"""Decoders are lost with what they decode, and with the service: nothing else suffers from it."""
+
+import json
+import re
+import sys
+from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor
+from concurrent.futures import wait as wait_for
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx2
+import psutil
+import pytest
+
+from services.client import ServiceError
+from services.decoding.pool import SECONDS
+from tests.end_to_end.captures.test_bad_input import ZIP, check_problem
+from tests.end_to_end.conftest import Service, serving
+from tests.end_to_end.mattes.test_composites import SENT, asked
+from tests.services.api.mattes.archives import archive
+from tests.services.cluster.clusters import children, decoders, running, wait, workers
+from tests.workflows.composite.video.test_steps import clip, even, pictures
+from tests.workflows.ingest.video.camera import capture as filmed
+from tests.workflows.ingest.video.camera import overstated, zipped
+from tests.workflows.untrusted.test_decoder_guard import fragmented
+from workflows.programs.program import Program
+
+pytestmark = pytest.mark.full
+
+
+@contextmanager
+def held(service: Service, matte: str) -> Iterator[tuple[psutil.Process, "Future[httpx2.Response]"]]:
+    """A decoder that is stopped in the middle of a request, and that request; the next is decoded by another one."""
+    for one in decoders(service.process):
+        one.kill()
+    wait(lambda: not decoders(service.process))
+    assert asked(service, matte).status_code == 200
+    (one,) = decoders(service.process)
+    one.suspend()
+    with ThreadPoolExecutor(2) as threads, httpx2.Client(base_url=service.url, timeout=4 * SECONDS) as http:
+        url = f"/v1/mattes/{matte}/composite"
+        both = [threads.submit(http.post, url, content=SENT) for _ in range(2)]
+        done, (left,) = wait_for(both, return_when=FIRST_COMPLETED)
+        assert [answer.result().status_code for answer in done] == [200]
+        yield one, left
+
+
+def test_a_decoder_that_is_killed_costs_one_request(service: Service, matte: str) -> None:
+    expected = asked(service, matte).content
+    with held(service, matte) as (one, answer):
+        one.kill()
+        problem = check_problem(answer.result(), 422, "bad-image")
+    assert "SIGKILL" in problem["detail"]
+    assert asked(service, matte).content == expected
+
+
+def test_a_decoder_that_hangs_is_given_up_and_others_are_answered_meanwhile(
+    service: Service, matte: str
+) -> None:
+    expected = asked(service, matte).content
+    with held(service, matte) as (one, answer):
+        meanwhile = 0
+        while not answer.done():
+            assert asked(service, matte).content == expected
+            assert service.http.get("/healthz").status_code == 200
+            meanwhile += 1
+        problem = check_problem(answer.result(), 422, "bad-image")
+        assert meanwhile > 3
+        assert "takes more than 20 s" in problem["detail"]
+        wait(lambda: not running([one]))
+
+
+@pytest.mark.parametrize(
+    ("end", "environment"),
+    [("terminate", {}), ("kill", {}), ("kill", {"ENVMATTE_COORDINATE": "false"})],
+    ids=["asked", "killed", "killed without workers"],
+)
+def test_decoders_end_with_the_service(tmp_path: Path, end: str, environment: dict[str, str]) -> None:
+    with serving(tmp_path / "data", "--workers", "1", **environment) as service:
+        sent = service.http.post("/v1/mattes", content=archive(tmp_path, 40, 30), headers=ZIP)
+        matte = sent.json()["id"]
+        assert asked(service, matte).status_code == 200
+        assert decoders(service.process)
+        tree = children(service.process)
+        getattr(service.process, end)()
+        service.process.wait(30)
+        wait(lambda: not running(tree))
+
+
+def taken_at_most(one: psutil.Process) -> int:
+    """Bytes that a process has had in memory at once."""
+    found = re.search(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{one.pid}/status").read_text())
+    assert found is not None
+    return int(found[1]) << 10
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="it is Linux that limits what a process takes")
+def test_a_film_that_takes_all_memory_to_decode_fails_alone(
+    bundle: Path, program: Program, tmp_path: Path
+) -> None:
+    data = overstated(clip(pictures(9), even(9)), 40_000_000)  # FFmpeg makes an index of 2.8 GB of it
+    record, files = filmed(program, data, 2.0)
+    bomb = tmp_path / "bomb.zip"
+    bomb.write_bytes(zipped(json.dumps(record).encode(), files))
+    with serving(tmp_path / "data", "--workers", "1", ENVMATTE_INGEST_MEMORY=str(64 << 20)) as service:
+        sent = service.http.post("/v1/mattes", content=archive(tmp_path, 40, 30), headers=ZIP)
+        matte = sent.json()["id"]
+        service.client.wait(service.client.upload(bundle)["job"])
+        (worker,) = workers(service.process)
+        before = taken_at_most(worker)
+
+        uploaded = service.client.upload(bomb)
+        with pytest.raises(ServiceError, match="an index that takes too much memory") as caught:
+            service.client.wait(uploaded["job"])
+        assert caught.value.problem["entry"] == "clip.mp4"
+        # Another takes it bit by bit, and FFmpeg's own error of that is not one that every process can read.
+        slowly = zipped(json.dumps(record).encode(), {"clip.mp4": fragmented(4_000_000)})
+        job = service.http.post("/v1/captures", content=slowly, headers=ZIP).json()["job"]
+        with pytest.raises(ServiceError, match=r"^decoding clip\.mp4 takes more than the 384 MB"):
+            service.client.wait(job)
+        job = service.http.post(
+            f"/v1/mattes/{matte}/composite", content=data, headers={"Content-Type": "video/mp4"}
+        ).json()["id"]
+        with pytest.raises(ServiceError, match="an index that takes too much memory"):
+            service.client.wait(job)
+
+        assert workers(service.process) == [worker]
+        assert taken_at_most(worker) - before < 500 << 20
+        service.client.wait(service.client.upload(bundle)["job"])

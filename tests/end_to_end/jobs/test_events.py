@@ -1,0 +1,57 @@
+"""Jobs followed by server-sent events."""
+
+import json
+from collections.abc import Iterator
+
+import httpx2
+
+from tests.end_to_end.captures.test_bad_input import check_problem
+from tests.end_to_end.conftest import Service
+
+
+def events(answer: httpx2.Response) -> Iterator[tuple[str, dict]]:
+    """Ids and data, as they come."""
+    id, data = "", ""
+    for line in answer.iter_lines():
+        name, _, value = line.partition(": ")
+        if name == "id":
+            id = value
+        elif name == "data":
+            data += value
+        elif not line and data:
+            yield id, json.loads(data)
+            id, data = "", ""
+
+
+def followed(service: Service, job: str, last: str | None = None) -> list[tuple[str, dict]]:
+    headers = {"Last-Event-ID": last} if last else {}
+    with service.http.stream("GET", f"/v1/jobs/{job}/events", headers=headers) as answer:
+        assert answer.status_code == 200
+        assert answer.headers["content-type"].startswith("text/event-stream")
+        return list(events(answer))
+
+
+def test_a_job_is_told_as_it_goes_on_and_to_its_end(service: Service, capture: str) -> None:
+    job = service.client.recover(capture, tile=16)["id"]
+    found = followed(service, job)
+    states = [data["state"] for _, data in found]
+    assert states[-1] == "succeeded"
+    assert "running" in states
+    assert [data["progress"] for _, data in found] == sorted(data["progress"] for _, data in found)
+    assert found[-1][1] | {"run_seconds": 0} == service.client.job(job).answer | {"run_seconds": 0}
+    ids = [id for id, _ in found]
+    assert len(set(ids)) == len(ids)
+    # Who comes back gets what is new: the end, or nothing, and then asks no more.
+    assert followed(service, job, ids[0])[-1] == found[-1]
+    assert service.http.get(f"/v1/jobs/{job}/events", headers={"Last-Event-ID": ids[-1]}).status_code == 204
+
+
+def test_a_job_that_is_cancelled_or_deleted_ends_its_events(service: Service, capture: str) -> None:
+    job = service.client.recover(capture)["id"]
+    with service.http.stream("GET", f"/v1/jobs/{job}/events") as answer:
+        told = events(answer)
+        next(told)
+        service.client.cancel(job)
+        assert [data["state"] for _, data in told][-1] == "cancelled"
+    assert service.http.delete(f"/v1/jobs/{job}").status_code == 204
+    check_problem(service.http.get(f"/v1/jobs/{job}/events"), 404, "not-found")

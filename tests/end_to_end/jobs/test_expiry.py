@@ -1,0 +1,77 @@
+"""Captures and mattes that expire: in a real service, with what they take of the disk."""
+
+import os
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from tests.end_to_end.captures.test_bad_input import check_problem
+from tests.end_to_end.conftest import Service, paused, serving
+
+
+def disk(service: Service) -> int:
+    """Bytes in the store, which may be deleted from meanwhile: `os.walk` passes over a folder that is gone."""
+    used = 0
+    for folder, _, names in os.walk(service.data / "store"):
+        for name in names:
+            with suppress(FileNotFoundError):
+                used += Path(folder, name).stat().st_size
+    return used
+
+
+def test_what_has_expired_leaves_the_disk_and_what_a_job_needs_does_not(bundle: Path, tmp_path: Path) -> None:
+    """Both expire while they are made, long before the recovery begins, and it succeeds all the same."""
+    with serving(
+        tmp_path / "data", "--workers", "1", ENVMATTE_CAPTURE_SECONDS="1", ENVMATTE_MATTE_SECONDS="1"
+    ) as service:
+        before = disk(service)
+        with paused(service):
+            capture = service.client.upload(bundle)
+            job = service.client.recover(capture["id"])
+            time.sleep(4)  # more than a second, and the two between looks of the coordinator
+            found = service.client.capture(capture["id"])
+            assert found["expires_at"] > found["created_at"]
+            assert disk(service) - before >= bundle.stat().st_size
+        assert service.client.wait(job["id"])["state"] == "succeeded"
+        deadline = time.monotonic() + 60
+        for url in (f"/v1/captures/{capture['id']}", f"/v1/mattes/{job['matte']}"):
+            while service.http.get(url).status_code != 404:
+                assert time.monotonic() < deadline
+                time.sleep(0.1)
+            check_problem(service.http.get(url), 404, "not-found")
+        while disk(service) > before:
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        used = service.http.get("/v1/limits").json()["limits"]
+        assert {one["name"]: one["used"] for one in used if one["used"] is not None} == {
+            "owner_captures": 0,
+            "owner_jobs": 0,
+            "owner_bytes": 0,
+            "store_bytes": 0,
+        }
+        assert service.client.job(job["id"])["state"] == "succeeded"  # what is known of it stays
+
+
+@pytest.mark.long
+def test_what_is_deleted_leaves_the_disk(bundle: Path, tmp_path: Path) -> None:
+    with serving(tmp_path / "data", "--workers", "1") as service:
+        before = disk(service)
+        capture = service.client.upload(bundle)
+        service.client.wait(capture["job"])
+        matte = service.client.wait(service.client.recover(capture["id"])["id"])["matte"]
+        deadline = time.monotonic() + 60
+        while True:  # until all of it is counted, which comes after the job's end
+            limits = service.http.get("/v1/limits").json()["limits"]
+            used = {one["name"]: one["used"] for one in limits}
+            # Besides, there are the folders' own zarr.json.
+            if used["owner_bytes"] and disk(service) - before - used["owner_bytes"] in range(2000):
+                break
+            assert time.monotonic() < deadline, (used, disk(service) - before)
+            time.sleep(0.1)
+        for url in (f"/v1/mattes/{matte}", f"/v1/captures/{capture['id']}"):
+            assert service.http.delete(url).status_code == 204
+        assert disk(service) - before in range(2000)
+        limits = service.http.get("/v1/limits").json()["limits"]
+        assert {one["name"]: one["used"] for one in limits}["owner_bytes"] == 0

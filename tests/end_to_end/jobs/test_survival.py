@@ -1,0 +1,262 @@
+"""What a service survives: kills, cancels, a second service; and that the bytes stay the same."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from services.client import ServiceError
+from tests.end_to_end.captures.test_uploads import begin, create
+from tests.end_to_end.conftest import Service, digests, png, serving
+from tests.services.cluster.clusters import workers
+
+pytestmark = pytest.mark.full
+
+
+def files_of(service: Service, matte: str) -> dict[str, str]:
+    return digests(service.data / "store" / "mattes" / matte)
+
+
+def gone(service: Service, matte: str) -> None:
+    """Wait until a matte has left nothing."""
+    deadline = time.monotonic() + 20
+    while service.http.get(f"/v1/mattes/{matte}").status_code != 404 or any(
+        matte in n for n in service.stored()
+    ):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def recovered(service: Service, bundle: Path, **options: object) -> dict[str, str]:
+    uploaded = service.client.upload(bundle)
+    job = service.client.wait(service.client.recover(uploaded["id"], **options)["id"])
+    return files_of(service, job["matte"])
+
+
+def test_a_killed_server_goes_on_where_it_stood(
+    service: Service, matte: str, bundle: Path, tmp_path: Path
+) -> None:
+    data = tmp_path / "data"
+    with serving(data, "--workers", "1") as first:
+        job = first.client.recover(first.client.upload(bundle)["id"])
+        while first.client.job(job["id"])["tiles"]["done"] < 5:
+            time.sleep(0.01)
+        family = psutil.Process(first.process.pid).children(recursive=True)
+        first.kill()
+        _, alive = psutil.wait_procs(family, timeout=10)
+        assert alive == []
+    with serving(data, "--workers", "1") as second:
+        found = second.client.job(job["id"])
+        assert 5 <= found["tiles"]["done"] < 30
+        ended = second.client.wait(job["id"])
+        assert ended["tiles"] == {"total": 30, "done": 30, "failed": 0}
+        log = [line["text"] for line in second.http.get(f"/v1/jobs/{job['id']}/log").json()["lines"]]
+        assert log.count("preparing") == 1
+        assert files_of(second, ended["matte"]) == files_of(service, matte)
+
+
+@pytest.mark.long
+def test_a_server_killed_during_ingest_goes_on(
+    service: Service, matte: str, bundle: Path, tmp_path: Path
+) -> None:
+    data = tmp_path / "data"
+    # A frame takes 20 kB: a budget of 1 MiB makes slabs of a few frames, and many tiles.
+    with serving(data, "--workers", "1", ENVMATTE_INGEST_MEMORY=str(1 << 20)) as first:
+        uploaded = first.client.upload(bundle)
+        while first.client.job(uploaded["job"])["stage"] == "waiting":
+            time.sleep(0.01)
+        first.kill()
+    with serving(data, "--workers", "2", ENVMATTE_INGEST_MEMORY=str(1 << 20)) as second:
+        assert second.client.wait(uploaded["job"])["state"] == "succeeded"
+        job = second.client.wait(second.client.recover(uploaded["id"])["id"])
+        assert files_of(second, job["matte"]) == files_of(service, matte)
+
+
+def test_the_bytes_do_not_depend_on_tiles_or_workers(
+    service: Service, matte: str, bundle: Path, tmp_path: Path
+) -> None:
+    expected = files_of(service, matte)
+    assert len(expected) > 200
+    assert recovered(service, bundle, tile=48) == expected
+    assert recovered(service, bundle, tile=1024) == expected
+    with serving(tmp_path / "data", "--workers", "3") as other:
+        assert recovered(other, bundle, tile=32) == expected
+
+
+def test_a_cancelled_job_leaves_nothing(service: Service, capture: str) -> None:
+    job = service.client.recover(capture)
+    while service.client.job(job["id"])["tiles"]["done"] < 2:
+        time.sleep(0.01)
+    assert service.client.cancel(job["id"])["state"] == "cancelled"
+    with pytest.raises(ServiceError, match="cancelled"):
+        service.client.wait(job["id"])
+    gone(service, job["matte"])
+    assert service.client.cancel(job["id"])["state"] == "cancelled"
+
+
+def test_a_job_cancelled_while_it_waits_leaves_nothing(service: Service, bundle: Path) -> None:
+    uploaded = service.client.upload(bundle)
+    job = service.client.recover(uploaded["id"])
+    assert service.client.cancel(job["id"])["state"] == "cancelled"
+    service.client.wait(uploaded["job"])
+    gone(service, job["matte"])
+
+
+def test_a_cancelled_ingest_leaves_nothing(service: Service, capture: str, bundle: Path) -> None:
+    service.client.recover(capture, tile=1024)  # keeps a worker busy
+    before = service.stored()
+    uploaded = service.client.upload(bundle)
+    service.client.cancel(uploaded["job"])
+    deadline = time.monotonic() + 20
+    while service.client.capture(uploaded["id"])["state"] == "ingesting":
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    assert service.client.capture(uploaded["id"])["problem"]["detail"].startswith("the ingest was cancelled")
+    while any(uploaded["id"] in name for name in service.stored() - before):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def test_an_ingest_that_failed_for_no_fault_of_the_capture_can_be_retried(
+    bundle: Path, tmp_path: Path
+) -> None:
+    with serving(tmp_path / "data", "--workers", "1") as service:
+        first = service.client.upload(bundle)
+        service.client.wait(first["job"])
+        busy = service.client.recover(first["id"], tile=1024)
+        while service.client.job(busy["id"])["stage"] != "recovering":
+            time.sleep(0.01)
+        time.sleep(0.3)
+        second = service.client.upload(bundle)
+        (archive,) = (service.data / "store" / "uploads" / second["id"]).glob("*.part")
+        data = archive.read_bytes()
+        archive.unlink()
+        with pytest.raises(ServiceError, match="failed 3 times"):
+            service.client.wait(second["job"])
+        assert service.client.capture(second["id"])["state"] == "failed"
+        archive.write_bytes(data)
+        assert service.http.post(f"/v1/jobs/{second['job']}/retry").status_code == 202
+        service.client.wait(second["job"])
+        assert service.client.capture(second["id"])["state"] == "ready"
+
+
+@pytest.mark.long
+def test_a_job_cancelled_before_a_kill_leaves_nothing(bundle: Path, tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    with serving(data, "--workers", "1") as first:
+        job = first.client.recover(first.client.upload(bundle)["id"])
+        while first.client.job(job["id"])["tiles"]["done"] < 2:
+            time.sleep(0.01)
+        first.client.cancel(job["id"])
+        first.kill()
+    (data / "store" / "uploads").mkdir(exist_ok=True)
+    (data / "store" / "uploads" / "orphan.zip").write_bytes(b"an upload that was cut off by the kill")
+    (data / "store" / "uploads" / "orphan.zip#1").write_bytes(b"and one that was being written")
+    with serving(data, "--workers", "1") as second:
+        assert not [name for name in second.stored() if "orphan" in name]
+        gone(second, job["matte"])
+        assert second.client.job(job["id"])["state"] == "cancelled"
+        assert second.client.wait(second.client.recover(job["capture"])["id"])["state"] == "succeeded"
+
+
+def test_a_worker_that_is_killed_costs_nothing(service: Service, matte: str, capture: str) -> None:
+    job = service.client.recover(capture)
+    while service.client.job(job["id"])["tiles"]["done"] < 3:
+        time.sleep(0.01)
+    workers(service.process)[-1].kill()
+    ended = service.client.wait(job["id"])
+    assert files_of(service, ended["matte"]) == files_of(service, matte)
+
+
+def test_a_damaged_matte_is_said_to_be_damaged(service: Service, capture: str) -> None:
+    job = service.client.wait(service.client.recover(capture, tile=48)["id"])
+    folder = service.data / "store" / "mattes" / job["matte"]
+    for at, name in ((0, "S/c/0/0/0"), (16, "count/c/1/1/0"), (32, "T/2.2/weight/c/0")):
+        data = (folder / name).read_bytes()
+        (folder / name).unlink()
+        white = png(np.ones((2, 2, 3), np.float32), "srgb", np.uint8)
+        block = {"x": at, "y": at, "width": 16, "height": 16}  # others would be kept in memory
+        answer = service.http.post(f"/v1/mattes/{job['matte']}/composite", params=block, content=white)
+        assert (answer.status_code, answer.json()["type"]) == (500, "urn:envmatte:problem:corrupt")
+        (folder / name).write_bytes(data)
+
+
+def test_a_tile_that_always_fails_fails_its_job_and_retry_goes_on(
+    service: Service, matte: str, bundle: Path
+) -> None:
+    uploaded = service.client.upload(bundle)
+    service.client.wait(uploaded["job"])
+    chunk = service.data / "store" / "captures" / uploaded["id"] / "frames" / "c" / "0" / "0" / "1" / "0"
+    data = chunk.read_bytes()
+    chunk.unlink()
+    job = service.client.recover(uploaded["id"])
+    with pytest.raises(ServiceError, match="is missing"):
+        service.client.wait(job["id"])
+    failed = service.client.job(job["id"])
+    assert failed["state"] == "failed"
+    assert failed["tiles"]["done"] < 30
+    chunk.write_bytes(data)
+    assert service.http.post(f"/v1/jobs/{job['id']}/retry").status_code == 202
+    assert service.client.wait(job["id"])["tiles"] == {"total": 30, "done": 30, "failed": 0}
+    assert files_of(service, job["matte"]) == files_of(service, matte)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_a_server_that_is_asked_to_stop_leaves_no_process(
+    bundle: Path, tmp_path: Path, number: int, code: int
+) -> None:
+    with serving(tmp_path / "data", "--workers", "2") as service:
+        service.client.recover(service.client.upload(bundle)["id"])
+        sending = begin(service, create(service, 1000), 0, 1000, b"the rest of which never comes")
+        family = psutil.Process(service.process.pid).children(recursive=True)
+        assert len(family) >= 2
+        service.process.send_signal(number)
+        assert service.process.wait(20) == code
+        sending.close()
+        _, alive = psutil.wait_procs(family, timeout=10)
+        assert alive == []
+
+
+def test_a_second_service_on_one_folder_says_so_and_stops(service: Service) -> None:
+    command = [sys.executable, "-m", "services", "serve", "--data", str(service.data), "--port", "0"]
+    second = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert second.returncode == 1
+    assert "serves" in second.stderr
+    assert "already" in second.stderr
+    assert service.http.get("/healthz").status_code == 200
+
+
+def test_an_open_door_is_refused(tmp_path: Path) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        "services",
+        "serve",
+        "--data",
+        str(tmp_path / "data"),
+        "--host",
+        "0.0.0.0",
+    ]
+    environment = {name: value for name, value in os.environ.items() if name != "ENVMATTE_KEYS"}
+    refused = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
+    assert refused.returncode == 1
+    assert "envmatte keys make" in refused.stderr
+    assert "ENVMATTE_KEYS" in refused.stderr
+
+
+def test_keys_are_asked_for(tmp_path: Path) -> None:
+    with serving(tmp_path / "data", "--workers", "1", ENVMATTE_KEYS="first-key, second-key") as service:
+        assert service.http.get("/healthz").status_code == 200
+        for headers in ({}, {"Authorization": "Bearer wrong"}, {"Authorization": "Basic first-key"}):
+            answer = service.http.get("/v1/captures", headers=headers)
+            assert (answer.status_code, answer.headers["www-authenticate"]) == (401, "Bearer")
+        for key in ("first-key", "second-key"):
+            answer = service.http.get("/v1/captures", headers={"Authorization": f"Bearer {key}"})
+            assert answer.json() == {"captures": []}

@@ -1,0 +1,198 @@
+"""A matte that leaves one service and comes to another."""
+
+import io
+import json
+import time
+import zipfile
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+
+import httpx2
+import numpy as np
+import pytest
+
+from services.client import ServiceError
+from storage.layout import mattes
+from storage.layout.matte_archive import MANIFEST, Archive
+from storage.layout.mattes import Block
+from storage.objects.store import Objects
+from tests.end_to_end.captures.test_bad_input import ZIP, check_problem
+from tests.end_to_end.conftest import Service, digests, png, serving
+from tests.end_to_end.use.test_cli import envmatte
+from workflows.simulation import glass_ball
+
+pytestmark = pytest.mark.full
+
+
+@pytest.fixture(scope="module")
+def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    """Another service, which knows nothing of the first."""
+    with serving(tmp_path_factory.mktemp("elsewhere") / "data", "--workers", "1") as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def archive(service: Service, matte: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scene's matte, exported."""
+    path = tmp_path_factory.mktemp("archive") / "matte.zip"
+    service.client.export(matte, path)
+    return path
+
+
+def test_a_matte_comes_to_another_service_as_it_was(
+    service: Service, elsewhere: Service, matte: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "matte.zip"
+    exported = envmatte(service, "export", matte, "-o", str(path))
+    assert (exported.returncode, exported.stdout.strip()) == (0, str(path)), exported.stderr
+    assert "export: 100%" in exported.stderr
+    assert [file.name for file in tmp_path.iterdir()] == ["matte.zip"]
+
+    imported = envmatte(elsewhere, "import", str(path))
+    assert imported.returncode == 0, imported.stderr
+    assert "import: 100%" in imported.stderr
+    there = imported.stdout.strip()
+    store = Path("store/mattes")
+    assert digests(elsewhere.data / store / there) == digests(service.data / store / matte)
+
+    backdrop = png(glass_ball.backdrop(160, 120), "srgb", "uint8")
+    assert elsewhere.client.composite(there, backdrop) == service.client.composite(matte, backdrop)
+    before, after = service.client.matte(matte), elsewhere.client.matte(there)
+    assert (after["state"], after["capture"], after["job"]) == ("ready", None, None)
+    for name in ("width", "height", "monitor", "columns", "rows"):
+        assert after[name] == before[name]
+    assert after["options"].items() <= before["options"].items()
+    assert after["id"] in [m["id"] for m in elsewhere.http.get("/v1/mattes").json()["mattes"]]
+
+    elsewhere.client.export(there, tmp_path / "again.zip")
+    assert (tmp_path / "again.zip").read_bytes() == path.read_bytes()
+    assert elsewhere.http.delete(f"/v1/mattes/{there}").status_code == 204
+    assert elsewhere.stored() == set()
+
+
+def test_the_answer_is_a_file_with_a_name_and_a_size(service: Service, matte: str, archive: Path) -> None:
+    answer = service.http.get(f"/v1/mattes/{matte}/archive")
+    assert answer.content == archive.read_bytes()
+    assert answer.headers["content-type"] == "application/zip"
+    assert answer.headers["content-length"] == str(archive.stat().st_size)
+    assert answer.headers["content-disposition"] == f'attachment; filename="matte-{matte}.zip"'
+    check_problem(service.http.get("/v1/mattes/none/archive"), 404, "not-found")
+
+
+def test_a_repeat_with_the_same_key_makes_nothing_twice(elsewhere: Service, archive: Path) -> None:
+    headers = ZIP | {"Idempotency-Key": "once"}
+    first, again = (
+        elsewhere.http.post("/v1/mattes", content=archive.read_bytes(), headers=headers) for _ in range(2)
+    )
+    assert (first.status_code, again.status_code) == (201, 201)
+    made = first.json()["id"]
+    assert again.json()["id"] == made
+    assert first.headers["location"] == again.headers["location"] == f"/v1/mattes/{made}"
+    other = elsewhere.client.import_matte(archive)["id"]
+    assert other != made
+    for id in (made, other):
+        elsewhere.http.delete(f"/v1/mattes/{id}")
+    assert elsewhere.stored() == set()
+
+
+def test_what_lies_is_refused_and_leaves_nothing(elsewhere: Service, archive: Path, tmp_path: Path) -> None:
+    with zipfile.ZipFile(archive) as file:
+        files = {name: file.read(name) for name in file.namelist()}
+    lies = io.BytesIO()
+    with zipfile.ZipFile(lies, "w") as file:
+        for name, data in files.items():
+            file.writestr(name, data if name != "rho/c/0/0/0" else data[::-1])
+    listed = elsewhere.http.get("/v1/mattes").json()
+    for body, entry in (
+        (lies.getvalue(), "rho/c/0/0/0"),
+        (archive.read_bytes()[:-1000], None),
+        (b"", None),
+    ):
+        answer = elsewhere.http.post("/v1/mattes", content=body, headers=ZIP)
+        assert check_problem(answer, 422, "bad-archive").get("entry") == entry
+    answer = elsewhere.http.post("/v1/mattes", content=b"{}", headers={"Content-Type": "application/json"})
+    check_problem(answer, 415, "wrong-media-type")
+    (tmp_path / "lies.zip").write_bytes(lies.getvalue())
+    refused = envmatte(elsewhere, "import", str(tmp_path / "lies.zip"))
+    assert (refused.returncode, refused.stdout) == (1, "")
+    assert "rho/c/0/0/0" in refused.stderr
+    assert elsewhere.http.get("/v1/mattes").json() == listed
+    assert elsewhere.stored() == set()
+
+
+@pytest.mark.long
+def test_one_that_is_too_large_is_refused_with_the_limit(archive: Path, tmp_path: Path) -> None:
+    size = archive.stat().st_size
+    with serving(tmp_path / "data", "--workers", "1", ENVMATTE_UPLOAD_BYTES=str(size - 1)) as small:
+
+        def pieces() -> Iterator[bytes]:
+            yield archive.read_bytes()
+
+        for body in (archive.read_bytes(), pieces()):  # with its length, and without
+            answer = small.http.post("/v1/mattes", content=body, headers=ZIP)
+            assert check_problem(answer, 413, "too-large")["limit"] == size - 1
+        with pytest.raises(ServiceError, match=str(size - 1)):
+            small.client.import_matte(archive)
+        assert small.stored() == set()
+    with serving(tmp_path / "data", "--workers", "1", ENVMATTE_UNPACKED_BYTES="100000") as small:
+        answer = small.http.post("/v1/mattes", content=archive.read_bytes(), headers=ZIP)
+        assert check_problem(answer, 422, "bad-archive")["limit"] == 100000
+        assert small.stored() == set()
+
+
+@pytest.fixture(scope="module")
+def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An archive of 22 MB, more than a connection holds."""
+    folder = tmp_path_factory.mktemp("large")
+    objects = Objects((folder / "store").as_uri())
+    given = {"monitor": [8, 6], "crosstalk": np.eye(3).tolist(), "options": {}}
+    matte = mattes.create(objects, "m", height=768, width=1024, columns=4, rows=3, **given)
+    rng = np.random.default_rng(0)
+    nowhere = np.zeros((64, 64), bool)
+    count, cell = np.zeros((64, 64, 3), np.uint32), np.zeros(0, np.uint32)
+    for row, column in product(range(matte.block_rows), range(matte.block_columns)):
+        S, rho = rng.random((2, 64, 64, 3), np.float32)
+        error, weight = rng.random((64, 64), np.float32), np.zeros(0, np.float32)
+        matte.write(row, column, Block(S, rho, error, ~nowhere, nowhere, count, cell, weight))
+    (folder / "matte.zip").write_bytes(b"".join(Archive(objects, "m")))
+    return folder / "matte.zip"
+
+
+def test_a_matte_deleted_while_it_is_sent_ends_the_connection(
+    elsewhere: Service, large: Path, tmp_path: Path
+) -> None:
+    there = elsewhere.client.import_matte(large)["id"]
+    sent: list[bytes] = []
+    with elsewhere.http.stream("GET", f"/v1/mattes/{there}/archive") as answer:
+        assert elsewhere.http.delete(f"/v1/mattes/{there}").status_code == 204
+        with pytest.raises(httpx2.RemoteProtocolError):
+            sent.extend(answer.iter_bytes())
+    assert not zipfile.is_zipfile(io.BytesIO(b"".join(sent)))
+    with pytest.raises(ServiceError, match=there):
+        elsewhere.client.export(there, tmp_path / "matte.zip")
+    assert list(tmp_path.iterdir()) == []
+    assert elsewhere.stored() == set()
+
+
+@pytest.mark.long
+def test_a_service_that_is_killed_keeps_the_mattes_that_came_and_nothing_else(
+    archive: Path, tmp_path: Path
+) -> None:
+    with serving(tmp_path / "data", "--workers", "1") as first:
+        whole = first.client.import_matte(archive)["id"]
+        kept = first.stored()
+        half = first.data / "store/mattes/half/S/c/0/0/0"  # what an import that was killed has written
+        half.parent.mkdir(parents=True)
+        half.write_bytes(b"x")
+        (first.data / "store/uploads/half").mkdir(parents=True)
+        (first.data / "store/uploads/half/all.part").write_bytes(b"x")
+        first.kill()
+    with serving(tmp_path / "data", "--workers", "1") as second:
+        give_up = time.monotonic() + 60
+        while second.stored() != kept and time.monotonic() < give_up:
+            time.sleep(0.1)
+        assert second.stored() == kept
+        assert second.client.matte(whole)["state"] == "ready"
+        manifest = json.loads(zipfile.ZipFile(archive).read(MANIFEST))
+        assert second.client.matte(whole)["options"] == manifest["matte"]["options"]

@@ -1,0 +1,280 @@
+"""Composites over HTTP: what is asked for, and what is answered."""
+
+import io
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import httpx2
+import imagecodecs
+import numpy as np
+import psutil
+import pytest
+from PIL import Image
+
+from tests.end_to_end.captures.test_bad_input import check_problem
+from tests.end_to_end.conftest import Service, png
+from tests.end_to_end.use.test_cli import envmatte
+from tests.services.cluster.clusters import decoders
+from workflows.images import float_formats, integer_formats
+from workflows.images.tone_curves import from_light
+
+BACKDROP = np.random.default_rng(0).random((30, 40, 3), np.float32).repeat(4, axis=0).repeat(4, axis=1)
+SENT = png(BACKDROP, "srgb", np.uint8)
+
+
+def asked(
+    service: Service, matte: str, body: bytes = SENT, accept: str = "image/png", **query
+) -> httpx2.Response:
+    return service.http.post(
+        f"/v1/mattes/{matte}/composite", params=query, content=body, headers={"Accept": accept}
+    )
+
+
+def decoded(answer: httpx2.Response) -> np.ndarray:
+    assert answer.status_code == 200, answer.text
+    return integer_formats.decode(answer.content, memory=1 << 24)
+
+
+@pytest.mark.full
+def test_the_three_kinds_of_answer_are_one_picture(service: Service, matte: str) -> None:
+    exr = asked(service, matte, accept="image/x-exr")
+    assert exr.headers["content-type"] == "image/x-exr"
+    light = float_formats.decode(exr.content, memory=1 << 24)
+    shown = decoded(asked(service, matte))
+    expected = integer_formats.to_integers(from_light(np.clip(light, 0, 1), "srgb"), np.dtype(np.uint8))
+    assert np.abs(shown.astype(int) - expected).max() <= 1
+    assert (shown == expected).mean() > 0.999
+    jpeg = asked(service, matte, accept="text/html, image/jpeg;q=0.9, image/png;q=0.1", quality=100)
+    assert jpeg.headers["content-type"] == "image/jpeg"
+    assert np.abs(decoded(jpeg).astype(int) - shown).max() <= 6
+    assert len(asked(service, matte, accept="image/jpeg", quality=20).content) < len(jpeg.content) / 3
+
+
+def test_light_goes_in_and_comes_out_as_exr(service: Service, matte: str) -> None:
+    def seen(gain: float) -> np.ndarray:
+        sent = float_formats.encode_exr({"RGB": BACKDROP * np.float32(gain)})
+        return float_formats.decode(asked(service, matte, sent, "image/x-exr").content, memory=1 << 24)
+
+    dark, once, four = seen(0), seen(1), seen(4)
+    assert four.max() > 2
+    np.testing.assert_allclose(four - dark, 4 * (once - dark), atol=1e-4)
+    deep = decoded(asked(service, matte, float_formats.encode_exr({"RGB": BACKDROP})))
+    assert deep.dtype == np.uint16
+
+
+def test_a_crop_is_a_piece_and_a_preview_is_small(service: Service, matte: str) -> None:
+    whole = decoded(asked(service, matte))
+    crop = decoded(asked(service, matte, x=10, y=20, width=31, height=17))
+    np.testing.assert_array_equal(crop, whole[20:37, 10:41])
+    np.testing.assert_array_equal(decoded(asked(service, matte, x=90, y=70)), whole[70:, 90:])
+    assert decoded(asked(service, matte, size=48)).shape == (36, 48, 3)
+    assert decoded(asked(service, matte, size=500)).shape == whole.shape
+
+
+@pytest.mark.parametrize(
+    ("query", "field"),
+    [({"x": 96}, "x"), ({"y": 60, "height": 13}, "y"), ({"width": 97}, "x"), ({"x": 90, "width": 10}, "x")],
+)
+def test_a_crop_outside_is_refused(service: Service, matte: str, query: dict[str, int], field: str) -> None:
+    problem = check_problem(asked(service, matte, **query), 422, "bad-option")
+    assert problem["field"] == field
+    assert "96 x 72" in problem["detail"]
+
+
+@pytest.mark.parametrize("query", [{"size": 0}, {"quality": 101}, {"scale": 0}, {"crop": 1}, {"x": -1}])
+def test_a_request_that_makes_no_sense_is_refused(
+    service: Service, matte: str, query: dict[str, int]
+) -> None:
+    assert check_problem(asked(service, matte, **query), 422, "bad-request")["field"] in query
+
+
+def test_a_moved_backdrop_is_the_backdrop_moved(service: Service, matte: str) -> None:
+    half = np.zeros_like(BACKDROP)
+    half[:, 80:] = BACKDROP[:, :80]
+    moved = decoded(asked(service, matte, right=0.5)).astype(int)
+    expected = decoded(asked(service, matte, png(half, "srgb", np.uint8))).astype(int)
+    assert np.abs(moved - expected).mean() < 1.5
+    assert np.abs(moved - decoded(asked(service, matte))).mean() > 10
+
+
+@pytest.mark.full
+def test_a_backdrop_at_another_depth(service: Service, matte: str) -> None:
+    still = decoded(asked(service, matte)).astype(int)
+    told = {"distance": 3, "camera": 5}
+    same = decoded(asked(service, matte, depth=3, **told)).astype(int)
+    assert np.abs(same - still).mean() < 0.5
+    farther = decoded(asked(service, matte, depth=4, **told)).astype(int)
+    assert np.abs(farther - still).mean() > 5
+    for query in ({"depth": 3}, {"distance": 3}, {"depth": 3, "distance": 3, "other": matte}):
+        found = check_problem(asked(service, matte, **query), 422, "bad-request")
+        assert "depth, distance and camera" in found["detail"]
+    missing = {"depth": 3, "distance": 3, "other": "no-such-id", "other_distance": 4}
+    check_problem(asked(service, matte, **missing), 404, "not-found")
+
+
+def test_what_the_caller_has_is_not_made_again(service: Service, matte: str) -> None:
+    url = f"/v1/mattes/{matte}/composite"
+    first = service.http.post(url, content=SENT)
+    tag = first.headers["etag"]
+    again = service.http.post(url, content=SENT)
+    assert (again.headers["etag"], again.content) == (tag, first.content)
+    known = service.http.post(url, content=SENT, headers={"If-None-Match": f'"other", {tag}'})
+    check_problem(known, 412, "not-needed")
+    assert known.headers["etag"] == tag
+    others = [
+        asked(service, matte, size=40),
+        asked(service, matte, png(BACKDROP[::-1], "srgb", np.uint8)),
+        asked(service, matte, accept="image/jpeg"),
+    ]
+    assert len({tag, *(other.headers["etag"] for other in others)}) == 4
+
+
+def test_a_picture_served_is_the_one_that_the_command_line_makes(
+    service: Service, matte: str, tmp_path
+) -> None:
+    (tmp_path / "backdrop.png").write_bytes(SENT)
+    for name, kind in (("a.png", "image/png"), ("a.jpg", "image/jpeg"), ("a.exr", "image/x-exr")):
+        out = tmp_path / name
+        command = ["composite", matte, str(tmp_path / "backdrop.png"), "-o", str(out)]
+        envmatte(service, *command)
+        assert out.read_bytes() == asked(service, matte, accept=kind).content
+
+
+def test_many_ask_at_once_and_all_get_the_same(service: Service, matte: str) -> None:
+    expected = asked(service, matte, accept="image/jpeg").content
+    with ThreadPoolExecutor(16) as threads:
+        answers = list(threads.map(lambda _: asked(service, matte, accept="image/jpeg").content, range(64)))
+    assert set(answers) == {expected}
+
+
+def test_a_matte_in_the_making_is_composited_as_far_as_it_is(service: Service, capture: str) -> None:
+    job = service.client.recover(capture, tile=16)
+    shares: list[float] = []
+    pictures: list[np.ndarray] = []
+
+    def look(found: dict) -> None:
+        answer = asked(service, job["matte"])
+        if answer.status_code == 409:
+            assert "nothing of it is there yet" in answer.json()["detail"]
+            return
+        shares.append(float(answer.headers["envmatte-recovered"]))
+        pictures.append(
+            decoded(answer)
+            if shares[-1] == 1
+            else integer_formats.decode(answer.content, memory=1 << 24, alpha=True)
+        )
+
+    service.client.wait(job["id"], progress=look, poll=0.05)
+    final = decoded(asked(service, job["matte"]))
+    assert shares == sorted(shares)
+    assert any(0 < share < 1 for share in shares), shares
+    for share, picture in zip(shares, pictures, strict=True):
+        if share < 1:
+            there = picture[..., 3] > 0
+            assert abs(there.mean() - share) < 0.02
+            np.testing.assert_array_equal(picture[there][:, :3], final[there])
+    assert asked(service, job["matte"]).headers["envmatte-recovered"] == "1.0000"
+    assert service.http.delete(f"/v1/mattes/{job['matte']}").status_code == 204
+
+
+def test_a_matte_that_is_deleted_while_it_is_served(service: Service, capture: str) -> None:
+    matte = service.client.wait(service.client.recover(capture)["id"])["matte"]
+    expected = asked(service, matte).content
+    answers: list[httpx2.Response] = []
+
+    def ask() -> None:
+        with httpx2.Client(base_url=service.url, timeout=60) as http:
+            while not answers or answers[-1].status_code == 200:
+                answers.append(
+                    http.post(f"/v1/mattes/{matte}/composite", content=SENT, headers={"Accept": "image/png"})
+                )
+
+    asker = threading.Thread(target=ask)
+    asker.start()
+    while len(answers) < 3:
+        pass
+    assert service.http.delete(f"/v1/mattes/{matte}").status_code == 204
+    asker.join()
+    assert all(answer.content == expected for answer in answers[:-1])
+    check_problem(answers[-1], 404, "not-found")
+
+
+def saved(picture: Image.Image, kind: str, **options: object) -> bytes:
+    target = io.BytesIO()
+    picture.save(target, kind, **options)
+    return target.getvalue()
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        saved(Image.fromarray((255 * BACKDROP).astype(np.uint8)).convert("CMYK"), "JPEG"),
+        saved(Image.fromarray((255 * BACKDROP).astype(np.uint8)).convert("P"), "PNG"),
+        saved(Image.fromarray((255 * BACKDROP).astype(np.uint8)).convert("RGBA"), "PNG"),
+        saved(
+            Image.fromarray((255 * BACKDROP).astype(np.uint8)),
+            "JPEG",
+            icc_profile=imagecodecs.cms_profile("adobergb"),
+        ),
+        saved(Image.fromarray((255 * BACKDROP).astype(np.uint8)[:1, :1]), "PNG"),
+        saved(Image.fromarray((255 * BACKDROP).astype(np.uint8)[:, :1]), "TIFF"),
+    ],
+    ids=["cmyk", "palette", "alpha", "profile", "one pixel", "one column"],
+)
+def test_every_kind_of_picture_is_a_backdrop(service: Service, matte: str, body: bytes) -> None:
+    assert decoded(asked(service, matte, body)).shape == (72, 96, 3)
+
+
+def test_a_backdrop_of_8_bits_that_lets_through_is_answered_with_as_many(
+    service: Service, matte: str
+) -> None:
+    codes = (255 * BACKDROP).astype(np.uint8)
+    glassy = np.concatenate([codes, np.full((*codes.shape[:2], 1), 100, np.uint8)], axis=2)
+    assert decoded(asked(service, matte, integer_formats.encode_png(glassy))).dtype == np.uint8
+
+
+def test_a_bomb_is_refused_before_it_goes_off(service: Service, matte: str) -> None:
+    bomb = saved(Image.new("1", (20_000, 20_000)), "PNG")
+    assert len(bomb) < 1 << 20
+    problem = check_problem(asked(service, matte, bomb), 422, "bad-image")
+    assert "too large" in problem["detail"] or "takes more" in problem["detail"]
+    cut = check_problem(asked(service, matte, SENT[: len(SENT) // 2]), 422, "bad-image")
+    assert "cut off or damaged" in cut["detail"]
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    "requests", [600, pytest.param(10_000, marks=[pytest.mark.long, pytest.mark.timeout(3600)])]
+)
+def test_requests_leave_nothing_behind(service: Service, matte: str, requests: int) -> None:
+    """Neither in the API's process nor in those that decode backdrops for it."""
+    askers = 4
+
+    def ask(count: int) -> None:
+        with ThreadPoolExecutor(askers) as threads:
+            list(threads.map(lambda _: asked(service, matte, accept="image/jpeg", size=24), range(count)))
+
+    def held() -> dict[int, np.ndarray]:
+        """Bytes, files and threads of each process."""
+        every = [psutil.Process(service.process.pid), *decoders(service.process)]
+        return {
+            one.pid: np.array([one.memory_full_info().uss, one.num_fds(), one.num_threads()]) for one in every
+        }
+
+    ask(requests // 3)  # until every thread has what it keeps
+    before = held()
+    ask(requests)
+    after = held()
+    assert set(before) <= set(after), "a decoder is gone"
+    assert 1 < len(after) <= 1 + askers
+    same = {pid: after[pid] for pid in before}  # and one more may have been started
+    for when, found in (("before", before), ("after", same)):
+        memory, files, threads = sum(found.values())
+        print(
+            f"{when} {requests} requests: {memory / 1e6:.1f} MB, {files} open files, {threads} threads, "
+            f"in the API's process and {len(found) - 1} decoders"
+        )
+    memory, files, threads = sum(same.values()) - sum(before.values())
+    assert memory < 24 << 20
+    assert files < 16
+    assert threads < 16

@@ -1,0 +1,91 @@
+"""A backup is taken of a service that runs, and another one goes on with its jobs, on other kinds of stores."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from storage.objects.store import Objects
+from tests.end_to_end.conftest import Service, digests, paused, serving
+from tests.faults.rig import stored
+from tests.postgres import Server
+
+
+def envmatte(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "services", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=200, env=os.environ | environment)
+
+
+def tiles_done(service: Service, job: str) -> int:
+    return int(service.client.job(job)["tiles"]["done"])
+
+
+@pytest.mark.full
+def test_a_job_that_ran_is_finished_where_the_backup_is_restored(
+    bundle: Path, s3: str, postgresql_server: Server, tmp_path: Path
+) -> None:
+    backup, data = str(tmp_path / "backup"), tmp_path / "data"
+    with serving(data, "--workers", "1") as first:
+        uploaded = first.client.upload(bundle)
+        first.client.wait(uploaded["job"])
+        job = first.client.recover(uploaded["id"], quality="fast")
+        while tiles_done(first, job["id"]) < 2:
+            time.sleep(0.02)
+        with paused(first):
+            made = envmatte("backup", backup, "--data", str(data))
+            assert made.returncode == 0, made.stderr
+            assert "objects" in made.stdout
+            assert "backup: 100%" in made.stderr
+            looked = envmatte("verify", "--data", str(data))
+            assert (looked.returncode, looked.stdout) == (0, "all is as it was written\n"), looked.stderr
+            assert "1 are being written, and were left out" in looked.stderr
+            refused = envmatte("restore", backup, "--data", str(data))
+            assert (refused.returncode, "another envmatte serves" in refused.stderr) == (1, True)
+        matte = first.client.wait(job["id"])["matte"]
+        whole = digests(data / "store" / "mattes" / matte)
+    with postgresql_server.database() as database:
+        where = ("--data", str(tmp_path / "other"), "--database", database, "--store", s3)
+        came = envmatte("restore", backup, *where, "--json")
+        assert came.returncode == 0, came.stderr
+        assert json.loads(came.stdout)["objects"] > 20
+        with serving(tmp_path / "other", "--workers", "1", "--database", database, "--store", s3) as second:
+            assert tiles_done(second, job["id"]) >= 2
+            ended = second.client.wait(job["id"])
+            assert (ended["state"], ended["matte"]) == ("succeeded", matte)
+            assert stored(Objects(s3), f"mattes/{matte}") == whole
+            assert second.client.capture(uploaded["id"])["name"] == "ball"
+            chunk = f"mattes/{matte}/S/c/0/0/0"
+            data_of = bytearray(Objects(s3).load(chunk))
+            data_of[9] ^= 1
+            Objects(s3).store(chunk, iter([bytes(data_of)]))
+            looked = envmatte("verify", *where, "--json")
+            report = json.loads(looked.stdout)
+            assert (looked.returncode, report["read"]["unchecked"]) == (1, 0)
+            assert [(one["what"], one["object"]) for one in report["findings"]] == [("damaged", chunk)]
+            problem = second.http.get(f"/v1/mattes/{matte}/layers/S.png")
+            assert problem.status_code == 500
+            assert chunk in problem.json()["detail"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("backup", "ftp://x/y"), "give it as a folder, or as s3://BUCKET/PREFIX"),
+        (("backup", "target", "--data", "none"), "there is no database"),
+        (("verify", "--data", "none"), "there is no database"),
+        (("restore", "none", "--data", "new"), "there is no folder"),
+    ],
+)
+def test_what_can_not_be_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], said: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = envmatte(*arguments, PYTHONPATH=str(Path(__file__).parents[3]))
+    assert done.returncode in (1, 2)
+    assert said in done.stderr
+    assert done.stdout == ""
+    assert not (tmp_path / "none").exists()

@@ -1,0 +1,108 @@
+"""Who connects and is slow, or means no good, keeps nobody else out."""
+
+import contextlib
+import resource
+import socket
+import statistics
+import time
+from collections.abc import Iterator
+from urllib.parse import urlsplit
+
+import psutil
+import pytest
+
+from services.api.http import slow_clients
+from tests.end_to_end.conftest import Service
+
+pytestmark = pytest.mark.full
+
+
+@contextlib.contextmanager
+def connected(service: Service, count: int = 1) -> Iterator[list[socket.socket]]:
+    url = urlsplit(service.url)
+    assert url.hostname is not None
+    with contextlib.ExitStack() as stack:
+        yield [
+            stack.enter_context(socket.create_connection((url.hostname, url.port), timeout=90))
+            for _ in range(count)
+        ]
+
+
+def answer(connection: socket.socket) -> bytes:
+    """All that comes until the other side closes."""
+    came = b""
+    with contextlib.suppress(ConnectionResetError):
+        while part := connection.recv(1 << 16):
+            came += part
+    return came
+
+
+def test_thousands_that_say_nothing_keep_nobody_out_and_are_closed(service: Service) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    count = min(10_000, hard - 1000)  # of this process, and as many of the service's own
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    process = psutil.Process(service.process.pid)
+    before, most = process.num_fds(), 0
+    try:
+        for _ in range(5):  # a busy machine may take longer to open them all than the first ones are kept
+            with connected(service, count) as idle:
+                times = []
+                for _ in range(100):
+                    most = max(most, process.num_fds() - before)
+                    start = time.perf_counter()
+                    assert service.http.get("/healthz").status_code == 200
+                    times.append(time.perf_counter() - start)
+                assert answer(idle[-1]) == b""
+            give_up = time.monotonic() + 60
+            while process.num_fds() - before > 50:
+                assert time.monotonic() < give_up
+                time.sleep(0.1)
+            slowest = 1e3 * statistics.quantiles(times, n=100)[98]
+            print(f"{most} of {count} idle connections held at once: {slowest:.1f} ms at p99")
+            if most > 0.95 * count:
+                break
+        else:
+            pytest.fail(f"of {count} connections {most} at most were held at once")
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def test_a_head_that_comes_byte_by_byte_is_not_waited_for(service: Service) -> None:
+    begun = time.monotonic()
+    with connected(service) as (slow,):
+        slow.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert slow.recv(1 << 16).startswith(b"HTTP/1.1 200")
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            while time.monotonic() - begun < 2 * slow_clients.HEAD:
+                slow.sendall(b"G")
+                time.sleep(0.5)
+    assert time.monotonic() - begun < 1.5 * slow_clients.HEAD
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        b"GET / HTTP/1.1\r\nHost: localhost\r\nLong: " + (1 << 20) * b"x",
+        b"GET /" + (1 << 20) * b"x" + b" HTTP/1.1\r\nHost: localhost\r\n\r\n",
+        b"no request at all\r\n\r\n",
+        b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5\r\nContent-Length: 6\r\n\r\n{}   ",
+        b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 2\r\nTransfer-Encoding: gzip\r\n\r\n{}",
+    ],
+    ids=["a long header", "a long path", "noise", "two lengths", "an unknown encoding"],
+)
+def test_what_is_no_request_is_refused_and_the_connection_closed(service: Service, sent: bytes) -> None:
+    with connected(service) as (connection,):
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            connection.sendall(sent)
+        assert answer(connection)[:12] in (b"", b"HTTP/1.1 400", b"HTTP/1.1 501")
+    assert service.http.get("/healthz").status_code == 200
+
+
+def test_a_half_closed_connection_counts_as_gone(service: Service) -> None:
+    """A client that closes looks the same until it is written to, and computing for nobody would cost more."""
+    for sent in (b"GET /v1/jobs HTTP/1.1\r\nHost: localhost\r\n\r\n", b"GET /healthz HT"):
+        with connected(service) as (half,):
+            half.sendall(sent)
+            half.shutdown(socket.SHUT_WR)
+            assert answer(half)[:12] in (b"", b"HTTP/1.1 200", b"HTTP/1.1 400")
+    assert service.http.get("/healthz").status_code == 200

@@ -1,0 +1,189 @@
+"""The command line against a real service."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.end_to_end.conftest import Service, png
+from workflows.images import integer_formats
+from workflows.programs import presets
+from workflows.programs.preset_names import PRESETS
+from workflows.programs.program import Program
+
+
+def envmatte(service: Service, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "services", *arguments, "--url", service.url]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+
+
+def test_from_a_capture_to_a_composite(service: Service, bundle: Path, tmp_path: Path) -> None:
+    uploaded = envmatte(service, "upload", str(bundle), "--name", "by hand")
+    assert uploaded.returncode == 0, uploaded.stderr
+    assert "upload: 100%" in uploaded.stderr
+    capture = uploaded.stdout.strip()
+    assert service.client.capture(capture)["name"] == "by hand"
+
+    recovered = envmatte(service, "recover", capture, "--option", "tile=48", "--json")
+    job = json.loads(recovered.stdout)
+    assert (job["state"], job["options"]["tile"]) == ("succeeded", 48)
+    assert "recovery: 100%" in recovered.stderr
+    assert envmatte(service, "status", job["id"]).stdout.split() == ["succeeded", "succeeded", "1.0"]
+
+    backdrop = tmp_path / "backdrop.png"
+    backdrop.write_bytes(png(np.full((4, 4, 3), 0.5, np.float32), "srgb", np.uint8))
+    composite = tmp_path / "composite.png"
+    done = envmatte(service, "composite", job["matte"], str(backdrop), "-o", str(composite))
+    assert done.stdout.strip() == str(composite)
+    assert integer_formats.decode(composite.read_bytes(), memory=1 << 24).shape == (72, 96, 3)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["backdrop.png", "composite.png"]
+
+
+def test_what_the_service_refuses_is_told_with_exit_code_1(service: Service, tmp_path: Path) -> None:
+    broken = tmp_path / "broken.zip"
+    broken.write_bytes(b"no zip")
+    for arguments, said in (
+        (["upload", str(broken)], "cut off"),
+        (["recover", "no-such-capture"], "no-such-capture"),
+        (["status", "no-such-job"], "no-such-job"),
+    ):
+        refused = envmatte(service, *arguments)
+        assert (refused.returncode, refused.stdout) == (1, "")
+        assert said in refused.stderr
+        assert "Traceback" not in refused.stderr
+
+
+def test_a_wrong_command_line_has_exit_code_2(service: Service) -> None:
+    for arguments in (
+        ["recover"],
+        ["upload", "no-such-file.zip"],
+        ["recover", "x", "--option", "tile"],
+        ["fly"],
+    ):
+        assert envmatte(service, *arguments).returncode == 2
+
+
+def test_an_interrupt_stops_the_waiting_and_not_the_job(service: Service, capture: str) -> None:
+    command = [sys.executable, "-m", "services", "recover", capture, "--url", service.url]
+    waiting = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    newest = service.http.get("/v1/jobs?limit=1").json()["jobs"][0]["id"]
+    while (job := service.http.get("/v1/jobs?limit=1").json()["jobs"][0])["id"] == newest:
+        time.sleep(0.01)
+    time.sleep(0.3)
+    os.kill(waiting.pid, signal.SIGINT)
+    _, said = waiting.communicate(timeout=20)
+    assert waiting.returncode == 130
+    assert "Interrupted" in said
+    assert service.client.wait(job["id"])["state"] == "succeeded"
+
+
+def patterns(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "services", "patterns", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_the_patterns_of_a_preset_are_written_as_they_are(preset: str, tmp_path: Path) -> None:
+    folder = tmp_path / "new" / "patterns"
+    done = patterns(preset, str(folder), "--monitor", "160x120", "--json")
+    assert done.returncode == 0, done.stderr
+    assert "patterns: 100%" in done.stderr
+    program = presets.preset(preset, 160, 120)
+    assert json.loads(done.stdout) == {
+        "folder": str(folder),
+        "preset": preset,
+        "monitor": [160, 120],
+        "patterns": program.count,
+    }
+    assert Program.model_validate_json((folder / "program.json").read_text()) == program
+    names = [f"{n:05d}.png" for n in range(program.count)]
+    assert sorted(path.name for path in folder.iterdir()) == [*names, "program.json"]
+    assert [path.name for path in folder.parent.iterdir()] == ["patterns"]
+    for name, picture in zip(names, program.pictures(0, program.count), strict=True):
+        with Image.open(folder / name) as image:
+            pixels = np.asarray(image)
+        values = pixels.astype(np.float32) / np.float32(1 if pixels.dtype == bool else 255)
+        if pixels.ndim == 2:
+            values = np.broadcast_to(values[..., None], picture.shape)
+            # As small as can be: 1 bit where black and white is all there is.
+            assert (pixels.dtype == bool) == set(np.unique(picture)).issubset({0.0, 1.0})
+        else:
+            assert np.any(picture != picture[..., :1])
+        np.testing.assert_array_equal(values, picture)
+
+
+def test_every_preset_is_described_in_the_help() -> None:
+    assert set(PRESETS) == set(presets.PRESETS)
+    said = patterns("--help").stdout
+    for name, text in PRESETS.items():
+        assert text.startswith(f"{presets.preset(name).count} frames")
+        assert any(line.split(maxsplit=1) == [name, text] for line in said.splitlines())
+
+
+def test_patterns_go_into_a_new_or_empty_folder_alone(tmp_path: Path) -> None:
+    done = patterns("sketch", str(tmp_path), "--monitor", "16x12")
+    assert (done.returncode, done.stdout) == (0, f"{tmp_path}\n")
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert len(before) == 33
+    again = patterns("default", str(tmp_path), "--monitor", "16x12")
+    assert (again.returncode, again.stdout) == (2, "")
+    assert "is not empty" in again.stderr
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["best", "x"], "is not one of 'default'"),
+        (["quick"], "OUT"),
+        (["quick", "x", "--monitor", "1280"], "WIDTHxHEIGHT"),
+        (["quick", "x", "--monitor", "2x2"], "too small"),
+        (["quick", "x", "--monitor", "99999x960"], "less than or equal to 16384"),
+    ],
+)
+def test_patterns_that_can_not_be_made_are_refused(arguments: list[str], said: str, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "services", "patterns", *arguments]
+    refused = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert (refused.returncode, refused.stdout) == (2, "")
+    assert said in refused.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_film_is_made_of_a_preset_and_of_its_record(tmp_path: Path) -> None:
+    film = tmp_path / "new" / "sketch.mp4"
+    done = patterns("sketch", str(film), "--monitor", "320x240", "--rate", "10", "--json")
+    assert done.returncode == 0, done.stderr
+    assert "patterns: 100% 42 of 42" in done.stderr
+    assert json.loads(done.stdout) == {
+        "video": str(film),
+        "preset": "sketch",
+        "monitor": [296, 216],
+        "patterns": 32,
+    }
+    assert sorted(path.name for path in film.parent.iterdir()) == ["sketch.json", "sketch.mp4"]
+    again = patterns(str(film.with_suffix(".json")), str(tmp_path / "again.mp4"), "--rate", "10")
+    assert again.returncode == 0, again.stderr
+    assert (tmp_path / "again.mp4").read_bytes() == film.read_bytes()
+    refused = patterns("sketch", str(film))
+    assert (refused.returncode, refused.stdout) == (2, "")
+    assert "is there already" in refused.stderr
+
+
+@pytest.mark.parametrize(("out", "first"), [("patterns", "1 of 432"), ("patterns.mkv", "1 of 442")])
+def test_interrupted_patterns_leave_nothing(out: str, first: str, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "services", "patterns", "paper-400", str(tmp_path / out)]
+    writing = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    assert writing.stderr is not None
+    assert first in writing.stderr.readline()
+    os.kill(writing.pid, signal.SIGINT)
+    _, said = writing.communicate(timeout=20)
+    assert writing.returncode == 130
+    assert "Interrupted" in said
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,41 @@
+"""The demo, as a new user runs it."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+from PIL import Image
+
+
+@pytest.mark.full
+def test_the_demo_leaves_its_picture(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "services", "demo", "-o", "picture.png", "--keep", "kept", "--json"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stderr
+    figures = json.loads(done.stdout)
+    assert figures["psnr_db"] > 26
+    assert figures["object_pixels"] > 10_000
+    with Image.open(tmp_path / "picture.png") as picture:
+        assert picture.width > 4 * picture.height
+    assert sorted(path.name for path in (tmp_path / "kept").iterdir()) == ["backdrop.png", "glass-ball.zip"]
+    assert "done" in done.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends a process with its parent")
+def test_the_service_of_one_that_is_killed_ends(tmp_path: Path) -> None:
+    script = (
+        "import sys, time; from pathlib import Path; from services.cli.demo_run import service\n"
+        "with service(Path(sys.argv[1], 'data'), 1) as url: print(url, flush=True); time.sleep(300)"
+    )
+    command = [sys.executable, "-c", script, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as demo:
+        assert demo.stdout is not None
+        assert demo.stdout.readline().startswith("http://127.0.0.1:")
+        family = psutil.Process(demo.pid).children(recursive=True)
+        assert len(family) > 1
+        demo.kill()
+    _, alive = psutil.wait_procs(family, timeout=60)
+    assert alive == []

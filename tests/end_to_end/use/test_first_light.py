@@ -1,0 +1,175 @@
+"""A capture goes in over HTTP, a composite comes out."""
+
+import io
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.end_to_end.captures.test_uploads import gone
+from tests.end_to_end.conftest import Service, digests, png
+from workflows.images import integer_formats
+from workflows.images.tone_curves import to_light
+from workflows.programs.program import Images, Program
+from workflows.simulation.scene import Scene, write_capture
+
+
+def test_an_upload_is_ingested(service: Service, bundle: Path, scene: Scene) -> None:
+    headers = {"Content-Type": "application/zip"}
+    answer = service.http.post("/v1/captures?name=mine", content=bundle.read_bytes(), headers=headers)
+    assert answer.status_code == 201
+    made = answer.json()
+    assert answer.headers["location"] == f"/v1/captures/{made['id']}"
+    assert (made["name"], made["bytes"]) == ("mine", bundle.stat().st_size)
+    job = service.client.wait(made["job"])
+    assert (job["kind"], job["state"], job["progress"], job["problem"]) == ("ingest", "succeeded", 1, None)
+    found = service.client.capture(made["id"])
+    assert (found["state"], found["width"], found["height"], found["frames"]) == ("ready", 96, 72, 57)
+    assert datetime.fromisoformat(found["created_at"]).utcoffset() is not None
+    gone(service, made["id"])
+
+
+def test_frames_are_kept_as_they_were_filmed(service: Service, capture: str, scene: Scene, program) -> None:
+    filmed = list(scene.film(program))
+    for n in (0, 30, 56):
+        answer = service.http.get(f"/v1/captures/{capture}/frames/{n}.png")
+        assert answer.headers["content-type"] == "image/png"
+        np.testing.assert_array_equal(integer_formats.decode(answer.content, memory=1 << 24), filmed[n])
+
+
+def test_a_recovery_goes_from_queued_to_succeeded(service: Service, capture: str) -> None:
+    answer = service.http.post(
+        "/v1/jobs", json={"capture": capture, "options": {"method": "lobes", "tile": 32}}
+    )
+    assert answer.status_code == 202
+    posted = answer.json()
+    assert answer.headers["location"] == f"/v1/jobs/{posted['id']}"
+    seen: list[dict] = []
+    ended = service.client.wait(posted["id"], progress=seen.append, poll=0.02)
+    progress = [job["progress"] for job in seen]
+    assert progress == sorted(progress)
+    assert progress[-1] == 1
+    assert ended["tiles"] == {"total": 9, "done": 9, "failed": 0}
+    assert ended["pixels"] == 96 * 72
+    assert ended["run_seconds"] > 0
+    log = [line["text"] for line in service.http.get(f"/v1/jobs/{posted['id']}/log").json()["lines"]]
+    assert log == ["queued", "preparing", "recovering", "finishing", "succeeded"]
+
+
+def test_a_job_may_be_posted_while_its_capture_is_ingesting(service: Service, bundle: Path) -> None:
+    uploaded = service.client.upload(bundle)
+    job = service.client.recover(uploaded["id"])
+    assert service.client.wait(job["id"])["state"] == "succeeded"
+
+
+@pytest.mark.parametrize("transfer", ["srgb", "linear"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_a_composite_is_close_to_the_truth(
+    service: Service, matte: str, scene: Scene, transfer: str, dtype: type
+) -> None:
+    # Soft enough for the 32 x 24 cells of the program; what the grid can't show is measured elsewhere.
+    y, x = np.mgrid[:96, :128] / 128
+    backdrop = np.stack([x, 1 - x, 0.5 + 0.4 * np.sin(9 * y)], axis=-1).astype(np.float32)
+    answer = service.client.composite(matte, png(backdrop, transfer, dtype), transfer=transfer)
+    pixels = integer_formats.decode(answer, memory=1 << 24)
+    assert (pixels.shape, pixels.dtype) == ((72, 96, 3), dtype)
+    error = to_light(integer_formats.to_unit(pixels), transfer) - np.clip(scene.truth(backdrop), 0, 1)
+    assert -10 * np.log10(np.mean(error[scene.object_mask] ** 2)) > 32
+
+
+def test_a_composite_says_where_its_time_went(service: Service, matte: str) -> None:
+    answer = service.http.post(
+        f"/v1/mattes/{matte}/composite", content=png(np.ones((4, 4, 3), "f4"), "srgb", np.uint8)
+    )
+    assert answer.headers["content-type"] == "image/png"
+    names = [part.split(";")[0] for part in answer.headers["server-timing"].split(", ")]
+    assert names == ["open", "decode", "composite", "encode"]
+
+
+def test_what_the_mask_left_out_is_transparent(
+    service: Service, scene: Scene, program, tmp_path: Path
+) -> None:
+    masked = tmp_path / "masked.zip"
+    write_capture(scene, program, masked, mask=True)
+    uploaded = service.client.upload(masked)
+    job = service.client.wait(service.client.recover(uploaded["id"])["id"])
+    assert job["pixels"] == scene.object_mask.sum()
+    answer = service.client.composite(job["matte"], png(np.ones((4, 4, 3), "f4"), "srgb", np.uint8))
+    with Image.open(io.BytesIO(answer)) as picture:
+        alpha = np.asarray(picture)[..., 3]
+    np.testing.assert_array_equal(alpha > 0, scene.object_mask)
+    confidence = integer_formats.decode(service.client.layer(job["matte"], "confidence.png"), memory=1 << 24)[
+        ..., 0
+    ]
+    assert confidence.dtype == np.uint16
+    np.testing.assert_array_equal(confidence > 0, scene.object_mask)
+    assert np.unique(confidence).size > 100
+
+
+def test_lists_are_newest_first_and_go_on_after(service: Service, bundle: Path) -> None:
+    made = [service.client.upload(bundle)["id"] for _ in range(3)]
+    ids = [item["id"] for item in service.http.get("/v1/captures?limit=3").json()["captures"]]
+    assert ids == made[::-1]
+    rest = service.http.get("/v1/captures", params={"limit": 1, "after": ids[0]}).json()["captures"]
+    assert [item["id"] for item in rest] == [made[1]]
+    for capture in made:
+        job = service.client.capture(capture)["job"]
+        service.client.wait(job)
+    states = {job["state"] for job in service.http.get("/v1/jobs?state=succeeded").json()["jobs"]}
+    assert states == {"succeeded"}
+
+
+def test_a_repeated_post_makes_one_thing(service: Service, bundle: Path, capture: str) -> None:
+    headers = {"Content-Type": "application/zip", "Idempotency-Key": "upload-1"}
+    first, second = (
+        service.http.post("/v1/captures", content=bundle.read_bytes(), headers=headers).json()["id"]
+        for _ in "ab"
+    )
+    assert first == second
+    key = {"Idempotency-Key": "job-1"}
+    jobs = {service.http.post("/v1/jobs", json={"capture": capture}, headers=key).json()["id"] for _ in "ab"}
+    assert len(jobs) == 1
+
+
+def test_deleting_takes_everything_with_it(service: Service, bundle: Path) -> None:
+    uploaded = service.client.upload(bundle)
+    job = service.client.wait(service.client.recover(uploaded["id"])["id"])
+    assert any(job["matte"] in name for name in service.stored())
+    assert service.http.delete(f"/v1/mattes/{job['matte']}").status_code == 204
+    assert service.http.delete(f"/v1/captures/{uploaded['id']}").status_code == 204
+    assert service.http.delete(f"/v1/jobs/{job['id']}").status_code == 204
+    assert not [name for name in service.stored() if job["matte"] in name or uploaded["id"] in name]
+    for path in (f"mattes/{job['matte']}", f"captures/{uploaded['id']}", f"jobs/{job['id']}"):
+        assert service.http.get(f"/v1/{path}").status_code == 404
+
+
+def test_the_service_says_that_it_is_well(service: Service) -> None:
+    assert service.http.get("/healthz").json() == {"status": "alive"}
+    answer = service.http.get("/readyz")
+    assert answer.status_code == 200, answer.text
+    assert answer.json() == {"ready": True, "database": "ok", "store": "ok", "cluster": "ok"}
+
+
+def test_options_are_described(service: Service) -> None:
+    options = {option["name"]: option for option in service.http.get("/v1/options").json()["options"]}
+    assert options["method"]["values"] == ["lobes", "nn-dgsr"]
+    assert options["method"]["default"] == "lobes"
+    assert (options["tile"]["minimum"], options["tile"]["maximum"]) == (16, 1024)
+    assert all(option["description"] for option in options.values())
+
+
+def test_patterns_may_come_as_images(
+    service: Service, matte: str, scene: Scene, program: Program, tmp_path: Path
+) -> None:
+    constant, *bands = program.parts
+    shown = [pattern.astype(np.float32) for band in bands for pattern in band.bits]
+    files = tuple(f"patterns/{n}.png" for n in range(len(shown)))
+    same = Program(monitor=program.monitor, parts=(constant, Images(kind="images", files=files)))
+    bundle = tmp_path / "images.zip"
+    write_capture(scene, same, bundle, images=shown)
+    uploaded = service.client.upload(bundle)
+    job = service.client.wait(service.client.recover(uploaded["id"])["id"])
+    mattes = service.data / "store" / "mattes"
+    assert digests(mattes / job["matte"]) == digests(mattes / matte)

@@ -1,0 +1,196 @@
+"""Programs over HTTP: kept by their content, and all their files made on request."""
+
+import io
+import json
+import zipfile
+from pathlib import Path
+
+import av
+import httpx2
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.end_to_end.captures.test_bad_input import check_problem
+from tests.end_to_end.conftest import Service, serving
+from workflows.programs import video as program_video
+from workflows.programs.border import Border
+from workflows.programs.files import fitted, pictures, record
+from workflows.programs.preset_names import PRESETS
+from workflows.programs.program import Program
+
+SKETCH = fitted("sketch", (320, 240), bordered=True)
+CONSTANT = {"kind": "constant", "levels": [0, 1]}
+
+
+def grid(columns: int, rows: int, count: int) -> dict:
+    return {"kind": "bernoulli", "columns": columns, "rows": rows, "count": count, "seed": 1}
+
+
+@pytest.fixture(scope="module")
+def program(service: Service) -> dict:
+    asked = {"preset": "sketch", "monitor": {"width": 320, "height": 240}, "border": True}
+    answer = service.http.post("/v1/programs", json=asked)
+    assert answer.status_code == 201, answer.text
+    found: dict = answer.json()
+    assert answer.headers["location"] == f"/v1/programs/{found['id']}"
+    return found
+
+
+def test_a_program_is_kept_once_whatever_it_came_from(service: Service, program: dict) -> None:
+    assert Program.model_validate(program["program"]) == SKETCH
+    assert program["patterns"] == 32
+    assert program["monitor"] == {"width": 296, "height": 216}
+    assert program["display"] == {"width": 320, "height": 240}
+    again = service.http.post(
+        "/v1/programs", json={"program": record(SKETCH)}, headers={"Idempotency-Key": "again"}
+    )
+    assert (again.status_code, again.json()) == (201, program)
+    assert service.http.get(f"/v1/programs/{program['id']}").json() == program
+    listed = service.http.get("/v1/programs").json()["programs"]
+    assert [one["id"] for one in listed].count(program["id"]) == 1
+    made = service.http.get(f"/v1/programs/{program['id']}/program.json").json()
+    assert Program.model_validate(made) == SKETCH
+
+
+def test_presets_are_listed(service: Service) -> None:
+    listed = service.http.get("/v1/presets").json()["presets"]
+    assert {one["name"]: one["description"] for one in listed} == PRESETS
+
+
+def test_a_program_is_made_for_another_monitor_on_request(service: Service) -> None:
+    asked = {"program": record(SKETCH), "monitor": {"width": 640, "height": 480}}
+    for border, size in ((False, (640, 480)), (True, (592, 432))):
+        found = service.http.post("/v1/programs", json=asked | {"border": border}).json()
+        assert (found["monitor"]["width"], found["monitor"]["height"]) == size
+    small = service.http.post(
+        "/v1/programs", json={"preset": "sketch", "monitor": {"width": 30, "height": 20}}
+    )
+    assert small.json()["display"] is None
+    check_problem(service.http.get(f"{small.headers['location']}/patterns.mp4"), 422, "bad-option")
+
+
+def test_patterns_are_drawn_one_by_one_and_all_in_a_zip(service: Service, program: dict) -> None:
+    url = f"/v1/programs/{program['id']}"
+    zipped = service.http.get(f"{url}/patterns.zip")
+    assert zipped.headers["content-type"] == "application/zip"
+    every = list(pictures(SKETCH))
+    with zipfile.ZipFile(io.BytesIO(zipped.content)) as archive:
+        assert len(archive.namelist()) == 33
+        assert Program.model_validate_json(archive.read("program.json")) == SKETCH
+        for n in (0, 5, 31):
+            answer = service.http.get(f"{url}/patterns/{n}.png")
+            assert answer.headers["content-type"] == "image/png"
+            assert answer.content == archive.read(f"{n:05d}.png")
+            pixels = np.asarray(Image.open(io.BytesIO(answer.content)).convert("RGB"))
+            np.testing.assert_array_equal(pixels, np.broadcast_to(every[n], pixels.shape))
+    for n in (-1, 32):
+        problem = check_problem(service.http.get(f"{url}/patterns/{n}.png"), 404, "not-found")
+        assert "0 to 31" in problem["detail"]
+
+
+def test_the_video_is_the_one_of_the_command(service: Service, program: dict, tmp_path: Path) -> None:
+    answer = service.http.get(f"/v1/programs/{program['id']}/patterns.mp4?rate=10")
+    assert answer.headers["content-type"] == "video/mp4"
+    assert int(answer.headers["content-length"]) == len(answer.content)
+    program_video.write(SKETCH, tmp_path / "film.mp4", 10, lambda done, of: None)
+    assert answer.content == (tmp_path / "film.mp4").read_bytes()
+    with av.open(io.BytesIO(answer.content)) as video:
+        stream = video.streams.video[0]
+        assert (stream.width, stream.height, stream.average_rate) == (320, 240, 10)
+    check_problem(service.http.get(f"/v1/programs/{program['id']}/patterns.mp4?rate=99"), 422, "bad-request")
+
+
+@pytest.mark.parametrize(
+    ("body", "slug", "said"),
+    [
+        ({}, "bad-request", "either a preset or a program"),
+        ({"preset": "sketch", "program": record(SKETCH)}, "bad-request", "either a preset or a program"),
+        ({"preset": "best"}, "bad-option", "default, quick"),
+        ({"preset": "quick", "monitor": {"width": 5, "height": 5}}, "bad-option", "too small"),
+        (
+            {"preset": "quick", "monitor": {"width": 5, "height": 5}, "border": True},
+            "bad-option",
+            "no border",
+        ),
+        ({"preset": "quick", "monitor": {"width": 0, "height": 5}}, "bad-request", "monitor.width"),
+        (
+            {"preset": "quick", "monitor": {"width": 9000, "height": 9000}},
+            "bad-option",
+            "pixels of the monitor",
+        ),
+        (
+            {"preset": "paper-400", "monitor": {"width": 4096, "height": 4096}},
+            "bad-option",
+            "patterns together",
+        ),
+        (
+            {"program": {"monitor": {"width": 8, "height": 8}, "parts": [CONSTANT, grid(2, 2, 5000)]}},
+            "bad-option",
+            "5002 patterns",
+        ),
+        (
+            {
+                "program": {
+                    "monitor": {"width": 8, "height": 8},
+                    "parts": [CONSTANT, grid(2, 2, 5), grid(3, 3, 5)],
+                }
+            },
+            "bad-option",
+            "nest",
+        ),
+        ({"program": {"monitor": {"width": 8, "height": 8}, "parts": [CONSTANT]}}, "bad-request", "constant"),
+        (
+            {
+                "program": {
+                    "monitor": {"width": 8, "height": 8},
+                    "parts": [CONSTANT, {"kind": "images", "files": ["/etc/passwd"]}],
+                }
+            },
+            "bad-option",
+            "images",
+        ),
+    ],
+)
+def test_a_program_that_can_not_be_shown_is_refused(
+    service: Service, body: dict, slug: str, said: str
+) -> None:
+    before = service.http.get("/v1/programs").json()
+    problem = check_problem(service.http.post("/v1/programs", json=body), 422, slug)
+    assert said in problem["detail"]
+    assert service.http.get("/v1/programs").json() == before
+
+
+def test_a_body_that_is_no_program_is_refused(service: Service) -> None:
+    many = json.dumps({"program": {"parts": [grid(2, 2, 2)] * 2000}}).encode()
+    check_problem(service.http.post("/v1/programs", content=many), 413, "too-large")
+    check_problem(service.http.post("/v1/programs", content=b"{"), 422, "bad-request")
+
+
+def test_a_deleted_program_is_gone_with_all_its_files(service: Service) -> None:
+    asked = {"preset": "sketch", "monitor": {"width": 200, "height": 150}}
+    url = service.http.post("/v1/programs", json=asked).headers["location"]
+    assert service.http.delete(url).status_code == 204
+    for rest in ("", "/program.json", "/patterns.zip", "/patterns.mp4", "/patterns/0.png"):
+        check_problem(service.http.get(url + rest), 404, "not-found")
+    check_problem(service.http.delete(url), 404, "not-found")
+    assert service.http.post("/v1/programs", json=asked).headers["location"] == url
+
+
+@pytest.mark.full
+def test_a_key_is_asked_for_but_for_the_page(tmp_path: Path) -> None:
+    with serving(tmp_path / "data", ENVMATTE_KEYS="secret") as locked:
+        key = {"Authorization": "Bearer secret"}
+        asked = {"preset": "sketch", "monitor": {"width": 320, "height": 240}}
+        check_problem(locked.http.post("/v1/programs", json=asked), 401, "unauthorized")
+        url = locked.http.post("/v1/programs", json=asked, headers=key).headers["location"]
+        for rest in ("", "/program.json", "/patterns.zip", "/patterns.mp4", "/patterns/0.png"):
+            check_problem(locked.http.get(url + rest), 401, "unauthorized")
+            assert locked.http.get(url + rest, headers=key).status_code == 200
+        page = locked.http.get(f"{url}/play")
+        assert page.headers["content-type"].startswith("text/html")
+        assert locked.http.get(str(httpx2.URL(page.url).join("../../../web/play.js"))).status_code == 200
+
+
+def test_the_display_has_the_monitor_inside(service: Service, program: dict) -> None:
+    assert Border.model_validate(program["display"]).inner[2:] == (296, 216)

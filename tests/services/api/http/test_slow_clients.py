@@ -1,0 +1,217 @@
+"""Who takes his answer slowly, or never, or begins a body and falls silent, on a real port."""
+
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx2
+import psutil
+import pytest
+import uvicorn
+
+from services.api.app import build_app
+from services.api.http import slow_clients
+from services.api.http.slow_clients import Connection
+from services.settings import Settings
+from storage.database.engine import open_engine
+from storage.objects.store import Objects
+from tests.services.api.mattes.archives import archive
+from tests.services.cluster.clusters import wait
+
+pytestmark = pytest.mark.full
+
+PATIENCE = 1.0
+SIZE = 1200, 800
+"""Of a matte whose layers are some 10 MB."""
+
+
+@dataclass
+class Served:
+    """An API without a coordinator, in this process."""
+
+    server: uvicorn.Server
+    port: int
+    matte: str
+    folder: Path
+
+    @property
+    def count(self) -> int:
+        """Its connections."""
+        return len(self.server.server_state.connections)
+
+    def ask(self, path: str) -> httpx2.Response:
+        return httpx2.get(f"http://127.0.0.1:{self.port}{path}", timeout=60)
+
+    @contextlib.contextmanager
+    def connected(self, sent: bytes, room: int = 1 << 14) -> Iterator[socket.socket]:
+        """A connection that has little room for answers, and has sent something."""
+        with socket.socket() as connection:
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, room)
+            connection.settimeout(60)
+            connection.connect(("127.0.0.1", self.port))
+            connection.sendall(sent)
+            yield connection
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    folder = tmp_path_factory.mktemp("served")
+    settings = Settings(data=folder)
+    engine = open_engine(settings.database_url)
+    app = build_app(settings, engine, Objects(settings.store_url))
+    config = uvicorn.Config(app, port=0, http=Connection, log_config=None, lifespan="off")
+    with pytest.MonkeyPatch.context() as patch, config.bind_socket() as bound:
+        patch.setattr(slow_clients, "PATIENCE", PATIENCE)
+        server = uvicorn.Server(config)
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [bound]})
+        thread.start()
+        port = bound.getsockname()[1]
+        sent = httpx2.post(
+            f"http://127.0.0.1:{port}/v1/mattes",
+            content=archive(folder / "other", *SIZE),
+            headers={"Content-Type": "application/zip"},
+            timeout=60,
+        )
+        assert sent.status_code == 201, sent.text
+        yield Served(server, port, sent.json()["id"], folder)
+        server.should_exit = True
+        thread.join()
+    app.state.context.decoders.close()
+    engine.dispose()
+
+
+def get(path: str) -> bytes:
+    return f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode()
+
+
+def rest(connection: socket.socket) -> bytes:
+    """All that comes until the other side is gone."""
+    came = b""
+    with contextlib.suppress(ConnectionResetError):
+        while part := connection.recv(1 << 16):
+            came += part
+    return came
+
+
+def test_answers_that_nobody_takes_are_held_on_disk_and_given_up(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = f"/v1/mattes/{served.matte}/layers/S.exr"
+    whole = served.ask(path)
+    assert whole.status_code == 200
+    assert whole.headers["content-length"] == str(len(whole.content))
+    assert len(whole.content) > 6_000_000
+    monkeypatch.setattr(slow_clients, "PATIENCE", 30.0)  # at first: all of them are there at once
+    process, count = psutil.Process(), 12
+    before = process.memory_info().rss
+    with contextlib.ExitStack() as stack:
+        held = [stack.enter_context(served.connected(get(path))) for _ in range(count)]
+        for one in held:
+            assert one.recv(12) == b"HTTP/1.1 200"
+        grown = process.memory_info().rss - before
+        assert grown < count * len(whole.content) // 2, grown
+        assert served.ask(path).content == whole.content
+    wait(lambda: served.count == 0)
+    monkeypatch.setattr(slow_clients, "PATIENCE", PATIENCE)
+    with served.connected(get(path)) as one:
+        wait(lambda: served.count == 1)
+        wait(lambda: served.count == 0)
+        assert len(rest(one)) < len(whole.content) // 2
+
+
+def test_a_byte_now_and_then_is_not_enough(served: Served) -> None:
+    with served.connected(get(f"/v1/mattes/{served.matte}/layers/S.exr")) as one:
+        wait(lambda: one.recv(1) and served.count == 0)
+
+
+def test_who_is_slow_but_goes_on_gets_all_of_it(served: Served) -> None:
+    path = f"/v1/mattes/{served.matte}/archive"
+    sent = get(path).replace(b"\r\n\r\n", b"\r\nConnection: close\r\n\r\n")
+    size = int(served.ask(path).headers["content-length"])
+    begun = time.monotonic()
+    with served.connected(sent) as one:
+        came = 0
+        while part := one.recv(1 << 16):
+            came += len(part)
+            time.sleep(0.02)
+    assert came > size
+    assert time.monotonic() - begun > 2 * PATIENCE
+
+
+def test_a_half_closed_connection_that_takes_nothing_is_given_up(served: Served) -> None:
+    with served.connected(get(f"/v1/mattes/{served.matte}/archive")) as one:
+        assert one.recv(12) == b"HTTP/1.1 200"
+        one.shutdown(socket.SHUT_WR)
+        wait(lambda: served.count == 0)
+
+
+def head(method: str, path: str, **headers: str) -> bytes:
+    lines = [f"{method} {path} HTTP/1.1", "Host: localhost", "Content-Length: 1000000"]
+    lines += [f"{name.replace('_', '-')}: {value}" for name, value in headers.items()]
+    return "\r\n".join([*lines, "", ""]).encode()
+
+
+@pytest.mark.parametrize("crumbs", [b"", b"x"], ids=["silent", "a byte now and then"])
+@pytest.mark.parametrize(
+    ("path", "kind"),
+    [
+        ("/v1/captures", "application/zip"),
+        ("/v1/mattes", "application/zip"),
+        ("/v1/jobs", "application/json"),
+        ("/v1/mattes/MATTE/composite", "image/png"),
+        ("/v1/mattes/MATTE/composite", "video/mp4"),
+    ],
+)
+def test_a_body_that_does_not_go_on_is_given_up(served: Served, path: str, kind: str, crumbs: bytes) -> None:
+    before = files(served)
+    sent = head("POST", path.replace("MATTE", served.matte), Content_Type=kind) + b"{" * 2000
+    with served.connected(sent) as one:
+        wait(lambda: served.count == 1)
+        with contextlib.suppress(ConnectionError):
+            while served.count:
+                one.sendall(crumbs)
+                time.sleep(0.1)
+        assert rest(one) == b""
+    wait(lambda: files(served) == before)
+
+
+def test_of_an_upload_what_has_come_is_kept(served: Served) -> None:
+    tus = {"Tus-Resumable": "1.0.0", "Upload-Length": "1000000"}
+    where = httpx2.post(f"http://127.0.0.1:{served.port}/v1/uploads", headers=tus).headers["location"]
+    kind = {"Content_Type": "application/offset+octet-stream", "Upload_Offset": "0", "Tus_Resumable": "1.0.0"}
+    with served.connected(head("PATCH", where, **kind) + b"a" * 3000) as one:
+        assert rest(one) == b""
+
+    def offset() -> str:
+        url = f"http://127.0.0.1:{served.port}{where}"
+        return httpx2.head(url, headers={"Tus-Resumable": "1.0.0"}).headers["upload-offset"]
+
+    wait(lambda: offset() == "3000")
+
+
+def test_a_body_that_is_slow_but_goes_on_is_taken(served: Served) -> None:
+    size = 1_000_000
+    sent = head("POST", f"/v1/mattes/{served.matte}/composite", Connection="close")
+    begun = time.monotonic()
+    with served.connected(sent) as one:
+        for _ in range(50):
+            one.sendall(bytes(size // 50))
+            time.sleep(0.06)
+        assert rest(one).startswith(b"HTTP/1.1 422")
+    assert time.monotonic() - begun > 2 * PATIENCE
+
+
+def test_a_stream_of_events_that_has_nothing_to_say_lives_on(served: Served) -> None:
+    made = httpx2.post(f"http://127.0.0.1:{served.port}/v1/programs", json={"preset": "sketch"}).json()
+    with served.connected(get(f"/v1/programs/{made['id']}/events")) as one:
+        assert one.recv(12) == b"HTTP/1.1 200"
+        time.sleep(4 * PATIENCE)
+        assert served.count == 1
+
+
+def files(served: Served) -> set[Path]:
+    return {path for path in (served.folder / "store").rglob("*") if path.is_file()}

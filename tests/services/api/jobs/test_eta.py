@@ -1,0 +1,80 @@
+"""When a job will have succeeded, as the ledger tells it."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import Connection, Engine, update
+
+from services.api.jobs.eta import TYPICAL, seconds_left
+from storage.database import tables
+from storage.database.engine import open_engine, writing
+from storage.records import jobs, tiles
+from storage.steps import FINISH
+
+PLAN = {"tiles": 10, "slab": 4, "width": 160, "height": 120, "frames": 40, "video": False, "notes": []}
+FINISHING = TYPICAL * 40 * (160 * 120 + 100_000)
+
+
+@pytest.fixture
+def engine(tmp_path: Path) -> Iterator[Engine]:
+    opened = open_engine(f"sqlite:///{tmp_path / 'ledger.db'}")
+    yield opened
+    opened.dispose()
+
+
+def running(connection: Connection, kind: str, done: int, plan: dict[str, Any] = PLAN, **values: Any) -> str:
+    """A job of ten tiles, at a second each: its pace is measured from time 0 and tile 0 on."""
+    job = jobs.add(connection, kind, "a-capture", {})
+    tiles.begin(connection, job)
+    jobs.enter(connection, job, "reading")
+    tiles.lay_down(connection, job, plan)
+    tiles.finish(connection, job, [(tile, 1.0, 1) for tile in range(done)])
+    values = {"paced_at": 0.0, "paced_done": 0, "moved_at": float(done)} | values
+    connection.execute(update(tables.jobs).where(tables.jobs.c.id == job).values(values))
+    return job
+
+
+def ended(connection: Connection, finishing: float, plan: dict[str, Any] = PLAN) -> None:
+    """An ingest that has succeeded, its last step after some seconds."""
+    job = running(connection, "ingest", 10, plan)
+    tiles.finish(connection, job, [(FINISH, finishing, 0)])
+    jobs.end(connection, job, "succeeded")
+
+
+def left(connection: Connection, job: str, now: float) -> float | None:
+    return seconds_left(connection, jobs.get(connection, job), now)
+
+
+def test_a_recovery_goes_on_at_its_pace(engine: Engine) -> None:
+    with writing(engine) as c:
+        job = running(c, "recover", 2)
+        assert left(c, job, 2.0) == pytest.approx(8)
+        assert left(c, job, 2.5) == pytest.approx(7.5)
+        assert left(c, running(c, "recover", 10), 10.0) == 0
+        assert left(c, running(c, "recover", 2, paced_at=None), 2.0) is None
+
+
+def test_an_ingest_has_a_step_after_its_tiles(engine: Engine) -> None:
+    with writing(engine) as c:
+        assert left(c, running(c, "ingest", 2), 2.0) == pytest.approx(8 + FINISHING)
+        job = running(c, "ingest", 10, stage="finishing", stage_at=10.0)
+        assert left(c, job, 10.1) == pytest.approx(FINISHING - 0.1)
+        assert left(c, job, 1000.0) == 0
+        assert left(c, running(c, "ingest", 10), 11.0) == pytest.approx(FINISHING)
+
+
+def test_that_step_takes_what_it_took_others(engine: Engine) -> None:
+    with writing(engine) as c:
+        job = running(c, "ingest", 10)
+        ended(c, 60.0)  # the first on a machine compiles, and is no measure
+        assert left(c, job, 11.0) == pytest.approx(FINISHING)
+        ended(c, 3.0)
+        assert left(c, job, 11.0) == pytest.approx(3.0)
+        ended(c, 4.0)
+        ended(c, 5.0)
+        assert left(c, job, 11.0) == pytest.approx(4.0)
+        for _ in range(3):
+            ended(c, 20.0, PLAN | {"video": True})
+        assert left(c, job, 11.0) == pytest.approx(4.0)

@@ -1,0 +1,78 @@
+"""Webhooks that are named beside a body which is no JSON: the app, a real ledger and a real store."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy import Engine
+
+from services.api.app import build_app
+from services.settings import Settings
+from storage.database.engine import open_engine, reading, writing
+from storage.objects.store import Objects
+from storage.records import jobs, mattes
+from workflows.simulation import glass_ball
+from workflows.simulation.scene import nested_program, write_capture
+
+URL = "http://127.0.0.1:9/told?by=envmatte"
+ZIP = {"Content-Type": "application/zip"}
+VIDEO = {"Content-Type": "video/mp4"}
+
+
+@pytest.fixture
+def engine(tmp_path: Path) -> Iterator[Engine]:
+    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
+    with writing(engine) as c:
+        mattes.add_imported(c, "m", {}, {})
+    yield engine
+    engine.dispose()
+
+
+@pytest.fixture
+def bundle(tmp_path: Path) -> bytes:
+    program = nested_program(bands=((8, 6, 16),), levels=2)
+    write_capture(glass_ball.glass_ball(24, 16, rays=1), program, tmp_path / "ball.zip")
+    return (tmp_path / "ball.zip").read_bytes()
+
+
+def client(engine: Engine, tmp_path: Path, *, private: bool) -> TestClient:
+    """The API of a service without a coordinator: jobs stay queued."""
+    settings = Settings(data=tmp_path, webhook_secret=16 * "s", webhook_private=private)
+    app = build_app(settings, engine, Objects((tmp_path / "store").as_uri()))
+    return TestClient(app, "http://localhost")
+
+
+def webhook_of(engine: Engine, job: str) -> str | None:
+    with reading(engine) as c:
+        return jobs.get(c, job).webhook
+
+
+def test_captures_and_clips_take_one(engine: Engine, bundle: bytes, tmp_path: Path) -> None:
+    http = client(engine, tmp_path, private=True)
+    for told in ({"webhook": URL}, {}):
+        capture = http.post("/v1/captures", content=bundle, headers=ZIP, params=told)
+        assert webhook_of(engine, capture.json()["job"]) == told.get("webhook")
+        clip = http.post("/v1/mattes/m/composite", content=b"clip", headers=VIDEO, params=told)
+        assert clip.status_code == 202
+        assert webhook_of(engine, clip.json()["id"]) == told.get("webhook")
+        assert clip.json()["options"].keys() == {"transfer", "placement"}
+
+
+def test_an_address_that_is_not_public_is_refused(engine: Engine, bundle: bytes, tmp_path: Path) -> None:
+    http, told = client(engine, tmp_path, private=False), {"webhook": URL.replace("http:", "https:")}
+    for url, body, headers in (
+        ("/v1/captures", bundle, ZIP),
+        ("/v1/mattes/m/composite", b"clip", VIDEO),
+    ):
+        answer = http.post(url, content=body, headers=headers, params=told)
+        assert (answer.status_code, answer.json()["field"]) == (422, "webhook")
+    assert http.get("/v1/jobs").json() == {"jobs": []}
+    assert [path for path in (tmp_path / "store").rglob("*") if path.is_file()] == []
+
+
+def test_a_still_has_no_job_to_tell_of(engine: Engine, tmp_path: Path) -> None:
+    answer = client(engine, tmp_path, private=True).post(
+        "/v1/mattes/m/composite", content=b"picture", params={"webhook": URL}
+    )
+    assert (answer.status_code, answer.json()["field"]) == (422, "webhook")

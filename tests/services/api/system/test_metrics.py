@@ -1,0 +1,123 @@
+"""Figures and the cluster from a ledger alone: what is counted, and by how many short queries."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+from prometheus_client.parser import text_string_to_metric_families
+from sqlalchemy import Engine, event, update
+
+from services.api.app import build_app
+from services.settings import Settings
+from storage.database import tables
+from storage.database.engine import open_engine, writing
+from storage.objects.store import Objects
+from storage.records import captures, jobs, leases
+from storage.records import tiles as tile_records
+
+PROGRAM = {"parts": []}
+
+
+@pytest.fixture
+def engine(tmp_path: Path) -> Iterator[Engine]:
+    opened = open_engine(f"sqlite:///{tmp_path / 'ledger.db'}")
+    yield opened
+    opened.dispose()
+
+
+@pytest.fixture
+def client(engine: Engine, tmp_path: Path) -> Iterator[TestClient]:
+    app = build_app(Settings(data=tmp_path), engine, Objects((tmp_path / "store").as_uri()))
+    with TestClient(app, "http://localhost") as opened:
+        yield opened
+
+
+@pytest.fixture
+def job(engine: Engine) -> str:
+    """A recovery of 10 tiles: five done, of which two have gone missing, and one failed."""
+    with writing(engine) as c:
+        ingest = jobs.add(c, "ingest", "a-capture", {})
+        captures.add(c, "a-capture", ingest, name="", bytes=123, frames=4, program=PROGRAM)
+        jobs.add(c, "recover", "a-capture", {})
+        job = jobs.add(c, "recover", "a-capture", {})
+        tile_records.begin(c, job)
+        jobs.enter(c, job, "preparing")
+        tile_records.lay_down(c, job, {"tiles": 10})
+        jobs.enter(c, job, "recovering")
+        tile_records.finish(c, job, [(tile, 0.5, 100) for tile in range(5)])
+        tile_records.reopen(c, job, [1, 2], 8)
+        tile_records.miss(c, job, 7, "it is broken", 1)
+    return job
+
+
+def figures(client: TestClient) -> dict[tuple[str, ...], float]:
+    return {
+        (sample.name, *(sample.labels[name] for name in sorted(sample.labels))): sample.value
+        for family in text_string_to_metric_families(client.get("/metrics").text)
+        for sample in family.samples
+    }
+
+
+def test_tiles_are_counted_by_state(client: TestClient, job: str) -> None:
+    found = figures(client)
+    tiles = {s: found["envmatte_tiles", "recover", s] for s in ("queued", "done", "failed", "missing")}
+    assert tiles == {"queued": 4, "done": 3, "failed": 1, "missing": 2}
+    assert found["envmatte_tile_seconds_count", "recover"] == 5
+    assert found["envmatte_tile_seconds_sum", "recover"] == pytest.approx(2.5)
+    assert found["envmatte_pixels_total", "recover"] == 500
+    assert found["envmatte_tile_failures_total", "recover"] == 1
+    assert found["envmatte_tile_losses_total", "recover"] == 2
+    assert found["envmatte_jobs", "recover", "queued"] == 1
+    assert found["envmatte_capture_bytes", "ingesting"] == 123
+
+
+def test_without_a_coordinator_there_is_trouble(client: TestClient, engine: Engine) -> None:
+    assert figures(client)[("envmatte_trouble",)] == 1
+    assert ("envmatte_coordinator_last_sign_seconds",) not in figures(client)
+    assert "no coordinator" in client.get("/v1/cluster").json()["problem"]
+    with writing(engine) as c:
+        token = leases.take(c, "a-host:1")
+        assert token is not None
+    assert figures(client)[("envmatte_trouble",)] == 0
+    found = client.get("/v1/cluster").json()
+    assert (found["coordinator"]["holder"], found["problem"]) == ("a-host:1", None)
+    with writing(engine) as c:
+        leases.beat(c, token, {"workers": [], "problem": "no worker is connected"})
+    assert figures(client)[("envmatte_trouble",)] == 1
+    assert client.get("/v1/cluster").json()["problem"] == "no worker is connected"
+
+
+def test_memory_without_limit_has_none(client: TestClient, engine: Engine) -> None:
+    worker = {"address": "tls://a:1", "name": "a", "threads": 1, "memory_bytes": 5, "memory_limit_bytes": 7}
+    with writing(engine) as c:
+        token = leases.take(c, "a-host:1")
+        assert token is not None
+        leases.beat(c, token, {"workers": [worker, worker | {"memory_limit_bytes": None}], "problem": None})
+    found = client.get("/v1/cluster").json()
+    assert (found["memory_bytes"], found["memory_limit_bytes"], found["threads"]) == (10, None, 2)
+    assert figures(client)[("envmatte_workers_memory_bytes",)] == 10
+
+
+def test_the_queue_has_what_is_to_do_and_its_pace(client: TestClient, engine: Engine, job: str) -> None:
+    queue = client.get("/v1/cluster").json()["queue"]
+    assert (queue["jobs_queued"], queue["jobs_running"], queue["tiles_to_do"]) == (2, 1, 6)
+    assert queue["tiles_per_second"] is None
+    with writing(engine) as c:
+        values = {"paced_at": time.time() - 10, "paced_done": 1, "moved_at": time.time() - 2}
+        c.execute(update(tables.jobs).where(tables.jobs.c.id == job).values(values))
+    assert client.get("/v1/cluster").json()["queue"]["tiles_per_second"] == pytest.approx(0.5, rel=0.05)
+
+
+def test_no_query_goes_over_all_tiles(client: TestClient, engine: Engine, job: str) -> None:
+    """However many jobs there are it takes the same few, and of tiles only those that an index leads to."""
+    asked: list[tuple[str, object]] = []
+    event.listen(engine, "before_cursor_execute", lambda *a: asked.append((a[2], a[3])))
+    client.get("/metrics")
+    queries = [(query, given) for query, given in asked if query.startswith("SELECT")]
+    assert len(queries) <= 8
+    with engine.connect() as c:
+        for query, given in queries:
+            plan = c.exec_driver_sql(f"EXPLAIN QUERY PLAN {query}", given).all()  # type: ignore[arg-type]
+            assert not any(row.detail.startswith("SCAN tiles") for row in plan), (query, plan)

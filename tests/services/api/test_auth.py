@@ -1,0 +1,74 @@
+"""Who may call what, by keys: against a real database."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from sqlalchemy import Engine
+
+from services.api.auth import ADMIN, ANYONE, Caller, identify, see_that_it_is_closed
+from services.runtime.problems import Unauthorized
+from services.settings import Settings
+from storage.database.engine import open_engine, writing
+from storage.errors import InvalidInput
+from storage.records import api_keys
+
+
+@pytest.fixture
+def engine(tmp_path: Path) -> Iterator[Engine]:
+    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
+    yield engine
+    engine.dispose()
+
+
+def test_a_service_that_never_had_a_key_is_open(engine: Engine, tmp_path: Path) -> None:
+    assert identify(Settings(data=tmp_path), engine, None) == ANYONE
+    assert identify(Settings(data=tmp_path), engine, "any") == ANYONE
+
+
+def test_from_the_first_key_on_it_is_closed_for_good(engine: Engine, tmp_path: Path) -> None:
+    with writing(engine) as c:
+        key = api_keys.make(c, "lab", "alice", "read")
+    settings = Settings(data=tmp_path)
+    assert identify(settings, engine, key) == Caller("alice", "read")
+    with writing(engine) as c:
+        api_keys.revoke(c, "lab")
+    for given in (None, key, "", "any", "é"):
+        with pytest.raises(Unauthorized, match="Authorization: Bearer KEY"):
+            identify(settings, engine, given)
+
+
+def test_keys_of_the_settings_are_admins_of_the_default_owner(engine: Engine, tmp_path: Path) -> None:
+    settings = Settings(data=tmp_path, keys="one,twö")
+    with writing(engine) as c:
+        key = api_keys.make(c, "lab", "alice", "write")
+    assert identify(settings, engine, "one") == identify(settings, engine, "twö") == ADMIN
+    assert identify(settings, engine, key) == Caller("alice", "write")
+    for given in (None, "", "three", "one,twö"):
+        with pytest.raises(Unauthorized):
+            identify(settings, engine, given)
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1", "example.org"])
+def test_a_service_without_keys_stays_on_loopback(host: str, engine: Engine, tmp_path: Path) -> None:
+    with pytest.raises(
+        InvalidInput, match=r"`envmatte keys make NAME`, set ENVMATTE_KEYS .* or listen on 127"
+    ):
+        see_that_it_is_closed(Settings(data=tmp_path, host=host), engine)
+    see_that_it_is_closed(Settings(data=tmp_path, host=host, keys="a-key"), engine)
+    with writing(engine) as c:
+        api_keys.make(c, "lab", "alice", "read")
+        api_keys.revoke(c, "lab")
+    see_that_it_is_closed(Settings(data=tmp_path, host=host), engine)
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "::1", "localhost"])
+def test_loopback_needs_no_key(host: str, engine: Engine, tmp_path: Path) -> None:
+    see_that_it_is_closed(Settings(data=tmp_path, host=host), engine)
+
+
+def test_scopes_grow() -> None:
+    allowed = {
+        scope: [one for one in api_keys.SCOPES if Caller("o", scope).may(one)] for scope in api_keys.SCOPES
+    }
+    assert allowed == {"read": ["read"], "write": ["read", "write"], "admin": ["read", "write", "admin"]}

@@ -1,0 +1,268 @@
+"""Limits: refused before a byte is taken, and told with their names: the app, a real ledger and a real store."""
+
+import base64
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy import Engine
+
+from services.api.app import build_app
+from services.api.quotas import UNITS
+from services.settings import Settings
+from storage.database.engine import open_engine, reading, writing
+from storage.database.owners import bound
+from storage.objects.store import Objects
+from storage.records import api_keys, captures, jobs, mattes
+from workflows.simulation import glass_ball
+from workflows.simulation.scene import nested_program, write_capture
+
+Serve = Callable[..., TestClient]
+TUS = {"Tus-Resumable": "1.0.0"}
+ZIP = {"Content-Type": "application/zip"}
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    path = tmp_path_factory.mktemp("bundle") / "ball.zip"
+    write_capture(
+        glass_ball.glass_ball(24, 16, rays=1), nested_program(bands=((8, 6, 16),), levels=2), path, name="b"
+    )
+    return path.read_bytes()
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def engine(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Engine]:
+    sqlite = f"sqlite:///{tmp_path / 'ledger.db'}"
+    opened = open_engine(sqlite if request.param == "sqlite" else request.getfixturevalue("postgresql"))
+    with writing(opened) as c:
+        tmp_path.joinpath("alice").write_text(api_keys.make(c, "alice", "alice", "write"))
+        tmp_path.joinpath("bob").write_text(api_keys.make(c, "bob", "bob", "admin"))
+    yield opened
+    opened.dispose()
+
+
+@pytest.fixture
+def serve(engine: Engine, tmp_path: Path) -> Serve:
+    """The API of a service with some limits, and no coordinator: jobs stay queued."""
+
+    def serve(owner: str = "alice", **limits: int) -> TestClient:
+        app = build_app(Settings(data=tmp_path, **limits), engine, Objects((tmp_path / "store").as_uri()))
+        key = tmp_path.joinpath(owner).read_text()
+        return TestClient(app, headers={"Authorization": f"Bearer {key}"}, raise_server_exceptions=False)
+
+    return serve
+
+
+def files(tmp_path: Path) -> list[Path]:
+    return [path for path in (tmp_path / "store").rglob("*") if path.is_file()]
+
+
+def refused(answer: Any, status: int, name: str, limit: int, value: int) -> dict[str, Any]:
+    problem: dict[str, Any] = answer.json()
+    assert (answer.status_code, problem["name"], problem["limit"], problem["value"]) == (
+        status,
+        name,
+        limit,
+        value,
+    )
+    assert str(limit) in problem["detail"]
+    return problem
+
+
+def used(client: TestClient) -> dict[str, int | None]:
+    return {
+        one["name"]: one["used"]
+        for one in client.get("/v1/limits").json()["limits"]
+        if one["used"] is not None
+    }
+
+
+def create(client: TestClient, length: int) -> Any:
+    return client.post("/v1/uploads", headers=TUS | {"Upload-Length": str(length)})
+
+
+def test_all_limits_are_told_with_what_is_used(serve: Serve, bundle: bytes) -> None:
+    alice, bob = (
+        serve(owner_captures=7, store_bytes=1 << 30),
+        serve("bob", owner_captures=7, store_bytes=1 << 30),
+    )
+    assert used(alice) == {"owner_captures": 0, "owner_jobs": 0, "owner_bytes": 0}
+    assert alice.post("/v1/captures", content=bundle, headers=ZIP).status_code == 201
+    assert create(alice, 1000).status_code == 201
+    size = len(bundle) + 1000
+    assert used(alice) == {"owner_captures": 2, "owner_jobs": 1, "owner_bytes": size}
+    assert used(bob) == {"owner_captures": 0, "owner_jobs": 0, "owner_bytes": 0, "store_bytes": size}
+    told = alice.get("/v1/limits").json()
+    assert (told["owner"], told["scope"]) == ("alice", "write")
+    found = {one["name"]: one["limit"] for one in told["limits"]}
+    assert found.keys() == UNITS.keys()
+    assert (found["upload_bytes"], found["owner_captures"], found["owner_jobs"]) == (8 << 30, 7, None)
+    assert all(one["description"] for one in told["limits"])
+
+
+def test_bytes_of_an_upload(serve: Serve, bundle: bytes, tmp_path: Path) -> None:
+    client = serve(upload_bytes=100)
+    refused(create(client, 101), 413, "upload_bytes", 100, 101)
+    assert create(client, 100).status_code == 201
+    for url, headers in (("/v1/captures", ZIP), ("/v1/mattes", ZIP)):
+        refused(client.post(url, content=bundle, headers=headers), 413, "upload_bytes", 100, len(bundle))
+    assert files(tmp_path) == []
+
+
+def test_captures_of_an_owner(serve: Serve, bundle: bytes, tmp_path: Path) -> None:
+    client, bob = serve(owner_captures=2), serve("bob", owner_captures=2)
+    capture = client.post("/v1/captures", content=bundle, headers=ZIP).json()
+    assert create(client, 10).status_code == 201
+    before = files(tmp_path)
+    detail = refused(create(client, 10), 507, "owner_captures", 2, 3)["detail"]
+    assert "delete some first" in detail
+    refused(client.post("/v1/captures", content=bundle, headers=ZIP), 507, "owner_captures", 2, 3)
+    assert files(tmp_path) == before
+    assert bob.post("/v1/captures", content=bundle, headers=ZIP).status_code == 201
+    client.post(f"/v1/jobs/{capture['job']}/cancel")
+    assert client.delete(f"/v1/captures/{capture['id']}").status_code == 204
+    assert client.post("/v1/captures", content=bundle, headers=ZIP).status_code == 201
+
+
+def test_an_upload_counts_as_the_capture_that_it_becomes(serve: Serve, bundle: bytes) -> None:
+    client = serve(owner_captures=1, owner_bytes=len(bundle))
+    where = create(client, len(bundle)).headers["location"]
+    chunk = TUS | {"Content-Type": "application/offset+octet-stream", "Upload-Offset": "0"}
+    assert client.patch(where, content=bundle, headers=chunk).status_code == 204
+    body = {"upload": where.rsplit("/", 1)[1]}
+    assert client.post("/v1/captures", json=body).status_code == 201
+    assert used(client)["owner_captures"] == 1
+
+
+def test_jobs_of_an_owner(serve: Serve, bundle: bytes, engine: Engine) -> None:
+    client, bob = serve(owner_jobs=2), serve("bob", owner_jobs=2)
+    capture = client.post("/v1/captures", content=bundle, headers=ZIP).json()
+    wanted = {"capture": capture["id"]}
+    job = client.post("/v1/jobs", json=wanted).json()["id"]
+    answer = client.post("/v1/jobs", json=wanted)
+    refused(answer, 429, "owner_jobs", 2, 3)
+    assert int(answer.headers["retry-after"]) > 0
+    refused(client.post("/v1/captures", content=bundle, headers=ZIP), 429, "owner_jobs", 2, 3)
+    with writing(bound(engine, "alice")) as c:
+        mattes.add_imported(c, "m", {}, {})
+    video = {"Content-Type": "video/mp4"}
+    refused(client.post("/v1/mattes/m/composite", content=b"clip", headers=video), 429, "owner_jobs", 2, 3)
+    with writing(engine) as c:
+        jobs.end(c, job, "failed", {"detail": "", "status": 500})
+    assert bob.post("/v1/captures", content=bundle, headers=ZIP).status_code == 201
+    assert client.post("/v1/jobs", json=wanted).status_code == 202
+    refused(client.post(f"/v1/jobs/{job}/retry"), 429, "owner_jobs", 2, 3)
+    clip = serve().post("/v1/mattes/m/composite", content=b"clip", headers=video)
+    assert (clip.status_code, clip.json()["capture"], clip.json()["matte"]) == (202, None, "m")
+    with reading(engine) as c:
+        assert jobs.get(c, job).state == "failed"
+
+
+@pytest.mark.parametrize(("name", "others"), [("owner_bytes", False), ("store_bytes", True)])
+def test_bytes_stored(serve: Serve, bundle: bytes, tmp_path: Path, name: str, others: bool) -> None:
+    size = len(bundle)
+    alice, bob = serve(**{name: 2 * size}), serve("bob", **{name: 2 * size})
+    capture = alice.post("/v1/captures", content=bundle, headers=ZIP).json()["id"]
+    assert create(bob, size).status_code == 201
+    before = files(tmp_path)
+    problem = create(alice, size + 1).json()
+    assert (problem["status"], problem["name"], problem["limit"]) == (507, name, 2 * size)
+    assert problem["missing"] == (size + 1 if others else 1)
+
+    def pieces() -> Iterator[bytes]:
+        yield bundle  # of a length that is not said before: it is refused once it has come
+
+    answers = [alice.post("/v1/captures", content=content, headers=ZIP) for content in (bundle, pieces())]
+    assert [answer.status_code for answer in answers] == [507 if others else 201, 507]
+    if others:
+        assert files(tmp_path) == before
+        problem = alice.post("/v1/mattes", content=bundle, headers=ZIP).json()
+        assert (problem["status"], problem["name"]) == (507, name)
+        assert str(3 * size) not in problem["detail"]  # what bob has is not told
+    assert alice.get(f"/v1/captures/{capture}").status_code == 200
+
+
+@pytest.mark.parametrize(("name", "others"), [("owner_bytes", False), ("store_bytes", True)])
+def test_bytes_of_programs(serve: Serve, name: str, others: bool) -> None:
+    def asked(seed: int) -> dict[str, Any]:
+        parts = [
+            {"kind": "constant", "levels": [0, 1]},
+            {"kind": "bernoulli", "columns": 2, "rows": 2, "count": 5, "seed": seed},
+        ]
+        return {"program": {"monitor": {"width": 8, "height": 8}, "parts": parts}}
+
+    bob = serve("bob")
+    kept = [bob.post("/v1/programs", json=asked(seed)).json()["program"] for seed in (1, 2)]
+    sizes = [len(json.dumps(program)) for program in kept]
+    assert used(bob) == {
+        "owner_captures": 0,
+        "owner_jobs": 0,
+        "owner_bytes": sum(sizes),
+        "store_bytes": sum(sizes),
+    }
+    most = (4 if others else 2) * sizes[0]
+    alice = serve(**{name: most})
+    first, second = (alice.post("/v1/programs", json=asked(seed)) for seed in (1, 2))
+    assert (first.status_code, second.status_code) == (201, 201)
+    assert used(alice)["owner_bytes"] == sum(sizes)
+    problem = alice.post("/v1/programs", json=asked(3)).json()
+    assert (problem["status"], problem["name"], problem["limit"]) == (507, name, most)
+    assert problem["missing"] == sizes[0]
+    assert create(alice, 1).status_code == 507
+    assert [one["id"] for one in alice.get("/v1/programs").json()["programs"]] == [
+        answer.json()["id"] for answer in (second, first)
+    ]
+    assert alice.post("/v1/programs", json=asked(1)).json() == first.json()  # a repeat takes nothing
+    assert alice.delete(f"/v1/programs/{first.json()['id']}").status_code == 204
+    assert alice.post("/v1/programs", json=asked(3)).status_code == 201
+
+
+def test_frames_of_a_capture(serve: Serve, bundle: bytes, tmp_path: Path) -> None:
+    client = serve(capture_frames=17)
+    refused(client.post("/v1/captures", content=bundle, headers=ZIP), 413, "capture_frames", 17, 18)
+    where = create(client, len(bundle)).headers["location"]
+    chunk = TUS | {"Content-Type": "application/offset+octet-stream", "Upload-Offset": "0"}
+    client.patch(where, content=bundle, headers=chunk)
+    body = {"upload": where.rsplit("/", 1)[1]}
+    refused(client.post("/v1/captures", json=body), 413, "capture_frames", 17, 18)
+    assert files(tmp_path) == []  # it would be refused again
+    assert serve(capture_frames=18).post("/v1/captures", content=bundle, headers=ZIP).status_code == 201
+
+
+def test_frames_that_are_declared_are_refused_before_they_come(serve: Serve, tmp_path: Path) -> None:
+    client = serve(capture_frames=17, capture_pixels=384)
+
+    def declaring(**told: object) -> Any:
+        pairs = (f"{name} {base64.b64encode(str(value).encode()).decode()}" for name, value in told.items())
+        return client.post(
+            "/v1/uploads", headers=TUS | {"Upload-Length": "10", "Upload-Metadata": ", ".join(pairs)}
+        )
+
+    refused(declaring(frames=18), 413, "capture_frames", 17, 18)
+    refused(declaring(filename="a.zip", width=25, height=16), 413, "capture_pixels", 384, 400)
+    for wrong in ("many", "", "-1", "9" * 19, "٣"):
+        answer = declaring(frames=wrong)
+        assert (answer.status_code, answer.json()["field"]) == (400, "Upload-Metadata")
+    assert files(tmp_path) == []
+    assert used(client)["owner_captures"] == 0
+    for fine in ({"frames": 17, "width": 24, "height": 16}, {"width": 9999}, {"frame": 99}):
+        assert declaring(**fine).status_code == 201
+
+
+def test_when_it_expires_is_told(serve: Serve, bundle: bytes, engine: Engine) -> None:
+    client = serve(capture_seconds=60, matte_seconds=3600)
+    capture = client.post("/v1/captures", content=bundle, headers=ZIP).json()
+    matte = client.post("/v1/jobs", json={"capture": capture["id"]}).json()["matte"]
+    with reading(engine) as c:
+        for seconds, row in ((60, captures.get(c, capture["id"])), (3600, mattes.get(c, matte))):
+            assert row.expires_at - row.created_at == pytest.approx(seconds)
+    for url in (f"/v1/captures/{capture['id']}", f"/v1/mattes/{matte}"):
+        found = client.get(url).json()
+        assert found["expires_at"].endswith("Z")
+        assert found["expires_at"] > found["created_at"]
+    forever = serve().post("/v1/captures", content=bundle, headers=ZIP).json()
+    assert forever["expires_at"] is None

@@ -1,0 +1,227 @@
+"""The command line on its own: its help, its completion, its exit codes."""
+
+import json
+import os
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from services.cli.main import main
+from tests.services.client.test_client import JOB, answering, ok, refused, saying
+
+README = (Path(__file__).parents[3] / "README.md").read_text()
+COMMAND = [sys.executable, "-m", "services"]
+PROCESSES = {"serve", "coordinator", "scheduler", "worker", "completion"}
+"""Commands that have no answer to print as JSON."""
+
+
+def envmatte(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    command = [*COMMAND, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, env=os.environ | environment)
+
+
+def commands(group: click.Group = main, *above: str) -> Iterator[tuple[str, click.Command]]:
+    """Every command and group by its whole name, as `keys make`."""
+    for name, command in group.commands.items():
+        yield " ".join([*above, name]), command
+        if isinstance(command, click.Group):
+            yield from commands(command, *above, name)
+
+
+ALL = dict(commands())
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_the_help_of_every_command_has_an_example_that_can_be_typed(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said = CliRunner().invoke(main, [*name.split(), "--help"]).output
+    lines = re.search(r"Example:\n((?:    .*\n)+)", said)
+    assert lines, said
+    monkeypatch.chdir(tmp_path)
+    for file in ("film.zip", "matte.zip", "backdrop.png"):
+        (tmp_path / file).write_bytes(b"any")
+    if name == "completion":
+        assert 'eval "$(envmatte completion bash)"' in lines[1]
+        return
+    for line in lines[1].splitlines():
+        depth = 1 + len(name.split())
+        words = shlex.split(line)
+        assert words[:depth] == ["envmatte", *name.split()]
+        ALL[name].make_context(name, words[depth:])
+
+
+@pytest.mark.parametrize("name", sorted(ALL.keys() - PROCESSES))
+def test_every_command_that_prints_prints_json(name: str) -> None:
+    leaf = not isinstance(ALL[name], click.Group)
+    assert any("--json" in parameter.opts for parameter in ALL[name].params) == leaf
+
+
+def test_the_exit_codes_are_the_same_wherever_they_are_told() -> None:
+    table = re.findall(
+        r"^\| (\d+) \| (.*) \|$", README.partition("| exit code | |")[2].partition("\n\n")[0], re.M
+    )
+    assert [code for code, _ in table] == ["0", "1", "2", "3", "130"]
+    import services.cli
+
+    for text in (services.cli.__doc__, main.help):
+        assert text is not None
+        assert re.findall(r"\b(\d+) [a-z]", text.partition("Exit codes:")[2]) == [code for code, _ in table]
+
+
+def test_0_done() -> None:
+    with saying(lambda n: ok()) as (url, _):
+        done = envmatte("status", "j", "--url", url)
+        assert (done.returncode, done.stdout) == (0, "running recovering 0.5\n")
+        assert json.loads(envmatte("status", "j", "--url", url, "--json").stdout) == JOB
+
+
+def test_1_refused_failed_or_not_written(tmp_path: Path) -> None:
+    with saying(lambda n: refused(404)) as (url, _):
+        found = envmatte("status", "j", "--url", url)
+    assert (found.returncode, found.stdout, found.stderr) == (1, "", "Error: why, and what to do\n")
+    failed = JOB | {"state": "failed", "problem": {"detail": "no light"}}
+    with saying(lambda n: ok(failed)) as (url, _):
+        found = envmatte("wait", "j", "--url", url)
+    assert (found.returncode, found.stdout) == (1, "")
+    assert "no light" in found.stderr
+    (tmp_path / "backdrop.png").write_bytes(b"any")
+    with saying(lambda n: ok()) as (url, _):
+        output = tmp_path / "no folder" / "out.png"
+        found = envmatte("composite", "m", str(tmp_path / "backdrop.png"), "-o", str(output), "--url", url)
+    assert found.returncode == 1
+    assert "no folder" in found.stderr
+    assert "Traceback" not in found.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["fly"], ["status"], ["upload", "no-such-file"], ["status", "j", "--url", "localhost:8000"]],
+    ids=" ".join,
+)
+def test_2_wrong_command_line(arguments: list[str]) -> None:
+    found = envmatte(*arguments)
+    assert (found.returncode, found.stdout) == (2, "")
+    assert "Error: " in found.stderr
+    assert "python -m" not in found.stderr
+
+
+def test_3_out_of_reach_or_asked_to_come_later() -> None:
+    found = envmatte("status", "j", "--url", "http://127.0.0.1:9")
+    assert (found.returncode, found.stdout) == (3, "")
+    assert "envmatte serve" in found.stderr
+    with saying(lambda n: refused(429, **{"Retry-After": "3600"})) as (url, _):
+        assert envmatte("status", "j", "--url", url).returncode == 3
+
+
+def interrupted(command: list[str], come: threading.Event) -> tuple[int, str]:
+    """Run a command, and interrupt it once something has come."""
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert come.wait(60)
+    os.kill(process.pid, signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    return process.returncode, said
+
+
+def test_130_interrupted_layers_leave_nothing(tmp_path: Path) -> None:
+    come, over = threading.Event(), threading.Event()
+    matte = {"id": "m", "state": "ready", "created_at": "", "capture": None, "job": None, "options": {}}
+    matte |= {"width": 1, "height": 1, "monitor": [1, 1]}
+
+    class Slow(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            if "layers/rho" in self.path:  # the fourth of six
+                come.set()
+                over.wait(60)
+                return
+            body = b"pixels" if "layers" in self.path else json.dumps(matte).encode()
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, *arguments: object) -> None:
+            pass
+
+    with answering(Slow) as url:
+        command = [*COMMAND, "layers", "m", str(tmp_path / "out"), "--url", url]
+        code, said = interrupted(command, come)
+        over.set()
+    assert (code, list(tmp_path.iterdir())) == (130, [])
+    assert said.endswith("Interrupted.\n")
+
+
+def test_130_an_interrupted_composite_of_a_clip_cancels_its_job(tmp_path: Path) -> None:
+    come = threading.Event()
+
+    def answer(n: int):  # type: ignore[no-untyped-def]
+        if n == 3:
+            come.set()
+        return ok()
+
+    clip = tmp_path / "clip.mp4"
+    clip.write_bytes(b"\0\0\0\x18ftypisom" + bytes(100))
+    with saying(answer) as (url, calls):
+        output = tmp_path / "out.mp4"
+        code, _ = interrupted([*COMMAND, "composite", "m", str(clip), "-o", str(output), "--url", url], come)
+    assert code == 130
+    assert calls[-1]["call"] == "POST /v1/jobs/j/cancel"
+    assert [path.name for path in tmp_path.iterdir()] == ["clip.mp4"]
+
+
+def test_130_an_interrupted_recovery_says_how_to_go_on_with_its_job() -> None:
+    come = threading.Event()
+
+    def answer(n: int):  # type: ignore[no-untyped-def]
+        if n == 3:
+            come.set()
+        return ok()
+
+    with saying(answer) as (url, calls):
+        code, said = interrupted([*COMMAND, "recover", "c", "--url", url], come)
+    assert code == 130
+    assert "envmatte wait j" in said
+    assert not any("cancel" in call["call"] for call in calls)
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_is_what_a_shell_takes(shell: str, tmp_path: Path) -> None:
+    done = envmatte("completion", shell)
+    assert done.returncode == 0
+    assert f"_ENVMATTE_COMPLETE={shell}_complete" in done.stdout
+    words = {"COMP_WORDS": "envmatte rec", "COMP_CWORD": "rec" if shell == "fish" else "1"}
+    found = envmatte(_ENVMATTE_COMPLETE=f"{shell}_complete", **words)
+    assert re.findall(r"\b[a-z]+\b", found.stdout)[:2] == ["plain", "recover"]
+    if shutil.which(shell) is None:
+        pytest.skip(f"{shell} is not installed: its script was not run")
+    (tmp_path / "script").write_text(done.stdout)
+    subprocess.run([shell, "-n", str(tmp_path / "script")], check=True)
+
+
+def test_bash_completes_commands_and_options(tmp_path: Path) -> None:
+    (tmp_path / "envmatte").write_text(f'#!/bin/sh\nexec {shlex.join(COMMAND)} "$@"\n')
+    (tmp_path / "envmatte").chmod(0o755)
+    script = """
+eval "$(envmatte completion bash)"
+complete -p envmatte
+COMP_WORDS=(envmatte composite --tr) COMP_CWORD=2 COMPREPLY=()
+_envmatte_completion envmatte
+echo "${COMPREPLY[@]}"
+"""
+    path = f"{tmp_path}:{os.environ['PATH']}"
+    done = subprocess.run(
+        ["bash", "-c", script], capture_output=True, text=True, env=os.environ | {"PATH": path}, timeout=60
+    )
+    assert done.stdout.splitlines()[-1] == "--transfer", done.stderr
+    assert "_envmatte_completion envmatte" in done.stdout

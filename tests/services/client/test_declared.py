@@ -1,0 +1,62 @@
+"""What the client tells of a capture before it sends it."""
+
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from services.client._declared import declared
+from workflows.images import integer_formats
+from workflows.simulation import glass_ball
+from workflows.simulation.scene import nested_program, write_capture
+
+PARTS = [
+    {"kind": "constant", "levels": [0, 1]},
+    {"kind": "constant", "colours": [[1, 0, 0]]},
+    {"kind": "bernoulli", "columns": 8, "rows": 6, "count": 16, "seed": 1},
+    {"kind": "images", "files": ["a.png", "b.png"]},
+]
+
+
+def archive(path: Path, record: Any, compression: int = zipfile.ZIP_STORED, **files: bytes) -> Path:
+    with zipfile.ZipFile(path, "w", compression) as made:
+        made.writestr("capture.json", record if isinstance(record, bytes) else json.dumps(record))
+        for name, data in files.items():
+            made.writestr(name, data)
+    return path
+
+
+def test_a_capture(tmp_path: Path) -> None:
+    path = tmp_path / "ball.zip"
+    program = nested_program(bands=((8, 6, 16),), levels=2)
+    write_capture(glass_ball.glass_ball(24, 16, rays=1), program, path)
+    assert declared(path) == {"frames": 18, "width": 24, "height": 16}
+
+
+@pytest.mark.parametrize("quality", [30, 95])
+def test_jpeg_in_a_packed_archive(tmp_path: Path, quality: int) -> None:
+    image = integer_formats.encode_jpeg(np.zeros((33, 70, 3), np.uint8), quality)
+    record = {"frames": [{"file": "one", "pattern": 0}] * 5}
+    path = archive(tmp_path / "c.zip", record, zipfile.ZIP_DEFLATED, one=image)
+    assert declared(path) == {"frames": 5, "width": 70, "height": 33}
+
+
+def test_a_film_has_the_frames_of_its_program(tmp_path: Path) -> None:
+    record = {"program": {"parts": PARTS}, "video": {"file": "film.mp4"}}
+    assert declared(archive(tmp_path / "c.zip", record)) == {"frames": 2 + 1 + 16 + 2}
+
+
+@pytest.mark.parametrize("record", [b"{", b"[]", {"frames": 3}, {}, {"program": {"parts": [{}]}}])
+def test_what_is_wrong_is_left_to_the_service(tmp_path: Path, record: Any) -> None:
+    assert declared(archive(tmp_path / "c.zip", record)) == {}
+
+
+def test_an_image_of_another_kind_is_left_out(tmp_path: Path) -> None:
+    record = {"frames": [{"file": "one", "pattern": 0}]}
+    assert declared(archive(tmp_path / "c.zip", record, one=b"II*\0 and so on")) == {"frames": 1}
+    assert declared(archive(tmp_path / "d.zip", record)) == {"frames": 1}
+    (tmp_path / "e.zip").write_bytes(b"no archive")
+    assert declared(tmp_path / "e.zip") == {}

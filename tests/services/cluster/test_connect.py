@@ -1,0 +1,337 @@
+"""A scheduler and workers in processes of their own: who gets in, and what is killed comes again."""
+
+import asyncio
+import signal
+import socket
+import ssl
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import psutil
+import pytest
+from distributed import Client, Scheduler, Worker
+from distributed.comm import connect as open_comm
+from distributed.scheduler import KilledWorker
+from distributed.security import Security
+
+from services.cluster.connect import connect, embedded
+from services.runtime import certificates
+from services.settings import Settings
+from storage.errors import Unavailable
+from tests.services.cluster.clusters import address, children, listening, running, started, wait, workers
+
+pytestmark = pytest.mark.full
+
+WORKERS = 2
+
+
+@dataclass
+class Cluster:
+    """A scheduler that can be killed and started again, and workers."""
+
+    folder: Path
+    security: Security
+    address: str
+    workers: subprocess.Popen[str]
+    scheduler: subprocess.Popen[str]
+    ending: ExitStack
+
+    def kill_scheduler(self) -> None:
+        """End it as a crash would."""
+        self.ending.close()
+
+    def start_scheduler(self) -> None:
+        """Start it where it was."""
+        self.scheduler = self.ending.enter_context(scheduling(self.folder, urlsplit(self.address).port or 0))
+        address(self.scheduler)
+
+    @property
+    def log(self) -> str:
+        """What the workers have said so far."""
+        return (self.folder / "workers.log").read_text()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("cluster")
+    certificates.make(folder / "certs")
+    certificates.make(folder / "others")
+    return folder
+
+
+@contextmanager
+def scheduling(folder: Path, port: int = 0, host: str = "0.0.0.0") -> Iterator[subprocess.Popen[str]]:
+    options = ("--host", host, "--port", str(port), "--certs", str(folder / "certs"))
+    with started(folder / "scheduler.log", "scheduler", *options) as process:
+        yield process
+
+
+@contextmanager
+def working(folder: Path, at: str, *options: str, **environment: str) -> Iterator[subprocess.Popen[str]]:
+    command = ("worker", "--cluster", at, "--certs", str(folder / "certs"), *options)
+    with started(folder / "workers.log", *command, **environment) as process:
+        yield process
+
+
+@pytest.fixture(scope="module")
+def cluster(folder: Path) -> Iterator[Cluster]:
+    """Workers first: they wait for the scheduler."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    at = f"tls://127.0.0.1:{port}"
+    (folder / "workers.log").touch()
+    with working(folder, at, "--workers", str(WORKERS), "--host", "0.0.0.0") as these:
+        wait(lambda: "waiting for the scheduler" in (folder / "workers.log").read_text())
+        with ExitStack() as ending:
+            scheduler = ending.enter_context(scheduling(folder, port))
+            assert urlsplit(address(scheduler)).port == port
+            yield Cluster(folder, certificates.security_of(folder / "certs"), at, these, scheduler, ending)
+
+
+@pytest.fixture
+def client(cluster: Cluster) -> Iterator[Client]:
+    with connect(cluster.address, cluster.security) as client:
+        wait(lambda: len(client.nthreads()) == WORKERS)
+        yield client
+
+
+async def gets_in(at: str, security: Security) -> bool:
+    """Whether a dask client is answered."""
+    try:
+        opening = open_comm(at, timeout=2, **security.get_connection_args("client"))
+        comm = await asyncio.wait_for(opening, 5)
+        await comm.write({"op": "identity", "reply": True})
+        reply = await asyncio.wait_for(comm.read(), 5)
+        comm.abort()
+    except (OSError, TimeoutError):
+        return False
+    return bool(reply["id"])
+
+
+async def answers_without_certificate(port: int) -> bool:
+    """Whether a word comes back over TLS from who does not ask for a certificate."""
+    context = ssl.create_default_context()
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    try:
+        reader, writer = await asyncio.wait_for(asyncio.open_connection("127.0.0.1", port, ssl=context), 5)
+        word = await asyncio.wait_for(reader.read(1), 5)
+        writer.close()
+    except (OSError, TimeoutError):
+        return False
+    return bool(word)
+
+
+def test_no_socket_lets_in_who_has_no_certificate_of_the_cluster(cluster: Cluster, client: Client) -> None:
+    own = {urlsplit(name).port for name in client.nthreads()}
+    info = client.scheduler_info(n_workers=-1)["workers"].values()
+    own |= {urlsplit(one["nanny"]).port for one in info} | {urlsplit(cluster.address).port}
+    assert len(own) == 1 + 2 * WORKERS
+    processes = [psutil.Process(p.pid) for p in (cluster.scheduler, cluster.workers)]
+    processes += [*children(cluster.scheduler), *children(cluster.workers)]
+    found = {port: ip for process in processes for ip, port in listening(process)}
+    assert own <= found.keys()
+    assert {ip for port, ip in found.items() if port not in own} <= {"127.0.0.1", "::1"}
+    others = certificates.security_of(cluster.folder / "others")
+
+    async def who_gets_in(port: int) -> list[bool]:
+        return await asyncio.gather(
+            gets_in(f"tls://127.0.0.1:{port}", cluster.security),
+            gets_in(f"tls://127.0.0.1:{port}", others),
+            gets_in(f"tcp://127.0.0.1:{port}", Security()),
+            answers_without_certificate(port),
+        )
+
+    async def all_ports() -> list[list[bool]]:
+        return await asyncio.gather(*(who_gets_in(port) for port in found))
+
+    for port, got_in in zip(found, asyncio.run(all_ports()), strict=True):
+        assert got_in == [port in own, False, False, False], (port, own)
+
+
+def test_a_client_of_another_cluster_is_told(cluster: Cluster) -> None:
+    with pytest.raises(Unavailable, match="same certificates"):
+        connect(cluster.address, certificates.security_of(cluster.folder / "others"))
+    with pytest.raises(Unavailable, match="no scheduler answers at tcp"):
+        connect("tcp://127.0.0.1:9", None)
+
+
+def test_who_takes_a_connection_and_is_silent_is_not_waited_for() -> None:
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        silent.listen()
+        with pytest.raises(Unavailable, match="no scheduler answers"):
+            connect(f"tcp://127.0.0.1:{silent.getsockname()[1]}", None)
+
+
+def test_a_worker_process_that_is_killed_comes_again(cluster: Cluster, client: Client) -> None:
+    before = client.nthreads().keys()
+    workers(cluster.workers)[0].kill()
+    wait(lambda: len(client.nthreads().keys() - before) == 1 and len(client.nthreads()) == WORKERS)
+    assert client.submit(sum, [1, 2]).result(60) == 3
+
+
+@pytest.mark.long
+def test_workers_join_a_scheduler_that_was_killed(cluster: Cluster, client: Client) -> None:
+    busy = client.submit(time.sleep, 3)
+    for _ in range(2):
+        cluster.kill_scheduler()
+        said = cluster.log.count("waiting for the scheduler")
+        wait(lambda said=said: cluster.log.count("waiting for the scheduler") > said)
+        cluster.start_scheduler()
+        with connect(cluster.address, cluster.security) as again:
+            wait(lambda again=again: len(again.nthreads()) == WORKERS)
+            assert again.submit(sum, [1, 2]).result(60) == 3
+    assert busy.status != "finished"
+
+
+def test_of_tasks_that_are_over_next_to_nothing_is_kept(cluster: Cluster, client: Client) -> None:
+    """Each alone, as the tiles of a job are that is done last."""
+
+    def kept(dask_scheduler: Scheduler) -> int:
+        import gc
+
+        from distributed.scheduler import TaskGroup
+
+        gc.collect()
+        return sum(type(one) is TaskGroup for one in gc.get_objects())
+
+    def counted(dask_worker: Worker) -> int:
+        return len(dask_worker.digests_total)
+
+    def bursts(number: int) -> None:
+        for _ in range(number):
+            assert client.submit(pow, 2, 3, pure=False).result(timeout=60) == 8
+
+    bursts(1)
+    before = sum(client.run(counted).values())
+    bursts(150)
+    wait(lambda: client.run_on_scheduler(kept) < 15)
+    assert sum(client.run(counted).values()) < before + 50
+
+
+def test_memory_has_an_end_and_a_task_that_takes_it_all_is_blamed_at_once(
+    cluster: Cluster, client: Client, tmp_path: Path
+) -> None:
+    limit = 700 << 20
+    with working(
+        cluster.folder, cluster.address, "--workers", "1", ENVMATTE_WORKER_MEMORY=str(limit)
+    ) as process:
+        wait(lambda: len(client.nthreads()) == WORKERS + 1)
+        (small,) = [
+            name
+            for name, one in client.scheduler_info(n_workers=-1)["workers"].items()
+            if one["memory_limit"] == limit
+        ]
+        before = workers(process)
+        greedy = client.submit(lambda: time.sleep(60 if bytearray(limit * 2) else 0), workers=[small])
+        with pytest.raises(KilledWorker):
+            greedy.result(60)
+        wait(lambda: workers(process) and workers(process) != before)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_workers_that_are_asked_to_end_leave_nothing(
+    cluster: Cluster, client: Client, tmp_path: Path, number: signal.Signals
+) -> None:
+    before = client.nthreads().keys()
+    with working(cluster.folder, cluster.address, "--workers", "2", TMPDIR=str(tmp_path)) as process:
+        wait(lambda: len(client.nthreads()) == WORKERS + 2)
+        assert any(tmp_path.iterdir())
+        these = client.nthreads().keys() - before
+        busy = [client.submit(time.sleep, 1000, workers=[one], pure=False) for one in these]
+        wait(lambda: all(client.processing()[one] for one in these))
+        tree = children(process)
+        process.send_signal(number)
+        assert process.wait(60) == (0 if number == signal.SIGTERM else 130)
+        assert not any(tmp_path.iterdir())
+        wait(lambda: not running(tree))
+        client.cancel(busy)
+    wait(lambda: len(client.nthreads()) == WORKERS)
+    assert "Traceback" not in cluster.log[-2000:]
+
+
+def test_workers_that_are_still_starting_end_when_they_are_asked(cluster: Cluster, tmp_path: Path) -> None:
+    with working(cluster.folder, cluster.address, "--workers", "2", TMPDIR=str(tmp_path)) as process:
+        wait(lambda: len(workers(process)) == 2)
+        tree = children(process)
+        process.terminate()
+        assert process.wait(60) == 0
+        assert not any(tmp_path.iterdir())
+        wait(lambda: not running(tree))
+
+
+def test_workers_die_with_their_nanny(cluster: Cluster, client: Client) -> None:
+    with working(cluster.folder, cluster.address, "--workers", "2") as process:
+        wait(lambda: len(client.nthreads()) == WORKERS + 2)
+        tree = children(process)
+        assert len(tree) >= 2
+        process.kill()
+        wait(lambda: not running(tree))
+    wait(lambda: len(client.nthreads()) == WORKERS)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_waiting_workers_end_when_they_are_asked(folder: Path, number: signal.Signals) -> None:
+    (folder / "workers.log").write_text("")
+    with working(folder, "tls://127.0.0.1:9", "--workers", "2") as process:
+        wait(lambda: "waiting for the scheduler at tls://127.0.0.1:9" in (folder / "workers.log").read_text())
+        process.send_signal(number)
+        assert process.wait(60) == (0 if number == signal.SIGTERM else 130)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_scheduler_ends_when_it_is_asked(folder: Path, number: signal.Signals) -> None:
+    with scheduling(folder, host="127.0.0.1") as process:
+        assert address(process).startswith("tls://127.0.0.1:")
+        process.send_signal(number)
+        assert process.wait(60) == (0 if number == signal.SIGTERM else 130)
+
+
+@pytest.mark.long
+def test_a_scheduler_without_certificates_is_for_this_machine_alone(tmp_path: Path) -> None:
+    data = {"ENVMATTE_DATA": str(tmp_path)}
+    with started(tmp_path / "log", "scheduler", "--host", "0.0.0.0", **data) as process:
+        assert process.wait(60) == 1
+    assert "envmatte certs" in (tmp_path / "log").read_text()
+    with started(tmp_path / "log", "scheduler", "--port", "0", **data) as process:
+        at = address(process)
+        assert {ip for ip, _ in listening(psutil.Process(process.pid))} == {"127.0.0.1"}
+        with started(tmp_path / "log", "worker", "--cluster", at, "--host", "0.0.0.0", **data) as refused:
+            assert refused.wait(60) == 1
+        assert "without TLS" in (tmp_path / "log").read_text()
+        with (
+            started(tmp_path / "log", "worker", "--cluster", at, "--workers", "1", **data) as worker,
+            connect(at, None) as client,
+        ):
+            wait(lambda: client.nthreads())
+            for one in (psutil.Process(worker.pid), *children(worker)):
+                assert {ip for ip, _ in listening(one)} <= {"127.0.0.1"}
+
+
+def test_the_embedded_cluster_listens_on_loopback_alone(tmp_path: Path) -> None:
+    this = psutil.Process()
+    others = set(this.children(recursive=True))
+    with embedded(Settings(data=tmp_path, workers=1)) as cluster:
+        found = {ip for one in {this, *this.children(recursive=True)} - others for ip, _ in listening(one)}
+        assert found == {"127.0.0.1"}
+        with connect(cluster.scheduler_address, None) as client:
+            assert list(client.nthreads().values()) == [1]
+
+
+def test_a_port_in_use_is_told(folder: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        (folder / "scheduler.log").write_text("")
+        with scheduling(folder, taken.getsockname()[1], "127.0.0.1") as process:
+            assert process.wait(60) == 1
+    log = (folder / "scheduler.log").read_text()
+    assert "can't listen on 127.0.0.1" in log
+    assert "Traceback" not in log

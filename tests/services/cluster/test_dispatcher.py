@@ -1,0 +1,121 @@
+"""What is handed to a real cluster, and what comes back of it."""
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from distributed import Client, LocalCluster
+
+from services.cluster.connect import Scale, embedded
+from services.cluster.dispatcher import Dispatcher, Flight, Outcome, _blamed
+from services.cluster.task import key_of, read_key
+from services.settings import Settings
+from storage.errors import Unavailable
+from workflows.jobs import Task
+from workflows.untrusted.limits import Limits
+
+
+def test_of_what_a_dead_worker_had_the_first_is_to_blame() -> None:
+    dead = [
+        (Flight("a", 1, 5), "one"),
+        (Flight("b", 2, 3), "one"),
+        (Flight("a", 3, 4), "two"),
+        (Flight("b", 4, 6), "one"),
+    ]
+    assert _blamed(dead, {"two"}) == [
+        Outcome("a", 1),
+        Outcome("b", 2, died="one"),
+        Outcome("a", 3, died="two", starved=True),
+        Outcome("b", 4),
+    ]
+
+
+def test_a_cluster_has_as_many_workers_as_are_of_use(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 0.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    asked: list[int] = []
+    scale = Scale(asked.append, 4)
+    scale(0)
+    now = 400.0
+    scale(0)
+    scale(0)
+    assert asked == [1]
+    scale(3)
+    scale(2)
+    scale(100)
+    assert asked == [1, 3, 4]
+    now = 600.0
+    scale(0)
+    assert asked == [1, 3, 4]
+    now = 701.0
+    scale(0)
+    assert asked == [1, 3, 4, 1]
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LocalCluster]:
+    with embedded(Settings(data=tmp_path_factory.mktemp("data"), workers=1)) as cluster:
+        yield cluster
+
+
+def task(job: str, folder: Path) -> Task:
+    return Task(job, folder.as_uri(), "none", "none", {}, Limits(1 << 30, 1 << 26), {})
+
+
+def outcomes(dispatcher: Dispatcher, count: int) -> list[Outcome]:
+    found: list[Outcome] = []
+    end = time.monotonic() + 60
+    while len(found) < count:
+        assert time.monotonic() < end
+        found += dispatcher.collect()
+        time.sleep(0.02)
+    return found
+
+
+def test_errors_come_back_and_what_dies_with_its_worker_is_told(
+    cluster: LocalCluster, tmp_path: Path
+) -> None:
+    with Dispatcher(lambda: Client(cluster, set_as_default=False)) as dispatcher:
+        while not dispatcher.free:
+            time.sleep(0.02)
+        assert dispatcher.free == 1
+        dispatcher.submit("recover", task("a", tmp_path), 3)
+        assert dispatcher.under_way("a") == 1
+        (outcome,) = outcomes(dispatcher, 1)
+        assert (outcome.job, outcome.tile, outcome.done, outcome.died) == ("a", 3, None, None)
+        assert "not in the store" in str(outcome.error)
+        assert dispatcher.under_way("a") == 0
+
+        (pid,) = (worker.pid for worker in cluster.workers.values())
+        os.kill(pid, signal.SIGSTOP)  # so that both are there when it dies
+        for tile in (1, 2):
+            dispatcher.submit("recover", task("b", tmp_path), tile)
+        time.sleep(0.5)
+        os.kill(pid, signal.SIGKILL)
+        found = sorted(outcomes(dispatcher, 2), key=lambda outcome: outcome.tile)
+        assert found[0].died is not None
+        assert found[1] == Outcome("b", 2)
+
+
+def test_a_scheduler_that_is_not_there_is_a_problem_in_words() -> None:
+    def connect() -> Client:
+        raise Unavailable("no scheduler answers at tcp://127.0.0.1:1")
+
+    with Dispatcher(connect) as dispatcher:
+        end = time.monotonic() + 10
+        while "no scheduler answers" not in dispatcher.cluster["problem"]:
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        assert (dispatcher.free, dispatcher.threads) == (0, 0)
+        assert dispatcher.collect() == []
+        dispatcher.drop("a")
+
+
+def test_a_task_is_known_by_its_name() -> None:
+    assert read_key(key_of("recover", "0ab1", -2)) == ("0ab1", -2)
+    assert read_key(key_of("ingest", "0ab1", 12)) == ("0ab1", 12)
+    assert key_of("ingest", "0ab1", 12) != key_of("ingest", "0ab1", 12)
+    assert read_key("sleep-47ad-b581-4a62-8164") is None

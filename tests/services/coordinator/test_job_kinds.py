@@ -1,0 +1,96 @@
+"""What ends of composite jobs mean to the ledger and to the store: against real ones."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from sqlalchemy import Engine
+
+from services.coordinator.job_kinds import KINDS
+from services.coordinator.job_run import Drive, end_badly
+from services.coordinator.retention import sweep
+from storage.database.engine import open_engine, writing
+from storage.errors import ClipError, Conflict, EnvmatteError, GaveUp, NotFound
+from storage.layout import composites
+from storage.objects.store import Objects
+from storage.records import jobs, mattes, tiles
+from workflows.untrusted.limits import Limits
+
+MADE = (composites.clip_path, composites.ticks_path, composites.video_path)
+
+
+@pytest.fixture
+def engine(tmp_path: Path) -> Iterator[Engine]:
+    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
+    yield engine
+    engine.dispose()
+
+
+@pytest.fixture
+def objects(tmp_path: Path) -> Objects:
+    return Objects((tmp_path / "store").as_uri())
+
+
+@pytest.fixture
+def job(engine: Engine, objects: Objects) -> str:
+    """A composite job that has written something."""
+    with writing(engine) as c:
+        mattes.add(c, "m", "cap", "other", {})
+        mattes.change(c, "m", state="ready")
+        job = jobs.add(c, "composite", "cap", {"transfer": "srgb"}, "m")
+        tiles.begin(c, job)
+    for path in MADE:
+        objects.put(path(job), b"any")
+    objects.put(composites.segment_path(job, 0), b"any")
+    return job
+
+
+def fail(engine: Engine, job: str, error: EnvmatteError) -> None:
+    with writing(engine) as c:
+        task = Drive.of(jobs.get(c, job), [], "file:///store", Limits(1, 1)).task
+        end_badly(c, "composite", task, error)
+
+
+def test_it_leaves_its_matte_alone_and_needs_no_capture(engine: Engine, job: str) -> None:
+    with writing(engine) as c:
+        assert KINDS["composite"].is_due(c, jobs.get(c, job))
+    fail(engine, job, GaveUp("again and again"))
+    with writing(engine) as c:
+        assert mattes.get(c, "m").state == "ready"
+
+
+def test_what_is_left_of_a_success_is_the_video(objects: Objects, engine: Engine, job: str) -> None:
+    with writing(engine) as c:
+        row = jobs.get(c, job)
+    KINDS["composite"].tidy(objects, row)
+    assert objects.below(composites.path(job)) == {composites.video_path(job)}
+    KINDS["composite"].discard(objects, row)
+    assert objects.below(composites.path(job)) == set()
+
+
+@pytest.mark.parametrize(("error", "kept"), [(ClipError("no clip"), False), (GaveUp("again"), True)])
+def test_a_clip_is_kept_for_as_long_as_it_may_be_tried_again(
+    engine: Engine, objects: Objects, job: str, error: EnvmatteError, kept: bool
+) -> None:
+    fail(engine, job, error)
+    sweep(engine, objects, seconds=0)
+    assert bool(objects.below(composites.path(job))) == kept
+    with writing(engine) as c:
+        row = jobs.get(c, job)
+        if kept:
+            KINDS["composite"].retried(c, row)
+            mattes.forget(c, "m")
+        with pytest.raises(NotFound if kept else Conflict):
+            KINDS["composite"].retried(c, row)
+
+
+def test_what_killed_uploads_left_is_swept_and_the_rest_is_not(
+    engine: Engine, objects: Objects, job: str
+) -> None:
+    objects.put(composites.clip_path("nobody"), b"any")
+    sweep(engine, objects, seconds=0)
+    assert objects.names("composites") == [job]
+    with writing(engine) as c:
+        jobs.cancel(c, job)
+    sweep(engine, objects, seconds=0)
+    assert objects.names("composites") == []

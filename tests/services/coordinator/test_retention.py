@@ -1,0 +1,200 @@
+"""What expires, and what is counted: against a real ledger and a real store."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from sqlalchemy import Engine, select, update
+
+from services.coordinator.retention import count, forget_expired, forget_jobs
+from storage.database import tables
+from storage.database.engine import open_engine, reading, writing
+from storage.database.owners import bound
+from storage.layout import captures as stored_captures
+from storage.layout import composites
+from storage.layout import mattes as stored_mattes
+from storage.layout import uploads as stored_uploads
+from storage.objects.checksums import SUFFIX
+from storage.objects.store import Objects
+from storage.records import captures, idempotency, jobs, mattes, statistics, tiles, uploads
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def engine(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Engine]:
+    sqlite = f"sqlite:///{tmp_path}/ledger.db"
+    engine = open_engine(sqlite if request.param == "sqlite" else request.getfixturevalue("postgresql"))
+    yield engine
+    engine.dispose()
+
+
+@pytest.fixture
+def objects(tmp_path: Path) -> Objects:
+    return Objects((tmp_path / "store").as_uri())
+
+
+def add(engine: Engine, owner: str, name: str, **times: float) -> None:
+    """A capture, a matte of it and an upload, all of one name, their jobs done."""
+    with writing(bound(engine, owner)) as c:
+        for kind, job in (("ingest", f"{name}-i"), ("recover", f"{name}-r")):
+            jobs.add(c, kind, name, {}, name, job=job)
+            jobs.end(c, job, "succeeded")
+        captures.add(c, name, f"{name}-i", name="", bytes=10, frames=1, program={}, **times)
+        captures.change(c, name, state="ready")
+        mattes.add(c, name, name, f"{name}-r", {}, **times)
+        mattes.change(c, name, state="ready")
+
+
+def over(engine: Engine) -> None:
+    """Whatever expires at all has expired."""
+    with writing(engine) as c:
+        for table in (tables.captures, tables.mattes):
+            c.execute(update(table).where(table.c.expires_at.is_not(None)).values(expires_at=time.time() - 1))
+
+
+def there(engine: Engine) -> dict[str, set[str]]:
+    with reading(engine) as c:
+        return {t.name: set(c.scalars(select(t.c.id))) for t in (tables.captures, tables.mattes)}
+
+
+def test_what_has_expired_goes_and_nothing_else(engine: Engine) -> None:
+    add(engine, "alice", "short", seconds=60.0)
+    add(engine, "bob", "long", seconds=3600.0)
+    add(engine, "bob", "ever")
+    with writing(engine) as c:
+        assert forget_expired(c) == []
+        for table in (tables.captures, tables.mattes):
+            row = c.execute(select(table).where(table.c.id == "short")).one()
+            assert row.expires_at == row.created_at + 60
+            c.execute(update(table).where(table.c.id == "short").values(expires_at=time.time() - 1))
+        uploads.add(c, "u", 5, "", -1, None)
+    with writing(engine) as c:
+        assert forget_expired(c) == ["uploads/u", "captures/short", "uploads/short", "mattes/short"]
+    assert there(engine) == {"captures": {"long", "ever"}, "mattes": {"long", "ever"}}
+    with reading(engine) as c:
+        assert jobs.get(c, "short-r").state == "succeeded"  # what is known of it stays
+
+
+@pytest.mark.parametrize("kind", ["recover", "composite"])
+@pytest.mark.parametrize("state", ["queued", "running"])
+def test_what_a_job_works_on_stays_until_it_has_ended(engine: Engine, kind: str, state: str) -> None:
+    add(engine, "alice", "used", seconds=60.0)
+    with writing(engine) as c:
+        job = jobs.add(c, kind, "used", {}, "used")
+        jobs.change(c, job, state=state)
+    over(engine)
+    with writing(engine) as c:
+        assert forget_expired(c) == []
+    assert there(engine) == {"captures": {"used"}, "mattes": {"used"}}
+    with writing(engine) as c:
+        jobs.end(c, job, "failed", {"detail": "", "status": 500})
+    with writing(engine) as c:
+        assert forget_expired(c) == ["captures/used", "uploads/used", "mattes/used"]
+
+
+def test_what_is_being_made_or_unmade_stays(engine: Engine) -> None:
+    """As long as a cancelled job is not wound up, its matte and its capture say so by their state."""
+    with writing(engine) as c:
+        job = jobs.add(c, "ingest", "c", {})
+        captures.add(c, "c", job, name="", bytes=1, frames=1, program={}, seconds=-1)
+        mattes.add(c, "m", "c", jobs.add(c, "recover", "c", {}, "m"), {}, -1)
+        for row in jobs.active(c):
+            jobs.cancel(c, row.id)
+        assert forget_expired(c) == []
+
+
+def ended_long_ago(engine: Engine) -> None:
+    with writing(engine) as c:
+        for row in c.execute(select(tables.jobs)).all():
+            if row.finished_at is not None:
+                jobs.change(c, row.id, finished_at=row.finished_at - 100)
+
+
+def listed(engine: Engine) -> set[str]:
+    with reading(engine) as c:
+        return set(c.scalars(select(tables.jobs.c.id)))
+
+
+def test_a_job_leaves_after_a_time_and_not_before_what_it_made(engine: Engine, objects: Objects) -> None:
+    add(engine, "alice", "kept")
+    add(engine, "bob", "gone")
+    with writing(engine) as c:
+        composite = jobs.add(c, "composite", "kept", {}, "kept", job="composite")
+        failed = jobs.add(c, "composite", "kept", {}, "kept", job="failed")
+        queued = jobs.add(c, "recover", "gone", {}, "gone", job="queued")
+        tiles.lay_down(c, composite, {"tiles": 3})
+        jobs.end(c, composite, "succeeded")
+        jobs.end(c, failed, "failed", {"detail": "", "status": 500})
+        captures.forget(c, "gone")
+        mattes.forget(c, "gone")
+    objects.put(composites.video_path(composite), b"video")
+    everything = {"kept-i", "kept-r", "gone-i", "gone-r", composite, failed, queued}
+    ended_long_ago(engine)
+    forget_jobs(engine, objects, None)
+    forget_jobs(engine, objects, 3600)
+    assert listed(engine) == everything
+    with writing(engine) as c:
+        tiles.retry(c, failed)
+    forget_jobs(engine, objects, 60)
+    assert listed(engine) == {"kept-i", "kept-r", failed, queued}
+    assert objects.below("composites") == set()
+    with reading(engine) as c:
+        for table in (tables.tiles, tables.log):
+            assert set(c.scalars(select(table.c.job))) <= listed(engine)
+
+
+def test_a_key_is_kept_as_long_as_what_it_made(engine: Engine, objects: Objects) -> None:
+    add(engine, "alice", "thing")
+    with writing(bound(engine, "alice")) as c:
+        for key, made in (("capture", "thing"), ("job", "thing-r"), ("gone", "another")):
+            idempotency.remember(c, key, "POST", made)
+    forget_jobs(engine, objects, None)
+
+    def known() -> list[str | None]:
+        with reading(bound(engine, "alice")) as c:
+            return [idempotency.made_by(c, key, "POST") for key in ("capture", "job", "gone")]
+
+    assert known() == ["thing", "thing-r", None]
+    with writing(engine) as c:
+        jobs.forget(c, "thing-r")
+        captures.forget(c, "thing")
+    forget_jobs(engine, objects, None)
+    assert known() == ["thing", None, None]  # the matte of this name is there
+    with writing(engine) as c:
+        mattes.forget(c, "thing")
+    forget_jobs(engine, objects, None)
+    assert known() == [None, None, None]
+
+
+def test_bytes_are_counted_once_a_thing_is_whole(engine: Engine, objects: Objects) -> None:
+    add(engine, "alice", "a")
+    add(engine, "bob", "b")
+    with writing(bound(engine, "alice")) as c:
+        captures.add(c, "under-way", "j", name="", bytes=1000, frames=1, program={})
+        mattes.add(c, "under-way", "a", "j", {})
+        uploads.add(c, "u", 20_000, "", 60, None)
+        clip = jobs.add(c, "composite", "a", {}, "a", stored=300_000)
+    objects.put(f"{stored_captures.path('a')}/x/y", bytes(1))
+    objects.put(f"{stored_uploads.path('a')}/rest", bytes(2))
+    objects.put(f"{stored_mattes.path('a')}/z", bytes(4))
+    objects.put(f"{stored_captures.path('under-way')}/z", bytes(999))
+    objects.put(composites.clip_path(clip), bytes(300_000))
+
+    def stored(owner: str) -> int:
+        count(engine, objects)
+        with reading(bound(engine, owner)) as c:
+            return statistics.of_bytes(c)
+
+    each = len(objects.load(f"{stored_mattes.path('a')}/z{SUFFIX}"))  # of the checksums, which count too
+    assert stored("alice") == 7 + 3 * each + 1000 + 20_000 + 300_000
+    assert stored("bob") == 0  # the bytes of its archive count until then
+    with writing(engine) as c:
+        jobs.end(c, clip, "succeeded")
+        jobs.change(c, clip, stored=None)
+        captures.change(c, "under-way", state="ready")
+        assert statistics.of_bytes(c, all_owners=True) == statistics.of_bytes(c)
+    objects.delete(composites.clip_path(clip))
+    objects.put(composites.video_path(clip), bytes(64))
+    assert stored("alice") == 7 + 999 + 20_000 + 64 + 5 * each
+    with reading(bound(engine, "bob")) as c:
+        assert statistics.of_bytes(c, all_owners=True) == 7 + 999 + 20_000 + 64 + 5 * each

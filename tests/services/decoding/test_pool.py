@@ -1,0 +1,236 @@
+"""Pictures decoded in child processes: the same pixels, and children that die, hang, grow or lie."""
+
+import io
+import pickle
+import socket
+import struct
+from collections.abc import Callable, Iterator
+from concurrent import futures
+from concurrent.futures import ThreadPoolExecutor
+
+import imagecodecs
+import numpy as np
+import psutil
+import pytest
+import tifffile
+from PIL import Image
+
+from services.decoding import process
+from services.decoding.pool import Decoders
+from services.decoding.process import NAME
+from storage.errors import ImageError, Unavailable
+from tests.services.cluster.clusters import running, wait
+from workflows.images import decode, float_formats, integer_formats
+from workflows.untrusted import decoder_guard
+
+MEMORY = 1 << 24
+PIXELS = np.random.default_rng(0).integers(0, 256, (30, 40, 3), np.uint8)
+
+
+def children() -> list[psutil.Process]:
+    """The decoders of this process."""
+    found = []
+    for one in running(psutil.Process().children(recursive=True)):
+        if one.name() == NAME:
+            found.append(one)
+    return found
+
+
+@pytest.fixture
+def decoders() -> Iterator[Decoders]:
+    made = Decoders(MEMORY)
+    yield made
+    made.close()
+    assert not children()
+
+
+def saved(kind: str, pixels: np.ndarray = PIXELS, **options: object) -> bytes:
+    target = io.BytesIO()
+    Image.fromarray(pixels).save(target, kind, **options)
+    return target.getvalue()
+
+
+def tiff(pixels: np.ndarray, **options: object) -> bytes:
+    target = io.BytesIO()
+    tifffile.imwrite(target, pixels, photometric="rgb", **options)
+    return target.getvalue()
+
+
+PNG = integer_formats.encode_png(PIXELS)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        PNG,
+        integer_formats.encode_png(PIXELS.astype(np.uint16) * 257),
+        integer_formats.encode_png(np.dstack([PIXELS, PIXELS[..., :1]])),
+        integer_formats.encode_png(PIXELS[..., :1]),
+        saved("JPEG"),
+        saved("JPEG", icc_profile=imagecodecs.cms_profile("adobergb")),
+        *(tiff(PIXELS, compression=name) for name in (None, "lzw", "zlib", "packbits", "lzma", "zstd")),
+        tiff(PIXELS.astype(np.uint16), compression="zlib", predictor=True),
+        tiff(PIXELS.astype(np.float32), compression="zlib", predictor=True),
+        float_formats.encode_exr({"RGB": PIXELS.astype(np.float32)}),
+    ],
+    ids=lambda data: data[:4].hex(),
+)
+def test_the_same_pixels_come_back(decoders: Decoders, data: bytes) -> None:
+    found = decoders.decode(data, "srgb")
+    expected = decode.decode(data, "srgb", memory=MEMORY)
+    assert found.dtype == expected.dtype
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"no picture", PNG[:-30], saved("PNG", np.zeros((4000, 5000, 3), np.uint8))]
+)
+def test_what_is_refused_is_refused_alike(decoders: Decoders, data: bytes) -> None:
+    with pytest.raises(ImageError) as expected:
+        decode.decode(data, "srgb", memory=MEMORY)
+    with pytest.raises(ImageError) as found:
+        decoders.decode(data, "srgb")
+    assert (found.value.detail, found.value.fields) == (expected.value.detail, expected.value.fields)
+    assert len(children()) == 1  # which goes on
+
+
+def test_as_many_as_are_asked_for_and_each_is_kept(decoders: Decoders) -> None:
+    assert not children()
+    for _ in range(5):
+        decoders.decode(PNG, "srgb")
+    assert len(children()) == 1
+    with ThreadPoolExecutor(4) as threads:
+        for found in threads.map(lambda _: decoders.decode(PNG, "srgb"), range(200)):
+            np.testing.assert_array_equal(found, PIXELS)
+    assert 1 <= len(children()) <= 4
+
+
+def asked(decoders: Decoders, after: Callable[[psutil.Process], None]) -> str:
+    """What is said of a picture whose decoder is stopped when it comes, and then something done to."""
+    decoders.decode(PNG, "srgb")
+    (child,) = children()
+    child.suspend()
+    with ThreadPoolExecutor(2) as threads:
+        both = [threads.submit(decoders.decode, PNG, "srgb") for _ in range(2)]
+        (done,), (left,) = futures.wait(both, return_when=futures.FIRST_COMPLETED)
+        np.testing.assert_array_equal(done.result(), PIXELS)  # by another one
+        after(child)
+        with pytest.raises(ImageError) as refused:
+            left.result()
+    wait(lambda: not running([child]))
+    np.testing.assert_array_equal(decoders.decode(PNG, "srgb"), PIXELS)
+    return refused.value.detail
+
+
+def test_one_that_is_killed_costs_its_picture_alone(decoders: Decoders) -> None:
+    assert "(SIGKILL)" in asked(decoders, lambda child: child.kill())
+
+
+@pytest.mark.full
+def test_one_that_hangs_is_given_up() -> None:
+    impatient = Decoders(MEMORY, seconds=8)
+    assert "takes more than 8 s" in asked(impatient, lambda child: None)
+    impatient.close()
+    assert not children()
+
+
+def test_one_that_dies_while_it_has_nothing_to_do_costs_nothing(decoders: Decoders) -> None:
+    decoders.decode(PNG, "srgb")
+    (child,) = children()
+    child.kill()
+    wait(lambda: not psutil.pid_exists(child.pid))  # with all of its threads
+    np.testing.assert_array_equal(decoders.decode(PNG, "srgb"), PIXELS)
+
+
+def test_memory_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(decoder_guard, "COPIES", 0)
+    monkeypatch.setattr(decoder_guard, "BESIDES", 32 << 20)
+    confined = Decoders(1 << 30)
+    large = saved("PNG", np.zeros((6000, 6000, 3), np.uint8))
+    with pytest.raises(ImageError, match="too much memory"):
+        confined.decode(large, "srgb")
+    np.testing.assert_array_equal(confined.decode(PNG, "srgb"), PIXELS)
+    confined.close()
+
+
+@pytest.mark.full
+def test_the_largest_that_is_allowed_has_room() -> None:
+    """16 bits, transparent and with a profile, which takes the most copies."""
+    noise = np.random.default_rng(1).integers(0, 1 << 16, (1000, 2000, 4), np.uint16)
+    data = tiff(
+        noise, compression="zlib", extrasamples=["unassalpha"], iccprofile=imagecodecs.cms_profile("adobergb")
+    )
+    decoders = Decoders(noise.nbytes)
+    assert decoders.decode(data, "srgb").shape == noise.shape
+    decoders.close()
+
+
+def framed(text: bytes) -> bytes:
+    return struct.pack("<I", len(text)) + text
+
+
+LIES = [
+    pickle.dumps(print),
+    framed(pickle.dumps({"said": None})),
+    framed(b"{}"),
+    struct.pack("<I", 1 << 31),
+    *(
+        framed(b'{"said": {"height": %s, "width": 40, "channels": 3, "dtype": "%s"}}' % head)
+        for head in (
+            (b"100000", b"float32"),
+            (b"-1", b"uint8"),
+            (b"30.5", b"uint8"),
+            (b"1e999", b"uint8"),
+            (b"30", b"object"),
+            (b'30, "more": 1', b"uint8"),
+        )
+    ),
+    framed(b'{"said": {"height": 30, "width": 40, "channels": 3, "dtype": "uint8"}}') + b"too few",
+    framed(b'{"said": {"height": 30, "width": 40, "channels": 4, "dtype": "float32"}}'),
+    framed(b'{"said": {"detail": 3}}'),
+    framed(b'{"said": {"detail": "no", "status": 200}}'),
+    b"",
+]
+
+
+def liar(number: int, connection: socket.socket, memory: int) -> None:
+    """A decoder that somebody has taken over."""
+    with connection:
+        connection.recv(1 << 16)
+        connection.sendall(LIES[number])
+
+
+class Liar:
+    """What a child runs in place of decoding; it goes there by its name, as all that runs there does."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+    def __call__(self, connection: socket.socket, memory: int) -> None:
+        liar(self.number, connection, memory)
+
+
+@pytest.mark.parametrize("number", range(len(LIES)))
+def test_what_one_answers_is_not_believed(
+    decoders: Decoders, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    monkeypatch.setattr(process, "_serve", Liar(number))
+    with pytest.raises(ImageError, match="ended the process"):
+        decoders.decode(PNG, "srgb")
+
+
+def test_whoever_comes_after_the_end_is_told(decoders: Decoders) -> None:
+    decoders.decode(PNG, "srgb")
+    decoders.close()
+    assert not children()
+    with pytest.raises(Unavailable, match="stopped"):
+        decoders.decode(PNG, "srgb")
+
+
+def test_a_child_is_confined(decoders: Decoders) -> None:
+    decoders.decode(PNG, "srgb")
+    (child,) = children()
+    assert child.rlimit(psutil.RLIMIT_CORE) == (0, 0)
+    assert child.rlimit(psutil.RLIMIT_FSIZE) == (0, 0)
+    room = decoder_guard.room(MEMORY)
+    assert room <= child.rlimit(psutil.RLIMIT_DATA)[1] < room + (4 << 30)

@@ -1,0 +1,265 @@
+"""Requests to URLs that strangers name: which are made, and how little of an answer they wait for."""
+
+import socket
+import ssl
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.webhooks import safe_http
+from storage.errors import OptionError
+from tests.services.webhooks.receivers import receiver
+
+PUBLIC = [
+    "93.184.216.34",
+    "1.1.1.1",
+    "2606:4700:4700::1111",
+    "::ffff:1.1.1.1",
+    "64:ff9b::101:101",
+    "2002:101:101::1",
+]
+NOT_PUBLIC = [
+    "0.0.0.0",
+    "10.0.0.1",
+    "100.64.0.1",
+    "127.0.0.1",
+    "127.9.9.9",
+    "169.254.169.254",
+    "172.16.0.1",
+    "192.168.1.1",
+    "198.18.0.1",
+    "224.0.0.1",
+    "239.255.255.250",
+    "240.0.0.1",
+    "255.255.255.255",
+    "::",
+    "::1",
+    "::127.0.0.1",
+    "::ffff:127.0.0.1",
+    "::ffff:10.0.0.1",
+    "::ffff:a9fe:a9fe",
+    "64:ff9b::7f00:1",
+    "64:ff9b:1::1",
+    "2002:7f00:1::1",
+    "2001:db8::1",
+    "fc00::1",
+    "fd12:3456::1",
+    "fe80::1",
+    "fe80::1%lo",
+    "fec0::1",
+    "ff02::1",
+    "100::1",
+]
+REFUSED = [
+    "https://127.0.0.1/",
+    "https://127.0.0.1:8000/x",
+    "https://2130706433/",
+    "https://0x7f000001/",
+    "https://0177.0.0.1/",
+    "https://127.1/",
+    "https://0/",
+    "https://167772161/",
+    "https://[::1]/",
+    "https://[::ffff:127.0.0.1]/",
+    "https://[::ffff:7f00:1]/",
+    "https://[fd00::1]/",
+    "https://localhost/",
+    "https://localhost./",
+    "https://a.LOCALHOST/",
+]
+NO_URL = [
+    "",
+    "example.com",
+    "ftp://example.com/",
+    "file:///etc/passwd",
+    "https://",
+    "https:///x",
+    "https://user@example.com/",
+    "https://user:secret@example.com/",
+    "https://example.com/#x",
+    "https://example.com:99999/",
+    "https://example.com:0/",
+    "https://example.com/\r\nX: y",
+    "https://example.com/ x",
+    "https://exämple.com/",
+    "https://[::1",
+    "https://a..b/",
+    "https://./",
+    "https://" + "x" * 64 + ".com/",
+    "https://[fe80::1%lo]/",
+    "https://[fe80::1%25lo]/",
+    "https://example.com/" + "x" * 2000,
+]
+
+
+@pytest.mark.parametrize("address", PUBLIC)
+def test_public_addresses(address: str) -> None:
+    assert safe_http.is_public(address)
+
+
+@pytest.mark.parametrize("address", NOT_PUBLIC)
+def test_addresses_that_are_not_public(address: str) -> None:
+    assert not safe_http.is_public(address)
+
+
+@pytest.mark.parametrize("url", REFUSED)
+def test_urls_of_such_addresses_are_refused_unless_they_may_be(url: str) -> None:
+    with pytest.raises(OptionError, match="ENVMATTE_WEBHOOK_PRIVATE") as caught:
+        safe_http.check(url, private=False)
+    assert caught.value.fields == {"field": "webhook"}
+    safe_http.check(url, private=True)
+
+
+@pytest.mark.parametrize("url", NO_URL)
+@pytest.mark.parametrize("private", [False, True])
+def test_what_is_no_webhook_is_refused(url: str, private: bool) -> None:
+    with pytest.raises(OptionError, match="https://HOST"):
+        safe_http.check(url, private=private)
+
+
+def test_without_tls_only_where_addresses_may_be_private() -> None:
+    safe_http.check("https://example.com:8443/a?b=c", private=False)
+    safe_http.check("http://example.com/", private=True)
+    with pytest.raises(OptionError, match="https://HOST"):
+        safe_http.check("http://example.com/", private=False)
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "2130706433", "127.1"])
+def test_nothing_connects_to_an_address_that_is_not_public(host: str) -> None:
+    with receiver(lambda n: 200) as found:
+        url = found.url.replace("127.0.0.1", host)
+        with pytest.raises(safe_http.Refused, match="not public"):
+            safe_http.post(url, b"x", {}, private=False)
+        assert found.came == []
+        assert safe_http.post(url, b"x", {"A": "b"}, private=True) == 200
+    ((headers, body),) = found.came
+    assert (headers["Host"].rpartition(":")[0], headers["A"], body) == (host, "b", b"x")
+
+
+def test_a_name_with_one_address_that_is_not_public_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    def both(*arguments: object, **options: object) -> list[tuple[object, ...]]:
+        return [(2, 1, 6, "", ("93.184.216.34", 0)), (10, 1, 6, "", ("::1", 0, 0, 0))]
+
+    monkeypatch.setattr(socket, "getaddrinfo", both)
+    with pytest.raises(safe_http.Refused, match="::1, which is not public"):
+        safe_http.post("https://example.com/", b"", {}, private=False)
+
+
+def test_it_connects_to_the_address_that_was_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    real, asked = socket.getaddrinfo, []
+
+    def rebinding(host: str, *arguments: object, **options: object) -> object:
+        if host == "rebinding.example":
+            asked.append(host)
+            return real("127.0.0.1" if len(asked) == 1 else "127.0.0.2", *arguments, **options)  # type: ignore[arg-type]
+        return real(host, *arguments, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(socket, "getaddrinfo", rebinding)
+    with receiver(lambda n: 200) as found:
+        url = found.url.replace("127.0.0.1", "rebinding.example")
+        assert safe_http.post(url, b"x", {}, private=True) == 200
+    assert len(asked) == 1
+    assert found.came[0][0]["Host"].startswith("rebinding.example:")
+
+
+def test_a_redirect_is_not_followed() -> None:
+    with receiver(lambda n: 200) as goal, receiver(lambda n: 302, Location=goal.url) as found:
+        assert safe_http.post(found.url, b"x", {}, private=True) == 302
+        assert goal.came == []
+
+
+@pytest.fixture(scope="module")
+def certificate(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file with a key and a certificate of localhost, signed by itself."""
+    key, name = ec.generate_private_key(ec.SECP256R1()), x509.Name([])
+    now = datetime.now(UTC)
+    made = (
+        x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number())
+        .not_valid_before(now - timedelta(hours=1))
+        .not_valid_after(now + timedelta(hours=1))
+        .add_extension(x509.SubjectAlternativeName([x509.DNSName("localhost")]), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    pem = serialization.Encoding.PEM
+    secret = key.private_bytes(pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    file = tmp_path_factory.mktemp("certificate") / "localhost.pem"
+    file.write_bytes(secret + made.public_bytes(pem))
+    return file
+
+
+def test_whom_it_talks_to_by_tls_has_to_have_a_certificate(
+    certificate: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with receiver(lambda n: 200, certificate=certificate) as found:
+        named = found.url.replace("127.0.0.1", "localhost")
+        with pytest.raises(ssl.SSLCertVerificationError):
+            safe_http.post(named, b"x", {}, private=True)
+        monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
+        assert safe_http.post(named, b"x", {}, private=True) == 200
+        with pytest.raises(ssl.SSLCertVerificationError):  # of another name
+            safe_http.post(found.url, b"x", {}, private=True)
+    assert len(found.came) == 1
+
+
+@given(st.one_of(st.text(), st.text().map("https://{}/".format), st.text().map("https://[{}]:1/".format)))
+def test_whatever_is_given_is_taken_or_refused(url: str) -> None:
+    with suppress(OptionError):
+        safe_http.check(url, private=False)
+
+
+@contextmanager
+def talking(say: Callable[[socket.socket], None]) -> Iterator[str]:
+    """A server that reads a request and says something of its own."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve() -> None:
+            connection, _ = server.accept()
+            with connection, suppress(OSError):
+                connection.recv(65536)
+                say(connection)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        yield f"http://127.0.0.1:{server.getsockname()[1]}/"
+        thread.join()
+
+
+def test_one_who_drips_an_answer_is_given_up() -> None:
+    def drip(connection: socket.socket) -> None:
+        connection.sendall(b"HTTP/1.1 200 OK\r\n")
+        while True:
+            connection.sendall(b"X: y\r\n"[:1])
+            threading.Event().wait(0.05)
+
+    with talking(drip) as url, pytest.raises(TimeoutError, match=r"0\.5 s"):
+        safe_http.post(url, b"x", {}, private=True, seconds=0.5)
+
+
+@pytest.mark.parametrize("line", [b"x" * 100_000 + b"\r\n", b"X: y\r\n" * 10_000], ids=["long", "many"])
+def test_an_answer_is_not_read_without_end(line: bytes) -> None:
+    def flood(connection: socket.socket) -> None:
+        connection.sendall(b"HTTP/1.1 200 OK\r\n")
+        while True:
+            connection.sendall(line)
+
+    with talking(flood) as url, pytest.raises((OSError, safe_http.http.client.HTTPException)):
+        safe_http.post(url, b"x", {}, private=True)
+
+
+def test_a_body_without_end_is_not_read() -> None:
+    def flood(connection: socket.socket) -> None:
+        connection.sendall(b"HTTP/1.1 204 No Content\r\nTransfer-Encoding: chunked\r\n\r\n")
+        while True:
+            connection.sendall(b"ffff\r\n" + bytes(0xFFFF) + b"\r\n")
+
+    with talking(flood) as url:
+        assert safe_http.post(url, b"x", {}, private=True) == 204

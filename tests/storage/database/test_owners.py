@@ -1,0 +1,132 @@
+"""The one rule of who sees what: statements over an engine that is bound to an owner."""
+
+import pytest
+from sqlalchemy import Engine, Executable, delete, exists, func, insert, select, text, union, update
+
+from storage.database import tables
+from storage.database.engine import reading, writing
+from storage.database.owners import NOBODY, bound, of_all
+from storage.database.rows import page
+from storage.errors import NotFound
+from storage.layout import uploads as stored_uploads
+from storage.records import captures, job_log, jobs, leases, tiles, uploads
+
+OWNERS = ("alice", "bob")
+
+
+@pytest.fixture
+def filled(engine: Engine) -> Engine:
+    """A database in which alice and bob have an active job, a capture and an upload each."""
+    for owner in OWNERS:
+        with writing(bound(engine, owner)) as c:
+            jobs.add(c, "ingest", f"{owner}-capture", {}, job=f"{owner}-job")
+            tiles.begin(c, f"{owner}-job")
+            captures.add(c, f"{owner}-capture", f"{owner}-job", name="", bytes=1, frames=1, program={})
+            uploads.add(c, f"{owner}-upload", 10, "", 60, "the-same-key")
+            uploads.advance(c, f"{owner}-upload", 0, [stored_uploads.Part(owner, 4)], 60)
+    return engine
+
+
+def test_lists_and_lookups_are_the_owners(filled: Engine) -> None:
+    for owner, other in (OWNERS, OWNERS[::-1]):
+        with reading(bound(filled, owner)) as c:
+            for table, what in ((tables.captures, "capture"), (tables.jobs, "job")):
+                assert [row.id for row in page(c, table, 10, None)] == [f"{owner}-{what}"]
+                with pytest.raises(NotFound):
+                    page(c, table, 10, f"{other}-{what}")
+            for get, what in ((captures.get, "capture"), (jobs.get, "job"), (uploads.get, "upload")):
+                assert get(c, f"{owner}-{what}").owner == owner
+                with pytest.raises(NotFound):
+                    get(c, f"{other}-{what}")
+            assert [row.id for row in jobs.active(c)] == [f"{owner}-job"]
+            found = uploads.by_key(c, "the-same-key")
+            assert found is not None
+            assert found.owner == owner
+    with reading(filled) as c:
+        assert [row.owner for row in jobs.active(c)] == list(OWNERS)
+    with reading(bound(filled, NOBODY)) as c:
+        assert jobs.active(c) == []
+
+
+def test_what_belongs_to_a_row_is_its_owners(filled: Engine) -> None:
+    with reading(bound(filled, "alice")) as c:
+        assert [line.text for line in job_log.notes(c, "alice-job", 0, 10)] == ["queued"]
+        assert job_log.notes(c, "bob-job", 0, 10) == []
+        assert uploads.parts_of(c, "alice-upload") == [stored_uploads.Part("alice", 4)]
+        assert uploads.parts_of(c, "bob-upload") == []
+        for joined in (
+            select(tables.jobs.c.id).join(tables.tiles),
+            select(tables.jobs.c.id).outerjoin(tables.tiles),
+            select(tables.tiles.c.job).join(tables.jobs),
+            select(tables.log.c.job).join(tables.tiles, tables.tiles.c.job == "bob-job"),
+        ):
+            assert set(c.scalars(joined)) <= {"alice-job"}
+
+
+def test_changes_and_deletions_touch_the_owners_rows_alone(filled: Engine) -> None:
+    with writing(bound(filled, "alice")) as c:
+        assert c.execute(update(tables.jobs).values(stage="mine")).rowcount == 1
+        assert c.execute(update(tables.tiles).values(attempts=7)).rowcount == 2
+        assert c.execute(delete(tables.log)).rowcount == 1
+        assert not uploads.forget(c, "bob-upload")
+        assert c.execute(delete(tables.captures)).rowcount == 1
+    with reading(filled) as c:
+        assert jobs.get(c, "bob-job").stage == "waiting"
+        assert len(job_log.notes(c, "bob-job", 0, 10)) == 1
+        assert c.scalar(select(func.sum(tables.tiles.c.attempts)).where(tables.tiles.c.job == "bob-job")) == 0
+        assert captures.exists(c, "bob-capture")
+
+
+def test_sums_over_all_owners_say_so(filled: Engine) -> None:
+    query = select(func.count()).select_from(tables.jobs)
+    with reading(bound(filled, "alice")) as c:
+        assert c.scalar(query) == 1
+        assert c.scalar(of_all(query)) == 2
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        text("SELECT * FROM jobs"),
+        select(text("* FROM jobs")),
+        select(tables.totals),
+        select(tables.keys),
+        select(tables.captures).where(exists().where(tables.jobs.c.id == "x")),
+        select(tables.jobs.c.id).where(tables.jobs.c.id.in_(select(tables.mattes.c.job))),
+        select(tables.jobs.alias()),
+        select(select(tables.jobs).subquery()),
+        select(tables.jobs).cte().select(),
+        select(select(tables.jobs.c.id).limit(1).scalar_subquery()),
+        union(select(tables.jobs.c.id), select(tables.captures.c.id)),
+        insert(tables.made).from_select(
+            ["key", "call", "id"], select(tables.jobs.c.id, tables.jobs.c.id, tables.jobs.c.id)
+        ),
+        delete(tables.log).where(tables.log.c.job.in_(select(tables.jobs.c.id))),
+        update(tables.totals).values(tiles=0),
+    ],
+    ids=lambda statement: " ".join(str(statement).split())[:60],
+)
+def test_what_cannot_be_narrowed_is_refused(engine: Engine, statement: Executable) -> None:
+    with writing(bound(engine, "alice")) as c, pytest.raises(TypeError, match="owner's"):
+        c.execute(statement)
+
+
+def test_every_table_is_someones_or_known_to_be_nobodys(engine: Engine) -> None:
+    refused = set()
+    for name, table in tables.metadata.tables.items():
+        with reading(bound(engine, "alice")) as c:
+            try:
+                assert c.execute(select(table)).all() == []
+            except TypeError:
+                refused.add(name)
+    assert refused == {"totals", "keys", "deliveries"}
+
+
+def test_the_coordinator_is_seen_by_all(engine: Engine) -> None:
+    with writing(engine) as c:
+        leases.take(c, "me")
+    with writing(bound(engine, NOBODY)) as c:
+        leases.touch(c)
+        sign = leases.last_sign(c)
+        assert sign is not None
+        assert sign.holder == "me"

@@ -1,0 +1,201 @@
+"""A capture in the store: its stack whatever the order of writing, its damage, and its record."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from numpy.typing import NDArray
+from sqlalchemy import Engine
+
+from storage.database.engine import writing
+from storage.errors import Corrupt, NotFound
+from storage.layout import captures as stored_captures
+from storage.layout.blocks import block_edge
+from storage.layout.captures import Stack, create_stack, write_slab
+from storage.objects.store import Objects
+from storage.records import captures
+
+SHAPE = (11, 37, 50, 3)
+
+
+def create(
+    objects: Objects,
+    capture: str = "c",
+    shape: tuple[int, int, int, int] = SHAPE,
+    slab: int = 4,
+    **more: object,
+) -> int:
+    given = {"mask": None, "images": (), "attributes": {"patterns": [1, 0]}} | more
+    memory = 2 * slab * int(np.prod(shape[1:])) * 2
+    return create_stack(objects, capture, shape, np.dtype("uint16"), memory=memory, **given)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def values() -> NDArray[np.uint16]:
+    made = np.random.default_rng(1).integers(0, 65536, SHAPE, np.uint16)
+    made[4:8] = 0  # a slab of nothing but zeros is stored like any other
+    return made
+
+
+def fill(objects: Objects, values: NDArray[np.uint16], order: tuple[int, ...] = (0, 1, 2)) -> Stack:
+    assert create(objects) == 4
+    for slab in order:
+        write_slab(objects, "c", slab * 4, values[slab * 4 : slab * 4 + 4])
+    return Stack(objects, "c")
+
+
+def test_what_is_written_is_read(objects: Objects, values: NDArray[np.uint16]) -> None:
+    stack = fill(objects, values)
+    assert stack.missing() == []
+    assert (stack.frames, stack.height, stack.width, stack.channels) == SHAPE
+    assert stack.dtype == np.uint16
+    assert stack.attributes == {"patterns": [1, 0]}
+    np.testing.assert_array_equal(stack.read(), values)
+    part = stack.read(slice(5, 33), slice(15, 18), slice(3, 9))
+    np.testing.assert_array_equal(part, values[3:9, 5:33, 15:18])
+    picked = stack.pick([9, 0, 4, 4], slice(5, 33), slice(15, 18))
+    np.testing.assert_array_equal(picked, values[[9, 0, 4, 4], 5:33, 15:18])
+    assert stack.recovered(slice(5, 33), slice(15, 18)).all()
+    of_part, mask = stack.read_masked(slice(5, 33), slice(15, 18))
+    np.testing.assert_array_equal(of_part, values[:, 5:33, 15:18])
+    assert mask.shape == (28, 3)
+    assert mask.all()
+    assert stack.images() == []
+
+
+@pytest.mark.parametrize("order", [(2, 0, 1), (1, 2, 0, 1, 1)])
+def test_slabs_in_any_order_and_again_are_the_same_bytes(
+    objects: Objects,
+    values: NDArray[np.uint16],
+    digests: Callable[[str], dict[str, str]],
+    order: tuple[int, ...],
+) -> None:
+    fill(objects, values)
+    plain = digests("captures/c")
+    fill(objects, values, order)
+    assert digests("captures/c") == plain
+    assert (
+        sum("/c/" in name for name in plain)
+        == zarr.open_array(objects.zarr, path="captures/c/frames").nchunks
+    )
+
+
+def test_masks_and_images_come_back(objects: Objects) -> None:
+    rng = np.random.default_rng(2)
+    mask = rng.random((37, 50)) < 0.5
+    images = [rng.random((n, 3, 1 + 2 * (n % 2)), np.float32) for n in range(1, 12)]
+    create(objects, mask=mask, images=images)
+    frames = rng.integers(0, 65536, SHAPE, np.uint16)
+    for slab in (0, 4, 8):
+        write_slab(objects, "c", slab, frames[slab : slab + 4])
+    stack = Stack(objects, "c")
+    np.testing.assert_array_equal(stack.read_masked()[1], mask)
+    np.testing.assert_array_equal(stack.recovered(slice(3, 9), slice(40, 50)), mask[3:9, 40:50])
+    of_part, part = stack.read_masked(slice(3, 9), slice(40, 50))
+    np.testing.assert_array_equal(of_part, frames[:, 3:9, 40:])
+    np.testing.assert_array_equal(part, mask[3:9, 40:])
+    assert part.dtype == bool
+    for read, image in zip(stack.images(), images, strict=True):
+        np.testing.assert_array_equal(read, image)
+
+
+@pytest.mark.parametrize("memory", [1, 10**5, 10**7, 10**9])
+@pytest.mark.parametrize("shape", [(7, 5, 3, 1), (200, 100, 130, 3), (30, 600, 1000, 3)])
+def test_a_slab_and_its_chunks_are_bounded(
+    objects: Objects, memory: int, shape: tuple[int, int, int, int]
+) -> None:
+    slab = create_stack(
+        objects, "c", shape, np.dtype("uint8"), memory=memory, attributes={}, mask=None, images=()
+    )
+    frame = int(np.prod(shape[1:]))
+    assert 1 <= slab <= shape[0]
+    assert slab == 1 or slab * frame <= memory / 2
+    assert slab == shape[0] or (slab + 1) * frame > memory / 2
+    chunks = zarr.open_array(objects.zarr, path="captures/c/frames").chunks
+    edge = block_edge(shape[1], shape[2])
+    least = slab * min(edge, shape[1]) * min(edge, shape[2]) * shape[3]
+    assert int(np.prod(chunks)) <= max(2 * stored_captures.CHUNK, least)
+    for size, n in zip(chunks[1:3], shape[1:3], strict=True):
+        assert size == n or size % edge == 0
+
+
+def test_a_stack_made_again_keeps_what_was_written(objects: Objects, values: NDArray[np.uint16]) -> None:
+    stack = fill(objects, values)
+    stack.annotate(noise=1)
+    stack.save()
+    assert create(objects) == 4
+    again = Stack(objects, "c")
+    np.testing.assert_array_equal(again.read(), values)
+    assert again.attributes == {"patterns": [1, 0], "noise": 1}
+
+
+def test_what_was_measured_is_kept(objects: Objects) -> None:
+    create(objects)
+    stack = Stack(objects, "c")
+    stack.annotate(noise={"read": 1e-6})
+    assert stack.attributes == {"patterns": [1, 0], "noise": {"read": 1e-6}}
+    assert Stack(objects, "c").attributes == {"patterns": [1, 0]}
+    stack.save()
+    assert Stack(objects, "c").attributes == {"patterns": [1, 0], "noise": {"read": 1e-6}}
+
+
+def test_a_removed_chunk_is_corrupt(objects: Objects, folder: Path, values: NDArray[np.uint16]) -> None:
+    stack = fill(objects, values)
+    (folder / "captures/c/frames/c/1/0/0/0").unlink()
+    assert stack.missing() == [1]
+    with pytest.raises(Corrupt, match="frames/c/1/0/0/0"):
+        Stack(objects, "c").read(slice(0, 2), slice(0, 2))
+    np.testing.assert_array_equal(stack.read(frames=slice(0, 4)), values[:4])
+
+
+@pytest.mark.parametrize("name", ["mask", "images/0"])
+def test_a_removed_chunk_of_a_mask_or_an_image_is_corrupt(objects: Objects, folder: Path, name: str) -> None:
+    create(objects, mask=np.zeros(SHAPE[1:3], bool), images=[np.zeros((4, 4, 1), np.float32)])
+    for slab in (0, 4, 8):
+        write_slab(objects, "c", slab, np.zeros((min(4, 11 - slab), *SHAPE[1:]), np.uint16))
+    stack = Stack(objects, "c")
+    assert not stack.read_masked()[1].any()
+    assert not stack.images()[0].any()
+    chunk = next(path for path in (folder / "captures/c" / name / "c").rglob("*") if path.is_file())
+    chunk.unlink()
+    with pytest.raises(Corrupt):
+        stack.read_masked() if name == "mask" else stack.images()
+
+
+def test_slabs_that_were_never_written_are_corrupt(objects: Objects, values: NDArray[np.uint16]) -> None:
+    stack = fill(objects, values, order=(0, 2))
+    assert stack.missing() == [1]
+    with pytest.raises(Corrupt):
+        stack.read()
+
+
+def test_a_capture_that_is_not_there(objects: Objects) -> None:
+    with pytest.raises(Corrupt, match="capture none"):
+        Stack(objects, "none")
+
+
+def test_a_capture_without_its_frames_is_corrupt(objects: Objects, folder: Path) -> None:
+    create(objects)
+    (folder / "captures/c/frames/zarr.json").unlink()
+    with pytest.raises(Corrupt, match="capture c"):
+        Stack(objects, "c")
+
+
+def test_the_record(engine: Engine) -> None:
+    with writing(engine) as connection:
+        captures.add(connection, "c1", "j1", name="ball", bytes=7, frames=3, program={"parts": []})
+        captures.add(connection, "c2", "j2", name="", bytes=8, frames=4, program={})
+        row = captures.get(connection, "c1")
+        assert (row.state, row.job, row.name, row.bytes, row.frames) == ("ingesting", "j1", "ball", 7, 3)
+        assert (row.program, row.width, row.problem) == ({"parts": []}, None, None)
+        captures.change(connection, "c1", state="ready", width=20, height=10)
+    with writing(engine) as connection:
+        row = captures.get(connection, "c1")
+        assert (row.state, row.width, row.height) == ("ready", 20, 10)
+        assert captures.get(connection, "c2").state == "ingesting"
+        captures.forget(connection, "c1")
+        with pytest.raises(NotFound, match="'c1'"):
+            captures.get(connection, "c1")
+        assert captures.get(connection, "c2").job == "j2"

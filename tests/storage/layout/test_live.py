@@ -1,0 +1,41 @@
+"""What is kept of a matte for graphics hardware."""
+
+from pathlib import Path
+
+import pytest
+import zarr
+
+from storage.layout import live, mattes
+from storage.objects.store import Objects
+
+FORMAT = "live-1"
+
+
+@pytest.fixture
+def objects(tmp_path: Path) -> Objects:
+    made = Objects(tmp_path.as_uri())
+    mattes.create(made, "m", height=4, width=5, columns=8, rows=6)
+    return made
+
+
+def test_what_is_kept_is_read_again_until_the_matte_goes(objects: Objects) -> None:
+    assert live.read(objects, "m", FORMAT) is None
+    live.keep(objects, "m", FORMAT, bytes(range(256)))
+    live.keep(objects, "m", FORMAT, b"another")
+    assert live.read(objects, "m", FORMAT) == b"another"
+    assert live.read(objects, "m", "live-2") is None
+    objects.delete(mattes.path("m"))
+    assert live.read(objects, "m", FORMAT) is None
+
+
+def test_what_is_half_written_is_made_again(objects: Objects, tmp_path: Path) -> None:
+    live.keep(objects, "m", FORMAT, b"whole")
+    (tmp_path / "mattes/m" / FORMAT / "c/0").unlink()
+    assert live.read(objects, "m", FORMAT) is None
+
+
+def test_it_is_an_array_of_the_mattes_group(objects: Objects, tmp_path: Path) -> None:
+    live.keep(objects, "m", FORMAT, b"bytes")
+    group = zarr.open_group(tmp_path / "mattes/m", mode="r")
+    assert FORMAT in dict(group.members())
+    assert bytes(group[FORMAT][:]) == b"bytes"

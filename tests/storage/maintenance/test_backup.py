@@ -1,0 +1,348 @@
+"""A backup of a whole installation, and its way back: into other kinds of databases and stores, whole or not at all."""
+
+import hashlib
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import Engine, delete, func, select, text
+
+from storage.database import dialects, migrations
+from storage.database import tables as database_tables
+from storage.database.engine import open_engine, reading, writing
+from storage.errors import Conflict, Corrupt, InvalidInput
+from storage.layout import composites
+from storage.maintenance import row_dump
+from storage.maintenance.backup import LEDGER, MANIFEST, back_up
+from storage.maintenance.restore import MARKER, restore
+from storage.maintenance.row_dump import open_as_it_is
+from storage.maintenance.verify import verify
+from storage.objects.store import Objects
+from storage.records import captures, jobs, leases, mattes, tiles
+from tests.storage.furnished import contents, flip, furnish
+
+Bytes = dict[str, bytes]
+HALF = """
+import os, sys
+from storage import dialects
+from storage.objects.store import Objects
+from storage.maintenance.restore import restore
+source, database, store = sys.argv[1:]
+restore(Objects(source), dialects.create(database), Objects(store), lambda share, size: os._exit(9))
+"""
+
+
+@pytest.fixture
+def furnished(engine: Engine, objects: Objects) -> Objects:
+    furnish(engine, objects)
+    return objects
+
+
+@pytest.fixture
+def target(tmp_path: Path) -> Objects:
+    return Objects((tmp_path / "backup").as_uri())
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path) -> Iterator[tuple[Engine, Objects]]:
+    """An installation that holds nothing yet."""
+    engine = dialects.create(f"sqlite:///{tmp_path}/elsewhere.db")
+    yield engine, Objects((tmp_path / "elsewhere").as_uri())
+    engine.dispose()
+
+
+def rows_of(engine: Engine) -> list[str]:
+    """All rows that a backup has, as it has them; a job that runs is queued where it is restored."""
+    with reading(engine) as c:
+        lines = [list(line) for line in row_dump.lines(c, row_dump.tables_of(c))]
+    for name, row in lines:
+        if name == "jobs" and row["state"] == "running":
+            row |= {"state": "queued", "stage": "waiting"}
+    return sorted(json.dumps(line, sort_keys=True) for line in lines)
+
+
+def needed(objects: Objects) -> Bytes:
+    return {
+        path: data for path, data in contents(objects).items() if not path.startswith("composites/v/clip")
+    }
+
+
+def nothing(engine: Engine, objects: Objects) -> None:
+    """See that an installation holds nothing."""
+    with reading(engine) as c:
+        assert row_dump.counts(c, row_dump.tables_of(c)) == {}
+    assert contents(objects) == {}
+
+
+def lines_of(target: Objects, name: str = MANIFEST) -> list[bytes]:
+    return target.load(name).splitlines(keepends=True)
+
+
+def sealed(target: Objects, lines: list[bytes]) -> None:
+    """Write a manifest whose last line fits the others."""
+    entries = [json.loads(line) for line in lines[1:-1]]
+    digest = hashlib.sha256(b"".join(lines[:-1])).hexdigest()
+    last = {"objects": len(entries), "bytes": sum(one["size"] for one in entries), "sha256": digest}
+    target.store(MANIFEST, iter([*lines[:-1], json.dumps(last).encode()]))
+
+
+@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+def test_from_sqlite_and_a_folder_to_postgresql_and_a_bucket_and_back(
+    engine: Engine,
+    objects: Objects,
+    folder: Path,
+    s3: str,
+    postgresql: str,
+    elsewhere: tuple[Engine, Objects],
+) -> None:
+    furnish(engine, objects)
+    there, bucket = Objects(f"{s3}/backup"), Objects(f"{s3}/store")
+    told: list[tuple[float, int]] = []
+    made = back_up(engine, objects, there, "1.2.3", lambda *how: told.append(how))
+    assert told[-1] == (1.0, made["bytes"])
+    assert made["bytes"] == sum(map(len, contents(objects).values()))
+    header = json.loads(lines_of(there)[0])
+    assert (header["version"], header["revision"]) == ("1.2.3", migrations.newest())
+    second = dialects.create(postgresql)
+    assert restore(there, second, bucket) == made
+    assert rows_of(second) == rows_of(engine)
+    assert contents(bucket) == contents(objects)
+    assert bucket.names("") == ["captures", "composites", "mattes", "uploads"]
+    assert verify(second, bucket).findings == []
+    with writing(second) as c:  # it goes on with its numbers
+        number = c.scalar(select(func.max(database_tables.jobs.c.number)))
+        assert jobs.get(c, jobs.add(c, "ingest", "n", {})).number == number + 1
+        jobs.cancel(
+            c, c.scalar(select(database_tables.jobs.c.id).where(database_tables.jobs.c.capture == "n"))
+        )
+    back = Objects((folder.parent / "back").as_uri())
+    again = back_up(second, bucket, back, "1.2.3")
+    assert again["objects"] == made["objects"]
+    restore(back, *elsewhere)
+    assert rows_of(elsewhere[0]) == rows_of(second)
+    assert contents(elsewhere[1]) == contents(objects)
+    second.dispose()
+    with reading(elsewhere[0]) as c:
+        row = jobs.get(c, "rr")
+        assert (row.state, row.done, tiles.to_do(c, "rr")) == ("queued", 2, [2, 3, 4, 5])
+        tables = row_dump.tables_of(c)
+        for name in row_dump.LEFT_OUT:  # who drives, and what the first service still has to tell
+            assert c.scalar(select(func.count()).select_from(tables[name])) == 0
+    with reading(engine) as c:
+        assert c.scalar(select(func.count()).select_from(database_tables.deliveries)) == 1
+
+
+def test_what_is_deleted_or_ends_meanwhile(
+    engine: Engine, furnished: Objects, target: Objects, elsewhere: tuple[Engine, Objects]
+) -> None:
+    """Each family but the first that is copied has changed when its turn comes."""
+    first: list[str] = []
+
+    def meanwhile(share: float, size: int) -> None:
+        if first:
+            return
+        first.extend(target.names("objects"))
+        with writing(engine) as c:
+            jobs.cancel(c, "rr")
+            mattes.forget(c, "m")
+            mattes.forget(c, "r")
+            captures.change(c, "i", state="ready")
+            jobs.end(c, "ii", "succeeded")
+            for job in ("v", "w"):
+                c.execute(delete(database_tables.jobs).where(database_tables.jobs.c.id == job))
+        for path in ("mattes/m", "mattes/r", "uploads/i", "composites/v", "composites/w"):
+            furnished.delete(path)
+        for path in [path for path in furnished.sizes("captures/c")]:
+            furnished.store(path.replace("/c/", "/i/", 1), iter([furnished.load(path)]))
+
+    back_up(engine, furnished, target, "1", meanwhile)
+    restore(target, *elsewhere)
+    assert verify(*elsewhere).findings == []
+    with reading(elsewhere[0]) as c:
+        found = dict(c.execute(select(database_tables.captures.c.id, database_tables.captures.c.state)).all())
+        assert found["c"] == "ready"
+        assert set(c.scalars(select(database_tables.mattes.c.id))) in ({"l"}, {"l", "m", "r"})
+        for row in jobs.active(c):  # whatever goes on has what it needs
+            if row.kind == "recover":
+                assert mattes.get(c, row.matte).state == "recovering"
+                assert f"mattes/{row.matte}/zarr.json" in elsewhere[1].sizes(f"mattes/{row.matte}")
+            if row.kind == "composite":
+                assert composites.clip_path(row.id) in elsewhere[1].sizes(composites.path(row.id))
+        if found["i"] == "ready":
+            assert jobs.get(c, "ii").state == "succeeded"
+
+
+@pytest.mark.parametrize("how", ["flipped", "gone"])
+def test_what_is_damaged_is_no_backup(engine: Engine, furnished: Objects, target: Objects, how: str) -> None:
+    path = "mattes/m/S/c/1/2/0"
+    flip(furnished, path) if how == "flipped" else furnished.delete(path)
+    with pytest.raises(
+        Corrupt, match=rf"{path} is (damaged|missing) .*recover, or import, it again.*envmatte verify"
+    ):
+        back_up(engine, furnished, target, "1")
+    assert target.names("") == []
+
+
+def test_only_into_what_is_empty(
+    engine: Engine, furnished: Objects, target: Objects, elsewhere: tuple[Engine, Objects]
+) -> None:
+    with pytest.raises(
+        Conflict, match=r"has no manifest\.jsonl: there is no backup, or one that was never finished"
+    ):
+        restore(target, *elsewhere)
+    back_up(engine, furnished, target, "1")
+    with pytest.raises(Conflict, match="has a backup already: name an empty folder"):
+        back_up(engine, furnished, target, "1")
+    target.delete(MANIFEST)
+    with pytest.raises(Conflict, match=r"is not empty, 'ledger\.jsonl' is there"):
+        back_up(engine, furnished, target, "1")
+    for what in (LEDGER, "objects"):
+        target.delete(what)
+    back_up(engine, furnished, target, "1")
+    with pytest.raises(Conflict, match=r"not empty, its database has rows: .*2 of captures.*name another"):
+        restore(target, engine, elsewhere[1])
+    with pytest.raises(Conflict, match=r"not empty, its store .* has captures/c\."):
+        restore(target, elsewhere[0], furnished)
+    used = open_engine(elsewhere[0].url.render_as_string(hide_password=False))
+    with writing(used) as c:
+        leases.take(c, "somebody")
+    with pytest.raises(Conflict, match="a service runs on the installation: stop it"):
+        restore(target, *elsewhere)
+    with writing(used) as c:
+        leases.give_back(c, 1)
+    restore(target, *elsewhere)
+    used.dispose()
+
+
+def change(index: int, **values: Any) -> Callable[[list[bytes]], None]:
+    def apply(lines: list[bytes]) -> None:
+        lines[index] = json.dumps(json.loads(lines[index]) | values).encode() + b"\n"
+
+    return apply
+
+
+LIES: dict[str, tuple[str, Callable[[list[bytes]], None]]] = {
+    "cut": ("cut short, or was changed", lambda lines: lines.__delitem__(slice(5, None))),
+    "half a line": ("cut short, or was changed", lambda lines: lines.__setitem__(-1, lines[-1][:30])),
+    "one less": ("cut short, or was changed", lambda lines: lines.__delitem__(4)),
+    "empty": ("cut short, or was changed", lambda lines: lines.clear()),
+    "format": ("the format 'x', and this envmatte knows", change(0, format="x")),
+    "revision": ("the backup is of a newer envmatte: it has revision 9999", change(0, revision="9999")),
+}
+SEALED: dict[str, tuple[str, Callable[[list[bytes]], None]]] = {
+    "above": ("names 'captures/../../x', which is no object", change(3, name="captures/../../x")),
+    "root": ("names '/etc/x'", change(3, name="/etc/x")),
+    "elsewhere": ("names 'certs/ca.pem'", change(3, name="certs/ca.pem")),
+    "hidden": ("names 'captures/c/.x'", change(3, name="captures/c/.x")),
+    "number": ("names 3", change(3, name=3)),
+    "not there": ("captures/c/none is missing in the backup", change(3, name="captures/c/none")),
+    "checksum": ("is not what manifest.jsonl says: it is damaged", change(3, sha256="0" * 64)),
+    "no checksum": ("no size and checksum of", change(3, sha256="x")),
+    "ledger": ("ledger.jsonl in the backup is not what", change(0, ledger={"size": 1, "sha256": "0" * 64})),
+}
+
+
+@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+def test_what_lies_is_refused_and_leaves_nothing(
+    engine: Engine, furnished: Objects, folder: Path, target: Objects, elsewhere: tuple[Engine, Objects]
+) -> None:
+    back_up(engine, furnished, target, "1")
+    whole = lines_of(target)
+    for lies, seal in ((LIES, False), (SEALED, True)):
+        for match, apply in lies.values():
+            lines = list(whole)
+            apply(lines)
+            sealed(target, lines) if seal else target.store(MANIFEST, iter(lines))
+            with pytest.raises((InvalidInput, Conflict), match=match):
+                restore(target, *elsewhere)
+            nothing(*elsewhere)
+    target.store(MANIFEST, iter(whole))
+    for path in ("objects/mattes/m/rho/c/0/0/0", LEDGER):
+        flip(target, path)
+        with pytest.raises(InvalidInput, match=r"is not what manifest\.jsonl says: it is damaged"):
+            restore(target, *elsewhere)
+        nothing(*elsewhere)
+        flip(target, path)
+    rows = lines_of(target, LEDGER)
+    for row, match in (
+        (b'["alembic_version",{"version_num":"x"}]\n', "table 'alembic_version'"),
+        (b'["coordinator",{"id":1}]\n', "table 'coordinator'"),
+        (b'["jobs",{"id":1}]\n', "a row of jobs with other columns"),
+        (b"[1]\n", "a line that is no row"),
+    ):
+        data = b"".join(rows) + row
+        target.store(LEDGER, iter([data]))
+        lines = list(whole)
+        change(0, ledger={"size": len(data), "sha256": hashlib.sha256(data).hexdigest()})(lines)
+        sealed(target, lines)
+        with pytest.raises(InvalidInput, match=match):
+            restore(target, *elsewhere)
+        nothing(*elsewhere)
+    target.store(LEDGER, iter(rows))
+    target.store(MANIFEST, iter(whole))
+    restore(target, *elsewhere)
+    assert rows_of(elsewhere[0]) == rows_of(engine)
+    assert contents(elsewhere[1]) == contents(furnished)
+
+
+@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+def test_one_that_was_killed_holds_nothing_and_is_done_again(
+    engine: Engine, furnished: Objects, target: Objects, elsewhere: tuple[Engine, Objects]
+) -> None:
+    back_up(engine, furnished, target, "1")
+    second, store = elsewhere
+    where = [target.url, second.url.render_as_string(), store.url]
+    killed = subprocess.run([sys.executable, "-c", HALF, *where], timeout=120)
+    assert killed.returncode == 9
+    assert contents(store)
+    assert MARKER in store.names("")
+    store.put("mattes/x/left", b"of the first")
+    other = dialects.create(f"{second.url.render_as_string()}.other")
+    with pytest.raises(Conflict, match=r"its store .* has \w+/"):  # it may be in use with the first database
+        restore(target, other, store)
+    other.dispose()
+    restore(target, second, store)
+    assert contents(store) == contents(furnished)
+    assert MARKER not in store.names("")
+
+
+def test_one_of_an_earlier_revision_is_brought_up_to_date(
+    tmp_path: Path, objects: Objects, target: Objects, elsewhere: tuple[Engine, Objects]
+) -> None:
+    url = f"sqlite:///{tmp_path}/old.db"
+    old = dialects.create(url)
+    with writing(old) as c:
+        migrations.upgrade(c, "0004")
+        c.execute(
+            text(
+                "INSERT INTO jobs VALUES (7, 'j', 'recover', 'running', 'recovering', 'c', 'm', '{}', "
+                "'{\"tiles\": 2}', 2, 1, 0, 10, NULL, 1000.5, 1001.5, NULL, NULL, NULL, NULL, 0, NULL)"
+            )
+        )
+        c.execute(
+            text("INSERT INTO tiles VALUES ('j', 0, 'done', 1, 0.5, 0), ('j', 1, 'queued', 2, NULL, 0)")
+        )
+        c.execute(text("INSERT INTO uploads VALUES ('u', NULL, 1, 2, 1, '', 1000.5, 9e9)"))
+        c.execute(text("INSERT INTO upload_parts VALUES ('u', 0, 'p', 1)"))
+    old.dispose()
+    objects.store("uploads/u/p.part", iter([b"x"]))
+    opened = open_as_it_is(url)
+    back_up(opened, objects, target, "1")
+    with reading(opened) as c:
+        assert migrations.revision(c) == "0004"  # which making a copy before an upgrade is for
+    opened.dispose()
+    restore(target, *elsewhere)
+    with reading(elsewhere[0]) as c:
+        assert migrations.revision(c) == migrations.newest()
+        row = jobs.get(c, "j")
+        assert (row.state, row.stage, row.problem, row.owner) == ("queued", "waiting", None, "default")
+        assert tiles.to_do(c, "j") == [1]
+        assert (
+            c.scalar(select(database_tables.jobs.c.id).where(database_tables.jobs.c.problem.is_(None))) == "j"
+        )
+        assert c.execute(select(database_tables.upload_parts)).all() == [("u", 0, "p", 1)]
+    assert verify(*elsewhere).read["unchecked"] == 1

@@ -1,0 +1,148 @@
+"""Checksums: what has rotted is told wherever it is read; what has none is read as before."""
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import google_crc32c
+import numpy as np
+import pytest
+import zarr
+from sqlalchemy import Engine
+
+from storage.errors import Corrupt
+from storage.layout import captures, composites, live, uploads
+from storage.layout.captures import Stack
+from storage.layout.matte_archive import Archive
+from storage.layout.mattes import Matte
+from storage.objects.checksums import BLOCK, CODECS, Table, crc32c, is_intact, seal, unseal
+from storage.objects.store import Objects, together
+from tests.storage.furnished import ARCHIVE, flip, furnish, stream
+
+READS: dict[str, tuple[str, Callable[[Objects], Any]]] = {
+    "frames": ("captures/c/frames/c/0/0/0/0", lambda o: Stack(o, "c").read()),
+    "mask": ("captures/c/mask/c/0/0", lambda o: Stack(o, "c").recovered()),
+    "images": ("captures/c/images/0/c/0/0/0", lambda o: Stack(o, "c").images()),
+    "shares": ("captures/c/shares/c/0/0", lambda o: Stack(o, "c").shares()),
+    "manifest": ("captures/c/zarr.json", lambda o: Stack(o, "c")),
+    "measured": ("captures/c/measured/zarr.json", lambda o: Stack(o, "c")),
+    "stack": ("captures/c/frames/zarr.json", lambda o: Stack(o, "c")),
+    "figures": ("mattes/m/zarr.json", lambda o: Matte(o, "m")),
+    "layer": ("mattes/m/rho/c/0/0/0", lambda o: Matte(o, "m").layer("rho")),
+    "truths": ("mattes/m/shared/c/1/2", lambda o: Matte(o, "m").read(1, 2)),
+    "cells": ("mattes/m/T/1.2/cell/c/0", lambda o: Matte(o, "m").read(1, 2)),
+    "weights": ("mattes/m/T/1.2/weight/c/0", lambda o: Matte(o, "m").read(1, 2)),
+    "rows": ("mattes/m/T/1.2/weight/zarr.json", lambda o: Matte(o, "m").read(1, 2)),
+    "export": ("mattes/m/T/1.2/weight/c/0", lambda o: list(Archive(o, "m"))),
+    "part": ("uploads/i/all.part", lambda o: uploads.read(o, "i").read()),
+    "index": ("uploads/i/parts.json", lambda o: uploads.read(o, "i")),
+    "clip": ("composites/w/clip", lambda o: o.read(composites.clip_path("w")).read()),
+    "video": ("composites/v/video.mp4", lambda o: o.read(composites.video_path("v")).read()),
+    "table": ("composites/v/video.mp4.crc32c", lambda o: o.read(composites.video_path("v")).read()),
+}
+
+
+@pytest.fixture
+def furnished(engine: Engine, objects: Objects) -> Objects:
+    furnish(engine, objects)
+    return objects
+
+
+@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+def test_a_flipped_bit_is_told_by_name_wherever_it_is_read(furnished: Objects) -> None:
+    for path, read in READS.values():
+        read(furnished)
+        for at in (0.0, 0.5, 1.0):
+            flip(furnished, path, at)
+            with pytest.raises(Corrupt) as caught:
+                read(furnished)
+            assert path in caught.value.detail or path.partition("/m/")[2] in caught.value.detail
+            assert "again" in caught.value.detail
+            flip(furnished, path, at)
+        read(furnished)
+
+
+@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+def test_a_browser_s_bytes_that_rot_are_made_again(furnished: Objects) -> None:
+    assert live.read(furnished, "m", "live-1") is not None
+    flip(furnished, "mattes/m/live-1/c/0")
+    assert live.read(furnished, "m", "live-1") is None
+
+
+def test_a_stretch_is_read_though_another_block_is_damaged(objects: Objects) -> None:
+    stream(objects, "uploads/u/p.part", ARCHIVE)
+    flip(objects, "uploads/u/p.part")
+    with objects.read("uploads/u/p.part") as file:
+        assert file.read(1000) == ARCHIVE[:1000]
+        file.seek(2 * BLOCK)
+        assert file.read() == ARCHIVE[2 * BLOCK :]
+        file.seek(BLOCK - 10)
+        with pytest.raises(Corrupt, match=r"uploads/u/p\.part is damaged"):
+            file.read(20)
+
+
+@pytest.mark.parametrize("cut", [-1, 1])
+def test_another_length_is_damage(objects: Objects, cut: int) -> None:
+    stream(objects, "a/b", ARCHIVE[:BLOCK])
+    objects.store("a/b", iter([ARCHIVE[: BLOCK + cut]]))
+    with pytest.raises(Corrupt, match="a/b is damaged"), objects.read("a/b") as file:
+        file.read()
+
+
+def test_what_was_stored_before_there_were_checksums_is_read(objects: Objects) -> None:
+    values = np.arange(24, dtype=np.uint16).reshape(1, 2, 4, 3)
+    captures.create_stack(
+        objects, "c", values.shape, values.dtype, memory=1000, attributes={"a": 1}, mask=None, images=()
+    )
+    group = zarr.create_group(objects.zarr, path="captures/c", attributes={"a": 1}, overwrite=True)
+    group.create_array("frames", data=values, chunks=values.shape)
+    stack = Stack(objects, "c")
+    np.testing.assert_array_equal(stack.read(), values)
+    assert stack.attributes == {"a": 1}
+    flip(objects, "captures/c/frames/c/0/0/0/0", 0.0)  # of zstd's magic number
+    with pytest.raises(Corrupt, match=r"frames/c/0/0/0/0 is damaged .* upload it again"):
+        stack.read()
+    objects.store("uploads/u/p.part", iter([b"any"]))
+    assert objects.read("uploads/u/p.part").read() == b"any"
+
+
+def test_any_zarr_reader_checks_chunks(objects: Objects) -> None:
+    together(objects.put_array("a", np.arange(1000)))
+    document = json.loads(objects.load("a/zarr.json"))
+    assert [codec["name"] for codec in document["codecs"]] == ["bytes", "zstd", "crc32c"]
+    assert [codec.to_dict() for codec in CODECS] == document["codecs"][1:]
+    assert is_intact(objects.load("a/c/0"))
+    assert crc32c(b"123456789") == 0xE3069283  # RFC 3720's check value
+
+
+def test_a_table_is_the_same_however_the_bytes_come() -> None:
+    whole, pieces = Table(), Table()
+    whole.update(ARCHIVE)
+    for at in range(0, len(ARCHIVE), 77_777):
+        pieces.update(memoryview(ARCHIVE)[at : at + 77_777])
+    assert whole.to_bytes() == pieces.to_bytes()
+    sums = np.frombuffer(whole.to_bytes()[:-4], "<u4")
+    assert list(sums) == [
+        google_crc32c.value(ARCHIVE[at : at + BLOCK]) for at in range(0, len(ARCHIVE), BLOCK)
+    ]
+    assert len(Table().to_bytes()) == 4
+
+
+def test_a_sealed_document_is_checked_but_for_how_it_is_set() -> None:
+    document = {"attributes": {"x": [0.1, None, "é"]}, "zarr_format": 3}
+    sealed = seal(json.dumps(document).encode())
+    assert seal(sealed) == sealed
+    assert unseal("a", sealed) == (document, True)
+    assert unseal("a", json.dumps(json.loads(sealed), indent=2).encode()) == (document, True)
+    assert unseal("a", json.dumps(document, indent=2).encode()) == (document, False)
+    for damage in (
+        b"",
+        b"[]",
+        b"{",
+        b'{"attributes": 3}',
+        sealed.replace(b"0.1", b"0.2"),
+        sealed.replace(b"crc", b"crs"),
+        b"\xff" + sealed[1:],
+    ):
+        with pytest.raises(Corrupt, match=r"^captures/c/zarr\.json is damaged"):
+            unseal("captures/c/zarr.json", damage)

@@ -1,0 +1,120 @@
+"""What graphics hardware gets, drawn here as the module says it is to be."""
+
+import gzip
+import json
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from storage.layout import mattes
+from storage.layout.mattes import Block, Matte
+from storage.objects.store import Objects
+from workflows.composite import composite
+from workflows.composite.live.encode import LOOKUPS, MOST_PIXELS, encode_live
+from workflows.recovery.pyramid import Pyramid
+
+HEIGHT, WIDTH, COLUMNS, ROWS = 20, 35, 75, 37
+CROSSTALK = [[0.9, 0.1, 0], [0.05, 0.8, 0.15], [0.02, 0.18, 0.8]]
+
+
+@pytest.fixture
+def matte(objects: Objects) -> Matte:
+    """A matte of as many nodes a row as there are lookups, at most."""
+    rng = np.random.default_rng(0)
+    nodes = Pyramid.over(COLUMNS, ROWS).nodes
+    made = mattes.create(
+        objects, "m", height=HEIGHT, width=WIDTH, columns=COLUMNS, rows=ROWS, crosstalk=CROSSTALK
+    )
+    for at in np.ndindex(made.block_rows, made.block_columns):
+        shape = tuple(part.stop - part.start for part in made.span(*at))
+        recovered = rng.random(shape) < 0.8
+        S, rho = (rng.random((2, *shape, 3), np.float32) * recovered[..., np.newaxis]).astype(np.float32)
+        count = np.zeros((*shape, 3), np.uint32)
+        count[..., 0] = rng.integers(1, LOOKUPS + 1, shape) * recovered
+        cells = [rng.choice(nodes, n, replace=False) for n in count[..., 0].flat]
+        weights = [(w := rng.random(n) + 0.1) / w.sum() for n in count[..., 0].flat]
+        error = np.zeros(shape, np.float32)
+        cell, weight = np.concatenate(cells).astype(np.uint32), np.concatenate(weights).astype(np.float32)
+        made.write(*at, Block(S, rho, error, recovered, recovered, count, cell, weight))
+    return made
+
+
+def drawn(data: bytes, backdrop: NDArray[np.float32]) -> tuple[NDArray[np.float64], dict[str, Any]]:
+    """The glass before light on the cells, (height, width, 4), and the header."""
+    plain = gzip.decompress(data)
+    start = 4 + int.from_bytes(plain[:4], "little")
+    header = json.loads(plain[4:start])
+    planes = np.frombuffer(plain, np.uint8, offset=start).reshape(-1, header["height"], header["width"])
+    assert len(planes) == 8 * header["lookups"] + 7
+    light = Pyramid.over(COLUMNS, ROWS).light(backdrop)
+    starts = Pyramid.over(COLUMNS, ROWS).starts
+
+    def bilinear(level: int, x: float, y: float) -> NDArray[np.float32]:
+        columns, rows = header["levels"][level]
+        grid = light[starts[level] : starts[level + 1]].reshape(rows, columns, 3)
+        x, y = x / 2**level - 0.5, y / 2**level - 0.5
+        seen = np.zeros(3, np.float32)
+        for i in (int(np.floor(y)), int(np.floor(y)) + 1):
+            for j in (int(np.floor(x)), int(np.floor(x)) + 1):
+                share = (1 - abs(y - i)) * (1 - abs(x - j))
+                seen += share * grid[np.clip(i, 0, rows - 1), np.clip(j, 0, columns - 1)]
+        return seen
+
+    arrived = np.zeros((header["height"], header["width"], 3))
+    for k in range(header["lookups"]):
+        one = planes[8 * k : 8 * k + 8].astype(np.int64)
+        x = np.cumsum(256 * one[0] + one[1], axis=1) % 65536 / 65536 * header["texture"][0]
+        y = np.cumsum(256 * one[2] + one[3], axis=1) % 65536 / 65536 * header["texture"][1]
+        for at in zip(*np.nonzero(one[5:8].any(axis=0)), strict=True):
+            level, further = divmod(one[4][at] / 16, 1)
+            below = bilinear(int(level), x[at], y[at])
+            above = bilinear(int(level) + 1, x[at], y[at]) if further else below
+            arrived[at] += one[5:8, *at] / 255 * (below + further * (above - below))
+    S, rho = (
+        header[name] * np.moveaxis(planes[first : first + 3] / 255.0, 0, 2) ** 2
+        for name, first in (("S", -7), ("rho", -4))
+    )
+    seen = S + (rho * arrived) @ np.transpose(header["crosstalk"])
+    alpha = planes[-1, ..., np.newaxis] / 255
+    return np.concatenate([seen * alpha, alpha], axis=2), header
+
+
+def test_it_is_the_composite_where_lookups_suffice(matte: Matte) -> None:
+    backdrop = np.random.default_rng(1).random((ROWS, COLUMNS, 3), np.float32)
+    got, header = drawn(encode_live(matte, 1), backdrop)
+    assert (header["width"], header["height"], header["step"]) == (WIDTH, HEIGHT, 1)
+    assert header["levels"] == [[75, 37], [38, 19], [19, 10]]
+    assert header["texture"] == [76, 40]
+    expected = composite(matte, backdrop)
+    np.testing.assert_array_equal(got[..., 3], expected[..., 3])
+    # what 8 bits of S, rho and the shares leave
+    assert np.sqrt(np.mean((got - expected) ** 2)) < 0.005
+
+
+def test_the_bytes_are_the_same_by_any_threads(matte: Matte) -> None:
+    assert encode_live(matte, 3) == encode_live(matte, 1)
+
+
+def test_of_a_large_matte_some_pixels_are_told(objects: Objects) -> None:
+    height, width = 610, 900
+    large = mattes.create(
+        objects, "large", height=height, width=width, columns=COLUMNS, rows=ROWS, crosstalk=CROSSTALK
+    )
+
+    for row, column in product(range(large.block_rows), range(large.block_columns)):
+        y, x = large.span(row, column)
+        shape = y.stop - y.start, x.stop - x.start
+        S = np.repeat(np.add.outer(np.arange(y.start, y.stop), np.arange(x.start, x.stop))[..., None], 3, 2)
+        rows = np.zeros((*shape, 3), np.uint32), np.zeros(0, np.uint32), np.zeros(0, np.float32)
+        whole = np.ones(shape, bool)
+        S = S.astype(np.float32)
+        large.write(row, column, Block(S, 0 * S, whole.astype(np.float32), whole, whole, *rows))
+    got, header = drawn(encode_live(large, 1), np.zeros((ROWS, COLUMNS, 3), np.float32))
+    assert (header["width"], header["height"], header["step"]) == (450, 305, 2)
+    assert header["width"] * header["height"] <= MOST_PIXELS
+    assert got[..., 3].all()
+    expected = np.add.outer(np.arange(1, height, 2), np.arange(1, width, 2))
+    np.testing.assert_allclose(got[..., 0], expected, atol=0.01 * expected.max())

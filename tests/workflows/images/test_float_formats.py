@@ -1,0 +1,167 @@
+"""EXR and float TIFF: the very values, and nothing but ImageError from damaged or hostile files."""
+
+import io
+import struct
+import tracemalloc
+from typing import Any
+
+import numpy as np
+import OpenEXR
+import pytest
+import tifffile
+from numpy.typing import NDArray
+
+from storage.errors import ImageError
+from workflows.images.float_formats import decode, is_float
+
+MEMORY = 1 << 20
+VALUES = np.random.default_rng(4).normal(0.4, 3, (19, 23, 4)).astype(np.float32)
+VALUES[0, 0, :3] = np.nan, np.inf, -np.inf
+
+
+def exr(
+    channels: dict[str, NDArray[Any]], kind: Any = OpenEXR.scanlineimage, pack: Any = OpenEXR.ZIP_COMPRESSION
+) -> bytes:
+    header = {"compression": pack, "type": kind}
+    if kind == OpenEXR.tiledimage:
+        header["tiles"] = OpenEXR.TileDescription()
+        header["tiles"].xSize = header["tiles"].ySize = 16
+    target = io.BytesIO()
+    OpenEXR.File(header, {name: np.ascontiguousarray(plane) for name, plane in channels.items()}).write(
+        target
+    )
+    return target.getvalue()
+
+
+def tiff(pixels: NDArray[Any], **options: Any) -> bytes:
+    target = io.BytesIO()
+    tifffile.imwrite(target, pixels, **options)
+    return target.getvalue()
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+@pytest.mark.parametrize("pack", [OpenEXR.NO_COMPRESSION, OpenEXR.ZIP_COMPRESSION, OpenEXR.PIZ_COMPRESSION])
+@pytest.mark.parametrize("kind", [OpenEXR.scanlineimage, OpenEXR.tiledimage])
+def test_an_exr_is_read_exactly(dtype: type, pack: Any, kind: Any) -> None:
+    values = VALUES.astype(dtype)
+    planes = {name: values[:, :, c] for c, name in enumerate("RGBA")}
+    data = exr(planes, kind, pack)
+    assert is_float(data)
+    np.testing.assert_array_equal(decode(data, memory=MEMORY), values[:, :, :3].astype(np.float32))
+    grey = exr({"Y": values[:, :, 1], "depth.Z": values[:, :, 2]}, kind, pack)
+    np.testing.assert_array_equal(decode(grey, memory=MEMORY), values[:, :, 1:2].astype(np.float32))
+
+
+@pytest.mark.parametrize("dtype", ["float16", "float32", "float64"])
+@pytest.mark.parametrize("compression", [None, "zlib", "lzw"])
+def test_a_float_tiff_is_read_exactly(dtype: str, compression: str | None) -> None:
+    values = VALUES.astype(dtype)
+    files = [
+        (values[:, :, :3], values[:, :, :3], "rgb", {}),
+        (values[:, :, :3], np.moveaxis(values[:, :, :3], 2, 0), "rgb", {"planarconfig": "separate"}),
+        (values[:, :, :3], values, "rgb", {"extrasamples": ["unassalpha"]}),
+        (values[:, :, :1], values[:, :, 0], "minisblack", {"rowsperstrip": 5}),
+    ]
+    for expected, written, kind, layout in files:
+        data = tiff(written, photometric=kind, compression=compression, **layout)
+        assert is_float(data)
+        np.testing.assert_array_equal(decode(data, memory=MEMORY), expected.astype(np.float32))
+
+
+def test_integers_and_others_are_no_floats() -> None:
+    for data in (b"", b"II", b"MM\0*" + bytes(20), b"\x89PNG", tiff(np.ones((4, 4), np.uint16))):
+        assert not is_float(data)
+
+
+@pytest.mark.parametrize(
+    ("data", "why"),
+    [
+        (exr({"Z": VALUES[:, :, 3]}), "channels R, G and B, or Y; this one has Z"),
+        (
+            tiff(
+                VALUES[:, :, :2],
+                photometric="minisblack",
+                planarconfig="contig",
+                extrasamples=["unspecified"],
+            ),
+            None,
+        ),
+        (
+            tiff(
+                np.ones((3, 9, 9), np.float32), photometric="minisblack", volumetric=True, tile=(16, 16, 16)
+            ),
+            "axes",
+        ),
+        (
+            tiff(np.ones((9, 9, 7), np.float32), photometric="minisblack", planarconfig="contig"),
+            "grey or RGB",
+        ),
+    ],
+)
+def test_odd_ones_are_refused(data: bytes, why: str | None) -> None:
+    if why is None:  # grey with alpha is not odd
+        assert decode(data, memory=MEMORY).shape == (19, 23, 1)
+        return
+    with pytest.raises(ImageError, match=why):
+        decode(data, memory=MEMORY)
+
+
+def test_several_parts_are_refused() -> None:
+    part = {"Y": np.ones((4, 5), np.float32)}
+    target = io.BytesIO()
+    OpenEXR.File([OpenEXR.Part({}, part, "a"), OpenEXR.Part({}, part, "b")]).write(target)
+    with pytest.raises(ImageError, match="one part"):
+        decode(target.getvalue(), memory=MEMORY)
+
+
+def test_the_limit_is_checked_in_the_header() -> None:
+    planes = {name: np.zeros((200, 300), np.float32) for name in "RGB"}
+    data = exr(planes)
+    assert len(data) < 10_000
+    with pytest.raises(ImageError, match="300 x 200 float pixels") as caught:
+        decode(data, memory=200 * 300 * 24 - 1)
+    assert caught.value.fields == {"limit": 200 * 300 * 24 - 1}
+    decode(data, memory=200 * 300 * 24)
+    packed = tiff(np.zeros((200, 300, 3), np.float32), photometric="rgb", compression="zlib")
+    with pytest.raises(ImageError, match="300 x 200 float pixels"):
+        decode(packed, memory=200 * 300 * 24 - 1)
+    box = data.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4
+    for corner in (2**30, 2**31 - 1, -5):
+        lying = bytearray(data)
+        struct.pack_into("<ii", lying, box + 8, corner, corner)
+        with pytest.raises(ImageError):
+            decode(bytes(lying), memory=MEMORY)
+
+
+def test_tiles_much_larger_than_the_image_are_refused() -> None:
+    data = bytearray(
+        tiff(np.zeros((16, 16, 3), np.float32), photometric="rgb", tile=(16, 16), compression="zlib")
+    )
+    width = data.index(struct.pack("<HHII", 322, 4, 1, 16))  # TileWidth
+    decode(bytes(data), memory=MEMORY)
+    struct.pack_into("<I", data, width + 8, 1 << 24)
+    with pytest.raises(ImageError, match="tiles of 16777216 x 16 pixels"):
+        decode(bytes(data), memory=MEMORY)
+
+
+def test_a_tiff_whose_width_is_a_text_costs_no_memory() -> None:
+    data = bytearray(tiff(np.zeros((16, 16, 3), np.float32), photometric="rgb", tile=(16, 16)))
+    for tag, kind, value in ((256, 2, ord("$")), (257, 4, 1 << 30)):  # ImageWidth, ImageLength
+        at = data.index(struct.pack("<HHII", tag, 4, 1, 16))
+        struct.pack_into("<HHII", data, at, tag, kind, 1, value)
+    tracemalloc.start()
+    try:
+        with pytest.raises(ImageError):
+            decode(bytes(data), memory=MEMORY)
+        assert tracemalloc.get_traced_memory()[1] < 20 << 20
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("kind", ["exr", "tiff"])
+def test_a_truncated_file_is_refused(kind: str) -> None:
+    planes = {name: VALUES[:, :, c] for c, name in enumerate("RGB")}
+    data = exr(planes) if kind == "exr" else tiff(VALUES[:, :, :3], photometric="rgb", compression="zlib")
+    for length in np.linspace(4, len(data) * 0.95, 30).astype(int):
+        with pytest.raises(ImageError):
+            decode(data[:length], memory=MEMORY)

@@ -1,0 +1,175 @@
+"""Tone curves: they invert each other, are the standard's, and are found from what a camera stored."""
+
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from workflows.images.tone_curves import (
+    BLACK,
+    Curve,
+    Estimate,
+    Gamma,
+    Response,
+    estimate,
+    from_light,
+    table,
+    to_light,
+)
+
+
+def f32(*values: float) -> np.ndarray:
+    return np.array(values, np.float32)
+
+
+def test_srgb_is_the_standards() -> None:
+    # IEC 61966-2-1: the ends of the straight part, and light that is computed with a pocket calculator.
+    encoded = f32(0, 0.02, 0.04045, 0.5, 1, 188 / 255)
+    light = to_light(encoded, "srgb")
+    np.testing.assert_allclose(light, [0, 0.02 / 12.92, 0.0031308, 0.21404114, 1, 0.50288646], rtol=2e-5)
+    assert light.dtype == np.float32
+
+
+@pytest.mark.parametrize("curve", ["linear", "srgb"])
+def test_curves_invert_each_other(curve: str) -> None:
+    values = np.linspace(0, 1, 4097, dtype=np.float32)
+    there = to_light(values, curve)  # type: ignore[arg-type]
+    np.testing.assert_allclose(from_light(there, curve), values, atol=2e-6)  # type: ignore[arg-type]
+    assert np.all(np.diff(there) > 0)
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16"])
+def test_a_code_survives_the_way_to_light_and_back(dtype: str) -> None:
+    codes = np.arange(np.iinfo(dtype).max + 1)
+    back = from_light(table("srgb", np.dtype(dtype)), "srgb") * np.float32(codes[-1])
+    np.testing.assert_array_equal(np.rint(back), codes)
+
+
+def test_a_gamma_is_a_power() -> None:
+    np.testing.assert_allclose(to_light(f32(0, 0.5, 1), Gamma(gamma=2.5)), [0, 0.5**2.5, 1], rtol=1e-6)
+    np.testing.assert_array_equal(to_light(f32(-0.1), Gamma(gamma=2.5)), [0])
+    with pytest.raises(ValueError, match="less than or equal to 5"):
+        Gamma(gamma=6)
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16"])
+def test_a_table_has_the_light_of_every_value(dtype: str) -> None:
+    made = table("srgb", np.dtype(dtype))
+    top = np.iinfo(dtype).max
+    assert made.shape == (top + 1,)
+    assert made.dtype == np.float32
+    assert made[0] == 0
+    assert made[top] == pytest.approx(1)
+    assert made[top // 2] == pytest.approx(float(to_light(f32((top // 2) / top), "srgb")[0]))
+
+
+def stored(levels: np.ndarray, monitor: Curve, camera_gamma: float, noise: float = 0.002) -> np.ndarray:
+    """(k, n) values that a camera of this gamma stores of 500 pixels, S and rho of each its own."""
+    rng = np.random.default_rng(5)
+    S, rho = rng.uniform(0.02, 0.1, 500), rng.uniform(0.2, 0.8, 500)
+    light = S + rho * to_light(levels, monitor).astype(np.float64)[:, None]
+    light += rng.normal(0, noise, light.shape)
+    return (np.maximum(light, 1e-4) ** (1 / camera_gamma)).astype(np.float32)
+
+
+LEVELS = np.linspace(0, 1, 9, dtype=np.float32)
+
+
+def told(
+    levels: np.ndarray,
+    values: np.ndarray,
+    monitor: Response,
+    camera: Response,
+    exposures: np.ndarray | None = None,
+) -> Estimate:
+    usable = (values > 0) & (values < 0.9999)
+    return estimate(
+        levels, np.ones_like(levels) if exposures is None else exposures, values, usable, monitor, camera
+    )
+
+
+@pytest.mark.parametrize("gamma", [0.8, 1.5, 1.8, 2.4])
+def test_the_cameras_gamma_is_found(gamma: float) -> None:
+    found = told(LEVELS, stored(LEVELS, "srgb", gamma), "srgb", "unknown")
+    assert found.monitor == "srgb"
+    assert isinstance(found.camera, Gamma)
+    assert found.camera.gamma == pytest.approx(gamma, abs=0.05)
+    assert found.assumed == ()
+
+
+@pytest.mark.parametrize("curve", ["linear", "srgb"])
+@pytest.mark.parametrize("bits", [8, 16])
+def test_the_cameras_curve_is_recognised(curve: Literal["linear", "srgb"], bits: int) -> None:
+    light = stored(LEVELS, "srgb", 1.0)
+    values = np.rint(from_light(light, curve) * (2**bits - 1)) / np.float32(2**bits - 1)
+    assert told(LEVELS, values, "srgb", "unknown") == ("srgb", curve, ())
+
+
+@pytest.mark.parametrize("gamma", [1.4, 1.8, 2.6])
+def test_the_monitors_gamma_is_found(gamma: float) -> None:
+    values = stored(LEVELS, Gamma(gamma=gamma), 2.2)
+    found = told(LEVELS, values, "unknown", Gamma(gamma=2.2))
+    assert found.camera == Gamma(gamma=2.2)
+    assert isinstance(found.monitor, Gamma)
+    assert found.monitor.gamma == pytest.approx(gamma, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("levels", "said", "found"),
+    [
+        (LEVELS, ("unknown", "unknown"), ("srgb", "srgb", ("camera", "monitor"))),
+        (f32(0, 1), ("linear", "unknown"), ("linear", "srgb", ("camera",))),
+        (f32(0, 1, 1, 0), ("unknown", "linear"), ("srgb", "linear", ("monitor",))),
+        (LEVELS, ("linear", "srgb"), ("linear", "srgb", ())),
+        (LEVELS, (Gamma(gamma=1.7), "linear"), (Gamma(gamma=1.7), "linear", ())),
+    ],
+)
+def test_what_can_not_be_told_is_srgb_and_what_is_known_stays(
+    levels: np.ndarray, said: tuple[Response, Response], found: tuple[Curve, Curve, tuple[str, ...]]
+) -> None:
+    assert told(levels, stored(levels, "linear", 1.5), *said) == found
+
+
+@pytest.mark.parametrize(("camera", "gamma"), [("srgb", 2.2), ("linear", 1.6), (2.6, 1.8)])
+def test_exposures_tell_both_curves(camera: Literal["linear", "srgb"] | float, gamma: float) -> None:
+    levels, exposures = np.tile(LEVELS, 3), np.repeat(f32(1, 3, 9), len(LEVELS))
+    rng = np.random.default_rng(5)
+    S, rho = rng.uniform(0.01, 0.02, 500), rng.uniform(0.1, 0.5, 500)
+    light = exposures[:, None] * (S + rho * to_light(levels, Gamma(gamma=gamma)).astype(np.float64)[:, None])
+    light = np.clip(light + rng.normal(0, 0.001, light.shape), 0, 1).astype(np.float32)
+    values = from_light(light, camera) if isinstance(camera, str) else light ** np.float32(1 / camera)
+    found = told(levels, values, "unknown", "unknown", exposures)
+    assert found.assumed == ()
+    assert isinstance(found.monitor, Gamma)
+    assert found.monitor.gamma == pytest.approx(gamma, abs=0.05)
+    if isinstance(camera, str):
+        assert found.camera == camera
+    else:
+        assert isinstance(found.camera, Gamma)
+        assert found.camera.gamma == pytest.approx(camera, abs=0.05)
+
+
+def test_two_levels_at_two_exposures_tell_the_camera() -> None:
+    levels, exposures = f32(0, 1, 0, 1), f32(1, 1, 2, 2)
+    rng = np.random.default_rng(5)
+    light = exposures[:, None] * (0.05 + 0.4 * levels[:, None] * rng.uniform(0.2, 1, 500))
+    values = from_light(light.astype(np.float32), "srgb")
+    assert told(levels, values, "unknown", "unknown", exposures) == ("srgb", "srgb", ("monitor",))
+
+
+def test_no_usable_pixel_is_srgb() -> None:
+    assert told(LEVELS, np.zeros((9, 0), np.float32), "linear", "unknown").camera == "srgb"
+    assert told(LEVELS, np.zeros((9, 50), np.float32), "linear", "unknown").camera == "srgb"
+
+
+def test_a_camera_that_saw_no_difference_gets_some_curve() -> None:
+    values = np.full((9, 50), 0.25, np.float32)
+    assert told(LEVELS, values, "linear", "unknown") == ("linear", "srgb", ("camera",))
+
+
+@pytest.mark.parametrize("curve", ["linear", "srgb"])
+def test_a_black_value_is_no_light_and_what_is_below_is_negative(curve: Curve) -> None:
+    made = table(curve, np.dtype(np.uint16), BLACK)
+    assert made[BLACK] == 0
+    assert made[65535] == pytest.approx(1)
+    assert np.all(np.diff(made) > 0)

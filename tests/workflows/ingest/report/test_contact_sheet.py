@@ -1,0 +1,52 @@
+"""Contact sheets: small pictures of any capture, with what is clipped marked."""
+
+import io
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from storage.layout.captures import Stack
+from workflows.images.integer_formats import encode_png
+from workflows.ingest.report.contact_sheet import AT_BLACK, AT_WHITE, HEIGHT, WIDTH, contact_sheet
+from workflows.simulation.glass_ball import glass_ball
+from workflows.simulation.scene import nested_program, write_capture
+
+Ingest = Callable[..., Stack]
+
+
+@pytest.mark.parametrize(("width", "height"), [(40, 30), (30, 40), (500, 31)])
+@pytest.mark.parametrize("depth", [8, 16])
+def test_what_is_clipped_is_marked(ingest: Ingest, width: int, height: int, depth: int) -> None:
+    target = io.BytesIO()
+    scene = glass_ball(width, height, monitor=(64, 48), rays=4)
+    program = nested_program((64, 48), ((4, 3, 4), (8, 6, 5)), levels=3)
+    write_capture(scene, program, target, gain=1.2, offset=0.0, noise=0, depth=depth)
+    stack = ingest("c", target.getvalue())
+    with Image.open(io.BytesIO(contact_sheet(stack))) as sheet:
+        assert sheet.format == "PNG"
+        pixels = np.asarray(sheet)
+    assert pixels.shape[1] <= 4 * (WIDTH + 8) + 8
+    assert pixels.shape[0] <= 5 * (HEIGHT + 30)
+    first = slice(8, 8 + width // -(-width // WIDTH))
+    black = pixels[8, first]
+    assert (black == AT_BLACK).all(axis=1).mean() > 0.9
+    assert (pixels == AT_WHITE).all(axis=2).sum() > 20
+
+
+def test_grey_frames_have_one_too(ingest: Ingest, make_zip: Callable[..., bytes]) -> None:
+    record = {
+        "format": "envmatte-capture/1",
+        "program": {
+            "monitor": {"width": 64, "height": 48},
+            "parts": [
+                {"kind": "constant", "levels": [0, 1]},
+                {"kind": "stripes", "axis": "x", "count": 2},
+            ],
+        },
+        "frames": [{"file": f"{n}.png", "pattern": n} for n in range(4)],
+    }
+    files = {f"{n}.png": encode_png(np.full((12, 16, 1), 60 * n + 9, np.uint8)) for n in range(4)}
+    with Image.open(io.BytesIO(contact_sheet(ingest("c", make_zip(record, files))))) as sheet:
+        assert sheet.size == (4 * 24 + 8, 12 + 18 + 16)

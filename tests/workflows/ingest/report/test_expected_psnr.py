@@ -1,0 +1,79 @@
+"""What is promised of a program's composites, against what was measured of it."""
+
+from typing import Any
+
+import pytest
+
+from workflows.ingest.report.expected_psnr import expected
+from workflows.programs.presets import preset
+from workflows.programs.program import Program
+from workflows.simulation.scene import nested_program
+
+SURVEY = {"contrast": 0.81, "deviation": 0.0058}
+"""Of a clear ball with usual noise."""
+NESTED = tuple((16 << n, 12 << n, 20) for n in range(6))
+
+
+def ends(program: Program, **other: float) -> tuple[float, float]:
+    quality = expected(program, SURVEY | other)
+    assert quality is not None
+    assert quality.low < quality.high
+    return quality.low, quality.high
+
+
+def still(blocks: int, count: int = 60) -> Program:
+    return nested_program((1280, 960), ((16, 12, 24), (4 * blocks // 3, blocks, count)), levels=2)
+
+
+# PSNR of composites of the ball, the dispersing solid and the frosted lens, see the function's Notes.
+@pytest.mark.parametrize(
+    ("program", "measured"),
+    [
+        (preset("default"), (50.0, 43.3, 46.8)),
+        (preset("quick"), (47.0, 37.9, 45.0)),
+        (preset("sketch"), (40.3, 34.3, 43.4)),
+        (preset("paper-250"), (32.6, 36.1, 42.0)),
+        (nested_program((1280, 960), NESTED), (39.1, 38.2, 43.3)),
+        (still(48), (25.2, 32.2, 39.8)),
+        (still(24, 24), (21.1, 28.2, 38.9)),
+    ],
+    ids=["default", "quick", "sketch", "paper-250", "nested", "48 blocks", "24 blocks"],
+)
+def test_no_more_is_promised_than_was_measured(program: Program, measured: tuple[float, ...]) -> None:
+    ball, solid, frosted = (
+        SURVEY,
+        {"contrast": 0.6, "deviation": 0.0053},
+        {"contrast": 0.82, "deviation": 0.0059},
+    )
+    for survey, psnr in zip((ball, solid, frosted), measured, strict=True):
+        low, high = ends(program, **survey)
+        assert low - 0.7 < psnr < high + 2
+
+
+def test_grids_without_offsets_promise_what_their_finest_blocks_tell() -> None:
+    quality = expected(still(96), SURVEY)
+    assert quality is not None
+    assert quality.blocks == 96
+    assert expected(preset("default"), SURVEY).blocks is None  # type: ignore[union-attr]
+    coarse, fine = ends(still(24)), ends(still(384))
+    assert coarse[0] < fine[0] - 8
+    assert coarse[1] < fine[1]
+    assert ends(still(24, 4000))[0] == pytest.approx(coarse[0], abs=1)  # more of the same do not help
+    assert ends(still(384), deviation=0.05)[0] < fine[0] - 3
+
+
+def test_patterns_without_offsets_beside_others_are_not_counted() -> None:
+    program = preset("default")
+    more = Program(monitor=program.monitor, parts=(*program.parts, *still(96).parts[1:]))
+    assert ends(more) == ends(program)
+
+
+def parts(*parts: dict[str, Any]) -> Program:
+    constant = {"kind": "constant", "levels": [0, 1]}
+    return Program.model_validate({"monitor": {"width": 64, "height": 48}, "parts": [constant, *parts]})
+
+
+def test_nothing_is_promised_of_what_was_never_measured() -> None:
+    for part in ({"kind": "images", "files": ["a.png"]}, {"kind": "stripes", "axis": "x", "count": 5}):
+        assert expected(parts(part), SURVEY) is None
+    assert expected(preset("default"), SURVEY | {"contrast": 0.0}) is None

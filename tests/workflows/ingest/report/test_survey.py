@@ -1,0 +1,116 @@
+"""What a survey measures of captures whose exposure and clipping are known."""
+
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from storage.layout.captures import Stack
+from workflows.images.integer_formats import decode, encode_png
+from workflows.ingest.report.findings import Finding
+from workflows.ingest.report.report import Report, report
+from workflows.programs.presets import preset
+from workflows.simulation.glass_ball import glass_ball
+from workflows.simulation.scene import write_capture
+
+pytestmark = pytest.mark.full
+
+Ingest = Callable[..., Stack]
+
+
+@pytest.fixture(scope="module")
+def bundle() -> bytes:
+    target = io.BytesIO()
+    scene = glass_ball(120, 90, monitor=(320, 240), rays=16)
+    write_capture(scene, preset("default", 320, 240), target, mask=True)
+    return target.getvalue()
+
+
+def filmed(bundle: bytes, *, gain: float = 1, less: int = 0, **more: Any) -> bytes:
+    """The capture as another exposure, or a camera that takes something off, would have had it."""
+    target = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(bundle)) as archive, zipfile.ZipFile(target, "w") as out:
+        record = json.loads(archive.read("capture.json"))
+        out.writestr("capture.json", json.dumps(record | more))
+        out.writestr(record["mask"], archive.read(record["mask"]))
+        for frame in record["frames"]:
+            values = decode(archive.read(frame["file"]), memory=1 << 24).astype(np.float64) * gain - less
+            out.writestr(frame["file"], encode_png(np.clip(np.rint(values), 0, 255).astype(np.uint8)))
+    return target.getvalue()
+
+
+def reported(ingest: Ingest, data: bytes) -> tuple[Report, dict[str, Finding]]:
+    stack = ingest("c", data)
+    made = report(stack.attributes, stack.frames)
+    return made, {finding.name: finding for finding in made.findings}
+
+
+def test_a_good_capture_is_good(ingest: Ingest, bundle: bytes) -> None:
+    made, found = reported(ingest, bundle)
+    assert made.level == "good"
+    assert {finding.level for finding in made.findings} == {"good"}
+    assert all(finding.message and not finding.remedy for finding in made.findings)
+    assert made.frames.model_dump() == {"kept": 132, "patterns": 132, "exposures": 1, "missing": []}
+    assert made.clipping.white == 0
+    assert made.white_reaches == pytest.approx(0.86, abs=0.03)
+    assert made.noise.black == pytest.approx(255 * 0.0025, rel=0.4)
+    assert "no difference to black and white" in found["monitor_curve"].message
+
+
+def test_a_white_that_is_clipped_asks_for_less_exposure(ingest: Ingest, bundle: bytes) -> None:
+    made, found = reported(ingest, filmed(bundle, gain=1.3))
+    assert made.level == found["exposure"].level == "bad"
+    assert made.clipping.white > 0.3
+    assert "expose a stop less" in found["exposure"].remedy
+
+
+@pytest.mark.parametrize(
+    ("gain", "level", "more"), [(0.4, "warning", "a stop more"), (0.1, "bad", "3 stops more")]
+)
+def test_a_dark_white_asks_for_more_exposure(
+    ingest: Ingest, bundle: bytes, gain: float, level: str, more: str
+) -> None:
+    _, found = reported(ingest, filmed(bundle, gain=gain))
+    assert found["exposure"].level == level
+    assert more in found["exposure"].remedy
+
+
+def test_a_clipped_black_is_found(ingest: Ingest, bundle: bytes) -> None:
+    made, found = reported(ingest, filmed(bundle, less=9))
+    assert found["black"].level == "bad"
+    assert made.clipping.black > 0.9
+
+
+def test_more_noise_and_fewer_patterns_promise_less(ingest: Ingest, bundle: bytes) -> None:
+    def promised(data: bytes) -> tuple[float, float]:
+        quality = reported(ingest, data)[0].quality
+        assert quality is not None
+        return quality.low, quality.high
+
+    scene = glass_ball(60, 45, monitor=(320, 240), rays=4)
+    noisy, few = io.BytesIO(), io.BytesIO()
+    write_capture(scene, preset("default", 320, 240), noisy, noise=6)
+    write_capture(scene, preset("sketch", 320, 240), few)
+    best = promised(bundle)
+    for data in (noisy.getvalue(), few.getvalue()):
+        assert all(lesser < b - 2 for lesser, b in zip(promised(data), best, strict=True))
+    assert best[0] < best[1] < 60
+
+
+def test_a_curve_that_is_assumed_is_a_warning(ingest: Ingest, bundle: bytes) -> None:
+    made, found = reported(ingest, filmed(bundle, response="unknown"))
+    assert made.camera.source == "assumed"
+    assert [f for f in made.findings if f.level == "bad"] == []
+    assert made.level == found["camera_curve"].level == "warning"
+    assert "name it in capture.json" in found["camera_curve"].remedy
+
+
+def test_a_capture_that_saw_nothing_is_bad(ingest: Ingest, bundle: bytes) -> None:
+    made, found = reported(ingest, filmed(bundle, gain=0))
+    assert made.level == "bad"
+    assert made.drift is made.flicker is made.quality is None
+    assert found["noise"].level == "bad"

@@ -1,0 +1,76 @@
+"""The light of patterns: exposures merged by what they say, and frames moved back to one place."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from workflows.images.tone_curves import table
+from workflows.ingest.measured_light import Light, margin_of, merge, unclipped_light
+
+LOOK_UP = table("linear", np.dtype(np.uint8))
+
+
+def merged(codes: NDArray[np.uint8], given: dict[str, Any], count: int) -> Light:
+    return merge(
+        lambda n: (LOOK_UP[codes[n]], (codes[n] > 0) & (codes[n] < 255)), given, count, codes.shape[1]
+    )[0]
+
+
+def test_merged_light_leaves_out_what_is_clipped() -> None:
+    codes = np.array(
+        [[[51, 0, 255]], [[102, 0, 255]], [[204, 4, 255]], [[255, 8, 255]], [[10, 20, 30]]], np.uint8
+    )
+    given = {"patterns": [0, 0, 0, 0, 1], "exposures": [0.5, 1.0, 2.0, 4.0, 1.0]}
+    light, usable, worth = merged(codes, given, 2)
+    assert usable[0].tolist() == [[True, True, False], [True, True, True]]
+    np.testing.assert_allclose(worth[0], [[7, 12, 15], [2, 2, 2]])
+    np.testing.assert_allclose(light[0, 0, :2] * 255, [357 / 7, 12 / 12], rtol=1e-6)
+    np.testing.assert_allclose(light[0, 1] * 255, [5, 10, 15], rtol=1e-6)
+
+
+def test_a_clipped_repeat_takes_its_whole_exposure_out() -> None:
+    codes = np.array([[[250, 100, 9]], [[255, 110, 0]]], np.uint8)
+    given = {"patterns": [0, 0], "exposures": [1.0, 1.0]}
+    light, usable, worth = merged(codes, given, 1)
+    assert usable[0, 0].tolist() == [False, True, False]
+    np.testing.assert_allclose(light[0, 0] * 255, [252.5, 105, 4.5])
+    np.testing.assert_array_equal(worth, 2)
+
+
+def test_the_gain_of_a_pattern_is_that_of_its_frames_by_what_they_count() -> None:
+    codes = np.array([[[50, 100, 0]], [[100, 255, 0]]], np.uint8)
+    given = {"patterns": [0, 0], "exposures": [1.0, 3.0], "gains": [1.2, 0.8]}
+    _, gain = merge(lambda n: (LOOK_UP[codes[n]], (codes[n] > 0) & (codes[n] < 255)), given, 1, 1)
+    assert gain is not None
+    np.testing.assert_allclose(gain[0, 0], [0.9, 1.2, 0.9], rtol=1e-6)
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.5, 0.0), (-1.3, 2.6)])
+def test_a_picture_that_moved_is_moved_back(shift: tuple[float, float]) -> None:
+    def picture(dx: float, dy: float) -> NDArray[np.uint8]:
+        y, x = np.mgrid[:40, :50].astype(float)
+        value = 120 + 60 * np.sin((x - dx) / 2.5) + 50 * np.cos((y - dy) / 3 + (x - dx) / 9)
+        return np.rint(np.stack([value, value / 2, value], axis=2)).astype(np.uint8)
+
+    margin = margin_of([shift])
+    moved, whole = unclipped_light(picture(*shift), shift, margin, LOOK_UP)
+    inside = slice(margin, -margin)
+    assert whole.all()
+    np.testing.assert_allclose(255 * moved, picture(0, 0)[inside, inside], atol=1.5)
+    # the same in whatever rectangle
+    part, _ = unclipped_light(picture(*shift)[5:30, 7:44], shift, margin, LOOK_UP)
+    np.testing.assert_array_equal(part, moved[5 : 30 - 2 * margin, 7 : 44 - 2 * margin])
+
+
+def test_a_value_made_of_clipped_ones_is_clipped() -> None:
+    codes = np.full((20, 20, 3), 100, np.uint8)
+    codes[10, 10, 1] = 255
+    _, whole = unclipped_light(codes, (0.4, 0.0), 4, LOOK_UP)
+    assert whole[..., [0, 2]].all()
+    # two neighbours are made of it, those further on hardly
+    assert not whole[6, 5:7, 1].any()
+    assert 2 <= np.count_nonzero(~whole) <= 4
+    _, still = unclipped_light(codes, (0.0, 0.0), 4, LOOK_UP)
+    assert np.count_nonzero(~still) == 1

@@ -1,0 +1,276 @@
+"""Ingest: a capture's files into its stack, value for value, within its memory, and what it refuses."""
+
+import io
+import json
+import random
+import sys
+import zipfile
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+
+from storage.errors import CaptureError, Corrupt, OverLimit
+from storage.layout.captures import Stack
+from storage.objects.store import Objects
+from tests.workflows.ingest import peak
+from tests.workflows.ingest.records import record
+from workflows.images.integer_formats import encode_png
+from workflows.ingest import steps as ingest_steps
+from workflows.recovery.noise import Noise
+from workflows.simulation.glass_ball import glass_ball
+from workflows.simulation.scene import nested_program, write_capture
+from workflows.untrusted.limits import Limits
+
+Zip = Callable[..., bytes]
+Ingest = Callable[..., Stack]
+Put = Callable[[str, bytes], None]
+Digests = Callable[[str], dict[str, str]]
+HEIGHT, WIDTH = 21, 37
+
+
+def tiff(pixels: NDArray[Any]) -> bytes:
+    target = io.BytesIO()
+    kind = "rgb" if pixels.shape[2] == 3 else "minisblack"
+    tifffile.imwrite(target, pixels, photometric=kind, compression="zlib")
+    return target.getvalue()
+
+
+def shots(count: int, channels: int, dtype: str) -> NDArray[Any]:
+    top = np.iinfo(dtype).max
+    return np.random.default_rng(3).integers(0, top, (count, HEIGHT, WIDTH, channels), dtype, endpoint=True)
+
+
+def bundle_of(
+    make_zip: Zip, stack: NDArray[Any], patterns: list[int], suffix: str = "png", **more: Any
+) -> bytes:
+    encode = tiff if suffix == "tif" else encode_png
+    files = {f"{n}.{suffix}": encode(frame) for n, frame in enumerate(stack)}
+    extra = more.pop("files", {})
+    return make_zip(record(patterns, suffix, **more), files | extra)
+
+
+PATTERNS = [4, 0, 1, 5, 0, 2, 3, 1, 4, 0]
+"""Several frames of a pattern, in no order."""
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+@pytest.mark.parametrize("dtype", ["uint8", "uint16"])
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("memory", [1 << 24, 40_000])
+def test_the_stack_holds_the_very_values(
+    make_zip: Zip, ingest: Ingest, suffix: str, dtype: str, channels: int, memory: int
+) -> None:
+    values = shots(len(PATTERNS), channels, dtype)
+    mask = np.random.default_rng(4).random((HEIGHT, WIDTH)) < 0.6
+    files = {"mask.png": encode_png((mask * 7).astype(np.uint8)[..., None])}
+    stack = ingest(
+        "c", bundle_of(make_zip, values, PATTERNS, suffix, mask="mask.png", files=files), memory=memory
+    )
+    assert stack.dtype == dtype
+    np.testing.assert_array_equal(stack.read(), values)
+    np.testing.assert_array_equal(stack.read_masked()[1], mask)
+    assert stack.attributes["patterns"] == PATTERNS
+    assert stack.attributes["camera_curve"] == stack.attributes["monitor_curve"] == "linear"
+    assert set(stack.attributes["noise"]) == {"read", "shot"}
+
+
+def test_patterns_that_are_images_are_kept_on_their_grid(make_zip: Zip, ingest: Ingest) -> None:
+    grid = np.array([[[0], [255], [51]], [[102], [0], [255]]], np.uint8)
+    files = {
+        "a.png": encode_png(grid.repeat(8, axis=0).repeat(4, axis=1)),
+        "b.png": encode_png(grid.repeat(3, 2)),
+    }
+    given = record([0, 1, 2, 3])
+    given["program"]["parts"][0]["levels"] = [0, 1]
+    given["program"]["parts"][1] = {"kind": "images", "files": ["a.png", "b.png"]}
+    pictures = {f"{n}.png": encode_png(frame) for n, frame in enumerate(shots(4, 1, "uint8"))}
+    one, two = ingest("c", make_zip(given, files | pictures)).images()
+    np.testing.assert_allclose(one, grid / 255, rtol=1e-6)
+    np.testing.assert_allclose(two, grid.repeat(3, 2) / 255, rtol=1e-6)
+
+
+def test_patterns_that_are_large_images_are_refused(make_zip: Zip, ingest: Ingest) -> None:
+    photograph = np.random.default_rng(0).integers(0, 255, (60, 60, 3), np.uint8)
+    names = [f"{n}.jpg.png" for n in range(9)]
+    given = record(list(range(12)))
+    given["program"]["parts"][1] = {"kind": "images", "files": names}
+    pictures = {f"{n}.png": encode_png(frame) for n, frame in enumerate(shots(12, 1, "uint8"))}
+    data = make_zip(given, pictures | dict.fromkeys(names, encode_png(photograph)))
+    with pytest.raises(CaptureError, match="patterns that come as images") as caught:
+        ingest("c", data, memory=400_000)
+    assert caught.value.fields == {"entry": names[4], "limit": 200_000}
+
+
+def test_slabs_in_any_order_and_again_are_the_same_bytes(
+    make_zip: Zip, ingest: Ingest, digests: Digests
+) -> None:
+    data = bundle_of(make_zip, shots(len(PATTERNS), 3, "uint16"), PATTERNS)
+    memory = 6 * HEIGHT * WIDTH * 3 * 2  # slabs of three frames
+    ingest("c", data, memory=memory)
+    plain = digests("captures/c")
+
+    def shuffled(slabs: range) -> Iterator[int]:
+        assert len(slabs) == 4
+        order = [*slabs, *slabs]
+        random.Random(1).shuffle(order)
+        yield from order
+
+    ingest("c", data, memory=memory, order=shuffled)
+    assert digests("captures/c") == plain
+
+
+def test_a_slab_left_out_is_corrupt(make_zip: Zip, ingest: Ingest) -> None:
+    data = bundle_of(make_zip, shots(len(PATTERNS), 3, "uint16"), PATTERNS)
+    with pytest.raises(Corrupt, match=r"frames/c/\d/0/0/0 is missing"):
+        ingest("c", data, memory=6 * HEIGHT * WIDTH * 6, order=lambda slabs: iter(slabs[1:]))
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        np.zeros((HEIGHT + 1, WIDTH, 3), np.uint8),
+        np.zeros((WIDTH, HEIGHT, 3), np.uint8),
+        np.zeros((HEIGHT, WIDTH, 3), np.uint16),
+        np.zeros((HEIGHT, WIDTH, 1), np.uint8),
+    ],
+)
+def test_a_frame_unlike_the_first_is_refused(make_zip: Zip, ingest: Ingest, odd: NDArray[Any]) -> None:
+    data = bundle_of(make_zip, shots(5, 3, "uint8"), [0, 1, 2, 3, 4, 5], files={"5.png": encode_png(odd)})
+    with pytest.raises(CaptureError, match="one size and kind") as caught:
+        ingest("c", data)
+    assert caught.value.fields == {"entry": "5.png"}
+
+
+@pytest.mark.parametrize("at", [0, 3])
+@pytest.mark.parametrize("data", [b"no image", encode_png(shots(1, 3, "uint8")[0])[:-30], b""])
+def test_a_frame_that_can_not_be_decoded_is_refused(
+    make_zip: Zip, ingest: Ingest, at: int, data: bytes
+) -> None:
+    given = bundle_of(make_zip, shots(6, 3, "uint8"), [0, 1, 2, 3, 4, 5], files={f"{at}.png": data})
+    with pytest.raises(CaptureError, match=rf"^{at}\.png: ") as caught:
+        ingest("c", given)
+    assert caught.value.fields["entry"] == f"{at}.png"
+
+
+def test_a_mask_of_another_size_is_refused(make_zip: Zip, ingest: Ingest) -> None:
+    files = {"mask.png": encode_png(np.zeros((WIDTH, HEIGHT, 1), np.uint8))}
+    data = bundle_of(make_zip, shots(6, 3, "uint8"), list(range(6)), mask="mask.png", files=files)
+    with pytest.raises(CaptureError, match="the frames are 37 x 21") as caught:
+        ingest("c", data)
+    assert caught.value.fields == {"entry": "mask.png"}
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16"])
+def test_a_frame_larger_than_a_quarter_of_the_memory_is_refused(
+    make_zip: Zip, ingest: Ingest, dtype: str
+) -> None:
+    flat = np.full((6, 100, 100, 3), 9, dtype)
+    size = flat[0].nbytes
+    data = bundle_of(make_zip, flat, list(range(6)))
+    ingest("c", data, memory=4 * size)
+    with pytest.raises(CaptureError, match="100 x 100 pixels") as caught:
+        ingest("c", data, memory=4 * (size - 1))
+    assert caught.value.fields == {"entry": "0.png", "limit": size - 1}
+
+
+@pytest.mark.parametrize(
+    ("camera", "monitor", "found"),
+    [
+        ("unknown", "linear", {"camera_curve": 2.2, "monitor_curve": "linear"}),
+        ("linear", "unknown", {"camera_curve": "linear", "monitor_curve": 2.2}),
+        ("unknown", "unknown", {"camera_curve": "srgb", "monitor_curve": "srgb"}),
+    ],
+)
+def test_an_unknown_response_is_estimated(
+    ingest: Ingest, camera: str, monitor: str, found: dict[str, Any]
+) -> None:
+    scene = glass_ball(40, 30, monitor=(64, 48), rays=4)
+    program = nested_program((64, 48), ((4, 3, 4),), levels=8)
+    if monitor == "unknown":
+        # Levels that a gamma of 2.2 turns into those that were filmed.
+        levels = tuple((np.linspace(0, 1, 8) ** (1 / 2.2)).tolist())
+    else:
+        levels = tuple(np.linspace(0, 1, 8).tolist())
+    target = io.BytesIO()
+    write_capture(scene, program, target, noise=0.5, depth=16)
+    changed = io.BytesIO()
+    with zipfile.ZipFile(target) as archive, zipfile.ZipFile(changed, "w") as out:
+        for name in archive.namelist():
+            data = archive.read(name)
+            if name == "capture.json":
+                given = json.loads(data)
+                given["response"] = camera
+                given["program"]["monitor"]["response"] = monitor
+                given["program"]["parts"][0]["levels"] = levels
+                data = json.dumps(given).encode()
+            elif camera == "unknown":
+                value = ingest_steps.images.decode(data, memory=1 << 24) / 65535
+                data = encode_png(np.rint(value ** (1 / 2.2) * 65535).astype(np.uint16))
+            out.writestr(name, data)
+    attributes = ingest("c", changed.getvalue()).attributes
+    for name, curve in found.items():
+        if isinstance(curve, float):
+            assert attributes[name]["gamma"] == pytest.approx(curve, abs=0.1)
+        else:
+            assert attributes[name] == curve
+
+
+def test_the_noise_is_the_cameras(ingest: Ingest) -> None:
+    scene = glass_ball(80, 60, monitor=(64, 48), rays=4)
+    target = io.BytesIO()
+    write_capture(scene, nested_program((64, 48), ((4, 3, 2),), levels=8), target, noise=2.0, depth=16)
+    noise = Noise(**ingest("c", target.getvalue()).attributes["noise"])
+    for value in (0.05, 0.3, 0.8):
+        # The simulated camera's deviation is 0.002 + 0.006 sqrt(value), times `noise`.
+        deviation = float(noise.variance(np.array([value], np.float32))[0]) ** 0.5
+        assert deviation == pytest.approx(2 * (0.002 + 0.006 * value**0.5), rel=0.25)
+
+
+def test_a_stack_that_takes_more_than_is_allowed_is_refused(make_zip: Zip, ingest: Ingest) -> None:
+    # One small file, named by a hundred thousand frames.
+    flat = encode_png(np.full((100, 100, 3), 9, np.uint8))
+    given = record([n % 6 for n in range(100_000)])
+    for frame in given["frames"]:
+        frame["file"] = "0.png"
+    with pytest.raises(
+        CaptureError, match="100000 frames of 100 x 100 pixels take 3000000000 bytes"
+    ) as caught:
+        ingest("c", make_zip(given, {"0.png": flat}, zipfile.ZIP_DEFLATED), unpacked=1 << 31)
+    assert caught.value.fields == {"entry": "capture.json", "field": "frames", "limit": 1 << 31}
+
+
+def test_frames_of_more_pixels_than_are_allowed_are_refused(
+    make_zip: Zip, put: Put, objects: Objects
+) -> None:
+    put("c", bundle_of(make_zip, shots(6, 3, "uint8"), list(range(6))))
+    most = HEIGHT * WIDTH
+    assert ingest_steps.prepare(objects, "c", Limits(1 << 30, 1 << 26, pixels=most))["tiles"] >= 1
+    with pytest.raises(OverLimit, match=f"a frame may have {most - 1} pixels") as caught:
+        ingest_steps.prepare(objects, "c", Limits(1 << 30, 1 << 26, pixels=most - 1))
+    assert {"name": "capture_pixels", "limit": most - 1, "value": most}.items() <= caught.value.fields.items()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the resident peak is read from Linux's /proc")
+def test_a_stack_larger_than_the_memory_is_ingested_within_it(
+    make_zip: Zip, put: Put, objects: Objects
+) -> None:
+    memory, count = 128 << 20, 100
+    patterns = [n % 6 for n in range(count)]
+    put("small", bundle_of(make_zip, shots(6, 3, "uint8"), list(range(6))))
+    y, x = np.mgrid[:980, :1440]
+    smooth = np.stack([x // 4, y // 3, (x + y) // 8], axis=2).astype(np.uint8)
+    files = {f"{n}.png": encode_png(smooth + np.uint8(n % 6)) for n in range(6)}
+    given = record(patterns)
+    for n, frame in enumerate(given["frames"]):
+        frame["file"] = f"{n % 6}.png"
+    put("large", make_zip(given, files))
+    stack = count * smooth.nbytes
+    assert stack > 3 * memory
+    tiles, grown = peak.of_large_after_small(objects, memory)
+    assert tiles > 4
+    assert memory // 3 < grown <= memory
+    assert Stack(objects, "large").frames == count

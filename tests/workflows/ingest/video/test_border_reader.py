@@ -1,0 +1,161 @@
+"""The border in a recording: found in perspective, its numbers read, whatever is missing of the recording."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from storage.errors import CaptureError
+from storage.layout.captures import Stack
+from tests.workflows.ingest.video.camera import TICK, Camera, Film, capture, film
+from workflows.ingest.video.border_reader import find
+from workflows.ingest.video.decoder import Large
+from workflows.ingest.video.recording import Recording
+from workflows.programs.border import LEAD, Border, draw, schedule
+from workflows.programs.presets import preset
+from workflows.simulation.glass_ball import glass_ball
+
+pytestmark = pytest.mark.full
+BORDER = Border.on(640, 480)
+WIDTH, HEIGHT = 224, 168
+HOLD = 0.25
+ASKEW = ((20, 14), (16, 156), (203, 24), (210, 150))
+"""Where the camera sees the display's corners: left top, left bottom, right top, right bottom."""
+
+
+def through(corners: Any) -> Callable[[np.ndarray], np.ndarray]:
+    """A camera's view of a display: (rows, columns, 3) float32 of the same."""
+    rows = []
+    known = np.array([(0, 0), (0, BORDER.height), (BORDER.width, 0), (BORDER.width, BORDER.height)], float)
+    seen = np.array(corners, float)
+    for (x, y), (u, v) in zip(seen, known, strict=True):
+        rows += [[x, y, 1, 0, 0, 0, -u * x, -u * y], [0, 0, 0, x, y, 1, -v * x, -v * y]]
+    matrix = np.append(np.linalg.solve(np.array(rows), known.ravel()), 1).reshape(3, 3)
+    down, across = (np.mgrid[: 3 * HEIGHT, : 3 * WIDTH] + 0.5) / 3
+    x, y, scale = np.tensordot(matrix, np.stack([across, down, np.ones_like(down)]), 1)
+    column, row = np.floor(x / scale).astype(int), np.floor(y / scale).astype(int)
+    inside = (column >= 0) & (column < BORDER.width) & (row >= 0) & (row < BORDER.height)
+    column, row = np.where(inside, column, 0), np.where(inside, row, 0)
+
+    def view(display: np.ndarray) -> np.ndarray:
+        seen = np.where(inside[..., None], display[row, column], np.float32(0.02))
+        return np.broadcast_to(
+            seen.reshape(HEIGHT, 3, WIDTH, 3, -1).mean(axis=(1, 3)), (HEIGHT, WIDTH, 3)
+        ).copy()
+
+    return view
+
+
+@pytest.fixture
+def take(make_zip: Callable[..., bytes], ingest: Callable[..., Any]) -> Callable[..., Any]:
+    """Films a preset, with a glass ball before the display, and ingests the film."""
+    _, _, width, height = BORDER.inner
+    program = preset("sketch", width, height)
+    ball = glass_ball(WIDTH // 2, HEIGHT // 2, monitor=(width, height), rays=1)
+    pictures = list(program.pictures(0, program.count))
+
+    def run(camera: Camera, corners: Any = ASKEW, border: Border = BORDER) -> tuple[Stack, Film, list[int]]:
+        view, numbers, shown = through(corners), [], []
+        for step in schedule(program.count, 1 / HOLD):
+            picture = np.full((height, width, 1), float(step.white), np.float32)
+            if step.number != LEAD:
+                picture = pictures[step.number]
+            codes = np.round(255 * picture).astype(np.uint8)
+            light = view(draw(codes, step.number, BORDER).astype(np.float32) / 255)
+            glass = ball.truth(np.broadcast_to(picture, (height, width, 3)))
+            light[HEIGHT // 4 : HEIGHT // 4 + HEIGHT // 2, WIDTH // 4 : WIDTH // 4 + WIDTH // 2] = glass
+            repeats = round(step.seconds / HOLD)
+            shown += [light] * repeats
+            numbers += [step.number] * repeats
+        made = film(shown, camera)
+        record, files = capture(program, made.data, 1 / camera.hold)
+        record["video"]["border"] = border.model_dump(mode="json")
+        return ingest("c", make_zip(record, files)), made, numbers
+
+    return run
+
+
+def wrong(stack: Stack, made: Film, numbers: list[int]) -> list[tuple[int, int]]:
+    """The shares of frames that show something else than their pattern."""
+    times, tick = np.array(sorted(made.shown)), stack.attributes["video"]["tick"]
+    found = []
+    for at, ticks, _ in stack.shares().tolist():
+        time = int(times[np.abs(times - ticks * tick * TICK).argmin()])
+        pattern = stack.attributes["patterns"][at]
+        own = [share for share, number in zip(made.shown[time], numbers, strict=False) if number == pattern]
+        if sum(own) < 0.97:
+            found.append((pattern, time))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("camera", "corners"),
+    [
+        pytest.param(Camera(hold=HOLD), ASKEW, id="askew"),
+        pytest.param(
+            Camera(hold=HOLD, fps=24, exposure=1.0),
+            ASKEW,
+            id="24 frames a second, all of them exposed",
+            marks=pytest.mark.long,
+        ),
+        pytest.param(Camera(hold=0.1, fps=60), ASKEW, id="10 patterns a second", marks=pytest.mark.long),
+        pytest.param(
+            Camera(hold=HOLD, options={"crf": "32"}),
+            ((2, 3), (2, 164), (221, 3), (222, 165)),
+            id="compressed",
+            marks=pytest.mark.long,
+        ),
+        pytest.param(Camera(hold=HOLD), ((20, 14), (16, 190), (203, 24), (210, 187)), id="bottom hidden"),
+        pytest.param(Camera(hold=HOLD), ASKEW[::-1], id="upside down", marks=pytest.mark.long),
+    ],
+)
+def test_every_number_is_read(take: Callable[..., Any], camera: Camera, corners: Any) -> None:
+    stack, made, numbers = take(camera, corners)
+    assert stack.attributes["video"]["numbered"]
+    assert stack.attributes["video"]["missing"] == {}
+    assert wrong(stack, made, numbers) == []
+    assert stack.attributes["video"]["patterns_per_second"] == pytest.approx(1 / camera.hold, rel=0.1)
+    assert stack.attributes["video"]["first_pattern_seconds"] == pytest.approx(
+        made.starts[numbers.index(0)], abs=0.5 * camera.hold
+    )
+
+
+def test_what_is_cut_out_costs_its_patterns_alone(take: Callable[..., Any]) -> None:
+    stack, made, numbers = take(Camera(hold=HOLD, cut=(7.0, 9.0)))
+    gone = [numbers[k] for k in np.flatnonzero((made.starts[1:] > 7.0) & (made.starts[:-1] < 9.0))]
+    missing = [int(number) for number in stack.attributes["video"]["missing"]]
+    assert stack.attributes["video"]["numbered"]
+    assert len(missing) >= 6
+    assert set(missing) <= set(gone)
+
+
+def test_a_hand_costs_the_patterns_behind_it(take: Callable[..., Any]) -> None:
+    stack, made, numbers = take(Camera(hold=HOLD, hand=(7.0, 8.0)))
+    behind = [numbers[k] for k in np.flatnonzero((made.starts[1:] > 7.0) & (made.starts[:-1] < 8.0))]
+    assert stack.attributes["video"]["numbered"]
+    assert {int(number) for number in stack.attributes["video"]["missing"]} <= set(behind)
+    assert {pattern for pattern, _ in wrong(stack, made, numbers)} <= set(behind)
+
+
+def test_without_its_sides_in_the_picture_the_times_tell(take: Callable[..., Any]) -> None:
+    stack, made, numbers = take(
+        Camera(hold=HOLD, jitter=0.02), ((-20, 14), (-18, 156), (240, 24), (235, 150))
+    )
+    assert not stack.attributes["video"]["numbered"]
+    assert stack.attributes["video"]["missing"] == {}
+    assert wrong(stack, made, numbers) == []
+
+
+def test_what_is_cut_out_without_numbers_is_refused(take: Callable[..., Any]) -> None:
+    with pytest.raises(CaptureError, match=r"do not fit|does not look|are found"):
+        take(Camera(hold=HOLD, cut=(7.0, 9.0)), ((-20, 14), (-18, 156), (240, 24), (235, 150)))
+
+
+def test_noise_has_no_numbers() -> None:
+    random = np.random.Generator(np.random.PCG64(0))
+    steps = np.repeat(random.integers(0, 256, (40, 24, 32, 3), np.uint8), 6, axis=0)
+    recording = Recording(steps, np.arange(240) / 30, 0.2)
+    assert len(recording.events) == 39
+    grey = np.repeat(random.integers(0, 256, (40, 96, 128), np.uint8), 6, axis=0)
+    assert find(recording, Large(grey, np.arange(240)), BORDER, 32) is None

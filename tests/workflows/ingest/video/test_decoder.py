@@ -1,0 +1,80 @@
+"""Means of a video's frames: the colours that were filmed, whatever system and depth they are coded in."""
+
+import gc
+import io
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from storage.errors import CaptureError
+from tests.workflows.composite.video.test_steps import clip, even, pictures
+from workflows.ingest.video.decoder import PARTS, Clip, Share
+
+
+@pytest.mark.parametrize(
+    ("codec", "pixels", "container", "options", "off"),
+    [
+        ("libx264", "yuv420p", "mp4", {"qp": "1"}, 2.0),
+        ("libx264", "yuv444p10le", "mp4", {"qp": "1"}, 0.5),
+        ("libx265", "yuv420p10le", "mp4", {"crf": "4", "x265-params": "log-level=none"}, 0.5),
+        ("mjpeg", "yuvj422p", "mov", {"qmin": "1", "qmax": "1"}, 2.5),
+        ("ffv1", "bgr0", "matroska", {}, 0.2),
+        ("ffv1", "gbrp10le", "matroska", {}, 0.2),
+        ("prores_ks", "yuv422p10le", "mov", {}, 0.5),
+    ],
+)
+def test_a_mean_has_the_colours_that_were_filmed(
+    codec: str, pixels: str, container: str, options: dict[str, str], off: float
+) -> None:
+    random = np.random.Generator(np.random.PCG64(0))
+    codes = random.integers(0, 256, (6, 8, 3), np.uint8)
+    codes[0, :2] = [[255, 255, 255], [0, 0, 0]]
+    picture = codes.repeat(16, axis=0).repeat(16, axis=1)
+    target = io.BytesIO()
+    with av.open(target, "w", format=container) as box:
+        stream = box.add_stream(codec, rate=30)
+        stream.width, stream.height, stream.pix_fmt, stream.options = 128, 96, pixels, options
+        for number in range(8):
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            frame.pts = number
+            box.mux(stream.encode(frame))
+        box.mux(stream.encode())
+    film = Clip(io.BytesIO(target.getvalue()), "clip", 1 << 24)
+    _, ticks, _ = film.signatures(1 << 24)
+    (mean,) = film.means([[Share(int(ticks[2]), 100), Share(int(ticks[5]), PARTS - 100)]])
+    film.close()
+    middles = mean[8::16, 8::16]
+    np.testing.assert_array_equal(middles[0, :2], [[65535] * 3, [0] * 3])  # to the end of the scale: clipped
+    assert np.abs(middles / 257 - codes).max() < off
+
+
+def decoding() -> list[str]:
+    """The threads of this process that decode."""
+    names = [task.read_text() for task in Path("/proc/self/task").glob("*/comm")]
+    return [name for name in names if name.startswith("av:")]
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="threads are looked up in /proc")
+def test_a_decoder_is_gone_when_its_clip_is() -> None:
+    """And not only when the collector of cycles comes by: each has threads, and frames of tens of megabytes."""
+    data = clip(pictures(20), even(20))
+    gc.collect()
+    before = decoding()
+    gc.disable()
+    try:
+        for used in (True, False):
+            opened = Clip(io.BytesIO(data), "clip", 1 << 24)
+            if used:
+                ticks, _ = opened.ticks(99)
+                list(opened.means([[Share(tick, PARTS)] for tick in ticks[:5].tolist()]))
+            assert len(decoding()) > len(before)
+            opened.close()
+            del opened
+            assert decoding() == before
+        with pytest.raises(CaptureError):
+            Clip(io.BytesIO(data), "clip", 1000)
+        assert decoding() == before
+    finally:
+        gc.enable()

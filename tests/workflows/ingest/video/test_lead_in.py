@@ -1,0 +1,73 @@
+"""Films of what `envmatte patterns` shows: the lead-in before a preset's patterns is told from them."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from storage.layout.captures import Stack
+from tests.workflows.ingest.video.camera import Camera, Film, capture, film, lights
+from workflows.programs.border import LEAD, schedule
+from workflows.programs.presets import preset
+from workflows.simulation.glass_ball import glass_ball
+
+pytestmark = pytest.mark.full
+MONITOR = (192, 144)
+HOLD = 0.5
+
+
+@pytest.fixture
+def take(make_zip: Callable[..., bytes], ingest: Callable[..., Any]) -> Callable[..., Stack]:
+    """Films a preset with its lead-in and ingests the film."""
+
+    def run(name: str, camera: Camera) -> tuple[Stack, Film, int]:
+        program = preset(name, *MONITOR)
+        patterns = lights(glass_ball(96, 72, monitor=MONITOR, rays=4), program)
+        dark, bright = np.min(patterns, axis=0), np.max(patterns, axis=0)
+        shown = []
+        for step in schedule(program.count, 1 / HOLD):
+            light = patterns[step.number] if step.number != LEAD else bright if step.white else dark
+            shown += [light] * round(step.seconds / HOLD)
+        before = next(at for at, light in enumerate(shown) if light is patterns[0])
+        made = film(shown, camera)
+        record, files = capture(program, made.data, 1 / HOLD)
+        record["video"]["border"] = {"width": 216, "height": 160}
+        return ingest("c", make_zip(record, files)), made, before
+
+    return run
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("default", marks=pytest.mark.long),
+        "quick",
+        pytest.param("sketch", marks=pytest.mark.long),
+    ],
+)
+@pytest.mark.parametrize(
+    "camera",
+    [
+        pytest.param(
+            Camera(hold=HOLD, jitter=0.0, fps=30), id="a player that keeps time", marks=pytest.mark.long
+        ),
+        pytest.param(Camera(hold=HOLD, jitter=0.03, fps=25, exposure=0.9), id="one that does not quite"),
+    ],
+)
+def test_the_lead_in_is_told_from_the_patterns(
+    take: Callable[..., tuple[Stack, Film, int]], name: str, camera: Camera
+) -> None:
+    stack, made, before = take(name, camera)
+    assert not stack.attributes["video"]["missing"]
+    patterns = np.array(stack.attributes["patterns"])
+    for at, tick, _ in stack.shares().tolist():
+        time = tick * stack.attributes["video"]["tick"]
+        k = before + patterns[at]
+        assert made.starts[k] - 0.05 < time < made.starts[k + 1] + 0.01
+
+
+def test_a_film_without_the_lead_out_is_read_too(take: Callable[..., tuple[Stack, Film, int]]) -> None:
+    stack, _, _ = take("sketch", Camera(hold=HOLD, jitter=0.0, tail=-4.2))
+    missing = stack.attributes["video"]["missing"]
+    assert set(map(int, missing)) <= set(range(28, 32))

@@ -1,0 +1,57 @@
+"""What a report says of the patterns that a recording has no frame of."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from storage.layout.captures import Stack
+from tests.workflows.ingest.video.camera import Camera, capture, film, lights
+from workflows.ingest.report.report import report
+from workflows.ingest.video.missing_patterns import REMEDIES, by_reason, ranges, remedy
+from workflows.simulation.glass_ball import glass_ball
+from workflows.simulation.scene import nested_program
+
+Zip = Callable[..., bytes]
+Ingest = Callable[..., Stack]
+PROGRAM = nested_program((64, 48), ((4, 3, 14), (8, 6, 12), (32, 24, 6)), levels=5)
+
+
+@pytest.fixture(scope="module")
+def light() -> list[np.ndarray]:
+    return lights(glass_ball(96, 72, monitor=(64, 48), rays=16), PROGRAM)
+
+
+@pytest.mark.parametrize(
+    ("camera", "what"),
+    [(Camera(hand=(5.0, 6.0)), "keep hands"), (Camera(tail=-1.5), "go on until after")],
+    ids=["a hand in front", "ended too early"],
+)
+def test_patterns_without_a_frame_are_named_with_a_remedy(
+    make_zip: Zip, ingest: Ingest, light: list[np.ndarray], camera: Camera, what: str
+) -> None:
+    stack = ingest("c", make_zip(*capture(PROGRAM, film(light, camera).data, 1 / camera.hold)))
+    made = report(stack.attributes, stack.frames)
+    (finding,) = (f for f in made.findings if f.name == "frames")
+    assert made.frames.missing
+    assert finding.level in ("warning", "bad")
+    assert finding.message.startswith(f"{len(made.frames.missing)} of {PROGRAM.count} patterns")
+    assert what in finding.remedy
+    reasons = stack.attributes["video"]["missing"]
+    assert set(reasons.values()) <= REMEDIES.keys()
+    for numbers, reason in by_reason({int(number): reason for number, reason in reasons.items()}):
+        assert f"{ranges(numbers)} ({reason})" in finding.message
+
+
+@pytest.mark.parametrize(
+    ("numbers", "text"), [([7], "7"), ([1, 2], "1 to 2"), ([0, 3, 4, 5, 9, 11, 12], "0, 3 to 5, 9, 11 to 12")]
+)
+def test_numbers_in_words(numbers: list[int], text: str) -> None:
+    assert ranges(numbers) == text
+
+
+def test_each_remedy_is_given_once() -> None:
+    parts = remedy([*REMEDIES, *REMEDIES]).removeprefix("film again: ").split("; ")
+    assert len(parts) == len(set(parts))
+    assert {*parts} == {part for each in REMEDIES.values() for part in each.split("; ")}
+    assert "show each pattern for longer" in remedy(["a reason of an earlier version"])

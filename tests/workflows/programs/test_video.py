@@ -1,0 +1,107 @@
+"""A program's video, decoded again: every picture as it was, as long as it should be."""
+
+import json
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
+
+from storage.errors import OptionError
+from workflows.programs import video as program_video
+from workflows.programs.border import LEAD_SECONDS, Border, draw, schedule
+from workflows.programs.files import fitted, pictures
+from workflows.programs.program import Bernoulli, Constant, Monitor, Program
+
+LEVELS = Constant(kind="constant", levels=(0, 0.25, 0.5, 0.75, 1))
+RANDOM = Bernoulli(kind="bernoulli", columns=64, rows=48, count=6, seed=3, offset=True)
+GREY = Program(monitor=Monitor(width=271, height=199), parts=(LEVELS, RANDOM))  # odd sizes
+COLOURED = fitted("sketch", (320, 240), bordered=True)
+
+
+@pytest.mark.parametrize("end", [".mp4", ".mkv"])
+@pytest.mark.parametrize(("program", "off"), [(GREY, 0), (COLOURED, 1)], ids=["grey", "coloured"])
+@pytest.mark.parametrize("rate", [2.0, 7.5])
+def test_every_picture_comes_back_for_its_time(
+    program: Program, off: int, end: str, rate: float, tmp_path: Path
+) -> None:
+    path = tmp_path / f"film{end}"
+    program_video.write(program, path, rate, lambda done, of: None)
+    border = Border.around(program.monitor.width, program.monitor.height)
+    of_patterns = list(pictures(program))
+    steps = schedule(program.count, rate)
+    with av.open(path) as video:
+        stream = video.streams.video[0]
+        frames = [
+            (float(Fraction(frame.pts) * frame.time_base), frame.to_ndarray(format="rgb24"))
+            for frame in video.decode(stream)
+        ]
+        context = stream.codec_context
+        assert (context.color_range, context.colorspace) == (ColorRange.JPEG, Colorspace.ITU709)
+        assert (context.color_primaries, context.color_trc) == (ColorPrimaries.BT709, ColorTrc.IEC61966_2_1)
+        spacing = float(1 / stream.average_rate)
+    times = np.array([time for time, _ in frames])
+    start = 0.0
+    for step in steps:
+        level = np.full((1, 1, 1), 255 * step.white, np.uint8)
+        picture = draw(level if step.number < 0 else of_patterns[step.number], step.number, border)
+        within = [
+            frame
+            for time, frame in frames
+            if start - 1e-2 * spacing <= time - times[0] < start + step.seconds / 2
+        ]
+        assert within
+        for frame in within:
+            assert np.abs(frame.astype(int) - picture).max() <= off
+        lasts = step.seconds if step.number >= 0 else round(step.seconds / spacing) * spacing
+        start += lasts
+    assert times[-1] - times[0] + spacing == pytest.approx(start, abs=2e-3)
+    assert start == pytest.approx(2 * sum(LEAD_SECONDS) + program.count / rate, abs=10 * spacing)
+
+
+def test_beside_the_video_is_what_the_capture_needs(tmp_path: Path) -> None:
+    program_video.write(COLOURED, tmp_path / "sketch.mp4", 3.0, lambda done, of: None)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["sketch.json", "sketch.mp4"]
+    record = json.loads((tmp_path / "sketch.json").read_text())
+    assert record["format"] == "envmatte-capture/1"
+    assert Program.model_validate(record["program"]) == COLOURED
+    assert record["video"]["patterns_per_second"] == 3
+    assert Border.model_validate(record["video"]["border"]) == Border(width=320, height=240)
+
+
+def test_the_same_program_gives_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("a.mp4", "b.mp4"):
+        program_video.write(COLOURED, tmp_path / name, 2.0, lambda done, of: None)
+    assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
+
+
+@pytest.mark.parametrize("name", ["film.mp4", "film.json"])
+def test_a_file_that_is_there_is_kept(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(OptionError, match=f"{name} is there already"):
+        program_video.write(COLOURED, tmp_path / "film.mp4", 2.0, lambda done, of: None)
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
+
+
+@pytest.mark.parametrize(
+    ("program", "rate", "said"),
+    [
+        (GREY, 0.0, "0.0 patterns a second"),
+        (GREY, float("nan"), "nan patterns a second"),
+        (fitted("sketch", (40, 30), bordered=False), 2.0, "no border can be drawn"),
+        (
+            Program(monitor=GREY.monitor, parts=(LEVELS, RANDOM.model_copy(update={"count": 4091}))),
+            2.0,
+            "4096 patterns",
+        ),
+    ],
+    ids=["rate", "nan", "border", "patterns"],
+)
+def test_what_can_not_be_filmed_is_refused_and_leaves_nothing(
+    program: Program, rate: float, said: str, tmp_path: Path
+) -> None:
+    with pytest.raises(OptionError, match=said):
+        program_video.write(program, tmp_path / "new" / "film.mkv", rate, lambda done, of: None)
+    assert not list(tmp_path.rglob("*.*"))

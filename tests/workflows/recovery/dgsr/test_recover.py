@@ -1,0 +1,164 @@
+"""What NN-DGSR owes, whatever its options: known scenes, any batch, dark channels, patterns of three colours."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from workflows.recovery.dgsr import recover as dgsr
+from workflows.recovery.photometry import Photometry
+from workflows.recovery.sensing import Sensing
+
+METHODS = {
+    "dgsr": dgsr.recover,
+    "dgsr-plain": partial(dgsr.recover, prior="none"),
+    "dgsr-direct": partial(dgsr.recover, levels="direct"),
+    "dgsr-joint": partial(dgsr.recover, channels="joint"),
+    "dgsr-plain-direct-joint": partial(dgsr.recover, prior="none", levels="direct", channels="joint"),
+}
+BANDS = [(8, 6, 24), (32, 24, 120)]
+COLUMNS, ROWS = 32, 24
+
+
+@pytest.fixture(params=METHODS.values(), ids=METHODS)
+def recover(request):
+    return request.param
+
+
+@pytest.fixture(params=[name for name in METHODS if "joint" not in name])
+def recover_apart(request):
+    """A method for which the channels may differ."""
+    return METHODS[request.param]
+
+
+def dense(transport):
+    assert (transport.columns, transport.rows) == (COLUMNS, ROWS)
+    out = np.zeros((*transport.count.shape, ROWS * COLUMNS))
+    row = np.repeat(np.arange(out.shape[0] * 3), transport.count.ravel())
+    out.reshape(-1, out.shape[2])[row, transport.cell] = transport.weight
+    return out
+
+
+def cells(*weights):
+    """One pixel's T from (column, row, weight), the same in all channels."""
+    out = np.zeros((1, 3, ROWS, COLUMNS))
+    for column, row, weight in weights:
+        out[:, :, row, column] += weight
+    return out.reshape(1, 3, -1)
+
+
+def lobe(column, row, major, minor, angle):
+    """An oriented Gaussian in units of cells; the centre of cell 0 is at 0.5."""
+    y, x = np.mgrid[:ROWS, :COLUMNS] + 0.5
+    u = (x - column) * np.cos(angle) + (y - row) * np.sin(angle)
+    v = (y - row) * np.cos(angle) - (x - column) * np.sin(angle)
+    grid = np.exp(-0.5 * ((u / major) ** 2 + (v / minor) ** 2))
+    return np.repeat((grid / grid.sum()).reshape(1, 1, -1), 3, axis=1)
+
+
+def mixture(n=24, seed=5):
+    """Random pixels of one to three cells, each channel its own."""
+    rng = np.random.default_rng(seed)
+    out = np.zeros((n, 3, ROWS * COLUMNS))
+    for p in range(n):
+        for c in range(3):
+            where = rng.choice(ROWS * COLUMNS, 1 + p % 3, replace=False)
+            out[p, c, where] = rng.dirichlet(np.full(where.size, 5.0))
+    return out
+
+
+def test_one_cell(recover, sensing_of, observe):
+    truth = cells((13, 7, 1.0))
+    sensing = sensing_of(BANDS, 1)
+    found = dense(recover(*args(observe(sensing, truth), sensing)))
+    assert np.abs(found - truth).sum(2).max() < 0.05
+
+
+def test_two_cells(recover, sensing_of, observe):
+    truth = cells((3, 20, 0.7), (27, 4, 0.3))
+    sensing = sensing_of(BANDS, 2)
+    found = dense(recover(*args(observe(sensing, truth), sensing)))
+    assert np.abs(found - truth).sum(2).max() < 0.08
+
+
+def test_an_oriented_gaussian_between_cells(recover, sensing_of, observe):
+    truth = lobe(17.0, 9.4, 1.8, 0.8, 0.6)
+    sensing = sensing_of(BANDS, 3)
+    found = dense(recover(*args(observe(sensing, truth), sensing)))
+    assert np.abs(found - truth).sum(2).max() < 0.3
+    x = np.arange(COLUMNS * ROWS) % COLUMNS + 0.5
+    y = np.arange(COLUMNS * ROWS) // COLUMNS + 0.5
+    np.testing.assert_allclose(found @ x, 17.0, atol=0.15)
+    np.testing.assert_allclose(found @ y, 9.4, atol=0.15)
+
+
+@pytest.mark.parametrize("colours", [1, 3])
+def test_channels_that_differ(recover_apart, sensing_of, observe, colours):
+    truth = mixture()
+    sensing = sensing_of(BANDS, 4, channels=colours)
+    error = np.abs(dense(recover_apart(*args(observe(sensing, truth), sensing))) - truth).sum(2)
+    assert np.median(error) < 0.1
+
+
+def test_patterns_of_three_colours(recover, sensing_of, observe):
+    truth = cells((5, 5, 0.6), (22, 15, 0.4))
+    sensing = sensing_of(BANDS, 5, channels=3)
+    found = dense(recover(*args(observe(sensing, truth), sensing)))
+    assert np.abs(found - truth).sum(2).max() < 0.1
+
+
+@pytest.mark.parametrize("colours", [1, 3])
+def test_result_does_not_depend_on_the_batch(recover, sensing_of, observe, colours):
+    truth = np.concatenate([mixture(), lobe(12.0, 12.5, 2.5, 1.2, 0.3)])
+    sensing = sensing_of(BANDS, 6, channels=colours)
+    measurements, photometry, noise = observe(sensing, truth)
+    whole = recover(measurements, photometry, sensing, noise)
+    order = np.random.default_rng(0).permutation(len(truth))
+    for part in (order, order[:7], order[7:8]):
+        own = Photometry(*(array[part] for array in vars(photometry).values()))
+        alone = recover(measurements[part], own, sensing, noise)
+        np.testing.assert_array_equal(alone.count, whole.count[part])
+        np.testing.assert_array_equal(dense(alone), dense(whole)[part])
+
+
+def test_dark_channels_get_empty_rows(recover, sensing_of, observe):
+    truth = np.concatenate([cells((13, 7, 1.0)), cells((13, 7, 1.0))])
+    sensing = sensing_of(BANDS, 7)
+    scene = observe(sensing, truth, rho=[[0.7, 0.002, 0.0], [0.0, 0.0, 0.0]])
+    found = recover(*args(scene, sensing))
+    assert (found.count[0] > 0).tolist() == [True, False, False]
+    assert (found.count[1] == 0).all()
+    assert np.abs(dense(found)[0, 0] - truth[0, 0]).sum() < 0.05
+
+
+def test_rows_are_clean(recover, sensing_of, observe):
+    sensing = sensing_of(BANDS, 8)
+    found = recover(*args(observe(sensing, mixture(6)), sensing))
+    np.testing.assert_allclose(dense(found).sum(2), 1, atol=1e-6)
+    assert found.weight.min() >= 0.99e-4
+    assert found.cell.dtype == np.uint32
+
+
+def test_no_pixels(recover, sensing_of, observe):
+    sensing = sensing_of(BANDS, 9)
+    found = recover(*args(observe(sensing, mixture(0)), sensing))
+    assert found.count.shape == (0, 3)
+
+
+def test_one_level_serves(recover, sensing_of, observe):
+    truth = cells((13, 7, 1.0))
+    sensing = Sensing(sensing_of([(COLUMNS, ROWS, 60)], 10).levels[-1:])
+    found = dense(recover(*args(observe(sensing, truth), sensing)))
+    assert np.abs(found - truth).sum(2).max() < 0.1
+
+
+def test_measurements_of_another_number_of_pixels_are_refused(recover, sensing_of, observe):
+    sensing = sensing_of(BANDS, 11)
+    measurements, photometry, noise = observe(sensing, mixture(3))
+    with pytest.raises(ValueError, match="measurements"):
+        recover(measurements[:2], photometry, sensing, noise)
+
+
+def args(scene, sensing):
+    measurements, photometry, noise = scene
+    return measurements, photometry, sensing, noise

@@ -1,0 +1,174 @@
+"""Lobes fitted to measurements: what is there is found, noise pays for none, what was not measured is left out."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from workflows.recovery.lobes.footprint import PARAMETERS, Shown, bump_variance
+from workflows.recovery.lobes.mixture import Effort, Mixture
+from workflows.recovery.lobes.search import fit, search
+
+COLUMNS, ROWS, MOST = 64, 48, 3
+SIGMA = 0.01
+EFFORT = Effort(
+    most_lobes=MOST,
+    fit_resolution=0.8,
+    resolution=1.3,
+    rounds=2,
+    steps=20,
+    tolerance=0.1,
+    beam=6,
+    doubt=0.01,
+    passes=1,
+    gradients=10,
+    least_weight=1e-4,
+)
+
+
+class Fitted(NamedTuple):
+    """What `fit` made of a pixel, the lobes by falling weight."""
+
+    lobes: NDArray[np.float64]
+    level: NDArray[np.int64]
+    offset: NDArray[np.float64]
+    kappa: float
+    objective: float
+
+    def covariance(self, i):
+        """Of a lobe and its bumps."""
+        root = np.array([[self.lobes[i, 3], 0], self.lobes[i, 4:]])
+        return root @ root.T + bump_variance(int(self.level[i])) * np.eye(2)
+
+
+@pytest.fixture(scope="module")
+def patterns(patterns_of):
+    return patterns_of([(8, 6, 24), (16, 12, 24), (32, 24, 24), (COLUMNS, ROWS, 24)], 1)
+
+
+@pytest.fixture(scope="module")
+def shown(patterns):
+    return Shown(patterns.pyramid.arrays, patterns.code, 0, 1, patterns.count)
+
+
+@pytest.fixture(scope="module")
+def measure(patterns):
+    """Noisy measurements of T on the first grid, and their variance."""
+
+    def of(T, seed=0, offset=0.0):
+        rng = np.random.default_rng(seed)
+        signed = patterns.code[: COLUMNS * ROWS] / 127.5 - 1
+        y = T.reshape(-1) @ np.concatenate([signed, np.tile([-1.0, 1.0], (len(signed), 1))], axis=1)
+        y += offset + SIGMA * rng.standard_normal(y.size)
+        return y.astype(np.float32), np.full(y.size, SIGMA**2, np.float32)
+
+    return of
+
+
+@pytest.fixture(scope="module")
+def fitted(shown):
+    def run(y, variance, most=MOST):
+        mixture = Mixture(np.zeros((MOST, PARAMETERS)), np.zeros(MOST, np.int64), np.zeros(1))
+        k, kappa, objective = fit(shown, y, variance, mixture, 0, EFFORT._replace(most_lobes=most))
+        order = np.argsort(-mixture.lobes[:k, 0], kind="stable")
+        return Fitted(mixture.lobes[order], mixture.level[order], mixture.offset, kappa, objective)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def truth(gaussian):
+    """(cells,) a Gaussian's shares."""
+    return lambda *shape: gaussian(COLUMNS, ROWS, *shape)[0, 0]
+
+
+def turned(major, minor, angle):
+    """The covariance of an oriented Gaussian seen through cells."""
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return turn @ np.diag([major**2, minor**2]) @ turn.T + np.eye(2) / 12
+
+
+@pytest.mark.parametrize(
+    "shape", [(20.3, 30.8, 1.2, 1.2, 0.0), (40.0, 20.5, 3.0, 1.4, 0.7), (30.2, 22.1, 6.0, 2.5, 2.2)]
+)
+def test_one_lobe_is_recovered(measure, fitted, truth, shape):
+    found = fitted(*measure(truth(*shape)))
+    assert len(found.lobes) == 1
+    assert found.lobes[0, 0] == pytest.approx(1, abs=0.03)
+    np.testing.assert_allclose(found.lobes[0, 1:3], shape[:2], atol=0.1)
+    expected = turned(*shape[2:])
+    np.testing.assert_allclose(found.covariance(0), expected, atol=0.1 * np.trace(expected))
+
+
+def test_two_lobes_are_recovered(measure, fitted, truth):
+    shapes = (18.4, 12.7, 2.0, 1.0, 0.5), (45.6, 33.2, 1.5, 1.5, 0.0)
+    found = fitted(*measure(0.65 * truth(*shapes[0]) + 0.35 * truth(*shapes[1])))
+    assert len(found.lobes) == 2
+    np.testing.assert_allclose(found.lobes[:, 0], [0.65, 0.35], atol=0.03)
+    for i, shape in enumerate(shapes):
+        np.testing.assert_allclose(found.lobes[i, 1:3], shape[:2], atol=0.15)
+        expected = turned(*shape[2:])
+        np.testing.assert_allclose(found.covariance(i), expected, atol=0.2 * np.trace(expected))
+
+
+def test_the_offset_is_free(measure, fitted, truth):
+    shape = (30.3, 20.6, 2.0, 2.0)
+    found = fitted(*measure(truth(*shape), offset=0.05))
+    assert found.offset[0] == pytest.approx(0.05, abs=0.01)
+    np.testing.assert_allclose(found.lobes[0, 1:3], shape[:2], atol=0.1)
+
+
+def test_noise_pays_for_no_second_lobe(measure, fitted, truth):
+    T = truth(30.3, 20.6, 2.0, 1.5, 0.4)
+    assert [len(fitted(*measure(T, seed)).lobes) for seed in range(12)] == [1] * 12
+    rng = np.random.default_rng(0)
+    variance = measure(T)[1]
+    for _ in range(6):
+        y = np.append(rng.normal(0, SIGMA, variance.size - 2), [-1, 1]).astype(np.float32)
+        assert len(fitted(y, variance).lobes) == 1
+
+
+def test_no_more_lobes_than_asked_for(measure, fitted, truth):
+    T = 0.5 * truth(18.4, 12.7, 1.5, 1.5) + 0.5 * truth(45.6, 33.2, 1.5, 1.5)
+    assert len(fitted(*measure(T), most=1).lobes) == 1
+
+
+def test_what_was_not_measured_is_left_out(measure, fitted, truth):
+    shape = (30.3, 20.6, 2.0, 1.5, 0.4)
+    y, variance = measure(truth(*shape))
+    variance[3::7] = np.inf
+    plain = fitted(y, variance)
+    y[3::7] = 100
+    wild = fitted(y, variance)
+    np.testing.assert_array_equal(wild.lobes, plain.lobes)
+    assert (wild.kappa, wild.objective) == (plain.kappa, plain.objective)
+    np.testing.assert_allclose(wild.lobes[0, 1:3], shape[:2], atol=0.1)
+
+
+@pytest.mark.parametrize("known", ["nothing", "black and white", "one pattern"])
+def test_too_few_measurements_give_one_finite_lobe(measure, fitted, truth, known):
+    y, variance = measure(truth(30.3, 20.6, 2.0, 1.5))
+    there = {"nothing": [], "black and white": [-2, -1], "one pattern": [0]}[known]
+    variance[[i for i in range(-2, y.size - 2) if i not in there]] = np.inf
+    found = fitted(y, variance)
+    assert len(found.lobes) == 1
+    assert np.isfinite(found.lobes).all()
+    assert np.isfinite([found.kappa, found.objective]).all()
+
+
+def test_search_finds_the_node_that_is_missing(patterns, shown):
+    m, grids = patterns.count, shown.grids
+    for level, column, row in ((0, 41, 17), (1, 9, 20)):
+        node = grids.starts[level] + row * grids.columns[level] + column
+        f = np.append(np.zeros(m), [-1, 1]).astype(np.float32)
+        y = np.append(0.2 * (patterns.code[node] / 127.5 - 1), [-1, 1]).astype(np.float32)
+        precision = np.full(m + 2, SIGMA**-2, np.float32)
+        found = search(shown, y, f, precision, 6)
+        assert found[:3] == (level, column, row)
+        assert found[4] == pytest.approx(0.2, rel=1e-4)
+        d = patterns.code[node] / 127.5 - 1
+        z_squared = 0.04 * (d @ d) / SIGMA**2
+        places = grids.columns[level] * grids.rows[level]
+        assert found[3] == pytest.approx(z_squared - 2 * np.log(places), rel=1e-4)
+    assert search(shown, f, f, precision, 6)[0] == -1

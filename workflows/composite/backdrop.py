@@ -1,0 +1,262 @@
+"""The light of a backdrop at the nodes of T: resampled to the monitor's cells, then from grid to coarser grid."""
+
+import math
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from workflows.composite.placement import Placement, place
+from workflows.composite.threads import in_parts
+from workflows.images.decode import Transfer
+from workflows.images.float_formats import Floats
+from workflows.images.integer_formats import Codes
+from workflows.images.tone_curves import table
+from workflows.recovery.pyramid import Pyramid
+
+ROWS = 64
+"""Rows of cells that a thread makes at a time."""
+
+
+@dataclass(frozen=True)
+class Backdrop:
+    """A picture to put a matte before.
+
+    Attributes
+    ----------
+    pixels : (h, w, 1 to 4) uint8 or uint16, or (h, w, 1 or 3) float32
+        With an alpha channel if it has two or four: what is transparent is black, in part in proportion.
+    table : (256 or 65536,) float32, optional
+        Linear light of every value of an integer type; float values are linear light.
+    """
+
+    pixels: NDArray[np.integer] | NDArray[np.float32]
+    table: NDArray[np.float32] | None = None
+
+
+def backdrop_of(pixels: Codes | Floats, transfer: Transfer) -> Backdrop:
+    """A backdrop of a picture that `images.decode.decode` has decoded.
+
+    Parameters
+    ----------
+    pixels : (h, w, 1 to 4) uint8 or uint16, or (h, w, 1 or 3) float32
+        With an alpha channel if it has two or four. Float values are changed in place.
+    transfer : str
+        How integers encode light; float values are linear light.
+
+    Returns
+    -------
+    Backdrop
+        Where it is transparent it is black, in part in proportion: there is no light behind it. What is infinite or
+        no number in a float image is black.
+    """
+    if pixels.dtype == np.float32:
+        light = cast("Floats", pixels)
+        light[~np.isfinite(light)] = 0
+        return Backdrop(light)
+    codes = cast("Codes", pixels)
+    return Backdrop(codes, table(transfer, codes.dtype))
+
+
+def node_light(
+    backdrop: Backdrop,
+    columns: int,
+    rows: int,
+    threads: int,
+    placement: Placement | None = None,
+    monitor: tuple[int, int] = (1, 1),
+) -> NDArray[np.float32]:
+    """The light that the nodes of a pyramid see of a backdrop.
+
+    Parameters
+    ----------
+    backdrop : Backdrop
+    columns, rows : int
+        The pyramid's first grid.
+    threads : int
+        To share the work.
+    placement : Placement, optional
+        Where it stands; default stretched over the monitor.
+    monitor : (int, int)
+        The monitor's width and height, for a placement.
+
+    Returns
+    -------
+    (nodes + 1, 3) float32
+        Row by row; the last one is 0, and nobody's: `gather` reads past a node's three values.
+
+    Notes
+    -----
+    A cell sees the mean of the backdrop over it, as the patterns' blocks were to it: nothing aliases, whatever the
+    backdrop's size. A backdrop that is placed elsewhere is first made as coarse as the cells, by means too, and then
+    sampled between its pixels. Further grids see what `Pyramid` says.
+    """
+    pyramid = Pyramid.over(columns, rows)
+    light = np.empty((pyramid.nodes + 1, 3), np.float32)
+    light[-1] = 0
+    starts, grids = pyramid.starts, pyramid.grids
+    finest = light[: starts[1]].reshape(rows, columns, 3)
+    if placement is None:
+        _resample(backdrop, finest, threads, (rows, columns))
+    else:
+        _place(backdrop, placement, monitor, finest, threads)
+    for level in range(1, len(grids)):
+        fine = light[starts[level - 1] : starts[level]].reshape(*grids[level - 1][::-1], 3)
+        coarse = light[starts[level] : starts[level + 1]].reshape(*grids[level][::-1], 3)
+
+        def halve(start: int, fine: NDArray[np.float32] = fine, coarse: NDArray[np.float32] = coarse) -> None:
+            _halve(fine, start, min(start + ROWS, len(coarse)), coarse)
+
+        in_parts(halve, range(0, len(coarse), ROWS), threads)
+    return light
+
+
+def _resample(
+    backdrop: Backdrop,
+    cells: NDArray[np.float32],
+    threads: int,
+    grid: tuple[int, int],
+    corner: tuple[int, int] = (0, 0),
+) -> None:
+    """Stretch a backdrop over a grid of rows and columns: each cell gets the mean over it.
+
+    Made are the cells (rows, columns, 3) from the grid's row and column `corner` on.
+    """
+    in_parts(
+        lambda start: _area_mean(
+            backdrop.pixels, backdrop.table, grid, corner, start, min(start + ROWS, len(cells)), cells
+        ),
+        range(0, len(cells), ROWS),
+        threads,
+    )
+
+
+def _place(
+    backdrop: Backdrop,
+    placement: Placement,
+    monitor: tuple[int, int],
+    cells: NDArray[np.float32],
+    threads: int,
+) -> None:
+    """Place a backdrop before cells (rows, columns, 3)."""
+    rows, columns, _ = cells.shape
+    height, width, _ = backdrop.pixels.shape
+    steps = np.hypot(*placement.matrix((columns, rows), monitor, (width, height))[:, :2].T)
+    wide, high = (math.ceil(size / max(step, 1.0)) for size, step in zip((width, height), steps, strict=True))
+    matrix = placement.matrix((columns, rows), monitor, (wide, high))
+    # No more of it than the cells see: of a backdrop that is much enlarged all pixels would be too many.
+    across, down = _seen(matrix[0], columns, rows, wide), _seen(matrix[1], columns, rows, high)
+    corner = (down.start, across.start)
+    picture = np.empty((len(down), len(across), 3), np.float32)
+    _resample(backdrop, picture, threads, (high, wide), corner)
+    in_parts(
+        lambda start: place(picture, (high, wide), corner, matrix, start, min(start + ROWS, rows), cells),
+        range(0, rows, ROWS),
+        threads,
+    )
+
+
+def _seen(line: NDArray[np.float64], columns: int, rows: int, size: int) -> range:
+    """The pixels along an axis of a picture between which cells sample it, and one more at each end, for rounding.
+
+    Parameters
+    ----------
+    line : (3,) float64
+        The axis' line of a placement's matrix.
+    columns, rows : int
+        Of the grid of cells.
+    size : int
+        Of the picture.
+    """
+    places = [line @ (x, y, 1) for x in (0, columns) for y in (0, rows)]
+    first, end = (min(max(at, 0), size) for at in (math.floor(min(places)) - 2, math.floor(max(places)) + 3))
+    return range(first, end)
+
+
+@njit(nogil=True, cache=True)
+def _light_at(
+    image: NDArray[np.integer] | NDArray[np.float32],
+    table: NDArray[np.float32] | None,
+    y: int,
+    x: int,
+    channel: int,
+) -> np.float32:
+    """The linear light of a colour of a pixel, looked up only here: no backdrop of codes is held as float."""
+    if table is None:
+        value: np.float32 = image[y, x, channel]
+        return value
+    light: np.float32 = table[image[y, x, channel]]
+    last = image.shape[2] - 1
+    if last & 1:  # which is alpha then
+        light *= np.float32(image[y, x, last]) / np.float32(table.size - 1)
+    return light
+
+
+@njit(nogil=True, cache=True)
+def _area_mean(
+    image: NDArray[np.integer] | NDArray[np.float32],
+    table: NDArray[np.float32] | None,
+    grid: tuple[int, int],
+    corner: tuple[int, int],
+    start: int,
+    stop: int,
+    cells: NDArray[np.float32],
+) -> None:
+    """The mean over each cell of a part of a grid, of an image that is constant over each of its pixels.
+
+    Parameters
+    ----------
+    image, table
+        A backdrop's.
+    grid : (int, int)
+        Rows and columns of the grid that the image is stretched over.
+    corner : (int, int)
+        Row and column that the part begins with.
+    start, stop : int
+        Rows of the part.
+    cells : (rows, columns, 3) float32
+        The part; written between `start` and `stop`.
+    """
+    height, width, channels = image.shape
+    rows, columns = grid
+    colours = 3 if channels >= 3 else 1
+    line = np.empty((width // columns + 2, colours), np.float32)  # of the pixels of a cell
+    for r in range(start, stop):
+        top, bottom = (corner[0] + r) * height / rows, (corner[0] + r + 1) * height / rows
+        for k in range(cells.shape[1]):
+            left, right = (corner[1] + k) * width / columns, (corner[1] + k + 1) * width / columns
+            first, end = int(left), min(int(np.ceil(right)), width)
+            line[: end - first] = 0
+            for y in range(int(top), min(int(np.ceil(bottom)), height)):
+                share = np.float32((min(bottom, y + 1.0) - max(top, float(y))) / (bottom - top))
+                for x in range(first, end):
+                    for c in range(colours):
+                        line[x - first, c] += share * _light_at(image, table, y, x, c)
+            red = green = blue = np.float32(0)
+            for x in range(first, end):
+                share = np.float32((min(right, x + 1.0) - max(left, float(x))) / (right - left))
+                red += share * line[x - first, 0]
+                green += share * line[x - first, colours // 2]
+                blue += share * line[x - first, colours - 1]
+            cells[r, k, 0], cells[r, k, 1], cells[r, k, 2] = red, green, blue
+
+
+@njit(nogil=True, cache=True)
+def _halve(fine: NDArray[np.float32], start: int, stop: int, coarse: NDArray[np.float32]) -> None:
+    """Some rows of the next grid: every second node seen with the weights [1, 3, 3, 1] / 8 along each axis."""
+    rows, columns, _ = fine.shape
+    line = np.empty((columns, 3), np.float32)
+    three, eighth = np.float32(3), np.float32(1 / 8)
+    for r in range(start, stop):
+        above, upper = fine[max(2 * r - 1, 0)], fine[2 * r]
+        lower, below = fine[min(2 * r + 1, rows - 1)], fine[min(2 * r + 2, rows - 1)]
+        for x in range(columns):
+            for c in range(3):
+                line[x, c] = eighth * (above[x, c] + below[x, c] + three * (upper[x, c] + lower[x, c]))
+        for k in range(coarse.shape[1]):
+            a, b = max(2 * k - 1, 0), 2 * k
+            d, e = min(2 * k + 1, columns - 1), min(2 * k + 2, columns - 1)
+            for c in range(3):
+                coarse[r, k, c] = eighth * (line[a, c] + line[e, c] + three * (line[b, c] + line[d, c]))

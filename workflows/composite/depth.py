@@ -1,0 +1,277 @@
+"""A backdrop that stands at another depth than the monitor did: the rays that the matte's pixels see.
+
+T says where a pixel's light left the monitor, and not under which angle. With a second matte of the same object and
+camera, before a monitor at another distance, the ray through both places is known. With one, it is taken to start where
+the camera's line of sight meets the plane through the object, square to the camera's axis: which is right for what is
+thin, and off by what light moves sideways in the object for what is thick.
+"""
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from storage.errors import Conflict
+from storage.layout.mattes import Matte
+from workflows.composite.threads import in_parts
+from workflows.mattes.lobes import lobes_of
+from workflows.recovery.pyramid import Grids
+
+LOBES = 3
+"""Of a pixel, of which the heaviest counts."""
+DIRECT = 0.9
+"""Share of a pixel's light in its heaviest lobe, from which on it may see the monitor directly."""
+NEAR = 0.004
+"""How far, in widths of the monitor, such a pixel may see beside the common perspective: four pixels of a thousand."""
+STRAY = 0.1
+"""How far beside the pixels about it, in widths of the monitor, a ray meets the object's plane at most."""
+LEAST = 0.02
+"""Share of the recovered pixels that must see the monitor directly, to tell the camera's perspective."""
+Places = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Where pixels see a backdrop at another depth.
+
+    What a pixel saw of the monitor at p, it sees of the backdrop at ``shift + scale p``, both in widths and heights of
+    the monitor from its top left; the backdrop is as large as the monitor, and its middle on the same axis.
+
+    Attributes
+    ----------
+    shift : (height, width, 2) float32
+    scale : float
+    """
+
+    shift: NDArray[np.float32]
+    scale: float
+
+
+def places_of(matte: Matte, threads: int) -> Places:
+    """The heaviest lobe of every pixel.
+
+    Returns
+    -------
+    (height, width, 4) float32
+        Its centre, in widths and heights of the monitor from the top left; its mean standard deviation, in widths; its
+        share of the light. The last is 0 where nothing was recovered.
+    """
+    places = np.zeros((matte.height, matte.width, 4), np.float32)
+    blocks = list(product(range(matte.block_rows), range(matte.block_columns)))
+
+    def one(number: int) -> None:
+        lobe = lobes_of(matte, matte.read(*blocks[number]), LOBES)[:, :, 0]
+        at = places[matte.span(*blocks[number])]
+        at[..., 3] = lobe[..., 2:5].mean(axis=2)
+        at[..., 0], at[..., 1] = lobe[..., 0], np.where(at[..., 3] > 0, 1 - lobe[..., 1], 0)
+        at[..., 2] = np.sqrt(lobe[..., 5] * lobe[..., 6])
+
+    in_parts(one, range(len(blocks)), threads)
+    return places
+
+
+def from_two(first: Places, second: Places, distances: tuple[float, float], depth: float) -> Rays:
+    """Rays through what two mattes saw.
+
+    Parameters
+    ----------
+    first, second : (height, width, 4) float32
+        As `places_of` gives them; the first is that of the matte to be composited.
+    distances : (float, float)
+        Of the monitor from the object, in each; in any unit.
+    depth : float
+        Of the backdrop, in the same unit.
+
+    Raises
+    ------
+    Conflict
+        If too few pixels were recovered in both.
+
+    Notes
+    -----
+    Both places lie on a ray that meets the plane of the object, at distance 0, in ``(d2 p1 - d1 p2) / (d2 - d1)``.
+    Where that is far from where the pixels about look through, the two saw different light (a reflection, say, that
+    misses the farther monitor), and what those pixels share stands in: an affine map of the frame.
+    """
+    near, far = distances
+    through = (far * first[..., :2] - near * second[..., :2]) / np.float32(far - near)
+    y, x = np.mgrid[: through.shape[0], : through.shape[1]].astype(np.float32) / max(through.shape[:2])
+    frame = np.stack([x, y, np.ones_like(x)], axis=2)
+    fits = (first[..., 3] > 0) & (second[..., 3] > 0)
+    if np.count_nonzero(fits) < 16:
+        raise Conflict("too few pixels were recovered in both mattes to tell their rays")
+    for _ in range(10):
+        common = frame @ np.linalg.lstsq(frame[fits], through[fits], rcond=None)[0]
+        off = np.hypot(*np.moveaxis(through - common, 2, 0))
+        near_enough = max(STRAY, 5 * float(np.median(off[fits])))
+        fits = (first[..., 3] > 0) & (second[..., 3] > 0) & (off < near_enough)
+    return _through(np.where(fits[..., np.newaxis], through, common), depth / near)
+
+
+def from_one(places: Places, aspect: float, distance: float, camera: float, depth: float) -> Rays:
+    """Rays that leave the plane of the object where the camera's lines of sight meet it.
+
+    Parameters
+    ----------
+    places : (height, width, 4) float32
+        As `places_of` gives them.
+    aspect : float
+        Height of the monitor as a share of its width.
+    distance, camera, depth : float
+        From the object to the monitor, to the camera and to the backdrop; in one unit.
+
+    Raises
+    ------
+    Conflict
+        If too few pixels see the monitor directly to tell where the camera looks.
+
+    Notes
+    -----
+    The camera's perspective is the homography between its pixels and the places of the monitor that they see beside the
+    object; the foot of the camera on the monitor is taken to be in the middle of the frame.
+    """
+    sight = _perspective(places, aspect)
+    height, width = sight.shape[:2]
+    foot = sight[(height - 1) // 2 : height // 2 + 1, (width - 1) // 2 : width // 2 + 1].mean(axis=(0, 1))
+    through = foot + (sight - foot) * np.float32(camera / (camera + distance))
+    return _through(through, depth / distance)
+
+
+def _through(place: NDArray[np.floating], away: float) -> Rays:
+    """Rays through places (height, width, 2) of the object's plane, to so many times the monitor's distance."""
+    return Rays((place * (1 - away)).astype(np.float32), away)
+
+
+def _perspective(places: Places, aspect: float) -> NDArray[np.float32]:
+    """Where on the monitor each pixel would look without the object, (height, width, 2)."""
+    height, width, _ = places.shape
+    y, x = np.mgrid[:height, :width].astype(np.float64)
+    across, down = (2 * x + 1) / width - 1, (2 * y + 1) / height - 1
+    seen = places[..., :2].astype(np.float64)
+    sharp = places[..., 3] > DIRECT
+    candidates = sharp & (places[..., 2] < 2 * np.median(places[..., 2][sharp])) if sharp.any() else sharp
+    # Beside the object is where the frame ends, to begin with; then wherever the same perspective is seen.
+    fits = candidates & (np.maximum(np.abs(across), np.abs(down)) > 0.9)
+    least = max(LEAST * np.count_nonzero(places[..., 3]), 16)
+    for _ in range(10):
+        if np.count_nonzero(fits) < least:
+            raise Conflict(
+                "too little of the monitor is seen directly beside the object to tell where the camera looks: film it "
+                "with some of the bare monitor in the frame and no mask, or give a second matte at another distance"
+            )
+        h = _homography(across[fits], down[fits], seen[fits])
+        scale = h[2, 0] * across + h[2, 1] * down + h[2, 2]
+        sight = np.stack([h[k, 0] * across + h[k, 1] * down + h[k, 2] for k in (0, 1)], axis=2)
+        sight /= scale[..., np.newaxis]
+        off = np.hypot(*np.moveaxis((sight - seen) * (1, aspect), 2, 0))
+        now = candidates & (off < max(NEAR, float(np.median(off[fits]))))
+        if (now == fits).all():
+            break
+        fits = now
+    return np.asarray(sight, np.float32)
+
+
+def _homography(
+    x: NDArray[np.float64], y: NDArray[np.float64], seen: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The (3, 3) homography that takes (x, y, 1) to ``seen`` (n, 2), its last entry 1, by linear least squares."""
+    u, v = seen.T
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    rows = np.concatenate(
+        [
+            np.stack([x, y, one, zero, zero, zero, -u * x, -u * y], axis=1),
+            np.stack([zero, zero, zero, x, y, one, -v * x, -v * y], axis=1),
+        ]
+    )
+    found, *_ = np.linalg.lstsq(rows, np.concatenate([u, v]), rcond=None)
+    return np.append(found, 1.0).reshape(3, 3)
+
+
+@njit(nogil=True, cache=True)
+def arrived_along(
+    count: NDArray[np.uint32],
+    shared: NDArray[np.bool_],
+    cell: NDArray[np.uint32],
+    weight: NDArray[np.float32],
+    light: NDArray[np.float32],
+    grids: Grids,
+    shift: NDArray[np.float32],
+    scale: float,
+    arrived: NDArray[np.float32],
+) -> None:
+    """T L of a strip, of a backdrop at another depth.
+
+    Parameters
+    ----------
+    count, shared, cell, weight
+        Of the strip.
+    light : (nodes + 1, 3) float32
+        Of the backdrop, as if it stood where the monitor did.
+    grids : Grids
+        Of the pyramid.
+    shift : (h, w, 2) float32
+        Of `Rays`, for the strip's pixels.
+    scale : float
+    arrived : (h, w, 3) float32
+        Written.
+
+    Notes
+    -----
+    A node that is seen larger by ``scale`` is looked up as much coarser: between two grids, and between the nodes of
+    each.
+    """
+    columns, rows, starts = grids
+    entry, levels = 0, len(columns)
+    seen, coarser = np.empty(3, np.float32), np.log2(scale)
+    for y in range(shared.shape[0]):
+        for x in range(shared.shape[1]):
+            arrived[y, x] = 0
+            for channel in range(3):
+                for _ in range(count[y, x, channel]):
+                    node, level = np.int64(cell[entry]), 0
+                    while node >= starts[level + 1]:
+                        level += 1
+                    row, column = divmod(node - starts[level], columns[level])
+                    u = (column + 0.5) * 2.0**level / columns[0] * scale + shift[y, x, 0]
+                    v = (row + 0.5) * 2.0**level / rows[0] * scale + shift[y, x, 1]
+                    seen[:] = 0
+                    if 0 <= u < 1 and 0 <= v < 1:
+                        at = min(max(level + coarser, 0.0), levels - 1.0)
+                        lower = min(int(at), levels - 1)
+                        share = np.float32(at - lower)
+                        _look_up(light, grids, lower, u, v, 1 - share, seen)
+                        if share > 0:
+                            _look_up(light, grids, lower + 1, u, v, share, seen)
+                    w = weight[entry]
+                    if shared[y, x]:
+                        for c in range(3):
+                            arrived[y, x, c] += w * seen[c]
+                    else:
+                        arrived[y, x, channel] += w * seen[channel]
+                    entry += 1
+
+
+@njit(nogil=True, cache=True)
+def _look_up(
+    light: NDArray[np.float32],
+    grids: Grids,
+    level: int,
+    u: float,
+    v: float,
+    share: float,
+    seen: NDArray[np.float32],
+) -> None:
+    """Add a share of the light between the nodes of a grid."""
+    columns, rows, starts = grids
+    wide, high, first = columns[level], rows[level], starts[level]
+    x = min(max(u * columns[0] / 2.0**level - 0.5, 0.0), wide - 1.0)
+    y = min(max(v * rows[0] / 2.0**level - 0.5, 0.0), high - 1.0)
+    i, j = int(x), int(y)
+    a, b = x - i, y - j
+    p, q = min(i + 1, wide - 1), min(j + 1, high - 1)
+    for c in range(3):
+        upper = light[first + j * wide + i, c] * (1 - a) + light[first + j * wide + p, c] * a
+        lower = light[first + q * wide + i, c] * (1 - a) + light[first + q * wide + p, c] * a
+        seen[c] += np.float32(share * (upper * (1 - b) + lower * b))

@@ -1,0 +1,1 @@
+"""What a browser draws the glass from."""

@@ -1,0 +1,88 @@
+"""Composites as integers: rounded exactly as the tone curve says, without a power a pixel."""
+
+from functools import cache
+from typing import Literal
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from workflows.composite.threads import in_parts
+from workflows.images.integer_formats import Codes
+from workflows.images.tone_curves import to_light
+
+STEPS = 1 << 14
+"""Places of the look-up that leads close to a code."""
+ROWS = 64
+
+
+def encode(
+    picture: NDArray[np.float32],
+    transfer: Literal["srgb", "linear"],
+    dtype: np.dtype[np.unsignedinteger],
+    threads: int,
+) -> Codes:
+    """A picture as unsigned integers: clipped to 0 to 1, encoded, rounded.
+
+    Parameters
+    ----------
+    picture : (h, w, 4) float32
+        Linear light, and alpha.
+    transfer : str
+        How light is encoded; alpha never is.
+    dtype : numpy.dtype
+        uint8 or uint16.
+    threads : int
+        To share the work.
+
+    Returns
+    -------
+    (h, w, 3 or 4) uint8 or uint16
+        Without alpha where it is 1 everywhere.
+    """
+    edges, first = _edges(transfer, dtype)
+    channels = 3 if (picture[..., 3] == 1).all() else 4
+    codes = np.empty((*picture.shape[:2], channels), dtype)
+    in_parts(
+        lambda start: _encode(picture[start : start + ROWS], edges, first, codes[start : start + ROWS]),
+        range(0, len(picture), ROWS),
+        threads,
+    )
+    return codes
+
+
+@cache
+def _edges(
+    transfer: Literal["srgb", "linear"], dtype: np.dtype[np.unsignedinteger]
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """The light at which each code ends and the next begins, and the code at each of `STEPS` + 1 places."""
+    top = np.iinfo(dtype).max
+    halves = (np.arange(top, dtype=np.float64) + 0.5) / top
+    edges = np.append(to_light(halves, transfer), np.inf).astype(np.float32)  # type: ignore[arg-type]
+    return edges, np.searchsorted(edges, np.arange(STEPS + 1, dtype=np.float32) / STEPS, side="right")
+
+
+@njit(nogil=True, cache=True)
+def _encode(
+    picture: NDArray[np.float32],
+    edges: NDArray[np.float32],
+    first: NDArray[np.int64],
+    codes: NDArray[np.unsignedinteger],
+) -> None:
+    height, width, channels = codes.shape
+    steps, top = np.float32(first.size - 1), edges.size - 1
+    for y in range(height):
+        for x in range(width):
+            for c in range(3):
+                value = picture[y, x, c]
+                if not value > 0:  # no number either
+                    codes[y, x, c] = 0
+                elif value >= 1:
+                    codes[y, x, c] = top
+                else:
+                    code = first[int(value * steps)]
+                    while value >= edges[code]:
+                        code += 1
+                    codes[y, x, c] = code
+            if channels == 4:
+                codes[y, x, 3] = round(picture[y, x, 3] * top)

@@ -1,0 +1,195 @@
+"""A matte before a clip: the steps of a job that composites its frames and makes a video of them.
+
+Frames keep their times, to the tick of the clip's clock, and none is made up: where some can't be decoded, the one
+before stays for as long as they would have been shown, as it does in a player; a clip that was cut short gives a video
+as long as what is left of it. The job's log says what was lost. Sound is left out.
+"""
+
+import asyncio
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from functools import partial
+from typing import Any, BinaryIO, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.errors import CaptureError, ClipError, Corrupt
+from storage.layout import composites
+from storage.layout.mattes import Matte
+from storage.objects.byte_objects import PART
+from storage.objects.store import Objects, together
+from workflows.composite import composite
+from workflows.composite.backdrop import Backdrop
+from workflows.composite.cache import Cache
+from workflows.composite.placement import Placement
+from workflows.composite.quantise import encode
+from workflows.composite.video import segments
+from workflows.images import tone_curves
+from workflows.ingest.video.decoder import PARTS, Clip, Share, opened
+from workflows.untrusted.limits import Limits
+
+Transfer = Literal["srgb", "linear"]
+KEPT = 1 << 29
+"""Bytes of a matte that a worker keeps from frame to frame."""
+MOST = 1_000_000
+"""Frames of a clip, at most: nine hours at 30 a second."""
+SHORTEST, LONGEST = 16, 64
+"""Frames of a tile: enough to be worth seeking, few enough for a tile to take seconds."""
+PIXELS = 8_000_000
+"""Pixels of a tile, of its frames and of what is composited of them, about."""
+CLOCK = 20_000
+"""Ticks a second of an MP4 at least, about, where the clip has fewer; it counts those of a frame in 32 bits."""
+SHORT = 0.5
+"""Seconds that may lack at the end before it is said: containers round, and count their sound in."""
+
+
+def prepare(objects: Objects, job: str, matte: str, limits: Limits) -> dict[str, Any]:
+    """Look a clip over, and write down when its frames are shown.
+
+    Returns
+    -------
+    dict
+        ``tiles``: how many there are; ``length``: frames of one; ``frames``, ``width``, ``height``: of the clip;
+        ``tick``: seconds of a tick, as numerator and denominator; ``last``: ticks of the last frame; ``rate``: frames a
+        second, about; ``notes``: lines for the job's log.
+
+    Raises
+    ------
+    ClipError
+        If it is no clip that can be read.
+    """
+    put_before = Matte(objects, matte)
+    with _reading(objects, job, limits) as clip:
+        ticks, last = clip.ticks(MOST)
+        tick, width, height = clip.time_base, clip.width, clip.height
+        notes = list(_losses(clip, ticks, last))
+    gaps = np.append(np.diff(ticks), last)
+    longest = int(np.argmax(gaps))
+    shown = float(gaps[longest] * tick)
+    if shown * max(tick.denominator, CLOCK) >= 1 << 31:
+        raise ClipError(
+            f"by its timestamps frame {longest} of the clip is shown for {shown:.0f} s, in ticks of {tick} s, which no "
+            "MP4 can hold: write the clip anew with a video editor"
+        )
+    objects.put(composites.ticks_path(job), ticks.astype("<i8").tobytes())
+    pixels = width * height + put_before.width * put_before.height
+    length = int(np.clip(PIXELS // pixels, SHORTEST, LONGEST))
+    seconds = float((ticks[-1] + last - ticks[0]) * tick)
+    return {
+        "tiles": -(-len(ticks) // length),
+        "length": length,
+        "frames": len(ticks),
+        "width": width,
+        "height": height,
+        "tick": [tick.numerator, tick.denominator],
+        "last": last,
+        "rate": int(np.clip(round(len(ticks) / seconds), 1, 240)),
+        "notes": [f"the clip has {len(ticks)} frames of {width} x {height} pixels, {seconds:.3f} s", *notes],
+    }
+
+
+def work(
+    objects: Objects,
+    job: str,
+    matte: str,
+    transfer: Transfer,
+    placement: Placement,
+    limits: Limits,
+    plan: dict[str, Any],
+    tile: int,
+) -> int:
+    """Composite the frames of a tile, and store them as a segment; returns their pixels.
+
+    Parameters
+    ----------
+    placement : Placement
+        Where the clip stands.
+    plan : dict
+        As `prepare` returned it.
+
+    Raises
+    ------
+    ClipError
+        If a frame that was there when the clip was looked over can't be decoded again.
+    """
+    length = plan["length"]
+    ticks = _ticks(objects, job)[tile * length : (tile + 1) * length]
+    cache = Cache(objects, KEPT)
+    put, light = cache.matte(matte), tone_curves.table(transfer, np.dtype(np.uint16))
+
+    def shown(frame: NDArray[np.uint16]) -> NDArray[np.uint8]:
+        """An 8 bit picture, black where the mask left the matte out."""
+        backdrop = Backdrop(frame, light)
+        where = None if placement == Placement() else placement
+        picture = composite(put, backdrop, placement=where, read=partial(cache.strip, matte), threads=1)
+        return encode(picture, transfer, np.dtype(np.uint8), 1)[..., :3].astype(np.uint8, copy=False)
+
+    with _reading(objects, job, limits) as clip:
+        frames = clip.means([[Share(tick, PARTS)] for tick in ticks.tolist()])
+        pictures = (shown(frame) for frame in frames)
+        segment = segments.encode(pictures, plan["rate"], length, transfer)
+    objects.put(composites.segment_path(job, tile), segment)
+    return len(ticks) * put.width * put.height
+
+
+def finish(objects: Objects, job: str, plan: dict[str, Any]) -> None:
+    """Join the segments into the video."""
+    found = (_whole(objects, composites.segment_path(job, tile)) for tile in range(plan["tiles"]))
+    # Without a name: nothing stays of it when this process is killed.
+    with tempfile.TemporaryFile() as file:
+        segments.join(found, _ticks(objects, job), plan["last"], Fraction(*plan["tick"]), file)
+        file.seek(0)
+        together(_store(objects, composites.video_path(job), file))
+
+
+def _losses(clip: Clip, ticks: NDArray[np.int64], last: int) -> Iterator[str]:
+    """What a clip lacks, in words."""
+    tick = clip.tick
+    lost = sorted({at for at in clip.lost if at >= ticks[0]} - set(ticks.tolist()))
+    if lost:
+        yield (
+            f"frames between {lost[0] * tick:.3f} s and {lost[-1] * tick:.3f} s can't be decoded, for the clip is "
+            "damaged there: the frame before stays in their place"
+        )
+    ends = (int(ticks[-1]) + last) * tick
+    if clip.announced > ends + SHORT:
+        yield (
+            f"the clip ends early: it is {clip.announced:.3f} s long by what it says, and its last frame that can be "
+            f"decoded ends at {ends:.3f} s; the video ends there"
+        )
+
+
+@contextmanager
+def _reading(objects: Objects, job: str, limits: Limits) -> Iterator[Clip]:
+    """The clip of a job, opened as hostile; what is wrong with it is told as of a clip, not of a capture."""
+    try:
+        file = objects.read(composites.clip_path(job))
+    except FileNotFoundError as error:
+        raise Corrupt("the clip is not in the store any more; send it again") from error
+    try:
+        with file, opened(file, "the clip", limits.image) as clip:
+            yield clip
+    except CaptureError as error:
+        fields = {name: value for name, value in error.fields.items() if name != "entry"}
+        raise ClipError(error.detail, **fields) from error
+
+
+def _ticks(objects: Objects, job: str) -> NDArray[np.int64]:
+    return np.frombuffer(_whole(objects, composites.ticks_path(job)), "<i8").astype(np.int64)
+
+
+def _whole(objects: Objects, path: str) -> bytes:
+    try:
+        with objects.read(path) as file:
+            return file.read()
+    except FileNotFoundError as error:
+        raise Corrupt(f"{path} is missing in the store; composite the clip again") from error
+
+
+async def _store(objects: Objects, path: str, file: BinaryIO) -> None:
+    async with objects.write(path) as target:
+        while data := await asyncio.to_thread(file.read, PART):
+            await target.write(data)

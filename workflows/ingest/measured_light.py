@@ -1,0 +1,238 @@
+"""The light of each pattern at some pixels, from all of its frames: moved to one place, brought to one monitor."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import TypeAdapter
+
+from storage.layout.captures import Stack
+from workflows.images.integer_formats import Codes
+from workflows.images.tone_curves import Curve, table
+from workflows.programs.program import Program
+
+LOBES = 3
+"""Of Lanczos' kernel on either side, which frames are moved by."""
+TOUCHED = 0.05
+"""A value that was moved is clipped where the clipped ones among those that it comes from weigh more than this."""
+
+Floats = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+FrameOf = Callable[[int], tuple[Floats, Bools]]
+"""Of a frame, by its number: (n, channels) light and whether it is not clipped."""
+
+
+class Light(NamedTuple):
+    """The light of each pattern.
+
+    Attributes
+    ----------
+    values : (n, count, 3) float32
+        In units of what fills the camera's range in the shortest exposure.
+    usable : (n, count, 3) bool
+        False where in every exposure some frame is clipped, at black or at white, and where there is no frame.
+    worth : (n, count, 3) float32
+        Frames of the shortest exposure that say as much.
+    """
+
+    values: Floats
+    usable: Bools
+    worth: Floats
+
+
+def look_up_of(stack: Stack) -> Floats:
+    """(k,) float32: the light of each value that a stack stores."""
+    camera = TypeAdapter[Curve](Curve).validate_python(stack.attributes["camera_curve"])
+    return table(camera, stack.dtype, stack.attributes["storage"]["black"])
+
+
+def exposures_of(attributes: dict[str, Any]) -> Floats:
+    """(frames,) float32: how long a stack's frames were exposed, in units of the shortest."""
+    exposures = np.array(attributes["exposures"], np.float32)
+    exposures /= exposures.min()
+    return exposures
+
+
+def read_light(stack: Stack, span: tuple[slice, slice], program: Program) -> tuple[Light, Bools]:
+    """The light of each pattern at the pixels of a rectangle that are to be recovered, and (y, x) bool: which they are.
+
+    Drift and flicker are taken out if `workflows.ingest.report.steadiness` was sure of them, crosstalk always.
+
+    Raises
+    ------
+    Corrupt
+        If a chunk of the stack is missing.
+    """
+    attributes = stack.attributes
+    shifts = attributes.get("shifts")
+    look_up = look_up_of(stack)
+    top = np.iinfo(stack.dtype).max
+    if shifts is None:
+        codes, recovered = stack.read_masked(*span)
+        codes = codes[:, recovered]
+
+        def at_rest(frame: int) -> tuple[Floats, Bools]:
+            return look_up[codes[frame]], (codes[frame] > 0) & (codes[frame] < top)
+
+        frame_of: FrameOf = at_rest
+    else:
+        margin = margin_of(shifts)
+        around, recovered = _around(stack, span, margin), stack.recovered(*span)
+
+        def in_place(frame: int) -> tuple[Floats, Bools]:
+            values, whole = unclipped_light(around[frame], shifts[frame], margin, look_up)
+            return values[recovered], whole[recovered]
+
+        frame_of = in_place
+    return light_of(frame_of, attributes, program, int(recovered.sum())), recovered
+
+
+def light_of(frame_of: FrameOf, attributes: dict[str, Any], program: Program, pixels: int) -> Light:
+    """The light of each pattern at some pixels, from their frames: merged, without flicker and crosstalk.
+
+    Notes
+    -----
+    Of light S that is not the monitor's, gains g of the monitor leave ``C = S + g rho T L``. The light of a pattern,
+    over all of its frames, is brought to ``S + (C - S) / g``, g being the mean of its frames' by what they count, and
+    S what is seen before a black monitor.
+    """
+    light, gain = merge(frame_of, attributes, program.count, pixels)
+    values, usable, worth = light
+    if gain is not None:
+        black = np.intersect1d(black_patterns(program), attributes["patterns"])
+        S = values[:, black].mean(axis=1, keepdims=True)
+        values = (S + (values - S) / gain).astype(np.float32)
+    crosstalk = np.array(attributes["crosstalk"])
+    if np.any(crosstalk != np.eye(3)):
+        values = (values @ np.linalg.inv(crosstalk).T).astype(np.float32)
+        usable = usable & usable.all(axis=2, keepdims=True)
+    return Light(values, usable, worth)
+
+
+def merge(
+    frame_of: FrameOf, attributes: dict[str, Any], count: int, pixels: int
+) -> tuple[Light, Floats | None]:
+    """The light of each of ``count`` patterns from all of its frames, and the monitor's gain in it, if it has one.
+
+    Notes
+    -----
+    A frame that was exposed t times as long as the shortest has the value v = t x of the light x, with the variance
+    ``read + shot v``. Where the photons' noise counts most, the likelihood's maximum is ``sum v / sum t``, over the
+    exposures that are not clipped, with the variance ``shot x / sum t``: `worth` is ``sum t``. Read noise, which long
+    exposures have less of, is then rather overstated. The gain, as the light, is ``sum g t / sum t``.
+    """
+    exposures = exposures_of(attributes)
+    gains = attributes.get("gains")
+    shape = (pixels, count, 3)
+    light, worth = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    every, times = np.zeros(shape, np.float32), np.zeros(count, np.float32)
+    gain, mean_gain = np.zeros(shape if gains else (0, 0, 0), np.float32), np.zeros(count, np.float32)
+    of_exposure: dict[tuple[int, float], list[int]] = {}
+    for frame, key in enumerate(zip(attributes["patterns"], exposures.tolist(), strict=True)):
+        of_exposure.setdefault(key, []).append(frame)
+    for (pattern, exposure), frames in of_exposure.items():
+        total = np.zeros((pixels, 3), np.float32)
+        whole = np.ones((pixels, 3), bool)
+        for frame in frames:
+            values, unclipped = frame_of(frame)
+            total += values
+            whole &= unclipped
+        time = np.float32(len(frames) * exposure)
+        light[:, pattern] += np.where(whole, total, 0)
+        worth[:, pattern] += np.where(whole, time, 0)
+        every[:, pattern] += total
+        times[pattern] += time
+        if gains:
+            lit = np.float32(sum(gains[frame] for frame in frames) * exposure)
+            gain[:, pattern] += np.where(whole, lit, 0)
+            mean_gain[pattern] += lit
+    usable = worth > 0
+    np.copyto(worth, np.maximum(times, 1)[:, np.newaxis], where=~usable)
+    np.copyto(light, every, where=~usable)
+    light /= worth
+    if gains:
+        np.copyto(gain, np.where(times > 0, mean_gain, 1)[:, np.newaxis], where=~usable)
+        gain /= worth
+    return Light(light, usable, worth), gain if gains else None
+
+
+def black_patterns(program: Program) -> NDArray[np.intp]:
+    """The numbers of the patterns that are black all over."""
+    numbers, sent = program.constants
+    return numbers[~sent.any(axis=1)]
+
+
+def margin_of(shifts: Sequence[Sequence[float]]) -> int:
+    """Pixels around others that these are made of when frames are moved."""
+    return LOBES + math.ceil(max((abs(s) for shift in shifts for s in shift), default=0))
+
+
+def unclipped_light(
+    codes: Codes, shift: Sequence[float], margin: int, look_up: Floats
+) -> tuple[Floats, Bools]:
+    """The light of a frame, moved back by the shift of its picture, and whether it is not clipped.
+
+    Parameters
+    ----------
+    codes : (..., h, w, channels) uint8 or uint16
+    shift : (float, float)
+        x and y of what lay at the origin, in pixels: of the picture at (y, x) they tell what is at
+        (y + shift[1], x + shift[0]) of the frame.
+    margin : int
+        What `codes` has on each side beyond what is wanted, `margin_of` the shift at least.
+    look_up : (k,) float32
+
+    Returns
+    -------
+    values : (..., h - 2 margin, w - 2 margin, channels) float32
+    whole : the same, bool
+
+    Notes
+    -----
+    The kernel is Lanczos', of three lobes, one axis after the other. A value is the same in whatever rectangle.
+    """
+    values = look_up[codes]
+    clipped = (codes == 0) | (codes == len(look_up) - 1)
+    share = clipped.astype(np.float32) if clipped.any() else None
+    for axis, distance in ((-2, shift[0]), (-3, shift[1])):
+        whole = math.floor(distance)
+        taps = _lanczos(distance - whole)
+        values = _weighed(values, taps, axis, margin + whole, values.shape[axis] - 2 * margin)
+        if share is not None:
+            share = _weighed(share, np.abs(taps), axis, margin + whole, share.shape[axis] - 2 * margin)
+    return values, np.ones(values.shape, bool) if share is None else share < TOUCHED
+
+
+def _lanczos(fraction: float) -> Floats:
+    """Weights of the neighbours from ``1 - LOBES`` to ``LOBES`` of what lies a fraction of a pixel on."""
+    distance = np.arange(1 - LOBES, LOBES + 1) - fraction
+    taps = np.sinc(distance) * np.sinc(distance / LOBES)
+    weights: Floats = (taps / taps.sum()).astype(np.float32)
+    return weights
+
+
+def _weighed(values: Floats, taps: Floats, axis: int, first: int, length: int) -> Floats:
+    """The weighted sums of neighbours, along an axis, of ``length`` values from ``first`` on."""
+
+    def neighbours(place: int) -> Floats:
+        inside = [slice(None)] * values.ndim
+        inside[axis] = slice(place, place + length)
+        return values[tuple(inside)]
+
+    total = np.zeros_like(neighbours(first))
+    for place, tap in enumerate(taps, start=first + 1 - LOBES):
+        total += tap * neighbours(place)
+    return total
+
+
+def _around(stack: Stack, span: tuple[slice, slice], margin: int) -> Codes:
+    """The values of a rectangle and of a margin around it; beyond the frame, those of its edge."""
+    inside, beyond = [], [(0, 0)]
+    for given, size in zip(span, (stack.height, stack.width), strict=True):
+        start, stop, _ = given.indices(size)
+        first, last = max(start - margin, 0), min(stop + margin, size)
+        inside.append(slice(first, last))
+        beyond.append((first - (start - margin), stop + margin - last))
+    return np.pad(stack.read(*inside), [*beyond, (0, 0)], mode="edge")

@@ -1,0 +1,102 @@
+"""A picture of a capture at a glance: some of its frames, with what is clipped marked."""
+
+import io
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from storage.layout.captures import Stack
+from workflows.images.tone_curves import from_light
+from workflows.ingest.measured_light import look_up_of
+from workflows.programs.program import Program
+
+WIDTH, HEIGHT = 240, 240
+"""Pixels of a thumbnail, at most."""
+ACROSS = 4
+EACH = 2
+"""Patterns of each part, and at most `PARTS` parts."""
+PARTS = 9
+CAPTION = 18
+AT_WHITE, AT_BLACK = (255, 0, 0), (0, 90, 255)
+
+
+def contact_sheet(stack: Stack) -> bytes:
+    """Draw the darkest and the brightest constant frame and some patterns of each part.
+
+    Returns
+    -------
+    bytes
+        A PNG. Red is what is clipped at white, blue at black, in some channel of some pixel under a thumbnail's.
+    """
+    program = Program.model_validate(stack.attributes["program"])
+    picked = _pick(stack, program)
+    light, high, low = _shrink(stack, [frame for frame, _ in picked])
+    height, width = light.shape[1:3]
+    rows = -(-len(picked) // ACROSS)
+    across = min(ACROSS, len(picked))
+    sheet = Image.new("RGB", (across * (width + 8) + 8, rows * (height + CAPTION + 8) + 8), (32, 32, 32))
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(12)
+    for at, (_, caption) in enumerate(picked):
+        x, y = 8 + at % ACROSS * (width + 8), 8 + at // ACROSS * (height + CAPTION + 8)
+        values = np.rint(from_light(np.clip(light[at], 0, 1), "srgb") * 255).astype(np.uint8)
+        values = np.repeat(values, 3 // values.shape[2], axis=2)
+        values[low[at]], values[high[at]] = AT_BLACK, AT_WHITE
+        sheet.paste(Image.fromarray(values), (x, y))
+        draw.text((x, y + height + 2), caption, (220, 220, 220), font)
+    target = io.BytesIO()
+    sheet.save(target, "PNG")
+    return target.getvalue()
+
+
+def _pick(stack: Stack, program: Program) -> list[tuple[int, str]]:
+    """Frames, in the order of their patterns, and their captions."""
+    numbers, sent = program.constants
+    chosen = {
+        int(numbers[np.argmin(sent.sum(axis=1))]): "darkest",
+        int(numbers[np.argmax(sent.sum(axis=1))]): "brightest",
+    }
+    patterned = [
+        (part, start, end)
+        for part, (start, end) in zip(program.parts, pairwise(program.starts), strict=True)
+        if part.kind != "constant"
+    ]
+    spread = np.unique(np.linspace(0, len(patterned) - 1, min(PARTS, len(patterned))).astype(int))
+    for part, start, end in (patterned[at] for at in spread):
+        grid = f" {part.columns} x {part.rows}" if part.kind == "bernoulli" else ""
+        for number in np.unique(np.linspace(start, end - 1, EACH).astype(int)).tolist():
+            chosen[number] = part.kind + grid
+    patterns = stack.attributes["patterns"]
+    exposures = stack.attributes["exposures"]
+    frames = sorted(range(len(patterns)), key=lambda n: (exposures[n], n))
+    first: dict[int, int] = {}
+    for frame in frames:
+        first.setdefault(patterns[frame], frame)
+    return [
+        (first[number], f"frame {first[number]}: {what}")
+        for number, what in chosen.items()
+        if number in first
+    ]
+
+
+def _shrink(
+    stack: Stack, frames: list[int]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
+    """The light of frames at a thumbnail's size, and what is clipped in it; a band of rows is read at a time."""
+    factor = max(1, -(-stack.width // WIDTH), -(-stack.height // HEIGHT))
+    height, width = stack.height // factor, stack.width // factor
+    # The light is shown as if full scale were white, whatever the camera's curve.
+    top = np.iinfo(stack.dtype).max
+    look_up = look_up_of(stack)
+    light = np.zeros((len(frames), height, width, stack.channels), np.float32)
+    high, low = (np.zeros((len(frames), height, width), bool) for _ in range(2))
+    band = max(1, 64 // factor)
+    for first in range(0, height, band):
+        last = min(first + band, height)
+        codes = stack.pick(frames, slice(first * factor, last * factor), slice(0, width * factor))
+        cells = codes.reshape(len(frames), last - first, factor, width, factor, stack.channels)
+        light[:, first:last] = look_up[cells].mean(axis=(2, 4))
+        high[:, first:last] = (cells == top).any(axis=(2, 4, 5))
+        low[:, first:last] = (cells == 0).any(axis=(2, 4, 5))
+    return light, high, low

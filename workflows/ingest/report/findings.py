@@ -1,0 +1,252 @@
+"""What figures of a capture mean, and what to do about them, in words."""
+
+from math import floor, log2
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel
+
+from workflows.ingest.report.figures import Drift, Figures, Flicker, Quality
+from workflows.ingest.video.missing_patterns import by_reason, ranges, remedy
+from workflows.programs.program import Images, Program
+
+Level = Literal["good", "warning", "bad"]
+LEVELS: tuple[Level, ...] = ("good", "warning", "bad")
+
+SURE = 4.0
+"""Standard errors of a frame's, from which a drift or a flicker is one."""
+
+
+class Finding(BaseModel):
+    """One thing that was looked at.
+
+    ``name`` is stable and for machines, ``message`` says what is, ``remedy`` what to do about it: empty if it is good.
+    """
+
+    name: str
+    level: Level
+    message: str
+    remedy: str = ""
+
+
+def findings(made: Figures, program: Program, attributes: dict[str, Any]) -> list[Finding]:
+    """All findings about a capture, from its figures, its program and its stack's attributes."""
+    found = [
+        _frames(made),
+        *_exposure(made, attributes["storage"]),
+        *_steadiness(attributes.get("steadiness")),
+        *_drift(made.drift),
+        *_flicker(made.flicker),
+        _noise(made, attributes["survey"]),
+        _crosstalk(made, program),
+        *_curves(made, program),
+    ]
+    if made.quality is not None:
+        found.append(_quality(made.quality))
+    return found
+
+
+def _graded(value: float, warning: float, bad: float) -> Level:
+    return "bad" if value >= bad else "warning" if value >= warning else "good"
+
+
+def _quality(quality: Quality) -> Finding:
+    if quality.blocks is None:
+        worst, best, why = "frosted glass, dispersion, many edges", "clear glass", ""
+    else:
+        worst, best = "clear glass, many edges", "frosted glass"
+        why = (
+            f": the random grids lie still, and where in a block of the finest, {quality.blocks} along the shorter "
+            "side, light comes from is not told. Patterns with offsets, as of the preset `default`, do better"
+        )
+    return Finding(
+        name="quality",
+        level="good",
+        message=f"composites of about {quality.low:.0f} dB ({worst}) to {quality.high:.0f} dB ({best}) are to be "
+        f"expected, if nothing else is wrong{why}",
+    )
+
+
+def _frames(made: Figures) -> Finding:
+    # Only those of a recording may be without one.
+    missing = {int(number): why for number, why in made.video["missing"].items()} if made.video else {}
+    if missing:
+        which = "; ".join(f"{ranges(numbers)} ({why})" for numbers, why in by_reason(missing))
+        return Finding(
+            name="frames",
+            level=_graded(len(missing) / made.frames.patterns, 0, 0.1),
+            message=f"{len(missing)} of {made.frames.patterns} patterns have no frame that can be used: {which}",
+            remedy=remedy(missing.values()),
+        )
+    several = f", in {made.frames.exposures} exposures" if made.frames.exposures > 1 else ""
+    return Finding(
+        name="frames",
+        level="good",
+        message=f"{made.frames.kept} frames of all {made.frames.patterns} patterns{several}",
+    )
+
+
+def _exposure(made: Figures, storage: dict[str, Any]) -> list[Finding]:
+    found = []
+    if storage["bounded"]:
+        found.append(_white(made))
+    black = made.clipping.black
+    level = _graded(black, 0.05, 0.3) if storage["black"] == 0 else "good"
+    found.append(
+        Finding(
+            name="black",
+            level=level,
+            message=f"the black frame is clipped in {100 * black:.1f} % of the pixels",
+            remedy=""
+            if level == "good"
+            else "raise the camera's black level, let a little light into the room, or film RAW: what lies below black "
+            "is lost, and dark glass comes out too bright",
+        )
+    )
+    return found
+
+
+def _white(made: Figures) -> Finding:
+    clipped, reach = made.clipping.white, made.white_reaches
+    level = _graded(clipped, 0.002, 0.05)
+    if level != "good":
+        less = "a third of a stop" if clipped < 0.01 else "half a stop" if clipped < 0.05 else "a stop"
+        return Finding(
+            name="exposure",
+            level=level,
+            message=f"the white frame is clipped in {100 * clipped:.1f} % of the pixels",
+            remedy=f"expose {less} less, or add frames of a shorter exposure",
+        )
+    level = _graded(-reach, -0.5, -0.15)
+    message = f"white reaches {100 * reach:.0f} % of the range"
+    if level == "good":
+        return Finding(name="exposure", level=level, message=message)
+    stops = floor(2 * log2(0.9 / max(reach, 0.01))) / 2
+    more = "half a stop" if stops <= 0.5 else "a stop" if stops == 1 else f"{stops:g} stops"
+    return Finding(
+        name="exposure",
+        level=level,
+        message=f"white reaches only {message[14:]}",
+        remedy=f"expose {more} more",
+    )
+
+
+def _steadiness(found: dict[str, Any] | None) -> list[Finding]:
+    if found is None or (found.get("drift") and found.get("flicker")):
+        return []
+    return [
+        Finding(
+            name="steadiness",
+            level="warning",
+            message="the patterns of the program don't explain what the frames show: how still the camera was and how "
+            "even the light can't be told",
+            remedy="name the camera's curve (`response`), see that the frames show the patterns that capture.json "
+            "says, and that neither camera nor glass was moved by more than three pixels",
+        )
+    ]
+
+
+def _drift(drift: Drift | None) -> list[Finding]:
+    if drift is None:
+        return []
+    # Of what is taken out, a little is left; what is within its own error is none.
+    limits = (0.5, 2.0) if drift.corrected else (0.1, 0.5)
+    level = _graded(drift.pixels if drift.corrected or drift.pixels > SURE * drift.error else 0.0, *limits)
+    found = f"the camera moved by {drift.pixels:.2f} pixels (a frame's place is told to {drift.error:.3f})"
+    return [
+        Finding(
+            name="drift",
+            level=level,
+            message=found + (": recovery moves the frames back" if drift.corrected else ""),
+            remedy=""
+            if level == "good"
+            else "fix camera, glass and monitor better, release from afar, and film again: "
+            + (
+                "what moved so far is taken out only in part"
+                if drift.corrected
+                else "no common shift of the frames explains it, so it is not corrected"
+            ),
+        )
+    ]
+
+
+def _flicker(flicker: Flicker | None) -> list[Finding]:
+    if flicker is None:
+        return []
+    limits = (2.0, 10.0) if flicker.corrected else (0.5, 2.0)
+    level = _graded(flicker.percent if flicker.percent > SURE * flicker.error else 0.0, *limits)
+    return [
+        Finding(
+            name="flicker",
+            level=level,
+            message=f"the light varies by {flicker.percent:.2f} % between frames, by {flicker.worst_percent:+.1f} % in "
+            f"frame {flicker.worst_frame}" + (": recovery takes it out" if flicker.corrected else ""),
+            remedy=""
+            if level == "good"
+            else "switch automatic exposure and the monitor's dimming off, let the monitor warm up, and expose "
+            "for whole periods of its refresh"
+            + (
+                ": so much is taken out only in part"
+                if flicker.corrected
+                else ": it is not corrected, for it is not told surely, or no frame is black"
+            ),
+        )
+    ]
+
+
+def _noise(made: Figures, survey: dict[str, Any]) -> Finding:
+    ratio = survey["contrast"] / survey["deviation"] if survey["deviation"] else 0.0
+    level = _graded(-ratio, -25, -8)
+    return Finding(
+        name="noise",
+        level=level,
+        message=f"noise of {made.noise.black:.1f} grey levels of 8 bits at black, {made.noise.full:.1f} at full scale; "
+        f"white less black is {ratio:.0f} times that of a pixel between them",
+        remedy=""
+        if level == "good"
+        else "expose longer at a lower ISO, take several frames of each pattern, make the monitor brighter or the room "
+        "darker; or the mask takes in pixels that see no monitor",
+    )
+
+
+def _crosstalk(made: Figures, program: Program) -> Finding:
+    between = float(np.abs(np.array(made.crosstalk) - np.eye(3)).max())
+    _, sent = program.constants
+    told = np.linalg.matrix_rank(np.concatenate([np.ones((len(sent), 1)), sent], axis=1)) == 4
+    if told:
+        text = f"the camera's channels see up to {100 * between:.1f} % of the monitor's other colours: it is taken out"
+        return Finding(name="crosstalk", level=_graded(between, 0.3, 0.7), message=text)
+    coloured = any(getattr(part, "colour", "grey") == "rgb" for part in program.parts)
+    return Finding(
+        name="crosstalk",
+        level="warning" if coloured else "good",
+        message="no crosstalk between colours is assumed: the program shows none alone",
+        remedy="add constant frames of red, green and blue, as the coloured presets do" if coloured else "",
+    )
+
+
+def _curves(made: Figures, program: Program) -> list[Finding]:
+    _, sent = program.constants
+    greys = not np.isin(sent, (0, 1)).all() or any(isinstance(part, Images) for part in program.parts)
+    words = {
+        "given": "named by the capture",
+        "estimated": "estimated from constant levels",
+        "assumed": "only assumed",
+    }
+    found = []
+    for name, curve, matters in (("camera", made.camera, True), ("monitor", made.monitor, greys)):
+        assumed = curve.source == "assumed" and matters
+        shape = curve.curve if isinstance(curve.curve, str) else f"a gamma of {curve.curve.gamma:g}"
+        harmless = "" if matters else "; it makes no difference to black and white"
+        found.append(
+            Finding(
+                name=f"{name}_curve",
+                level="warning" if assumed else "good",
+                message=f"the {name}'s curve is {shape}, {words[curve.source]}{harmless}",
+                remedy=""
+                if not assumed
+                else "name it in capture.json (`response`), show three or more grey levels, or film the constant ones "
+                "in two exposures; RAW needs no curve",
+            )
+        )
+    return found

@@ -1,0 +1,72 @@
+"""A report on a capture that a person can act on: what was measured, what it means, and what to do about it."""
+
+from typing import Any
+
+import numpy as np
+
+from workflows.ingest.report.expected_psnr import expected
+from workflows.ingest.report.figures import Clipping, Figures, Frames, Noise, ToneCurve
+from workflows.ingest.report.findings import LEVELS, Finding, Level, findings
+from workflows.programs.program import Program
+
+
+class Report(Figures):
+    """A report on a capture; ``level`` is that of the worst finding."""
+
+    level: Level
+    findings: list[Finding]
+
+
+def report(attributes: dict[str, Any], frames: int) -> Report:
+    """The report on a capture.
+
+    Parameters
+    ----------
+    attributes : dict
+        Of its stack, as `measure` and `survey` left them.
+    frames : int
+        Of the stack.
+    """
+    program = Program.model_validate(attributes["program"])
+    survey, noise, steadiness = attributes["survey"], attributes["noise"], attributes.get("steadiness") or {}
+    said = {"monitor": program.monitor.response, "camera": attributes["response"]}
+    curves = {
+        name: ToneCurve(
+            curve=attributes[f"{name}_curve"],
+            source="assumed"
+            if name in attributes["assumed_curves"]
+            else "estimated"
+            if response == "unknown"
+            else "given",
+        )
+        for name, response in said.items()
+    }
+    made = Figures(
+        frames=Frames(
+            kept=frames,
+            patterns=program.count,
+            exposures=len(np.unique(attributes["exposures"])),
+            missing=np.setdiff1d(np.arange(program.count), attributes["patterns"]).tolist(),
+        ),
+        clipping=Clipping(
+            white=survey["white"]["clipped_high"],
+            black=survey["black"]["clipped_low"],
+            patterns_white=survey["patterns"]["clipped_high"],
+            patterns_black=survey["patterns"]["clipped_low"],
+        ),
+        white_reaches=survey["white"]["reaches"],
+        drift=steadiness.get("drift"),
+        flicker=steadiness.get("flicker"),
+        noise=Noise(
+            black=255 * noise["read"] ** 0.5,
+            full=255 * (noise["read"] + noise["shot"]) ** 0.5,
+            read=noise["read"],
+            shot=noise["shot"],
+        ),
+        crosstalk=attributes["crosstalk"],
+        **curves,
+        quality=expected(program, survey),
+        video=attributes.get("video"),
+    )
+    found = findings(made, program, attributes)
+    return Report(**dict(made), level=max((f.level for f in found), key=LEVELS.index), findings=found)

@@ -1,0 +1,110 @@
+"""How a capture turned out: clipping, exposure and contrast, from windows of frames, and how steady it was."""
+
+from collections.abc import Iterator
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.layout.captures import Stack
+from workflows.ingest.measured_light import look_up_of
+from workflows.ingest.report.calibration import constant_frames, measure
+from workflows.ingest.report.steadiness import find_steadiness
+from workflows.programs.program import Program
+from workflows.recovery.noise import Noise
+
+EDGE = 96
+"""Pixels of a window, at most; there are four by four, spread over the frame."""
+FRAMES = 2000
+"""Frames that are looked at, at most, spread over the capture."""
+BATCH = 32 << 20
+"""Bytes of a window's frames that are read at once, about."""
+
+
+def survey(stack: Stack) -> None:
+    """Measure what a report on a capture needs, and annotate the stack with it as ``survey``, which is not saved.
+
+    How steady it was is found first, and the noise measured anew where frames flicker: that is none.
+    """
+    find_steadiness(stack)
+    if stack.attributes["gains"] is not None:
+        measure(stack, stack.attributes["gains"])
+    attributes = stack.attributes
+    program = Program.model_validate(attributes["program"])
+    look_up = look_up_of(stack)
+    patterns = np.array(attributes["patterns"])
+    chosen = np.unique(np.linspace(0, stack.frames - 1, FRAMES).astype(int))
+    is_pattern = ~np.isin(patterns[chosen], program.constants[0])
+
+    frames, sent, times = constant_frames(stack, program)
+    level = sent.mean(axis=1) + np.where(times == times.min(), 0, np.nan)
+    white, black = frames[int(np.nanargmax(level))], frames[int(np.nanargmin(level))]
+    noise = Noise(**attributes["noise"])
+
+    clipped = np.zeros((2, len(chosen)), np.int64)
+    ends = np.zeros((2, 2))
+    contrasts: list[NDArray[np.float32]] = []
+    deviations: list[NDArray[np.float32]] = []
+    brightest: list[NDArray[np.float32]] = []
+    pixels = 0
+    for rows, columns in _windows(stack):
+        wanted = stack.recovered(rows, columns)
+        if not wanted.any():
+            continue
+        codes_black, codes_white = (stack.read(rows, columns, slice(n, n + 1))[0] for n in (black, white))
+        B, W = look_up[codes_black].mean(axis=2), look_up[codes_white].mean(axis=2)
+        top = np.iinfo(stack.dtype).max
+        pixels += int(np.count_nonzero(wanted))
+        ends[0] += [np.count_nonzero((c == 0).any(axis=2) & wanted) for c in (codes_black, codes_white)]
+        ends[1] += [np.count_nonzero((c == top).any(axis=2) & wanted) for c in (codes_black, codes_white)]
+        contrasts.append((W - B)[wanted])
+        deviations.append(np.sqrt(noise.variance((B + W) / 2))[wanted])
+        brightest.append(look_up[codes_white].max(axis=2)[wanted])
+        for at, codes in _batches(stack, rows, columns, chosen):
+            for end, value in enumerate((0, top)):
+                clipped[end, at] += ((codes == value).any(axis=3) & wanted).sum(axis=(1, 2))
+    contrast, middling, bright = (
+        _percentile(c, q) for c, q in ((contrasts, 50), (deviations, 50), (brightest, 99))
+    )
+    share = clipped / max(pixels, 1)
+    stack.annotate(
+        survey={
+            "pixels": pixels,
+            "black": {"clipped_low": ends[0, 0] / max(pixels, 1)},
+            "white": {
+                "clipped_high": ends[1, 1] / max(pixels, 1),
+                "reaches": bright,
+            },
+            "patterns": {
+                "clipped_low": float(share[0, is_pattern].mean()),
+                "clipped_high": float(share[1, is_pattern].mean()),
+            },
+            "contrast": contrast,
+            "deviation": middling,
+        }
+    )
+
+
+def _percentile(values: list[NDArray[np.float32]], q: float) -> float:
+    return float(np.percentile(np.concatenate(values), q)) if values else 0.0
+
+
+def _windows(stack: Stack) -> Iterator[tuple[slice, slice]]:
+    def spread(n: int) -> list[slice]:
+        length = min(EDGE, max(1, -(-n // 4)))
+        return [slice(start, start + length) for start in sorted({(n - length) * k // 3 for k in range(4)})]
+
+    return product(spread(stack.height), spread(stack.width))
+
+
+def _batches(
+    stack: Stack, rows: slice, columns: slice, chosen: NDArray[np.intp]
+) -> Iterator[tuple[NDArray[np.intp], NDArray[Any]]]:
+    """The chosen frames of a window, some at a time: their places among the chosen, and their values."""
+    size = (rows.stop - rows.start) * (columns.stop - columns.start) * stack.channels * stack.dtype.itemsize
+    # Values become floats, by then of several kinds.
+    step = max(1, BATCH // (16 * size))
+    for first in range(0, len(chosen), step):
+        at = np.arange(first, min(first + step, len(chosen)))
+        yield at, stack.pick(chosen[at].tolist(), rows, columns)

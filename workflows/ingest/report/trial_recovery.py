@@ -1,0 +1,218 @@
+"""A trial recovery of some pixels of a capture: what each of its frames shows otherwise than the others say."""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from storage.layout.captures import Stack
+from workflows.images.integer_formats import Codes
+from workflows.images.tone_curves import Curve, to_light
+from workflows.ingest.measured_light import LOBES, exposures_of, light_of, look_up_of, unclipped_light
+from workflows.programs.program import Program
+from workflows.recovery.lobes import recover as lobes
+from workflows.recovery.noise import Noise
+from workflows.recovery.photometry import fit_photometry
+from workflows.recovery.sensing import Patterns
+from workflows.recovery.transport import Transport
+
+EDGE = 8
+"""Pixels of the squares that are looked at."""
+SQUARES = 40
+"""Of these, at most, spread over what is recovered."""
+BYTES = 96 << 20
+"""Of their frames, at most."""
+FEWEST_SQUARES = 8
+"""For anything to be told: how far their answers lie apart is how sure it is."""
+PIXELS = 640
+"""Of the squares, at most, that are recovered."""
+VALUES = 1 << 20
+"""Pixels times frames that are recovered, at most."""
+FEWEST = 100
+"""Pixels with contrast, at least, for anything to be told."""
+CONTRAST = 10.0
+"""Standard deviations of a mid-grey value between black and white, from which a pixel is asked."""
+FURTHEST = 3
+"""Pixels that a frame is moved by, at most."""
+HUBER, REWEIGHTED = 1.5, 6
+"""Deviations from which a value counts less, and how often that is found anew."""
+OUTLIER = 9.0
+"""The most that one value counts for a residual."""
+
+_SLOPE = 2
+# Between the pixels that are looked at and the edge of what is read of a frame.
+_MARGIN = _SLOPE + LOBES + FURTHEST
+
+Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
+
+
+class Sample(NamedTuple):
+    """Pixels of some squares, in all frames.
+
+    Attributes
+    ----------
+    codes : (frames, squares, h, w, channels) uint8 or uint16
+        With `_MARGIN` on each side.
+    chosen : three (n,) intp
+        Square, row and column of the pixels, margins left out.
+    """
+
+    codes: Codes
+    chosen: tuple[NDArray[np.intp], ...]
+
+
+class _Seen(NamedTuple):
+    """The pixels as the frames show them where these have been moved back: all (frames, n, channels) float32."""
+
+    values: Floats
+    whole: NDArray[np.bool_]
+    slopes: tuple[Floats, Floats]
+
+
+class Trial(NamedTuple):
+    """What one trial recovery says of the frames.
+
+    Attributes
+    ----------
+    off : (frames, 3) float64
+        Shift x and y in pixels and relative gain that are left; NaN where they are not told.
+    error : (frames, 3) float64
+        Standard errors.
+    residual : float
+        Of the values, what T does not explain, in standard deviations of the noise: root mean square without outliers.
+    """
+
+    off: Doubles
+    error: Doubles
+    residual: float
+
+
+def sampled(stack: Stack) -> Sample | None:
+    """Squares spread over what is recovered, and pixels of them; None where there are too few."""
+    wanted = stack.recovered()
+    down, across = (np.arange(_MARGIN, size - _MARGIN - EDGE + 1, EDGE) for size in wanted.shape)
+    corners = [(y, x) for y in down.tolist() for x in across.tolist()]
+    counts = np.array([np.count_nonzero(wanted[y : y + EDGE, x : x + EDGE]) for y, x in corners], int)
+    useful = np.flatnonzero(counts >= EDGE**2 // 4)
+    size = stack.frames * (EDGE + 2 * _MARGIN) ** 2 * stack.channels * stack.dtype.itemsize
+    most = min(len(useful), SQUARES, BYTES // size)
+    if most < FEWEST_SQUARES:
+        return None
+    corners = [corners[useful[at]] for at in np.linspace(0, len(useful) - 1, most).astype(int)]
+    wide = EDGE + _MARGIN
+    squares = [stack.read(slice(y - _MARGIN, y + wide), slice(x - _MARGIN, x + wide)) for y, x in corners]
+    inside = np.stack([wanted[y : y + EDGE, x : x + EDGE] for y, x in corners])
+    chosen = np.stack(np.nonzero(inside))
+    limit = max(min(PIXELS, VALUES // stack.frames), FEWEST)
+    chosen = chosen[:, :: -(-chosen.shape[1] // limit)]
+    return Sample(np.stack(squares, axis=1), tuple(chosen))
+
+
+def _see(stack: Stack, sample: Sample, shifts: Doubles) -> _Seen:
+    """The sample's pixels in frames that are moved back."""
+    look_up = look_up_of(stack)
+    square, y, x = sample.chosen
+    y, x = y + _SLOPE, x + _SLOPE
+    shape = (stack.frames, len(square), stack.channels)
+    values, across, down = np.empty((3, *shape), np.float32)
+    whole = np.empty(shape, bool)
+    for n, (codes, shift) in enumerate(zip(sample.codes, shifts.tolist(), strict=True)):
+        picture, unclipped = unclipped_light(codes, shift, _MARGIN - _SLOPE, look_up)
+        values[n], whole[n] = picture[square, y, x], unclipped[square, y, x]
+        # the slope of the polynomial through five values
+        for slope, (dy, dx) in ((across, (0, 1)), (down, (1, 0))):
+            near = picture[square, y + dy, x + dx] - picture[square, y - dy, x - dx]
+            far = picture[square, y + 2 * dy, x + 2 * dx] - picture[square, y - 2 * dy, x - 2 * dx]
+            slope[n] = (8 * near - far) / 12
+    return _Seen(values, whole, (across, down))
+
+
+def look(
+    stack: Stack, program: Program, monitor: Curve, patterns: Patterns, sample: Sample, state: Doubles
+) -> Trial | None:
+    """Recover the sample's pixels with frames moved and dimmed back, and say what these have left."""
+    seen, gains = _see(stack, sample, state[:, :2]), np.exp(state[:, 2])
+    attributes = stack.attributes | {"gains": gains.tolist() if state[:, 2].any() else None}
+    noise = Noise(**attributes["noise"])
+    light, usable, worth = light_of(
+        lambda n: (seen.values[n], seen.whole[n]), attributes, program, len(sample.chosen[0])
+    )
+    numbers, sent = program.constants_among(attributes["patterns"])
+    levels = to_light(sent, monitor)
+    photometry = fit_photometry(light[:, numbers], levels, usable[:, numbers], noise, worth[:, numbers])
+    alive = photometry.rho**2 > CONTRAST**2 * noise.variance(photometry.S + photometry.rho / 2)
+    if np.count_nonzero(alive.any(axis=1)) < FEWEST:
+        return None
+    shown = program.measured
+    transport, photometry, _ = lobes.recover(
+        np.ascontiguousarray(light[:, shown]), photometry, patterns, noise, usable[:, shown], worth[:, shown]
+    )
+    predicted = np.zeros((program.count, *alive.shape), np.float32)
+    predicted[shown] = photometry.rho * _arrived(transport, patterns)
+    predicted[numbers] = photometry.rho * levels[:, np.newaxis]
+    exposures = exposures_of(attributes)
+    apart = np.linalg.inv(np.array(attributes["crosstalk"])).astype(np.float32).T
+    off, error = np.full((2, stack.frames, 3), np.nan)
+    squares: list[float] = []
+    for n, pattern in enumerate(attributes["patterns"]):
+        value, across, down = (
+            np.broadcast_to(v[n] / exposures[n], alive.shape) @ apart for v in (seen.values, *seen.slopes)
+        )
+        lit = np.float32(gains[n]) * predicted[pattern]
+        weight = exposures[n] ** 2 / noise.variance(exposures[n] * value)
+        good = alive & np.broadcast_to(seen.whole[n], alive.shape)
+        if not lit[good].any():
+            continue
+        rest = (value - photometry.S - lit)[good]
+        is_shown = pattern in shown
+        columns = [across, down, lit] if is_shown else [lit]
+        design = np.stack([column[good] for column in columns], axis=1)
+        of = np.broadcast_to(sample.chosen[0][:, np.newaxis], alive.shape)[good]
+        fitted = _fit(design, rest, weight[good], of)
+        if fitted is not None:
+            off[n, -len(columns) :], error[n, -len(columns) :] = fitted
+        if is_shown:
+            squares.append(float(np.minimum(rest**2 * weight[good], OUTLIER).mean()))
+    off[:, :2] *= -1
+    off[:, 2] = np.log1p(np.maximum(off[:, 2], -0.9))
+    return Trial(off, error, float(np.sqrt(np.mean(squares))) if squares else np.inf)
+
+
+def _arrived(transport: Transport, patterns: Patterns) -> Floats:
+    """T L of each pattern, (m, n, 3)."""
+    cells, place = np.unique(transport.cell, return_inverse=True)
+    ends = np.concatenate([[0], np.cumsum(transport.count, dtype=np.int64)])
+    size = len(transport.shared)
+    T = sp.csr_array((transport.weight, place, ends), shape=(3 * size, len(cells)))
+    light = (patterns.code[cells] / np.float32(255)).reshape(len(cells), patterns.channels, patterns.count)
+    arrived = np.empty((patterns.count, size, 3), np.float32)
+    for c in range(3):
+        rows = 3 * np.arange(size) + np.where(transport.shared, 0, c)
+        arrived[:, :, c] = (T[rows] @ light[:, c % patterns.channels]).T
+    return arrived
+
+
+def _fit(
+    design: Floats, rest: Floats, weight: Floats, square: NDArray[np.intp]
+) -> tuple[Doubles, Doubles] | None:
+    """Robust least squares, and standard errors by what squares say otherwise; None where it is not told."""
+    scale = np.sqrt(weight.astype(np.float64))
+    A, r = design * scale[:, np.newaxis], rest * scale
+    trust = np.ones(len(r))
+    for _ in range(REWEIGHTED):
+        weighed = A * trust[:, np.newaxis]
+        gram = weighed.T @ A
+        if np.linalg.eigvalsh(gram)[0] <= 1e-9 * np.trace(gram):
+            return None
+        found = np.linalg.solve(gram, weighed.T @ r)
+        size = np.abs(r - A @ found)
+        trust = np.minimum(1, HUBER * 1.4826 * np.median(size) / np.maximum(size, 1e-12))
+    pull = (weighed * (r - A @ found)[:, np.newaxis]) @ np.linalg.inv(gram)
+    sums = np.stack([np.bincount(square, p) for p in pull.T])
+    count = np.count_nonzero(np.bincount(square))
+    if count <= A.shape[1]:
+        return None
+    error: Doubles = np.sqrt((sums**2).sum(axis=1) * count / (count - A.shape[1]))
+    return found.astype(np.float64), error

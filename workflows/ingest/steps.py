@@ -1,0 +1,206 @@
+"""The ingest of a capture: frames are read one at a time and written, a slab of them at once, into the stack."""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import TypeAdapter
+
+from storage.errors import CaptureError, ImageError
+from storage.layout import uploads
+from storage.layout.captures import Stack, create_stack, write_slab
+from storage.objects.store import Objects
+from workflows.images import integer_formats
+from workflows.images.resample import smallest_grid
+from workflows.images.tone_curves import Response
+from workflows.ingest import stills
+from workflows.ingest.bundle import MANIFEST, Bundle
+from workflows.ingest.video.border_reader import LOOKS
+from workflows.ingest.video.decoder import Share, opened
+from workflows.ingest.video.matching import MOST_PATTERNS, Sorted, sort
+from workflows.ingest.video.resemblance import lay_out
+from workflows.programs.program import Images
+from workflows.untrusted.decoder_guard import Guard
+from workflows.untrusted.limits import Limits
+
+
+def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, Any]:
+    """Look into the bundle of a capture and make its empty stack.
+
+    Returns
+    -------
+    dict
+        ``tiles``: the number of slabs; ``slab``: frames of one; ``memory``: the limit that it comes of; ``width``,
+        ``height``, ``frames``; ``notes``: lines for people about what was found in a video.
+
+    Raises
+    ------
+    CaptureError
+    """
+    with uploads.read(objects, capture) as file:
+        bundle = Bundle(file, limits)
+        manifest = bundle.manifest
+        names = [n for part in manifest.program.parts if isinstance(part, Images) for n in part.files]
+        patterns: list[NDArray[np.float32]] = []
+        for name in names:
+            patterns.append(integer_formats.to_unit(smallest_grid(_decode(bundle, name, limits))))
+            if sum(pattern.nbytes for pattern in patterns) > limits.memory // 2:
+                raise CaptureError(
+                    f"the patterns that come as images take more than {limits.memory // 2} bytes together, from "
+                    f"{name} on: use fewer, smaller or coarser ones",
+                    entry=name,
+                    limit=limits.memory // 2,
+                )
+        # Of all frames, for the camera stood still: one that looks down takes itself for turned now this way, now that.
+        turn = (
+            1 if manifest.video is not None else stills.orientation(bundle, manifest.frames[0].file, limits)
+        )
+        shape, storage, filmed = _look(bundle, patterns, limits)
+        mask = None
+        if manifest.mask is not None:
+            mask = np.any(_decode(bundle, manifest.mask, limits), axis=2)
+            if mask.shape != shape[1:3]:
+                raise CaptureError(
+                    f"{manifest.mask} is {_size(mask)}, the frames are {shape[2]} x {shape[1]}"
+                    + (", turned upright as the first of them says" if turn > 1 else ""),
+                    entry=manifest.mask,
+                )
+    frames, height, width, _ = shape
+    shown = manifest.frames[0].file if manifest.video is None else manifest.video.file
+    limits.see_that_pixels_may(width, height, entry=shown)
+    taken = math.prod(shape) * storage.dtype.itemsize
+    if taken > limits.unpacked:
+        raise CaptureError(
+            f"{frames} frames of {width} x {height} pixels take {taken} bytes, more than the "
+            f"{limits.unpacked} allowed: use fewer or smaller ones",
+            entry=MANIFEST,
+            field="frames" if filmed is None else "video",
+            limit=limits.unpacked,
+        )
+    slab = create_stack(
+        objects,
+        capture,
+        shape,
+        storage.dtype,
+        memory=limits.memory,
+        attributes={
+            "program": manifest.program.model_dump(mode="json"),
+            # Float values are linear light, whatever is left unsaid.
+            "response": "linear"
+            if storage.black
+            else TypeAdapter(Response).dump_python(manifest.response, mode="json"),
+            "storage": {"black": storage.black, "full": storage.full, "bounded": storage.bounded},
+            "patterns": [frame.pattern for frame in manifest.frames]
+            if filmed is None
+            else list(filmed.shares),
+            "exposures": [frame.exposure for frame in manifest.frames] or [1.0] * frames,
+            **({"orientation": turn} if filmed is None else {"video": filmed.record}),
+        },
+        mask=mask,
+        images=patterns,
+        shares=None if filmed is None else filmed.table,
+    )
+    notes = [] if filmed is None else filmed.notes
+    size = {"width": width, "height": height, "frames": frames, "video": filmed is not None}
+    return {"tiles": -(-frames // slab), "slab": slab, "memory": limits.memory, **size, "notes": notes}
+
+
+def _look(
+    bundle: Bundle, patterns: Sequence[NDArray[np.float32]], limits: Limits
+) -> tuple[tuple[int, int, int, int], stills.Storage, Sorted | None]:
+    """The shape of the stack and how it is stored, and of a video which of its frames show what."""
+    manifest = bundle.manifest
+    if manifest.video is None:
+        first = stills.read(bundle, manifest.frames[0].file, limits)
+        height, width, channels = first.shape
+        shape = len(manifest.frames), height, width, channels
+        return shape, stills.storage_of(bundle, first, limits), None
+    program, entry = manifest.program, manifest.video.file
+    if program.count > MOST_PATTERNS:
+        raise CaptureError(
+            f"{entry} shows {program.count} patterns, more than the {MOST_PATTERNS} that are told apart in a video: "
+            "send frames, or show fewer",
+            entry=entry,
+            limit=MOST_PATTERNS,
+        )
+    curve = "srgb" if program.monitor.response == "unknown" else program.monitor.response
+    light = lay_out(program, curve, patterns)
+    with bundle.open(entry) as file, opened(file, entry, limits.image) as clip:
+        border, rate = manifest.video.border, manifest.video.patterns_per_second
+        signatures, ticks, large = clip.signatures(
+            limits.memory // 4, math.inf if border is None else 1 / (LOOKS * rate)
+        )
+        filmed = sort(
+            signatures,
+            ticks,
+            clip.tick,
+            program,
+            light,
+            rate,
+            entry,
+            large,
+            border,
+        )
+        shape = len(filmed.shares), clip.height, clip.width, 3
+        return shape, stills.Storage(np.dtype(np.uint16), 0, 1.0, True), filmed
+
+
+def read_slab(objects: Objects, capture: str, limits: Limits, slab: int, index: int) -> int:
+    """Decode the frames of slab ``index``, of ``slab`` frames, into the stack; returns their pixels.
+
+    Raises
+    ------
+    CaptureError
+        Naming the frame that can't be decoded, or is of another size or kind than the first.
+    """
+    stack = Stack(objects, capture)
+    first, last = index * slab, min((index + 1) * slab, stack.frames)
+    frames = np.empty((last - first, stack.height, stack.width, stack.channels), stack.dtype)
+    with uploads.read(objects, capture) as file:
+        bundle = Bundle(file, limits)
+        for n, pixels in enumerate(_pixels(bundle, stack, first, last, limits)):
+            frames[n] = pixels
+    write_slab(objects, capture, first, frames)
+    return int(frames.shape[0] * frames.shape[1] * frames.shape[2])
+
+
+def _pixels(
+    bundle: Bundle, stack: Stack, first: int, last: int, limits: Limits
+) -> Iterator[integer_formats.Codes]:
+    """The frames of a stack from ``first`` up to ``last``, one after another."""
+    video = bundle.manifest.video
+    if video is not None:
+        shares = stack.shares()
+        plan = [[Share(*row) for row in shares[shares[:, 0] == n, 1:].tolist()] for n in range(first, last)]
+        with bundle.open(video.file) as file, opened(file, video.file, limits.image) as clip:
+            yield from clip.means(plan)
+        return
+    shape = (stack.height, stack.width, stack.channels)
+    storage = stills.Storage(stack.dtype, **stack.attributes["storage"])
+    kind = np.dtype(np.float32) if storage.black else stack.dtype
+    turn = stack.attributes.get("orientation", 1)  # which captures did not have before it was looked at
+    for frame in bundle.manifest.frames[first:last]:
+        pixels = stills.read(bundle, frame.file, limits, turn)
+        if pixels.shape != shape or pixels.dtype != kind:
+            raise CaptureError(
+                f"{frame.file} is {_size(pixels)} with {pixels.shape[2]} channels of {pixels.dtype}, the first "
+                f"frame {stack.width} x {stack.height} with {stack.channels} of {kind}: all frames must "
+                "be of one size and kind",
+                entry=frame.file,
+            )
+        yield storage.encode(pixels)
+
+
+def _decode(bundle: Bundle, entry: str, limits: Limits) -> integer_formats.Codes:
+    data = bundle.read(entry)
+    try:
+        with Guard(entry, limits.image).on():
+            return integer_formats.decode(data, memory=limits.image)
+    except ImageError as error:
+        raise CaptureError(f"{entry}: {error.detail}", entry=entry, **error.fields) from error
+
+
+def _size(pixels: NDArray[np.generic]) -> str:
+    return f"{pixels.shape[1]} x {pixels.shape[0]}"

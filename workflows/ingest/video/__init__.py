@@ -1,0 +1,1 @@
+"""Videos of programs: which frames show which pattern."""

@@ -1,0 +1,247 @@
+"""The display in a recording: where its border lies in the frames, and the numbers that it shows."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, find_objects, label
+
+from workflows.ingest.video.decoder import Large
+from workflows.ingest.video.missing_patterns import Reason
+from workflows.ingest.video.recording import Recording
+from workflows.ingest.video.timing import Found
+from workflows.programs import border as program_border
+from workflows.programs.border import Border, Box
+
+LOOKS = 6
+"""Frames that are to be looked at for the numbers while a pattern is shown."""
+FEWEST = 8
+"""Plateaus that are needed to tell cells from patterns."""
+MOST = 128
+"""Plateaus from which the display's place is told, at most, and whose numbers are read at once."""
+_PLATEAUS = 2  # for each pattern
+# Of a code: near enough to any camera's curve to compare the cells of a pair.
+_LIGHT = ((np.arange(256) / 255) ** 2.2).astype(np.float32)
+_ALTERNATES = 0.6  # see `_alternation`
+_CONTRAST = 0.15  # of a pixel, as a share of the frame's largest
+_WITHIN = (0.3, 0.5, 0.7)  # of a cell: where it is looked at
+_SIMPLEX = 1.0  # pixels, the first step of the search for the corners
+_MOSTLY = 0.5  # of the plateaus with numbers: that are in order, of a display that was found
+
+Doubles = NDArray[np.float64]
+Floats = NDArray[np.float32]
+"""(plateaus, rows, columns) float32: what was seen, about in linear light."""
+Points = NDArray[np.float64]
+"""(n, 2) float64: x, y in pixels."""
+
+
+def find(recording: Recording, large: Large, border: Border, patterns: int) -> Found | None:
+    """The frames of each pattern, by the numbers in the border.
+
+    Parameters
+    ----------
+    recording : Recording
+    large : Large
+        Some of its frames at a size that shows the cells.
+    border : Border
+        As it was shown.
+    patterns : int
+        Of the program.
+
+    Returns
+    -------
+    Found or None
+        None if the border can't be read: it is out of the picture, too small, or another one.
+
+    Notes
+    -----
+    The cells of the sides change from each pattern to the next and back: pixels that do so are two columns, whose ends
+    are four points of the display. From there on the homography (Hartley and Zisserman, 2004, ch. 4) that shows the
+    largest differences in all pairs of cells is searched by the simplex of Nelder and Mead (1965). Numbers must ascend
+    in time; what stands out of the longest row that does is a misreading.
+    """
+    plateaus = [recording.plateau(n) for n in range(len(recording.events) + 1)]
+    if len(plateaus) > _PLATEAUS * patterns + 100:
+        return None
+    # The first and the last of a plateau may be torn.
+    inner = [_among(large, plateau[1:-1]) for plateau in plateaus]
+    chosen = [looks if looks.size else _among(large, p) for looks, p in zip(inner, plateaus, strict=True)]
+    there = np.flatnonzero([looks.size > 0 for looks in chosen])
+    whole = np.flatnonzero([inner[n].size > 0 for n in there])
+    if whole.size < FEWEST:
+        return None
+    codes = np.stack([np.median(large.grey[chosen[n]], axis=0).astype(np.uint8) for n in there])
+    middle = max((whole.size - MOST) // 2, 0)
+    some = codes[whole[middle : middle + MOST]]
+    for quarters in range(4):
+        light = _LIGHT[np.rot90(some, quarters, axes=(1, 2))]
+        ends = _columns(light)
+        if ends is None:
+            continue
+        homography = _adjusted(light, ends, border)
+        upright = np.rot90(codes, quarters, axes=(1, 2))
+        parts = (_LIGHT[upright[at : at + MOST]] for at in range(0, len(upright), MOST))
+        numbers = np.concatenate([_numbers(part, homography, border) for part in parts])
+        numbers[numbers >= patterns] = program_border.LEAD
+        row = _ascending(numbers)
+        if len(row) >= max(FEWEST, _MOSTLY * np.count_nonzero(numbers > program_border.LEAD)):
+            return _found(recording, {int(there[at]): int(numbers[at]) for at in row}, patterns)
+    return None
+
+
+def _among(large: Large, frames: range) -> NDArray[np.intp]:
+    """Which of the large ones are among some frames."""
+    return np.flatnonzero((large.frames >= frames.start) & (large.frames < frames.stop))
+
+
+def _columns(light: Floats) -> Points | None:
+    """The ends of the sides' middle lines: left top, left bottom, right top, right bottom."""
+    column: list[list[tuple[float, float]]] = []
+    mask = binary_dilation(_alternation(light) > _ALTERNATES, np.ones((5, 1), bool))
+    labels, _ = label(mask, np.ones((3, 3)))
+    boxes = [(place, n + 1) for n, place in enumerate(find_objects(labels))]
+    boxes.sort(key=lambda found: found[0][0].start - found[0][0].stop)
+    for (rows, _), number in boxes[:2]:
+        of_row = [np.flatnonzero(labels[y] == number) for y in range(rows.start, rows.stop)]
+        # less what the dilation added
+        y = np.arange(rows.start, rows.stop)[2:-2]
+        x = np.array([xs.mean() for xs in of_row])[2:-2]
+        width = float(np.median([xs.size for xs in of_row]))
+        if y.size < 2 * program_border.TICKS:
+            return None
+        kept = np.abs(x - np.median(x)) < np.inf
+        for _ in range(4):  # the parity's cells lie beside the end of a column
+            slope, start = np.polyfit(y[kept], x[kept], 1)
+            off = np.abs(x - slope * y - start)
+            kept = off <= max(2 * float(np.median(off)), 0.35 * width)
+        top, bottom = y[kept].min() - 0.5, y[kept].max() + 0.5
+        column.append([(slope * end + start, end) for end in (top, bottom)])
+    if len(column) < 2:
+        return None
+    return np.array(sorted(column)).reshape(4, 2)
+
+
+def _alternation(light: Floats) -> Floats:
+    """(rows, columns) float32: 1 where each plateau differs from the next and not from the one after; 0 by chance.
+
+    It does not count for how long nothing changes.
+    """
+    contrast = np.quantile(light, 0.9, axis=0) - np.quantile(light, 0.1, axis=0)
+    near = np.abs(light[1:] - light[:-1]).mean(axis=0)
+    far = np.abs(light[2:] - light[:-2]).mean(axis=0)
+    seen = contrast > _CONTRAST * contrast.max()
+    return np.where(seen, (near - far) / np.maximum(near + far, 1e-6), 0)
+
+
+def _adjusted(light: Floats, ends: Points, border: Border) -> Doubles:
+    """(3, 3) homography from the display's pixels to the frame's, where the cells of the pairs differ most."""
+    first, last = border.left[0], border.left[-1]
+    top, bottom = first[1], last[1] + last[3]
+    left, right = border.thickness / 2, border.width - border.thickness / 2
+    known = np.array([(left, top), (left, bottom), (right, top), (right, bottom)])
+    cells = (*border.top, *border.bottom, *border.left, *border.right)
+
+    def alike(moved: Doubles) -> float:
+        pairs = _cells(light, _homography(known, ends + moved.reshape(4, 2)), cells)
+        return -float(np.abs(pairs[:, ::2] - pairs[:, 1::2]).mean())
+
+    simplex = np.concatenate([np.zeros((1, 8)), _SIMPLEX * np.eye(8)])
+    from scipy.optimize import minimize  # half a second to import, and only who ingests a video comes here
+
+    best = minimize(
+        alike,
+        np.zeros(8),
+        method="Nelder-Mead",
+        options={"initial_simplex": simplex, "xatol": 0.02, "maxfev": 600},
+    )
+    return _homography(known, ends + best.x.reshape(4, 2))
+
+
+def _homography(known: Points, seen: Points) -> Doubles:
+    """(3, 3) float64, from four points to four others."""
+    rows = []
+    for (x, y), (u, v) in zip(known, seen, strict=True):
+        rows += [[x, y, 1, 0, 0, 0, -u * x, -u * y], [0, 0, 0, x, y, 1, -v * x, -v * y]]
+    solved, *_ = np.linalg.lstsq(np.array(rows), seen.ravel(), rcond=None)
+    return np.append(solved, 1.0).reshape(3, 3)
+
+
+def _cells(light: Floats, homography: Doubles, cells: Sequence[Box]) -> Doubles:
+    """(plateaus, cells) mean light of the cells' inner halves, between pixels linear; 0 outside of the frame."""
+    box = np.array(cells, float)
+    x = box[:, 0, None, None] + box[:, 2, None, None] * np.array(_WITHIN)[:, None]
+    y = box[:, 1, None, None] + box[:, 3, None, None] * np.array(_WITHIN)[None, :]
+    x, y = np.broadcast_arrays(x, y)
+    across, down, scale = np.tensordot(homography, np.stack([x, y, np.ones_like(x)]), 1)
+    # a pixel's value is that of its middle
+    u, v = across / scale - 0.5, down / scale - 0.5
+    height, width = light.shape[1:]
+    inside = (u > -1) & (v > -1) & (u < width) & (v < height) & (scale > 0)
+    u, v = np.clip(np.where(inside, u, 0), 0, width - 1), np.clip(np.where(inside, v, 0), 0, height - 1)
+    i, j = np.minimum(u.astype(int), width - 2), np.minimum(v.astype(int), height - 2)
+    a, b = u - i, v - j
+    values = (light[:, j, i] * (1 - a) + light[:, j, i + 1] * a) * (1 - b)
+    values += (light[:, j + 1, i] * (1 - a) + light[:, j + 1, i + 1] * a) * b
+    return np.asarray((values * inside).mean(axis=(2, 3)))
+
+
+def _numbers(light: Floats, homography: Doubles, border: Border) -> NDArray[np.intp]:
+    """(plateaus,) the pattern's number, or `LEAD` where there is none, or none that is certain."""
+    read = [program_border.read(_cells(light, homography, cells)) for cells in (border.top, border.bottom)]
+    (above, clear_above), (below, clear_below) = read
+    number = np.where(clear_above, above, below)
+    ticks = _cells(light, homography, (*border.left, *border.right))
+    odd = ticks[:, ::2].sum(axis=1) > ticks[:, 1::2].sum(axis=1)
+    certain = (clear_above | clear_below) & ~(clear_above & clear_below & (above != below))
+    return np.where(certain & (odd == (number + 1) % 2), number, program_border.LEAD)
+
+
+def _ascending(numbers: NDArray[np.intp]) -> list[int]:
+    """Where the longest row of numbers is that never falls; patience sorting (Fredman, 1975)."""
+    ends: list[int] = []
+    before: dict[int, int | None] = {}
+    for at in np.flatnonzero(numbers > program_border.LEAD).tolist():
+        place = int(np.searchsorted([numbers[end] for end in ends], numbers[at], "right"))
+        before[at] = ends[place - 1] if place else None
+        ends[place : place + 1] = [at]
+    row: list[int] = []
+    last = ends[-1] if ends else None
+    while last is not None:
+        row.append(last)
+        last = before[last]
+    return row[::-1]
+
+
+def _found(recording: Recording, seen: dict[int, int], patterns: int) -> Found:
+    """The frames of the plateaus that show a number: of several with the same one, of the longest."""
+    frames = [np.zeros(0, np.intp)] * patterns
+    weights = [np.zeros(0)] * patterns
+    reasons: dict[int, Reason] = {}
+    longest: dict[int, range] = {}
+    for plateau, number in seen.items():
+        if len(recording.plateau(plateau)) > len(longest.get(number, ())):
+            longest[number] = recording.plateau(plateau)
+    for number in range(patterns):
+        if number in longest and len(longest[number]) > 1:
+            frames[number], weights[number] = recording.clean(longest[number])
+        elif number in longest:
+            reasons[number] = Reason.TORN
+        elif number < min(longest):
+            reasons[number] = Reason.BEFORE
+        elif number > max(longest):
+            reasons[number] = Reason.AFTER
+        else:
+            reasons[number] = Reason.UNNUMBERED
+    begins = np.array([recording.times[longest[number].start] for number in sorted(longest)])
+    holds = np.diff(begins) / np.diff(sorted(longest))
+    # of the middle half: what was cut out, or stood still, is left aside
+    hold = float(np.sort(holds)[len(holds) // 4 : len(holds) - len(holds) // 4].mean())
+    return Found(
+        frames,
+        weights,
+        reasons,
+        float(begins[0] - recording.times[0]) - min(longest) * hold,
+        1 / hold,
+        0.0,
+        False,
+    )

@@ -1,0 +1,1 @@
+"""Mattes: recovered tile by tile, and what is read from them."""

@@ -1,0 +1,36 @@
+"""The values of a block that came in an archive."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from storage.layout.mattes import Block
+
+BRIGHTEST = 1e20
+"""More than any S and rho, and little enough for whatever is added up of them in 32 bits."""
+TOLERANCE = 1e-4
+"""By which the sum of a row of T may miss 1: it is stored in 32 bits."""
+
+
+def faults(block: Block, nodes: int) -> Iterator[tuple[str, str]]:
+    """What is wrong with a block: the array, and why."""
+    for name in ("S", "rho"):
+        if not (np.abs(getattr(block, name)) < BRIGHTEST).all():
+            yield name, "a value is infinite, no number, or larger than any light"
+    if not (block.error >= 0).all():  # infinite where nothing was recovered
+        yield "error", "a value is negative, or no number"
+    if block.count[~block.recovered].any():
+        yield "count", "a pixel that was left out has cells"
+    if block.count[block.shared, 1:].any():
+        yield "count", "a pixel whose channels share a row has cells in the others"
+    if block.cell.max(initial=0) >= nodes:
+        yield "cell", f"a cell is beyond the {nodes} of its grids"
+    sizes = block.count.ravel().astype(np.int64)
+    row = np.repeat(np.arange(sizes.size), sizes)
+    if not ((np.diff(block.cell.astype(np.int64)) > 0) | (np.diff(row) > 0)).all():
+        yield "cell", "the cells of a row do not ascend"
+    if not (np.isfinite(block.weight) & (block.weight > 0)).all():
+        yield "weight", "a weight is not positive"
+    total = np.bincount(row, block.weight, sizes.size)
+    if (np.abs(total - 1)[sizes > 0] > TOLERANCE).any():
+        yield "weight", "the weights of a row do not add up to 1"

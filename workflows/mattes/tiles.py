@@ -1,0 +1,153 @@
+"""How a frame is cut into tiles, and the work of one: what a dask task runs."""
+
+from functools import lru_cache
+from itertools import product
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import TypeAdapter
+
+from storage.layout.captures import Stack
+from storage.layout.mattes import Block, Matte
+from storage.objects.store import Objects
+from workflows.images.tone_curves import Curve, to_light
+from workflows.ingest.measured_light import read_light
+from workflows.mattes.options import RecoveryOptions
+from workflows.programs.program import Program
+from workflows.programs.pyramid_light import lay_out, pyramid_of
+from workflows.recovery.dgsr import recover as dgsr
+from workflows.recovery.lobes import recover as lobes
+from workflows.recovery.noise import Noise
+from workflows.recovery.normalise import normalise
+from workflows.recovery.photometry import fit_photometry
+from workflows.recovery.sensing import Patterns, Sensing
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+
+def cut(matte: Matte, tile: int) -> list[tuple[range, range]]:
+    """The tiles of a matte, row by row, each a rectangle of its blocks.
+
+    Parameters
+    ----------
+    tile : int
+        Edge of a tile in pixels, rounded up to whole blocks.
+
+    Returns
+    -------
+    list of (range, range)
+        Block rows and block columns.
+    """
+    edge = -(-tile // matte.block)
+    return [
+        (
+            range(row, min(row + edge, matte.block_rows)),
+            range(column, min(column + edge, matte.block_columns)),
+        )
+        for row in range(0, matte.block_rows, edge)
+        for column in range(0, matte.block_columns, edge)
+    ]
+
+
+def recover_tile(objects: Objects, capture: str, matte: str, options: RecoveryOptions, index: int) -> int:
+    """Recover the blocks of a matte that a tile consists of, one after another.
+
+    What is held in memory is a block's, and what comes out is the same however blocks make up tiles.
+
+    Returns
+    -------
+    int
+        Pixels recovered.
+
+    Raises
+    ------
+    Corrupt
+        If the store lacks the capture or the matte.
+    """
+    target, stack = Matte(objects, matte), Stack(objects, capture)
+    rows, columns = cut(target, options.tile or target.block)[index]
+    pixels = 0
+    for row, column in product(rows, columns):
+        block = _recover_block(stack, objects.url, capture, target.span(row, column), options)
+        target.write(row, column, block)
+        pixels += int(block.recovered.sum())
+    return pixels
+
+
+def _recover_block(
+    stack: Stack, url: str, capture: str, span: tuple[slice, slice], options: RecoveryOptions
+) -> Block:
+    program, monitor = program_of(url, capture)
+    attributes = stack.attributes
+    noise = Noise(**attributes["noise"])
+    (light, usable, worth), recovered = read_light(stack, span, program)
+    crosstalk = np.array(attributes["crosstalk"])
+    numbers, sent = program.constants_among(attributes["patterns"])
+    photometry = fit_photometry(
+        light[:, numbers], to_light(sent, monitor), usable[:, numbers], noise, worth[:, numbers]
+    )
+    shown = program.measured
+    measurements = np.ascontiguousarray(light[:, shown])
+    given = (noise, usable[:, shown], worth[:, shown])
+    if options.method == "nn-dgsr":
+        sensing = sensing_of(url, capture)
+        transport = dgsr.recover(measurements, photometry, sensing, *given, **options.constants)
+        measured = normalise(measurements, photometry, noise, options.constants["least_contrast"], *given[1:])
+        error = dgsr.error_of(transport, photometry, measured, sensing)
+    else:
+        transport, photometry, error = lobes.recover(
+            measurements, photometry, patterns_of(url, capture), *given, **options.constants
+        )
+
+    def spread(values: NDArray[Scalar], *channels: int) -> NDArray[Scalar]:
+        """Values of the recovered pixels, and zeros for the others."""
+        block = np.zeros((*recovered.shape, *channels), values.dtype)
+        block[recovered] = values
+        return block
+
+    return Block(
+        spread((photometry.S @ crosstalk.T).astype(np.float32), 3),
+        spread(photometry.rho, 3),
+        spread(error),
+        recovered,
+        spread(transport.shared),
+        spread(transport.count, 3),
+        transport.cell,
+        transport.weight,
+    )
+
+
+def grid_of(url: str, capture: str, options: RecoveryOptions) -> tuple[int, int]:
+    """Columns and rows of the first grid of the T that a method recovers from a capture."""
+    if options.method == "nn-dgsr":
+        finest = sensing_of(url, capture).levels[-1]
+        return finest.columns, finest.rows
+    program, _ = program_of(url, capture)
+    return pyramid_of(program, program.channels(_images_of(url, capture))).grids[0]
+
+
+@lru_cache(maxsize=2)
+def program_of(url: str, capture: str) -> tuple[Program, Curve]:
+    """A capture's program and monitor curve, kept from tile to tile: a capture never changes."""
+    attributes = Stack(Objects(url), capture).attributes
+    monitor = TypeAdapter[Curve](Curve).validate_python(attributes["monitor_curve"])
+    return Program.model_validate(attributes["program"]), monitor
+
+
+@lru_cache(maxsize=1)
+def sensing_of(url: str, capture: str) -> Sensing:
+    """A capture's sensing matrices."""
+    program, monitor = program_of(url, capture)
+    return program.sensing(monitor, _images_of(url, capture))
+
+
+@lru_cache(maxsize=1)
+def patterns_of(url: str, capture: str) -> Patterns:
+    """A capture's patterns on a pyramid."""
+    program, monitor = program_of(url, capture)
+    return lay_out(program, monitor, _images_of(url, capture))
+
+
+def _images_of(url: str, capture: str) -> list[NDArray[np.float32]]:
+    return Stack(Objects(url), capture).images()

@@ -1,0 +1,1 @@
+"""Pattern programs: what the monitor shows."""

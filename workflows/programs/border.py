@@ -1,0 +1,280 @@
+"""The border around a program's patterns, and the lead-in before them: what makes a film of them certain to read.
+
+The patterns are shown in a rectangle, the monitor of their program, and the border lies around it: recovery needs to
+know nothing of it. Every bit in it is a pair of cells side by side, one lit and one dark; which of the two is lit is
+the bit.
+
+Notes
+-----
+Why pairs: a bit is the sign of a difference of neighbours. Exposure, and light that falls off towards the edges,
+scale both of them by the same factor; a camera's gamma is a rising curve, which keeps their order; a blur takes as much
+from one as it gives to the other, and keeps the sign as long as it is narrower than a cell. And whatever the bits are,
+half of the cells are lit: the mean light of the border is constant, and goes into the offset S of the glass.
+
+Why a Gray code: from one number to the next a single bit changes, so a frame exposed across a change is undecided in
+that bit (and in the parity) alone, and reads as one of the two patterns it saw, and never as a third.
+
+The number is shown along the top and along the bottom, there in reversed order: a frame that a rolling shutter tore
+shows two numbers, and what stands in the way of a bit above leaves it free below. At the left and the right a tick, the
+number's parity, is repeated from top to bottom: it shows in which rows the frame is torn.
+
+References
+----------
+F. Gray, Pulse code communication, US patent 2,632,058, 1953.
+"""
+
+from collections.abc import Iterator
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ValidationError, model_validator
+
+from storage.errors import OptionError
+from workflows.programs.parts import Record
+
+BITS = 12
+MOST = 2**BITS - 1
+"""Patterns that can be numbered: code 0 is the lead's."""
+TICKS = 8
+"""Times that the tick is repeated along each side."""
+LEAD = -1
+"""The number of what is shown before the first pattern and after the last."""
+LEAD_SECONDS = (1.0, 0.5, 0.5, 0.5, 0.5)
+"""Black, white, black, white, black."""
+LEAST_CELL = 4
+"""Pixels along the edge."""
+FAINT = 0.1
+"""The contrast that the median pair must have at least: less is noise, and no display in view."""
+CERTAIN = 0.5
+"""The contrast of a cell pair, as a share of the pairs' median, under which its bit is not certain."""
+
+Box = tuple[int, int, int, int]
+"""x, y, width, height in pixels."""
+
+
+class Border(Record):
+    """The border on a display of a size: where its cells are. All of it follows from the size.
+
+    Notes
+    -----
+    It is ``height // 20`` pixels thick. Along the top and the bottom lie 2 (BITS + 1) cells, along each side 2 TICKS,
+    all as thick as the border, as long as whole pixels allow, and centred; the corners stay black.
+    """
+
+    width: Annotated[int, Field(ge=1, le=16384)]
+    height: Annotated[int, Field(ge=1, le=16384)]
+
+    @model_validator(mode="after")
+    def _room_for_cells(self) -> "Border":
+        if min(self.top[0][2], self.left[0][3]) < LEAST_CELL:
+            raise ValueError(
+                f"a display of {self.width} x {self.height} pixels is too small for the cells of a border"
+            )
+        return self
+
+    @classmethod
+    def around(cls, width: int, height: int) -> "Border":
+        """On the display that a rectangle of ``width`` x ``height`` pixels just fits in.
+
+        Raises
+        ------
+        OptionError
+            If the rectangle is too small for the cells around it, or too large for a display.
+        """
+        thickness = height // 18
+        return cls.on(width + 2 * thickness, height + 2 * thickness)
+
+    @classmethod
+    def on(cls, width: int, height: int) -> "Border":
+        """On a display of ``width`` x ``height`` pixels.
+
+        Raises
+        ------
+        OptionError
+            If it is too small for the cells, or too large.
+        """
+        try:
+            return cls(width=width, height=height)
+        except ValidationError as error:
+            raise OptionError(
+                f"no border can be drawn on a display of {width} x {height} pixels: its cells need some 150 x 100, "
+                "and it may have 16384 x 16384",
+                field="monitor",
+            ) from error
+
+    @property
+    def thickness(self) -> int:
+        """Of the border, in pixels."""
+        return self.height // 20
+
+    @property
+    def inner(self) -> Box:
+        """The rectangle that the patterns are shown in."""
+        t = self.thickness
+        return t, t, self.width - 2 * t, self.height - 2 * t
+
+    @property
+    def top(self) -> tuple[Box, ...]:
+        """The cells along the top, as `code` orders them."""
+        return tuple((x, 0, size, self.thickness) for x, size in self._cells(self.width, BITS + 1))
+
+    @property
+    def bottom(self) -> tuple[Box, ...]:
+        """The cells along the bottom, as `code` orders them: from right to left."""
+        y = self.height - self.thickness
+        return tuple((x, y, w, h) for x, _, w, h in reversed(self.top))
+
+    @property
+    def left(self) -> tuple[Box, ...]:
+        """The cells along the left, as `tick` orders them: from top to bottom."""
+        return tuple((0, y, self.thickness, size) for y, size in self._cells(self.height, TICKS))
+
+    @property
+    def right(self) -> tuple[Box, ...]:
+        """The cells along the right, as `tick` orders them: from top to bottom."""
+        x = self.width - self.thickness
+        return tuple((x, y, w, h) for _, y, w, h in self.left)
+
+    def _cells(self, length: int, pairs: int) -> list[tuple[int, int]]:
+        """Where each cell of some pairs begins along an edge, and its length."""
+        size = (length - 2 * self.thickness) // (2 * pairs)
+        start = (length - 2 * pairs * size) // 2
+        return [(start + i * size, size) for i in range(2 * pairs)]
+
+
+class Step(NamedTuple):
+    """What is shown for a time.
+
+    Attributes
+    ----------
+    start, seconds : float
+        Since the beginning of the lead-in, and for how long.
+    number : int
+        The pattern's, or `LEAD`.
+    white : bool
+        In the lead: whether the rectangle is white, or black.
+    """
+
+    start: float
+    seconds: float
+    number: int
+    white: bool = False
+
+
+def schedule(count: int, rate: float) -> list[Step]:
+    """What is shown when: the lead-in, ``count`` patterns at ``rate`` a second, and the lead-out, which is the same.
+
+    Raises
+    ------
+    OptionError
+        If there are more patterns than can be numbered.
+    """
+    if count > MOST:
+        raise OptionError(
+            f"{count} patterns: a film may have {MOST}, show some of them in another one", limit=MOST
+        )
+    end = sum(LEAD_SECONDS)
+    patterns = [Step(end + n / rate, 1 / rate, n) for n in range(count)]
+    return [*_lead(0.0), *patterns, *_lead(end + count / rate)]
+
+
+def _lead(start: float) -> Iterator[Step]:
+    for i, seconds in enumerate(LEAD_SECONDS):
+        yield Step(start, seconds, LEAD, white=i % 2 == 1)
+        start += seconds
+
+
+def code(number: int) -> NDArray[np.bool_]:
+    """Which cells along the top and the bottom are lit for a pattern, (2 (BITS + 1),) bool.
+
+    Notes
+    -----
+    The Gray code of number + 1, most significant bit first, and at the end the parity that makes the number of set
+    bits even. A set bit is lit, dark; one that is not, dark, lit.
+    """
+    value = number + 1
+    gray = value ^ (value >> 1)
+    bits = [gray >> (BITS - 1 - i) & 1 for i in range(BITS)]
+    return _pairs([*bits, sum(bits) & 1])
+
+
+def tick(number: int) -> NDArray[np.bool_]:
+    """Which cells along each side are lit for a pattern, (2 TICKS,) bool: is number + 1 odd?"""
+    return _pairs([(number + 1) & 1] * TICKS)
+
+
+def _pairs(bits: list[int]) -> NDArray[np.bool_]:
+    lit = np.array(bits, bool)
+    return np.stack([lit, ~lit], axis=1).ravel()
+
+
+def draw(picture: NDArray[np.uint8], number: int, border: Border) -> NDArray[np.uint8]:
+    """A picture on the display with its border.
+
+    Parameters
+    ----------
+    picture : (rows, columns, 1 or 3) uint8
+        Stretched over the rectangle by repeating pixels; as it is if it has the rectangle's size.
+    number : int
+        The pattern's, or `LEAD`.
+    border : Border
+
+    Returns
+    -------
+    (height, width, 1 or 3) uint8
+    """
+    shown = np.zeros((border.height, border.width, picture.shape[2]), np.uint8)
+    x, y, width, height = border.inner
+    rows, columns = (
+        np.arange(height) * picture.shape[0] // height,
+        np.arange(width) * picture.shape[1] // width,
+    )
+    shown[y : y + height, x : x + width] = picture[rows[:, None], columns]
+    number_cells, tick_cells = code(number), tick(number)
+    for boxes, lit in (
+        (border.top, number_cells),
+        (border.bottom, number_cells),
+        (border.left, tick_cells),
+        (border.right, tick_cells),
+    ):
+        for i in np.flatnonzero(lit):
+            left, top, across, down = boxes[i]
+            shown[top : top + down, left : left + across] = 255
+    return shown
+
+
+def read(light: NDArray[np.floating]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """The patterns' numbers from the cells along an edge, as a camera saw them.
+
+    Parameters
+    ----------
+    light : (..., 2 (BITS + 1)) float
+        Mean camera values of the cells of `Border.top` or `Border.bottom`, in their order, in any unit and through
+        any rising curve. The inner half of each cell is best: it has least of its neighbours.
+
+    Returns
+    -------
+    number : (...) intp
+        The pattern's, or `LEAD`; where it is not certain, what comes closest.
+    certain : (...) bool
+        Whether every bit shows clearly and the parity is right. In a frame exposed across a change it is false unless
+        one of the two patterns was shown for most of the exposure.
+
+    Notes
+    -----
+    A pair of a and b has the contrast (a - b) / (a + b), which does not depend on how much light falls on it. A bit is
+    clear if its contrast has at least `CERTAIN` of the median's size, and that is not `FAINT`.
+    """
+    values = np.maximum(np.asarray(light, np.float64), 0)
+    first, second = values[..., ::2], values[..., 1::2]
+    contrast = (first - second) / np.maximum(first + second, np.finfo(np.float64).tiny)
+    size = np.abs(contrast)
+    usual = np.median(size, axis=-1, keepdims=True)
+    clear = np.all((size >= CERTAIN * usual) & (usual >= FAINT), axis=-1)
+    bits = contrast > 0
+    even = np.count_nonzero(bits, axis=-1) % 2 == 0
+    # A binary digit is the parity of the Gray digits down to it.
+    binary = np.cumsum(bits[..., :BITS], axis=-1) % 2
+    number: NDArray[np.intp] = binary @ (1 << np.arange(BITS)[::-1]) - 1
+    return number, clear & even

@@ -1,0 +1,274 @@
+"""A pattern program: what the monitor shows, as bits, as pictures, and as rows of the sensing matrix."""
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property
+from typing import Annotated, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import FailFast, Field, model_validator
+
+from workflows.images.resample import stretch
+from workflows.images.tone_curves import Curve, to_light
+from workflows.programs.nested_grids import Shape, chain, fitting, nested, sense
+from workflows.programs.parts import (
+    MOST_PATTERNS,
+    Bernoulli,
+    Constant,
+    Images,
+    Monitor,
+    Part,
+    Record,
+    Stripes,
+)
+from workflows.recovery.sensing import Sensing
+
+__all__ = ["Bernoulli", "Constant", "Images", "Monitor", "Program", "Stripes"]
+
+Value = TypeVar("Value", bound=np.generic)
+
+MOST_PARTS = 1000
+"""The chain of their grids is found in time in proportion to the square."""
+SENSING_BYTES = 512 << 20
+"""The largest sensing matrix that a worker is asked to hold."""
+
+
+class Program(Record):
+    """The patterns that a monitor shows, numbered from 0 through the parts, in order."""
+
+    monitor: Monitor
+    parts: Annotated[tuple[Part, ...], FailFast(), Field(min_length=1, max_length=MOST_PARTS)]
+
+    @model_validator(mode="after")
+    def _usable(self) -> "Program":
+        if self.count > MOST_PATTERNS:
+            raise ValueError(f"{self.count} patterns, more than the {MOST_PATTERNS} that a program may have")
+        for part in self.parts:
+            if isinstance(part, Bernoulli) and (
+                part.columns > self.monitor.width or part.rows > self.monitor.height
+            ):
+                raise ValueError(f"a grid of {part.columns} x {part.rows} is finer than the monitor's pixels")
+            if isinstance(part, Stripes):
+                size = self.monitor.width if part.axis == "x" else self.monitor.height
+                most = size.bit_length() - 1
+                if part.first + part.count > most:
+                    raise ValueError(
+                        f"{2 ** (part.first + part.count)} stripes are finer than the monitor's {size} pixels along "
+                        f"{part.axis}: first and count may add up to {most}"
+                    )
+        constants = [part.values for part in self.parts if isinstance(part, Constant)]
+        if not constants or np.any(np.ptp(np.concatenate(constants), axis=0) == 0):
+            raise ValueError(
+                "no two different constant levels: without them neither S nor rho can be told; "
+                'add a part like {"kind": "constant", "levels": [0, 1]}'
+            )
+        if all(isinstance(part, Constant) for part in self.parts):
+            raise ValueError("only constant parts: without patterns no T can be told")
+        size = 4 * sum(
+            p.count * p.columns * p.rows * p.channels for p in self.parts if isinstance(p, Bernoulli)
+        )
+        if size > SENSING_BYTES:
+            raise ValueError(
+                f"the patterns' blocks would take {size} bytes, more than {SENSING_BYTES}: "
+                "use coarser grids or fewer patterns"
+            )
+        return self
+
+    @cached_property
+    def starts(self) -> tuple[int, ...]:
+        """The first pattern of each part, and at the end the number of patterns."""
+        return tuple(np.cumsum([0, *(part.count for part in self.parts)]).tolist())
+
+    @property
+    def count(self) -> int:
+        """The number of patterns."""
+        return self.starts[-1]
+
+    @cached_property
+    def constants(self) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+        """The constant patterns: their numbers (k,) intp and the values sent to the monitor (k, 3) float32."""
+        found = [
+            (np.arange(start, start + part.count), part.values)
+            for start, part in zip(self.starts, self.parts, strict=False)
+            if isinstance(part, Constant)
+        ]
+        return np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
+
+    def constants_among(self, patterns: Sequence[int]) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+        """`constants`, less those that are not among some patterns: a video may lack some."""
+        numbers, sent = self.constants
+        there = np.isin(numbers, patterns)
+        return numbers[there], sent[there]
+
+    def values(
+        self, first: int, last: int, images: Sequence[NDArray[np.float32]] = ()
+    ) -> list[NDArray[np.float32]]:
+        """What is sent to the monitor for the patterns from ``first`` up to ``last``.
+
+        Returns
+        -------
+        list of (rows, columns, 1 or 3) float32
+            0 to 1, each on its own grid; patterns with an offset on the monitor's pixels.
+        """
+        return list(self._values(first, last, images))
+
+    def pictures(
+        self, first: int, last: int, images: Sequence[NDArray[np.float32]] = ()
+    ) -> Iterator[NDArray[np.float32]]:
+        """The pictures sent to the monitor for the patterns from ``first`` up to ``last``, one after another.
+
+        Parameters
+        ----------
+        first, last : int
+        images : sequence of (rows, columns, 1 or 3) float32
+            The images of the `Images` parts, in order, at any size.
+
+        Returns
+        -------
+        iterator of (height, width, 1 or 3) float32
+            0 to 1, at the monitor's resolution.
+        """
+        return self.mapped(lambda values: values, first, last, images)
+
+    def mapped(
+        self,
+        point: Callable[[NDArray[np.float32]], NDArray[Value]],
+        first: int,
+        last: int,
+        images: Sequence[NDArray[np.float32]] = (),
+    ) -> Iterator[NDArray[Value]]:
+        """As `pictures`, put through a function of each value alone: a tone curve, say.
+
+        A pattern has few blocks and the monitor many pixels, so the function is given whichever are fewer.
+        """
+        pixels = self.monitor.width * self.monitor.height
+        for values, offset in self._drawn(first, last, images):
+            if values.shape[0] * values.shape[1] <= pixels:
+                yield self._placed(point(values), offset)
+            else:
+                yield point(self._placed(values, offset))
+
+    def _values(
+        self, first: int, last: int, images: Sequence[NDArray[np.float32]]
+    ) -> Iterator[NDArray[np.float32]]:
+        """As `values`, one after another: at the monitor's resolution, all of them may be too much to hold."""
+        for values, offset in self._drawn(first, last, images):
+            yield values if offset is None else self._placed(values, offset)
+
+    def _placed(self, values: NDArray[Value], offset: tuple[int, int] | None) -> NDArray[Value]:
+        """Values of a pattern's grid on the monitor's pixels."""
+        picture = stretch(values, self.monitor.width, self.monitor.height)
+        return picture if offset is None else np.roll(picture, (-offset[1], -offset[0]), axis=(0, 1))
+
+    def _drawn(
+        self, first: int, last: int, images: Sequence[NDArray[np.float32]]
+    ) -> Iterator[tuple[NDArray[np.float32], tuple[int, int] | None]]:
+        """The patterns on their own grids, and the offsets dx and dy of those that have one."""
+        given = iter(images)
+        for start, part in zip(self.starts, self.parts, strict=False):
+            inside = range(max(first - start, 0), min(last - start, part.count))
+            if isinstance(part, Images):
+                of_part = [next(given) for _ in part.files]
+                yield from ((of_part[i], None) for i in inside)
+            elif isinstance(part, Constant):
+                yield from ((part.values[i].reshape(1, 1, 3), None) for i in inside)
+            elif isinstance(part, Stripes):
+                yield from ((part.values(i), None) for i in inside)
+            elif inside:
+                offsets = part.offsets(self.monitor)
+                for i in inside:
+                    dx, dy = offsets[i].tolist()
+                    yield part.pattern(i).astype(np.float32), (dx, dy) if part.offset else None
+
+    def bands(self) -> list[tuple[int, int]]:
+        """The columns and rows of the Bernoulli parts' grids that nest, from coarse to fine.
+
+        Those of the parts without an offset; if there are none, the longest chain of the others' that ends with
+        their finest.
+
+        Raises
+        ------
+        OptionError
+            If two grids without an offset do not nest.
+        """
+        parts = [part for part in self.parts if isinstance(part, Bernoulli)]
+        fixed = {(part.columns, part.rows) for part in parts if not part.offset}
+        return nested(fixed) if fixed else chain({(part.columns, part.rows) for part in parts})
+
+    def sensing(
+        self,
+        monitor_curve: Curve,
+        images: Sequence[NDArray[np.float32]] = (),
+    ) -> Sensing:
+        """The rows of the sensing matrix L_M (eq. 7) at every grid of the program, constants left out.
+
+        Parameters
+        ----------
+        monitor_curve : Curve
+            From the value sent to the light emitted.
+        images : sequence of (rows, columns, 1 or 3) float32
+            The images of the `Images` parts, in order, each on the coarsest grid that holds it
+            (`smallest_grid`).
+
+        Raises
+        ------
+        OptionError
+            If the grids of two bands without an offset do not nest, or the matrices would be too large with the
+            coarsest level alone.
+
+        Notes
+        -----
+        The levels are the `bands`; without any, grids of the images and stripes that nest. The finest levels are
+        left out if the matrices would be too large with them. A pattern is exact on its own grid and on every
+        finer one, and is listed from the first of them on. One with an offset is averaged over the cells, and
+        listed from the first level on whose cells are no larger than its blocks. What is left (a photograph,
+        say) is averaged over the cells of the finest.
+        """
+        shapes, channels = self._shapes(images), self.channels(images)
+        grids = fitting(
+            self.bands() or self._grids_of_others(images), 4 * channels * len(shapes), SENSING_BYTES
+        )
+        return sense(self._light(monitor_curve, images, grids[-1]), shapes, grids)
+
+    def channels(self, images: Sequence[NDArray[np.float32]] = ()) -> int:
+        """1 if every pattern that is not constant is grey, else 3."""
+        return max(shape.channels for shape in self._shapes(images))
+
+    def _light(
+        self, curve: Curve, images: Sequence[NDArray[np.float32]], finest: tuple[int, int]
+    ) -> Iterator[NDArray[np.float32]]:
+        """The light of the patterns that are not constant: on their own grids, with an offset on the finest."""
+        for start, part in zip(self.starts, self.parts, strict=False):
+            if isinstance(part, Bernoulli) and part.offset:
+                yield from part.means(self.monitor, *finest)  # no curve changes black and white
+            elif not isinstance(part, Constant):
+                yield from (to_light(v, curve) for v in self._values(start, start + part.count, images))
+
+    def _grids_of_others(self, images: Sequence[NDArray[np.float32]]) -> list[tuple[int, int]]:
+        """A chain of the grids of the images, and of those that hold the stripes along both axes."""
+        grids = {(image.shape[1], image.shape[0]) for image in images}
+        stripes = [part for part in self.parts if isinstance(part, Stripes)]
+        if stripes:
+            x, y = np.max([part.grid(part.count - 1) for part in stripes], axis=0).tolist()
+            widest = min(part.first for part in stripes) + 1
+            grids |= {(min(2**i, x), min(2**i, y)) for i in range(widest, max(x, y).bit_length())}
+        return chain(grids)
+
+    def _shapes(self, images: Sequence[NDArray[np.float32]]) -> list[Shape]:
+        """The shapes of the patterns that are not constant."""
+        given = iter(images)
+        shapes: list[Shape] = []
+        for part in self.parts:
+            if isinstance(part, Bernoulli):
+                shapes += [Shape(part.columns, part.rows, part.channels, part.offset)] * part.count
+            elif isinstance(part, Stripes):
+                shapes += [Shape(*part.grid(i), 1) for i in range(part.count)]
+            elif isinstance(part, Images):
+                sizes = [next(given).shape for _ in part.files]
+                shapes += [Shape(columns, rows, channels) for rows, columns, channels in sizes]
+        return shapes
+
+    @cached_property
+    def measured(self) -> NDArray[np.intp]:
+        """The numbers of the patterns that are not constant, in order: axis 1 of the measurements."""
+        return np.setdiff1d(np.arange(self.count), self.constants[0])

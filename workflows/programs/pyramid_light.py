@@ -1,0 +1,81 @@
+"""The light of a program's patterns on a pyramid over the monitor."""
+
+from collections.abc import Iterator, Sequence
+from itertools import compress, islice
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workflows.images.integer_formats import Codes, to_integers
+from workflows.images.resample import area_mean
+from workflows.images.tone_curves import Curve, to_light
+from workflows.programs.program import Program
+from workflows.recovery.pyramid import Pyramid, halve_codes
+from workflows.recovery.sensing import Patterns
+
+CODE = np.dtype(np.uint8)
+PATTERNS_BYTES = 256 << 20
+"""What a worker may hold of a program; with more patterns or pixels, the pyramid starts at cells of several pixels."""
+
+# Patterns written at a time: a node's are neighbours in memory.
+_BATCH = 24
+
+
+def pyramid_of(program: Program, channels: int) -> Pyramid:
+    """The pyramid that the patterns of a program are laid out on: over the monitor's pixels, or over cells of
+    2 x 2, 4 x 4, … of them where all of it would take more than `PATTERNS_BYTES`."""
+    columns, rows = program.monitor.width, program.monitor.height
+    while (pyramid := Pyramid.over(columns, rows)).nodes * channels * program.measured.size > PATTERNS_BYTES:
+        columns, rows = -(-columns // 2), -(-rows // 2)
+    return pyramid
+
+
+def lay_out(program: Program, curve: Curve, images: Sequence[NDArray[np.float32]] = ()) -> Patterns:
+    """Lay the patterns of a program, constants left out, on its pyramid.
+
+    Parameters
+    ----------
+    program : Program
+    curve : Curve
+        From the value sent to the monitor to the light emitted.
+    images : sequence of (rows, columns, 1 or 3) float32
+        The images of the `Images` parts, in order.
+
+    Returns
+    -------
+    Patterns
+    """
+    channels = program.channels(images)
+    pyramid = pyramid_of(program, channels)
+    columns, rows = pyramid.grids[0]
+    m = program.measured.size
+    code = np.empty((pyramid.nodes, channels * m), np.uint8)
+    measured = compress(
+        _codes(program, curve, images, columns, rows), np.isin(np.arange(program.count), program.measured)
+    )
+    planes = np.empty((channels, min(_BATCH, m), rows, columns), np.uint8)
+    for first in range(0, m, _BATCH):
+        batch = planes[:, : m - first]
+        for i, picture in enumerate(islice(measured, batch.shape[1])):
+            batch[:, i] = np.moveaxis(picture, 2, 0)
+        for c in range(channels):
+            at = c * m + first
+            code[: columns * rows, at : at + batch.shape[1]] = batch[c].reshape(-1, columns * rows).T
+    sums = np.empty(channels * m, np.uint16)
+    for level in range(len(pyramid.grids) - 1):
+        fine, coarse = (code[slice(*pyramid.starts[at : at + 2])] for at in (level, level + 1))
+        halve_codes(fine, *pyramid.grids[level], coarse, sums)
+    return Patterns(pyramid, channels, code)
+
+
+def _codes(
+    program: Program, curve: Curve, images: Sequence[NDArray[np.float32]], columns: int, rows: int
+) -> Iterator[Codes]:
+    """The light of a program's pictures on a grid, (rows, columns, 1 or 3) uint8 each."""
+    if (columns, rows) == (program.monitor.width, program.monitor.height):
+        return program.mapped(
+            lambda values: to_integers(to_light(values, curve), CODE), 0, program.count, images
+        )
+    # A cell's light is the mean of its pixels': rounding comes after it, the curve before.
+    lights = program.mapped(lambda values: to_light(values, curve), 0, program.count, images)
+    return (to_integers(area_mean(light, columns, rows), CODE) for light in lights)

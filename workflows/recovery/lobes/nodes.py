@@ -1,0 +1,122 @@
+"""Lobes as weights of single nodes, and the lobes again that such weights make."""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from workflows.recovery.lobes.footprint import NODES, Shown, fit_level, load, sample
+from workflows.recovery.lobes.mixture import Mixture
+from workflows.recovery.pyramid import Grids
+
+
+@njit(nogil=True, cache=True)
+def spread_lobes(
+    grids: Grids,
+    mixture: Mixture,
+    k: int,
+    resolution: float,
+    node: NDArray[np.int64],
+    weight: NDArray[np.float32],
+    end: NDArray[np.int64],
+) -> int:
+    """Write the nodes under k lobes and their weights, which sum to 1.
+
+    Parameters
+    ----------
+    grids : Grids
+    mixture : Mixture
+        Changed: lobes are moved to the levels of the resolution.
+    k : int
+    resolution : float
+        As in :func:`~workflows.recovery.lobes.footprint.fit_level`.
+    node, weight : (k NODES,)
+        Written, lobe after lobe; a node under two lobes is there twice.
+    end : (k or more,) int64
+        Written: where the nodes of each lobe end.
+
+    Returns
+    -------
+    int
+        How many there are.
+    """
+    lobes, level = mixture.lobes, mixture.level
+    terms, n, total = np.empty((1, NODES), np.float32), 0, 0.0
+    for i in range(k):
+        total += lobes[i, 0]
+    for i in range(k):
+        level[i] = fit_level(lobes[i], level[i], grids.columns, resolution)
+        found = sample(lobes[i], level[i], grids, node[n:], terms)
+        for j in range(found):
+            weight[n + j] = terms[0, j] * lobes[i, 0] / total
+        n += found
+        end[i] = n
+    return n
+
+
+@njit(nogil=True, cache=True)
+def gather_lobes(
+    grids: Grids,
+    node: NDArray[np.int64],
+    weight: NDArray[np.float32],
+    end: NDArray[np.int64],
+    mixture: Mixture,
+    k: int,
+    resolution: float,
+) -> None:
+    """Give k lobes the moments of the weights under them: what :func:`spread_lobes` did, the other way round.
+
+    Parameters
+    ----------
+    grids : Grids
+    node, weight, end
+        As from :func:`spread_lobes`, with any weights.
+    mixture : Mixture
+        Changed; a lobe with no weight left stays as it is, but for its own.
+    k : int
+    resolution : float
+        As in :func:`~workflows.recovery.lobes.footprint.fit_level`.
+    """
+    columns, starts, level = grids.columns, grids.starts, mixture.level
+    begin = 0
+    for i in range(k):
+        spacing, lobe = 2.0 ** level[i], mixture.lobes[i]
+        total, sx, sy, sxx, sxy, syy = 1e-30, 0.0, 0.0, 0.0, 0.0, 0.0
+        for j in range(begin, end[i]):
+            row, column = divmod(node[j] - starts[level[i]], columns[level[i]])
+            # about the lobe's centre, for the squares of small numbers lose nothing
+            w, x, y = weight[j], (column + 0.5) * spacing - lobe[1], (row + 0.5) * spacing - lobe[2]
+            total += w
+            sx, sy = sx + w * x, sy + w * y
+            sxx, sxy, syy = sxx + w * x * x, sxy + w * x * y, syy + w * y * y
+        begin = end[i]
+        lobe[0] = total
+        if total > 1e-6:
+            x, y = sx / total, sy / total
+            least = (0.3 * spacing) ** 2
+            lobe[1], lobe[2] = lobe[1] + x, lobe[2] + y
+            lobe[3] = math.sqrt(max(sxx / total - x * x, least))
+            lobe[4] = (sxy / total - x * y) / lobe[3]
+            lobe[5] = math.sqrt(max(syy / total - y * y - lobe[4] ** 2, least))
+            level[i] = fit_level(lobe, level[i], columns, resolution)
+
+
+@njit(nogil=True, cache=True)
+def rows_of(shown: Shown, node: NDArray[np.int64], n: int, A: NDArray[np.float32]) -> None:
+    """Write what the measurements of a pixel would be if all light came from a node.
+
+    Parameters
+    ----------
+    shown : Shown
+    node : (n or more,) int64
+    n : int
+    A : (n or more, groups (m + 2)) float32
+        Written.
+    """
+    m = shown.m
+    for g in range(shown.groups):
+        to = g * (m + 2)
+        load(shown.code, shown.first + g * m, m, node, n, A, to)
+        for i in range(n):
+            A[i, to + m], A[i, to + m + 1] = -1.0, 1.0

@@ -1,0 +1,204 @@
+"""The posterior mean of T about a first estimate: what the lobes of a pixel do not say, its measurements still may."""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from workflows.recovery.lobes.likelihood import scatter
+from workflows.recovery.solvers import inner, subtract
+
+# Standard deviation of the offset of a group, in units of T: S is known better than that.
+_OFFSET = 0.03
+# Conjugate gradients end when this share of the squared right-hand side is left.
+_ENOUGH = 1e-5
+# T is never known to be the first estimate.
+_LEAST_KAPPA = 1e-5
+
+
+@njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})
+def add_moments(
+    A: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    mean: NDArray[np.float32],
+    square: NDArray[np.float32],
+) -> None:
+    """Add the weighted sums of the rows of A, and of their squares, to `mean` and `square`."""
+    n = A.shape[0]
+    # two rows at a time: the sums are read and written half as often
+    for i in range(0, n - 1, 2):
+        a, b, v, w = A[i], A[i + 1], weight[i], weight[i + 1]
+        for j in range(mean.size):
+            mean[j] += v * a[j] + w * b[j]
+            square[j] += v * a[j] * a[j] + w * b[j] * b[j]
+    if n % 2:
+        a, v = A[n - 1], weight[n - 1]
+        for j in range(mean.size):
+            mean[j] += v * a[j]
+            square[j] += v * a[j] * a[j]
+
+
+@njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})
+def add_products(
+    A: NDArray[np.float32],
+    scale: np.float32,
+    weight: NDArray[np.float32],
+    p: NDArray[np.float32],
+    out: NDArray[np.float32],
+) -> None:
+    """Add ``scale A' diag(weight) A p`` to `out`."""
+    n = A.shape[0]
+    # four rows at a time, while they are in the cache
+    for i in range(0, n - 3, 4):
+        a, b, c, d = A[i], A[i + 1], A[i + 2], A[i + 3]
+        s, t, u, v = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+        for j in range(p.size):
+            s += a[j] * p[j]
+            t += b[j] * p[j]
+            u += c[j] * p[j]
+            v += d[j] * p[j]
+        s *= scale * weight[i]
+        t *= scale * weight[i + 1]
+        u *= scale * weight[i + 2]
+        v *= scale * weight[i + 3]
+        for j in range(p.size):
+            out[j] += s * a[j] + t * b[j] + u * c[j] + v * d[j]
+    for i in range(n - n % 4, n):
+        subtract(out, -scale * weight[i] * inner(A[i], p), A[i])
+
+
+@njit(nogil=True, cache=True)
+def unresolved(
+    y: NDArray[np.float32],
+    f: NDArray[np.float32],
+    mean: NDArray[np.float32],
+    square: NDArray[np.float32],
+    variance: NDArray[np.float32],
+    groups: int,
+    total: NDArray[np.float32],
+) -> tuple[float, float]:
+    """kappa about a T, and the variance of measurements for what is finer than its nodes.
+
+    Parameters
+    ----------
+    y, f : (groups (m + 2),) float32
+        Measurements, and their prediction with the offsets.
+    mean, square : like y
+        What the nodes of T make of the measurements, and of their squares, in the mean.
+    variance : like y
+        The camera's variance.
+    groups : int
+    total : like y
+        Written: the variance, and kappa times the share of the contrast that is within nodes.
+
+    Returns
+    -------
+    kappa, misfit : float
+        As from :func:`~workflows.recovery.lobes.likelihood.scatter`.
+    """
+    m = y.size // groups - 2
+    kappa, misfit = scatter(y, f, mean, variance, groups, 0, _LEAST_KAPPA)
+    for g in range(groups):
+        for j in range(g * (m + 2), (g + 1) * (m + 2)):
+            within = kappa * max(1 - square[j], 0.0) if j < g * (m + 2) + m else 0.0
+            total[j] = variance[j] + within
+    return kappa, misfit
+
+
+@njit(nogil=True, cache=True)
+def update(
+    A: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    y: NDArray[np.float32],
+    variance: NDArray[np.float32],
+    groups: int,
+    offset: NDArray[np.float64],
+    passes: int,
+    steps: int,
+) -> tuple[float, float]:
+    """Replace the weights of a T by their posterior mean given the measurements, again and again.
+
+    Parameters
+    ----------
+    A : (n, groups (m + 2)) float32
+        As from :func:`~workflows.recovery.lobes.nodes.rows_of`.
+    weight : (n,) float32
+        Zero or more, of sum 1; changed.
+    y, variance : (groups (m + 2),) float32
+    groups : int
+    offset : (groups,) float64
+        Changed.
+    passes : int
+        Each starts from the weights that the one before left.
+    steps : int
+        Most conjugate gradients in a pass.
+
+    Returns
+    -------
+    kappa, misfit : float
+        As from :func:`unresolved`, before the last pass. The misfit is an estimate of the squared error of T times a
+        pattern that it was not fitted to.
+
+    Notes
+    -----
+    A priori T ~ N(t, kappa diag t): what a sample of 1 / kappa rays of t would be. With K = kappa A' diag(t) A + V, the
+    posterior mean is ``t + kappa t * A K^-1 (y - A' t)``; negative weights are cut off. K is never built:
+    ``K x = r`` is solved by conjugate gradients, of which the diagonal is the preconditioner.
+    """
+    n, M = A.shape
+    m = M // groups - 2
+    f, total, diagonal = np.empty_like(y), np.empty_like(y), np.empty_like(y)
+    r, x, p, z, Kp = np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y)
+    mean, square = np.empty_like(y), np.empty_like(y)
+    kappa, misfit = 0.0, 0.0
+    for _ in range(passes):
+        for j in range(M):
+            mean[j] = square[j] = 0
+        add_moments(A, weight, mean, square)
+        for g in range(groups):
+            for j in range(g * (m + 2), (g + 1) * (m + 2)):
+                f[j] = offset[g] + mean[j]
+        kappa, misfit = unresolved(y, f, mean, square, variance, groups, total)
+        for j in range(M):
+            diagonal[j] = total[j] + np.float32(_OFFSET**2) + np.float32(kappa) * square[j]
+        for j in range(M):
+            # what was not measured stays as predicted
+            r[j] = y[j] - f[j] if variance[j] < np.inf else 0.0
+            total[j] = total[j] if variance[j] < np.inf else 0.0
+            x[j], z[j] = 0.0, r[j] / diagonal[j]
+            p[j] = z[j]
+        left = inner(r, z)
+        enough = left * np.float32(_ENOUGH)
+        for _ in range(steps):
+            if left <= enough:
+                break
+            for j in range(M):
+                Kp[j] = total[j] * p[j]
+            for g in range(groups):
+                lean = np.float32(0)
+                for j in range(g * (m + 2), (g + 1) * (m + 2)):
+                    lean += p[j]
+                for j in range(g * (m + 2), (g + 1) * (m + 2)):
+                    Kp[j] += np.float32(_OFFSET**2) * lean
+            add_products(A, np.float32(kappa), weight, p, Kp)
+            for j in range(M):
+                Kp[j] = Kp[j] if variance[j] < np.inf else 0.0
+            length = left / inner(p, Kp)
+            subtract(x, -length, p)
+            subtract(r, length, Kp)
+            for j in range(M):
+                z[j] = r[j] / diagonal[j]
+            now = inner(r, z)
+            for j in range(M):
+                p[j] = z[j] + now / left * p[j]
+            left = now
+        for g in range(groups):
+            for j in range(g * (m + 2), (g + 1) * (m + 2)):
+                offset[g] += _OFFSET**2 * x[j]
+        whole = 0.0
+        for i in range(n):
+            weight[i] *= max(1 + np.float32(kappa) * inner(A[i], x), np.float32(0))
+            whole += weight[i]
+        if whole > 0:
+            for i in range(n):
+                weight[i] /= np.float32(whole)
+    return kappa, misfit

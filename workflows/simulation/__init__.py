@@ -1,0 +1,1 @@
+"""Traced scenes, for the demo and the tests."""
