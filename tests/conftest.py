@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import pytest
 
 from storage.database.engine import open_engine
-from tests import postgres
-from tests.s3 import s3, s3_server
+from tests.parts import postgres
+from tests.parts.s3 import s3, s3_server
 
 AT_LENGTH = 3
 """What `--times` is from which on tests at length are run too."""

@@ -14,8 +14,8 @@ import pytest
 from playwright.sync_api import Browser, Page, Route, expect
 
 from tests.browser.pages import MINUTE, ZIP, asks_before_it_closes, opened
-from tests.disks import small_disk
 from tests.end_to_end.conftest import Service, paused, serving
+from tests.parts.disks import small_disk
 
 pytestmark = pytest.mark.full
 

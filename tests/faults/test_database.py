@@ -8,7 +8,7 @@ import pytest
 
 from tests.faults.conftest import Known, check, prepared
 from tests.faults.rig import Rig, Row, freeze, thaw
-from tests.postgres import TEMPLATE, Server
+from tests.parts.postgres import TEMPLATE, Server
 from tests.services.cluster.clusters import wait
 
 pytestmark = [pytest.mark.full, pytest.mark.timeout(3600)]

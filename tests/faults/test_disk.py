@@ -12,10 +12,10 @@ import pytest
 
 from storage.layout import mattes
 from storage.objects.store import Objects
-from tests.disks import small_disk
 from tests.end_to_end.conftest import Service, paused, serving
 from tests.faults.conftest import check
 from tests.faults.rig import Row, stored
+from tests.parts.disks import small_disk
 from tests.services.cluster.clusters import wait
 
 pytestmark = [pytest.mark.full, pytest.mark.timeout(900)]

@@ -13,7 +13,7 @@ import pytest
 
 from tests.faults.conftest import Known, check, prepared
 from tests.faults.rig import Rig, Row
-from tests.s3 import BUCKET, KEYS
+from tests.parts.s3 import BUCKET, KEYS
 
 pytestmark = [pytest.mark.full, pytest.mark.timeout(3600), pytest.mark.long]
 

@@ -15,8 +15,8 @@ from storage.database.engine import open_engine, writing
 from storage.errors import NoRoom
 from storage.objects.store import Objects
 from storage.records import uploads
-from tests.disks import small_disk
-from tests.postgres import TEMPLATE, Server
+from tests.parts.disks import small_disk
+from tests.parts.postgres import TEMPLATE, Server
 from tests.services.cluster.clusters import wait
 
 SIZE = 12 << 20

@@ -19,9 +19,9 @@ from sqlalchemy import update
 from services.client import ServiceError
 from storage.database.engine import open_engine, writing
 from storage.database.tables import uploads as table
-from tests.disks import small_disk
 from tests.end_to_end.captures.test_bad_input import check_problem
 from tests.end_to_end.conftest import Service, paused, serving
+from tests.parts.disks import small_disk
 
 pytestmark = pytest.mark.full
 

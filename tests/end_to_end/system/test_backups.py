@@ -12,7 +12,7 @@ import pytest
 from storage.objects.store import Objects
 from tests.end_to_end.conftest import Service, digests, paused, serving
 from tests.faults.rig import stored
-from tests.postgres import Server
+from tests.parts.postgres import Server
 
 
 def envmatte(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:

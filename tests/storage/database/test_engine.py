@@ -14,7 +14,7 @@ from storage.database.engine import open_engine, reading, writing
 from storage.database.tables import clock, metadata
 from storage.errors import InvalidInput, Unavailable
 from storage.records import job_log, jobs, tiles
-from tests.postgres import Server
+from tests.parts.postgres import Server
 
 
 def test_sqlite_is_set_up(sqlite: str) -> None:

@@ -22,7 +22,7 @@ from storage.errors import Conflict, NotFound
 from storage.layout.uploads import Part
 from storage.records import captures, idempotency, job_log, jobs, mattes, programs, uploads
 from storage.records import tiles as tile_records
-from tests.postgres import Server
+from tests.parts.postgres import Server
 
 BEFORE_REVISIONS = Path(__file__).with_name("before_revisions.sql")
 OPEN = """
