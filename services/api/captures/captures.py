@@ -4,13 +4,13 @@ from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
 import anyio.to_thread
-from fastapi import APIRouter, Header, Query, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
-from sqlalchemy import Row
-from sqlalchemy.exc import IntegrityError
+from sqlalchemy import Connection, Row
 
 from services.api.context import After, Context, Limit, Needs
 from services.api.http.bodies import announced, read_json, schema_of, store_body
+from services.api.http.idempotency import IdempotencyKey, find_earlier, idempotent
 from services.api.http.responses import answered, time_of
 from services.api.quotas import admit, admit_upload
 from services.runtime import tracing
@@ -24,7 +24,7 @@ from storage.layout import captures as stored_captures
 from storage.layout import uploads as stored_uploads
 from storage.layout.captures import Stack
 from storage.layout.uploads import Part
-from storage.records import captures, idempotency, jobs, uploads
+from storage.records import captures, jobs, uploads
 from workflows.images.integer_formats import encode_png
 from workflows.ingest.bundle import Bundle
 
@@ -81,9 +81,6 @@ class FromUpload(BaseModel):
     webhook: str | None = Field(None, description="URL, https, that is told when the capture is ingested.")
 
 
-Key = Annotated[str | None, Header(alias="Idempotency-Key", max_length=256)]
-
-
 @router.post(
     "/captures",
     status_code=201,
@@ -102,7 +99,7 @@ async def upload(
     response: Response,
     name: Annotated[str, Query(max_length=200, description="A name for people.")] = "",
     webhook: Annotated[str | None, Query(description="URL, https, that is told when it is ingested.")] = None,
-    idempotency_key: Key = None,
+    idempotency_key: IdempotencyKey = None,
 ) -> Capture:
     """Make a capture: the body is its ZIP, format envmatte-capture/1, or names the upload that has brought it.
 
@@ -177,9 +174,9 @@ async def _from_body(
     await anyio.to_thread.run_sync(sender.check, webhook, context.settings)  # which looks its host up
     limit = context.settings.upload_bytes
     length = announced(request, limit)
-    row = await anyio.to_thread.run_sync(_made, context, key)
-    if row is not None:
-        return row
+    earlier = await anyio.to_thread.run_sync(_find_earlier, context, key)
+    if earlier is not None:
+        return earlier
     await anyio.to_thread.run_sync(_admit, context, length)
     capture = new_id()
     try:
@@ -199,9 +196,9 @@ def _from_upload(context: Context, wanted: FromUpload, key: str | None) -> Row[A
     """Make a capture from a finished upload, under the same id; a repeat answers with it."""
     upload = wanted.upload
     sender.check(wanted.webhook, context.settings)
-    made = _made(context, key)
-    if made is not None:
-        return made
+    earlier = _find_earlier(context, key)
+    if earlier is not None:
+        return earlier
     with reading(context.engine) as c:
         if captures.exists(c, upload):
             return captures.get(c, upload)
@@ -226,10 +223,8 @@ def _from_upload(context: Context, wanted: FromUpload, key: str | None) -> Row[A
         raise
 
 
-def _made(context: Context, key: str | None) -> Row[Any] | None:
-    with reading(context.engine) as c:
-        made = idempotency.made_by(c, key, CALL) if key else None
-        return captures.get(c, made) if made else None
+def _find_earlier(context: Context, key: str | None) -> Row[Any] | None:
+    return find_earlier(context.engine, key, CALL, captures.get)
 
 
 def _admit(context: Context, length: int) -> None:
@@ -251,28 +246,23 @@ def _register(
     stored_uploads.seal(context.objects, capture, parts)
     with stored_uploads.read(context.objects, capture) as file:
         manifest = Bundle(file, context.settings.limits).manifest
-    try:
-        with writing(context.engine) as c:
-            if resumable and not uploads.forget(c, capture):
-                raise NotFound(f"upload {capture} is gone")
-            size = sum(part.size for part in parts)
-            admit(c, context.settings, captures=1, jobs=1, size=size)
-            job = jobs.add(c, "ingest", capture, {}, trace=tracing.asked_by(), webhook=webhook)
-            captures.add(
-                c,
-                capture,
-                job,
-                name=name or manifest.name,
-                seconds=context.settings.capture_seconds,
-                bytes=size,
-                frames=len(manifest.frames) or manifest.program.count,
-                program=manifest.program.model_dump(mode="json"),
-            )
-            if key:
-                idempotency.remember(c, key, CALL, capture)
-            return captures.get(c, capture)
-    except IntegrityError:  # a repeat with the same key was quicker
-        row = _made(context, key)
-        if row is None:
-            raise
-        return row
+
+    def create(c: Connection) -> str:
+        if resumable and not uploads.forget(c, capture):
+            raise NotFound(f"upload {capture} is gone")
+        size = sum(part.size for part in parts)
+        admit(c, context.settings, captures=1, jobs=1, size=size)
+        job = jobs.add(c, "ingest", capture, {}, trace=tracing.asked_by(), webhook=webhook)
+        captures.add(
+            c,
+            capture,
+            job,
+            name=name or manifest.name,
+            seconds=context.settings.capture_seconds,
+            bytes=size,
+            frames=len(manifest.frames) or manifest.program.count,
+            program=manifest.program.model_dump(mode="json"),
+        )
+        return capture
+
+    return idempotent(context.engine, key, CALL, captures.get, create)

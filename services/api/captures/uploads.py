@@ -2,10 +2,10 @@
 
 from datetime import UTC, datetime
 from email.utils import format_datetime
-from typing import Annotated, Any
+from typing import Any
 
 import anyio.to_thread
-from fastapi import APIRouter, Depends, Header, Request, Response
+from fastapi import APIRouter, Depends, Request, Response
 from sqlalchemy import Row
 from sqlalchemy.exc import IntegrityError
 from starlette.requests import ClientDisconnect
@@ -22,6 +22,7 @@ from services.api.captures.tus import (
 )
 from services.api.context import Context, Needs
 from services.api.http.bodies import too_large
+from services.api.http.idempotency import IdempotencyKey
 from services.api.quotas import admit_upload
 from services.runtime.problems import TooLarge
 from storage.database.engine import reading, writing
@@ -51,7 +52,7 @@ def get_protocol(context: Needs, response: Response) -> None:
 async def create_upload(
     context: Needs,
     request: Request,
-    idempotency_key: Annotated[str | None, Header(max_length=256)] = None,
+    idempotency_key: IdempotencyKey = None,
 ) -> Response:
     """Start an upload of `Upload-Length` bytes; the body may be the first of them.
 

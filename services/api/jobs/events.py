@@ -110,7 +110,7 @@ def _is_over(job: Job) -> bool:
 def _read(context: Context, id: str) -> Job:
     context.check()
     with reading(context.engine) as c:
-        return Job.of(c, jobs.get(c, id))
+        return Job.read(c, id)
 
 
 def _mark(job: Job) -> str:

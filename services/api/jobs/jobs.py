@@ -4,12 +4,13 @@ import time
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Depends, Header, Query, Request, Response
+from fastapi import APIRouter, Depends, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection, Row
 
 from services.api.context import After, Limit, Needs
 from services.api.http.bodies import read_json, schema_of
+from services.api.http.idempotency import IdempotencyKey, idempotent
 from services.api.http.responses import time_of
 from services.api.jobs.eta import seconds_left
 from services.api.jobs.wait_reason import reason
@@ -22,7 +23,7 @@ from storage.database.rows import new_id, page
 from storage.database.tables import jobs as table
 from storage.errors import Conflict
 from storage.layout import composites
-from storage.records import captures, idempotency, job_log, jobs, leases, mattes
+from storage.records import captures, job_log, jobs, leases, mattes
 from storage.records import tiles as tile_records
 from storage.records.leases import Sign
 from workflows.mattes.options import describe_options, parse_options
@@ -78,6 +79,11 @@ class Job(BaseModel):
     created_at: datetime
     started_at: datetime | None
     finished_at: datetime | None
+
+    @classmethod
+    def read(cls, connection: Connection, id: str) -> "Job":
+        """A job by its id; `NotFound` if there is none."""
+        return cls.of(connection, jobs.get(connection, id))
 
     @classmethod
     def of(cls, connection: Connection, row: Row[Any], sign: Sign | None = None) -> "Job":
@@ -162,31 +168,28 @@ def post_job(
     context: Needs,
     request: Annotated[JobRequest, Depends(_job_request)],
     response: Response,
-    idempotency_key: Annotated[str | None, Header(alias="Idempotency-Key", max_length=256)] = None,
+    idempotency_key: IdempotencyKey = None,
 ) -> Job:
     """Queue the recovery of a matte; the capture may still be ingesting."""
     options = parse_options(request.options)
     sender.check(request.webhook, context.settings)
-    with writing(context.engine) as c:
-        job = idempotency.made_by(c, idempotency_key, CALL) if idempotency_key else None
-        if job is None:
-            capture = captures.get(c, request.capture)
-            if capture.state == "failed":
-                raise Conflict(f"capture {capture.id} failed: {capture.problem['detail']}")
-            # Grids that do not nest are refused now, and not by the job.
-            Program.model_validate(capture.program).bands()
-            admit(c, context.settings, jobs=1)
-            matte = new_id()
-            chosen = options.model_dump(mode="json")
-            job = jobs.add(
-                c, "recover", capture.id, chosen, matte, tracing.asked_by(), webhook=request.webhook
-            )
-            mattes.add(c, matte, capture.id, job, chosen, context.settings.matte_seconds)
-            if idempotency_key:
-                idempotency.remember(c, idempotency_key, CALL, job)
-        made = Job.of(c, jobs.get(c, job))
-    response.headers["Location"] = f"/v1/jobs/{job}"
-    return made
+
+    def create(c: Connection) -> str:
+        capture = captures.get(c, request.capture)
+        if capture.state == "failed":
+            raise Conflict(f"capture {capture.id} failed: {capture.problem['detail']}")
+        # Grids that do not nest are refused now, and not by the job.
+        Program.model_validate(capture.program).bands()
+        admit(c, context.settings, jobs=1)
+        matte = new_id()
+        chosen = options.model_dump(mode="json")
+        job = jobs.add(c, "recover", capture.id, chosen, matte, tracing.asked_by(), webhook=request.webhook)
+        mattes.add(c, matte, capture.id, job, chosen, context.settings.matte_seconds)
+        return job
+
+    job = idempotent(context.engine, idempotency_key, CALL, Job.read, create)
+    response.headers["Location"] = f"/v1/jobs/{job.id}"
+    return job
 
 
 @router.get("/jobs")
@@ -201,7 +204,7 @@ def list_jobs(context: Needs, limit: Limit = 100, after: After = None, state: St
 def get_job(context: Needs, id: str) -> Job:
     """A job."""
     with reading(context.engine) as c:
-        return Job.of(c, jobs.get(c, id))
+        return Job.read(c, id)
 
 
 @router.get("/jobs/{id}/log")
@@ -220,7 +223,7 @@ def cancel_job(context: Needs, id: str) -> Job:
     """Cancel a job; what it wrote is removed as soon as its running tasks have ended."""
     with writing(context.engine) as c:
         jobs.cancel(c, id)
-        return Job.of(c, jobs.get(c, id))
+        return Job.read(c, id)
 
 
 @router.post("/jobs/{id}/retry", status_code=202)
@@ -234,7 +237,7 @@ def retry_job(context: Needs, id: str) -> Job:
             admit(c, context.settings, jobs=1)
         tile_records.retry(c, id, anew=memory != context.settings.ingest_memory, trace=tracing.asked_by())
         job_kinds.KINDS[row.kind].retried(c, row)
-        return Job.of(c, jobs.get(c, id))
+        return Job.read(c, id)
 
 
 @router.delete("/jobs/{id}", status_code=204)

@@ -5,23 +5,23 @@ from typing import Any
 import anyio.to_thread
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import StreamingResponse
-from sqlalchemy import Row
-from sqlalchemy.exc import IntegrityError
+from sqlalchemy import Connection, Row
 
-from services.api.captures.captures import ONLY, Key
+from services.api.captures.captures import ONLY
 from services.api.context import Context, Needs
 from services.api.http.bodies import announced, store_body
+from services.api.http.idempotency import IdempotencyKey, find_earlier, idempotent
 from services.api.mattes.mattes import Matte
 from services.api.quotas import admit
 from services.runtime.problems import WrongMediaType
-from storage.database.engine import reading, writing
+from storage.database.engine import reading
 from storage.database.rows import new_id
-from storage.errors import NoRoom
+from storage.errors import NoRoom, NotFound
 from storage.layout import mattes as stored_mattes
 from storage.layout import uploads as stored_uploads
 from storage.layout.matte_archive import Archive
 from storage.layout.uploads import Part
-from storage.records import idempotency, mattes, uploads
+from storage.records import mattes, uploads
 from workflows.mattes.imports.importing import take_in
 
 router = APIRouter(tags=["mattes"])
@@ -56,7 +56,7 @@ def get_archive(context: Needs, id: str) -> StreamingResponse:
     openapi_extra={"requestBody": {"content": {ZIP: {"schema": {"type": "string", "format": "binary"}}}}},
 )
 async def post_archive(
-    context: Needs, request: Request, response: Response, idempotency_key: Key = None
+    context: Needs, request: Request, response: Response, idempotency_key: IdempotencyKey = None
 ) -> Matte:
     """Make a matte of an archive: the body is what `GET /v1/mattes/{id}/archive` gave.
 
@@ -74,9 +74,9 @@ async def _from_body(context: Context, request: Request, key: str | None) -> Row
     """Stream an archive into the store, and make a matte of it; the archive is gone in the end."""
     limit = context.settings.upload_bytes
     length = announced(request, limit)
-    row = await anyio.to_thread.run_sync(_made, context, key)
-    if row is not None:
-        return row
+    earlier = await anyio.to_thread.run_sync(find_earlier, context.engine, key, CALL, mattes.get)
+    if earlier is not None:
+        return earlier
     await anyio.to_thread.run_sync(_admit, context, length)
     matte = new_id()
     try:
@@ -96,32 +96,24 @@ def _import(context: Context, matte: str, size: int, key: str | None) -> Row[Any
         made = take_in(file, objects, matte, context.settings.limits)
     stored = sum(objects.sizes(stored_mattes.path(matte)).values())
     kept = context.settings.matte_seconds
+
+    def create(c: Connection) -> str:
+        admit(c, context.settings, size=stored)
+        mattes.add_imported(c, matte, made.attributes["options"], made.figures, stored, kept)
+        return matte
+
     try:
-        with writing(context.engine) as c:
-            admit(c, context.settings, size=stored)
-            mattes.add_imported(c, matte, made.attributes["options"], made.figures, stored, kept)
-            if key:
-                idempotency.remember(c, key, CALL, matte)
-            return mattes.get(c, matte)
-    # Of any other error it is not known whether the row was written; without one the matte is swept.
-    except NoRoom:
+        row = idempotent(context.engine, key, CALL, mattes.get, create)
+    except (NoRoom, NotFound):
+        # After any other error the row may have been written; if it was not, the coordinator sweeps the matte.
         objects.delete(stored_mattes.path(matte))
         raise
-    except IntegrityError:  # a repeat with the same key was quicker
+    if row.id != matte:  # a repeat with the same key was quicker
         objects.delete(stored_mattes.path(matte))
-        row = _made(context, key)
-        if row is None:
-            raise
-        return row
+    return row
 
 
 def _admit(context: Context, length: int) -> None:
     with reading(context.engine) as c:
         admit(c, context.settings, size=length)
         uploads.check_room(c, context.objects, 2 * length)  # the archive, and the matte beside it
-
-
-def _made(context: Context, key: str | None) -> Row[Any] | None:
-    with reading(context.engine) as c:
-        made = idempotency.made_by(c, key, CALL) if key else None
-        return mattes.get(c, made) if made else None

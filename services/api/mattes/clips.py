@@ -7,19 +7,20 @@ from typing import Any, BinaryIO
 import anyio.to_thread
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import StreamingResponse
-from sqlalchemy.exc import IntegrityError
+from sqlalchemy import Connection
 
 from services.api.context import Context, Needs
 from services.api.http.bodies import announced, store_body
+from services.api.http.idempotency import find_earlier, idempotent
 from services.api.jobs.jobs import Job
 from services.api.quotas import admit, admit_upload
 from services.runtime import tracing
 from services.webhooks import sender
-from storage.database.engine import reading, writing
+from storage.database.engine import reading
 from storage.database.rows import new_id
 from storage.errors import Conflict, Corrupt
 from storage.layout import composites
-from storage.records import idempotency, jobs, mattes, tiles
+from storage.records import jobs, mattes, tiles
 
 router = APIRouter(tags=["jobs"])
 CALL = "POST /v1/mattes/{id}/composite"
@@ -61,19 +62,21 @@ async def composite_clip(
     limit = context.settings.upload_bytes
     length = announced(request, limit, CLIP)
     key = request.headers.get("idempotency-key", "")[:256]
-    made = await anyio.to_thread.run_sync(_check, context, matte, key, length)
-    job = made or new_id()
-    if made is None:
+    job = await anyio.to_thread.run_sync(find_earlier, context.engine, key, CALL, Job.read)
+    if job is None:
+        await anyio.to_thread.run_sync(_admit, context, matte, length)
+        id = new_id()
         try:
-            size = await store_body(request, context.objects, composites.clip_path(job), limit, CLIP)
-            job = await anyio.to_thread.run_sync(_queue, context, job, matte, options, key, size, webhook)
+            size = await store_body(request, context.objects, composites.clip_path(id), limit, CLIP)
+            job = await anyio.to_thread.run_sync(_queue, context, id, matte, options, key, size, webhook)
         except Exception:
             # Not when cancelled, where `_queue` may still be at work: what has no job the coordinator sweeps.
-            await anyio.to_thread.run_sync(context.objects.delete, composites.path(job))
+            await anyio.to_thread.run_sync(context.objects.delete, composites.path(id))
             raise
-    answer = await anyio.to_thread.run_sync(_job, context, job)
-    headers = {"Location": f"/v1/jobs/{job}"}
-    return Response(answer.model_dump_json(), 202, headers, media_type="application/json")
+        if job.id != id:  # a repeat with the same key was quicker
+            await anyio.to_thread.run_sync(context.objects.delete, composites.path(id))
+    headers = {"Location": f"/v1/jobs/{job.id}"}
+    return Response(job.model_dump_json(), 202, headers, media_type="application/json")
 
 
 @router.get(
@@ -110,14 +113,11 @@ def get_video(context: Needs, id: str, request: Request) -> Response:
     return StreamingResponse(pieces, 206 if part else 200, headers, media_type="video/mp4")
 
 
-def _check(context: Context, matte: str, key: str, length: int) -> str | None:
-    """See that a clip can be taken; returns the job that a repeat with the same key has made already."""
+def _admit(context: Context, matte: str, length: int) -> None:
+    """Check, before a clip is sent, that its matte is ready and that there is room for it."""
     with reading(context.engine) as c:
-        made = idempotency.made_by(c, key, CALL) if key else None
-        if made is None:
-            mattes.get_ready(c, matte)
-            admit_upload(c, context.settings, context.objects, length, jobs=1)
-        return made
+        mattes.get_ready(c, matte)
+        admit_upload(c, context.settings, context.objects, length, jobs=1)
 
 
 def _queue(
@@ -128,31 +128,19 @@ def _queue(
     key: str,
     size: int,
     webhook: str | None,
-) -> str:
-    """Write down the job of a clip that is stored; returns its id, or that of a repeat that was quicker."""
+) -> Job:
+    """Add the job of a clip that is stored; returns it, or that of a repeat with the same key that was quicker."""
     context.check()
-    try:
-        with writing(context.engine) as c:
-            row = mattes.get_ready(c, matte)
-            admit(c, context.settings, jobs=1, size=size)
-            capture, trace = row.capture or "", tracing.asked_by()
-            jobs.add(c, "composite", capture, options, matte, trace, job, size, webhook)
-            tiles.begin(c, job)  # while it has tiles it has something in the store, see `jobs.not_wound_up`
-            if key:
-                idempotency.remember(c, key, CALL, job)
-            return job
-    except IntegrityError:
-        with reading(context.engine) as c:
-            made = idempotency.made_by(c, key, CALL) if key else None
-        if made is None:
-            raise
-        context.objects.delete(composites.path(job))
-        return made
 
+    def create(c: Connection) -> str:
+        row = mattes.get_ready(c, matte)
+        admit(c, context.settings, jobs=1, size=size)
+        capture, trace = row.capture or "", tracing.asked_by()
+        jobs.add(c, "composite", capture, options, matte, trace, job, size, webhook)
+        tiles.begin(c, job)  # while it has tiles it has something in the store, see `jobs.not_wound_up`
+        return job
 
-def _job(context: Context, job: str) -> Job:
-    with reading(context.engine) as c:
-        return Job.of(c, jobs.get(c, job))
+    return idempotent(context.engine, key, CALL, Job.read, create)
 
 
 def _span(text: str, size: int) -> tuple[int, int]:

@@ -1,0 +1,81 @@
+"""Repeated requests with one Idempotency-Key: one thing is created, and every answer is about it."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from sqlalchemy import Connection, Engine
+
+from services.api.http import idempotency
+from services.api.http.idempotency import find_earlier, idempotent
+from storage.database.engine import open_engine, reading, writing
+from storage.errors import NotFound
+from storage.records import jobs
+
+CALL = "POST /v1/jobs"
+
+
+@pytest.fixture
+def engine(tmp_path: Path) -> Iterator[Engine]:
+    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
+    yield engine
+    engine.dispose()
+
+
+def create(connection: Connection) -> str:
+    return jobs.add(connection, "recover", "cap", {}, "mat")
+
+
+def count(engine: Engine) -> int:
+    with reading(engine) as c:
+        return len(jobs.active(c))
+
+
+def test_repeat_with_key_answers_with_first(engine: Engine) -> None:
+    assert find_earlier(engine, "a", CALL, jobs.get) is None
+    first = idempotent(engine, "a", CALL, jobs.get, create)
+    assert idempotent(engine, "a", CALL, jobs.get, create).id == first.id
+    earlier = find_earlier(engine, "a", CALL, jobs.get)
+    assert earlier is not None
+    assert earlier.id == first.id
+    assert count(engine) == 1
+
+
+@pytest.mark.parametrize("key", [None, ""])
+def test_without_key_each_request_creates(engine: Engine, key: str | None) -> None:
+    assert idempotent(engine, key, CALL, jobs.get, create) != idempotent(engine, key, CALL, jobs.get, create)
+    assert find_earlier(engine, key, CALL, jobs.get) is None
+    assert count(engine) == 2
+
+
+def test_key_counts_once_for_each_route(engine: Engine) -> None:
+    idempotent(engine, "a", CALL, jobs.get, create)
+    idempotent(engine, "a", "POST /v1/captures", jobs.get, create)
+    assert count(engine) == 2
+
+
+def test_repeat_after_deletion_is_not_found(engine: Engine) -> None:
+    first = idempotent(engine, "a", CALL, jobs.get, create)
+    with writing(engine) as c:
+        jobs.end(c, first.id, "cancelled")
+        jobs.forget(c, first.id)
+    with pytest.raises(NotFound):
+        find_earlier(engine, "a", CALL, jobs.get)
+    with pytest.raises(NotFound):
+        idempotent(engine, "a", CALL, jobs.get, create)
+    assert count(engine) == 0
+
+
+def test_concurrent_repeat_answers_with_quicker_one(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As with PostgreSQL, where two transactions may both find the key unused."""
+    first = idempotent(engine, "a", CALL, jobs.get, create)
+    real, asked = idempotency.made_by, []
+
+    def blind_at_first(connection: Connection, key: str, call: str) -> str | None:
+        asked.append(key)
+        return None if len(asked) == 1 else real(connection, key, call)
+
+    monkeypatch.setattr(idempotency, "made_by", blind_at_first)
+    assert idempotent(engine, "a", CALL, jobs.get, create).id == first.id
+    assert len(asked) == 2
+    assert count(engine) == 1
