@@ -19,6 +19,7 @@ from PIL import Image
 from starlette.requests import Request
 
 from services.api.captures import tus
+from services.api.http.media_types import preferred, require_media_type
 from services.api.http.responses import is_known
 from services.api.mattes import clips as clips_api
 from services.api.mattes import composites as composites_api
@@ -390,8 +391,8 @@ def read_headers(data: bytes, folder: Path) -> None:
         "upload-checksum": lambda: tus.Checksum.of(request),
         "upload-metadata": lambda: tus.metadata_of(request),
         "upload-length": lambda: tus.number(request, "Upload-Length"),
-        "content-type": lambda: tus.check_media_type(request),
-        "accept": lambda: composites_api._chosen(request.headers["accept"]),
+        "content-type": lambda: require_media_type(request, tus.CHUNK, "the bytes of an upload"),
+        "accept": lambda: preferred(request.headers["accept"], composites_api.ANSWERS),
     }
     refused = None
     for name in readers.keys() & request.headers.keys():

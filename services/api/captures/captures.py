@@ -9,8 +9,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection, Row
 
 from services.api.context import After, Context, Limit, Needs
-from services.api.http.bodies import announced, read_json, schema_of, store_body
+from services.api.http.bodies import read_json, schema_of, store_body, upload_limit
 from services.api.http.idempotency import IdempotencyKey, find_earlier, idempotent
+from services.api.http.media_types import JSON, ZIP, media_type_of
 from services.api.http.responses import answered, time_of
 from services.api.quotas import admit, admit_upload
 from services.runtime import tracing
@@ -87,8 +88,8 @@ class FromUpload(BaseModel):
     openapi_extra={
         "requestBody": {
             "content": {
-                "application/zip": {"schema": {"type": "string", "format": "binary"}},
-                "application/json": {"schema": schema_of(FromUpload)},
+                ZIP: {"schema": {"type": "string", "format": "binary"}},
+                JSON: {"schema": schema_of(FromUpload)},
             }
         }
     },
@@ -105,18 +106,18 @@ async def upload(
 
     `name` and `webhook` of the query are for a ZIP; JSON has its own.
     """
-    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    if media_type == "application/json":
+    media_type = media_type_of(request)
+    if media_type == JSON:
         wanted = await read_json(request, FromUpload, FROM_UPLOAD_BYTES)
         row = await anyio.to_thread.run_sync(
             _from_upload, context, wanted, idempotency_key, limiter=context.bundles
         )
-    elif media_type == "application/zip":
+    elif media_type == ZIP:
         row = await _from_body(context, request, name, idempotency_key, webhook)
     else:
         raise WrongMediaType(
-            f"send the ZIP of a capture as application/zip, not as {media_type or 'nothing'}, or the id of a finished "
-            "upload as application/json"
+            f"send the ZIP of a capture as {ZIP}, not as {media_type or 'nothing'}, or the id of a finished upload "
+            f"as {JSON}"
         )
     response.headers["Location"] = f"/v1/captures/{row.id}"
     return Capture.of(row)
@@ -172,8 +173,8 @@ async def _from_body(
 ) -> Row[Any]:
     """Stream the archive into the store; what is cut off, too large or refused leaves nothing."""
     await anyio.to_thread.run_sync(sender.check, webhook, context.settings)  # which looks its host up
-    limit = context.settings.upload_bytes
-    length = announced(request, limit)
+    limit = upload_limit(context.settings)
+    length = limit.check_announced(request)
     earlier = await anyio.to_thread.run_sync(_find_earlier, context, key)
     if earlier is not None:
         return earlier

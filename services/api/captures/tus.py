@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from fastapi import Header, Request
 from starlette.datastructures import Headers, MutableHeaders
 
-from services.runtime.problems import BadHeader, ChecksumMismatch, WrongMediaType, WrongVersion
+from services.runtime.problems import BadHeader, ChecksumMismatch, WrongVersion
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -157,15 +157,3 @@ def _base64(text: str, name: str) -> bytes:
         return base64.b64decode(text, validate=True)
     except (binascii.Error, ValueError) as error:
         raise BadHeader(f"{name}: {text!r} is not Base64", field=name) from error
-
-
-def check_media_type(request: Request) -> None:
-    """See that a body is a stretch of an upload.
-
-    Raises
-    ------
-    WrongMediaType
-    """
-    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    if media_type != CHUNK:
-        raise WrongMediaType(f"send the bytes of an upload as {CHUNK}, not as {media_type or 'nothing'}")

@@ -12,19 +12,19 @@ from starlette.requests import ClientDisconnect
 
 from services.api.captures.tus import (
     ALGORITHMS,
+    CHUNK,
     EXTENSIONS,
     Checksum,
-    check_media_type,
     declared,
     metadata_of,
     number,
     version_spoken,
 )
 from services.api.context import Context, Needs
-from services.api.http.bodies import too_large
+from services.api.http.bodies import BodyLimit, has_body, upload_limit
 from services.api.http.idempotency import IdempotencyKey
+from services.api.http.media_types import require_media_type
 from services.api.quotas import admit_upload
-from services.runtime.problems import TooLarge
 from storage.database.engine import reading, writing
 from storage.database.rows import new_id
 from storage.errors import InvalidInput, NotFound
@@ -60,12 +60,11 @@ async def create_upload(
     limits before any byte comes. What does come is checked all the same.
     """
     length = number(request, "Upload-Length")
-    if length > context.settings.upload_bytes:
-        raise too_large(context.settings.upload_bytes, length)
+    upload_limit(context.settings).check(length)
     checksum = Checksum.of(request)
-    with_body = request.headers.get("content-length", "0") != "0" or "transfer-encoding" in request.headers
+    with_body = has_body(request)
     if with_body:
-        check_media_type(request)
+        _require_chunk(request)
     metadata = metadata_of(request)
     known, limits = declared(metadata), context.settings.limits
     if "frames" in known:
@@ -95,7 +94,7 @@ async def append(context: Needs, request: Request, id: str) -> Response:
     whole or not at all.
     """
     row = await anyio.to_thread.run_sync(_get, context, id)
-    check_media_type(request)
+    _require_chunk(request)
     checksum = Checksum.of(request)
     uploads.check_offset(row, number(request, "Upload-Offset"))
     if row.parts >= MOST_PARTS:
@@ -118,12 +117,13 @@ def delete_upload(context: Needs, id: str) -> None:
 
 async def _append(context: Context, request: Request, row: Row[Any], checksum: Checksum | None) -> Row[Any]:
     """Store a body from an upload's offset on; returns the row as it is then."""
-    room = row.length - row.offset
-    if int(request.headers.get("content-length", 0)) > room:
-        raise _too_long(row)
-    body = (
-        request.stream()
-    )  # from which a client that falls silent is disconnected, see `services.api.http.slow_clients`
+    limit = BodyLimit(
+        row.length,
+        f"upload {row.id} was to have {row.length} bytes, and more have come; send no more than the rest",
+    )
+    limit.check_announced(request, row.offset)
+    # A client that falls silent is disconnected, see `services.api.http.slow_clients`.
+    body = limit.stream(request, row.offset)
     stored: list[Part] = []
     offset, more = row.offset, True
     try:
@@ -134,9 +134,6 @@ async def _append(context: Context, request: Request, row: Row[Any], checksum: C
                 try:
                     async for data in body:
                         size += len(data)
-                        room -= len(data)
-                        if room < 0:
-                            raise _too_long(row)
                         if checksum:
                             checksum.update(data)
                         await file.write(data)
@@ -215,8 +212,5 @@ def _headers(row: Row[Any]) -> dict[str, str]:
     return {"Upload-Offset": str(row.offset), "Upload-Expires": expires}
 
 
-def _too_long(row: Row[Any]) -> TooLarge:
-    return TooLarge(
-        f"upload {row.id} was to have {row.length} bytes, and more have come; send no more than the rest",
-        limit=row.length,
-    )
+def _require_chunk(request: Request) -> None:
+    require_media_type(request, CHUNK, "the bytes of an upload")

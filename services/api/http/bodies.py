@@ -1,4 +1,4 @@
-"""Bodies of requests: no larger than they may be, whether they say how large they are or not."""
+"""Bodies of requests: streamed, and refused as soon as they are larger than they may be."""
 
 import tempfile
 from collections.abc import AsyncIterator
@@ -11,32 +11,119 @@ from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ValidationError
 
 from services.runtime.problems import TooLarge
+from services.settings import Settings
 from storage.objects.store import Objects
 
 SPOOLED = 1 << 20
-"""Bytes of a body that are kept in memory while it comes."""
+"""Bytes of a body that are kept in memory; a larger one is written to a temporary file."""
 Model = TypeVar("Model", bound=BaseModel)
 
 
-async def read_body(request: Request, limit: int) -> bytes:
-    """The body of a request, read whole.
+class BodyLimit:
+    """How many bytes a body may have, and how a larger one is refused.
+
+    Parameters
+    ----------
+    limit : int
+        In bytes.
+    detail : str, optional
+        What to say of a larger body.
+    name : str, optional
+        Setting that the limit comes from: the problem then has it, and the bytes that were too many.
+    """
+
+    def __init__(self, limit: int, detail: str | None = None, name: str | None = None) -> None:
+        self._limit = limit
+        self._detail = detail or f"the body of this request may have {limit} bytes; send a smaller one"
+        self._name = name
+
+    def check(self, size: int) -> None:
+        """Check a number of bytes.
+
+        Raises
+        ------
+        TooLarge
+        """
+        if size > self._limit:
+            fields: dict[str, str | int] = {"name": self._name, "value": size} if self._name else {}
+            raise TooLarge(self._detail, limit=self._limit, **fields)
+
+    def check_announced(self, request: Request, start: int = 0) -> int:
+        """Check the bytes that a request announces (Content-Length); returns them, 0 if it announces none.
+
+        Parameters
+        ----------
+        start : int
+            Bytes that came before this body and count as well.
+
+        Raises
+        ------
+        TooLarge
+        """
+        length = int(request.headers.get("content-length", 0))
+        self.check(start + length)
+        return length
+
+    async def stream(self, request: Request, start: int = 0) -> AsyncIterator[bytes]:
+        """The parts of a body as they come.
+
+        Parameters
+        ----------
+        start : int
+            As of `check_announced`.
+
+        Raises
+        ------
+        TooLarge
+            In place of the part that goes over the limit.
+        """
+        size = start
+        async for part in request.stream():
+            size += len(part)
+            self.check(size)
+            yield part
+
+
+def upload_limit(settings: Settings, what: str = "an archive") -> BodyLimit:
+    """The limit ENVMATTE_UPLOAD_BYTES.
+
+    Parameters
+    ----------
+    what : str
+        What is sent, for the message.
+    """
+    limit = settings.upload_bytes
+    return BodyLimit(
+        limit,
+        f"{what} may have {limit} bytes; send a smaller one or raise ENVMATTE_UPLOAD_BYTES",
+        "upload_bytes",
+    )
+
+
+def has_body(request: Request) -> bool:
+    """Whether a request has a body, by its headers."""
+    return request.headers.get("content-length", "0") != "0" or "transfer-encoding" in request.headers
+
+
+async def store_body(request: Request, objects: Objects, path: str, limit: BodyLimit) -> int:
+    """Stream a body into the store as one object; returns its bytes.
 
     Raises
     ------
     TooLarge
-        As soon as more than ``limit`` bytes have come.
+        As soon as more bytes than the limit have come.
     """
-    body = bytearray()
-    async for part in request.stream():
-        body += part
-        if len(body) > limit:
-            raise _too_large(limit)
-    return bytes(body)
+    size = 0
+    async with objects.write(path) as file:
+        async for part in limit.stream(request):
+            size += len(part)
+            await file.write(part)
+    return size
 
 
 @asynccontextmanager
 async def spool_body(request: Request, limit: int) -> AsyncIterator[IO[bytes]]:
-    """The body of a request in a temporary file, in memory while it is small: any number may come in slowly.
+    """The body of a request as a file: in memory while it is small, so that many slow senders take little memory.
 
     Raises
     ------
@@ -45,10 +132,8 @@ async def spool_body(request: Request, limit: int) -> AsyncIterator[IO[bytes]]:
     """
     with tempfile.SpooledTemporaryFile(SPOOLED) as file:
         size = 0
-        async for part in request.stream():
+        async for part in BodyLimit(limit).stream(request):
             size += len(part)
-            if size > limit:
-                raise _too_large(limit)
             if size > SPOOLED:
                 await anyio.to_thread.run_sync(file.write, part)
             else:
@@ -58,86 +143,40 @@ async def spool_body(request: Request, limit: int) -> AsyncIterator[IO[bytes]]:
 
 
 async def read_json(request: Request, model: type[Model], limit: int) -> Model:
-    """The JSON of a request, not read whole before its size is known, as a framework would."""
+    """The JSON body of a request; unlike FastAPI, which reads any body whole, it stops at a limit.
+
+    Raises
+    ------
+    TooLarge
+        As soon as more than ``limit`` bytes have come.
+    RequestValidationError
+    """
+    body = bytearray()
+    async for part in BodyLimit(limit).stream(request):
+        body += part
     try:
-        return model.model_validate_json(await read_body(request, limit))
+        return model.model_validate_json(bytes(body))
     except ValidationError as error:
         found = [detail | {"loc": ("body", *detail["loc"])} for detail in error.errors(include_url=False)]
         raise RequestValidationError(found) from error
 
 
 def schema_of(model: type[BaseModel]) -> dict[str, Any]:
-    """The JSON schema of a body that a handler reads itself, with nothing in it that refers to another place of it."""
-    whole = model.model_json_schema()
-    parts = whole.pop("$defs", {})
+    """The JSON Schema of a model, with all of its ``$ref`` replaced by what they refer to.
 
-    def filled(node: Any) -> Any:
+    OpenAPI needs it for a body that a route reads itself: references there start at the document's root.
+    """
+    whole = model.model_json_schema()
+    definitions = whole.pop("$defs", {})
+
+    def resolve(node: Any) -> Any:
         if isinstance(node, list):
-            return [filled(one) for one in node]
+            return [resolve(one) for one in node]
         if not isinstance(node, dict):
             return node
         if "$ref" in node:
-            return filled(parts[node["$ref"].rpartition("/")[2]])
-        return {name: filled(one) for name, one in node.items() if name != "discriminator"}
+            return resolve(definitions[node["$ref"].rpartition("/")[2]])
+        return {name: resolve(one) for name, one in node.items() if name != "discriminator"}
 
-    schema: dict[str, Any] = filled(whole)
+    schema: dict[str, Any] = resolve(whole)
     return schema
-
-
-def announced(request: Request, limit: int, what: str = "an archive") -> int:
-    """The bytes that a body is said to have, 0 if that is not said.
-
-    Parameters
-    ----------
-    limit : int
-        That it may have, by ENVMATTE_UPLOAD_BYTES.
-    what : str
-        What it is, for people.
-
-    Raises
-    ------
-    TooLarge
-    """
-    length = int(request.headers.get("content-length", 0))
-    if length > limit:
-        raise too_large(limit, length, what)
-    return length
-
-
-async def store_body(
-    request: Request, objects: Objects, path: str, limit: int, what: str = "an archive"
-) -> int:
-    """Stream a body into the store as one object; returns its bytes.
-
-    Parameters
-    ----------
-    limit, what
-        As of `announced`.
-
-    Raises
-    ------
-    TooLarge
-        As soon as more than ``limit`` bytes have come.
-    """
-    size = 0
-    async with objects.write(path) as file:
-        async for part in request.stream():
-            size += len(part)
-            if size > limit:
-                raise too_large(limit, size, what)
-            await file.write(part)
-    return size
-
-
-def too_large(limit: int, size: int, what: str = "an archive") -> TooLarge:
-    """What is sent is over the limit of the settings, of so many bytes or more."""
-    return TooLarge(
-        f"{what} may have {limit} bytes; send a smaller one or raise ENVMATTE_UPLOAD_BYTES",
-        name="upload_bytes",
-        limit=limit,
-        value=size,
-    )
-
-
-def _too_large(limit: int) -> TooLarge:
-    return TooLarge(f"the body of this request may have {limit} bytes; send a smaller one", limit=limit)

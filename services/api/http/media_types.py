@@ -45,9 +45,12 @@ def preferred(accept: str, offered: Sequence[str]) -> str | None:
             ranges.append((-float(quality), name))
         except ValueError:
             continue
-    for quality, name in sorted(ranges, key=lambda item: item[0]):
-        prefix = name.removesuffix("*").removeprefix("*/") if name.endswith("/*") else None
-        for media_type in offered if quality else ():
-            if media_type == name or (prefix is not None and media_type.startswith(prefix)):
-                return media_type
+    for worth, name in sorted(ranges, key=lambda one: one[0]):
+        found = next((media_type for media_type in offered if _matches(name, media_type)), None)
+        if worth and found:
+            return found
     return None
+
+
+def _matches(name: str, media_type: str) -> bool:
+    return name in ("*/*", media_type) or (name.endswith("/*") and media_type.startswith(name[:-1]))

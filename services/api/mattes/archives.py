@@ -9,11 +9,11 @@ from sqlalchemy import Connection, Row
 
 from services.api.captures.captures import ONLY
 from services.api.context import Context, Needs
-from services.api.http.bodies import announced, store_body
+from services.api.http.bodies import store_body, upload_limit
 from services.api.http.idempotency import IdempotencyKey, find_earlier, idempotent
+from services.api.http.media_types import ZIP, require_media_type
 from services.api.mattes.mattes import Matte
 from services.api.quotas import admit
-from services.runtime.problems import WrongMediaType
 from storage.database.engine import reading
 from storage.database.rows import new_id
 from storage.errors import NoRoom, NotFound
@@ -26,7 +26,6 @@ from workflows.mattes.imports.importing import take_in
 
 router = APIRouter(tags=["mattes"])
 CALL = "POST /v1/mattes"
-ZIP = "application/zip"
 
 
 @router.get(
@@ -62,9 +61,7 @@ async def post_archive(
 
     All of it is checked before the answer, which takes some seconds for each 100 MB.
     """
-    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    if media_type != ZIP:
-        raise WrongMediaType(f"send the archive of a matte as {ZIP}, not as {media_type or 'nothing'}")
+    require_media_type(request, ZIP, "the archive of a matte")
     row = await _from_body(context, request, idempotency_key)
     response.headers["Location"] = f"/v1/mattes/{row.id}"
     return Matte.of(row)
@@ -72,8 +69,8 @@ async def post_archive(
 
 async def _from_body(context: Context, request: Request, key: str | None) -> Row[Any]:
     """Stream an archive into the store, and make a matte of it; the archive is gone in the end."""
-    limit = context.settings.upload_bytes
-    length = announced(request, limit)
+    limit = upload_limit(context.settings)
+    length = limit.check_announced(request)
     earlier = await anyio.to_thread.run_sync(find_earlier, context.engine, key, CALL, mattes.get)
     if earlier is not None:
         return earlier

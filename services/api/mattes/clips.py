@@ -10,8 +10,9 @@ from fastapi.responses import StreamingResponse
 from sqlalchemy import Connection
 
 from services.api.context import Context, Needs
-from services.api.http.bodies import announced, store_body
+from services.api.http.bodies import store_body, upload_limit
 from services.api.http.idempotency import find_earlier, idempotent
+from services.api.http.media_types import JSON, media_type_of
 from services.api.jobs.jobs import Job
 from services.api.quotas import admit, admit_upload
 from services.runtime import tracing
@@ -24,7 +25,6 @@ from storage.records import jobs, mattes, tiles
 
 router = APIRouter(tags=["jobs"])
 CALL = "POST /v1/mattes/{id}/composite"
-CLIP = "a clip"
 PIECE = 1 << 20
 """Bytes of a video that are read at once."""
 RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
@@ -32,7 +32,7 @@ RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 
 def is_clip(request: Request) -> bool:
     """Whether a request brings a clip, and not a picture."""
-    return request.headers.get("content-type", "").strip().lower().startswith("video/")
+    return media_type_of(request).startswith("video/")
 
 
 async def composite_clip(
@@ -59,15 +59,15 @@ async def composite_clip(
         If the URL can't be told.
     """
     await anyio.to_thread.run_sync(sender.check, webhook, context.settings)  # which looks its host up
-    limit = context.settings.upload_bytes
-    length = announced(request, limit, CLIP)
+    limit = upload_limit(context.settings, "a clip")
+    length = limit.check_announced(request)
     key = request.headers.get("idempotency-key", "")[:256]
     job = await anyio.to_thread.run_sync(find_earlier, context.engine, key, CALL, Job.read)
     if job is None:
         await anyio.to_thread.run_sync(_admit, context, matte, length)
         id = new_id()
         try:
-            size = await store_body(request, context.objects, composites.clip_path(id), limit, CLIP)
+            size = await store_body(request, context.objects, composites.clip_path(id), limit)
             job = await anyio.to_thread.run_sync(_queue, context, id, matte, options, key, size, webhook)
         except Exception:
             # Not when cancelled, where `_queue` may still be at work: what has no job the coordinator sweeps.
@@ -76,7 +76,7 @@ async def composite_clip(
         if job.id != id:  # a repeat with the same key was quicker
             await anyio.to_thread.run_sync(context.objects.delete, composites.path(id))
     headers = {"Location": f"/v1/jobs/{job.id}"}
-    return Response(job.model_dump_json(), 202, headers, media_type="application/json")
+    return Response(job.model_dump_json(), 202, headers, media_type=JSON)
 
 
 @router.get(

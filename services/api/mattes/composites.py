@@ -17,6 +17,7 @@ from starlette.datastructures import Headers
 from services.api.context import Context, Needs
 from services.api.errors import answer as problem_answer
 from services.api.http.bodies import spool_body
+from services.api.http.media_types import preferred
 from services.api.http.responses import answered, is_known
 from services.api.jobs.jobs import Job
 from services.api.mattes import clips
@@ -153,7 +154,10 @@ async def post_composite(
         return await clips.composite_clip(context, request, id, wanted.of_a_clip(), wanted.webhook)
     if wanted.webhook is not None:
         raise OptionError("webhook is for clips: a still is in the answer, and has no job", field="webhook")
-    kind = _chosen(request.headers.get("accept", "*/*"))
+    accept = request.headers.get("accept", "*/*")
+    kind = preferred(accept, ANSWERS)
+    if kind is None:
+        raise NotAcceptable(f"composites are answered as {', '.join(ANSWERS)}, not as {accept}")
     seen = await anyio.to_thread.run_sync(_seen, context, id)
     async with spool_body(request, context.settings.backdrop_bytes) as body, context.composites:
         try:
@@ -269,20 +273,3 @@ def _encoded(picture: NDArray[np.float32], backdrop: Backdrop, kind: str, wanted
     if kind == "image/png":
         return integer_formats.encode_png(codes)
     return integer_formats.encode_jpeg(codes[..., :3], wanted.quality)
-
-
-def _chosen(accept: str) -> str:
-    """The kind of answer that the caller likes best (RFC 9110, 12.5.1); of two alike, the first that he names."""
-    asked = []
-    for part in accept.split(","):
-        name, *parameters = (one.strip().lower() for one in part.split(";"))
-        quality = next((one[2:] for one in parameters if one.startswith("q=")), "1")
-        try:
-            asked.append((-float(quality), name))
-        except ValueError:
-            continue
-    for worth, name in sorted(asked, key=lambda one: one[0]):
-        kind = ANSWERS[0] if name in ("*/*", "image/*") else name
-        if worth and kind in ANSWERS:
-            return kind
-    raise NotAcceptable(f"composites are answered as {', '.join(ANSWERS)}, not as {accept}")
