@@ -5,13 +5,8 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
-import uvicorn
 from sqlalchemy import Engine
 
-from services.api.app import build_app
-from services.api.auth import see_that_it_is_closed
-from services.api.http.browser_security import Careful
-from services.api.http.slow_clients import Connection, allow_many
 from services.cluster.connect import dispatcher_of
 from services.coordinator.coordinator import Coordinator
 from services.runtime import tracing
@@ -34,14 +29,22 @@ def serve(settings: Settings) -> None:
     Conflict
         If another service has the data folder.
     """
+    # A coordinator alone needs none of these, and starts without them.
+    import uvicorn
+
+    from services.api.app import build_app
+    from services.api.auth import require_keys_unless_loopback
+    from services.api.http.browser_security import SecurityHeaders
+    from services.api.http.slow_clients import Connection, allow_many
+
     allow_many()
     with _opened(settings, "service") as (stack, engine, objects):
-        see_that_it_is_closed(settings, engine)
+        require_keys_unless_loopback(settings, engine)
         app = build_app(settings, engine, objects)
         stack.callback(app.state.context.decoders.close)
         # The port is taken before workers start, so that one in use is told at once.
         config = uvicorn.Config(
-            Careful(app),
+            SecurityHeaders(app),
             settings.host,
             settings.port,
             http=Connection,

@@ -1,12 +1,11 @@
-"""The HTTP API: `build_app`, and one file a resource."""
+"""The app of the HTTP API, with the routes of all resources."""
 
 from fastapi import Depends, FastAPI
 from sqlalchemy import Engine
 
 from services.api import errors
 from services.api.captures import captures, reports, tus, uploads
-from services.api.context import WEB, Context, authorized
-from services.api.errors import PROBLEM
+from services.api.context import Context, authorized
 from services.api.jobs import events, jobs
 from services.api.mattes import archives, clips, composites, layers, live, mattes
 from services.api.programs import playback, programs
@@ -19,12 +18,12 @@ from workflows.composite.cache import Cache
 
 
 def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
-    """Build the app: it holds no state of its own, so any number of them may serve one database and store."""
+    """Build the app. It keeps no state of its own, so any number of apps may serve one database and store."""
     app = FastAPI(
         title="envmatte",
         version="1",
         description="Environment mattes of transparent objects, by compressive sensing.",
-        responses=PROBLEM,
+        responses=errors.RESPONSES,
         docs_url=None,
         redoc_url=None,
     )
@@ -63,5 +62,5 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
     app.include_router(metrics.router)
     app.include_router(pages.page)
     app.mount("/web/swagger", pages.Files(directory=pages.SWAGGER))
-    app.mount("/web", pages.Files(directory=WEB))
+    app.mount("/web", pages.Files(directory=pages.WEB))
     return app

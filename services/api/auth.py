@@ -1,4 +1,4 @@
-"""Who calls, and what he may: by the key that a request brings."""
+"""Who calls and what they may do, by the key that a request brings."""
 
 import hmac
 from dataclasses import dataclass
@@ -15,14 +15,14 @@ from storage.database.owners import DEFAULT
 from storage.errors import InvalidInput
 from storage.records import api_keys
 
-LOOKS = ("GET", "HEAD", "OPTIONS")
-"""Methods for which a key of the scope ``read`` is enough."""
-bearer = HTTPBearer(auto_error=False, description="An API key, where the service has any.")
+READ_METHODS = ("GET", "HEAD", "OPTIONS")
+"""Methods that a key of the scope ``read`` allows."""
+bearer = HTTPBearer(auto_error=False, description="An API key, if the service has any.")
 
 
 @dataclass(frozen=True)
 class Caller:
-    """Whom a key stands for."""
+    """The owner and the scope of a key."""
 
     owner: str
     scope: str
@@ -30,18 +30,18 @@ class Caller:
     """Whether there was a key."""
 
     def may(self, scope: str) -> bool:
-        """Whether the key allows what a scope does."""
+        """Whether the key allows what a scope allows."""
         return api_keys.SCOPES.index(self.scope) >= api_keys.SCOPES.index(scope)
 
 
 ADMIN = Caller(DEFAULT, "admin")
-"""Who has a key of the settings."""
+"""The caller with a key of the settings."""
 ANYONE = Caller(DEFAULT, "admin", known=False)
-"""Anyone, while a service has no key at all."""
+"""Every caller of a service without keys."""
 
 
 def identify(settings: Settings, engine: Engine, key: str | None) -> Caller:
-    """Whom a key stands for, now.
+    """Look up the caller that a key belongs to.
 
     Raises
     ------
@@ -49,8 +49,9 @@ def identify(settings: Settings, engine: Engine, key: str | None) -> Caller:
         If the service has keys, and this is none of them.
     """
     if key is not None:
-        given = [hmac.compare_digest(key.encode(), one.encode()) for one in settings.keys]
-        if any(given):
+        # All of them are compared, so that the time it takes says nothing.
+        matches = [hmac.compare_digest(key.encode(), own.encode()) for own in settings.keys]
+        if any(matches):
             return ADMIN
     with reading(engine) as c:
         row = api_keys.known(c, key) if key is not None else None
@@ -61,18 +62,18 @@ def identify(settings: Settings, engine: Engine, key: str | None) -> Caller:
     raise Unauthorized("send a key of this service: `Authorization: Bearer KEY`")
 
 
-def see_that_it_may(caller: Caller, request: Request) -> None:
-    """See that a key is enough for a method, whatever the route.
+def check_method(caller: Caller, request: Request) -> None:
+    """Check that a caller's scope allows the method of a request, whatever the route.
 
     Raises
     ------
     Forbidden
     """
-    demand(caller, "read" if request.method in LOOKS else "write")
+    require_scope(caller, "read" if request.method in READ_METHODS else "write")
 
 
-def demand(caller: Caller, scope: str) -> None:
-    """See that a key allows what a scope does.
+def require_scope(caller: Caller, scope: str) -> None:
+    """Check that a caller's key allows what a scope allows.
 
     Raises
     ------
@@ -80,22 +81,22 @@ def demand(caller: Caller, scope: str) -> None:
     """
     if not caller.may(scope):
         raise Forbidden(
-            f"this takes a key of the scope {scope}, and yours has {caller.scope}; whoever runs the service makes one "
-            f"with `envmatte keys make NAME --scope {scope}`",
+            f"this needs a key of the scope {scope}, and yours has {caller.scope}; an administrator of the service "
+            f"can make one with `envmatte keys make NAME --scope {scope}`",
             scope=scope,
         )
 
 
 def is_open(settings: Settings, engine: Engine) -> bool:
-    """Whether there is no key, so that anyone may do everything."""
+    """Whether the service has no key, so that anyone may do everything."""
     if settings.keys:
         return False
     with reading(engine) as c:
         return not api_keys.any_was_made(c)
 
 
-def see_that_it_is_closed(settings: Settings, engine: Engine) -> None:
-    """See that a service without a key listens on loopback alone.
+def require_keys_unless_loopback(settings: Settings, engine: Engine) -> None:
+    """Check that a service without keys listens on loopback only.
 
     Raises
     ------
@@ -104,7 +105,6 @@ def see_that_it_is_closed(settings: Settings, engine: Engine) -> None:
     if is_loopback(settings.host) or not is_open(settings, engine):
         return
     raise InvalidInput(
-        f"asked to listen on {settings.host} without a key, where anyone on the network could use the service: make "
-        "one with `envmatte keys make NAME`, set ENVMATTE_KEYS to one or more keys, separated by commas, or listen on "
-        "127.0.0.1"
+        f"the service has no key, and on {settings.host} anyone on the network could use it: make a key with "
+        "`envmatte keys make NAME`, set ENVMATTE_KEYS to one or more keys, separated by commas, or listen on 127.0.0.1"
     )

@@ -1,21 +1,19 @@
-"""What every request handler needs: the settings, the database as the caller may see it, and the store."""
+"""What request handlers work with: settings, database and store, bound to the owner of the request's key."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 from typing import Annotated
 
 from anyio import CapacityLimiter
-from fastapi import Depends, Query, Request
+from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials
-from pydantic import Field
 from sqlalchemy import Engine
 
-from services.api.auth import ADMIN, Caller, bearer, demand, identify, see_that_it_may
-from services.api.http.browser_security import see_that_no_site_asks
+from services.api.auth import ADMIN, Caller, bearer, check_method, identify, require_scope
+from services.api.http.browser_security import require_own_site
 from services.decoding.pool import Decoders
 from services.settings import Settings
 from storage.database.owners import NOBODY, bound
@@ -24,104 +22,97 @@ from storage.objects.store import Objects
 from workflows.composite.cache import Cache
 from workflows.composite.threads import CORES
 
-LOOK = 1.0
-"""Seconds between two looks at the key of whoever downloads."""
-WEB = Path(__file__).parents[1] / "web"
-"""The browser's files."""
+KEY_CHECK = 1.0
+"""Seconds between two checks of a caller's key during a download."""
 
 
 @dataclass(frozen=True)
 class Context:
-    """Built once with the app, and for each request bound to whoever calls, see `Needs`."""
+    """The parts of the service that handlers use: built once with the app, and bound to the caller for each request."""
 
     settings: Settings
     engine: Engine
-    """Of the database. A request's own shows what belongs to the caller, see `storage.database.owners`."""
+    """Of the database. A request's own shows only what its caller may see, see `storage.database.owners`."""
     objects: Objects
     cache: Cache
     """Strips of mattes."""
     decoders: Decoders
-    """What decodes what strangers send."""
+    """Processes that decode uploaded pictures."""
     pictures: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(4))
-    """Pictures of programs that are drawn at once, which bounds what they take."""
+    """Pictures of programs drawn at once. Like the limiters below, it bounds the memory that they take."""
     films: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(1))
-    """Videos of programs that are encoded at once."""
+    """Videos of programs encoded at once."""
     composites: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(CORES + 1))
-    """Composites that are made at once, which bounds what they take: one more than there are cores."""
-    bundles: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(2))
-    """Bundles whose records are read at once, for one may take 200 MB."""
+    """Composites computed at once: one more than there are cores."""
+    captures: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(2))
+    """Capture archives checked at once; one may take 200 MB."""
     imports: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(2))
-    """Archives of mattes that are unpacked at once."""
+    """Archives of mattes unpacked at once."""
     layers: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(1))
-    """Layers of mattes that are encoded at once."""
+    """Layers of mattes encoded at once."""
     caller: Caller = ADMIN
-    check: Callable[[], object] = lambda: None
-    """Look at the caller's key once more, as `access.identify` does: for what goes on long after its first look."""
+    check_key: Callable[[], object] = lambda: None
+    """Checks again that the caller's key is valid, as `auth.identify` does: for requests that take long."""
 
     def while_allowed(self, pieces: Iterable[bytes]) -> Iterator[bytes]:
-        """Pieces of an answer, as long as the caller's key is good.
+        """The pieces of a download, as long as the caller's key is valid.
 
         Raises
         ------
         Unauthorized
-            Within a second's pieces of its end.
+            Within about a second after the key was revoked.
         """
-        looked_at = time.monotonic()
+        checked_at = time.monotonic()
         for piece in pieces:
-            if time.monotonic() - looked_at > LOOK:
-                with suppress(Unavailable):  # the database is away, and comes back
-                    self.check()
-                looked_at = time.monotonic()
+            if time.monotonic() - checked_at > KEY_CHECK:
+                with suppress(Unavailable):  # the database may come back
+                    self.check_key()
+                checked_at = time.monotonic()
             yield piece
 
 
 Key = Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)]
 
 
-def _unbound(request: Request) -> Context:
+def _service_context(request: Request) -> Context:
     context: Context = request.app.state.context
     return context
 
 
 def authorized(request: Request, given: Key) -> Context:
-    """The context of a request whose key allows its method, bound to the owner of the key.
+    """The context of a request, bound to the owner of its key; the key must allow the request's method.
 
     Raises
     ------
     Unauthorized, Forbidden, ForeignSite
     """
-    context = _unbound(request)
+    context = _service_context(request)
     key = given.credentials if given else None
     caller = identify(context.settings, context.engine, key)
     if not caller.known:
-        see_that_no_site_asks(request)
-    see_that_it_may(caller, request)
-    check = partial(identify, context.settings, context.engine, key)
-    return replace(context, engine=bound(context.engine, caller.owner), caller=caller, check=check)
+        require_own_site(request)
+    check_method(caller, request)
+    check_key = partial(identify, context.settings, context.engine, key)
+    return replace(context, engine=bound(context.engine, caller.owner), caller=caller, check_key=check_key)
 
 
-Needs = Annotated[Context, Depends(authorized)]
-"""For whoever has a key: what is his."""
+OwnerContext = Annotated[Context, Depends(authorized)]
+"""For routes that take any key: sees what belongs to the key's owner."""
 
 
-def _whole(request: Request, context: Needs) -> Context:
-    demand(context.caller, "admin")
-    return _unbound(request)
+def _for_admins(request: Request, context: OwnerContext) -> Context:
+    require_scope(context.caller, "admin")
+    return _service_context(request)
 
 
-Whole = Annotated[Context, Depends(_whole)]
-"""For admins: the service, with what is anyone's."""
+AdminContext = Annotated[Context, Depends(_for_admins)]
+"""For routes that take an admin's key: sees what belongs to any owner."""
 
 
-def _keyless(request: Request) -> Context:
-    context = _unbound(request)
+def _for_anyone(request: Request) -> Context:
+    context = _service_context(request)
     return replace(context, engine=bound(context.engine, NOBODY))
 
 
-Keyless = Annotated[Context, Depends(_keyless)]
-"""For anyone: what is nobody's."""
-# Lists, and not tuples, whose schema few generators of clients know.
-Pair = Annotated[list[int], Field(min_length=2, max_length=2)]
-Colour = Annotated[list[float], Field(min_length=3, max_length=3)]
-Limit = Annotated[int, Query(ge=1, le=1000, description="The most items to list.")]
-After = Annotated[str | None, Query(description="The id of the last item of the page before.")]
+AnonymousContext = Annotated[Context, Depends(_for_anyone)]
+"""For routes that take no key: sees nothing that belongs to an owner."""

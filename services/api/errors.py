@@ -1,4 +1,4 @@
-"""From errors to HTTP: the only table, and the only shape (RFC 9457)."""
+"""Error handlers: every error of the API is answered as a problem detail (RFC 9457)."""
 
 import logging
 from http import HTTPStatus
@@ -11,19 +11,10 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.routing import Match, Route
 
-from services.runtime.problems import (
-    MEDIA_TYPE,
-    Unauthorized,
-    _problem,
-    problem_of,
-)
-from storage.errors import (
-    EnvmatteError,
-    TooMany,
-    Unavailable,
-)
+from services.runtime.problems import MEDIA_TYPE, Unauthorized, problem_detail, problem_of
+from storage.errors import EnvmatteError, InvalidInput, TooMany, Unavailable
 
-PROBLEM: dict[int | str, dict[str, Any]] = {
+RESPONSES: dict[int | str, dict[str, Any]] = {
     "default": {
         "description": "A problem (RFC 9457)",
         "content": {
@@ -38,23 +29,22 @@ PROBLEM: dict[int | str, dict[str, Any]] = {
                         "detail": {"type": "string"},
                         "entry": {"type": "string"},
                         "field": {"type": "string"},
-                        "name": {"type": "string", "description": "Of a limit, as `GET /v1/limits` has it."},
+                        "name": {"type": "string", "description": "Of a limit, as in `GET /v1/limits`."},
                         "limit": {"type": "number"},
-                        "value": {"type": "number", "description": "What would have to be within it."},
+                        "value": {"type": "number", "description": "The value that exceeds the limit."},
                     },
                 }
             }
         },
     }
 }
-logger = logging.getLogger(__name__)
-
-
+"""The answer that every route may give, for OpenAPI."""
 HEADERS: dict[type[EnvmatteError], dict[str, str]] = {
     Unauthorized: {"WWW-Authenticate": "Bearer"},
     Unavailable: {"Retry-After": "2"},  # seconds
     TooMany: {"Retry-After": "10"},
 }
+logger = logging.getLogger(__name__)
 
 
 def answer(problem: dict[str, Any], headers: dict[str, str] | None = None) -> JSONResponse:
@@ -63,7 +53,7 @@ def answer(problem: dict[str, Any], headers: dict[str, str] | None = None) -> JS
 
 
 def register(app: FastAPI) -> None:
-    """Give every error of an app this shape, those of the framework included."""
+    """Register handlers for every error of an app, those of the framework included."""
 
     @app.exception_handler(EnvmatteError)
     async def _ours(request: Request, error: EnvmatteError) -> JSONResponse:
@@ -77,33 +67,27 @@ def register(app: FastAPI) -> None:
         headers = dict(error.headers or {})
         if status == HTTPStatus.METHOD_NOT_ALLOWED:
             headers["Allow"] = ", ".join(sorted(_methods(request)))
-        return answer(_problem(status, slug, status.phrase, detail), headers)
+        return answer(problem_detail(status, slug, status.phrase, detail), headers)
 
     @app.exception_handler(RequestValidationError)
     async def _validation(request: Request, error: RequestValidationError) -> JSONResponse:
         first = error.errors()[0]
         field = ".".join(str(part) for part in first["loc"][1:])
-        problem = _problem(
-            HTTPStatus.UNPROCESSABLE_ENTITY,
-            "bad-request",
-            "The request can't be used",
-            f"{field or first['loc'][0]}: {first['msg']}",
-            field=field,
-        )
-        return answer(problem)
+        detail = f"{field or first['loc'][0]}: {first['msg']}"
+        return answer(problem_of(InvalidInput(detail, field=field)))
 
     @app.exception_handler(ClientDisconnect)
-    async def _nobody_there(request: Request, error: ClientDisconnect) -> Response:
-        return Response(status_code=HTTPStatus.REQUEST_TIMEOUT)  # which nobody reads
+    async def _disconnected(request: Request, error: ClientDisconnect) -> Response:
+        return Response(status_code=HTTPStatus.REQUEST_TIMEOUT)  # nobody reads it
 
     @app.exception_handler(Exception)
-    async def _unforeseen(request: Request, error: Exception) -> JSONResponse:
+    async def _unexpected(request: Request, error: Exception) -> JSONResponse:
         logger.error("%s %s", request.method, request.url.path, exc_info=error)
         return answer(problem_of(error))
 
 
 def _methods(request: Request) -> set[str]:
-    """What can be done with a path, by all of its routes: the framework tells only what the first of them does."""
+    """The methods of all routes of a path; the framework names only those of the first route that matches."""
     matching = [
         r for r in request.app.routes if isinstance(r, Route) and r.matches(request.scope)[0] != Match.NONE
     ]

@@ -1,4 +1,4 @@
-"""From errors to problem details (RFC 9457): the only table."""
+"""Problem details (RFC 9457): the status, slug and title of each error, for answers and for failed jobs."""
 
 from http import HTTPStatus
 from typing import Any
@@ -25,43 +25,43 @@ MEDIA_TYPE = "application/problem+json"
 
 
 class TooLarge(InvalidInput):
-    """A body of more bytes than are taken."""
+    """A body with more bytes than the limit."""
 
 
 class WrongMediaType(InvalidInput):
-    """A body of another media type than is taken."""
+    """A body of another media type than the route takes."""
 
 
 class NotAcceptable(InvalidInput):
-    """An answer asked for in a media type that can't be given."""
+    """An Accept header without any media type that the route can answer in."""
 
 
 class NotNeeded(InvalidInput):
-    """An answer that the caller has already, as its If-None-Match says."""
+    """A request for what the caller already has, by its If-None-Match."""
 
 
 class BadHeader(InvalidInput):
-    """A header that is missing, or does not say what it should."""
+    """A header that is missing or malformed."""
 
 
 class WrongVersion(InvalidInput):
-    """A version of the protocol of uploads that is not spoken."""
+    """Another version of the upload protocol than the service speaks."""
 
 
 class ChecksumMismatch(InvalidInput):
-    """A body that is not what its checksum was made of."""
+    """A body that does not match its checksum."""
 
 
 class Unauthorized(EnvmatteError):
-    """No key, or one that is not known."""
+    """No key, or an unknown one."""
 
 
 class Forbidden(EnvmatteError):
-    """A key that does not allow this."""
+    """A key whose scope does not allow the request."""
 
 
 class ForeignSite(EnvmatteError):
-    """Asked for by a website of others, of a service without keys."""
+    """A request by another website, to a service without keys."""
 
 
 PROBLEMS: dict[type[Exception], tuple[int, str, str]] = {
@@ -75,35 +75,39 @@ PROBLEMS: dict[type[Exception], tuple[int, str, str]] = {
     WrongMediaType: (HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "wrong-media-type", "Wrong media type"),
     NotAcceptable: (HTTPStatus.NOT_ACCEPTABLE, "not-acceptable", "Not acceptable"),
     NotNeeded: (HTTPStatus.PRECONDITION_FAILED, "not-needed", "Not needed"),
-    BadHeader: (HTTPStatus.BAD_REQUEST, "bad-header", "A header can't be used"),
-    WrongVersion: (HTTPStatus.PRECONDITION_FAILED, "wrong-version", "Another version is spoken here"),
-    ChecksumMismatch: (460, "checksum-mismatch", "Not what the checksum was made of"),  # of tus
+    BadHeader: (HTTPStatus.BAD_REQUEST, "bad-header", "Bad header"),
+    WrongVersion: (HTTPStatus.PRECONDITION_FAILED, "wrong-version", "Wrong protocol version"),
+    ChecksumMismatch: (460, "checksum-mismatch", "Checksum mismatch"),  # the status is of tus
     InvalidInput: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-request", "The request can't be used"),
-    Unauthorized: (HTTPStatus.UNAUTHORIZED, "unauthorized", "A key is needed"),
+    Unauthorized: (HTTPStatus.UNAUTHORIZED, "unauthorized", "Key required"),
     Forbidden: (HTTPStatus.FORBIDDEN, "forbidden", "The key does not allow this"),
-    ForeignSite: (HTTPStatus.FORBIDDEN, "foreign-site", "Not for other websites"),
+    ForeignSite: (HTTPStatus.FORBIDDEN, "foreign-site", "Refused to another website"),
     NotFound: (HTTPStatus.NOT_FOUND, "not-found", "Not found"),
     Conflict: (HTTPStatus.CONFLICT, "conflict", "Not in this state"),
     NoRoom: (HTTPStatus.INSUFFICIENT_STORAGE, "no-room", "There is no room for it"),
     TooMany: (HTTPStatus.TOO_MANY_REQUESTS, "too-many", "Too many at once"),
-    Unavailable: (HTTPStatus.SERVICE_UNAVAILABLE, "unavailable", "Out of reach for now"),
+    Unavailable: (HTTPStatus.SERVICE_UNAVAILABLE, "unavailable", "Temporarily unavailable"),
     Corrupt: (HTTPStatus.INTERNAL_SERVER_ERROR, "corrupt", "Stored data is missing or damaged"),
-    GaveUp: (HTTPStatus.INTERNAL_SERVER_ERROR, "gave-up", "The work failed again and again"),
-    Exception: (HTTPStatus.INTERNAL_SERVER_ERROR, "internal", "Something went wrong here"),
+    GaveUp: (HTTPStatus.INTERNAL_SERVER_ERROR, "gave-up", "The work failed repeatedly"),
+    Exception: (HTTPStatus.INTERNAL_SERVER_ERROR, "internal", "Internal error"),
 }
+"""Status, slug and title by the type of the error, or by the closest of its bases."""
 
 
 def problem_of(error: Exception) -> dict[str, Any]:
-    """The problem detail of an error: ``type``, ``title``, ``status``, ``detail``, and what locates the fault."""
-    kind = next(kind for kind in type(error).__mro__ if kind in PROBLEMS)
-    status, slug, title = PROBLEMS[kind]
+    """The problem detail of an error: ``type``, ``title``, ``status``, ``detail``, and fields that locate the fault."""
+    known = next(base for base in type(error).__mro__ if base in PROBLEMS)
+    status, slug, title = PROBLEMS[known]
     if isinstance(error, EnvmatteError):
-        return _problem(status, slug, title, error.detail, **error.fields)
-    # What an unforeseen error says is for the log: it may name what is no caller's business.
-    return _problem(status, slug, title, f"an unforeseen {type(error).__name__}; the service's log has more")
+        return problem_detail(status, slug, title, error.detail, **error.fields)
+    # The text of an unexpected error is for the log only: it may hold what callers must not see.
+    return problem_detail(
+        status, slug, title, f"unexpected {type(error).__name__}; the service's log has the details"
+    )
 
 
-def _problem(status: int, slug: str, title: str, detail: str, **fields: Any) -> dict[str, Any]:
+def problem_detail(status: int, slug: str, title: str, detail: str, **fields: Any) -> dict[str, Any]:
+    """A problem detail with the members of RFC 9457, and with fields of its own."""
     return {
         "type": f"urn:envmatte:problem:{slug}",
         "title": title,

@@ -8,11 +8,12 @@ from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection, Row
 
-from services.api.context import After, Context, Limit, Needs
+from services.api.context import Context, OwnerContext
 from services.api.http.bodies import read_json, schema_of, store_body, upload_limit
 from services.api.http.idempotency import IdempotencyKey, find_earlier, idempotent
 from services.api.http.media_types import JSON, ZIP, media_type_of
 from services.api.http.responses import answered, time_of
+from services.api.http.types import After, Limit
 from services.api.quotas import admit, admit_upload
 from services.runtime import tracing
 from services.runtime.problems import WrongMediaType
@@ -95,7 +96,7 @@ class FromUpload(BaseModel):
     },
 )
 async def upload(
-    context: Needs,
+    context: OwnerContext,
     request: Request,
     response: Response,
     name: Annotated[str, Query(max_length=200, description="A name for people.")] = "",
@@ -110,7 +111,7 @@ async def upload(
     if media_type == JSON:
         wanted = await read_json(request, FromUpload, FROM_UPLOAD_BYTES)
         row = await anyio.to_thread.run_sync(
-            _from_upload, context, wanted, idempotency_key, limiter=context.bundles
+            _from_upload, context, wanted, idempotency_key, limiter=context.captures
         )
     elif media_type == ZIP:
         row = await _from_body(context, request, name, idempotency_key, webhook)
@@ -125,7 +126,7 @@ async def upload(
 
 @router.get("/captures")
 def list_captures(
-    context: Needs,
+    context: OwnerContext,
     limit: Limit = 100,
     after: After = None,
     state: Literal["ingesting", "ready", "failed"] | None = None,
@@ -136,14 +137,14 @@ def list_captures(
 
 
 @router.get("/captures/{id}")
-def get_capture(context: Needs, id: str) -> Capture:
+def get_capture(context: OwnerContext, id: str) -> Capture:
     """A capture."""
     with reading(context.engine) as c:
         return Capture.of(captures.get(c, id))
 
 
 @router.delete("/captures/{id}", status_code=204)
-def delete_capture(context: Needs, id: str) -> None:
+def delete_capture(context: OwnerContext, id: str) -> None:
     """Delete a capture and its frames; mattes that were recovered from it stay."""
     with writing(context.engine) as c:
         captures.get(c, id)
@@ -156,7 +157,7 @@ def delete_capture(context: Needs, id: str) -> None:
 
 
 @router.get("/captures/{id}/frames/{n}.png", response_class=Response)
-def get_frame(context: Needs, id: str, n: int) -> Response:
+def get_frame(context: OwnerContext, id: str, n: int) -> Response:
     """A frame as it was stored."""
     with reading(context.engine) as c:
         row = captures.get(c, id)
@@ -183,7 +184,7 @@ async def _from_body(
     try:
         size = await store_body(request, context.objects, stored_uploads.part_path(capture, ONLY), limit)
         given = context, capture, [Part(ONLY, size)], name, key, False, webhook
-        row = await anyio.to_thread.run_sync(_register, *given, limiter=context.bundles)
+        row = await anyio.to_thread.run_sync(_register, *given, limiter=context.captures)
     except Exception:
         # Not when cancelled, where `_register` may still be at work: the next start sweeps then.
         await anyio.to_thread.run_sync(stored_uploads.remove, context.objects, capture)
@@ -243,7 +244,7 @@ def _register(
     webhook: str | None = None,
 ) -> Row[Any]:
     """Check an archive that is complete, and write it down as a capture with its ingest job."""
-    context.check()
+    context.check_key()
     stored_uploads.seal(context.objects, capture, parts)
     with stored_uploads.read(context.objects, capture) as file:
         manifest = Bundle(file, context.settings.limits).manifest

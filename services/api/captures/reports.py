@@ -2,7 +2,7 @@
 
 from fastapi import APIRouter, Response
 
-from services.api.context import Context, Needs
+from services.api.context import Context, OwnerContext
 from services.api.http.responses import answered
 from storage.database.engine import reading
 from storage.errors import Conflict
@@ -15,14 +15,14 @@ router = APIRouter(tags=["captures"])
 
 
 @router.get("/captures/{id}/report")
-def get_report(context: Needs, id: str) -> Report:
+def get_report(context: OwnerContext, id: str) -> Report:
     """How a capture turned out, and what to do better."""
     stack = _stack(context, id)
     return report(stack.attributes, stack.frames)
 
 
 @router.get("/captures/{id}/contact-sheet.png", response_class=Response)
-def get_contact_sheet(context: Needs, id: str) -> Response:
+def get_contact_sheet(context: OwnerContext, id: str) -> Response:
     """Some of a capture's frames: what is clipped at white is red, at black blue."""
     return answered(contact_sheet(_stack(context, id)), "image/png")
 

@@ -20,7 +20,7 @@ from services.api.captures.tus import (
     number,
     version_spoken,
 )
-from services.api.context import Context, Needs
+from services.api.context import Context, OwnerContext
 from services.api.http.bodies import BodyLimit, has_body, upload_limit
 from services.api.http.idempotency import IdempotencyKey
 from services.api.http.media_types import require_media_type
@@ -41,7 +41,7 @@ Spoken = Depends(version_spoken)
 
 
 @router.options("", status_code=204, response_class=Response)
-def get_protocol(context: Needs, response: Response) -> None:
+def get_protocol(context: OwnerContext, response: Response) -> None:
     """What is spoken here: version, extensions, and the bytes of the largest upload."""
     response.headers["Tus-Extension"] = EXTENSIONS
     response.headers["Tus-Checksum-Algorithm"] = ",".join(ALGORITHMS)
@@ -50,7 +50,7 @@ def get_protocol(context: Needs, response: Response) -> None:
 
 @router.post("", status_code=201, dependencies=[Spoken], response_class=Response)
 async def create_upload(
-    context: Needs,
+    context: OwnerContext,
     request: Request,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
@@ -78,7 +78,7 @@ async def create_upload(
 
 
 @router.head("/{id}", dependencies=[Spoken], response_class=Response)
-def get_upload(context: Needs, id: str) -> Response:
+def get_upload(context: OwnerContext, id: str) -> Response:
     """How far an upload is: `Upload-Offset` of `Upload-Length` bytes."""
     with reading(context.engine) as c:
         row = uploads.get(c, id)
@@ -87,7 +87,7 @@ def get_upload(context: Needs, id: str) -> Response:
 
 
 @router.patch("/{id}", status_code=204, dependencies=[Spoken], response_class=Response)
-async def append(context: Needs, request: Request, id: str) -> Response:
+async def append(context: OwnerContext, request: Request, id: str) -> Response:
     """Send the bytes of an upload from `Upload-Offset` on.
 
     What has come of a body that breaks off is kept, unless it has an `Upload-Checksum`: then it is kept
@@ -107,7 +107,7 @@ async def append(context: Needs, request: Request, id: str) -> Response:
 
 
 @router.delete("/{id}", status_code=204, dependencies=[Spoken], response_class=Response)
-def delete_upload(context: Needs, id: str) -> None:
+def delete_upload(context: OwnerContext, id: str) -> None:
     """Give an upload up."""
     with writing(context.engine) as c:
         uploads.get(c, id)
@@ -160,7 +160,7 @@ async def _append(context: Context, request: Request, row: Row[Any], checksum: C
 
 
 def _advance(context: Context, upload: str, offset: int, stored: list[Part]) -> int:
-    context.check()
+    context.check_key()
     with writing(context.engine) as c:
         return uploads.advance(c, upload, offset, stored, context.settings.upload_seconds)
 

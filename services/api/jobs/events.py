@@ -12,7 +12,7 @@ from fastapi.responses import StreamingResponse
 from fastapi.sse import format_sse_event
 from pydantic import BaseModel
 
-from services.api.context import Context, Needs
+from services.api.context import Context, OwnerContext
 from services.api.jobs.jobs import Job
 from services.runtime.problems import Unauthorized
 from storage.database.engine import reading
@@ -39,7 +39,7 @@ CLOCKS = {"queued_seconds", "run_seconds", "eta_seconds"}
     },
 )
 async def follow_job(
-    context: Needs, id: str, last_event_id: Annotated[str | None, Header(max_length=256)] = None
+    context: OwnerContext, id: str, last_event_id: Annotated[str | None, Header(max_length=256)] = None
 ) -> Response:
     """The job, now and each time that it has changed, until it has ended; every event is all of it.
 
@@ -108,7 +108,7 @@ def _is_over(job: Job) -> bool:
 
 
 def _read(context: Context, id: str) -> Job:
-    context.check()
+    context.check_key()
     with reading(context.engine) as c:
         return Job.read(c, id)
 

@@ -8,10 +8,11 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection, Row
 
-from services.api.context import After, Limit, Needs
+from services.api.context import OwnerContext
 from services.api.http.bodies import read_json, schema_of
 from services.api.http.idempotency import IdempotencyKey, idempotent
 from services.api.http.responses import time_of
+from services.api.http.types import After, Limit
 from services.api.jobs.eta import seconds_left
 from services.api.jobs.wait_reason import reason
 from services.api.quotas import admit
@@ -165,7 +166,7 @@ def list_options() -> Options:
     openapi_extra={"requestBody": {"content": {"application/json": {"schema": schema_of(JobRequest)}}}},
 )
 def post_job(
-    context: Needs,
+    context: OwnerContext,
     request: Annotated[JobRequest, Depends(_job_request)],
     response: Response,
     idempotency_key: IdempotencyKey = None,
@@ -193,7 +194,9 @@ def post_job(
 
 
 @router.get("/jobs")
-def list_jobs(context: Needs, limit: Limit = 100, after: After = None, state: State | None = None) -> Jobs:
+def list_jobs(
+    context: OwnerContext, limit: Limit = 100, after: After = None, state: State | None = None
+) -> Jobs:
     """Jobs, newest first."""
     with reading(context.engine) as c:
         sign = leases.last_sign(c)  # once for all of them
@@ -201,7 +204,7 @@ def list_jobs(context: Needs, limit: Limit = 100, after: After = None, state: St
 
 
 @router.get("/jobs/{id}")
-def get_job(context: Needs, id: str) -> Job:
+def get_job(context: OwnerContext, id: str) -> Job:
     """A job."""
     with reading(context.engine) as c:
         return Job.read(c, id)
@@ -209,7 +212,7 @@ def get_job(context: Needs, id: str) -> Job:
 
 @router.get("/jobs/{id}/log")
 def get_log(
-    context: Needs, id: str, limit: Limit = 1000, after: Annotated[int, Query(ge=0, lt=1 << 63)] = 0
+    context: OwnerContext, id: str, limit: Limit = 1000, after: Annotated[int, Query(ge=0, lt=1 << 63)] = 0
 ) -> Log:
     """What happened to a job, line by line."""
     with reading(context.engine) as c:
@@ -219,7 +222,7 @@ def get_log(
 
 
 @router.post("/jobs/{id}/cancel")
-def cancel_job(context: Needs, id: str) -> Job:
+def cancel_job(context: OwnerContext, id: str) -> Job:
     """Cancel a job; what it wrote is removed as soon as its running tasks have ended."""
     with writing(context.engine) as c:
         jobs.cancel(c, id)
@@ -227,7 +230,7 @@ def cancel_job(context: Needs, id: str) -> Job:
 
 
 @router.post("/jobs/{id}/retry", status_code=202)
-def retry_job(context: Needs, id: str) -> Job:
+def retry_job(context: OwnerContext, id: str) -> Job:
     """Queue a failed job again; the tiles that are done are kept, unless `ENVMATTE_INGEST_MEMORY` has changed."""
     with writing(context.engine) as c:
         row = jobs.get(c, id)
@@ -241,7 +244,7 @@ def retry_job(context: Needs, id: str) -> Job:
 
 
 @router.delete("/jobs/{id}", status_code=204)
-def delete_job(context: Needs, id: str) -> None:
+def delete_job(context: OwnerContext, id: str) -> None:
     """Delete a job that has ended, and its log; its matte stays, the video of a composite goes."""
     with writing(context.engine) as c:
         kind = jobs.get(c, id).kind

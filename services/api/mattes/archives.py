@@ -8,7 +8,7 @@ from fastapi.responses import StreamingResponse
 from sqlalchemy import Connection, Row
 
 from services.api.captures.captures import ONLY
-from services.api.context import Context, Needs
+from services.api.context import Context, OwnerContext
 from services.api.http.bodies import store_body, upload_limit
 from services.api.http.idempotency import IdempotencyKey, find_earlier, idempotent
 from services.api.http.media_types import ZIP, require_media_type
@@ -33,7 +33,7 @@ CALL = "POST /v1/mattes"
     response_class=StreamingResponse,
     responses={200: {"content": {ZIP: {}}, "description": "The archive"}},
 )
-def get_archive(context: Needs, id: str) -> StreamingResponse:
+def get_archive(context: OwnerContext, id: str) -> StreamingResponse:
     """All of a matte in one ZIP, which any zarr reader opens, and which `POST /v1/mattes` takes elsewhere.
 
     The same matte makes the same bytes. Where the matte is deleted or the key revoked meanwhile, the connection ends
@@ -55,7 +55,7 @@ def get_archive(context: Needs, id: str) -> StreamingResponse:
     openapi_extra={"requestBody": {"content": {ZIP: {"schema": {"type": "string", "format": "binary"}}}}},
 )
 async def post_archive(
-    context: Needs, request: Request, response: Response, idempotency_key: IdempotencyKey = None
+    context: OwnerContext, request: Request, response: Response, idempotency_key: IdempotencyKey = None
 ) -> Matte:
     """Make a matte of an archive: the body is what `GET /v1/mattes/{id}/archive` gave.
 
@@ -86,7 +86,7 @@ async def _from_body(context: Context, request: Request, key: str | None) -> Row
 
 
 def _import(context: Context, matte: str, size: int, key: str | None) -> Row[Any]:
-    context.check()
+    context.check_key()
     objects = context.objects
     stored_uploads.seal(objects, matte, [Part(ONLY, size)])
     with stored_uploads.read(objects, matte) as file:

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Request, Response
 from fastapi.responses import StreamingResponse
 from sqlalchemy import Connection
 
-from services.api.context import Context, Needs
+from services.api.context import Context, OwnerContext
 from services.api.http.bodies import store_body, upload_limit
 from services.api.http.idempotency import find_earlier, idempotent
 from services.api.http.media_types import JSON, media_type_of
@@ -87,7 +87,7 @@ async def composite_clip(
         206: {"content": {"video/mp4": {}}, "description": "A part of it, by `Range`"},
     },
 )
-def get_video(context: Needs, id: str, request: Request) -> Response:
+def get_video(context: OwnerContext, id: str, request: Request) -> Response:
     """The video that a composite job has made: H.264 in MP4, with the times of the clip's frames, without sound."""
     with reading(context.engine) as c:
         row = jobs.get(c, id)
@@ -130,7 +130,7 @@ def _queue(
     webhook: str | None,
 ) -> Job:
     """Add the job of a clip that is stored; returns it, or that of a repeat with the same key that was quicker."""
-    context.check()
+    context.check_key()
 
     def create(c: Connection) -> str:
         row = mattes.get_ready(c, matte)

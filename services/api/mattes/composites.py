@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from starlette.datastructures import Headers
 
-from services.api.context import Context, Needs
+from services.api.context import Context, OwnerContext
 from services.api.errors import answer as problem_answer
 from services.api.http.bodies import spool_body
 from services.api.http.media_types import preferred
@@ -46,7 +46,7 @@ Distance = Annotated[float, Field(ge=1e-6, le=1e6)]
 """In whatever unit; far beyond it rays are no numbers any more."""
 
 
-class Wanted(BaseModel):
+class CompositeParams(BaseModel):
     """What of a composite is wanted, and how."""
 
     model_config = ConfigDict(extra="forbid")
@@ -82,7 +82,7 @@ class Wanted(BaseModel):
     )
 
     @model_validator(mode="after")
-    def _told(self) -> "Wanted":
+    def _told(self) -> "CompositeParams":
         given = [
             name
             for name in ("distance", "camera", "other", "other_distance")
@@ -139,7 +139,7 @@ class Wanted(BaseModel):
     },
 )
 async def post_composite(
-    context: Needs, id: str, request: Request, wanted: Annotated[Wanted, Query()]
+    context: OwnerContext, id: str, request: Request, wanted: Annotated[CompositeParams, Query()]
 ) -> Response:
     """Put the glass before a backdrop: the body is an image, the answer one of the matte's size.
 
@@ -199,7 +199,7 @@ def _seen(context: Context, id: str) -> Seen:
 
 
 def _answer(
-    context: Context, seen: Seen, body: IO[bytes], kind: str, wanted: Wanted, headers: Headers
+    context: Context, seen: Seen, body: IO[bytes], kind: str, wanted: CompositeParams, headers: Headers
 ) -> Response:
     times: list[str] = []
 
@@ -236,13 +236,13 @@ def _answer(
     return answered(answer, kind, told | {"Server-Timing": ", ".join(times)})
 
 
-def _rays(context: Context, seen: Seen, wanted: Wanted) -> Rays:
+def _rays(context: Context, seen: Seen, wanted: CompositeParams) -> Rays:
     """The rays to a backdrop at the depth that is wanted."""
     if seen.blocks is not None:
         raise Conflict(
             f"matte {seen.id} is still being recovered: a backdrop at another depth takes all of it"
         )
-    assert wanted.depth is not None  # as `Wanted` has seen to, and the next ones
+    assert wanted.depth is not None  # as `CompositeParams` has seen to, and the next ones
     assert wanted.distance is not None
     places = context.cache.places(seen.id, CORES)
     if wanted.camera is not None:
@@ -262,7 +262,7 @@ def _rays(context: Context, seen: Seen, wanted: Wanted) -> Rays:
     return from_two(places, others, (wanted.distance, wanted.other_distance), wanted.depth)
 
 
-def _encoded(picture: NDArray[np.float32], backdrop: Backdrop, kind: str, wanted: Wanted) -> bytes:
+def _encoded(picture: NDArray[np.float32], backdrop: Backdrop, kind: str, wanted: CompositeParams) -> bytes:
     if kind == "image/x-exr":
         opaque = bool((picture[..., 3] == 1).all())
         return float_formats.encode_exr(

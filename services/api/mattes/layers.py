@@ -8,8 +8,9 @@ import anyio.to_thread
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel
 
-from services.api.context import Colour, Context, Needs, Pair
+from services.api.context import Context, OwnerContext
 from services.api.http.responses import answered, is_known
+from services.api.http.types import Colour, Pair
 from storage.database.engine import reading
 from storage.errors import InvalidInput, NotFound
 from storage.layout import mattes as stored_mattes
@@ -78,7 +79,7 @@ class Transport(BaseModel):
     responses={200: {"content": {kind: {} for kind in MEDIA_TYPES.values()}, "description": "The layer"}},
 )
 async def get_layer(
-    context: Needs, id: str, file: str, request: Request, lobes: Lobes = layers.LOBES
+    context: OwnerContext, id: str, file: str, request: Request, lobes: Lobes = layers.LOBES
 ) -> Response:
     """A layer: `S`, `rho`, `alpha` or `confidence`, as `.png` (16 bits, linear, clipped to 0 to 1) or `.exr`;
     `stmap.exr`; or `all.exr`, all of it with the lobes of each pixel."""
@@ -108,7 +109,7 @@ async def get_layer(
 
 
 @router.get("/mattes/{id}/transport")
-def get_transport(context: Needs, id: str, x: X, y: Y, lobes: Lobes = layers.LOBES) -> Transport:
+def get_transport(context: OwnerContext, id: str, x: X, y: Y, lobes: Lobes = layers.LOBES) -> Transport:
     """Where the light of a pixel comes from: cells of the monitor and their weights by channel, and lobes."""
     pixel = look_into(_matte(context, id), x, y, lobes)
     return Transport(
@@ -136,7 +137,9 @@ def get_transport(context: Needs, id: str, x: X, y: Y, lobes: Lobes = layers.LOB
     response_class=Response,
     responses={200: {"content": {"image/png": {}}, "description": "The picture"}},
 )
-async def get_transport_picture(context: Needs, id: str, x: X, y: Y, lobes: Lobes = layers.LOBES) -> Response:
+async def get_transport_picture(
+    context: OwnerContext, id: str, x: X, y: Y, lobes: Lobes = layers.LOBES
+) -> Response:
     """The same as a picture: the monitor, a close-up with the lobes as ellipses, and the channels apart."""
 
     def draw() -> bytes:

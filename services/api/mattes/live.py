@@ -5,7 +5,7 @@ from contextlib import suppress
 import anyio.to_thread
 from fastapi import APIRouter, Request, Response
 
-from services.api.context import Needs
+from services.api.context import OwnerContext
 from services.api.http.responses import answered, is_known
 from storage.database.engine import reading
 from storage.errors import Corrupt, NoRoom
@@ -24,7 +24,7 @@ router = APIRouter(tags=["mattes"])
         200: {"content": {"application/octet-stream": {}}, "description": "The matte, as gzip encodes it"}
     },
 )
-async def get_live(context: Needs, id: str, request: Request) -> Response:
+async def get_live(context: OwnerContext, id: str, request: Request) -> Response:
     """The matte as a few look-ups a pixel in mip-mapped textures, with S, rho and alpha: what a graphics card draws the
     glass with before any backdrop. It is made when it is first asked for, and kept."""
 

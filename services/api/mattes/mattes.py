@@ -7,8 +7,9 @@ from fastapi import APIRouter
 from pydantic import BaseModel
 from sqlalchemy import Row
 
-from services.api.context import After, Limit, Needs, Pair
+from services.api.context import OwnerContext
 from services.api.http.responses import time_of
+from services.api.http.types import After, Limit, Pair
 from storage.database.engine import reading, writing
 from storage.database.rows import page
 from storage.database.tables import mattes as table
@@ -54,7 +55,7 @@ class Mattes(BaseModel):
 
 @router.get("/mattes")
 def list_mattes(
-    context: Needs,
+    context: OwnerContext,
     limit: Limit = 100,
     after: After = None,
     state: Literal["recovering", "ready", "failed"] | None = None,
@@ -65,14 +66,14 @@ def list_mattes(
 
 
 @router.get("/mattes/{id}")
-def get_matte(context: Needs, id: str) -> Matte:
+def get_matte(context: OwnerContext, id: str) -> Matte:
     """A matte."""
     with reading(context.engine) as c:
         return Matte.of(mattes.get(c, id))
 
 
 @router.delete("/mattes/{id}", status_code=204)
-def delete_matte(context: Needs, id: str) -> None:
+def delete_matte(context: OwnerContext, id: str) -> None:
     """Delete a matte."""
     with writing(context.engine) as c:
         row = mattes.get(c, id)

@@ -7,7 +7,7 @@ import anyio.to_thread
 from fastapi import APIRouter, Depends, Header, Request, Response
 from fastapi.responses import StreamingResponse
 
-from services.api.context import Needs
+from services.api.context import OwnerContext
 from services.api.http.bodies import read_json, schema_of
 from services.api.jobs.events import stream
 from services.api.programs.programs import Program, Told, get_program
@@ -28,7 +28,7 @@ async def _told(request: Request) -> Told:
     dependencies=[Depends(get_program)],  # one that is unknown is told before what is wrong with the body
     openapi_extra={"requestBody": {"content": {"application/json": {"schema": schema_of(Told)}}}},
 )
-def put_showing(context: Needs, id: str, told: Annotated[Told, Depends(_told)]) -> None:
+def put_showing(context: OwnerContext, id: str, told: Annotated[Told, Depends(_told)]) -> None:
     """Tell how far the showing of a program is: its page does, for whoever follows it elsewhere."""
     with writing(context.engine) as c:
         programs.show(c, id, told.model_dump(mode="json"))
@@ -36,12 +36,12 @@ def put_showing(context: Needs, id: str, told: Annotated[Told, Depends(_told)]) 
 
 @router.get("/programs/{id}/events", response_class=StreamingResponse)
 async def follow_program(
-    context: Needs, id: str, last_event_id: Annotated[str | None, Header(max_length=256)] = None
+    context: OwnerContext, id: str, last_event_id: Annotated[str | None, Header(max_length=256)] = None
 ) -> Response:
     """The program, now and each time that its page has told how far it is, as server-sent events."""
 
     def read() -> Program:
-        context.check()
+        context.check_key()
         return get_program(context, id)
 
     return stream(read, await anyio.to_thread.run_sync(read), _mark, last_event_id)

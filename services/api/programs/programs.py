@@ -14,11 +14,12 @@ from fastapi.responses import FileResponse, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from sqlalchemy import Row
 
-from services.api.context import WEB, After, Limit, Needs
+from services.api.context import OwnerContext
 from services.api.http.bodies import read_json, schema_of
 from services.api.http.responses import FromFile, answered
+from services.api.http.types import After, Limit
 from services.api.quotas import admit
-from services.api.system.pages import HEADERS
+from services.api.system.pages import HEADERS, WEB
 from storage.database.engine import reading, writing
 from storage.database.rows import page as page_of
 from storage.database.tables import programs as table
@@ -165,7 +166,7 @@ def list_presets() -> Presets:
     openapi_extra={"requestBody": {"content": {"application/json": {"schema": schema_of(ProgramRequest)}}}},
 )
 def post_program(
-    context: Needs, request: Annotated[ProgramRequest, Depends(_request)], response: Response
+    context: OwnerContext, request: Annotated[ProgramRequest, Depends(_request)], response: Response
 ) -> Program:
     """Keep a program. Its id follows from what it shows: a repeat makes nothing, with an Idempotency-Key or without."""
     screen = (request.monitor.width, request.monitor.height) if request.monitor else None
@@ -182,28 +183,28 @@ def post_program(
 
 
 @router.get("/programs")
-def list_programs(context: Needs, limit: Limit = 100, after: After = None) -> Programs:
+def list_programs(context: OwnerContext, limit: Limit = 100, after: After = None) -> Programs:
     """Programs, newest first."""
     with reading(context.engine) as c:
         return Programs(programs=[Program.of(row) for row in page_of(c, table, limit, after)])
 
 
 @router.get("/programs/{id}")
-def get_program(context: Needs, id: str) -> Program:
+def get_program(context: OwnerContext, id: str) -> Program:
     """A program."""
     with reading(context.engine) as c:
         return Program.of(programs.get(c, id))
 
 
 @router.delete("/programs/{id}", status_code=204)
-def delete_program(context: Needs, id: str) -> None:
+def delete_program(context: OwnerContext, id: str) -> None:
     """Delete a program; captures of it keep their own."""
     with writing(context.engine) as c:
         programs.get(c, id)
         programs.forget(c, id)
 
 
-def _shown(context: Needs, id: str) -> Shown:
+def _shown(context: OwnerContext, id: str) -> Shown:
     with reading(context.engine) as c:
         return Shown.model_validate(programs.get(c, id).program)
 
@@ -212,7 +213,7 @@ Asked = Annotated[Shown, Depends(_shown)]
 
 
 @router.get("/programs/{id}/program.json")
-def get_record(context: Needs, id: str) -> dict[str, Any]:
+def get_record(context: OwnerContext, id: str) -> dict[str, Any]:
     """A program as capture.json has it."""
     with reading(context.engine) as c:
         found: dict[str, Any] = programs.get(c, id).program
@@ -220,7 +221,7 @@ def get_record(context: Needs, id: str) -> dict[str, Any]:
 
 
 @router.get("/programs/{id}/patterns/{n}.png", response_class=Response)
-async def get_pattern(context: Needs, shown: Asked, n: int) -> Response:
+async def get_pattern(context: OwnerContext, shown: Asked, n: int) -> Response:
     """What the monitor shows for a pattern."""
     if not 0 <= n < shown.count:
         raise NotFound(f"this program has the patterns 0 to {shown.count - 1}", field="n")
@@ -232,7 +233,7 @@ async def get_pattern(context: Needs, shown: Asked, n: int) -> Response:
 
 
 @router.get("/programs/{id}/patterns.zip", response_class=StreamingResponse)
-async def get_patterns(context: Needs, shown: Asked) -> StreamingResponse:
+async def get_patterns(context: OwnerContext, shown: Asked) -> StreamingResponse:
     """`program.json` and a numbered PNG of each pattern, drawn while they are sent."""
     parts = archive(shown)
 
@@ -245,7 +246,7 @@ async def get_patterns(context: Needs, shown: Asked) -> StreamingResponse:
 
 @router.get("/programs/{id}/patterns.mp4", response_class=StreamingResponse)
 async def get_film(
-    context: Needs,
+    context: OwnerContext,
     shown: Asked,
     rate: Annotated[float, Query(ge=video.SLOWEST, le=video.FASTEST, description="Patterns a second.")] = 2.0,
 ) -> StreamingResponse:

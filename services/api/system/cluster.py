@@ -3,7 +3,7 @@
 from fastapi import APIRouter
 from pydantic import BaseModel, Field
 
-from services.api.context import Whole
+from services.api.context import AdminContext
 from services.api.jobs.wait_reason import trouble_of
 from storage.database.engine import reading
 from storage.records import leases, statistics
@@ -55,7 +55,7 @@ class Cluster(BaseModel):
 
 
 @router.get("/cluster")
-def get_cluster(context: Whole) -> Cluster:
+def get_cluster(context: AdminContext) -> Cluster:
     """Workers, threads, memory, the queue, and what is wrong if something is."""
     with reading(context.engine) as c:
         sign = leases.last_sign(c)

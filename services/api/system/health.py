@@ -6,7 +6,7 @@ from typing import Literal
 from fastapi import APIRouter, Response
 from pydantic import BaseModel
 
-from services.api.context import Keyless
+from services.api.context import AnonymousContext
 from services.api.jobs.wait_reason import trouble_of
 from storage.database.engine import reading, writing
 from storage.records import leases
@@ -36,7 +36,7 @@ def health() -> Health:
 
 
 @router.get("/readyz")
-def readiness(context: Keyless, response: Response) -> Readiness:
+def readiness(context: AnonymousContext, response: Response) -> Readiness:
     """Whether the database, the store and the cluster can be reached; 503 if not."""
 
     def database() -> str:

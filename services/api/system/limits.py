@@ -3,7 +3,7 @@
 from fastapi import APIRouter
 from pydantic import BaseModel, Field
 
-from services.api.context import Needs
+from services.api.context import OwnerContext
 from services.api.quotas import Unit, limits_of
 from storage.database.engine import reading
 
@@ -29,7 +29,7 @@ class Limits(BaseModel):
 
 
 @router.get("/limits")
-def get_limits(context: Needs) -> Limits:
+def get_limits(context: OwnerContext) -> Limits:
     """Every limit, and what of it the caller's owner has used; of the whole service for admins alone."""
     caller = context.caller
     with reading(context.engine) as c:

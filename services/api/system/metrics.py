@@ -10,7 +10,7 @@ from prometheus_client.exposition import choose_encoder
 from prometheus_client.registry import Collector
 from sqlalchemy import Connection
 
-from services.api.context import Whole
+from services.api.context import AdminContext
 from services.api.jobs.wait_reason import trouble_of
 from storage.database.engine import reading
 from storage.records import leases, statistics
@@ -34,7 +34,7 @@ class _Found(Collector):
 
 
 @router.get("/metrics", response_class=Response)
-def get_metrics(context: Whole, request: Request) -> Response:
+def get_metrics(context: AdminContext, request: Request) -> Response:
     """Figures for Prometheus, of the whole service."""
     with reading(context.engine) as c:
         found = _Found([*_of_the_queue(c), *_of_work(c), *_of_data(c), *_of_the_cluster(c)])

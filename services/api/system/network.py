@@ -6,7 +6,7 @@ from fastapi import APIRouter, Request
 from pydantic import BaseModel, Field
 
 from services.api.auth import is_open
-from services.api.context import Needs
+from services.api.context import OwnerContext
 from services.runtime.addresses import is_loopback
 
 router = APIRouter(tags=["system"])
@@ -23,7 +23,7 @@ class Network(BaseModel):
 
 
 @router.get("/network")
-def get_network(context: Needs, request: Request) -> Network:
+def get_network(context: OwnerContext, request: Request) -> Network:
     """The address of the web app for other devices of the local network, or why there is none."""
     host, port = context.settings.host, request.scope["server"][1]
     if is_loopback(host):

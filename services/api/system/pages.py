@@ -9,9 +9,9 @@ from fastapi import APIRouter
 from fastapi.responses import FileResponse, Response
 from starlette.staticfiles import StaticFiles
 
-from services.api.context import WEB
-
 page = APIRouter()
+WEB = Path(__file__).parents[2] / "web"
+"""The browser's files."""
 POLICY = "; ".join(
     (
         "default-src 'none'",

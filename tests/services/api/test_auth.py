@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from sqlalchemy import Engine
 
-from services.api.auth import ADMIN, ANYONE, Caller, identify, see_that_it_is_closed
+from services.api.auth import ADMIN, ANYONE, Caller, identify, require_keys_unless_loopback
 from services.runtime.problems import Unauthorized
 from services.settings import Settings
 from storage.database.engine import open_engine, writing
@@ -54,17 +54,17 @@ def test_a_service_without_keys_stays_on_loopback(host: str, engine: Engine, tmp
     with pytest.raises(
         InvalidInput, match=r"`envmatte keys make NAME`, set ENVMATTE_KEYS .* or listen on 127"
     ):
-        see_that_it_is_closed(Settings(data=tmp_path, host=host), engine)
-    see_that_it_is_closed(Settings(data=tmp_path, host=host, keys="a-key"), engine)
+        require_keys_unless_loopback(Settings(data=tmp_path, host=host), engine)
+    require_keys_unless_loopback(Settings(data=tmp_path, host=host, keys="a-key"), engine)
     with writing(engine) as c:
         api_keys.make(c, "lab", "alice", "read")
         api_keys.revoke(c, "lab")
-    see_that_it_is_closed(Settings(data=tmp_path, host=host), engine)
+    require_keys_unless_loopback(Settings(data=tmp_path, host=host), engine)
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "::1", "localhost"])
 def test_loopback_needs_no_key(host: str, engine: Engine, tmp_path: Path) -> None:
-    see_that_it_is_closed(Settings(data=tmp_path, host=host), engine)
+    require_keys_unless_loopback(Settings(data=tmp_path, host=host), engine)
 
 
 def test_scopes_grow() -> None:

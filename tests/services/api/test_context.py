@@ -1,4 +1,4 @@
-"""What goes on long after a request's key was looked at: against a real database."""
+"""Requests that go on after their key was checked, against a real database."""
 
 import time
 from collections.abc import Iterator
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from services.api.auth import identify
-from services.api.context import LOOK, Context
+from services.api.context import KEY_CHECK, Context
 from services.decoding.pool import Decoders
 from services.runtime.problems import Unauthorized
 from services.settings import Settings
@@ -18,21 +18,21 @@ from storage.records import api_keys
 from workflows.composite.cache import Cache
 
 
-def test_a_download_ends_with_its_key(tmp_path: Path) -> None:
+def test_download_ends_when_its_key_is_revoked(tmp_path: Path) -> None:
     engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
     with writing(engine) as c:
         key = api_keys.make(c, "lab", "alice", "read")
     settings, objects = Settings(data=tmp_path), Objects((tmp_path / "store").as_uri())
-    check = partial(identify, settings, engine, key)
-    decoders = Decoders(settings.backdrop_bytes)  # which start when they are asked
-    context = Context(settings, engine, objects, Cache(objects, 0), decoders, check=check)
+    check_key = partial(identify, settings, engine, key)
+    decoders = Decoders(settings.backdrop_bytes)  # no process starts before the first picture
+    context = Context(settings, engine, objects, Cache(objects, 0), decoders, check_key=check_key)
 
     def pieces() -> Iterator[bytes]:
         for n in range(5):
             if n == 3:
                 with writing(engine) as c:
                     api_keys.revoke(c, "lab")
-            time.sleep(1.1 * LOOK)
+            time.sleep(1.1 * KEY_CHECK)
             yield bytes([n])
 
     sent: list[bytes] = []
