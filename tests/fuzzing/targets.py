@@ -41,7 +41,7 @@ from workflows.composite.backdrop import backdrop_of
 from workflows.composite.video import steps as video_steps
 from workflows.images import camera_raw, decode, float_formats, integer_formats
 from workflows.ingest import steps as ingest_steps
-from workflows.ingest.bundle import Bundle
+from workflows.ingest.archive import CaptureArchive
 from workflows.ingest.video.decoder import PARTS, Share, opened
 from workflows.mattes.imports.importing import take_in
 from workflows.mattes.options import parse_options
@@ -92,7 +92,7 @@ def make_zip(random: Random, whole: Files) -> bytes:
 
 
 def read_zip(data: bytes, folder: Path) -> None:
-    archive = zip_files.opened(io.BytesIO(data), CaptureError)
+    archive = zip_files.open_archive(io.BytesIO(data), CaptureError)
     for info in zip_files.entries(archive, 100, LIMITS.unpacked, CaptureError).values():
         assert len(zip_files.read(archive, info, 1 << 16, CaptureError)) <= info.file_size
 
@@ -106,7 +106,7 @@ def make_bundle(random: Random, whole: Files) -> bytes:
 
 
 def read_bundle(data: bytes, folder: Path) -> None:
-    bundle = Bundle(io.BytesIO(data), LIMITS)
+    bundle = CaptureArchive(io.BytesIO(data), LIMITS)
     manifest = bundle.manifest
     for name in {frame.file for frame in manifest.frames}:
         bundle.read(name)

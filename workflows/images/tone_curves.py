@@ -9,10 +9,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class Gamma(BaseModel):
-    """A pure power: light = value ** gamma."""
+    """A pure power law: light = value ** gamma."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-    gamma: Annotated[float, Field(ge=0.2, le=5.0)]
+    gamma: Annotated[float, Field(ge=0.2, le=5.0, description="The exponent.", examples=[2.2])]
 
 
 # Pixels, about, that curves are fitted to.

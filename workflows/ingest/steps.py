@@ -16,7 +16,8 @@ from workflows.images import integer_formats
 from workflows.images.resample import smallest_grid
 from workflows.images.tone_curves import Response
 from workflows.ingest import stills
-from workflows.ingest.bundle import MANIFEST, Bundle
+from workflows.ingest.archive import CaptureArchive
+from workflows.ingest.manifest import MANIFEST
 from workflows.ingest.video.border_reader import LOOKS
 from workflows.ingest.video.decoder import Share, opened
 from workflows.ingest.video.matching import MOST_PATTERNS, Sorted, sort
@@ -27,7 +28,7 @@ from workflows.untrusted.limits import Limits
 
 
 def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, Any]:
-    """Look into the bundle of a capture and make its empty stack.
+    """Look into the archive of a capture and make its empty stack.
 
     Returns
     -------
@@ -40,12 +41,12 @@ def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, Any]:
     CaptureError
     """
     with uploads.read(objects, capture) as file:
-        bundle = Bundle(file, limits)
-        manifest = bundle.manifest
+        archive = CaptureArchive(file, limits)
+        manifest = archive.manifest
         names = [n for part in manifest.program.parts if isinstance(part, Images) for n in part.files]
         patterns: list[NDArray[np.float32]] = []
         for name in names:
-            patterns.append(integer_formats.to_unit(smallest_grid(_decode(bundle, name, limits))))
+            patterns.append(integer_formats.to_unit(smallest_grid(_decode(archive, name, limits))))
             if sum(pattern.nbytes for pattern in patterns) > limits.memory // 2:
                 raise CaptureError(
                     f"the patterns that come as images take more than {limits.memory // 2} bytes together, from "
@@ -55,12 +56,12 @@ def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, Any]:
                 )
         # Of all frames, for the camera stood still: one that looks down takes itself for turned now this way, now that.
         turn = (
-            1 if manifest.video is not None else stills.orientation(bundle, manifest.frames[0].file, limits)
+            1 if manifest.video is not None else stills.orientation(archive, manifest.frames[0].file, limits)
         )
-        shape, storage, filmed = _look(bundle, patterns, limits)
+        shape, storage, filmed = _look(archive, patterns, limits)
         mask = None
         if manifest.mask is not None:
-            mask = np.any(_decode(bundle, manifest.mask, limits), axis=2)
+            mask = np.any(_decode(archive, manifest.mask, limits), axis=2)
             if mask.shape != shape[1:3]:
                 raise CaptureError(
                     f"{manifest.mask} is {_size(mask)}, the frames are {shape[2]} x {shape[1]}"
@@ -69,7 +70,7 @@ def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, Any]:
                 )
     frames, height, width, _ = shape
     shown = manifest.frames[0].file if manifest.video is None else manifest.video.file
-    limits.see_that_pixels_may(width, height, entry=shown)
+    limits.check_pixels(width, height, entry=shown)
     taken = math.prod(shape) * storage.dtype.itemsize
     if taken > limits.unpacked:
         raise CaptureError(
@@ -108,15 +109,15 @@ def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, Any]:
 
 
 def _look(
-    bundle: Bundle, patterns: Sequence[NDArray[np.float32]], limits: Limits
+    archive: CaptureArchive, patterns: Sequence[NDArray[np.float32]], limits: Limits
 ) -> tuple[tuple[int, int, int, int], stills.Storage, Sorted | None]:
     """The shape of the stack and how it is stored, and of a video which of its frames show what."""
-    manifest = bundle.manifest
+    manifest = archive.manifest
     if manifest.video is None:
-        first = stills.read(bundle, manifest.frames[0].file, limits)
+        first = stills.read(archive, manifest.frames[0].file, limits)
         height, width, channels = first.shape
         shape = len(manifest.frames), height, width, channels
-        return shape, stills.storage_of(bundle, first, limits), None
+        return shape, stills.storage_of(archive, first, limits), None
     program, entry = manifest.program, manifest.video.file
     if program.count > MOST_PATTERNS:
         raise CaptureError(
@@ -127,7 +128,7 @@ def _look(
         )
     curve = "srgb" if program.monitor.response == "unknown" else program.monitor.response
     light = lay_out(program, curve, patterns)
-    with bundle.open(entry) as file, opened(file, entry, limits.image) as clip:
+    with archive.open(entry) as file, opened(file, entry, limits.image) as clip:
         border, rate = manifest.video.border, manifest.video.patterns_per_second
         signatures, ticks, large = clip.signatures(
             limits.memory // 4, math.inf if border is None else 1 / (LOOKS * rate)
@@ -159,30 +160,30 @@ def read_slab(objects: Objects, capture: str, limits: Limits, slab: int, index: 
     first, last = index * slab, min((index + 1) * slab, stack.frames)
     frames = np.empty((last - first, stack.height, stack.width, stack.channels), stack.dtype)
     with uploads.read(objects, capture) as file:
-        bundle = Bundle(file, limits)
-        for n, pixels in enumerate(_pixels(bundle, stack, first, last, limits)):
+        archive = CaptureArchive(file, limits)
+        for n, pixels in enumerate(_pixels(archive, stack, first, last, limits)):
             frames[n] = pixels
     write_slab(objects, capture, first, frames)
     return int(frames.shape[0] * frames.shape[1] * frames.shape[2])
 
 
 def _pixels(
-    bundle: Bundle, stack: Stack, first: int, last: int, limits: Limits
+    archive: CaptureArchive, stack: Stack, first: int, last: int, limits: Limits
 ) -> Iterator[integer_formats.Codes]:
     """The frames of a stack from ``first`` up to ``last``, one after another."""
-    video = bundle.manifest.video
+    video = archive.manifest.video
     if video is not None:
         shares = stack.shares()
         plan = [[Share(*row) for row in shares[shares[:, 0] == n, 1:].tolist()] for n in range(first, last)]
-        with bundle.open(video.file) as file, opened(file, video.file, limits.image) as clip:
+        with archive.open(video.file) as file, opened(file, video.file, limits.image) as clip:
             yield from clip.means(plan)
         return
     shape = (stack.height, stack.width, stack.channels)
     storage = stills.Storage(stack.dtype, **stack.attributes["storage"])
     kind = np.dtype(np.float32) if storage.black else stack.dtype
     turn = stack.attributes.get("orientation", 1)  # which captures did not have before it was looked at
-    for frame in bundle.manifest.frames[first:last]:
-        pixels = stills.read(bundle, frame.file, limits, turn)
+    for frame in archive.manifest.frames[first:last]:
+        pixels = stills.read(archive, frame.file, limits, turn)
         if pixels.shape != shape or pixels.dtype != kind:
             raise CaptureError(
                 f"{frame.file} is {_size(pixels)} with {pixels.shape[2]} channels of {pixels.dtype}, the first "
@@ -193,8 +194,8 @@ def _pixels(
         yield storage.encode(pixels)
 
 
-def _decode(bundle: Bundle, entry: str, limits: Limits) -> integer_formats.Codes:
-    data = bundle.read(entry)
+def _decode(archive: CaptureArchive, entry: str, limits: Limits) -> integer_formats.Codes:
+    data = archive.read(entry)
     try:
         with Guard(entry, limits.image).on():
             return integer_formats.decode(data, memory=limits.image)

@@ -10,7 +10,8 @@ from workflows.images import camera_raw, float_formats, integer_formats
 from workflows.images.float_formats import Floats
 from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import BLACK
-from workflows.ingest.bundle import MANIFEST, Bundle
+from workflows.ingest.archive import CaptureArchive
+from workflows.ingest.manifest import MANIFEST
 from workflows.untrusted.decoder_guard import Guard
 from workflows.untrusted.limits import Limits
 
@@ -56,14 +57,14 @@ class Storage(NamedTuple):
         return codes
 
 
-def orientation(bundle: Bundle, entry: str, limits: Limits) -> int:
+def orientation(archive: CaptureArchive, entry: str, limits: Limits) -> int:
     """How a frame says that it is to be turned to be upright, as `images.upright` takes it."""
-    data = bundle.read(entry)
+    data = archive.read(entry)
     with Guard(entry, limits.image).on():
         return camera_raw.orientation(data) if camera_raw.is_raw(entry) else integer_formats.orientation(data)
 
 
-def read(bundle: Bundle, entry: str, limits: Limits, turn: int | None = None) -> Codes | Floats:
+def read(archive: CaptureArchive, entry: str, limits: Limits, turn: int | None = None) -> Codes | Floats:
     """Decode a frame: PNG, TIFF, JPEG, EXR, camera RAW.
 
     Parameters
@@ -81,7 +82,7 @@ def read(bundle: Bundle, entry: str, limits: Limits, turn: int | None = None) ->
     CaptureError
         Naming the entry.
     """
-    data = bundle.read(entry)
+    data = archive.read(entry)
     try:
         with Guard(entry, limits.image).on():
             if camera_raw.is_raw(entry):
@@ -93,8 +94,8 @@ def read(bundle: Bundle, entry: str, limits: Limits, turn: int | None = None) ->
         raise CaptureError(f"{entry}: {error.detail}", entry=entry, **error.fields) from error
 
 
-def storage_of(bundle: Bundle, first: NDArray[np.generic], limits: Limits) -> Storage:
-    """How the frames of a bundle are to be stored, by its first.
+def storage_of(archive: CaptureArchive, first: NDArray[np.generic], limits: Limits) -> Storage:
+    """How the frames of a archive are to be stored, by its first.
 
     Raises
     ------
@@ -108,7 +109,7 @@ def storage_of(bundle: Bundle, first: NDArray[np.generic], limits: Limits) -> St
     """
     if first.dtype != np.float32:
         return Storage(first.dtype, 0, 1.0, True)  # type: ignore[arg-type]
-    manifest = bundle.manifest
+    manifest = archive.manifest
     if manifest.response not in ("linear", "unknown"):
         raise CaptureError(
             'RAW, EXR and float TIFF frames hold linear light: say so, "response": "linear"',
@@ -121,7 +122,7 @@ def storage_of(bundle: Bundle, first: NDArray[np.generic], limits: Limits) -> St
     entry = max(frames, key=lambda frame: frame.exposure).file
     full, bounded = 1.0, camera_raw.is_raw(entry)
     if not bounded:
-        values = read(bundle, entry, limits)
+        values = read(archive, entry, limits)
         finite = values[np.isfinite(values)]
         full = 0.0
         if finite.size:

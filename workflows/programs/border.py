@@ -54,16 +54,15 @@ Box = tuple[int, int, int, int]
 
 
 class Border(Record):
-    """The border on a display of a size: where its cells are. All of it follows from the size.
+    """A display that showed the patterns inside a numbered border, in pixels, border included.
 
-    Notes
-    -----
-    It is ``height // 20`` pixels thick. Along the top and the bottom lie 2 (BITS + 1) cells, along each side 2 TICKS,
-    all as thick as the border, as long as whole pixels allow, and centred; the corners stay black.
+    The size of the display determines where the cells of the border are.
     """
 
-    width: Annotated[int, Field(ge=1, le=16384)]
-    height: Annotated[int, Field(ge=1, le=16384)]
+    # The border is height // 20 pixels thick. Along the top and the bottom lie 2 (BITS + 1) cells, along each side
+    # 2 TICKS: all as thick as the border, as long as whole pixels allow, and centred. The corners stay black.
+    width: Annotated[int, Field(ge=1, le=16384, description="Width in pixels.", examples=[1920])]
+    height: Annotated[int, Field(ge=1, le=16384, description="Height in pixels.", examples=[1080])]
 
     @model_validator(mode="after")
     def _room_for_cells(self) -> "Border":

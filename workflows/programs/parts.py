@@ -1,4 +1,4 @@
-"""The monitor and the parts of a pattern program, as the capture format writes them."""
+"""The monitor and the parts of a pattern program, as capture.json writes them."""
 
 from collections.abc import Iterator
 from typing import Annotated, Literal
@@ -10,34 +10,55 @@ from pydantic import BaseModel, ConfigDict, FailFast, Field, model_validator
 from workflows.images.resample import area_mean, stretch
 from workflows.images.tone_curves import Response
 
-MOST_BLOCKS = 4096
-"""Of a random grid, along each axis."""
-MOST_PATTERNS = 100_000
-"""Of a part, and of all of a program's together."""
+MAX_BLOCKS = 4096
+"""Blocks of a random grid along each axis."""
+MAX_PATTERNS = 100_000
+"""Patterns of a part, and of a program."""
 
 Unit = Annotated[float, Field(ge=0, le=1)]
 
 
 class Record(BaseModel):
-    """A piece of capture.json; what this version does not know is passed over."""
+    """Base of the models in capture.json. Fields that this version does not know are ignored."""
 
     model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
 
 
 class Monitor(Record):
-    """The monitor that the program was shown on."""
+    """The part of the monitor that showed the patterns, in pixels."""
 
-    width: Annotated[int, Field(ge=1, le=16384)]
-    height: Annotated[int, Field(ge=1, le=16384)]
-    response: Response = "linear"
+    width: Annotated[int, Field(ge=1, le=16384, description="Width in pixels.", examples=[1920])]
+    height: Annotated[int, Field(ge=1, le=16384, description="Height in pixels.", examples=[1080])]
+    response: Response = Field(
+        default="linear",
+        description="Tone curve of the monitor, from value sent to light emitted: `linear`, `srgb`, a gamma, or "
+        "`unknown`, which has it estimated from the constant levels.",
+    )
 
 
 class Constant(Record):
-    """The whole monitor at one level or colour after another (Sect. 4.1)."""
+    """The whole monitor at one level or colour after another: one pattern for each. Give `levels` or `colours`."""
 
-    kind: Literal["constant"]
-    levels: Annotated[tuple[Unit, ...], FailFast(), Field(max_length=MOST_PATTERNS)] = ()
-    colours: Annotated[tuple[tuple[Unit, Unit, Unit], ...], FailFast(), Field(max_length=MOST_PATTERNS)] = ()
+    model_config = ConfigDict(
+        json_schema_extra={
+            "oneOf": [
+                {"required": [name], "properties": {name: {"minItems": 1}}} for name in ("levels", "colours")
+            ]
+        }
+    )
+    kind: Literal["constant"] = Field(description="Says that this part is constant.")
+    levels: Annotated[tuple[Unit, ...], FailFast(), Field(max_length=MAX_PATTERNS)] = Field(
+        default=(),
+        description="Grey values sent to the monitor, 0 (black) to 1 (white).",
+        examples=[[0, 0.25, 0.5, 0.75, 1]],
+    )
+    colours: Annotated[tuple[tuple[Unit, Unit, Unit], ...], FailFast(), Field(max_length=MAX_PATTERNS)] = (
+        Field(
+            default=(),
+            description="Colours sent to the monitor, each [red, green, blue] from 0 to 1.",
+            examples=[[[0, 0, 0], [1, 1, 1], [1, 0, 0]]],
+        )
+    )
 
     @model_validator(mode="after")
     def _one_of_them(self) -> "Constant":
@@ -57,15 +78,30 @@ class Constant(Record):
 
 
 class Bernoulli(Record):
-    """Random grids of black and white blocks (Sect. 4.2.1), each rolled by an offset of its own if asked for."""
+    """Random grids of black and white blocks. The seed determines the bits of all of them."""
 
-    kind: Literal["bernoulli"]
-    columns: Annotated[int, Field(ge=1, le=MOST_BLOCKS)]
-    rows: Annotated[int, Field(ge=1, le=MOST_BLOCKS)]
-    count: Annotated[int, Field(ge=1, le=MOST_PATTERNS)]
-    seed: Annotated[int, Field(ge=0, le=2**64 - 1)]
-    colour: Literal["grey", "rgb"] = "grey"
-    offset: bool = False
+    kind: Literal["bernoulli"] = Field(description="Says that this part consists of random grids.")
+    columns: Annotated[int, Field(ge=1, le=MAX_BLOCKS, description="Blocks in a row.", examples=[128])]
+    rows: Annotated[int, Field(ge=1, le=MAX_BLOCKS, description="Blocks in a column.", examples=[96])]
+    count: Annotated[int, Field(ge=1, le=MAX_PATTERNS, description="Number of patterns.", examples=[250])]
+    seed: Annotated[
+        int,
+        Field(
+            ge=0,
+            le=2**64 - 1,
+            description="Seed of numpy.random.PCG64. Its raw 64-bit words, little-endian, least significant bit first, "
+            "are the blocks in the order pattern, row, column, channel; 1 is lit.",
+            examples=[7],
+        ),
+    ]
+    colour: Literal["grey", "rgb"] = Field(
+        default="grey", description="`rgb` shows three independent grids at once, one in each channel."
+    )
+    offset: bool = Field(
+        default=False,
+        description="Whether each pattern is rolled over the monitor by an offset of its own, taken from the stream "
+        "after the bits: one word a pattern, low 32 bits modulo width, high 32 bits modulo height.",
+    )
 
     @property
     def channels(self) -> int:
@@ -73,17 +109,18 @@ class Bernoulli(Record):
 
     @property
     def bits(self) -> NDArray[np.uint8]:
-        """(count, rows, columns, 1 or 3) uint8, 1 is lit.
+        """The blocks of every pattern, (count, rows, columns, 1 or 3) uint8; 1 is lit.
 
         Notes
         -----
-        The raw 64-bit words of PCG64, little-endian, least significant bit first, in the order
-        (pattern, row, column, channel). `random_raw` is a stable stream; Generator's distributions are not.
+        They are the raw 64-bit words of PCG64, little-endian, least significant bit first, in the order
+        (pattern, row, column, channel). `random_raw` is a stable stream; the distributions of numpy's Generator are
+        not.
         """
         return np.stack([self.pattern(index) for index in range(self.count)])
 
     def pattern(self, index: int) -> NDArray[np.uint8]:
-        """(rows, columns, 1 or 3) uint8: the bits of one pattern, in the memory of one."""
+        """The blocks of one pattern, (rows, columns, 1 or 3) uint8, made without those of the others."""
         shape = (self.rows, self.columns, self.channels)
         size = self.rows * self.columns * self.channels
         first, within = divmod(index * size, 64)
@@ -92,13 +129,13 @@ class Bernoulli(Record):
         return bits[within:].reshape(shape)
 
     def offsets(self, monitor: Monitor) -> NDArray[np.int64]:
-        """(count, 2) int64: dx and dy of each pattern in pixels of the monitor, zeros without ``offset``.
+        """The offset dx, dy of each pattern in monitor pixels, (count, 2) int64; zeros without ``offset``.
 
         Notes
         -----
-        What is shown at (y, x) is P[(y + dy) % height, (x + dx) % width], P the pattern without its offset.
-        The stream of the bits goes on with one word a pattern: its low 32 bits modulo the monitor's width are
-        dx, its high 32 bits modulo the height are dy.
+        Shown at (y, x) is P[(y + dy) % height, (x + dx) % width], where P is the pattern without its offset.
+        The stream of bits continues with one word a pattern: dx is its low 32 bits modulo the monitor's width, dy
+        its high 32 bits modulo the height.
         """
         if not self.offset:
             return np.zeros((self.count, 2), np.int64)
@@ -107,10 +144,8 @@ class Bernoulli(Record):
         return np.stack([low % monitor.width, high % monitor.height], axis=1).astype(np.int64)
 
     def means(self, monitor: Monitor, columns: int, rows: int) -> Iterator[NDArray[np.float32]]:
-        """The mean of each pattern with its offset over the cells of a grid, (rows, columns, 1 or 3) float32.
-
-        One axis is averaged before the other is stretched to the monitor's pixels, which are many.
-        """
+        """The mean of each pattern, offset applied, over the cells of a grid: (rows, columns, 1 or 3) float32 each."""
+        # One axis is averaged before the other is stretched, so that no array has all of the monitor's pixels.
         for bits, (dx, dy) in zip(self.bits, self.offsets(monitor), strict=True):
             tall = np.roll(stretch(bits.astype(np.float32), self.columns, monitor.height), -dy, axis=0)
             wide = np.roll(stretch(area_mean(tall, self.columns, rows), monitor.width, rows), -dx, axis=1)
@@ -118,42 +153,54 @@ class Bernoulli(Record):
 
     @property
     def _words(self) -> int:
-        """64-bit words that hold the bits."""
+        """The number of 64-bit words that hold the bits."""
         return -(-self.count * self.rows * self.columns * self.channels // 64)
 
 
 class Stripes(Record):
-    """Gray-code stripes across the monitor, from two halves to the finest.
+    """Gray-code stripes across the monitor, from two halves to ever finer ones. No stripe is finer than a pixel."""
 
-    Notes
-    -----
-    Of K = first + count patterns, those from ``first`` on are shown. Stripe s = position * 2**K // size along the
-    axis is lit in pattern i where bit K - 1 - i of s ^ (s >> 1) is set. That bit depends on the first i + 1 bits of
-    s alone, so pattern i lies on a grid of 2**(i + 1) cells.
-    """
-
-    kind: Literal["stripes"]
-    axis: Literal["x", "y"]
-    count: Annotated[int, Field(ge=1, le=14)]
-    first: Annotated[int, Field(ge=0, le=13)] = 0
+    kind: Literal["stripes"] = Field(description="Says that this part consists of stripes.")
+    axis: Literal["x", "y"] = Field(description="The axis along which black and white alternate.")
+    count: Annotated[int, Field(ge=1, le=14, description="Number of patterns.", examples=[8])]
+    first: Annotated[int, Field(ge=0, le=13)] = Field(
+        default=0,
+        description="The Gray-code pattern to start with: larger numbers leave out the coarsest ones.",
+    )
 
     def grid(self, index: int) -> tuple[int, int]:
-        """Columns and rows of the part's pattern ``index``."""
+        """Columns and rows of the grid that pattern ``index`` of this part lies on."""
         cells = 2 ** (self.first + index + 1)
         return (cells, 1) if self.axis == "x" else (1, cells)
 
     def values(self, index: int) -> NDArray[np.float32]:
-        """(rows, columns, 1) float32: the part's pattern ``index``, 1 is lit."""
+        """Pattern ``index`` of this part, (rows, columns, 1) float32; 1 is lit.
+
+        Notes
+        -----
+        Of K = first + count patterns, those from ``first`` on are shown. Stripe s = position * 2**K // size along the
+        axis is lit in pattern i where bit K - 1 - i of s ^ (s >> 1) is set. That bit depends on the first i + 1 bits
+        of s alone, so pattern i lies on a grid of 2**(i + 1) cells.
+        """
         columns, rows = self.grid(index)
         s = np.arange(columns * rows)
         return ((s ^ (s >> 1)) & 1).astype(np.float32).reshape(rows, columns, 1)
 
 
 class Images(Record):
-    """Patterns from any tool, each an image stretched over the monitor."""
+    """Patterns made by any tool, as image files in the archive, each stretched over the monitor."""
 
-    kind: Literal["images"]
-    files: Annotated[tuple[str, ...], FailFast(), Field(min_length=1, max_length=MOST_PATTERNS)]
+    kind: Literal["images"] = Field(description="Says that this part consists of image files.")
+    files: Annotated[
+        tuple[str, ...],
+        FailFast(),
+        Field(
+            min_length=1,
+            max_length=MAX_PATTERNS,
+            description="Names of the images in the archive, one for each pattern.",
+            examples=[["patterns/0.png", "patterns/1.png"]],
+        ),
+    ]
 
     @property
     def count(self) -> int:

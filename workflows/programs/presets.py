@@ -3,7 +3,7 @@
 from typing import Literal, NamedTuple
 
 from storage.errors import OptionError
-from workflows.programs.parts import MOST_BLOCKS
+from workflows.programs.parts import MAX_BLOCKS
 from workflows.programs.program import Bernoulli, Constant, Monitor, Program, Stripes
 
 SEED = 7
@@ -88,11 +88,11 @@ def preset(name: str, width: int = 1280, height: int = 960) -> Program:
             "pixels along the shorter side",
             field="monitor",
         )
-    along = min(round(coarsest * long / short), MOST_BLOCKS)
+    along = min(round(coarsest * long / short), MAX_BLOCKS)
     counts: dict[tuple[int, int], int] = {}
     for blocks, count in recipe.grids.items():
         many = blocks // coarsest * along
-        if blocks <= short and many <= min(long, MOST_BLOCKS):
+        if blocks <= short and many <= min(long, MAX_BLOCKS):
             grid = (many, blocks) if width >= height else (blocks, many)
             counts[grid] = 0
         counts[grid] += count

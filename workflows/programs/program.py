@@ -12,7 +12,7 @@ from workflows.images.resample import stretch
 from workflows.images.tone_curves import Curve, to_light
 from workflows.programs.nested_grids import Shape, chain, fitting, nested, sense
 from workflows.programs.parts import (
-    MOST_PATTERNS,
+    MAX_PATTERNS,
     Bernoulli,
     Constant,
     Images,
@@ -27,22 +27,31 @@ __all__ = ["Bernoulli", "Constant", "Images", "Monitor", "Program", "Stripes"]
 
 Value = TypeVar("Value", bound=np.generic)
 
-MOST_PARTS = 1000
+MAX_PARTS = 1000
 """The chain of their grids is found in time in proportion to the square."""
 SENSING_BYTES = 512 << 20
 """The largest sensing matrix that a worker is asked to hold."""
 
 
 class Program(Record):
-    """The patterns that a monitor shows, numbered from 0 through the parts, in order."""
+    """The patterns that a monitor shows, numbered from 0 through the parts, in order.
 
-    monitor: Monitor
-    parts: Annotated[tuple[Part, ...], FailFast(), Field(min_length=1, max_length=MOST_PARTS)]
+    A program has at most 100,000 patterns, two different constant levels, and a part that is not constant.
+    """
+
+    monitor: Monitor = Field(description="The monitor that the patterns are shown on.")
+    parts: Annotated[
+        tuple[Part, ...],
+        FailFast(),
+        Field(
+            min_length=1, max_length=MAX_PARTS, description="The parts of the program, in the order shown."
+        ),
+    ]
 
     @model_validator(mode="after")
     def _usable(self) -> "Program":
-        if self.count > MOST_PATTERNS:
-            raise ValueError(f"{self.count} patterns, more than the {MOST_PATTERNS} that a program may have")
+        if self.count > MAX_PATTERNS:
+            raise ValueError(f"{self.count} patterns, more than the {MAX_PATTERNS} that a program may have")
         for part in self.parts:
             if isinstance(part, Bernoulli) and (
                 part.columns > self.monitor.width or part.rows > self.monitor.height

@@ -1,4 +1,4 @@
-"""What a capture archive may cost."""
+"""Limits on what an uploaded archive or video may cost to read."""
 
 from dataclasses import dataclass
 
@@ -7,16 +7,16 @@ from storage.errors import OverLimit
 
 @dataclass(frozen=True)
 class Limits:
-    """What a bundle may cost whoever reads it.
+    """What an uploaded archive or video may cost.
 
     Attributes
     ----------
     unpacked : int
-        Bytes of all its entries together, and of all its frames once they are decoded.
+        Bytes that all entries of an archive may unpack to together, and that all frames may take once decoded.
     memory : int
-        Bytes that one reader may hold; an entry, or an image decoded, may take a quarter of it.
+        Bytes that one reader may hold. An entry, or a decoded image, may take a quarter of it.
     frames, pixels : int, optional
-        How many frames it may have, and how many pixels one of them; no more limit than the others if None.
+        Frames of a capture, and pixels of a frame; None sets no limit of its own.
     """
 
     unpacked: int
@@ -26,16 +26,16 @@ class Limits:
 
     @property
     def image(self) -> int:
-        """Bytes that one entry, and one decoded image, may take."""
+        """Bytes that one entry, or one decoded image, may take."""
         return self.memory // 4
 
-    def see_that_frames_may(self, frames: int, **where: str) -> None:
-        """See that a capture may have so many frames.
+    def check_frames(self, frames: int, **where: str) -> None:
+        """Check that a capture may have ``frames`` frames.
 
         Parameters
         ----------
         **where : str
-            ``entry`` that says so, and its ``field``.
+            The ``entry``, and its ``field``, to name in the error.
 
         Raises
         ------
@@ -50,11 +50,21 @@ class Limits:
                 value=frames,
             )
 
-    def see_that_pixels_may(self, width: int, height: int, **where: str) -> None:
-        """See that frames may be so large; the same."""
+    def check_pixels(self, width: int, height: int, **where: str) -> None:
+        """Check that a frame may have ``width`` x ``height`` pixels.
+
+        Parameters
+        ----------
+        **where : str
+            The ``entry``, and its ``field``, to name in the error.
+
+        Raises
+        ------
+        OverLimit
+        """
         if self.pixels is not None and width * height > self.pixels:
             raise OverLimit(
-                f"a frame may have {self.pixels} pixels, and these have {width} x {height}; make them smaller",
+                f"a frame may have {self.pixels} pixels, these have {width} x {height}; make them smaller",
                 **where,
                 name="capture_pixels",
                 limit=self.pixels,

@@ -1,4 +1,4 @@
-"""ZIP archives that others made, opened as hostile: bounded memory, plain names, nothing twice."""
+"""Untrusted ZIP archives, read in bounded memory: plain relative names, no duplicates, no links."""
 
 import stat
 import zipfile
@@ -8,7 +8,7 @@ from typing import BinaryIO, cast
 from storage.errors import InvalidInput
 
 DIRECTORY_BYTES = 8 << 20
-"""Of an archive's directory, which is read in one piece."""
+"""The largest central directory, which zipfile reads in one piece."""
 UNREADABLE = (
     zipfile.BadZipFile,
     zlib.error,
@@ -21,7 +21,7 @@ UNREADABLE = (
 """What zipfile raises on damaged entries."""
 
 
-def opened(file: BinaryIO, refusal: type[InvalidInput]) -> zipfile.ZipFile:
+def open_archive(file: BinaryIO, refusal: type[InvalidInput]) -> zipfile.ZipFile:
     """Open an archive.
 
     Parameters
@@ -29,7 +29,7 @@ def opened(file: BinaryIO, refusal: type[InvalidInput]) -> zipfile.ZipFile:
     file : BinaryIO
         Seekable.
     refusal : type
-        What to raise where it is none.
+        The error to raise if this is not a ZIP archive.
 
     Raises
     ------
@@ -41,26 +41,25 @@ def opened(file: BinaryIO, refusal: type[InvalidInput]) -> zipfile.ZipFile:
         archive = zipfile.ZipFile(cast(BinaryIO, bounded))
     except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError) as error:
         raise refusal(
-            "this is no ZIP archive, or it is cut off: its directory can't be read. Make it again, and "
-            "see that all of it is sent"
+            "this is not a ZIP archive, or it is cut off: its directory can't be read. Create it again, and "
+            "check that all of it is uploaded"
         ) from error
-    bounded.most = None
+    bounded.limit = None
     return archive
 
 
 def entries(
-    archive: zipfile.ZipFile, most: int, unpacked: int, refusal: type[InvalidInput]
+    archive: zipfile.ZipFile, max_entries: int, unpacked: int, refusal: type[InvalidInput]
 ) -> dict[str, zipfile.ZipInfo]:
-    """The entries of an archive by name, none of which has been looked into.
+    """List the entries of an archive by name, without reading any of them.
 
     Parameters
     ----------
-    most : int
-        Entries that there may be.
+    max_entries : int
     unpacked : int
-        Bytes that they may unpack to, all together.
+        Bytes that all entries may unpack to together.
     refusal : type
-        What to raise of one that can't be used.
+        The error to raise for an entry that is not allowed.
 
     Raises
     ------
@@ -68,8 +67,8 @@ def entries(
         Of the given type.
     """
     infos = archive.infolist()
-    if len(infos) > most:
-        raise refusal(f"the archive has {len(infos)} entries, more than {most}", limit=most)
+    if len(infos) > max_entries:
+        raise refusal(f"the archive has {len(infos)} entries, more than {max_entries}", limit=max_entries)
     found: dict[str, zipfile.ZipInfo] = {}
     for info in infos:
         name = info.filename
@@ -80,9 +79,9 @@ def entries(
         if info.flag_bits & 1:
             raise refusal(f"{name!r} is encrypted", entry=name)
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            # bzip2 and LZMA unpack in zipfile without bounds.
+            # zipfile unpacks bzip2 and LZMA without bounds.
             raise refusal(
-                f"{name!r} is packed by a method other than deflate: store or deflate the entries",
+                f"{name!r} is compressed by a method other than deflate: store or deflate the entries",
                 entry=name,
             )
         if name in found:
@@ -97,8 +96,10 @@ def entries(
     return found
 
 
-def read(archive: zipfile.ZipFile, info: zipfile.ZipInfo, most: int, refusal: type[InvalidInput]) -> bytes:
-    """The bytes of an entry, which may have at most so many.
+def read(
+    archive: zipfile.ZipFile, info: zipfile.ZipInfo, max_bytes: int, refusal: type[InvalidInput]
+) -> bytes:
+    """The bytes of an entry, ``max_bytes`` at most.
 
     Raises
     ------
@@ -106,14 +107,14 @@ def read(archive: zipfile.ZipFile, info: zipfile.ZipInfo, most: int, refusal: ty
         Of the given type.
     """
     name = info.filename
-    if info.file_size > most:
+    if info.file_size > max_bytes:
         raise refusal(
-            f"{name} unpacks to {info.file_size} bytes, more than the {most} allowed for it",
+            f"{name} unpacks to {info.file_size} bytes, more than the {max_bytes} allowed for it",
             entry=name,
-            limit=most,
+            limit=max_bytes,
         )
     try:
-        # Not ZipFile.read, which unpacks all there is before it looks at the size that the directory gives.
+        # ZipFile.read would unpack everything before it checks the size in the directory.
         with archive.open(info) as file:
             return file.read(info.file_size)
     except UNREADABLE as error:
@@ -121,20 +122,20 @@ def read(archive: zipfile.ZipFile, info: zipfile.ZipInfo, most: int, refusal: ty
 
 
 class _Bounded:
-    """A file of which zipfile, while it opens it, may not read as much at once as a hostile directory says."""
+    """A file that bounds a single read while zipfile opens it, whatever size a hostile directory states."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
-        self.most: int | None = DIRECTORY_BYTES
+        self.limit: int | None = DIRECTORY_BYTES
         self.seek = file.seek
         self.tell = file.tell
         self.seekable = file.seekable
         self.close = file.close
 
     def read(self, size: int = -1) -> bytes:
-        if self.most is None:
+        if self.limit is None:
             return self._file.read(size)
-        data = self._file.read(min(size, self.most + 1) if size >= 0 else self.most + 1)
-        if len(data) > self.most:
-            raise zipfile.BadZipFile(f"a directory of more than {self.most} bytes")
+        data = self._file.read(min(size, self.limit + 1) if size >= 0 else self.limit + 1)
+        if len(data) > self.limit:
+            raise zipfile.BadZipFile(f"a directory of more than {self.limit} bytes")
         return data

@@ -28,7 +28,7 @@ from storage.layout.captures import Stack
 from storage.layout.uploads import Part
 from storage.records import captures, jobs, uploads
 from workflows.images.integer_formats import encode_png
-from workflows.ingest.bundle import Bundle
+from workflows.ingest.archive import CaptureArchive
 
 router = APIRouter(tags=["captures"])
 CALL = "POST /v1/captures"
@@ -247,7 +247,7 @@ def _register(
     context.check_key()
     stored_uploads.seal(context.objects, capture, parts)
     with stored_uploads.read(context.objects, capture) as file:
-        manifest = Bundle(file, context.settings.limits).manifest
+        manifest = CaptureArchive(file, context.settings.limits).manifest
 
     def create(c: Connection) -> str:
         if resumable and not uploads.forget(c, capture):

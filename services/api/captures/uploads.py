@@ -68,9 +68,9 @@ async def create_upload(
     metadata = metadata_of(request)
     known, limits = declared(metadata), context.settings.limits
     if "frames" in known:
-        limits.see_that_frames_may(known["frames"])
+        limits.check_frames(known["frames"])
     if "width" in known and "height" in known:
-        limits.see_that_pixels_may(known["width"], known["height"])
+        limits.check_pixels(known["width"], known["height"])
     row, new = await anyio.to_thread.run_sync(_create, context, length, metadata, idempotency_key)
     if with_body and new:
         row = await _append(context, request, row, checksum)

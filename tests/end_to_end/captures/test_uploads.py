@@ -415,7 +415,7 @@ def test_one_that_is_no_capture_leaves_nothing(service: Service, tmp_path: Path)
     for data in (b"", b"this is no archive" * 1000):
         broken = tmp_path / "broken.zip"
         broken.write_bytes(data)
-        with pytest.raises(ServiceError, match="no ZIP archive"):
+        with pytest.raises(ServiceError, match="not a ZIP archive"):
             service.client.upload(broken)
     assert service.stored() == before
 

@@ -53,7 +53,7 @@ class Reader:
 
     def __init__(self, file: BinaryIO, limits: Limits) -> None:
         self._limits = limits
-        self._archive = zip_files.opened(file, ArchiveError)
+        self._archive = zip_files.open_archive(file, ArchiveError)
         self._entries = zip_files.entries(self._archive, ENTRIES, limits.unpacked, ArchiveError)
         self._read_manifest()
         self._check_members()

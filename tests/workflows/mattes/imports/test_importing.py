@@ -376,4 +376,4 @@ def test_an_archive_that_unpacks_to_more_than_is_allowed(objects: Objects, archi
 
 def test_no_archive_at_all(objects: Objects, archive: bytes) -> None:
     for data in (b"", b"PK", json.dumps({}).encode(), archive[:-10], archive[: len(archive) // 2]):
-        refused(objects, data, "no ZIP archive")
+        refused(objects, data, "not a ZIP archive")

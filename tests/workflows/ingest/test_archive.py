@@ -1,4 +1,4 @@
-"""Bundles: every refusal names its entry or field, and no archive does anything but be read or refused."""
+"""Capture archives: every one is read or refused, and each refusal names the entry or field at fault."""
 
 import copy
 import io
@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 from storage.errors import CaptureError
 from storage.layout import uploads
 from storage.objects.store import Objects
-from workflows.ingest.bundle import Bundle
+from workflows.ingest.archive import CaptureArchive
 from workflows.untrusted.limits import Limits
 
 Zip = Callable[..., bytes]
@@ -52,25 +51,25 @@ def changed(change: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
     return record
 
 
-def open_bundle(data: bytes, limits: Limits = LIMITS) -> Bundle:
-    return Bundle(io.BytesIO(data), limits)
+def open_archive(data: bytes, limits: Limits = LIMITS) -> CaptureArchive:
+    return CaptureArchive(io.BytesIO(data), limits)
 
 
 def refused(data: bytes, limits: Limits = LIMITS) -> CaptureError:
     with pytest.raises(CaptureError) as caught:
-        open_bundle(data, limits)
+        open_archive(data, limits)
     assert caught.value.detail
     return caught.value
 
 
 @pytest.mark.parametrize("pack", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
 def test_a_bundle_is_read(make_zip: Zip, pack: int) -> None:
-    bundle = open_bundle(make_zip(RECORD, FILES, pack))
-    assert bundle.manifest.name == "ball"
-    assert bundle.manifest.program.count == 5
-    assert next((f.file, f.pattern) for f in bundle.manifest.frames) == ("frames/2.png", 2)
+    archive = open_archive(make_zip(RECORD, FILES, pack))
+    assert archive.manifest.name == "ball"
+    assert archive.manifest.program.count == 5
+    assert next((f.file, f.pattern) for f in archive.manifest.frames) == ("frames/2.png", 2)
     for name, data in FILES.items():
-        assert bundle.read(name) == data
+        assert archive.read(name) == data
 
 
 def test_unknown_fields_and_files_are_accepted(make_zip: Zip) -> None:
@@ -82,32 +81,14 @@ def test_unknown_fields_and_files_are_accepted(make_zip: Zip) -> None:
         record["program"]["parts"][1]["shuffled"] = False
 
     files = FILES | {"README.txt": b"hello", "empty/": b"", "ünï.png": b""}
-    bundle = open_bundle(make_zip(changed(extend), files))
-    assert bundle.manifest == open_bundle(make_zip(RECORD, FILES)).manifest
+    archive = open_archive(make_zip(changed(extend), files))
+    assert archive.manifest == open_archive(make_zip(RECORD, FILES)).manifest
 
 
 def test_a_record_is_needed(make_zip: Zip) -> None:
     assert refused(make_zip(None, FILES)).fields == {"entry": "capture.json"}
     deeper = make_zip(None, {"ball/capture.json": b"{}"})
     assert refused(deeper).fields == {"entry": "capture.json"}
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        b"",
-        b"{",
-        b"[]",
-        b"null",
-        b"\xff\xfe",
-        b"[" * 100_000,
-        b'{"format": "envmatte-capture/1",}',
-        b"\0" * 50,
-    ],
-)
-def test_a_malformed_record_is_refused(make_zip: Zip, text: bytes) -> None:
-    error = refused(make_zip(text, FILES))
-    assert error.fields["entry"] == "capture.json"
 
 
 @pytest.mark.parametrize(
@@ -231,10 +212,10 @@ def test_a_zip_bomb_is_refused_by_its_directory(make_zip: Zip) -> None:
 
 def test_an_entry_takes_a_quarter_of_the_memory_at_most(make_zip: Zip) -> None:
     files = FILES | {"fits": bytes(1 << 18), "large": bytes((1 << 18) + 1)}
-    bundle = open_bundle(make_zip(RECORD, files))
-    assert len(bundle.read("fits")) == 1 << 18
+    archive = open_archive(make_zip(RECORD, files))
+    assert len(archive.read("fits")) == 1 << 18
     with pytest.raises(CaptureError, match="more than the 262144") as caught:
-        bundle.read("large")
+        archive.read("large")
     assert caught.value.fields == {"entry": "large", "limit": 1 << 18}
 
 
@@ -244,11 +225,11 @@ def test_a_directory_that_lies_about_sizes_costs_no_memory(make_zip: Zip) -> Non
     at = data.rindex(b"PK\x01\x02")
     assert struct.unpack_from("<I", data, at + 24) == (size,)
     struct.pack_into("<I", data, at + 24, 1000)
-    bundle = open_bundle(bytes(data))
+    archive = open_archive(bytes(data))
     tracemalloc.start()
     try:
         with pytest.raises(CaptureError, match="z is damaged"):
-            bundle.read("z")
+            archive.read("z")
         assert tracemalloc.get_traced_memory()[1] < 4 << 20
     finally:
         tracemalloc.stop()
@@ -263,11 +244,11 @@ def test_a_directory_that_lies_is_refused_when_it_is_read(
     at = data.rindex(b"PK\x01\x02") + field
     # None: a few bytes into the entry itself; into another one, newer Pythons refuse that other one too.
     struct.pack_into("<I", data, at, struct.unpack_from("<I", data, at)[0] + 3 if value is None else value)
-    bundle = open_bundle(bytes(data))
+    archive = open_archive(bytes(data))
     with pytest.raises(CaptureError) as caught:
-        bundle.read("frames/4.png")
+        archive.read("frames/4.png")
     assert caught.value.fields == {"entry": "frames/4.png"}
-    assert bundle.read("frames/3.png") == FILES["frames/3.png"]
+    assert archive.read("frames/3.png") == FILES["frames/3.png"]
 
 
 def test_an_offset_beyond_all_is_refused(make_zip: Zip) -> None:
@@ -278,25 +259,25 @@ def test_an_offset_beyond_all_is_refused(make_zip: Zip) -> None:
     struct.pack_into("<I", entry, 42, 0xFFFFFFFF)  # the offset stands in the ZIP64 field
     tail = bytearray(data[end:])
     struct.pack_into("<I", tail, 12, struct.unpack_from("<I", tail, 12)[0] + len(extra))
-    bundle = open_bundle(data[:at] + bytes(entry) + extra + bytes(tail))
+    archive = open_archive(data[:at] + bytes(entry) + extra + bytes(tail))
     with pytest.raises(CaptureError) as caught:
-        bundle.read("frames/4.png")
+        archive.read("frames/4.png")
     assert caught.value.fields == {"entry": "frames/4.png"}
 
 
 def test_a_name_that_is_not_there(make_zip: Zip) -> None:
     with pytest.raises(CaptureError) as caught:
-        open_bundle(make_zip(RECORD, FILES)).read("none")
+        open_archive(make_zip(RECORD, FILES)).read("none")
     assert caught.value.fields == {"entry": "none"}
 
 
 def through(data: bytes, open_file: Callable[[bytes], Any]) -> int:
-    """Reads all of a bundle; 1 if some of it was refused. Any error but CaptureError fails the test."""
+    """Reads all of a archive; 1 if some of it was refused. Any error but CaptureError fails the test."""
     try:
         with open_file(data) as file:
-            bundle = Bundle(file, LIMITS)
+            archive = CaptureArchive(file, LIMITS)
             for name in FILES:
-                bundle.read(name)
+                archive.read(name)
     except CaptureError:
         return 1
     return 0
@@ -344,7 +325,7 @@ def test_a_damaged_archive_is_a_capture_error_or_read(
 def test_a_directory_of_too_many_entries_is_refused(make_zip: Zip) -> None:
     files = FILES | {f"more/{n}": b"" for n in range(20_000)}
     with pytest.raises(CaptureError, match="more than 20000"):
-        open_bundle(make_zip(RECORD, files))
+        open_archive(make_zip(RECORD, files))
 
 
 def test_a_directory_that_is_a_bomb_is_not_read(make_zip: Zip) -> None:
@@ -352,48 +333,19 @@ def test_a_directory_that_is_a_bomb_is_not_read(make_zip: Zip) -> None:
     tracemalloc.start()
     try:
         with pytest.raises(CaptureError, match="directory can't be read"):
-            open_bundle(data)
+            open_archive(data)
         assert tracemalloc.get_traced_memory()[1] < 12 << 20  # of 24 MB
     finally:
         tracemalloc.stop()
 
 
-def test_of_a_curve_out_of_range_the_range_is_told(make_zip: Zip) -> None:
-    with pytest.raises(CaptureError, match="less than or equal to 5") as caught:
-        open_bundle(make_zip(RECORD | {"response": {"gamma": 99}}, FILES))
-    assert caught.value.fields == {"entry": "capture.json", "field": "response.gamma"}
-
-
 def test_an_entry_larger_than_a_directory_may_be_is_read(make_zip: Zip) -> None:
     large = bytes(range(256)) * (9 << 12)
-    bundle = Bundle(io.BytesIO(make_zip(RECORD, FILES | {"large": large})), Limits(1 << 30, 1 << 30))
-    assert bundle.read("large") == large
-
-
-@pytest.mark.parametrize(
-    "way", ["frames", "program.parts", "program.parts.0.levels", "program.parts.0.colours"]
-)
-def test_of_many_faults_the_first_is_found_alone(make_zip: Zip, way: str) -> None:
-    record = copy.deepcopy(RECORD)
-    inner: Any = record
-    *names, last = (int(name) if name.isdigit() else name for name in way.split("."))
-    for name in names:
-        inner = inner[name]
-    inner[last] = [{}] * 1000
-    error = refused(make_zip(record, FILES))
-    assert str(error.fields["field"]).startswith(f"{way}.0")
-    assert isinstance(error.__cause__, ValidationError)
-    assert error.__cause__.error_count() < 4  # a list of millions takes gigabytes
+    archive = CaptureArchive(io.BytesIO(make_zip(RECORD, FILES | {"large": large})), Limits(1 << 30, 1 << 30))
+    assert archive.read("large") == large
 
 
 def test_a_record_larger_than_any_is_refused(make_zip: Zip) -> None:
     limits = Limits(unpacked=1 << 24, memory=1 << 24)
     error = refused(make_zip(b" " * ((4 << 20) + 1), FILES, zipfile.ZIP_DEFLATED), limits)
     assert error.fields == {"entry": "capture.json", "limit": 4 << 20}
-
-
-@pytest.mark.parametrize("piece", [b"[],", b'{"":0},'])
-def test_a_record_of_many_empty_things_is_refused(make_zip: Zip, piece: bytes) -> None:
-    limits = Limits(unpacked=1 << 24, memory=1 << 24)
-    error = refused(make_zip(b'{"more": [' + 200_000 * piece + b"0]}", FILES, zipfile.ZIP_DEFLATED), limits)
-    assert error.fields == {"entry": "capture.json", "limit": 150_000}

@@ -1,0 +1,146 @@
+"""The manifest of a capture archive, capture.json: its models, and how its text is parsed.
+
+`Manifest.model_json_schema()` is published as the JSON Schema of the format, so every field has a description.
+"""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
+
+from storage.errors import CaptureError
+from workflows.images.tone_curves import Response
+from workflows.programs.border import Border
+from workflows.programs.program import Program
+
+MANIFEST = "capture.json"
+MANIFEST_BYTES = 4 << 20
+"""The largest manifest: about 200 bytes for each of 20,000 frames."""
+MANIFEST_NODES = 150_000
+"""The most objects and lists in it: an empty one takes 2 bytes of text, but 300 bytes of memory while parsing."""
+UNION_TAGS = {"constant", "bernoulli", "stripes", "images", "Gamma"}
+"""Names that pydantic inserts in an error's location to say which member of a union it tried."""
+
+EXAMPLE: dict[str, Any] = {
+    "format": "envmatte-capture/1",
+    "name": "glass ball",
+    "program": {
+        "monitor": {"width": 1280, "height": 960, "response": "linear"},
+        "parts": [
+            {"kind": "constant", "levels": [0.0, 1.0]},
+            {"kind": "bernoulli", "columns": 16, "rows": 12, "count": 2, "seed": 7, "colour": "grey"},
+        ],
+    },
+    "response": "srgb",
+    "frames": [{"file": f"frames/{n:05d}.png", "pattern": n} for n in range(4)],
+    "mask": "mask.png",
+}
+
+
+class Frame(BaseModel):
+    """One frame: an image file in the archive, and the pattern that it shows."""
+
+    model_config = ConfigDict(frozen=True)
+    file: str = Field(
+        description="Name of the image in the archive: PNG, TIFF, JPEG, EXR or camera RAW. All frames have one size "
+        "and kind.",
+        examples=["frames/00000.png"],
+    )
+    pattern: int = Field(
+        ge=0,
+        description="Number of the pattern that the frame shows. Patterns are numbered from 0 through the program's "
+        "parts, in order.",
+        examples=[0],
+    )
+    exposure: Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)] = Field(
+        default=1.0,
+        description="Exposure time, in seconds or any other unit. Frames of one pattern with different exposures are "
+        "merged into one of higher dynamic range.",
+        examples=[0.008],
+    )
+
+
+class Video(BaseModel):
+    """A recording of the whole program, from before its start until after its end."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+    file: str = Field(
+        description="Name of the video in the archive: H.264, HEVC, MJPEG and others, in MP4, MOV, MKV, WebM or AVI.",
+        examples=["film.mp4"],
+    )
+    patterns_per_second: float = Field(
+        ge=0.01,
+        le=120,
+        description="About how many patterns the monitor showed in a second. The camera need not be synchronised.",
+        examples=[2.0],
+    )
+    border: Border | None = Field(
+        default=None,
+        description="The display on which the patterns were shown inside a numbered border; null without a border.",
+    )
+
+
+class Manifest(BaseModel):
+    """What a capture archive holds: the program that the monitor showed, and the frames or the video of it."""
+
+    model_config = ConfigDict(
+        frozen=True,
+        title="envmatte capture (capture.json)",
+        json_schema_extra={
+            "$schema": "https://json-schema.org/draft/2020-12/schema",
+            "oneOf": [
+                {"required": ["frames"], "properties": {"frames": {"minItems": 1}}},
+                {"required": ["video"], "properties": {"video": {"type": "object"}}},
+            ],
+            "examples": [EXAMPLE],
+        },
+    )
+    format: Literal["envmatte-capture/1"] = Field(description="Name and version of this format.")
+    name: str = Field(
+        default="", max_length=200, description="Name of the capture, for people.", examples=["glass ball"]
+    )
+    program: Program = Field(description="What the monitor showed: enough to make the patterns again.")
+    response: Response = Field(
+        default="unknown",
+        description="Tone curve of the camera, from light to stored value: `linear`, `srgb`, a gamma, or `unknown`, "
+        "which has it estimated from the constant levels.",
+    )
+    # FailFast: only the first error is reported, because a list of all of them takes a kilobyte each.
+    frames: Annotated[tuple[Frame, ...], FailFast()] = Field(
+        default=(),
+        description="The frames, in any order. Every pattern needs one; frames of one pattern are averaged. Leave "
+        "them out if there is a video.",
+    )
+    video: Video | None = Field(default=None, description="A recording of the program, in place of frames.")
+    mask: str | None = Field(
+        default=None,
+        description="Name of an image in the archive, of the frames' size. Pixels that are zero in it are not "
+        "recovered.",
+        examples=["mask.png"],
+    )
+
+
+def parse_manifest(text: bytes) -> Manifest:
+    """Parse and validate the text of a capture.json.
+
+    Raises
+    ------
+    CaptureError
+        Naming the field that is wrong, and why.
+    """
+    if text.count(b"{") + text.count(b"[") > MANIFEST_NODES:
+        raise CaptureError(
+            f"{MANIFEST} has more than {MANIFEST_NODES} objects and lists",
+            entry=MANIFEST,
+            limit=MANIFEST_NODES,
+        )
+    try:
+        return Manifest.model_validate_json(text)
+    except ValidationError as error:
+        # Each member of a union that was tried gives an error; the deepest one is the most specific.
+        first = max(error.errors(include_url=False, include_context=False), key=lambda e: len(e["loc"]))
+        names = [str(part) for part in first["loc"] if part not in UNION_TAGS]
+        field = ".".join(name for name in names if "[" not in name)
+        reason = first["msg"].removeprefix("Value error, ")
+        raise CaptureError(
+            f"{MANIFEST}: {field + ': ' if field else ''}{reason}", entry=MANIFEST, field=field
+        ) from error
