@@ -1,5 +1,6 @@
 """Parts that tests of every floor use."""
 
+import signal
 from collections.abc import Iterator
 
 import pytest
@@ -11,6 +12,12 @@ from tests.parts.s3 import s3, s3_server
 AT_LENGTH = 3
 """What `--times` is from which on tests at length are run too."""
 __all__ = ["postgresql", "postgresql_server", "s3", "s3_server"]
+
+
+def pytest_configure() -> None:
+    """Handle SIGINT even where a shell started pytest in the background: its jobs, and all they start, ignore it."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
