@@ -9,8 +9,8 @@ from storage.database.engine import open_engine
 from tests.parts import postgres
 from tests.parts.s3 import s3, s3_server
 
-AT_LENGTH = 3
-"""What `--times` is from which on tests at length are run too."""
+EXHAUSTIVE = 3
+"""Value of ``--times`` from which on exhaustive tests run too."""
 __all__ = ["postgresql", "postgresql_server", "s3", "s3_server"]
 
 
@@ -21,16 +21,25 @@ def pytest_configure() -> None:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--times", type=int, default=1, help="How often each fault is injected.")
+    parser.addoption("--all", action="store_true", help="Run the slow tests too.")
+    parser.addoption(
+        "--times",
+        type=int,
+        default=1,
+        help=f"How often each fault is injected; {EXHAUSTIVE} or more runs the exhaustive tests, and all others.",
+    )
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what is long, before anything is set up for it."""
-    if config.getoption("--times") < AT_LENGTH:
-        why = f"it takes a minute, or does more of what another test does: run with --times {AT_LENGTH} and more"
-        for item in items:
-            if item.get_closest_marker("long"):
-                item.add_marker(pytest.mark.skip(reason=why))
+    """Leave out tests that take long and were not asked for."""
+    exhaustive = config.getoption("--times") >= EXHAUSTIVE
+    wanted = {"slow": config.getoption("--all") or exhaustive, "exhaustive": exhaustive}
+    selected = [
+        item for item in items if all(wanted.get(marker.name, True) for marker in item.iter_markers())
+    ]
+    if len(selected) < len(items):
+        config.hook.pytest_deselected(items=list(set(items) - set(selected)))
+        items[:] = selected
 
 
 @pytest.fixture(scope="session")

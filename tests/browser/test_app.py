@@ -17,8 +17,6 @@ from tests.browser.pages import MINUTE, SIZE, opened
 from tests.end_to_end.conftest import Service, serving
 from workflows.images import integer_formats
 
-pytestmark = pytest.mark.full
-
 
 @pytest.fixture
 def tab(desk: Page) -> Page:

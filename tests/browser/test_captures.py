@@ -19,8 +19,6 @@ from workflows.programs.program import Program
 from workflows.simulation import glass_ball
 from workflows.simulation.scene import nested_program
 
-pytestmark = pytest.mark.full
-
 RATE = 4
 
 

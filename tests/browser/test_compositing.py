@@ -19,8 +19,6 @@ from tests.end_to_end.conftest import BANDS, Service, png
 from workflows.simulation import glass_ball
 from workflows.simulation.scene import nested_program, write_capture
 
-pytestmark = pytest.mark.full
-
 SIZE = 96, 72
 MINUTE = 60_000
 READY = "This browser draws the glass while you move"

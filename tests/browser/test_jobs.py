@@ -10,8 +10,6 @@ from playwright.sync_api import Browser, Page, expect
 from tests.browser.pages import MINUTE
 from tests.end_to_end.conftest import Service, paused, serving
 
-pytestmark = pytest.mark.full
-
 
 def test_a_wrong_option_is_refused_in_words(desk: Page, service: Service, ready: tuple[str, str]) -> None:
     desk.goto(f"{service.url}/#/captures/{ready[0]}")
@@ -121,7 +119,7 @@ def test_a_laptop_that_slept_takes_the_job_up_again(
     expect(desk.get_by_role("link", name="Open the matte")).to_be_visible(timeout=MINUTE)
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_a_service_with_keys_that_is_started_again(
     browser: Browser, ball: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:

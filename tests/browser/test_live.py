@@ -9,7 +9,7 @@ from tests.benchmarks.compositing.live import backdrops_of, measure, recover
 from tests.benchmarks.recovery.kits import load
 from tests.end_to_end.conftest import Service
 
-pytestmark = [pytest.mark.full, pytest.mark.long]
+pytestmark = pytest.mark.exhaustive
 
 
 @pytest.fixture(scope="session")

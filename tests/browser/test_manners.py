@@ -12,8 +12,6 @@ from playwright.sync_api import Browser, Page, expect
 from tests.browser.pages import PHONE, is_fitting, opened
 from tests.end_to_end.conftest import Service
 
-pytestmark = pytest.mark.full
-
 WEB = Path(__file__).parents[2] / "services" / "web"
 SERIOUS = ("serious", "critical")
 SHIFTS = """
@@ -65,7 +63,7 @@ def go(page: Page, service: Service, view: tuple[str, str]) -> None:
 @pytest.mark.parametrize(
     ("device", "scheme"),
     [
-        pytest.param(device, scheme, marks=() if scheme == usual else pytest.mark.long)
+        pytest.param(device, scheme, marks=() if scheme == usual else pytest.mark.exhaustive)
         for device, usual in zip(DEVICES, ("light", "dark"), strict=True)
         for scheme in ("light", "dark")
     ],

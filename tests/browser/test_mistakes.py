@@ -17,8 +17,6 @@ from tests.browser.pages import MINUTE, ZIP, asks_before_it_closes, opened
 from tests.end_to_end.conftest import Service, paused, serving
 from tests.parts.disks import small_disk
 
-pytestmark = pytest.mark.full
-
 DISK = 48 << 20
 
 

@@ -17,8 +17,6 @@ from workflows.programs import border as program_border
 from workflows.programs.files import pictures
 from workflows.programs.program import Program
 
-pytestmark = pytest.mark.full
-
 SCREEN = {"width": 640, "height": 360}
 DISPLAYS = [(640, 360), (1920, 1080), (1080, 1920), (3440, 1440), (161, 121), (90, 60), (200, 5000)]
 NUMBERS = [program_border.LEAD, 0, 1, 62, 63, 64, 1023, program_border.MOST - 1]

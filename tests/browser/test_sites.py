@@ -12,8 +12,6 @@ from playwright.sync_api import Page
 from tests.end_to_end.captures.test_bad_input import check_problem
 from tests.end_to_end.conftest import Service
 
-pytestmark = pytest.mark.full
-
 ASKED = {"preset": "sketch", "monitor": {"width": 64, "height": 48}}
 SEND = """([url, asked]) => fetch(url, { method: "POST", mode: "no-cors", body: JSON.stringify(asked) })
     .then(({ status }) => status, ({ name }) => name)"""

@@ -11,7 +11,7 @@ from tests.faults.rig import Rig, Row, freeze, thaw
 from tests.parts.postgres import TEMPLATE, Server
 from tests.services.cluster.clusters import wait
 
-pytestmark = [pytest.mark.full, pytest.mark.timeout(3600)]
+pytestmark = pytest.mark.timeout(3600)
 
 AWAY = 5.0
 """Seconds for which the server is stopped."""
@@ -30,7 +30,7 @@ def on_postgresql(
         yield prepared(rig, bundle)
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_a_restarted_server(
     on_postgresql: Known, postgresql_server: Server, table: list[Row], times: int
 ) -> None:
@@ -38,7 +38,7 @@ def test_a_restarted_server(
     check(table, row)
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_a_server_that_stays_away(
     on_postgresql: Known, postgresql_server: Server, table: list[Row], times: int
 ) -> None:
@@ -58,7 +58,7 @@ def test_a_server_that_stays_away(
     assert answers == {503}
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_a_late_writer(on_postgresql: Known, table: list[Row], seldom: int) -> None:
     rig = on_postgresql.rig
     told = "another coordinator drives the jobs now"

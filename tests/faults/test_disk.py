@@ -18,7 +18,7 @@ from tests.faults.rig import Row, stored
 from tests.parts.disks import small_disk
 from tests.services.cluster.clusters import wait
 
-pytestmark = [pytest.mark.full, pytest.mark.timeout(900)]
+pytestmark = pytest.mark.timeout(900)
 
 STORE, LEDGER = 64 << 20, 8 << 20
 
@@ -85,7 +85,7 @@ def full(disk: Path, left: int = 0) -> Iterator[None]:
         ballast.unlink()
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_at_ingest(small: Small, bundle: Path, table: list[Row]) -> None:
     service, start = small.service, time.monotonic()
     with ExitStack() as filled:
@@ -98,7 +98,7 @@ def test_at_ingest(small: Small, bundle: Path, table: list[Row]) -> None:
     check(table, small.row("a full disk at ingest", start, job["matte"]))
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_at_tiles(small: Small, table: list[Row]) -> None:
     start = time.monotonic()
     with full(small.store, 256 << 10):
@@ -108,7 +108,7 @@ def test_at_tiles(small: Small, table: list[Row]) -> None:
     check(table, small.row("a full disk at tiles", start, job["matte"]))
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_in_sqlite(small: Small, table: list[Row]) -> None:
     service, start = small.service, time.monotonic()
     job = service.client.recover(small.capture)

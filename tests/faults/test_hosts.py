@@ -13,7 +13,7 @@ from tests.faults.hosts import Hosts
 from tests.faults.rig import Row
 from tests.services.cluster.clusters import wait
 
-pytestmark = [pytest.mark.full, pytest.mark.timeout(3600)]
+pytestmark = pytest.mark.timeout(3600)
 
 AWAY = 20.0
 """Seconds for which a link is cut: longer than dask waits for an answer."""
@@ -26,12 +26,12 @@ def hosts(tmp_path_factory: pytest.TempPathFactory, bundle: Path) -> Iterator[Kn
 
 
 @pytest.mark.parametrize("name", ["service0", "scheduler"])
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_the_link_of_another_that_is_cut(hosts: Known, table: list[Row], seldom: int, name: str) -> None:
     cut_off(hosts, table, name, seldom)
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_the_link_of_a_worker_that_is_cut(hosts: Known, table: list[Row], seldom: int) -> None:
     cut_off(hosts, table, "worker0", seldom)
 

@@ -13,7 +13,7 @@ from tests.faults.conftest import Known, check
 from tests.faults.rig import Row, freeze, thaw
 from tests.services.cluster.clusters import wait
 
-pytestmark = [pytest.mark.full, pytest.mark.timeout(7200)]
+pytestmark = pytest.mark.timeout(7200)
 
 
 def test_a_killed_worker(known: Known, table: list[Row], times: int) -> None:
@@ -25,7 +25,7 @@ def test_a_killed_worker(known: Known, table: list[Row], times: int) -> None:
     check(table, known.disturb("SIGKILL of a worker", kill, times))
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_all_workers_killed(known: Known, table: list[Row], times: int) -> None:
     def kill() -> None:
         for worker in known.rig.workers():
@@ -34,7 +34,7 @@ def test_all_workers_killed(known: Known, table: list[Row], times: int) -> None:
     check(table, known.disturb("SIGKILL of all workers", kill, times))
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_a_killed_scheduler(known: Known, table: list[Row], times: int) -> None:
     rig = known.rig
     row = known.disturb("SIGKILL of the scheduler", lambda: rig.restart("scheduler"), times)
@@ -47,7 +47,7 @@ def test_a_killed_service_that_drives(known: Known, table: list[Row], times: int
     check(table, row)
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_a_frozen_worker(known: Known, table: list[Row]) -> None:
     frozen: list[psutil.Process] = []
 

@@ -13,7 +13,7 @@ from tests.faults.conftest import check
 from tests.faults.rig import Row
 from tests.services.cluster.clusters import wait
 
-pytestmark = [pytest.mark.full, pytest.mark.timeout(1800)]
+pytestmark = pytest.mark.timeout(1800)
 
 LARGER = 14
 """How many times wider and higher the frames are."""
@@ -37,7 +37,7 @@ def large(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_a_worker_out_of_memory(bundle: Path, large: Path, tmp_path: Path, table: list[Row]) -> None:
     memory = {"ENVMATTE_WORKER_MEMORY": str(LIMIT)}
     with serving(

@@ -11,7 +11,7 @@ from tests.end_to_end.conftest import png
 from tests.end_to_end.lines import Line
 from tests.faults.conftest import Known
 
-pytestmark = [pytest.mark.full, pytest.mark.timeout(900)]
+pytestmark = pytest.mark.timeout(900)
 
 
 class InTurn(Line):
@@ -30,7 +30,7 @@ class InTurn(Line):
         pass
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_two_services_behind_one_port(known: Known, bundle: Path) -> None:
     rig = known.rig
     size = bundle.stat().st_size

@@ -15,7 +15,7 @@ from tests.faults.conftest import Known, check, prepared
 from tests.faults.rig import Rig, Row
 from tests.parts.s3 import BUCKET, KEYS
 
-pytestmark = [pytest.mark.full, pytest.mark.timeout(3600), pytest.mark.long]
+pytestmark = [pytest.mark.timeout(3600), pytest.mark.exhaustive]
 
 AWAY = 10.0
 """Seconds for which the store is away."""

@@ -15,7 +15,7 @@ from tests.faults.conftest import Known, check
 from tests.faults.rig import Rig, Row
 from tests.services.cluster.clusters import listening
 
-pytestmark = [pytest.mark.full, pytest.mark.timeout(900)]
+pytestmark = pytest.mark.timeout(900)
 
 TILE, LAST = 64, 5
 """The edge of the tiles, and the number of the one in the corner."""
@@ -45,7 +45,7 @@ def deadly(rig: Rig, key: str) -> Iterator[None]:
         watcher.join()
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_a_tile_that_kills_its_workers(known: Known, table: list[Row], bundle_bytes: bytes) -> None:
     rig = known.rig
     headers = {"Content-Type": "application/zip"}

@@ -10,7 +10,7 @@ from tests.faults.conftest import Known
 from tests.faults.rig import Rig
 from tests.services.cluster.clusters import wait
 
-pytestmark = [pytest.mark.full, pytest.mark.long, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.exhaustive, pytest.mark.timeout(900)]
 
 
 def says(rig: Rig, job: str, words: str) -> Callable[[], bool]:

@@ -7,7 +7,7 @@ import pytest
 from tests.benchmarks.soak.soak import soak
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 @pytest.mark.timeout(900)
 def test_a_short_day_leaves_nothing(tmp_path: Path) -> None:
     found = soak(12, 1.2, tmp_path)

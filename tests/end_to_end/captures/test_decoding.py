@@ -26,8 +26,6 @@ from tests.workflows.ingest.video.camera import overstated, zipped
 from tests.workflows.untrusted.test_decoder_guard import fragmented
 from workflows.programs.program import Program
 
-pytestmark = pytest.mark.full
-
 
 @contextmanager
 def held(service: Service, matte: str) -> Iterator[tuple[psutil.Process, "Future[httpx2.Response]"]]:

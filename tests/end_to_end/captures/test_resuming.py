@@ -26,10 +26,8 @@ from tests.end_to_end.captures.test_uploads import CHUNK, TUS, begin, create, go
 from tests.end_to_end.conftest import Service, paused, serving
 from tests.end_to_end.lines import Line
 
-pytestmark = pytest.mark.full
-
 MB = 1_000_000
-SIZES = [50 * MB, pytest.param(1000 * MB, marks=[pytest.mark.long, pytest.mark.timeout(1800)])]
+SIZES = [50 * MB, pytest.param(1000 * MB, marks=[pytest.mark.exhaustive, pytest.mark.timeout(1800)])]
 
 
 def large(bundle: Path, path: Path, size: int) -> Path:
@@ -115,7 +113,7 @@ def test_what_a_hundred_cuts_let_through_is_kept(service: Service, tmp_path: Pat
     assert not [name for name in uploads_of(service) if upload in name]
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_a_server_that_is_killed_costs_nothing(bundle: Path, tmp_path: Path) -> None:
     data, file = tmp_path / "data", large(bundle, tmp_path / "large.zip", 50 * MB)
     made: list[dict] = []

@@ -23,8 +23,6 @@ from tests.end_to_end.captures.test_bad_input import check_problem
 from tests.end_to_end.conftest import Service, paused, serving
 from tests.parts.disks import small_disk
 
-pytestmark = pytest.mark.full
-
 TUS = {"Tus-Resumable": "1.0.0"}
 CHUNK = TUS | {"Content-Type": "application/offset+octet-stream"}
 
@@ -274,8 +272,7 @@ def test_what_came_before_a_line_broke_is_kept(service: Service) -> None:
     service.http.delete(where, headers=TUS)
 
 
-@pytest.mark.long
-@pytest.mark.full
+@pytest.mark.exhaustive
 def test_who_falls_silent_counts_as_gone(service: Service) -> None:
     where = create(service, 1000)
     silent = begin(service, where, 0, 1000, b"a" * 300)

@@ -15,8 +15,6 @@ from workflows.images.tone_curves import to_light
 from workflows.programs.program import Program
 from workflows.simulation.scene import Scene
 
-pytestmark = pytest.mark.full
-
 CAMERA = Camera(hold=0.25, hand=(6.0, 6.8), options={"crf": "12"})
 
 

@@ -54,7 +54,7 @@ def test_what_has_expired_leaves_the_disk_and_what_a_job_needs_does_not(bundle: 
         assert service.client.job(job["id"])["state"] == "succeeded"  # what is known of it stays
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_what_is_deleted_leaves_the_disk(bundle: Path, tmp_path: Path) -> None:
     with serving(tmp_path / "data", "--workers", "1") as service:
         before = disk(service)

@@ -16,8 +16,6 @@ from tests.end_to_end.captures.test_uploads import begin, create
 from tests.end_to_end.conftest import Service, digests, png, serving
 from tests.services.cluster.clusters import workers
 
-pytestmark = pytest.mark.full
-
 
 def files_of(service: Service, matte: str) -> dict[str, str]:
     return digests(service.data / "store" / "mattes" / matte)
@@ -61,7 +59,7 @@ def test_a_killed_server_goes_on_where_it_stood(
         assert files_of(second, ended["matte"]) == files_of(service, matte)
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_a_server_killed_during_ingest_goes_on(
     service: Service, matte: str, bundle: Path, tmp_path: Path
 ) -> None:
@@ -146,7 +144,7 @@ def test_an_ingest_that_failed_for_no_fault_of_the_capture_can_be_retried(
         assert service.client.capture(second["id"])["state"] == "ready"
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_a_job_cancelled_before_a_kill_leaves_nothing(bundle: Path, tmp_path: Path) -> None:
     data = tmp_path / "data"
     with serving(data, "--workers", "1") as first:
@@ -207,7 +205,7 @@ def test_a_tile_that_always_fails_fails_its_job_and_retry_goes_on(
     assert files_of(service, job["matte"]) == files_of(service, matte)
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
 def test_a_server_that_is_asked_to_stop_leaves_no_process(
     bundle: Path, tmp_path: Path, number: int, code: int

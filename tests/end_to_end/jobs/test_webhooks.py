@@ -78,7 +78,7 @@ def test_what_fails_first_comes_over_a_kill_and_signed(bundle: Path, tmp_path: P
     assert len(found.came) == 3
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_a_service_with_a_secret_refuses_addresses_that_are_not_public(bundle: Path, tmp_path: Path) -> None:
     with (
         receiver(lambda n: 200) as found,

@@ -22,8 +22,6 @@ from tests.end_to_end.conftest import Service, digests, png, serving
 from tests.end_to_end.use.test_cli import envmatte
 from workflows.simulation import glass_ball
 
-pytestmark = pytest.mark.full
-
 
 @pytest.fixture(scope="module")
 def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
@@ -121,7 +119,7 @@ def test_what_lies_is_refused_and_leaves_nothing(elsewhere: Service, archive: Pa
     assert elsewhere.stored() == set()
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_one_that_is_too_large_is_refused_with_the_limit(archive: Path, tmp_path: Path) -> None:
     size = archive.stat().st_size
     with serving(tmp_path / "data", "--workers", "1", ENVMATTE_UPLOAD_BYTES=str(size - 1)) as small:
@@ -175,7 +173,7 @@ def test_a_matte_deleted_while_it_is_sent_ends_the_connection(
     assert elsewhere.stored() == set()
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_a_service_that_is_killed_keeps_the_mattes_that_came_and_nothing_else(
     archive: Path, tmp_path: Path
 ) -> None:

@@ -114,8 +114,7 @@ def test_a_cancelled_job_frees_what_it_had_and_holds_its_matte_no_more(service: 
     assert service.client.matte(matte)["state"] == "ready"
 
 
-@pytest.mark.long
-@pytest.mark.full
+@pytest.mark.exhaustive
 def test_a_killed_worker_and_a_killed_service_change_no_byte(
     service: Service, matte: str, tmp_path: Path
 ) -> None:

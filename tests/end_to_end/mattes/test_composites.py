@@ -35,7 +35,6 @@ def decoded(answer: httpx2.Response) -> np.ndarray:
     return integer_formats.decode(answer.content, memory=1 << 24)
 
 
-@pytest.mark.full
 def test_the_three_kinds_of_answer_are_one_picture(service: Service, matte: str) -> None:
     exr = asked(service, matte, accept="image/x-exr")
     assert exr.headers["content-type"] == "image/x-exr"
@@ -97,7 +96,6 @@ def test_a_moved_backdrop_is_the_backdrop_moved(service: Service, matte: str) ->
     assert np.abs(moved - decoded(asked(service, matte))).mean() > 10
 
 
-@pytest.mark.full
 def test_a_backdrop_at_another_depth(service: Service, matte: str) -> None:
     still = decoded(asked(service, matte)).astype(int)
     told = {"distance": 3, "camera": 5}
@@ -242,9 +240,8 @@ def test_a_bomb_is_refused_before_it_goes_off(service: Service, matte: str) -> N
     assert "cut off or damaged" in cut["detail"]
 
 
-@pytest.mark.full
 @pytest.mark.parametrize(
-    "requests", [600, pytest.param(10_000, marks=[pytest.mark.long, pytest.mark.timeout(3600)])]
+    "requests", [600, pytest.param(10_000, marks=[pytest.mark.exhaustive, pytest.mark.timeout(3600)])]
 )
 def test_requests_leave_nothing_behind(service: Service, matte: str, requests: int) -> None:
     """Neither in the API's process nor in those that decode backdrops for it."""

@@ -31,7 +31,6 @@ def test_a_layer_is_a_png_and_an_exr(service: Service, matte: str, name: str) ->
     np.testing.assert_allclose(integer_formats.to_unit(pixels), np.clip(exact, 0, 1), atol=1e-5)
 
 
-@pytest.mark.full
 def test_all_layers_are_one_exr_with_as_many_lobes_as_asked_for(service: Service, matte: str) -> None:
     for query, lobes in (("", 4), ("?lobes=2", 2)):
         answer = service.http.get(f"/v1/mattes/{matte}/layers/all.exr{query}")

@@ -24,7 +24,6 @@ def tiles_done(service: Service, job: str) -> int:
     return int(service.client.job(job)["tiles"]["done"])
 
 
-@pytest.mark.full
 def test_a_job_that_ran_is_finished_where_the_backup_is_restored(
     bundle: Path, s3: str, postgresql_server: Server, tmp_path: Path
 ) -> None:

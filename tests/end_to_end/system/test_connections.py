@@ -14,8 +14,6 @@ import pytest
 from services.api.http import slow_clients
 from tests.end_to_end.conftest import Service
 
-pytestmark = pytest.mark.full
-
 
 @contextlib.contextmanager
 def connected(service: Service, count: int = 1) -> Iterator[list[socket.socket]]:

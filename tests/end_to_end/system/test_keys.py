@@ -185,7 +185,7 @@ def expected(route: str, kind: str) -> int | None:
     return 404 if kind.startswith("other") and (call.id or call.named) else None
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_a_clip_takes_a_matte_of_ones_own(locked: Locked) -> None:
     url, video = f"/v1/mattes/{locked.ids['matte']}/composite", {"Content-Type": "video/mp4"}
     for kind, status in (("other", 404), ("read", 403)):

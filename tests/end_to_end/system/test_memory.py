@@ -12,8 +12,6 @@ import pytest
 from tests.end_to_end.captures.test_uploads import create, patch
 from tests.end_to_end.conftest import Service, serving
 
-pytestmark = pytest.mark.full
-
 GIB = 1 << 30
 
 
@@ -36,7 +34,7 @@ def in_one_post(service: Service, file: Path) -> dict[str, Any]:
     return dict(answer.json())
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("send", [in_pieces, in_one_patch, in_one_post])
 def test_an_upload_of_a_gigabyte_is_streamed(
     bundle: Path, tmp_path: Path, send: Callable[[Service, Path], dict[str, Any]]
@@ -67,7 +65,7 @@ def test_an_upload_of_a_gigabyte_is_streamed(
         assert service.client.wait(uploaded["job"])["state"] == "succeeded"
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_an_upload_over_the_limit_is_refused_without_being_read(bundle: Path, tmp_path: Path) -> None:
     limit = bundle.stat().st_size - 1
     with serving(tmp_path / "data", "--workers", "1", ENVMATTE_UPLOAD_BYTES=str(limit)) as service:

@@ -18,7 +18,7 @@ from storage.database.engine import open_engine, writing
 from storage.records import api_keys
 from tests.end_to_end.conftest import Service, png, serving
 
-pytestmark = [pytest.mark.full, pytest.mark.timeout(1800)]
+pytestmark = pytest.mark.timeout(1800)
 
 SECRET = "secret"
 CHECKS = (
@@ -164,7 +164,7 @@ def test_a_few_calls_of_each_route(bundle: Path, tmp_path: Path) -> None:
     assert made_in(answers) == set(MAKING)
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("who", ["a key", "a key to look with", "no key", "a service without keys"])
 def test_the_service_is_as_its_document_says(
     bundle: Path, tmp_path: Path, who: str, pytestconfig: pytest.Config

@@ -19,8 +19,6 @@ from tests.services.cluster.clusters import wait
 from tests.services.runtime.collector import Collector, collecting
 from tests.workflows.composite.video.test_steps import clip, pictures
 
-pytestmark = pytest.mark.full
-
 CALLER = "00-0123456789abcdef0123456789abcdef-0123456789abcdef-01"
 
 

@@ -15,14 +15,12 @@ from pathlib import Path
 import av
 import httpx2
 import numpy as np
-import pytest
 
 from services.client import Client
 from tests.end_to_end.conftest import Service, png
 from tests.end_to_end.use.test_readme import README
 from workflows.simulation import glass_ball
 
-pytestmark = pytest.mark.full
 TASKS = ["Film", "Upload", "Recover", "Composite a folder of backdrops", "Scale out to three machines"]
 RECIPES = dict(
     re.findall(

@@ -10,7 +10,6 @@ import pytest
 from PIL import Image
 
 
-@pytest.mark.full
 def test_the_demo_leaves_its_picture(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "services", "demo", "-o", "picture.png", "--keep", "kept", "--json"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=200)

@@ -177,7 +177,6 @@ def test_a_deleted_program_is_gone_with_all_its_files(service: Service) -> None:
     assert service.http.post("/v1/programs", json=asked).headers["location"] == url
 
 
-@pytest.mark.full
 def test_a_key_is_asked_for_but_for_the_page(tmp_path: Path) -> None:
     with serving(tmp_path / "data", ENVMATTE_KEYS="secret") as locked:
         key = {"Authorization": "Bearer secret"}

@@ -25,8 +25,6 @@ from services.settings import Settings
 from storage.errors import Unavailable
 from tests.services.cluster.clusters import address, children, listening, running, started, wait, workers
 
-pytestmark = pytest.mark.full
-
 WORKERS = 2
 
 
@@ -176,7 +174,7 @@ def test_a_worker_process_that_is_killed_comes_again(cluster: Cluster, client: C
     assert client.submit(sum, [1, 2]).result(60) == 3
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_workers_join_a_scheduler_that_was_killed(cluster: Cluster, client: Client) -> None:
     busy = client.submit(time.sleep, 3)
     for _ in range(2):
@@ -276,7 +274,7 @@ def test_workers_die_with_their_nanny(cluster: Cluster, client: Client) -> None:
     wait(lambda: len(client.nthreads()) == WORKERS)
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_waiting_workers_end_when_they_are_asked(folder: Path, number: signal.Signals) -> None:
     (folder / "workers.log").write_text("")
@@ -294,7 +292,7 @@ def test_a_scheduler_ends_when_it_is_asked(folder: Path, number: signal.Signals)
         assert process.wait(60) == (0 if number == signal.SIGTERM else 130)
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_a_scheduler_without_certificates_is_for_this_machine_alone(tmp_path: Path) -> None:
     data = {"ENVMATTE_DATA": str(tmp_path)}
     with started(tmp_path / "log", "scheduler", "--host", "0.0.0.0", **data) as process:

@@ -9,7 +9,7 @@ OTHERS = 15
 """Writes that come once a job, or every few seconds whatever goes on: its start, its stages, the lease."""
 
 
-@pytest.mark.long
+@pytest.mark.exhaustive
 def test_progress_takes_a_few_writes_a_second() -> None:
     row = measure(tiles=1500, seconds=0.0, workers=1, threads=4)
     writes = row["writes a second"] * row["seconds"]

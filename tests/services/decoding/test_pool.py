@@ -126,7 +126,6 @@ def test_one_that_is_killed_costs_its_picture_alone(decoders: Decoders) -> None:
     assert "(SIGKILL)" in asked(decoders, lambda child: child.kill())
 
 
-@pytest.mark.full
 def test_one_that_hangs_is_given_up() -> None:
     impatient = Decoders(MEMORY, seconds=8)
     assert "takes more than 8 s" in asked(impatient, lambda child: None)
@@ -153,7 +152,6 @@ def test_memory_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
     confined.close()
 
 
-@pytest.mark.full
 def test_the_largest_that_is_allowed_has_room() -> None:
     """16 bits, transparent and with a profile, which takes the most copies."""
     noise = np.random.default_rng(1).integers(0, 1 << 16, (1000, 2000, 4), np.uint16)

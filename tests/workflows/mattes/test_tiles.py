@@ -89,7 +89,7 @@ def recover(objects: Objects, ingest: Ingest) -> Callable[..., tuple[mattes.Matt
     return whole
 
 
-@pytest.mark.parametrize("method", [pytest.param("lobes", marks=pytest.mark.full), "nn-dgsr"])
+@pytest.mark.parametrize("method", ["lobes", "nn-dgsr"])
 def test_the_matte_is_the_same_to_the_byte(
     recover: Callable[..., tuple[mattes.Matte, int]],
     digests: Digests,

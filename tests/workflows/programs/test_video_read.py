@@ -18,7 +18,6 @@ from workflows.programs.border import LEAD_SECONDS
 from workflows.programs.files import fitted
 from workflows.untrusted.limits import Limits
 
-pytestmark = pytest.mark.full
 RATE = 2.0
 
 

@@ -22,8 +22,6 @@ from storage.objects.store import Objects
 from tests.services.api.mattes.archives import archive
 from tests.services.cluster.clusters import wait
 
-pytestmark = pytest.mark.full
-
 PATIENCE = 1.0
 SIZE = 1200, 800
 """Of a matte whose layers are some 10 MB."""

@@ -27,8 +27,6 @@ from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import Scene, nested_program, write_capture
 from workflows.untrusted.limits import Limits
 
-pytestmark = pytest.mark.full
-
 Floats = NDArray[np.float32]
 Ingest = Callable[..., Stack]
 Digests = Callable[[str], dict[str, str]]
@@ -134,9 +132,9 @@ def test_what_is_steady_is_left_alone(ingest: Ingest, objects: Objects, digests:
 @pytest.mark.parametrize(
     ("ball", "pixels", "jumps", "gain"),
     [
-        pytest.param("default", 0.3, False, 6, marks=pytest.mark.long),
+        pytest.param("default", 0.3, False, 6, marks=pytest.mark.exhaustive),
         ("default", 0.6, True, 6),
-        pytest.param("quick", 1.0, False, 8, marks=pytest.mark.long),
+        pytest.param("quick", 1.0, False, 8, marks=pytest.mark.exhaustive),
     ],
     indirect=["ball"],
 )
@@ -160,7 +158,7 @@ def test_drift_is_found_and_taken_out(
 
 @pytest.mark.parametrize(
     ("ball", "percent", "gain"),
-    [pytest.param("default", 3.0, 3, marks=pytest.mark.long), ("quick", 8.0, 6)],
+    [pytest.param("default", 3.0, 3, marks=pytest.mark.exhaustive), ("quick", 8.0, 6)],
     indirect=["ball"],
 )
 def test_flicker_is_found_and_taken_out(

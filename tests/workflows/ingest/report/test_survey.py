@@ -17,8 +17,6 @@ from workflows.programs.presets import preset
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import write_capture
 
-pytestmark = pytest.mark.full
-
 Ingest = Callable[..., Stack]
 
 

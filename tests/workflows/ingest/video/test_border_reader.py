@@ -16,7 +16,6 @@ from workflows.programs.border import LEAD, Border, draw, schedule
 from workflows.programs.presets import preset
 from workflows.simulation.glass_ball import glass_ball
 
-pytestmark = pytest.mark.full
 BORDER = Border.on(640, 480)
 WIDTH, HEIGHT = 224, 168
 HOLD = 0.25
@@ -97,17 +96,19 @@ def wrong(stack: Stack, made: Film, numbers: list[int]) -> list[tuple[int, int]]
             Camera(hold=HOLD, fps=24, exposure=1.0),
             ASKEW,
             id="24 frames a second, all of them exposed",
-            marks=pytest.mark.long,
+            marks=pytest.mark.exhaustive,
         ),
-        pytest.param(Camera(hold=0.1, fps=60), ASKEW, id="10 patterns a second", marks=pytest.mark.long),
+        pytest.param(
+            Camera(hold=0.1, fps=60), ASKEW, id="10 patterns a second", marks=pytest.mark.exhaustive
+        ),
         pytest.param(
             Camera(hold=HOLD, options={"crf": "32"}),
             ((2, 3), (2, 164), (221, 3), (222, 165)),
             id="compressed",
-            marks=pytest.mark.long,
+            marks=pytest.mark.exhaustive,
         ),
         pytest.param(Camera(hold=HOLD), ((20, 14), (16, 190), (203, 24), (210, 187)), id="bottom hidden"),
-        pytest.param(Camera(hold=HOLD), ASKEW[::-1], id="upside down", marks=pytest.mark.long),
+        pytest.param(Camera(hold=HOLD), ASKEW[::-1], id="upside down", marks=pytest.mark.exhaustive),
     ],
 )
 def test_every_number_is_read(take: Callable[..., Any], camera: Camera, corners: Any) -> None:

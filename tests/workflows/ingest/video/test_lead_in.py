@@ -12,7 +12,6 @@ from workflows.programs.border import LEAD, schedule
 from workflows.programs.presets import preset
 from workflows.simulation.glass_ball import glass_ball
 
-pytestmark = pytest.mark.full
 MONITOR = (192, 144)
 HOLD = 0.5
 
@@ -41,16 +40,16 @@ def take(make_zip: Callable[..., bytes], ingest: Callable[..., Any]) -> Callable
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param("default", marks=pytest.mark.long),
+        pytest.param("default", marks=pytest.mark.exhaustive),
         "quick",
-        pytest.param("sketch", marks=pytest.mark.long),
+        pytest.param("sketch", marks=pytest.mark.exhaustive),
     ],
 )
 @pytest.mark.parametrize(
     "camera",
     [
         pytest.param(
-            Camera(hold=HOLD, jitter=0.0, fps=30), id="a player that keeps time", marks=pytest.mark.long
+            Camera(hold=HOLD, jitter=0.0, fps=30), id="a player that keeps time", marks=pytest.mark.exhaustive
         ),
         pytest.param(Camera(hold=HOLD, jitter=0.03, fps=25, exposure=0.9), id="one that does not quite"),
     ],
