@@ -183,13 +183,17 @@ def _loop() -> IOLoop:
 def dispatcher_of(settings: Settings) -> Iterator[Dispatcher]:
     """What hands tiles to the cluster that the settings name, reached or not yet, or to one of its own."""
     if settings.cluster:
-        with Dispatcher(partial(connect, settings.cluster, settings.security())) as dispatcher:
+        with Dispatcher(
+            partial(connect, settings.cluster, settings.security()), settings.store_url
+        ) as dispatcher:
             yield dispatcher
     else:
         with (
             embedded(settings) as cluster,
             Dispatcher(
-                partial(Client, cluster, set_as_default=False), Scale(cluster.scale, settings.workers)
+                partial(Client, cluster, set_as_default=False),
+                settings.store_url,
+                Scale(cluster.scale, settings.workers),
             ) as dispatcher,
         ):
             yield dispatcher

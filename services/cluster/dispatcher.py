@@ -20,7 +20,7 @@ from distributed.scheduler import KilledWorker
 
 from services.cluster.task import key_of, run
 from storage.errors import EnvmatteError
-from workflows.jobs import Task
+from workflows.jobs import Steps, Task
 
 logger = logging.getLogger(__name__)
 
@@ -76,12 +76,17 @@ class Dispatcher:
     ----------
     connect : callable
         Returns a synchronous client, or raises within seconds.
+    store : str
+        URL of the object store that workers read and write.
     scale : callable, optional
         Told how many workers are of use, where they can be had for the asking.
     """
 
-    def __init__(self, connect: Callable[[], Client], scale: Callable[[int], None] | None = None) -> None:
+    def __init__(
+        self, connect: Callable[[], Client], store: str, scale: Callable[[int], None] | None = None
+    ) -> None:
         self._connect = connect
+        self._store = store
         self._scale = scale
         self._client: Client | None = None
         self._flights: dict[Future, Flight] = {}
@@ -118,7 +123,7 @@ class Dispatcher:
         """
         return self.threads - sum(not future.done() for future in self._flights) if self._usable() else 0
 
-    def submit(self, kind: str, task: Task, tile: int, trace: str | None = None) -> bool:
+    def submit(self, steps: Steps, task: Task, tile: int, trace: str | None = None) -> bool:
         """Hand over a tile, and the trace that it is part of; `collect` says what became of it.
 
         False if it can't be, because the scheduler is being lost.
@@ -127,10 +132,12 @@ class Dispatcher:
         flight = Flight(task.job, tile, number)
         if client is None:
             return False
-        key = key_of(kind, task.job, tile)
+        key = key_of(steps.kind, task.job, tile)
         # By default what is submitted within 100 ms of one another runs in any order: `_blamed` goes by this one.
         try:
-            future = client.submit(run, kind, task, tile, trace, key=key, pure=False, fifo_timeout="0 ms")
+            future = client.submit(
+                run, steps, self._store, task, tile, trace, key=key, pure=False, fifo_timeout="0 ms"
+            )
         except Exception as error:
             logger.warning("nothing can be handed over: %r", error)
             return False

@@ -13,7 +13,10 @@ from distributed import Worker
 from distributed.core import Status
 from tornado.ioloop import PeriodicCallback
 
-# Importing the kernels, as this does, takes seconds: not out of the first job's time.
+# All steps, because importing their kernels takes seconds: the first task of a worker must not wait for it.
+import workflows.composite.video.steps
+import workflows.ingest.steps
+import workflows.mattes.steps  # noqa: F401
 from services.cluster.task import read_key
 from services.runtime import tracing
 from services.runtime.logs import about, log_as_nanny_does

@@ -1,8 +1,8 @@
-"""The coordinator: takes queued jobs and drives them on dask, one step after another.
+"""The coordinator: takes queued jobs and runs their steps on the cluster.
 
-Any number of coordinators may run; the one that holds the lease runs jobs (`storage.records.leases`). It polls, and it
-alone writes progress: results that travel with callbacks are lost with their client, and a scheduler keeps nothing over
-a restart. Whatever it holds in memory can be rebuilt from the ledger.
+Any number of coordinators may be up; the one that holds the lease runs the jobs (`storage.records.leases`). It polls,
+and it alone writes progress: results delivered by callbacks are lost with their client, and a dask scheduler keeps
+nothing over a restart. Whatever the coordinator holds in memory can be rebuilt from the ledger.
 """
 
 import logging
@@ -19,8 +19,8 @@ from typing import Any
 from sqlalchemy import Connection, Engine, Row
 
 from services.cluster.dispatcher import Dispatcher
-from services.coordinator.job_kinds import KINDS
-from services.coordinator.job_run import Drive, end_badly
+from services.coordinator.job_kinds import JOB_KINDS
+from services.coordinator.job_run import JobRun, write_failure
 from services.coordinator.retention import count, forget_expired, forget_jobs, remove, sweep
 from services.runtime.logs import about
 from services.settings import Settings
@@ -33,21 +33,21 @@ from storage.records.leases import Superseded
 logger = logging.getLogger(__name__)
 
 POLL = 0.1
-"""Seconds between two looks at the ledger; what the cluster has done is looked at as soon as it is."""
+"""Seconds between two reads of the ledger. News from the cluster is handled at once."""
 BEAT = 2.0
-"""Seconds between two signs of life."""
-SETTLE = 0.25
+"""Seconds between two heartbeats."""
+WRITE = 0.25
 """Seconds between two writes of progress, whatever the number of jobs and tiles."""
 DYING = 1.2
-"""Seconds after which no worker works on a job any more that was cancelled, see `services.cluster.worker_preload`."""
+"""Seconds until no worker works on a cancelled job any more, see `services.cluster.worker_preload`."""
 FORGET = 30.0
-"""Seconds between two looks for jobs that are kept no longer."""
+"""Seconds between two searches for jobs to delete."""
 SWEEP = 3600.0
 """Seconds between two sweeps of the store."""
 
 
 class Coordinator:
-    """Drives jobs until it is stopped, whenever it holds the lease.
+    """Runs jobs while it holds the lease, until it is stopped.
 
     Parameters
     ----------
@@ -64,17 +64,17 @@ class Coordinator:
         self._dispatcher = dispatcher
         self._name = f"{socket.gethostname()}:{os.getpid()}"
         self._token: int | None = None
-        self._drives: dict[str, Drive] = {}
-        self._leaving: deque[tuple[float, Row[Any]]] = deque()
-        """When what ended jobs wrote is removed: a time, and the job's row."""
+        self._runs: dict[str, JobRun] = {}
+        self._discards: deque[tuple[float, Row[Any]]] = deque()
+        """Jobs whose files are to be removed: the earliest time, and the job's row."""
         self._troubles: Counter[str] = Counter()
-        self._beat_at = self._forgot_at = self._swept_at = self._settled_at = self._read_at = -1e9
+        self._beat_at = self._forgot_at = self._swept_at = self._wrote_at = self._read_at = -1e9
         self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="coordinator")
-        self._house = ThreadPoolExecutor(1, thread_name_prefix="housekeeping")
+        self._thread = threading.Thread(target=self._loop, name="coordinator")
+        self._housekeeping = ThreadPoolExecutor(1, thread_name_prefix="housekeeping")
 
     def __enter__(self) -> "Coordinator":
-        if self._settings.alone:  # and nobody writes to the store yet
+        if self._settings.alone:  # and nothing writes to the store yet
             sweep(self._engine, self._objects, seconds=0)
         self._thread.start()
         return self
@@ -83,17 +83,17 @@ class Coordinator:
         self._stopped.set()
         self._dispatcher.news.set()
         self._thread.join()
-        self._house.shutdown(cancel_futures=True)
+        self._housekeeping.shutdown(cancel_futures=True)
         if self._token is not None:
             with suppress(Unavailable, NoRoom), writing(self._engine) as c:
                 leases.give_back(c, self._token)
 
     @property
     def token(self) -> int | None:
-        """Of the lease; None while another holds it."""
+        """Token of the lease; None while another coordinator holds it."""
         return self._token
 
-    def _run(self) -> None:
+    def _loop(self) -> None:
         while not self._stopped.is_set():
             self._dispatcher.news.clear()
             try:
@@ -103,15 +103,15 @@ class Coordinator:
                 logger.warning("%s: %s", self._name, error)
                 self._stand_down()
             except (Unavailable, NoRoom) as error:
-                logger.warning("going on as soon as it can: %s", error.detail)
+                logger.warning("trying again in a second: %s", error.detail)
                 self._stopped.wait(1)
             except Exception:  # nothing may end this thread
-                logger.exception("the coordinator goes on after an error")
+                logger.exception("the coordinator continues after an error")
                 self._stopped.wait(1)
             self._dispatcher.news.wait(POLL)
 
     def _leads(self) -> bool:
-        """Whether the lease is held: it is extended, or asked for, when that is due."""
+        """Whether this coordinator holds the lease; extends or requests it when that is due."""
         now = time.monotonic()
         if now - self._beat_at < BEAT:
             return self._token is not None
@@ -121,32 +121,32 @@ class Coordinator:
                 self._token = leases.take(c, self._name, seize=self._settings.alone)
             if self._token is None:
                 return False
-            logger.info("%s drives the jobs from now on", self._name)
+            logger.info("%s runs the jobs from now on", self._name)
         with self._writing() as c:
             leases.beat(c, self._token, self._dispatcher.cluster)
             expired = forget_expired(c)
         for path in expired:
-            self._house.submit(_logged, remove, self._objects, path)
+            self._housekeeping.submit(_logged, remove, self._objects, path)
         if now - self._forgot_at > FORGET:
             self._forgot_at = now
             kept = self._settings.job_seconds
-            self._house.submit(_logged, forget_jobs, self._engine, self._objects, kept)
+            self._housekeeping.submit(_logged, forget_jobs, self._engine, self._objects, kept)
         if now - self._swept_at > SWEEP:
             self._swept_at = now
-            self._house.submit(_logged, sweep, self._engine, self._objects)
-            self._house.submit(_logged, count, self._engine, self._objects)
+            self._housekeeping.submit(_logged, sweep, self._engine, self._objects)
+            self._housekeeping.submit(_logged, count, self._engine, self._objects)
         return True
 
     def _stand_down(self) -> None:
-        """Let go of everything: another has it."""
+        """Drop all jobs: another coordinator runs them now."""
         self._token = None
-        for job in list(self._drives):
+        for job in list(self._runs):
             self._drop(job)
-        self._leaving.clear()
+        self._discards.clear()
 
     @contextmanager
     def _writing(self) -> Iterator[Connection]:
-        """A transaction that is refused once another coordinator has taken over."""
+        """A transaction that fails if another coordinator has taken over."""
         if self._token is None:
             raise Superseded("this coordinator holds no lease")
         with writing(self._engine) as c:
@@ -154,157 +154,158 @@ class Coordinator:
             yield c
 
     def _step(self) -> None:
-        self._submit()  # first, for a thread may be idle
+        self._submit()  # first, because a thread may be idle
         now = time.monotonic()
         if now - self._read_at >= POLL:
             self._read_at = now
             self._read()
         for outcome in self._dispatcher.collect():
-            if outcome.job in self._drives:
-                self._drives[outcome.job].hear(outcome)
-        for drive in self._due():
-            self._guarded(drive.job, self._settle, drive)
+            if outcome.job in self._runs:
+                self._runs[outcome.job].record_outcome(outcome)
+        for run in self._due():
+            self._guarded(run.job, self._write, run)
         self._discard()
         self._submit()
 
     def _read(self) -> None:
-        """See in the ledger which jobs there are to drive, and which no more."""
+        """Read from the ledger which jobs to run, and which to run no longer."""
         with reading(self._engine) as c:
             active = {row.id: row for row in jobs.active(c)}
-            cancelled = jobs.not_wound_up(c)
+            cancelled = jobs.cancelled_with_leftovers(c)
         for row in active.values():
-            if row.id not in self._drives:
-                self._guarded(row.id, self._take_up, row)
-        for job in self._drives.keys() - active.keys():
+            if row.id not in self._runs:
+                self._guarded(row.id, self._start, row)
+        for job in self._runs.keys() - active.keys():
             self._drop(job)
         for row in cancelled:
-            self._wind_up(row)
+            self._clean_up(row)
 
     def _guarded(self, job: str, act: Any, *arguments: Any) -> None:
-        """Do something about a job; what is wrong with it must not hold up the others."""
+        """Do something about a job, whose errors must not hold up other jobs."""
         try:
             with about(job):
                 act(*arguments)
-        except (Superseded, Unavailable, NoRoom):  # of the ledger: no job is to blame
+        except (Superseded, Unavailable, NoRoom):  # of the ledger: the job is not to blame
             raise
         except EnvmatteError as error:
             self._fail(job, error)
         except Exception as error:
-            # Whatever it was, and whatever it left half done here: the ledger knows where the job stands.
+            # Whatever is half done in memory is dropped: the ledger has the state of the job.
             with about(job):
-                logger.exception("the job is taken up anew")
-            if job in self._drives:
+                logger.exception("starting the job again from the ledger")
+            if job in self._runs:
                 self._drop(job)
             self._troubles[job] += 1
             if self._troubles[job] >= self._settings.attempts:
-                self._fail(job, GaveUp(f"the coordinator failed at it, last with {error!r}"))
+                self._fail(job, GaveUp(f"the coordinator failed on this job, last with {error!r}"))
 
-    def _take_up(self, row: Row[Any]) -> None:
-        """Begin to drive a job, once what it needs is there; one for which it never will be is ended."""
+    def _start(self, row: Row[Any]) -> None:
+        """Start a job if what it needs is there; raises if it never will be."""
         with reading(self._engine) as c:
-            if not KINDS[row.kind].is_due(c, row):
+            if not JOB_KINDS[row.kind].is_due(c, row):
                 return
         with self._writing() as c:
             tiles.begin(c, row.id)
-            drive = self._drive_of(c, row)
-            jobs.enter(c, row.id, drive.stage)
-        drive.start = min((other.used() for other in self._drives.values()), default=0.0)
-        self._drives[row.id] = drive
-        logger.info("%s, from the stage %s on", row.kind, drive.stage)
+            run = self._run_of(c, row)
+            jobs.enter(c, row.id, run.stage)
+        run.start = min((other.used() for other in self._runs.values()), default=0.0)
+        self._runs[row.id] = run
+        logger.info("%s, from the stage %s on", row.kind, run.stage)
 
-    def _drive_of(self, connection: Connection, row: Row[Any]) -> Drive:
-        return Drive.of(row, tiles.to_do(connection, row.id), self._objects.url, self._settings.limits)
+    def _run_of(self, connection: Connection, row: Row[Any]) -> JobRun:
+        return JobRun.of(row, tiles.to_do(connection, row.id), self._settings.limits)
 
-    def _due(self) -> list[Drive]:
-        """The jobs of which something is written down now.
+    def _due(self) -> list[JobRun]:
+        """The jobs whose outcomes are written now.
 
-        Those that can't go on before it is, and otherwise one at a time: the one that has waited longest.
+        These are the jobs that can't continue otherwise. Of the others it is one at a time, the one that has waited
+        longest.
         """
         due = []
-        for drive in self._drives.values():
-            if drive.news and not drive.to_do and not self._dispatcher.under_way(drive.job):
-                due.append(drive)
+        for run in self._runs.values():
+            if run.outcomes and not run.to_do and not self._dispatcher.under_way(run.job):
+                due.append(run)
         now = time.monotonic()
-        if now - self._settled_at > SETTLE:
-            waiting = [drive for drive in self._drives.values() if drive.news and drive not in due]
+        if now - self._wrote_at > WRITE:
+            waiting = [run for run in self._runs.values() if run.outcomes and run not in due]
             if waiting:
-                due.append(min(waiting, key=lambda drive: drive.settled_at))
-                self._settled_at = now
+                due.append(min(waiting, key=lambda run: run.written_at))
+                self._wrote_at = now
         return due
 
-    def _settle(self, drive: Drive) -> None:
-        """Write down what became of a job's tiles, and go on with it from there."""
-        under_way = self._dispatcher.under_way(drive.job)
+    def _write(self, run: JobRun) -> None:
+        """Write the outcomes of a job's tiles, and advance the job."""
+        under_way = self._dispatcher.under_way(run.job)
         with self._writing() as c:
-            following = drive.settle(c, self._settings.attempts, self._dispatcher.threads, under_way)
-        drive.go_on(following)
+            following = run.write(c, self._settings.attempts, self._dispatcher.threads, under_way)
+        run.advance(following)
         if following.ended:
-            self._drop(drive.job)
-            self._tidy(drive.job)
+            self._drop(run.job)
+            self._tidy(run.job)
 
     def _drop(self, job: str) -> None:
-        """Drive a job no more: what the cluster has of it is cancelled."""
-        del self._drives[job]
+        """Stop running a job, and cancel its tasks on the cluster."""
+        del self._runs[job]
         self._dispatcher.drop(job)
 
     def _fail(self, job: str, error: EnvmatteError) -> None:
-        """End a job that can't be driven."""
+        """End a job that can't be run."""
         with self._writing() as c:
             row = jobs.get(c, job)
-            end_badly(c, row.kind, self._drive_of(c, row).task, error)
-        if job in self._drives:
+            write_failure(c, JOB_KINDS[row.kind], self._run_of(c, row).task, error)
+        if job in self._runs:
             self._drop(job)
         self._tidy(job)
 
     def _tidy(self, job: str) -> None:
-        """Remove what nobody needs once a job has ended: what it was given, or all of what can't be used."""
+        """Remove what is of no use after the end of a job: its input, or everything if it can't be retried."""
         with reading(self._engine) as c:
             row = jobs.get(c, job)
         if row.state == "succeeded":
-            self._house.submit(_logged, KINDS[row.kind].tidy, self._objects, row)
-            self._house.submit(_logged, count, self._engine, self._objects)
-        elif row.state == "failed" and KINDS[row.kind].discards(row.problem):
-            self._leaving.append((time.monotonic() + DYING, row))
+            self._housekeeping.submit(_logged, JOB_KINDS[row.kind].tidy, self._objects, row)
+            self._housekeeping.submit(_logged, count, self._engine, self._objects)
+        elif row.state == "failed" and JOB_KINDS[row.kind].discards(row.problem):
+            self._discards.append((time.monotonic() + DYING, row))
 
-    def _wind_up(self, row: Row[Any]) -> None:
-        """Free what a cancelled job wrote, once nobody works on it."""
+    def _clean_up(self, row: Row[Any]) -> None:
+        """Remove what a cancelled job wrote, once no worker works on it."""
         with self._writing() as c:
-            KINDS[row.kind].cancelled(c, row)
+            JOB_KINDS[row.kind].cancelled(c, row)
         dying = DYING if row.started_at else 0
-        self._leaving.append((time.monotonic() + dying, row))
+        self._discards.append((time.monotonic() + dying, row))
 
     def _discard(self) -> None:
-        """Remove what ended jobs wrote, as soon as no worker works on them any more."""
+        """Remove the files of ended jobs on which no worker works any more."""
         now = time.monotonic()
-        while self._leaving and self._leaving[0][0] <= now:
-            _, row = self._leaving.popleft()
-            self._house.submit(_logged, KINDS[row.kind].discard, self._objects, row)
+        while self._discards and self._discards[0][0] <= now:
+            _, row = self._discards.popleft()
+            self._housekeeping.submit(_logged, JOB_KINDS[row.kind].discard, self._objects, row)
 
     def _submit(self) -> None:
-        """Fill the cluster, the job that has had the fewest seconds of it first.
+        """Submit tiles for all free threads, first of the job that has used the fewest worker seconds.
 
-        One that begins counts from the least of the others, so that it neither waits for a large one to end nor takes
-        everything until it has caught up.
+        A job that starts is credited with the least of the others' seconds. So it neither waits for a large one to end,
+        nor takes all threads until it has caught up.
         """
         dispatcher = self._dispatcher
-        under_way = {job: dispatcher.under_way(job) for job in self._drives}
-        dispatcher.want(sum(len(drive.to_do) + under_way[job] for job, drive in self._drives.items()))
-        waiting = [drive for drive in self._drives.values() if drive.to_do]
+        under_way = {job: dispatcher.under_way(job) for job in self._runs}
+        dispatcher.want(sum(len(run.to_do) + under_way[job] for job, run in self._runs.items()))
+        waiting = [run for run in self._runs.values() if run.to_do]
         for _ in range(dispatcher.free):
             if not waiting:
                 return
-            drive = min(waiting, key=lambda drive: (drive.used(under_way[drive.job]), under_way[drive.job]))
-            if not dispatcher.submit(drive.kind, drive.task, drive.to_do[0], drive.trace):
+            run = min(waiting, key=lambda run: (run.used(under_way[run.job]), under_way[run.job]))
+            if not dispatcher.submit(run.kind.steps, run.task, run.to_do[0], run.trace):
                 return
-            drive.to_do.popleft()
-            under_way[drive.job] += 1
-            if not drive.to_do:
-                waiting.remove(drive)
+            run.to_do.popleft()
+            under_way[run.job] += 1
+            if not run.to_do:
+                waiting.remove(run)
 
 
 def _logged(act: Callable[..., None], *arguments: Any) -> None:
-    """Do something in the background; what it could not do, the next sweep does."""
+    """Run something in the background and log its errors; the next sweep does what it could not."""
     try:
         act(*arguments)
     except Exception:
-        logger.exception("housekeeping failed, and is tried again later")
+        logger.exception("housekeeping failed; the next sweep tries again")

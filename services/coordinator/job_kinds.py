@@ -1,6 +1,5 @@
-"""What each kind of job means to the ledger and to the store, besides its steps: one class a kind."""
+"""The registry of job kinds: the steps that workers run, and what each kind means to the ledger and the store."""
 
-from collections.abc import Mapping
 from typing import Any
 
 from sqlalchemy import Connection, Row
@@ -12,21 +11,28 @@ from storage.layout import composites, uploads
 from storage.layout import mattes as stored_mattes
 from storage.objects.store import Objects
 from storage.records import captures, jobs, mattes, tiles
-from workflows.jobs import Task
+from storage.records.jobs import is_retryable
+from workflows.composite.video import steps as video_steps
+from workflows.ingest import steps as ingest_steps
+from workflows.jobs import Steps, Task
+from workflows.mattes import steps as matte_steps
 
 Problem = dict[str, Any]
 
 
-def may_be_retried(problem: Problem) -> bool:
-    """Whether a job that failed with a problem may be tried again: what it had is kept then."""
-    return captures.may_be_retried(problem)
+class JobKind:
+    """A kind of job: its steps, what is recorded of it, and what is removed.
 
+    Methods that take a connection are part of a transaction. Methods that take the store run after it, and may be
+    repeated.
 
-class Kind:
-    """A kind of job: what is written down, and what is removed, as a job of it goes on.
-
-    What takes a connection is part of a transaction; what takes the store comes after it, and may be repeated.
+    Attributes
+    ----------
+    steps : Steps
+        What workers run.
     """
+
+    steps: Steps
 
     def is_due(self, connection: Connection, row: Row[Any]) -> bool:
         """Whether a queued job may begin.
@@ -48,7 +54,7 @@ class Kind:
         """It has failed."""
 
     def cancelled(self, connection: Connection, row: Row[Any]) -> None:
-        """It was cancelled: nothing is left of what `storage.records.jobs.not_wound_up` goes by."""
+        """It was cancelled. After this `storage.records.jobs.cancelled_with_leftovers` does not list it."""
 
     def retried(self, connection: Connection, row: Row[Any]) -> None:
         """It is queued again, having failed.
@@ -70,8 +76,10 @@ class Kind:
         return False
 
 
-class Ingest(Kind):
-    """Makes a capture of an archive."""
+class Ingest(JobKind):
+    """Makes a capture of a capture archive."""
+
+    steps = ingest_steps.STEPS
 
     def prepared(self, connection: Connection, task: Task, plan: dict[str, Any]) -> None:
         found = {name: plan[name] for name in ("width", "height", "frames")}
@@ -95,7 +103,7 @@ class Ingest(Kind):
 
     def retried(self, connection: Connection, row: Row[Any]) -> None:
         capture = captures.get(connection, row.capture)
-        if not may_be_retried(capture.problem):
+        if not is_retryable(capture.problem):
             raise Conflict(f"capture {capture.id} can't be used, and nothing of it was kept; upload it again")
         captures.change(connection, capture.id, state="ingesting", problem=None, stored=None)
 
@@ -107,11 +115,13 @@ class Ingest(Kind):
         uploads.remove(objects, row.capture)
 
     def discards(self, problem: Problem) -> bool:
-        return not may_be_retried(problem)
+        return not is_retryable(problem)
 
 
-class Recovery(Kind):
+class Recovery(JobKind):
     """Makes a matte of a capture, once that is ingested."""
+
+    steps = matte_steps.STEPS
 
     def is_due(self, connection: Connection, row: Row[Any]) -> bool:
         capture = captures.get(connection, row.capture)
@@ -139,8 +149,10 @@ class Recovery(Kind):
         objects.delete(stored_mattes.path(row.matte))
 
 
-class Composite(Kind):
-    """Makes a video of a clip and a matte. It has no record but the job's."""
+class Composite(JobKind):
+    """Makes a video of a clip and a matte. Its only record is the job's."""
+
+    steps = video_steps.STEPS
 
     def succeeded(self, connection: Connection, task: Task, figures: dict[str, Any]) -> None:
         jobs.change(connection, task.job, stored=None)
@@ -165,7 +177,7 @@ class Composite(Kind):
         objects.delete(composites.path(row.id))
 
     def discards(self, problem: Problem) -> bool:
-        return not may_be_retried(problem)
+        return not is_retryable(problem)
 
 
-KINDS: Mapping[str, Kind] = {"ingest": Ingest(), "recover": Recovery(), "composite": Composite()}
+JOB_KINDS = {kind.steps.kind: kind for kind in (Ingest(), Recovery(), Composite())}

@@ -1,4 +1,4 @@
-"""A job that is being driven: what of it is to be done, and what the ledger is told of what was."""
+"""One job under way: what is still to do, and what is written to the ledger as its tiles come back."""
 
 import logging
 import time
@@ -10,7 +10,7 @@ from typing import Any
 from sqlalchemy import Connection, Row
 
 from services.cluster.dispatcher import Outcome
-from services.coordinator.job_kinds import KINDS as RECORDS
+from services.coordinator.job_kinds import JOB_KINDS, JobKind
 from services.runtime import tracing
 from services.runtime.logs import about
 from services.runtime.problems import problem_of
@@ -19,28 +19,28 @@ from storage.errors import EnvmatteError, GaveUp, Unavailable
 from storage.records import job_log, jobs
 from storage.records import tiles as tile_records
 from storage.steps import FINISH, PREPARE
-from workflows.jobs import KINDS, Task, order
+from workflows.jobs import Task, order
 from workflows.untrusted.limits import Limits
 
 logger = logging.getLogger(__name__)
 
 LOSSES = 8
-"""How often a tile may be lost before its job fails: most workers die of something else, turned off say."""
-REMEDY = "give workers more (ENVMATTE_WORKER_MEMORY) or have them hold less (ENVMATTE_INGEST_MEMORY), and retry the job"
+"""How often a tile may be lost before its job fails. Most workers die of something else, such as being turned off."""
+REMEDY = "give workers more memory (ENVMATTE_WORKER_MEMORY) or have them use less (ENVMATTE_INGEST_MEMORY), and retry"
 
 
 @dataclass(frozen=True)
 class Next:
-    """How a job goes on, once what was written about it is committed.
+    """How a job continues, once what was written about it is committed.
 
     Attributes
     ----------
     stage : str
     to_do : sequence of int
-        Tiles to do besides those there are.
+        Tiles to do in addition to those that are waiting.
     task : Task
     ended : bool
-        Whether it does not go on.
+        Whether the job has ended.
     """
 
     stage: str
@@ -50,34 +50,34 @@ class Next:
 
 
 @dataclass
-class Drive:
-    """A job that is being driven.
+class JobRun:
+    """A job that this coordinator runs.
 
     Attributes
     ----------
     to_do : deque of int
-        Tiles that the cluster has not got, `PREPARE` and `FINISH` among them.
-    news : list of Outcome
-        What became of those it had, and is not written down yet.
-    settled_at : float
-        When something last was.
+        Tiles that have not been submitted to the cluster, `PREPARE` and `FINISH` among them.
+    outcomes : list of Outcome
+        Outcomes of tiles that are not written to the ledger yet.
+    written_at : float
+        When outcomes were last written.
     paced : int
-        Threads of the cluster for which the pace of its tiles is measured; 0 until there is a pace.
+        Number of threads of the cluster when the pace of its tiles was last measured; 0 until it was.
     trace : str, optional
-        The ``traceparent`` of the request that asked for it.
+        The ``traceparent`` of the request that asked for the job.
     start, spent : float
-        Seconds of workers that it is taken to have had when it began, and that it has had since.
+        Worker seconds that the job is credited with at its start, and those it has used since.
     counted : int
-        Tiles that took the latter.
+        Tiles that used the latter.
     """
 
     job: str
-    kind: str
+    kind: JobKind
     stage: str
     task: Task
     to_do: deque[int]
-    news: list[Outcome] = field(default_factory=list)
-    settled_at: float = 0.0
+    outcomes: list[Outcome] = field(default_factory=list)
+    written_at: float = 0.0
     paced: int = 0
     trace: str | None = None
     start: float = 0.0
@@ -85,51 +85,60 @@ class Drive:
     counted: int = 0
 
     @classmethod
-    def of(cls, row: Row[Any], tiles: Sequence[int], store: str, limits: Limits) -> "Drive":
-        """Take up a job where the ledger says that it stands: ``tiles`` are still to do."""
+    def of(cls, row: Row[Any], tiles: Sequence[int], limits: Limits) -> "JobRun":
+        """Continue a job from where the ledger says it is.
+
+        Parameters
+        ----------
+        row : sqlalchemy.Row
+            Of the job.
+        tiles : sequence of int
+            Its tiles that are still to do.
+        limits : Limits
+        """
         task = Task(
             job=row.id,
-            store=store,
             capture=row.capture,
             matte=row.matte or "",
             options=row.options,
             limits=limits,
             plan=row.plan or {},
         )
+        kind = JOB_KINDS[row.kind]
         if row.plan is None:
             stage, to_do = "preparing", [PREPARE]
         elif tiles:
-            stage, to_do = KINDS[row.kind].stage, order(row.kind, tiles)
+            stage, to_do = kind.steps.stage, order(kind.steps, tiles)
         else:
             stage, to_do = "finishing", [FINISH]
-        return cls(row.id, row.kind, stage, task, deque(to_do), trace=row.trace)
+        return cls(row.id, kind, stage, task, deque(to_do), trace=row.trace)
 
-    def hear(self, outcome: Outcome) -> None:
-        """Take in what became of a tile."""
-        self.news.append(outcome)
+    def record_outcome(self, outcome: Outcome) -> None:
+        """Keep the outcome of a tile until `write` writes it to the ledger."""
+        self.outcomes.append(outcome)
         if outcome.done is not None:
             self.spent += outcome.done[0]
             self.counted += 1
 
     def used(self, under_way: int = 0) -> float:
-        """Seconds of workers that it will have had once the tiles under way are done."""
+        """Worker seconds that the job will have used once the tiles under way are done."""
         return self.start + self.spent * (1 + under_way / max(self.counted, 1))
 
-    def settle(self, connection: Connection, attempts: int, threads: int, under_way: int) -> Next:
-        """Write down the news of a job.
+    def write(self, connection: Connection, attempts: int, threads: int, under_way: int) -> Next:
+        """Write the outcomes recorded so far to the ledger. Once that is committed, call `advance`.
 
         Parameters
         ----------
         attempts : int
             How often a tile may fail.
         threads : int
-            Of the cluster, now.
+            Number of threads of the cluster now.
         under_way : int
-            Tiles that the cluster still has.
+            Tiles that the cluster still works on.
         """
         again: list[int] = []
         error: EnvmatteError | None = None
-        results = {outcome.tile: outcome.done for outcome in self.news if outcome.done is not None}
+        results = {outcome.tile: outcome.done for outcome in self.outcomes if outcome.done is not None}
         tiles = [(tile, seconds, pixels) for tile, (seconds, pixels) in results.items() if tile >= 0]
         steps = [
             (tile, seconds, 0)
@@ -138,55 +147,55 @@ class Drive:
         ]
         tile_records.finish(connection, self.job, tiles + steps)
         if tiles and self.paced != threads:
-            # Not the first tiles: their workers load what the others find loaded.
+            # Not from the first tiles: their workers load what later ones find loaded.
             self.paced = threads if tile_records.pace(connection, self.job, after=threads) else 0
-        for outcome in self.news:
+        for outcome in self.outcomes:
             if outcome.done is not None:
                 continue
             try:
-                if self._may_go_on(connection, outcome, attempts):
+                if self._is_to_repeat(connection, outcome, attempts):
                     again.append(outcome.tile)
             except EnvmatteError as found:
                 error = error or found
         if error is not None:
-            end_badly(connection, self.kind, self.task, error)
+            write_failure(connection, self.kind, self.task, error)
             return Next(self.stage, (), self.task, ended=True)
         if PREPARE in results:
             return self._prepared(connection, results[PREPARE][1])
         if FINISH in results:
             return self._finished(connection, results[FINISH][1])
-        if self.stage == KINDS[self.kind].stage and not (again or self.to_do or under_way):
+        if self.stage == self.kind.steps.stage and not (again or self.to_do or under_way):
             return self._enter(connection, "finishing", [FINISH])
         return Next(self.stage, again, self.task)
 
-    def go_on(self, following: Next) -> None:
-        """Go on with a job as `settle` said; call it once that is committed."""
+    def advance(self, following: Next) -> None:
+        """Continue as `write` returned; call it after that is committed."""
         if following.stage != self.stage:
             self.paced = 0
         self.stage, self.task = following.stage, following.task
         self.to_do.extend(following.to_do)
-        self.news.clear()
-        self.settled_at = time.monotonic()
+        self.outcomes.clear()
+        self.written_at = time.monotonic()
 
-    def _may_go_on(self, connection: Connection, outcome: Outcome, attempts: int) -> bool:
-        """Whether a tile that came to nothing is to be done again.
+    def _is_to_repeat(self, connection: Connection, outcome: Outcome, attempts: int) -> bool:
+        """Whether a tile without a result is to be done again.
 
         Raises
         ------
         EnvmatteError
-            If the job can't go on without it.
+            If the job fails because of it.
         """
         tile, error, name = outcome.tile, outcome.error, job_steps.name_of(outcome.tile)
-        if outcome.died is not None:  # which says nothing any more
+        if outcome.died is not None:  # and can't log it
             with about(self.job, tile):
                 logger.warning("its worker %s died", outcome.died)
         if isinstance(error, EnvmatteError) and not isinstance(error, Unavailable):
-            raise error  # it would be the same the next time
+            raise error  # the next attempt would fail in the same way
         if error is not None:
             if tile_records.miss(connection, self.job, tile, repr(error), attempts):
                 return True
             raise GaveUp(f"{name} failed {attempts} times, last with {error!r}") from error
-        if outcome.starved:  # which its tile did, and would do again
+        if outcome.starved:  # because of its tile, and it would be again
             if tile_records.miss(
                 connection, self.job, tile, f"its worker {outcome.died} ran out of memory", attempts
             ):
@@ -196,8 +205,8 @@ class Drive:
             if tile_records.lose(connection, self.job, tile, f"its worker {outcome.died} died", LOSSES):
                 return True
             raise GaveUp(
-                f"{name}: {LOSSES} workers that did it died, of a file that a decoder hangs or crashes at, or for want "
-                f"of memory of their machines, as their logs may tell: send other files, or {REMEDY}"
+                f"{name}: {LOSSES} workers died while doing it. Either a file makes a decoder hang or crash, or their "
+                f"machines ran out of memory; their logs may say. Send other files, or {REMEDY}"
             )
         return True
 
@@ -210,33 +219,34 @@ class Drive:
     def _prepared(self, connection: Connection, plan: dict[str, Any]) -> Next:
         tile_records.lay_down(connection, self.job, plan)
         row = jobs.get(connection, self.job)
-        tracing.waited("queue", row.trace, row.created_at, row.started_at, job=self.job, kind=self.kind)
-        RECORDS[self.kind].prepared(connection, self.task, plan)
+        tracing.waited("queue", row.trace, row.created_at, row.started_at, job=self.job, kind=row.kind)
+        self.kind.prepared(connection, self.task, plan)
         for line in plan.get("notes", ()):
             job_log.note(connection, self.job, line)
-        tiles = order(self.kind, range(plan["tiles"]))
-        return self._enter(connection, KINDS[self.kind].stage, tiles, replace(self.task, plan=plan))
+        steps = self.kind.steps
+        tiles = order(steps, range(plan["tiles"]))
+        return self._enter(connection, steps.stage, tiles, replace(self.task, plan=plan))
 
     def _finished(self, connection: Connection, figures: dict[str, Any]) -> Next:
         if missing := figures.get("missing"):
             again = tile_records.reopen(connection, self.job, missing, LOSSES)
             if len(again) == len(missing):
-                return self._enter(connection, KINDS[self.kind].stage, again)
+                return self._enter(connection, self.kind.steps.stage, again)
             error = GaveUp(
-                f"{len(missing)} tiles are missing in the store, however often they are done: it loses what it is given"
+                f"the store loses what is written to it: {len(missing)} tiles are missing however often they are done"
             )
-            end_badly(connection, self.kind, self.task, error)
-        # Unless it was cancelled at the last moment, and is wound up next.
+            write_failure(connection, self.kind, self.task, error)
+        # Unless it was cancelled at the last moment.
         elif jobs.end(connection, self.job, "succeeded"):
             logger.info("succeeded")
-            RECORDS[self.kind].succeeded(connection, self.task, figures)
+            self.kind.succeeded(connection, self.task, figures)
         return Next(self.stage, (), self.task, ended=True)
 
 
-def end_badly(connection: Connection, kind: str, task: Task, error: EnvmatteError) -> None:
-    """Write down that a job failed."""
+def write_failure(connection: Connection, kind: JobKind, task: Task, error: EnvmatteError) -> None:
+    """Write to the ledger that a job failed."""
     problem = problem_of(error)
     with about(task.job):
         logger.warning("failed: %s", problem["detail"])
     if jobs.end(connection, task.job, "failed", problem):
-        RECORDS[kind].failed(connection, task, problem)
+        kind.failed(connection, task, problem)

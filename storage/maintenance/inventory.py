@@ -8,7 +8,7 @@ from sqlalchemy import Connection, Table, select
 
 from storage.database.tables import metadata
 from storage.layout import captures, composites, mattes, uploads
-from storage.records.captures import may_be_retried
+from storage.records.jobs import is_retryable
 
 FOLDERS = ("captures", "mattes", "uploads", "composites")
 """All that there is at the top of the store."""
@@ -87,7 +87,7 @@ def of_row(
         With `COLUMNS`.
     """
     family = family_of(table, row) or ""
-    if table == "captures" and (row["state"] != "failed" or may_be_retried(row["problem"])):
+    if table == "captures" and (row["state"] != "failed" or is_retryable(row["problem"])):
         id, ready = row["id"], row["state"] == "ready"
         state: Any = {"ready": "whole", "failed": "left"}.get(row["state"], "busy")
         yield Thing("capture", id, state, captures.path(id), family)
@@ -102,7 +102,7 @@ def of_row(
         names = tuple(connection.scalars(select(parts.c.name).where(parts.c.upload == id)))
         yield Thing("upload", id, "whole", uploads.path(id), family, names)
     elif table == "jobs" and row["kind"] == "composite":
-        kept = row["problem"] is None or may_be_retried(row["problem"])
+        kept = row["problem"] is None or is_retryable(row["problem"])
         if kept and row["state"] != "cancelled":
             state = {"succeeded": "whole", "failed": "left"}.get(row["state"], "busy")
             yield Thing("composite", row["id"], state, composites.path(row["id"]), family)

@@ -26,14 +26,6 @@ def exists(connection: Connection, capture: str) -> bool:
     return connection.scalar(select(captures.c.id).where(captures.c.id == capture)) is not None
 
 
-def may_be_retried(problem: dict[str, Any]) -> bool:
-    """Whether an ingest that ended with a problem may be tried again: what it had is kept then.
-
-    It may unless the fault was the caller's: the same archive would be refused again.
-    """
-    return bool(problem["status"] >= 500)
-
-
 def change(connection: Connection, capture: str, **values: Any) -> None:
     """Change a capture's row."""
     connection.execute(update(captures).where(captures.c.id == capture).values(values))

@@ -75,8 +75,16 @@ def active(connection: Connection) -> Sequence[Row[Any]]:
     return connection.execute(query).all()
 
 
-def not_wound_up(connection: Connection) -> Sequence[Row[Any]]:
-    """Jobs that were cancelled, and that have left something: a matte, or a capture, in the making, or a composite."""
+def is_retryable(problem: dict[str, Any]) -> bool:
+    """Whether a job that failed with a problem may be retried; if so, its input is kept.
+
+    It may unless the input was at fault, which would be refused again.
+    """
+    return bool(problem["status"] >= 500)
+
+
+def cancelled_with_leftovers(connection: Connection) -> Sequence[Row[Any]]:
+    """Cancelled jobs that have left something in the store: an unfinished matte, capture or composite."""
     # A composite has no other record: what it left is there for as long as its tiles are, see `clear`.
     left = (jobs.c.kind == "composite") & exists().where(tiles.c.job == jobs.c.id)
     query = (

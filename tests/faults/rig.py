@@ -124,7 +124,7 @@ class Rig:
     def driver(self) -> str:
         """The name of the service whose coordinator drives the jobs."""
         logs = {n: self.log(f"service{n}") for n in range(2)}
-        at = {n: max(log.rfind("drives the jobs from now on"), 0) for n, log in logs.items()}
+        at = {n: max(log.rfind("runs the jobs from now on"), 0) for n, log in logs.items()}
         lines = {n: logs[n][: at[n]].rsplit("\n", 1)[-1][:23] for n in at}
         return f"service{max(lines, key=lambda n: lines[n])}"
 

@@ -124,7 +124,7 @@ def test_in_sqlite(small: Small, table: list[Row]) -> None:
         return answer.status_code == 507
 
     log = service.data.parent / f"{service.data.name}.log"
-    told = "going on as soon as it can: the disk is full"
+    told = "trying again in a second: the disk is full"
     with ExitStack() as filled:
         with paused(service):
             filled.enter_context(full(small.ledger))
@@ -136,5 +136,5 @@ def test_in_sqlite(small: Small, table: list[Row]) -> None:
         assert service.client.job(job["id"])["state"] == "running"
     assert service.client.wait(job["id"])["state"] == "succeeded"
     wait(lambda: service.http.get("/readyz").status_code == 200)
-    assert "goes on after an error" not in log.read_text()
+    assert "continues after an error" not in log.read_text()
     check(table, small.row("a full disk of SQLite", start, job["matte"]))

@@ -64,7 +64,7 @@ def test_a_tile_that_kills_its_workers(known: Known, table: list[Row], bundle_by
         other = rig.recover(known.capture)
         found, beside = rig.ended(job["id"]), rig.ended(other["id"])
     assert found["state"] == "failed"
-    assert f"{LOSSES} workers that did it died" in found["problem"]["detail"]
+    assert f"{LOSSES} workers died while doing it" in found["problem"]["detail"]
     lines = lines_of(rig, job["id"])
     assert {line.split(",")[0] for line in lines if ", loss " in line} == {f"tile {LAST}"}, lines
     assert beside["state"] == "succeeded"

@@ -43,6 +43,7 @@ from workflows.images import camera_raw, decode, float_formats, integer_formats
 from workflows.ingest import steps as ingest_steps
 from workflows.ingest.archive import CaptureArchive
 from workflows.ingest.video.decoder import PARTS, Share, opened
+from workflows.jobs import Task
 from workflows.mattes.imports.importing import take_in
 from workflows.mattes.options import parse_options
 from workflows.programs.program import Program
@@ -291,9 +292,10 @@ def read_backdrop_clip(data: bytes, folder: Path) -> None:
     objects = store(folder)
     objects.put(stored_composites.clip_path("j"), data)
     try:
-        plan = video_steps.prepare(objects, "j", "m", LIMITS)
+        task = Task("j", "", "m", {"transfer": "srgb", "placement": {}}, LIMITS)
+        plan = video_steps.prepare(objects, task)
         json.dumps(plan, allow_nan=False)
-        video_steps.work(objects, "j", "m", "srgb", video_steps.Placement(), LIMITS, plan, 0)
+        video_steps.work(objects, replace(task, plan=plan), 0)
     finally:
         objects.delete(stored_composites.path("j"))
 
@@ -346,10 +348,11 @@ def read_capture(data: bytes, folder: Path) -> None:
     asyncio.run(put())
     uploads.seal(objects, "c", [uploads.Part("all", len(data))])
     try:
-        plan = ingest_steps.prepare(objects, "c", LIMITS)
-        json.dumps(plan, allow_nan=False)
-        for tile in range(plan["tiles"]):
-            ingest_steps.read_slab(objects, "c", LIMITS, plan["slab"], tile)
+        task = Task("j", "c", "", {}, LIMITS)
+        task = replace(task, plan=ingest_steps.prepare(objects, task))
+        json.dumps(task.plan, allow_nan=False)
+        for tile in range(task.plan["tiles"]):
+            ingest_steps.work(objects, task, tile)
     except CaptureError as error:
         if not error.fields["entry"]:
             raise AssertionError("a capture's error names no entry") from error

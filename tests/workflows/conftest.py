@@ -6,6 +6,7 @@ import io
 import json
 import zipfile
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,7 @@ from storage.layout.captures import Stack
 from storage.objects.store import Objects
 from tests.workflows.images.dngs import dng
 from workflows.ingest import steps as ingest_steps
-from workflows.ingest.report.calibration import measure
-from workflows.ingest.report.survey import survey
+from workflows.jobs import Task
 from workflows.untrusted.limits import Limits
 
 Zip = Callable[..., bytes]
@@ -81,14 +81,11 @@ def ingest(objects: Objects, put: Callable[[str, bytes], None]) -> Ingest:
     ) -> Stack:
         objects.delete(captures.path(capture))  # nothing of an earlier one
         put(capture, data)
-        limits = Limits(unpacked=unpacked, memory=memory)
-        plan = ingest_steps.prepare(objects, capture, limits)
-        for index in order(range(plan["tiles"])):
-            ingest_steps.read_slab(objects, capture, limits, plan["slab"], index)
-        stack = Stack(objects, capture)
-        measure(stack)
-        survey(stack)
-        stack.save()
+        task = Task("j", capture, "", {}, Limits(unpacked=unpacked, memory=memory))
+        task = replace(task, plan=ingest_steps.prepare(objects, task))
+        for tile in order(range(task.plan["tiles"])):
+            ingest_steps.work(objects, task, tile)
+        ingest_steps.finish(objects, task)
         return Stack(objects, capture)
 
     return run

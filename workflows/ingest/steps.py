@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from storage.errors import CaptureError, ImageError
-from storage.layout import uploads
+from storage.layout import captures, uploads
 from storage.layout.captures import Stack, create_stack, write_slab
 from storage.objects.store import Objects
 from workflows.images import integer_formats
@@ -18,16 +18,19 @@ from workflows.images.tone_curves import Response
 from workflows.ingest import stills
 from workflows.ingest.archive import CaptureArchive
 from workflows.ingest.manifest import MANIFEST
+from workflows.ingest.report.calibration import measure
+from workflows.ingest.report.survey import survey
 from workflows.ingest.video.border_reader import LOOKS
 from workflows.ingest.video.decoder import Share, opened
 from workflows.ingest.video.matching import MOST_PATTERNS, Sorted, sort
 from workflows.ingest.video.resemblance import lay_out
+from workflows.jobs import Steps, Task
 from workflows.programs.program import Images
 from workflows.untrusted.decoder_guard import Guard
 from workflows.untrusted.limits import Limits
 
 
-def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, Any]:
+def prepare(objects: Objects, task: Task) -> dict[str, Any]:
     """Look into the archive of a capture and make its empty stack.
 
     Returns
@@ -40,7 +43,8 @@ def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, Any]:
     ------
     CaptureError
     """
-    with uploads.read(objects, capture) as file:
+    limits = task.limits
+    with uploads.read(objects, task.capture) as file:
         archive = CaptureArchive(file, limits)
         manifest = archive.manifest
         names = [n for part in manifest.program.parts if isinstance(part, Images) for n in part.files]
@@ -82,7 +86,7 @@ def prepare(objects: Objects, capture: str, limits: Limits) -> dict[str, Any]:
         )
     slab = create_stack(
         objects,
-        capture,
+        task.capture,
         shape,
         storage.dtype,
         memory=limits.memory,
@@ -148,23 +152,41 @@ def _look(
         return shape, stills.Storage(np.dtype(np.uint16), 0, 1.0, True), filmed
 
 
-def read_slab(objects: Objects, capture: str, limits: Limits, slab: int, index: int) -> int:
-    """Decode the frames of slab ``index``, of ``slab`` frames, into the stack; returns their pixels.
+def work(objects: Objects, task: Task, tile: int) -> int:
+    """Decode the frames of a slab into the stack; returns the number of their pixels.
 
     Raises
     ------
     CaptureError
         Naming the frame that can't be decoded, or is of another size or kind than the first.
     """
-    stack = Stack(objects, capture)
-    first, last = index * slab, min((index + 1) * slab, stack.frames)
+    stack, slab = Stack(objects, task.capture), task.plan["slab"]
+    first, last = tile * slab, min((tile + 1) * slab, stack.frames)
     frames = np.empty((last - first, stack.height, stack.width, stack.channels), stack.dtype)
-    with uploads.read(objects, capture) as file:
-        archive = CaptureArchive(file, limits)
-        for n, pixels in enumerate(_pixels(archive, stack, first, last, limits)):
+    with uploads.read(objects, task.capture) as file:
+        archive = CaptureArchive(file, task.limits)
+        for n, pixels in enumerate(_pixels(archive, stack, first, last, task.limits)):
             frames[n] = pixels
-    write_slab(objects, capture, first, frames)
+    write_slab(objects, task.capture, first, frames)
     return int(frames.shape[0] * frames.shape[1] * frames.shape[2])
+
+
+def missing(objects: Objects, task: Task) -> list[int]:
+    """The slabs that are not in the store."""
+    return Stack(objects, task.capture).missing()
+
+
+def finish(objects: Objects, task: Task) -> dict[str, Any]:
+    """Remove what interrupted workers left beside the stack, and measure the capture."""
+    objects.sweep(captures.path(task.capture))
+    stack = Stack(objects, task.capture)
+    measure(stack)
+    survey(stack)
+    stack.save()
+    return {}
+
+
+STEPS = Steps("ingest", "reading", prepare, work, missing, finish, scattered=False)
 
 
 def _pixels(

@@ -69,16 +69,16 @@ def recover_tile(objects: Objects, capture: str, matte: str, options: RecoveryOp
     rows, columns = cut(target, options.tile or target.block)[index]
     pixels = 0
     for row, column in product(rows, columns):
-        block = _recover_block(stack, objects.url, capture, target.span(row, column), options)
+        block = _recover_block(objects, stack, capture, target.span(row, column), options)
         target.write(row, column, block)
         pixels += int(block.recovered.sum())
     return pixels
 
 
 def _recover_block(
-    stack: Stack, url: str, capture: str, span: tuple[slice, slice], options: RecoveryOptions
+    objects: Objects, stack: Stack, capture: str, span: tuple[slice, slice], options: RecoveryOptions
 ) -> Block:
-    program, monitor = program_of(url, capture)
+    program, monitor = program_of(objects, capture)
     attributes = stack.attributes
     noise = Noise(**attributes["noise"])
     (light, usable, worth), recovered = read_light(stack, span, program)
@@ -91,13 +91,13 @@ def _recover_block(
     measurements = np.ascontiguousarray(light[:, shown])
     given = (noise, usable[:, shown], worth[:, shown])
     if options.method == "nn-dgsr":
-        sensing = sensing_of(url, capture)
+        sensing = sensing_of(objects, capture)
         transport = dgsr.recover(measurements, photometry, sensing, *given, **options.constants)
         measured = normalise(measurements, photometry, noise, options.constants["least_contrast"], *given[1:])
         error = dgsr.error_of(transport, photometry, measured, sensing)
     else:
         transport, photometry, error = lobes.recover(
-            measurements, photometry, patterns_of(url, capture), *given, **options.constants
+            measurements, photometry, patterns_of(objects, capture), *given, **options.constants
         )
 
     def spread(values: NDArray[Scalar], *channels: int) -> NDArray[Scalar]:
@@ -118,36 +118,36 @@ def _recover_block(
     )
 
 
-def grid_of(url: str, capture: str, options: RecoveryOptions) -> tuple[int, int]:
+def grid_of(objects: Objects, capture: str, options: RecoveryOptions) -> tuple[int, int]:
     """Columns and rows of the first grid of the T that a method recovers from a capture."""
     if options.method == "nn-dgsr":
-        finest = sensing_of(url, capture).levels[-1]
+        finest = sensing_of(objects, capture).levels[-1]
         return finest.columns, finest.rows
-    program, _ = program_of(url, capture)
-    return pyramid_of(program, program.channels(_images_of(url, capture))).grids[0]
+    program, _ = program_of(objects, capture)
+    return pyramid_of(program, program.channels(_images_of(objects, capture))).grids[0]
 
 
 @lru_cache(maxsize=2)
-def program_of(url: str, capture: str) -> tuple[Program, Curve]:
+def program_of(objects: Objects, capture: str) -> tuple[Program, Curve]:
     """A capture's program and monitor curve, kept from tile to tile: a capture never changes."""
-    attributes = Stack(Objects(url), capture).attributes
+    attributes = Stack(objects, capture).attributes
     monitor = TypeAdapter[Curve](Curve).validate_python(attributes["monitor_curve"])
     return Program.model_validate(attributes["program"]), monitor
 
 
 @lru_cache(maxsize=1)
-def sensing_of(url: str, capture: str) -> Sensing:
+def sensing_of(objects: Objects, capture: str) -> Sensing:
     """A capture's sensing matrices."""
-    program, monitor = program_of(url, capture)
-    return program.sensing(monitor, _images_of(url, capture))
+    program, monitor = program_of(objects, capture)
+    return program.sensing(monitor, _images_of(objects, capture))
 
 
 @lru_cache(maxsize=1)
-def patterns_of(url: str, capture: str) -> Patterns:
+def patterns_of(objects: Objects, capture: str) -> Patterns:
     """A capture's patterns on a pyramid."""
-    program, monitor = program_of(url, capture)
-    return lay_out(program, monitor, _images_of(url, capture))
+    program, monitor = program_of(objects, capture)
+    return lay_out(program, monitor, _images_of(objects, capture))
 
 
-def _images_of(url: str, capture: str) -> list[NDArray[np.float32]]:
-    return Stack(Objects(url), capture).images()
+def _images_of(objects: Objects, capture: str) -> list[NDArray[np.float32]]:
+    return Stack(objects, capture).images()

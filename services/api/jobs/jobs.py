@@ -16,7 +16,7 @@ from services.api.http.types import After, Limit
 from services.api.jobs.eta import seconds_left
 from services.api.jobs.wait_reason import reason
 from services.api.quotas import admit
-from services.coordinator import job_kinds
+from services.coordinator.job_kinds import JOB_KINDS
 from services.runtime import tracing
 from services.webhooks import sender
 from storage.database.engine import reading, writing
@@ -239,7 +239,7 @@ def retry_job(context: OwnerContext, id: str) -> Job:
         if row.state == "failed":
             admit(c, context.settings, jobs=1)
         tile_records.retry(c, id, anew=memory != context.settings.ingest_memory, trace=tracing.asked_by())
-        job_kinds.KINDS[row.kind].retried(c, row)
+        JOB_KINDS[row.kind].retried(c, row)
         return Job.read(c, id)
 
 

@@ -137,7 +137,9 @@ def _queue(
         admit(c, context.settings, jobs=1, size=size)
         capture, trace = row.capture or "", tracing.asked_by()
         jobs.add(c, "composite", capture, options, matte, trace, job, size, webhook)
-        tiles.begin(c, job)  # while it has tiles it has something in the store, see `jobs.not_wound_up`
+        tiles.begin(
+            c, job
+        )  # while it has tiles it has something in the store, see `jobs.cancelled_with_leftovers`
         return job
 
     return idempotent(context.engine, key, CALL, Job.read, create)

@@ -20,7 +20,6 @@ from typing import Any
 import psutil
 from sqlalchemy import Connection, event
 
-import tests.benchmarks.cluster.simulated  # noqa: F401  # the coordinator knows the kind too
 from services.cluster.connect import connect
 from services.cluster.dispatcher import Dispatcher
 from services.coordinator.coordinator import Coordinator
@@ -29,6 +28,7 @@ from storage.database.engine import open_engine, reading, writing
 from storage.database.rows import new_id
 from storage.objects.store import Objects
 from storage.records import captures, jobs, mattes
+from tests.benchmarks.cluster import simulated
 
 
 def main() -> None:
@@ -57,20 +57,8 @@ def measure(tiles: int, seconds: float, workers: int, threads: int) -> dict[str,
         at = f"tcp://127.0.0.1:{port}"
         scheduler = _started(stack, "services", "scheduler", "--port", str(port))
         for _ in range(workers):
-            preload = [
-                "--preload",
-                "services.cluster.worker_preload",
-                "--preload",
-                "tests.benchmarks.cluster.simulated",
-            ]
-            command = [
-                "distributed.cli.dask_worker",
-                at,
-                "--nthreads",
-                str(threads),
-                "--no-dashboard",
-                *preload,
-            ]
+            options = ["--no-dashboard", "--preload", "services.cluster.worker_preload"]
+            command = ["distributed.cli.dask_worker", at, "--nthreads", str(threads), *options]
             _started(stack, *command, "--local-directory", str(folder))
         settings = Settings(data=folder, cluster=at, store=(folder / "store").as_uri())
         engine = open_engine(settings.database_url)
@@ -82,7 +70,8 @@ def measure(tiles: int, seconds: float, workers: int, threads: int) -> dict[str,
 
         event.listen(engine, "commit", count)
         objects = Objects(settings.store_url)
-        dispatcher = stack.enter_context(Dispatcher(partial(connect, at, None)))
+        simulated.register()
+        dispatcher = stack.enter_context(Dispatcher(partial(connect, at, None), settings.store_url))
         while dispatcher.threads < workers * threads:
             time.sleep(0.1)
         stack.enter_context(Coordinator(settings, engine, objects, dispatcher))

@@ -1,16 +1,34 @@
-"""A kind of job that takes time and does nothing: a worker that preloads this module knows it."""
+"""A kind of job that takes time and does nothing."""
 
 import time
+from typing import Any
 
-from services.coordinator import job_kinds
-from workflows.jobs import KINDS, Kind
+from services.coordinator.job_kinds import JOB_KINDS, JobKind
+from storage.objects.store import Objects
+from workflows.jobs import Steps, Task
 
-KINDS["simulated"] = Kind(
-    stage="working",
-    prepare=lambda task: {"tiles": task.options["tiles"]},
-    work=lambda task, tile: time.sleep(task.options["seconds"]) or 1000,
-    missing=lambda task: [],
-    finish=lambda task: {},
-    scattered=True,
-)
-job_kinds.KINDS["simulated"] = job_kinds.Kind()
+
+def prepare(objects: Objects, task: Task) -> dict[str, Any]:
+    return {"tiles": task.options["tiles"]}
+
+
+def work(objects: Objects, task: Task, tile: int) -> int:
+    time.sleep(task.options["seconds"])
+    return 1000
+
+
+def missing(objects: Objects, task: Task) -> list[int]:
+    return []
+
+
+def finish(objects: Objects, task: Task) -> dict[str, Any]:
+    return {}
+
+
+class Simulated(JobKind):
+    steps = Steps("simulated", "working", prepare, work, missing, finish, scattered=True)
+
+
+def register() -> None:
+    """Add the kind to those that a coordinator in this process runs."""
+    JOB_KINDS["simulated"] = Simulated()

@@ -15,6 +15,7 @@ from services.cluster.task import key_of, read_key
 from services.settings import Settings
 from storage.errors import Unavailable
 from workflows.jobs import Task
+from workflows.mattes.steps import STEPS
 from workflows.untrusted.limits import Limits
 
 
@@ -61,8 +62,8 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LocalCluster]:
         yield cluster
 
 
-def task(job: str, folder: Path) -> Task:
-    return Task(job, folder.as_uri(), "none", "none", {}, Limits(1 << 30, 1 << 26), {})
+def task(job: str) -> Task:
+    return Task(job, "none", "none", {}, Limits(1 << 30, 1 << 26))
 
 
 def outcomes(dispatcher: Dispatcher, count: int) -> list[Outcome]:
@@ -78,11 +79,11 @@ def outcomes(dispatcher: Dispatcher, count: int) -> list[Outcome]:
 def test_errors_come_back_and_what_dies_with_its_worker_is_told(
     cluster: LocalCluster, tmp_path: Path
 ) -> None:
-    with Dispatcher(lambda: Client(cluster, set_as_default=False)) as dispatcher:
+    with Dispatcher(lambda: Client(cluster, set_as_default=False), tmp_path.as_uri()) as dispatcher:
         while not dispatcher.free:
             time.sleep(0.02)
         assert dispatcher.free == 1
-        dispatcher.submit("recover", task("a", tmp_path), 3)
+        dispatcher.submit(STEPS, task("a"), 3)
         assert dispatcher.under_way("a") == 1
         (outcome,) = outcomes(dispatcher, 1)
         assert (outcome.job, outcome.tile, outcome.done, outcome.died) == ("a", 3, None, None)
@@ -92,7 +93,7 @@ def test_errors_come_back_and_what_dies_with_its_worker_is_told(
         (pid,) = (worker.pid for worker in cluster.workers.values())
         os.kill(pid, signal.SIGSTOP)  # so that both are there when it dies
         for tile in (1, 2):
-            dispatcher.submit("recover", task("b", tmp_path), tile)
+            dispatcher.submit(STEPS, task("b"), tile)
         time.sleep(0.5)
         os.kill(pid, signal.SIGKILL)
         found = sorted(outcomes(dispatcher, 2), key=lambda outcome: outcome.tile)
@@ -104,7 +105,7 @@ def test_a_scheduler_that_is_not_there_is_a_problem_in_words() -> None:
     def connect() -> Client:
         raise Unavailable("no scheduler answers at tcp://127.0.0.1:1")
 
-    with Dispatcher(connect) as dispatcher:
+    with Dispatcher(connect, "file:///store") as dispatcher:
         end = time.monotonic() + 10
         while "no scheduler answers" not in dispatcher.cluster["problem"]:
             assert time.monotonic() < end

@@ -2,7 +2,7 @@
 
 import pytest
 
-from services.coordinator.coordinator import SETTLE
+from services.coordinator.coordinator import WRITE
 from tests.benchmarks.cluster.overhead import measure
 
 OTHERS = 15
@@ -13,5 +13,5 @@ OTHERS = 15
 def test_progress_takes_a_few_writes_a_second() -> None:
     row = measure(tiles=1500, seconds=0.0, workers=1, threads=4)
     writes = row["writes a second"] * row["seconds"]
-    assert 2 < writes <= row["seconds"] * (1 / SETTLE + 0.5) + OTHERS
+    assert 2 < writes <= row["seconds"] * (1 / WRITE + 0.5) + OTHERS
     assert row["tiles"] > 5 * writes

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from sqlalchemy import Engine
 
-from services.coordinator.job_kinds import KINDS
-from services.coordinator.job_run import Drive, end_badly
+from services.coordinator.job_kinds import JOB_KINDS
+from services.coordinator.job_run import JobRun, write_failure
 from services.coordinator.retention import sweep
 from storage.database.engine import open_engine, writing
 from storage.errors import ClipError, Conflict, EnvmatteError, GaveUp, NotFound
@@ -47,13 +47,13 @@ def job(engine: Engine, objects: Objects) -> str:
 
 def fail(engine: Engine, job: str, error: EnvmatteError) -> None:
     with writing(engine) as c:
-        task = Drive.of(jobs.get(c, job), [], "file:///store", Limits(1, 1)).task
-        end_badly(c, "composite", task, error)
+        run = JobRun.of(jobs.get(c, job), [], Limits(1, 1))
+        write_failure(c, run.kind, run.task, error)
 
 
 def test_it_leaves_its_matte_alone_and_needs_no_capture(engine: Engine, job: str) -> None:
     with writing(engine) as c:
-        assert KINDS["composite"].is_due(c, jobs.get(c, job))
+        assert JOB_KINDS["composite"].is_due(c, jobs.get(c, job))
     fail(engine, job, GaveUp("again and again"))
     with writing(engine) as c:
         assert mattes.get(c, "m").state == "ready"
@@ -62,9 +62,9 @@ def test_it_leaves_its_matte_alone_and_needs_no_capture(engine: Engine, job: str
 def test_what_is_left_of_a_success_is_the_video(objects: Objects, engine: Engine, job: str) -> None:
     with writing(engine) as c:
         row = jobs.get(c, job)
-    KINDS["composite"].tidy(objects, row)
+    JOB_KINDS["composite"].tidy(objects, row)
     assert objects.below(composites.path(job)) == {composites.video_path(job)}
-    KINDS["composite"].discard(objects, row)
+    JOB_KINDS["composite"].discard(objects, row)
     assert objects.below(composites.path(job)) == set()
 
 
@@ -78,10 +78,10 @@ def test_a_clip_is_kept_for_as_long_as_it_may_be_tried_again(
     with writing(engine) as c:
         row = jobs.get(c, job)
         if kept:
-            KINDS["composite"].retried(c, row)
+            JOB_KINDS["composite"].retried(c, row)
             mattes.forget(c, "m")
         with pytest.raises(NotFound if kept else Conflict):
-            KINDS["composite"].retried(c, row)
+            JOB_KINDS["composite"].retried(c, row)
 
 
 def test_what_killed_uploads_left_is_swept_and_the_rest_is_not(

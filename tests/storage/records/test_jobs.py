@@ -303,14 +303,14 @@ def test_what_was_ever_done_is_added_up(connection: Connection) -> None:
     assert tuple(row) == ("recover", 3, 1, 1, 35, 1.0)
 
 
-def test_a_cancelled_composite_is_wound_up_until_its_tiles_are_cleared(connection: Connection) -> None:
+def test_a_cancelled_composite_has_leftovers_until_its_tiles_are_cleared(connection: Connection) -> None:
     recovery = jobs.add(connection, "recover", "cap", {}, matte="other")
     mattes.add(connection, "other", "cap", recovery, {})  # which is being recovered, and is no part of it
     job = jobs.add(connection, "composite", "cap", {"transfer": "srgb"}, "other", job="given")
     assert job == "given"
     tile_records.begin(connection, job)
-    assert jobs.not_wound_up(connection) == []
+    assert jobs.cancelled_with_leftovers(connection) == []
     jobs.cancel(connection, job)
-    assert [row.id for row in jobs.not_wound_up(connection)] == [job]
+    assert [row.id for row in jobs.cancelled_with_leftovers(connection)] == [job]
     tile_records.clear(connection, job)
-    assert jobs.not_wound_up(connection) == []
+    assert jobs.cancelled_with_leftovers(connection) == []

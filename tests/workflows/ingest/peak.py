@@ -7,12 +7,14 @@ process that started it had. A small ingest comes first, so that libraries and t
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from storage.layout.captures import Stack
 from storage.objects.store import Objects
 from workflows.ingest import steps as ingest_steps
 from workflows.ingest.report.calibration import measure
+from workflows.jobs import Task
 from workflows.untrusted.limits import Limits
 
 
@@ -25,12 +27,12 @@ def of_large_after_small(objects: Objects, memory: int) -> tuple[int, int]:
 
 
 def _ingest(objects: Objects, capture: str, memory: int) -> int:
-    limits = Limits(1 << 30, memory)
-    plan = ingest_steps.prepare(objects, capture, limits)
-    for index in range(plan["tiles"]):
-        ingest_steps.read_slab(objects, capture, limits, plan["slab"], index)
+    task = Task("j", capture, "", {}, Limits(1 << 30, memory))
+    task = replace(task, plan=ingest_steps.prepare(objects, task))
+    for tile in range(task.plan["tiles"]):
+        ingest_steps.work(objects, task, tile)
     measure(Stack(objects, capture))
-    return int(plan["tiles"])
+    return int(task.plan["tiles"])
 
 
 def peak() -> int:

@@ -6,6 +6,7 @@ import random
 import sys
 import zipfile
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from tests.workflows.ingest import peak
 from tests.workflows.ingest.records import record
 from workflows.images.integer_formats import encode_png
 from workflows.ingest import steps as ingest_steps
+from workflows.jobs import Task
 from workflows.recovery.noise import Noise
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import nested_program, write_capture
@@ -248,9 +250,11 @@ def test_frames_of_more_pixels_than_are_allowed_are_refused(
 ) -> None:
     put("c", bundle_of(make_zip, shots(6, 3, "uint8"), list(range(6))))
     most = HEIGHT * WIDTH
-    assert ingest_steps.prepare(objects, "c", Limits(1 << 30, 1 << 26, pixels=most))["tiles"] >= 1
+    task = Task("j", "c", "", {}, Limits(1 << 30, 1 << 26, pixels=most))
+    assert ingest_steps.prepare(objects, task)["tiles"] >= 1
+    task = replace(task, limits=Limits(1 << 30, 1 << 26, pixels=most - 1))
     with pytest.raises(OverLimit, match=f"a frame may have {most - 1} pixels") as caught:
-        ingest_steps.prepare(objects, "c", Limits(1 << 30, 1 << 26, pixels=most - 1))
+        ingest_steps.prepare(objects, task)
     assert {"name": "capture_pixels", "limit": most - 1, "value": most}.items() <= caught.value.fields.items()
 
 

@@ -18,6 +18,7 @@ from workflows.images import integer_formats
 from workflows.jobs import Task, run
 from workflows.mattes import layers
 from workflows.mattes.layers import confidence
+from workflows.mattes.steps import STEPS
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import nested_program, write_capture
 from workflows.untrusted.limits import Limits
@@ -175,9 +176,9 @@ def test_a_recomposite_from_the_exr_alone_is_as_close_to_the_truth(
         scene, nested_program((320, 240), ((16, 12, 24), (32, 24, 24), (64, 48, 20)), levels=5), target
     )
     ingest("c", target.getvalue())
-    task = Task("j", objects.url, "c", "m", {"method": "lobes"}, Limits(1 << 30, 1 << 26), {})
-    for step in (PREPARE, *range(run("recover", task, PREPARE)[1]["tiles"]), FINISH):
-        run("recover", task, step)
+    task = Task("j", "c", "m", {"method": "lobes"}, Limits(1 << 30, 1 << 26))
+    for step in (PREPARE, *range(run(STEPS, objects, task, PREPARE)[1]["tiles"]), FINISH):
+        run(STEPS, objects, task, step)
     matte = Matte(objects, "m")
     y, x = np.mgrid[:240, :320] / 320
     backdrop = np.stack([0.5 + 0.4 * np.sin(25 * x + 9 * y), 1 - x, 0.5 + 0.4 * np.sin(19 * y)], axis=-1)

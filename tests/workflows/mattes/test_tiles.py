@@ -20,6 +20,7 @@ from tests.workflows.ingest.video.camera import Camera, capture, film, lights
 from workflows.composite import composite
 from workflows.images.integer_formats import decode, encode_png
 from workflows.jobs import Task, run
+from workflows.mattes.steps import STEPS
 from workflows.mattes.tiles import cut
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import Scene, nested_program, write_capture
@@ -78,12 +79,12 @@ def recover(objects: Objects, ingest: Ingest) -> Callable[..., tuple[mattes.Matt
         ingest("c", data, memory=memory)
         objects.delete(mattes.path("m"))
         options = {"method": method, "tile": tile}
-        task = Task("j", objects.url, "c", "m", options, Limits(1 << 30, memory), {})
-        plan = run("recover", task, PREPARE)[1]
+        task = Task("j", "c", "m", options, Limits(1 << 30, memory))
+        plan = run(STEPS, objects, task, PREPARE)[1]
         tiles = list(order(range(plan["tiles"])))  # type: ignore[call-overload]
-        pixels = sum(run("recover", task, index)[1] for index in tiles)
+        pixels = sum(run(STEPS, objects, task, index)[1] for index in tiles)
         # of the monitor's pixels, or of the program's finest grid
-        assert run("recover", task, FINISH)[1]["columns"] == {"lobes": 64, "nn-dgsr": 8}[method]
+        assert run(STEPS, objects, task, FINISH)[1]["columns"] == {"lobes": 64, "nn-dgsr": 8}[method]
         return mattes.Matte(objects, "m"), pixels
 
     return whole
@@ -207,11 +208,11 @@ def test_a_damaged_stack_is_corrupt(
     chunk = next(path for path in (folder / "captures/c/frames/c").rglob("*") if path.is_file())
     chunk.unlink()
     objects.delete(mattes.path("m"))
-    task = Task("j", objects.url, "c", "m", {}, Limits(1 << 30, 1 << 26), {})
-    plan = run("recover", task, PREPARE)[1]
+    task = Task("j", "c", "m", {}, Limits(1 << 30, 1 << 26))
+    plan = run(STEPS, objects, task, PREPARE)[1]
     with pytest.raises(Corrupt, match="frames"):
-        sum(run("recover", task, index)[1] for index in range(plan["tiles"]))
-    assert run("recover", task, FINISH)[1] == {"missing": list(range(plan["tiles"]))}
+        sum(run(STEPS, objects, task, index)[1] for index in range(plan["tiles"]))
+    assert run(STEPS, objects, task, FINISH)[1] == {"missing": list(range(plan["tiles"]))}
 
 
 def test_frames_that_are_moved_back_are_the_same_in_any_tile(
@@ -226,9 +227,9 @@ def test_frames_that_are_moved_back_are_the_same_in_any_tile(
     stack.save()
     made = []
     for tile in (16, 32, 1024):
-        task = Task("j", objects.url, "c", "m", {"tile": tile}, Limits(1 << 30, 1 << 26), {})
-        for index in range(run("recover", task, PREPARE)[1]["tiles"]):
-            run("recover", task, index)
+        task = Task("j", "c", "m", {"tile": tile}, Limits(1 << 30, 1 << 26))
+        for index in range(run(STEPS, objects, task, PREPARE)[1]["tiles"]):
+            run(STEPS, objects, task, index)
         made.append(digests("mattes/m"))
     assert made[0] == made[1] == made[2]
 
@@ -243,7 +244,7 @@ def test_what_the_store_lacks_is_corrupt(
 ) -> None:
     recover(bundles[False], tile=1024)
     with pytest.raises(Corrupt, match="none is not in the store"):
-        run("recover", Task("j", objects.url, capture, matte, {}, Limits(1, 1), {}), 0)
+        run(STEPS, objects, Task("j", capture, matte, {}, Limits(1, 1)), 0)
 
 
 def bracketed(data: bytes, exposures: tuple[float, ...]) -> bytes:
@@ -274,10 +275,10 @@ def test_exposures_are_merged_by_what_they_say(objects: Objects, ingest: Ingest)
 
     def error(capture: str, data: bytes) -> float:
         ingest(capture, data)
-        task = Task("j", objects.url, capture, f"m-{capture}", {}, Limits(1 << 30, 1 << 26), {})
-        task = replace(task, plan=run("recover", task, PREPARE)[1])
+        task = Task("j", capture, f"m-{capture}", {}, Limits(1 << 30, 1 << 26))
+        task = replace(task, plan=run(STEPS, objects, task, PREPARE)[1])
         for tile in range(task.plan["tiles"]):
-            run("recover", task, tile)
+            run(STEPS, objects, task, tile)
         got = composite(mattes.Matte(objects, task.matte), backdrop)[..., :3]
         return float(np.sqrt(np.mean((got - exact) ** 2)))
 

@@ -13,6 +13,7 @@ from storage.layout import uploads
 from storage.layout.captures import Stack
 from storage.objects.store import Objects
 from workflows.ingest import steps as ingest_steps
+from workflows.jobs import Task
 from workflows.programs import video
 from workflows.programs.border import LEAD_SECONDS
 from workflows.programs.files import fitted
@@ -30,7 +31,7 @@ def prepared(folder: Path) -> Stack:
     objects = Objects((folder / "store").as_uri())
     objects.put(uploads.part_path("c", "all"), target.getvalue())
     uploads.seal(objects, "c", [uploads.Part("all", len(target.getvalue()))])
-    ingest_steps.prepare(objects, "c", Limits(unpacked=1 << 30, memory=1 << 28))
+    ingest_steps.prepare(objects, Task("j", "c", "", {}, Limits(unpacked=1 << 30, memory=1 << 28)))
     return Stack(objects, "c")
 
 

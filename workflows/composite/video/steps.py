@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from fractions import Fraction
 from functools import partial
-from typing import Any, BinaryIO, Literal
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,9 +29,8 @@ from workflows.composite.quantise import encode
 from workflows.composite.video import segments
 from workflows.images import tone_curves
 from workflows.ingest.video.decoder import PARTS, Clip, Share, opened
-from workflows.untrusted.limits import Limits
+from workflows.jobs import Steps, Task
 
-Transfer = Literal["srgb", "linear"]
 KEPT = 1 << 29
 """Bytes of a matte that a worker keeps from frame to frame."""
 MOST = 1_000_000
@@ -46,7 +45,7 @@ SHORT = 0.5
 """Seconds that may lack at the end before it is said: containers round, and count their sound in."""
 
 
-def prepare(objects: Objects, job: str, matte: str, limits: Limits) -> dict[str, Any]:
+def prepare(objects: Objects, task: Task) -> dict[str, Any]:
     """Look a clip over, and write down when its frames are shown.
 
     Returns
@@ -61,8 +60,8 @@ def prepare(objects: Objects, job: str, matte: str, limits: Limits) -> dict[str,
     ClipError
         If it is no clip that can be read.
     """
-    put_before = Matte(objects, matte)
-    with _reading(objects, job, limits) as clip:
+    put_before = Matte(objects, task.matte)
+    with _reading(objects, task) as clip:
         ticks, last = clip.ticks(MOST)
         tick, width, height = clip.time_base, clip.width, clip.height
         notes = list(_losses(clip, ticks, last))
@@ -74,7 +73,7 @@ def prepare(objects: Objects, job: str, matte: str, limits: Limits) -> dict[str,
             f"by its timestamps frame {longest} of the clip is shown for {shown:.0f} s, in ticks of {tick} s, which no "
             "MP4 can hold: write the clip anew with a video editor"
         )
-    objects.put(composites.ticks_path(job), ticks.astype("<i8").tobytes())
+    objects.put(composites.ticks_path(task.job), ticks.astype("<i8").tobytes())
     pixels = width * height + put_before.width * put_before.height
     length = int(np.clip(PIXELS // pixels, SHORTEST, LONGEST))
     seconds = float((ticks[-1] + last - ticks[0]) * tick)
@@ -91,31 +90,16 @@ def prepare(objects: Objects, job: str, matte: str, limits: Limits) -> dict[str,
     }
 
 
-def work(
-    objects: Objects,
-    job: str,
-    matte: str,
-    transfer: Transfer,
-    placement: Placement,
-    limits: Limits,
-    plan: dict[str, Any],
-    tile: int,
-) -> int:
-    """Composite the frames of a tile, and store them as a segment; returns their pixels.
-
-    Parameters
-    ----------
-    placement : Placement
-        Where the clip stands.
-    plan : dict
-        As `prepare` returned it.
+def work(objects: Objects, task: Task, tile: int) -> int:
+    """Composite the frames of a tile, and store them as a segment; returns the number of their pixels.
 
     Raises
     ------
     ClipError
         If a frame that was there when the clip was looked over can't be decoded again.
     """
-    length = plan["length"]
+    transfer, placement = task.options["transfer"], Placement(**task.options["placement"])
+    length, job, matte = task.plan["length"], task.job, task.matte
     ticks = _ticks(objects, job)[tile * length : (tile + 1) * length]
     cache = Cache(objects, KEPT)
     put, light = cache.matte(matte), tone_curves.table(transfer, np.dtype(np.uint16))
@@ -127,22 +111,32 @@ def work(
         picture = composite(put, backdrop, placement=where, read=partial(cache.strip, matte), threads=1)
         return encode(picture, transfer, np.dtype(np.uint8), 1)[..., :3].astype(np.uint8, copy=False)
 
-    with _reading(objects, job, limits) as clip:
+    with _reading(objects, task) as clip:
         frames = clip.means([[Share(tick, PARTS)] for tick in ticks.tolist()])
         pictures = (shown(frame) for frame in frames)
-        segment = segments.encode(pictures, plan["rate"], length, transfer)
+        segment = segments.encode(pictures, task.plan["rate"], length, transfer)
     objects.put(composites.segment_path(job, tile), segment)
     return len(ticks) * put.width * put.height
 
 
-def finish(objects: Objects, job: str, plan: dict[str, Any]) -> None:
+def missing(objects: Objects, task: Task) -> list[int]:
+    """The segments that are not in the store."""
+    return composites.missing(objects, task.job, task.plan["tiles"])
+
+
+def finish(objects: Objects, task: Task) -> dict[str, Any]:
     """Join the segments into the video."""
+    job, plan = task.job, task.plan
     found = (_whole(objects, composites.segment_path(job, tile)) for tile in range(plan["tiles"]))
     # Without a name: nothing stays of it when this process is killed.
     with tempfile.TemporaryFile() as file:
         segments.join(found, _ticks(objects, job), plan["last"], Fraction(*plan["tick"]), file)
         file.seek(0)
         together(_store(objects, composites.video_path(job), file))
+    return {}
+
+
+STEPS = Steps("composite", "compositing", prepare, work, missing, finish, scattered=False)
 
 
 def _losses(clip: Clip, ticks: NDArray[np.int64], last: int) -> Iterator[str]:
@@ -163,14 +157,14 @@ def _losses(clip: Clip, ticks: NDArray[np.int64], last: int) -> Iterator[str]:
 
 
 @contextmanager
-def _reading(objects: Objects, job: str, limits: Limits) -> Iterator[Clip]:
+def _reading(objects: Objects, task: Task) -> Iterator[Clip]:
     """The clip of a job, opened as hostile; what is wrong with it is told as of a clip, not of a capture."""
     try:
-        file = objects.read(composites.clip_path(job))
+        file = objects.read(composites.clip_path(task.job))
     except FileNotFoundError as error:
         raise Corrupt("the clip is not in the store any more; send it again") from error
     try:
-        with file, opened(file, "the clip", limits.image) as clip:
+        with file, opened(file, "the clip", task.limits.image) as clip:
             yield clip
     except CaptureError as error:
         fields = {name: value for name, value in error.fields.items() if name != "entry"}

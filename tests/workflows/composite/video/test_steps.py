@@ -22,6 +22,7 @@ from storage.objects.store import Objects
 from storage.steps import FINISH, PREPARE
 from workflows.composite import composite
 from workflows.composite.video import steps as video_steps
+from workflows.composite.video.steps import STEPS
 from workflows.images.tone_curves import from_light, to_light
 from workflows.ingest.video.decoder import ROUNDED
 from workflows.jobs import Task, run
@@ -138,11 +139,11 @@ def make(objects: Objects, matte: Matte) -> Make:
         data: bytes, job: str = "j", order: Callable[[range], Any] = iter, transfer: str = "srgb"
     ) -> bytes:
         objects.put(composites.clip_path(job), data)
-        task = Task(job, objects.url, "c", "m", {"transfer": transfer, "placement": {}}, LIMITS, {})
-        task = replace(task, plan=run("composite", task, PREPARE)[1])
+        task = Task(job, "c", "m", {"transfer": transfer, "placement": {}}, LIMITS)
+        task = replace(task, plan=run(STEPS, objects, task, PREPARE)[1])
         for tile in order(range(task.plan["tiles"])):
-            assert run("composite", task, tile)[1] % (HEIGHT * WIDTH) == 0
-        assert run("composite", task, FINISH)[1] == {}
+            assert run(STEPS, objects, task, tile)[1] % (HEIGHT * WIDTH) == 0
+        assert run(STEPS, objects, task, FINISH)[1] == {}
         with objects.read(composites.video_path(job)) as file:
             return file.read()
 
@@ -151,7 +152,7 @@ def make(objects: Objects, matte: Matte) -> Make:
 
 def plan_of(objects: Objects, data: bytes, limits: Limits = LIMITS) -> dict[str, Any]:
     objects.put(composites.clip_path("p"), data)
-    return video_steps.prepare(objects, "p", "m", limits)
+    return video_steps.prepare(objects, Task("p", "c", "m", {}, limits))
 
 
 def frames_of(video: bytes) -> tuple[list[NDArray[np.uint8]], list[Fraction], Fraction]:
@@ -291,12 +292,12 @@ def test_more_frames_than_are_taken_are_refused(
 def test_a_segment_that_is_missing_is_named_and_done_again(make: Make, objects: Objects) -> None:
     data = clip(pictures(50), even(50))
     whole = make(data)
-    task = Task("j", objects.url, "c", "m", {"transfer": "srgb", "placement": {}}, LIMITS, {})
-    task = replace(task, plan=run("composite", task, PREPARE)[1])
+    task = Task("j", "c", "m", {"transfer": "srgb", "placement": {}}, LIMITS)
+    task = replace(task, plan=run(STEPS, objects, task, PREPARE)[1])
     objects.delete(composites.segment_path("j", 1))
-    assert run("composite", task, FINISH)[1] == {"missing": [1]}
-    run("composite", task, 1)
-    run("composite", task, FINISH)
+    assert run(STEPS, objects, task, FINISH)[1] == {"missing": [1]}
+    run(STEPS, objects, task, 1)
+    run(STEPS, objects, task, FINISH)
     with objects.read(composites.video_path("j")) as file:
         assert file.read() == whole
 
@@ -306,4 +307,4 @@ def test_a_clip_that_is_gone_is_said(make: Make, objects: Objects) -> None:
     composites.tidy(objects, "j")
     assert objects.names(composites.path("j")) == [composites.VIDEO]
     with pytest.raises(Corrupt, match="send it again"):
-        video_steps.prepare(objects, "j", "m", LIMITS)
+        video_steps.prepare(objects, Task("j", "c", "m", {}, LIMITS))

@@ -21,6 +21,7 @@ from workflows.images.tone_curves import to_light
 from workflows.ingest.report.findings import Finding
 from workflows.ingest.report.report import report
 from workflows.jobs import Task, run
+from workflows.mattes.steps import STEPS
 from workflows.programs.presets import preset
 from workflows.programs.program import Program
 from workflows.simulation.glass_ball import glass_ball
@@ -82,10 +83,10 @@ def filmed(ball: Ball, shifts: NDArray[np.float64], gains: NDArray[np.float64]) 
 def decibels(objects: Objects, ball: Ball, shift: tuple[float, float]) -> float:
     """PSNR of a composite over the ball, where it lies by a shift."""
     scene, _, _, mask = ball
-    task = Task("j", objects.url, "c", "m", {}, Limits(1 << 30, 1 << 26), {})
-    task = replace(task, plan=run("recover", task, PREPARE)[1])
+    task = Task("j", "c", "m", {}, Limits(1 << 30, 1 << 26))
+    task = replace(task, plan=run(STEPS, objects, task, PREPARE)[1])
     for tile in range(task.plan["tiles"]):
-        run("recover", task, tile)
+        run(STEPS, objects, task, tile)
     y, x = np.mgrid[:240, :320]
     checker = ((y // 24 + x // 24) % 2).astype(np.float32)
     backdrop = np.stack([checker, x.astype(np.float32) / 320, 1 - checker], axis=2)

@@ -1,0 +1,65 @@
+"""The steps of a recovery: create the matte, recover its tiles, read its figures."""
+
+from itertools import product
+from typing import Any
+
+from storage.layout import mattes
+from storage.layout.captures import Stack
+from storage.layout.mattes import Matte
+from storage.objects.store import Objects
+from workflows.jobs import Steps, Task
+from workflows.mattes import tiles
+from workflows.mattes.options import parse_options
+
+
+def prepare(objects: Objects, task: Task) -> dict[str, Any]:
+    """Create the empty matte of a capture.
+
+    Returns
+    -------
+    dict
+        ``tiles``: how many there are.
+    """
+    stack = Stack(objects, task.capture)
+    program, _ = tiles.program_of(objects, task.capture)
+    options = parse_options(task.options)
+    columns, rows = tiles.grid_of(objects, task.capture, options)
+    matte = mattes.create(
+        objects,
+        task.matte,
+        height=stack.height,
+        width=stack.width,
+        columns=columns,
+        rows=rows,
+        monitor=[program.monitor.width, program.monitor.height],
+        crosstalk=stack.attributes["crosstalk"],
+        # Without the size of tiles, which changes nothing in the matte.
+        options=options.model_dump(mode="json", exclude={"tile"}),
+    )
+    return {"tiles": len(tiles.cut(matte, options.tile or matte.block))}
+
+
+def work(objects: Objects, task: Task, tile: int) -> int:
+    """Recover one tile; returns the number of pixels recovered."""
+    return tiles.recover_tile(objects, task.capture, task.matte, parse_options(task.options), tile)
+
+
+def missing(objects: Objects, task: Task) -> list[int]:
+    """The tiles with a block that is not in the store."""
+    matte = Matte(objects, task.matte)
+    blocks = matte.missing()
+    edge = parse_options(task.options).tile or matte.block
+    return [
+        tile
+        for tile, (rows, columns) in enumerate(tiles.cut(matte, edge))
+        if not blocks.isdisjoint(product(rows, columns))
+    ]
+
+
+def finish(objects: Objects, task: Task) -> dict[str, Any]:
+    """Remove what interrupted workers left beside the matte, and return its figures."""
+    objects.sweep(mattes.path(task.matte))
+    return Matte(objects, task.matte).figures
+
+
+STEPS = Steps("recover", "recovering", prepare, work, missing, finish, scattered=True)
