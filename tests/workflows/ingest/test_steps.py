@@ -210,7 +210,7 @@ def test_an_unknown_response_is_estimated(
                 given["program"]["parts"][0]["levels"] = levels
                 data = json.dumps(given).encode()
             elif camera == "unknown":
-                value = ingest_steps.images.decode(data, memory=1 << 24) / 65535
+                value = ingest_steps.integer_formats.decode(data, memory=1 << 24) / 65535
                 data = encode_png(np.rint(value ** (1 / 2.2) * 65535).astype(np.uint16))
             out.writestr(name, data)
     attributes = ingest("c", changed.getvalue()).attributes
