@@ -17,7 +17,7 @@ ARGUMENTS = [
     "--no-sandbox",  # tests may run as root; the pages are our own
     "--enable-unsafe-swiftshader",  # WebGL2 without a graphics card, and without a warning
     "--use-fake-device-for-media-stream",  # a camera that shows a moving picture
-    "--use-fake-ui-for-media-stream",  # and that every page may use
+    "--use-fake-ui-for-media-stream",  # which every page may use
 ]
 
 
@@ -26,7 +26,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--scenes",
         nargs=2,
         metavar=("KIT", "SCENES"),
-        help="What the benchmarks take: the path of a kit that films scenes, and a folder of scenes.",
+        help="A kit that films scenes, and a folder of scenes, as the benchmarks take them.",
     )
 
 
@@ -36,7 +36,7 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
         yield running
 
 
-# A module's: as long as it lives it keeps an event loop in this thread, and no other test could run one.
+# Of a module: it keeps an event loop in this thread while it lives, so no other test could run one.
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     if CHROMIUM is None:
@@ -66,14 +66,14 @@ def ready(service: Service, ball: Path) -> tuple[str, str]:
 
 @pytest.fixture
 def desk(browser: Browser) -> Iterator[Page]:
-    """A page of the app, of 1200 x 800 pixels, that has to behave."""
+    """A page of 1200 x 800 pixels that fails the test if anything goes wrong in it, see `opened`."""
     with opened(browser, viewport={"width": 1200, "height": 800}) as page:
         yield page
 
 
 @pytest.fixture
 def tab(browser: Browser) -> Iterator[Page]:
-    """A page of its own, of 640 x 360 pixels; what it throws fails the test."""
+    """A page of 640 x 360 pixels that fails the test if it throws."""
     context = browser.new_context(
         viewport={"width": 640, "height": 360}, screen={"width": 640, "height": 360}
     )

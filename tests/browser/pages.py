@@ -1,4 +1,4 @@
-"""Pages of the app for tests, and what they may not do."""
+"""Pages of the app for tests, and what they must not do."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -7,46 +7,44 @@ from urllib.parse import urlsplit
 
 from playwright.sync_api import Browser, Page
 
-ZIP = "Choose a capture’s ZIP or a film"
-"""The label of the field that takes captures."""
+ZIP = "Choose a capture archive or a film"
+"""The label of the field for capture archives and films."""
 MINUTE = 60_000
 """Milliseconds."""
 SIZE = 96, 72
 """Width and height of the capture that tests share."""
 PHONE = {"width": 390, "height": 844}
-SAID = (
+EXPECTED = (
     "the server responded with a status of",
     "net::ERR_CONNECTION_RE",
     "net::ERR_INCOMPLETE",
     "net::ERR_EMPTY",
     "GPU stall due to ReadPixels",
 )
-"""What the browser itself says of an answer that is a problem, of a line that breaks, and of WebGL without a GPU."""
+"""What the browser itself logs about error responses, broken connections, and WebGL without a graphics card."""
 
 
 @contextmanager
 def opened(browser: Browser, **options: Any) -> Iterator[Page]:
-    """A page that fails the test if it, or one that it opens, throws, complains, breaks its policy or asks another host
-    for anything.
-    """
+    """A page that fails the test if it or its popups throw, warn, break the policy or contact another host."""
     context = browser.new_context(accept_downloads=True, **options)
     wrong: list[str] = []
     hosts: set[str] = set()
     context.on("weberror", lambda thrown: wrong.append(str(thrown.error)))
     context.on(
         "console",
-        lambda said: wrong.append(said.text) if said.type in ("error", "warning") else None,
+        lambda message: wrong.append(message.text) if message.type in ("error", "warning") else None,
     )
     context.on("request", lambda request: hosts.add(urlsplit(request.url).netloc))
     yield context.new_page()
     context.close()
-    wrong = [text for text in wrong if not any(said in text for said in SAID)]
-    assert wrong == [], wrong  # in words: no test's file, so pytest does not say what it found
-    assert len(hosts - {""}) == 1  # what the page made itself has none
+    wrong = [text for text in wrong if not any(expected in text for expected in EXPECTED)]
+    assert wrong == [], wrong  # with a message: pytest does not rewrite asserts of this file
+    assert len(hosts - {""}) == 1  # blob and data URLs have no host
 
 
-def asks_before_it_closes(page: Page) -> bool:
-    """Whether a page does, and stays where it is told to."""
+def asks_before_closing(page: Page) -> bool:
+    """Whether a page asks before it closes, and stays open if the answer is no."""
     with page.expect_event("dialog") as asked:
         page.close(run_before_unload=True)
     asked.value.dismiss()

@@ -62,19 +62,19 @@ def picture(seed: int, width: int, height: int) -> bytes:
     return integer_formats.encode_png(np.kron(blocks, np.ones((height // 6, width // 8, 1), np.uint8)))
 
 
-def test_from_a_zip_to_a_composite(tab: Page, service: Service, ball: Path) -> None:
+def test_upload_report_recovery_and_composite(tab: Page, service: Service, ball: Path) -> None:
     tab.goto(service.url)
-    tab.get_by_label("Choose a capture’s ZIP or a film").set_input_files(ball)
+    tab.get_by_label("Choose a capture archive or a film").set_input_files(ball)
     expect(tab).to_have_url(re.compile(r"#/captures/\w+"), timeout=MINUTE)
     expect(tab.get_by_role("heading", name="a ball")).to_be_visible()
-    expect(tab.get_by_role("heading", name="How it turned out")).to_be_visible(timeout=MINUTE)
+    expect(tab.get_by_role("heading", name="Report")).to_be_visible(timeout=MINUTE)
     capture = service.client.capture(tab.url.rpartition("/")[2])
     report = service.http.get(capture["report"]).json()
-    told = tab.locator(".findings li")
-    expect(told).to_have_count(len(report["findings"]))
+    findings = tab.locator(".findings li")
+    expect(findings).to_have_count(len(report["findings"]))
     for number, finding in enumerate(report["findings"]):
-        expect(told.nth(number)).to_contain_text(finding["level"])
-        expect(told.nth(number)).to_contain_text(finding["message"].replace("`", ""))
+        expect(findings.nth(number)).to_contain_text(finding["level"])
+        expect(findings.nth(number)).to_contain_text(finding["message"].replace("`", ""))
     expect(tab.get_by_alt_text("Some of the frames")).to_be_visible()
     tab.get_by_role("slider", name="Frame").fill("3")
     expect(tab.get_by_text(f"4 of {capture['frames']}")).to_be_visible()
@@ -91,9 +91,7 @@ def test_from_a_zip_to_a_composite(tab: Page, service: Service, ball: Path) -> N
     expect(tab).to_have_url(re.compile(r"#/mattes/\w+"))
     matte = tab.url.rpartition("/")[2]
     assert service.client.matte(matte)["options"]["quality"] == "fast"
-    assert (
-        service.client.matte(matte)["options"]["most_lobes"] == 2
-    )  # as `fast` has it: nothing else was sent
+    assert service.client.matte(matte)["options"]["most_lobes"] == 2  # of `fast`: no other option was sent
     exact = re.compile(rf"^beach\.png: exact, {SIZE[0]} × {SIZE[1]} pixels")
     beach = picture(0, 1600, 1200)
     drop(tab, beach, "beach.png")
@@ -105,7 +103,7 @@ def test_from_a_zip_to_a_composite(tab: Page, service: Service, ball: Path) -> N
     assert 10 * np.log10(255**2 / error) > 28
 
 
-def test_a_backdrop_is_moved_by_hand_and_by_keys(tab: Page, service: Service, ready: tuple[str, str]) -> None:
+def test_backdrop_moves_by_mouse_and_keys(tab: Page, service: Service, ready: tuple[str, str]) -> None:
     tab.goto(f"{service.url}/#/mattes/{ready[1]}")
     status = tab.get_by_text("exact")
     expect(status).to_be_visible(timeout=MINUTE)
@@ -134,7 +132,7 @@ def test_a_backdrop_is_moved_by_hand_and_by_keys(tab: Page, service: Service, re
     expect(tab.locator("output[for=place-angle]")).to_have_text("2°")
     tab.get_by_role("slider", name="Size").press("End")
     expect(tab.locator("output[for=place-scale]")).to_have_text("1000 %")
-    tab.get_by_role("button", name="Back to the start").click()
+    tab.get_by_role("button", name="Reset").click()
     expect(right).to_have_text("0 %")
     expect(status).to_be_visible()
     np.testing.assert_array_equal(shown(tab, ".picture.stage img"), before)
@@ -145,7 +143,7 @@ def test_a_backdrop_is_moved_by_hand_and_by_keys(tab: Page, service: Service, re
         assert download.value.path().read_bytes().startswith(magic)
 
 
-def test_layers_and_where_light_comes_from(tab: Page, service: Service, ready: tuple[str, str]) -> None:
+def test_layers_and_lobes_of_a_pixel(tab: Page, service: Service, ready: tuple[str, str]) -> None:
     tab.goto(f"{service.url}/#/mattes/{ready[1]}")
     for name in ("S", "alpha", "confidence", "rho"):
         tab.get_by_role("radio", name=name, exact=True).check()
@@ -155,17 +153,17 @@ def test_layers_and_where_light_comes_from(tab: Page, service: Service, ready: t
     layer.focus()
     layer.press("ArrowRight")
     expect(tab.get_by_alt_text("pixel (49, 36)")).to_be_visible(timeout=MINUTE)
-    figures = tab.get_by_role("group", name="Its figures")
+    figures = tab.get_by_role("group", name="Lobes of this pixel")
     pixel = service.http.get(f"/v1/mattes/{ready[1]}/transport?x=49&y=36").json()
     expect(figures.get_by_role("row")).to_have_count(3 + len(pixel["lobes"]))
-    expect(figures.get_by_role("row", name="rho")).to_contain_text(f"{100 * pixel['rho'][0]:.0f} %")
+    expect(figures.get_by_role("row", name="Transparency")).to_contain_text(f"{100 * pixel['rho'][0]:.0f} %")
     place = f"{pixel['lobes'][0]['u'] * 1280:.0f}, {(1 - pixel['lobes'][0]['v']) * 960:.0f}"
     expect(figures.get_by_role("row", name="Lobe 1")).to_contain_text(place)
     layer.hover(position={"x": 5, "y": 5})
     expect(tab.get_by_alt_text("pixel (0, 0)")).to_be_visible()
 
 
-def test_layers_for_other_tools_are_saved(tab: Page, service: Service, ready: tuple[str, str]) -> None:
+def test_layers_for_other_tools_are_downloaded(tab: Page, service: Service, ready: tuple[str, str]) -> None:
     tab.goto(f"{service.url}/#/mattes/{ready[1]}")
     for name in ("all.exr", "stmap.exr"):
         with tab.expect_download() as download:
@@ -175,32 +173,32 @@ def test_layers_for_other_tools_are_saved(tab: Page, service: Service, ready: tu
         assert download.value.path().read_bytes() == wanted
 
 
-def test_a_matte_is_saved_and_what_is_deleted_is_gone(
+def test_matte_is_downloaded_and_deleted_items_are_gone(
     tab: Page, service: Service, ready: tuple[str, str], ball: Path
 ) -> None:
     tab.goto(f"{service.url}/#/mattes/{ready[1]}")
     with tab.expect_download() as download:
         tab.get_by_role("button", name="Download the matte").click()
     assert download.value.suggested_filename == f"matte-{ready[1]}.zip"
-    brought = service.client.import_matte(download.value.path())
+    imported = service.client.import_matte(download.value.path())
     uploaded = service.client.upload(ball)
     service.client.wait(uploaded["job"])
-    for kind, one in (("mattes", brought["id"]), ("captures", uploaded["id"])):
-        tab.goto(f"{service.url}/#/{kind}/{one}")
+    for kind, id in (("mattes", imported["id"]), ("captures", uploaded["id"])):
+        tab.goto(f"{service.url}/#/{kind}/{id}")
         drop = tab.get_by_role("button", name="Delete", exact=True)
         drop.click()
-        tab.get_by_role("button", name="Keep it").click()
+        tab.get_by_role("button", name="Cancel").click()
         expect(drop).to_be_enabled()
-        assert service.http.get(f"/v1/{kind}/{one}").status_code == 200
+        assert service.http.get(f"/v1/{kind}/{id}").status_code == 200
         drop.click()
-        tab.get_by_role("button", name="Delete it").click()
+        tab.get_by_role("button", name=f"Delete {kind[:-1]}").click()
         expect(tab).to_have_url(re.compile(f"#/{kind}$"))
         expect(tab.locator(f'a[href="#/{kind}/{ready[kind == "mattes"]}"]')).to_be_visible()
-        expect(tab.locator(f'a[href="#/{kind}/{one}"]')).to_have_count(0)
-        assert service.http.get(f"/v1/{kind}/{one}").status_code == 404
+        expect(tab.locator(f'a[href="#/{kind}/{id}"]')).to_have_count(0)
+        assert service.http.get(f"/v1/{kind}/{id}").status_code == 404
 
 
-def test_what_expires_says_when(
+def test_expiry_dates_are_shown(
     browser: Browser, tab: Page, service: Service, ready: tuple[str, str], ball: Path, tmp_path: Path
 ) -> None:
     service.client.export(ready[1], archive := tmp_path / "matte.zip")
@@ -212,13 +210,13 @@ def test_what_expires_says_when(
     ):
         capture = forgetful.client.upload(ball)["id"]
         matte = forgetful.client.import_matte(archive)["id"]
-        for kind, one in (("captures", capture), ("mattes", matte)):
-            expires = forgetful.http.get(f"/v1/{kind}/{one}").json()["expires_at"]
+        for kind, id in (("captures", capture), ("mattes", matte)):
+            expires = forgetful.http.get(f"/v1/{kind}/{id}").json()["expires_at"]
             local = datetime.fromisoformat(expires).astimezone(ZoneInfo(zone))
-            page.goto(f"{forgetful.url}/#/{kind}/{one}")
-            told = page.get_by_role("term").filter(has_text="Kept until").locator("+ dd")
-            expect(told).to_have_text(re.compile(rf"^{local.day} .* {local.year}, {local:%H:%M}$"))
-    for kind, one in zip(("captures", "mattes"), ready, strict=True):
-        tab.goto(f"{service.url}/#/{kind}/{one}")
+            page.goto(f"{forgetful.url}/#/{kind}/{id}")
+            kept_until = page.get_by_role("term").filter(has_text="Kept until").locator("+ dd")
+            expect(kept_until).to_have_text(re.compile(rf"^{local.day} .* {local.year}, {local:%H:%M}$"))
+    for kind, id in zip(("captures", "mattes"), ready, strict=True):
+        tab.goto(f"{service.url}/#/{kind}/{id}")
         expect(tab.get_by_role("term").filter(has_text="Monitor")).to_be_visible()
         expect(tab.get_by_role("term").filter(has_text="Kept until")).to_have_count(0)

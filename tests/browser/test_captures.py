@@ -1,4 +1,4 @@
-"""Captures in the app: films and ZIPs that are dropped, and frames to leaf through."""
+"""Captures in the app: films and archives that are dropped, and the frames of a capture."""
 
 import base64
 import io
@@ -40,30 +40,30 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_film_with_its_record_becomes_a_capture(desk: Page, service: Service, clip: Path) -> None:
+def test_film_with_its_record_becomes_a_capture(desk: Page, service: Service, clip: Path) -> None:
     desk.goto(service.url)
     desk.get_by_label(ZIP).set_input_files(clip)
-    asked = desk.get_by_label("Or the capture.json that came with the program")
-    asked.set_input_files({"name": "holiday.json", "mimeType": "application/json", "buffer": b"{}"})
-    expect(desk.get_by_text("This is no capture.json of a film")).to_be_visible()
-    asked.set_input_files(clip.with_suffix(".json"))
+    field = desk.get_by_label("Or the capture.json that came with the program")
+    field.set_input_files({"name": "holiday.json", "mimeType": "application/json", "buffer": b"{}"})
+    expect(desk.get_by_text("Not the capture.json of a film")).to_be_visible()
+    field.set_input_files(clip.with_suffix(".json"))
     expect(desk.get_by_role("heading", name="IMG 0001")).to_be_visible(timeout=MINUTE)
-    expect(desk.get_by_role("heading", name="How it turned out")).to_be_visible(timeout=2 * MINUTE)
+    expect(desk.get_by_role("heading", name="Report")).to_be_visible(timeout=2 * MINUTE)
     found = service.client.capture(desk.url.rpartition("/")[2])
     assert (found["state"], found["width"], found["height"]) == ("ready", 96, 72)
 
 
-def test_a_film_alone_is_asked_for_its_program(desk: Page, service: Service, clip: Path) -> None:
+def test_film_without_record_asks_for_its_program(desk: Page, service: Service, clip: Path) -> None:
     made = service.http.post(
         "/v1/programs", json={"preset": "sketch", "monitor": {"width": 800, "height": 450}, "border": True}
     ).json()
-    told = {
+    showing = {
         "phase": "shown",
         "patterns_per_second": 3.5,
         "shown": 32,
         "border": {"width": 801, "height": 451},
     }
-    assert service.http.put(f"/v1/programs/{made['id']}/showing", json=told).status_code == 204
+    assert service.http.put(f"/v1/programs/{made['id']}/showing", json=showing).status_code == 204
     desk.goto(service.url)
     desk.get_by_label(ZIP).set_input_files(clip)
     expect(desk.get_by_text("Which program does this film show?")).to_be_visible()
@@ -75,15 +75,15 @@ def test_a_film_alone_is_asked_for_its_program(desk: Page, service: Service, cli
     assert Program.model_validate(found) == Program.model_validate(made["program"])
 
 
-def test_a_film_and_its_record_are_one_zip(desk: Page, service: Service) -> None:
+def test_film_and_record_are_zipped(desk: Page, service: Service) -> None:
     desk.goto(service.url)
     text = desk.evaluate(
         """async () => {
-            const { bundle, recordOf } = await import("/web/app/film.js");
+            const { filmArchive, recordOf } = await import("/web/app/upload/film_bundle.js");
             const showing = { border: { width: 641, height: 361 } };
             const record = recordOf({ program: { parts: [] }, display: { width: 640, height: 360 }, showing }, 3.5);
             const film = new File([new Uint8Array(9e6).map((_, i) => i % 251)], "Größe.WebM", { type: "video/webm" });
-            const archive = await bundle(film, record);
+            const archive = await filmArchive(film, record);
             return new Promise((resolve) => {
                 const reader = new FileReader();
                 reader.onload = () => resolve(reader.result);
@@ -107,8 +107,8 @@ def test_a_film_and_its_record_are_one_zip(desk: Page, service: Service) -> None
         }
 
 
-def test_a_film_of_gigabytes_is_a_zip_too(desk: Page, service: Service, tmp_path: Path) -> None:
-    """What is between the heads is left out of the page, and a hole in the file here."""
+def test_film_of_gigabytes_is_zipped(desk: Page, service: Service, tmp_path: Path) -> None:
+    """The page makes the headers only; a hole in the file stands for the film."""
     size, record = 5 << 30, b"{}"
     files = [
         {"name": "film.mp4", "size": size, "crc": 0},
@@ -117,7 +117,7 @@ def test_a_film_of_gigabytes_is_a_zip_too(desk: Page, service: Service, tmp_path
     desk.goto(service.url)
     parts = desk.evaluate(
         """async (files) => {
-            const { framed } = await import("/web/app/zip.js");
+            const { framed } = await import("/web/app/upload/zip.js");
             const { heads, end } = framed(files);
             return Promise.all([...heads, end].map(async (part) => [...new Uint8Array(await part.arrayBuffer())]));
         }""",
@@ -128,15 +128,15 @@ def test_a_film_of_gigabytes_is_a_zip_too(desk: Page, service: Service, tmp_path
         file.seek(size, 1)
         file.write(bytes(parts[1]) + record + bytes(parts[2]))
         with zipfile.ZipFile(file) as archive:
-            film, told = archive.infolist()
+            film, entry = archive.infolist()
             assert (film.filename, film.file_size, film.compress_size) == ("film.mp4", size, size)
-            assert told.header_offset == len(parts[0]) + size
+            assert entry.header_offset == len(parts[0]) + size
             assert archive.read("capture.json") == record
             with archive.open("film.mp4") as entry:
                 assert entry.read(4) == bytes(4)
 
 
-def test_what_a_zip_says_of_its_frames_is_told_before_it_is_sent(
+def test_number_and_size_of_frames_are_sent_before_the_archive(
     desk: Page, service: Service, ball: Path, tmp_path: Path
 ) -> None:
     packed, jpeg, film = (tmp_path / name for name in ("packed.zip", "jpeg.zip", "film.zip"))
@@ -157,7 +157,7 @@ def test_what_a_zip_says_of_its_frames_is_told_before_it_is_sent(
     of_ball = {"frames": len(json.loads(zipfile.ZipFile(ball).read("capture.json"))["frames"])}
     of_ball |= {"width": 96, "height": 72}
     desk.goto(service.url)
-    for path, told in (
+    for path, expected in (
         (ball, of_ball),
         (packed, of_ball),
         (jpeg, {"frames": 3, "width": 70, "height": 33}),
@@ -166,21 +166,21 @@ def test_what_a_zip_says_of_its_frames_is_told_before_it_is_sent(
     ):
         found = desk.evaluate(
             """async (data) => {
-                const { declared } = await import("/web/app/declared.js");
-                return declared(new Blob([Uint8Array.from(atob(data), (one) => one.charCodeAt(0))]));
+                const { readArchiveInfo } = await import("/web/app/upload/archive_info.js");
+                return readArchiveInfo(new Blob([Uint8Array.from(atob(data), (one) => one.charCodeAt(0))]));
             }""",
             base64.b64encode(path.read_bytes()).decode(),
         )
-        assert found == told, path
+        assert found == expected, path
     with desk.expect_request(
         lambda request: request.method == "POST" and request.url.endswith("/uploads")
     ) as sent:
         desk.get_by_label(ZIP).set_input_files(packed)
-    said = dict(pair.split(" ") for pair in (sent.value.header_value("upload-metadata") or "").split(","))
-    assert {name: int(base64.b64decode(value)) for name, value in said.items()} == of_ball
+    metadata = dict(pair.split(" ") for pair in (sent.value.header_value("upload-metadata") or "").split(","))
+    assert {name: int(base64.b64decode(value)) for name, value in metadata.items()} == of_ball
 
 
-def test_frames_are_leafed_through_by_keys(desk: Page, service: Service, ready: tuple[str, str]) -> None:
+def test_frames_are_browsed_by_keys(desk: Page, service: Service, ready: tuple[str, str]) -> None:
     desk.goto(f"{service.url}/#/captures/{ready[0]}")
     frames = service.client.capture(ready[0])["frames"]
     slider = desk.get_by_role("slider", name="Frame")

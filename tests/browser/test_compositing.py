@@ -38,12 +38,12 @@ WITHOUT = """
         return kind === "webgl2" ? null : real.call(this, kind, ...given);
     };"""
 COARSER = """async ([id, picture, monitor]) => {
-    const { lightOf, glass } = await import("/web/app/glass.js");
-    const { fetchLive } = await import("/web/app/live.js");
-    const gl = lightOf(document.createElement("canvas"));
-    const painter = glass(gl, await fetchLive(id), monitor);
+    const { webglContext, createPainter } = await import("/web/app/composite/webgl.js");
+    const { fetchLive } = await import("/web/app/composite/live.js");
+    const gl = webglContext(document.createElement("canvas"));
+    const painter = createPainter(gl, await fetchLive(id), monitor);
     const bytes = Uint8Array.from(atob(picture), (one) => one.charCodeAt(0));
-    painter.take(await createImageBitmap(new Blob([bytes]), { premultiplyAlpha: "none" }));
+    painter.setBackdrop(await createImageBitmap(new Blob([bytes]), { premultiplyAlpha: "none" }));
     return [0, 1, 2].map((coarser) => {
         painter.draw({ right: 0.1, down: 0, scale: 1, angle: 0 }, coarser);
         return gl.canvas.toDataURL("image/png");
@@ -78,7 +78,7 @@ def context(browser: Browser) -> Iterator[BrowserContext]:
 
 
 def opened(context: BrowserContext, service: Service, matte: str) -> Page:
-    """The matte's page, with its first composite there; what it throws is kept."""
+    """The page of a matte with its first composite; fails the test if it throws."""
     page = context.new_page()
     page.on("pageerror", lambda error: pytest.fail(str(error)))
     page.goto(f"{service.url}/#/mattes/{matte}")
@@ -100,7 +100,7 @@ def of_url(url: str) -> NDArray[np.float64]:
     return pixels(base64.b64decode(url.partition(",")[2]))
 
 
-def bring(page: Page, data: bytes, name: str, kind: str) -> None:
+def choose(page: Page, data: bytes, name: str, kind: str) -> None:
     page.get_by_label("Your own picture or clip").set_input_files(
         {"name": name, "mimeType": kind, "buffer": data}
     )
@@ -118,15 +118,13 @@ def filmed(path: Path, frames: int) -> bytes:
     return path.read_bytes()
 
 
-def test_what_the_browser_draws_agrees_with_the_service(
-    context: BrowserContext, service: Service, ball: str
-) -> None:
+def test_live_picture_agrees_with_service(context: BrowserContext, service: Service, ball: str) -> None:
     page = opened(context, service, ball)
     expect(page.get_by_text(READY)).to_be_visible(timeout=MINUTE)
     asked: list[str] = []
     page.on("request", lambda one: asked.append(one.url) if "/composite?" in one.url else None)
     beach = png(glass_ball.backdrop(640, 480), "srgb", np.uint8)
-    bring(page, beach, "beach.png", "image/png")
+    choose(page, beach, "beach.png", "image/png")
     expect(page.get_by_text(re.compile("beach.png: exact"))).to_be_visible(timeout=MINUTE)
     for turned in ({}, {"Move right": "0.15"}, {"Move down": "-0.3", "Turn": "30"}, {"Size": "-0.3"}):
         for name, value in turned.items():
@@ -140,7 +138,7 @@ def test_what_the_browser_draws_agrees_with_the_service(
     assert not any("size=" in url for url in asked)
 
 
-def test_fewer_pixels_of_coarser_light_agree_too(
+def test_coarser_live_pictures_agree_with_service(
     context: BrowserContext, service: Service, ball: str
 ) -> None:
     page = opened(context, service, ball)
@@ -159,20 +157,20 @@ def test_fewer_pixels_of_coarser_light_agree_too(
         assert 10 * np.log10(255**2 / np.mean((found - wanted) ** 2)) > (30, 26, 22)[coarser]
 
 
-def test_fewer_are_drawn_where_it_takes_long(context: BrowserContext, service: Service, ball: str) -> None:
+def test_slow_device_draws_fewer_pixels(context: BrowserContext, service: Service, ball: str) -> None:
     context.add_init_script(SLOW)
     page = opened(context, service, ball)
     expect(page.get_by_text(READY)).to_be_visible(timeout=MINUTE)
     page.get_by_role("radio", name="Camera").check()
     canvas = page.locator(".picture.stage canvas")
     expect(canvas).to_have_js_property("width", SIZE[0] // 4, timeout=MINUTE)
-    page.get_by_role("button", name="Hold it").click()
+    page.get_by_role("button", name="Pause").click()
     expect(page.get_by_text(re.compile("Camera: exact"))).to_be_visible(timeout=MINUTE)
-    page.get_by_role("group", name="Composite.").press("ArrowRight")  # which is tried with more
+    page.get_by_role("group", name="Composite.").press("ArrowRight")  # starts with more pixels again
     expect(canvas).not_to_have_js_property("width", SIZE[0] // 4)
 
 
-def test_it_is_drawn_live_and_then_exactly(context: BrowserContext, service: Service, ball: str) -> None:
+def test_live_picture_is_replaced_by_exact_one(context: BrowserContext, service: Service, ball: str) -> None:
     page = opened(context, service, ball)
     expect(page.get_by_text(READY)).to_be_visible(timeout=MINUTE)
     held: list[Route] = []
@@ -191,7 +189,9 @@ def test_it_is_drawn_live_and_then_exactly(context: BrowserContext, service: Ser
     expect(canvas).to_be_hidden()
 
 
-def test_the_camera_is_a_backdrop_and_let_go_of(context: BrowserContext, service: Service, ball: str) -> None:
+def test_camera_is_a_backdrop_and_released_when_leaving(
+    context: BrowserContext, service: Service, ball: str
+) -> None:
     context.add_init_script(KEPT)
     page = opened(context, service, ball)
     expect(page.get_by_text(READY)).to_be_visible(timeout=MINUTE)
@@ -201,28 +201,28 @@ def test_the_camera_is_a_backdrop_and_let_go_of(context: BrowserContext, service
     page.wait_for_timeout(1500)
     now = drawn(page)  # with fewer pixels where this machine is slow
     assert now.shape != before.shape or np.abs(now - before).max() > 10
-    page.get_by_role("button", name="Hold it").click()
+    page.get_by_role("button", name="Pause").click()
     expect(page.get_by_text(re.compile("Camera: exact"))).to_be_visible(timeout=MINUTE)
-    page.get_by_role("button", name="Let it go on").click()
+    page.get_by_role("button", name="Play").click()
     expect(page.get_by_text("Camera: live")).to_be_visible()
     page.get_by_role("navigation").get_by_role("link", name="Mattes").click()
     page.wait_for_function("stream.getTracks().every((track) => track.readyState === 'ended')")
 
 
-def test_why_there_is_no_camera(context: BrowserContext, service: Service, ball: str) -> None:
+def test_missing_camera_is_explained(context: BrowserContext, service: Service, ball: str) -> None:
     context.add_init_script("Object.defineProperty(navigator, 'mediaDevices', { value: undefined })")
     page = opened(context, service, ball)
     page.get_by_role("radio", name="Camera").check()
-    expect(page.get_by_role("alert")).to_contain_text("open this page at https")
+    expect(page.get_by_role("alert")).to_contain_text("Open this page at https")
 
 
-def test_a_clip_from_choice_to_download(
+def test_clip_is_composited_and_downloaded(
     context: BrowserContext, service: Service, ball: str, tmp_path: Path
 ) -> None:
     page = opened(context, service, ball)
     expect(page.get_by_text(READY)).to_be_visible(timeout=MINUTE)
     page.get_by_role("slider", name="Turn").fill("10")
-    bring(page, filmed(tmp_path / "clip.mp4", 12), "clip.mp4", "video/mp4")
+    choose(page, filmed(tmp_path / "clip.mp4", 12), "clip.mp4", "video/mp4")
     expect(page.get_by_text("clip.mp4: live")).to_be_visible(timeout=MINUTE)
     page.get_by_role("button", name="Make the video").click()
     save = page.get_by_role("button", name="Download the video")
@@ -234,13 +234,13 @@ def test_a_clip_from_choice_to_download(
         made = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
     assert len(made) == 12
     assert made[0].shape == (SIZE[1], SIZE[0], 3)
-    job = page.get_by_role("link", name="Its job").get_attribute("href")
+    job = page.get_by_role("link", name="Show the job").get_attribute("href")
     assert job
     options = service.http.get(f"/v1/jobs/{job.rpartition('/')[2]}").json()["options"]
     assert options["placement"]["angle"] == 10
 
 
-def test_a_picture_is_pasted(context: BrowserContext, service: Service, ball: str) -> None:
+def test_pasted_picture_becomes_backdrop(context: BrowserContext, service: Service, ball: str) -> None:
     context.grant_permissions(["clipboard-read", "clipboard-write"])
     page = opened(context, service, ball)
     before = page.locator(".picture.stage img").get_attribute("src")
@@ -261,7 +261,7 @@ def test_two_fingers_move_scale_and_turn(browser: Browser, service: Service, bal
     touch = context.new_cdp_session(page)
 
     def fingers(kind: str, points: dict[int, tuple[float, float]]) -> None:
-        """Where which fingers are, or those are that are lifted: in widths of the picture from its middle."""
+        """Sends a touch event. Points are in widths of the picture from its centre, by finger."""
         at = [
             {
                 "id": n,
@@ -284,10 +284,12 @@ def test_two_fingers_move_scale_and_turn(browser: Browser, service: Service, bal
     context.close()
 
 
-def test_a_clip_that_the_browser_can_not_play(context: BrowserContext, service: Service, ball: str) -> None:
+def test_clip_that_browser_cannot_play_is_explained(
+    context: BrowserContext, service: Service, ball: str
+) -> None:
     page = opened(context, service, ball)
-    bring(page, b"no clip", "clip.mp4", "video/mp4")
-    expect(page.get_by_role("alert")).to_contain_text("can’t play the clip")
+    choose(page, b"no clip", "clip.mp4", "video/mp4")
+    expect(page.get_by_role("alert")).to_contain_text("cannot play the clip")
     page.get_by_role("button", name="Make the video").click()
     expect(page.get_by_text("failed")).to_be_visible(timeout=MINUTE)
 
@@ -307,7 +309,7 @@ def test_without_webgl_the_service_draws(context: BrowserContext, service: Servi
     assert not any(url.endswith("/live") for url in asked)
 
 
-def test_nothing_is_left_on_the_graphics_card(context: BrowserContext, service: Service, ball: str) -> None:
+def test_leaving_frees_the_graphics_card(context: BrowserContext, service: Service, ball: str) -> None:
     context.add_init_script(COUNTED)
     page = opened(context, service, ball)
     expect(page.get_by_text(READY)).to_be_visible(timeout=MINUTE)
@@ -318,7 +320,7 @@ def test_nothing_is_left_on_the_graphics_card(context: BrowserContext, service: 
 
 
 @pytest.mark.parametrize(("kind", "magic"), [("PNG", b"\x89PNG"), ("JPEG", b"\xff\xd8"), ("EXR", b"v/1\x01")])
-def test_a_still_is_saved(
+def test_composite_is_downloaded(
     context: BrowserContext, service: Service, ball: str, kind: str, magic: bytes
 ) -> None:
     page = opened(context, service, ball)

@@ -1,11 +1,11 @@
-"""Filming: a program is chosen, shown on a monitor, followed on a phone and filmed by a camera of the browser."""
+"""Filming: a program is chosen, played on a monitor, followed on a phone and recorded by a camera of the browser."""
 
 import re
 from pathlib import Path
 
 from playwright.sync_api import Browser, Page, Route, expect
 
-from tests.browser.pages import MINUTE, PHONE, ZIP, asks_before_it_closes, opened
+from tests.browser.pages import MINUTE, PHONE, ZIP, asks_before_closing, opened
 from tests.end_to_end.conftest import Service
 from workflows.programs.program import Program
 
@@ -19,16 +19,16 @@ SHORT = {
 }
 
 
-def test_a_preset_is_made_for_the_screen(desk: Page, service: Service) -> None:
+def test_preset_is_fitted_to_the_screen(desk: Page, service: Service) -> None:
     desk.goto(f"{service.url}/#/film")
     expect(desk.get_by_text("where no other device can reach it")).to_be_visible()
     expect(desk.get_by_label("The monitor’s width")).to_have_value("1200")
     desk.get_by_role("radio", name="sketch").check()
     desk.get_by_label("Height").fill("40")
-    desk.get_by_role("button", name="Go on").click()
+    desk.get_by_role("button", name="Continue").click()
     expect(desk.get_by_role("alert")).to_be_visible()
     desk.get_by_label("Height").fill("800")
-    desk.get_by_role("button", name="Go on").click()
+    desk.get_by_role("button", name="Continue").click()
     expect(desk.get_by_role("heading", name="32 patterns on a screen of 1200 × 800")).to_be_visible()
     made = service.http.get(f"/v1/programs/{desk.url.rpartition('/')[2]}").json()
     assert (made["patterns"], made["display"]) == (32, {"width": 1200, "height": 800})
@@ -36,7 +36,7 @@ def test_a_preset_is_made_for_the_screen(desk: Page, service: Service) -> None:
     expect(desk.get_by_role("link", name="32 patterns on a screen of 1200 × 800").first).to_be_visible()
 
 
-def test_a_program_is_followed_and_filmed(browser: Browser, desk: Page, service: Service) -> None:
+def test_program_is_followed_and_recorded(browser: Browser, desk: Page, service: Service) -> None:
     made = service.http.post(
         "/v1/programs", json={"program": SHORT, "monitor": SCREEN, "border": True}
     ).json()
@@ -46,88 +46,88 @@ def test_a_program_is_followed_and_filmed(browser: Browser, desk: Page, service:
         phone.goto(url)
         before = phone.get_by_role("checkbox")
         expect(before).to_have_count(7)
-        phone.get_by_text("Room dark").tap()
+        phone.get_by_text("Darken the room").tap()
         expect(before.nth(1)).to_be_checked()
         live = phone.get_by_role("timer")
-        expect(live).to_have_text("Not yet")
+        expect(live).to_have_text("Not started")
         desk.get_by_role("button", name="Use a camera of this device").click()
-        expect(desk.get_by_role("button", name="Start filming")).to_be_visible()
+        expect(desk.get_by_role("button", name="Start recording")).to_be_visible()
         with desk.expect_popup() as popup:
-            desk.get_by_role("link", name="Show it on this screen").click()
+            desk.get_by_role("link", name="Play it on this screen").click()
         monitor = popup.value
         monitor.set_viewport_size({"width": 640, "height": 360})
         expect(monitor.get_by_role("status")).to_have_text("Ready.", timeout=MINUTE)
         monitor.get_by_label("Patterns a second").fill("4")
         monitor.get_by_role("button", name="full screen").press("Enter")
         expect(live).to_have_text(re.compile(r"Starts in \d"))
-        expect(desk.get_by_role("button", name="Stop filming")).to_be_visible()
+        expect(desk.get_by_role("button", name="Stop recording")).to_be_visible()
         expect(live).to_have_text(re.compile(r"\d+ of 12"), timeout=MINUTE)
         expect(live).to_have_text("All shown", timeout=MINUTE)
-        expect(phone.get_by_text("a second. Stop the film")).to_be_visible()
-    # What was filmed goes up by itself, as a film of this program.
+        expect(phone.get_by_text("a second. Stop recording")).to_be_visible()
+    # The film is uploaded by itself, as a film of this program.
     expect(desk).to_have_url(re.compile(r"#/captures/\w+"), timeout=MINUTE)
     capture = service.client.capture(desk.url.rpartition("/")[2])
     assert (capture["name"], capture["frames"]) == ("film", 12)
     assert Program.model_validate(capture["program"]) == Program.model_validate(made["program"])
-    # Chromium's camera does not look at the monitor: the frames are read, and no program is found in them.
+    # The fake camera does not see the monitor, so ingest finds no program in the film.
     expect(desk.get_by_role("alert")).to_contain_text("film.", timeout=2 * MINUTE)
 
 
-def test_what_is_stopped_is_told(desk: Page, service: Service) -> None:
+def test_followers_see_countdown_progress_and_stop(desk: Page, service: Service) -> None:
     made = service.http.post(
         "/v1/programs", json={"program": SHORT, "monitor": SCREEN, "border": True}
     ).json()
     desk.goto(f"{service.url}/#/film/{made['id']}")
     live = desk.get_by_role("timer")
-    for told, said in (
+    for report, text in (
         ({"phase": "countdown", "seconds": 12}, re.compile(r"Starts in [1-9]$")),
-        # Once more, by a page that was loaded anew.
+        # Again, by a page that was reloaded.
         ({"phase": "countdown", "seconds": 12}, re.compile(r"Starts in 1\d$")),
         ({"phase": "stopped"}, "Stopped"),
         ({"phase": "showing", "shown": 5}, re.compile("of 12")),
     ):
-        body = {"patterns_per_second": 0.1} | told
+        body = {"patterns_per_second": 0.1} | report
         assert service.http.put(f"/v1/programs/{made['id']}/showing", json=body).status_code == 204
-        expect(live).to_contain_text(said)
+        expect(live).to_contain_text(text)
     for wrong, status in (({"phase": "dancing"}, 422), ({"phase": "shown", "patterns_per_second": -1}, 422)):
         assert service.http.put(f"/v1/programs/{made['id']}/showing", json=wrong).status_code == status
     assert service.http.put("/v1/programs/none/showing", json=body).status_code == 404
     desk.get_by_label("Choose the film").set_input_files(
         {"name": "holiday.txt", "mimeType": "text/plain", "buffer": b"twelve bytes"}
     )
-    expect(desk.get_by_role("alert")).to_contain_text("choose the video that the camera took")
+    expect(desk.get_by_role("alert")).to_contain_text("Choose the video that the camera recorded")
 
 
 def shown(service: Service, program: str, phase: str) -> None:
-    """Tell of a program what its page would."""
-    told = {"phase": phase, "patterns_per_second": 4, "shown": 12}
-    assert service.http.put(f"/v1/programs/{program}/showing", json=told).status_code == 204
+    """Report the phase of a program as its player page would."""
+    report = {"phase": phase, "patterns_per_second": 4, "shown": 12}
+    assert service.http.put(f"/v1/programs/{program}/showing", json=report).status_code == 204
 
 
 def filming(page: Page, service: Service) -> str:
-    """Take a film of a new program, whose id this is."""
+    """Start recording a new program; returns its id."""
     made = service.http.post(
         "/v1/programs", json={"program": SHORT, "monitor": SCREEN, "border": True}
     ).json()
     page.goto(f"{service.url}/#/captures")
     page.goto(f"{service.url}/#/film/{made['id']}")
     page.get_by_role("button", name="Use a camera of this device").click()
-    page.get_by_role("button", name="Start filming").click()
-    expect(page.get_by_role("button", name="Stop filming")).to_be_visible()
+    page.get_by_role("button", name="Start recording").click()
+    expect(page.get_by_role("button", name="Stop recording")).to_be_visible()
     return str(made["id"])
 
 
-def test_a_film_goes_on_while_another_view_is_looked_at(desk: Page, service: Service) -> None:
+def test_recording_continues_while_another_view_is_shown(desk: Page, service: Service) -> None:
     program = filming(desk, service)
-    note = desk.get_by_role("link", name="A film is being taken")
+    note = desk.get_by_role("link", name="Recording a film")
     expect(note).to_be_hidden()
     desk.go_back()
     expect(desk.get_by_role("heading", name="Captures")).to_be_visible()
     desk.get_by_role("navigation").get_by_role("link", name="Mattes").click()
     expect(desk.get_by_role("heading", name="Mattes")).to_be_visible()
-    assert asks_before_it_closes(desk)
+    assert asks_before_closing(desk)
     note.click()
-    expect(desk.get_by_role("button", name="Stop filming")).to_be_visible()
+    expect(desk.get_by_role("button", name="Stop recording")).to_be_visible()
     expect(desk.get_by_label("Choose the film")).to_be_attached()
     expect(note).to_be_hidden()
     assert not desk.get_by_label("What the camera sees").evaluate("(video) => video.paused")
@@ -149,19 +149,19 @@ def test_a_film_goes_on_while_another_view_is_looked_at(desk: Page, service: Ser
     expect(desk.get_by_role("button", name="Use a camera of this device")).to_be_visible()
 
 
-def test_a_film_that_broke_off_is_kept_until_its_fate_is_said(desk: Page, service: Service) -> None:
+def test_interrupted_film_is_kept_until_user_decides(desk: Page, service: Service) -> None:
     program = filming(desk, service)
     shown(service, program, "stopped")
     row = desk.get_by_role("region", name=re.compile("^film\\."))
-    expect(row).to_contain_text("It broke off")
+    expect(row).to_contain_text("The program stopped before its end")
     desk.go_back()
     expect(row).to_be_visible()
     desk.get_by_role("navigation").get_by_role("link", name="Film").click()
     expect(desk.get_by_role("heading", name="Choose a program")).to_be_visible()
     expect(row).to_be_visible()
-    assert asks_before_it_closes(desk)
+    assert asks_before_closing(desk)
     row.get_by_role("button", name="Delete").click()
-    desk.get_by_role("button", name="Keep it").click()
+    desk.get_by_role("button", name="Cancel").click()
     with desk.expect_download() as download:
         row.get_by_role("button", name="Save").click()
     assert download.value.path().stat().st_size > 1000
@@ -170,7 +170,7 @@ def test_a_film_that_broke_off_is_kept_until_its_fate_is_said(desk: Page, servic
     expect(desk.get_by_role("heading", name="film")).to_be_visible()
 
 
-def test_another_upload_does_not_end_a_film(desk: Page, service: Service, ball: Path) -> None:
+def test_another_upload_does_not_end_a_recording(desk: Page, service: Service, ball: Path) -> None:
     filming(desk, service)
     held: list[Route] = []
     desk.route(
@@ -187,4 +187,4 @@ def test_another_upload_does_not_end_a_film(desk: Page, service: Service, ball: 
     held.pop().continue_()
     expect(row).to_be_hidden(timeout=MINUTE)
     desk.wait_for_timeout(500)
-    expect(desk.get_by_role("button", name="Stop filming")).to_be_visible()
+    expect(desk.get_by_role("button", name="Stop recording")).to_be_visible()

@@ -1,4 +1,4 @@
-"""Jobs in the app: followed, cancelled, tried again, deleted."""
+"""Jobs in the app: followed, cancelled, retried, deleted."""
 
 import re
 import socket
@@ -11,14 +11,14 @@ from tests.browser.pages import MINUTE
 from tests.end_to_end.conftest import Service, paused, serving
 
 
-def test_a_wrong_option_is_refused_in_words(desk: Page, service: Service, ready: tuple[str, str]) -> None:
+def test_invalid_option_is_explained(desk: Page, service: Service, ready: tuple[str, str]) -> None:
     desk.goto(f"{service.url}/#/captures/{ready[0]}")
     known = {option["name"] for option in service.http.get("/v1/options").json()["options"]}
     desk.get_by_text("All options").click()
     fields = desk.locator("#recovery [name]")
     names = {fields.nth(n).get_attribute("name") for n in range(fields.count())}
     assert names == known
-    # Past the browser's own check, as another version of the service would have other ranges.
+    # Bypass the browser's own check, as if another version of the service had other ranges.
     desk.locator("#recovery").evaluate("(form) => (form.noValidate = true)")
     desk.get_by_label("most lobes").fill("99")
     desk.get_by_role("button", name="Start").click()
@@ -26,24 +26,22 @@ def test_a_wrong_option_is_refused_in_words(desk: Page, service: Service, ready:
     expect(desk.get_by_label("most lobes")).to_be_focused()
 
 
-def test_a_job_is_cancelled_and_deleted(desk: Page, service: Service, ready: tuple[str, str]) -> None:
+def test_job_is_cancelled_and_deleted(desk: Page, service: Service, ready: tuple[str, str]) -> None:
     with paused(service):
         job = service.client.recover(ready[0])["id"]
         desk.goto(f"{service.url}/#/jobs/{job}")
         desk.get_by_role("button", name="Cancel").click()
         expect(desk.locator(".stage .badge")).to_have_text("cancelled")
     desk.get_by_role("button", name="Delete", exact=True).click()
-    desk.get_by_role("button", name="Keep it").click()
+    desk.get_by_role("button", name="Cancel").click()
     expect(desk.get_by_role("heading", name="Recovery of a matte")).to_be_visible()
     desk.get_by_role("button", name="Delete", exact=True).click()
-    desk.get_by_role("button", name="Delete it").click()
+    desk.get_by_role("button", name="Delete job").click()
     expect(desk).to_have_url(re.compile("#/jobs$"))
     assert service.http.get(f"/v1/jobs/{job}").status_code == 404
 
 
-def test_a_failed_job_says_why_and_is_tried_again(
-    desk: Page, service: Service, ball: Path, tmp_path: Path
-) -> None:
+def test_failed_job_says_why_and_is_retried(desk: Page, service: Service, ball: Path, tmp_path: Path) -> None:
     capture = service.client.upload(ball)
     service.client.wait(capture["job"])
     frames = sorted((service.data / "store").glob(f"captures/{capture['id']}/**/c/**/*"))
@@ -58,7 +56,7 @@ def test_a_failed_job_says_why_and_is_tried_again(
     expect(desk.locator(".log")).to_contain_text("succeeded")
 
 
-def test_a_job_that_runs_is_followed_through_a_reload(
+def test_running_job_is_followed_across_a_reload(
     desk: Page, service: Service, ready: tuple[str, str]
 ) -> None:
     with paused(service):
@@ -74,10 +72,10 @@ def test_a_job_that_runs_is_followed_through_a_reload(
     asked: list[str] = []
     desk.on("request", lambda request: asked.append(request.url) if request.url.endswith(job) else None)
     expect(desk.get_by_role("link", name="Open the matte")).to_be_visible(timeout=MINUTE)
-    assert asked == []  # it is told, and does not ask
+    assert asked == []  # events bring the state, without polling
 
 
-def test_a_job_that_runs_says_how_far_it_is(desk: Page, service: Service, ready: tuple[str, str]) -> None:
+def test_running_job_shows_progress(desk: Page, service: Service, ready: tuple[str, str]) -> None:
     job = service.client.recover(ready[0], most_lobes=16)["id"]
     while (at := service.client.job(job))["eta_seconds"] is None:
         desk.wait_for_timeout(20)
@@ -86,16 +84,14 @@ def test_a_job_that_runs_says_how_far_it_is(desk: Page, service: Service, ready:
         expect(desk.locator("p.stage")).to_have_text(re.compile(r"running recovering, \d+ %, about .+ left"))
         facts = {"Tiles": rf"[1-9]\d* of {at['tiles']['total']}", "Workers": "1", "Ran": r".+ (s|min)"}
         for name, value in facts.items():
-            told = desk.get_by_label("Progress").get_by_role("term").filter(has_text=name).locator("+ dd")
-            expect(told).to_have_text(re.compile(f"^{value}$"))
+            shown = desk.get_by_label("Progress").get_by_role("term").filter(has_text=name).locator("+ dd")
+            expect(shown).to_have_text(re.compile(f"^{value}$"))
         expect(desk.get_by_role("progressbar")).not_to_have_js_property("value", 0)
         expect(desk.get_by_role("list", name="Log")).to_contain_text("recovering")
     service.http.post(f"/v1/jobs/{job}/cancel")
 
 
-def test_a_laptop_that_slept_takes_the_job_up_again(
-    desk: Page, service: Service, ready: tuple[str, str]
-) -> None:
+def test_job_is_followed_again_after_sleep(desk: Page, service: Service, ready: tuple[str, str]) -> None:
     asked: list[str | None] = []
     desk.on(
         "request",
@@ -109,18 +105,18 @@ def test_a_laptop_that_slept_takes_the_job_up_again(
         desk.goto(f"{service.url}/#/jobs/{job}")
         expect(desk.locator(".stage .badge")).to_have_text("running")
         expect(desk.get_by_label("Progress").get_by_role("term")).not_to_have_count(0)
-        while len(read) < 2:  # the log is, with what the page knew of the job and with the first event
+        while len(read) < 2:  # the log, for the known state and for the first event
             desk.wait_for_timeout(100)
         assert asked == [None]
         desk.clock.fast_forward("08:00:00")
         while len(asked) == 1:
             desk.wait_for_timeout(100)
-        assert asked[1]  # it goes on behind what it has had
+        assert asked[1]  # resumes after the last event received
     expect(desk.get_by_role("link", name="Open the matte")).to_be_visible(timeout=MINUTE)
 
 
 @pytest.mark.exhaustive
-def test_a_service_with_keys_that_is_started_again(
+def test_restarted_service_with_keys(
     browser: Browser, ball: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     folder = tmp_path_factory.mktemp("locked") / "data"

@@ -1,4 +1,4 @@
-"""The glass that browsers draw, beside the service's composites: traced scenes, which only a kit can film."""
+"""Live pictures of traced scenes beside the service's composites. Only a kit can film these scenes."""
 
 from pathlib import Path
 
@@ -14,14 +14,14 @@ pytestmark = pytest.mark.exhaustive
 
 @pytest.fixture(scope="session")
 def given(pytestconfig: pytest.Config) -> tuple[Path, Path]:
-    """A kit and a folder of scenes; without them nothing else is set up."""
+    """A kit and a folder of scenes; without them the test is skipped."""
     if not (paths := pytestconfig.getoption("--scenes")):
         pytest.skip("no scenes are given: --scenes KIT SCENES, as the benchmarks take them")
     return Path(paths[0]), Path(paths[1])
 
 
 @pytest.mark.timeout(1800)
-def test_scenes_are_drawn_as_the_service_does(
+def test_live_pictures_of_scenes_agree_with_service(
     given: tuple[Path, Path], desk: Page, service: Service, tmp_path: Path
 ) -> None:
     kit = load(given[0])

@@ -1,4 +1,4 @@
-"""Every view of the app, in light and dark, on a desk and on a phone: for all people, and without jumps."""
+"""Every view of the app, light and dark, on a desktop and a phone: accessible, and without layout shifts."""
 
 import os
 import re
@@ -24,7 +24,7 @@ SHIFTS = """
     }).observe({ type: "layout-shift", buffered: true });
 """
 MOST_SHIFT = 0.1
-"""Of a page that does not jump, by Core Web Vitals."""
+"""The most that Core Web Vitals call good."""
 DEVICES: dict[str, dict[str, Any]] = {
     "desk": {"viewport": {"width": 1200, "height": 800}},
     "phone": {"viewport": PHONE, "has_touch": True, "is_mobile": True},
@@ -33,14 +33,14 @@ DEVICES: dict[str, dict[str, Any]] = {
 
 @pytest.fixture(scope="module")
 def views(service: Service, ready: tuple[str, str]) -> dict[str, tuple[str, str]]:
-    """What to open, and a heading that is there then, by the name of a view."""
+    """The URL of each view, and a heading that it shows."""
     capture, matte = ready
     shown = {"preset": "sketch", "monitor": {"width": 1200, "height": 800}, "border": True}
     program = service.http.post("/v1/programs", json=shown).json()["id"]
     return {
         "film": ("#/film", "Choose a program"),
         "program": (f"#/film/{program}", "Before you start"),
-        "play": (f"v1/programs/{program}/play", "Show a program"),
+        "play": (f"v1/programs/{program}/play", "Play a program"),
         "captures": ("#/captures", "Captures"),
         "capture": (f"#/captures/{capture}", "Contact sheet"),
         "jobs": ("#/jobs", "Jobs"),
@@ -51,10 +51,10 @@ def views(service: Service, ready: tuple[str, str]) -> dict[str, tuple[str, str]
 
 
 def go(page: Page, service: Service, view: tuple[str, str]) -> None:
-    page.goto("about:blank")  # else only the part after `#` is another one, and the page the same
+    page.goto("about:blank")  # otherwise only the part after `#` changes, and the page is not loaded
     page.goto(f"{service.url}/{view[0]}")
     expect(page.get_by_role("heading", name=view[1]).first).to_be_visible()
-    if view[0].startswith("#/film/"):  # it is told what happens as long as it is open
+    if view[0].startswith("#/film/"):  # its event stream never ends
         page.wait_for_timeout(500)
     else:
         page.wait_for_load_state("networkidle")
@@ -68,7 +68,7 @@ def go(page: Page, service: Service, view: tuple[str, str]) -> None:
         for scheme in ("light", "dark")
     ],
 )
-def test_every_view_has_manners(
+def test_every_view_is_accessible_and_stable(
     browser: Browser,
     service: Service,
     views: dict[str, tuple[str, str]],
@@ -96,9 +96,7 @@ def test_every_view_has_manners(
             assert wrong == [], name
 
 
-def test_the_tabulator_gets_to_everything(
-    desk: Page, service: Service, views: dict[str, tuple[str, str]]
-) -> None:
+def test_tab_key_reaches_everything(desk: Page, service: Service, views: dict[str, tuple[str, str]]) -> None:
     for name, view in views.items():
         go(desk, service, view)
         wanted = desk.evaluate(
@@ -119,7 +117,7 @@ def test_the_tabulator_gets_to_everything(
         assert len(reached) >= wanted, name
 
 
-def test_the_documentation_is_drawn_from_here(desk: Page, service: Service) -> None:
+def test_api_documentation_is_served_locally(desk: Page, service: Service) -> None:
     desk.goto(f"{service.url}/docs")
     calls = sum(len(path) for path in service.http.get("/openapi.json").json()["paths"].values())
     expect(desk.locator(".opblock")).to_have_count(calls)
@@ -127,7 +125,7 @@ def test_the_documentation_is_drawn_from_here(desk: Page, service: Service) -> N
     expect(desk.locator(".opblock.is-open .parameters")).to_be_visible()
 
 
-def test_the_app_is_small_and_its_policy_strict(service: Service, views: dict[str, tuple[str, str]]) -> None:
+def test_app_is_small_and_its_policy_strict(service: Service, views: dict[str, tuple[str, str]]) -> None:
     files = [path for path in WEB.rglob("*") if path.is_file()]
     assert sum(path.stat().st_size for path in files) < 300_000
     for path in ("/", f"/{views['play'][0]}", "/docs"):
@@ -140,5 +138,5 @@ def test_the_app_is_small_and_its_policy_strict(service: Service, views: dict[st
             file = service.http.get(f"/{name}")
             assert file.status_code == 200
             assert file.headers["cache-control"] == "no-cache"
-    named = {path.name for path in files if path.suffix == ".js" and path.parent.name == "app"}
-    assert named == set(re.findall(r"web/app/(\w+\.js)", service.http.get("/").text))
+    scripts = {str(path.relative_to(WEB)) for path in (WEB / "app").rglob("*.js")}
+    assert scripts == set(re.findall(r"web/(app/[\w/]+\.js)", service.http.get("/").text))

@@ -1,4 +1,4 @@
-"""What goes wrong on the way: wrong files, broken lines, full disks, revoked keys, and what the app says then."""
+"""What can go wrong, and what the app says: wrong files, lost connections, full disks, revoked keys."""
 
 import io
 import os
@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, Route, expect
 
-from tests.browser.pages import MINUTE, ZIP, asks_before_it_closes, opened
+from tests.browser.pages import MINUTE, ZIP, asks_before_closing, opened
 from tests.end_to_end.conftest import Service, paused, serving
 from tests.parts.disks import small_disk
 
@@ -21,7 +21,7 @@ DISK = 48 << 20
 
 
 def empty_zip() -> bytes:
-    """What some other program would call its document."""
+    """A ZIP that is no capture archive, as of an office document."""
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
         archive.writestr("document.xml", "<document/>")
@@ -29,7 +29,7 @@ def empty_zip() -> bytes:
 
 
 def hold(page: Page) -> list[Route]:
-    """Where the parts of uploads that a page sends from now on stay until they are let go."""
+    """Holds the PATCH requests of uploads that a page sends from now on, until they are continued."""
     held: list[Route] = []
 
     def take(route: Route) -> None:
@@ -48,25 +48,25 @@ def envmatte_keys(data: Path, *given: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("name", "data", "said"),
+    ("name", "data", "reason"),
     [
         ("holiday.zip", b"twelve bytes", "neither a ZIP nor a film"),
         ("holiday.jpg", b"\xff\xd8\xff\xe0 and so on", "neither a ZIP nor a film"),
         ("holiday.docx", empty_zip(), "there is no capture.json"),
     ],
 )
-def test_a_wrong_file_is_refused_in_words(
-    desk: Page, service: Service, name: str, data: bytes, said: str
+def test_wrong_file_is_refused_with_reason(
+    desk: Page, service: Service, name: str, data: bytes, reason: str
 ) -> None:
     desk.goto(service.url)
     file = {"name": name, "mimeType": "application/octet-stream", "buffer": data}
     desk.get_by_label(ZIP).set_input_files(file)  # type: ignore[arg-type]
-    expect(desk.get_by_role("alert")).to_contain_text(said)
+    expect(desk.get_by_role("alert")).to_contain_text(reason)
     desk.get_by_role("button", name="Dismiss").click()
     expect(desk.get_by_role("alert")).to_have_count(0)
 
 
-def test_a_file_that_is_dropped_beside_does_not_take_the_page_s_place(desk: Page, service: Service) -> None:
+def test_file_dropped_beside_the_zone_does_not_replace_the_page(desk: Page, service: Service) -> None:
     desk.goto(service.url)
     files = desk.evaluate_handle(
         """() => {
@@ -85,7 +85,7 @@ def test_a_file_that_is_dropped_beside_does_not_take_the_page_s_place(desk: Page
     expect(desk.get_by_role("heading", name="Captures")).to_be_visible()
 
 
-def test_an_upload_that_breaks_off_goes_on(desk: Page, service: Service, ball: Path) -> None:
+def test_interrupted_upload_continues(desk: Page, service: Service, ball: Path) -> None:
     asked: list[str] = []
 
     def cut(route: Route) -> None:
@@ -97,16 +97,14 @@ def test_an_upload_that_breaks_off_goes_on(desk: Page, service: Service, ball: P
 
     desk.route("**/v1/uploads/**", cut)
     desk.goto(service.url)
-    with desk.expect_console_message(lambda said: "ERR_CONNECTION_RESET" in said.text):
+    with desk.expect_console_message(lambda message: "ERR_CONNECTION_RESET" in message.text):
         desk.get_by_label(ZIP).set_input_files(ball)
     expect(desk.get_by_text("trying again")).to_be_visible()
     expect(desk).to_have_url(re.compile(r"#/captures/\w+"), timeout=MINUTE)
     assert asked == ["PATCH", "HEAD", "PATCH"]
 
 
-def test_another_view_and_the_back_button_leave_an_upload_alone(
-    desk: Page, service: Service, ball: Path
-) -> None:
+def test_upload_survives_other_views_and_the_back_button(desk: Page, service: Service, ball: Path) -> None:
     held: list[Route] = []
     desk.route(
         "**/v1/uploads/*",
@@ -123,7 +121,7 @@ def test_another_view_and_the_back_button_leave_an_upload_alone(
     desk.go_forward()
     while not held:
         desk.wait_for_timeout(50)
-    assert asks_before_it_closes(desk)
+    assert asks_before_closing(desk)
     held.pop().continue_()
     desk.get_by_role("navigation").get_by_role("link", name="Captures").click()
     expect(desk.get_by_text("a ball", exact=True).first).to_be_visible(timeout=MINUTE)
@@ -131,7 +129,7 @@ def test_another_view_and_the_back_button_leave_an_upload_alone(
     assert desk.evaluate("Object.keys(localStorage)") == []
 
 
-def test_a_file_that_goes_up_in_two_tabs_is_one_capture(desk: Page, service: Service, ball: Path) -> None:
+def test_same_file_uploaded_in_two_tabs_is_one_capture(desk: Page, service: Service, ball: Path) -> None:
     before = {one["id"] for one in service.http.get("/v1/captures").json()["captures"]}
     desk.goto(service.url)
     second = desk.context.new_page()
@@ -161,9 +159,7 @@ def test_a_file_that_goes_up_in_two_tabs_is_one_capture(desk: Page, service: Ser
     assert made == {desk.url.rpartition("/")[2]}
 
 
-def test_a_reload_and_the_back_button_keep_the_view(
-    desk: Page, service: Service, ready: tuple[str, str]
-) -> None:
+def test_reload_and_back_button_keep_the_view(desk: Page, service: Service, ready: tuple[str, str]) -> None:
     _, matte = ready
     desk.goto(service.url)
     desk.get_by_role("link", name="a ball").first.click()
@@ -183,7 +179,7 @@ def test_a_reload_and_the_back_button_keep_the_view(
     expect(desk.get_by_role("alert")).to_contain_text("Not found")
 
 
-def test_what_another_tab_has_deleted_is_deleted(desk: Page, service: Service, ball: Path) -> None:
+def test_deleting_what_another_tab_deleted_succeeds(desk: Page, service: Service, ball: Path) -> None:
     capture = service.client.upload(ball)
     service.client.wait(capture["job"])
     recovered = service.client.wait(service.client.recover(capture["id"], quality="fast")["id"])
@@ -196,14 +192,14 @@ def test_what_another_tab_has_deleted_is_deleted(desk: Page, service: Service, b
         expect(desk.get_by_role("heading", name=title)).to_be_visible()
         assert service.http.delete(f"/v1/{kind}/{one}").status_code == 204
         desk.get_by_role("button", name="Delete", exact=True).click()
-        desk.get_by_role("button", name="Delete it").click()
+        desk.get_by_role("button", name=f"Delete {kind[:-1]}").click()
         expect(desk).to_have_url(re.compile(f"#/{kind}$"))
         expect(desk.get_by_role("alert")).to_have_count(0)
-        desk.go_back()  # not to what is gone
+        desk.go_back()  # not to what was deleted
         expect(desk).not_to_have_url(re.compile(one))
 
 
-def test_a_job_that_another_tab_has_deleted_is_gone(
+def test_job_deleted_by_another_tab_is_not_found(
     desk: Page, service: Service, ready: tuple[str, str]
 ) -> None:
     with paused(service):
@@ -211,10 +207,10 @@ def test_a_job_that_another_tab_has_deleted_is_gone(
         desk.goto(f"{service.url}/#/jobs/{job}")
         cancel = desk.get_by_role("button", name="Cancel")
         expect(cancel).to_be_visible()
-        # As a line that was cut would have it: of the end, nothing is heard.
+        # As if the connection were cut: the page learns nothing of the end.
         desk.route(f"**/v1/jobs/{job}/events", lambda route: route.abort("connectionreset"))
         desk.reload()
-        expect(desk.get_by_text("it is asked again")).to_be_visible()
+        expect(desk.get_by_text("trying again")).to_be_visible()
         service.http.post(f"/v1/jobs/{job}/cancel")
         while service.http.delete(f"/v1/jobs/{job}").status_code != 204:
             desk.wait_for_timeout(100)
@@ -223,7 +219,7 @@ def test_a_job_that_another_tab_has_deleted_is_gone(
         expect(cancel).to_have_count(0)
 
 
-def test_a_file_that_goes_away_in_an_upload_is_named(desk: Page, service: Service, tmp_path: Path) -> None:
+def test_file_removed_during_upload_is_named(desk: Page, service: Service, tmp_path: Path) -> None:
     film = tmp_path / "card.zip"
     film.write_bytes(b"PK\x03\x04" + bytes(9 << 20))  # more than one part
     held = hold(desk)
@@ -234,25 +230,23 @@ def test_a_file_that_goes_away_in_an_upload_is_named(desk: Page, service: Servic
     film.rename(tmp_path / "elsewhere")
     held.pop().continue_()
     expect(desk.get_by_role("alert")).to_contain_text(
-        "card.zip was changed, moved or taken out", timeout=MINUTE
+        "card.zip was changed, moved or removed", timeout=MINUTE
     )
     (tmp_path / "elsewhere").rename(film)
-    desk.get_by_role("button", name="Go on").click()
+    desk.get_by_role("button", name="Continue").click()
     while not held:
         desk.wait_for_timeout(50)
     assert held[0].request.header_value("upload-offset") == str(8 << 20)
 
 
-def test_a_key_is_typed_wrong_and_another_revoked_in_an_upload(
-    browser: Browser, ball: Path, tmp_path: Path
-) -> None:
+def test_wrong_key_then_key_revoked_during_upload(browser: Browser, ball: Path, tmp_path: Path) -> None:
     data = tmp_path / "data"
     with serving(data, "--workers", "1", ENVMATTE_KEYS="first") as locked, opened(browser) as page:
         lab = envmatte_keys(data, "make", "lab").split()[-1]
         page.goto(locked.url)
         key = page.get_by_label("Key of the service")
-        unknown = page.get_by_text("This key is not known to the service")
-        key.fill("ключ")  # which no header can hold
+        unknown = page.get_by_text("The service does not know this key")
+        key.fill("ключ")  # no header can hold it
         page.keyboard.press("Enter")
         expect(unknown).to_be_visible()
         key.fill(lab)
@@ -266,16 +260,16 @@ def test_a_key_is_typed_wrong_and_another_revoked_in_an_upload(
         expect(unknown).to_be_visible()
         page.keyboard.press("Escape")
         row = page.get_by_role("region", name="ball.zip")
-        expect(row).to_contain_text("what has come is kept")
+        expect(row).to_contain_text("the bytes sent so far are kept")
         expect(unknown).to_be_hidden()
         page.unroute("**/v1/uploads/*")
-        row.get_by_role("button", name="Go on").click()
+        row.get_by_role("button", name="Continue").click()
         key.fill("first")
         page.keyboard.press("Enter")
         expect(page.get_by_role("heading", name="a ball")).to_be_visible(timeout=MINUTE)
 
 
-def test_a_disk_that_is_full_is_said_and_the_upload_goes_on_with_room(
+def test_full_disk_is_reported_and_upload_continues_with_room(
     browser: Browser, ball: Path, tmp_path: Path
 ) -> None:
     with small_disk(tmp_path / "disk", DISK) as disk, serving(disk / "data", "--workers", "1") as small:
@@ -288,12 +282,12 @@ def test_a_disk_that_is_full_is_said_and_the_upload_goes_on_with_room(
             expect(page.get_by_role("alert")).to_contain_text("There is no room for it")
             expect(page.get_by_role("alert")).to_contain_text(re.compile("delete|room|free"))
             ballast.unlink()
-            page.get_by_role("button", name="Go on").click()
+            page.get_by_role("button", name="Continue").click()
             expect(page).to_have_url(re.compile(r"#/captures/\w+"), timeout=MINUTE)
             expect(page.get_by_role("heading", name="a ball")).to_be_visible()
 
 
-def test_the_server_goes_away_in_an_upload_and_comes_back_with_another_key(
+def test_service_restarts_with_another_key_during_upload(
     browser: Browser, ball: Path, tmp_path: Path
 ) -> None:
     folder = tmp_path / "data"
@@ -319,7 +313,7 @@ def test_the_server_goes_away_in_an_upload_and_comes_back_with_another_key(
             page.get_by_label(ZIP).set_input_files(ball)
             expect(page.get_by_text("trying again")).to_be_visible(timeout=MINUTE)
         with serving(folder, *settings, ENVMATTE_KEYS="second"):
-            expect(page.get_by_text("This key is not known to the service")).to_be_visible(timeout=MINUTE)
+            expect(page.get_by_text("The service does not know this key")).to_be_visible(timeout=MINUTE)
             page.get_by_label("Key of the service").fill("second")
             page.keyboard.press("Enter")
             expect(page.get_by_role("heading", name="a ball")).to_be_visible(timeout=MINUTE)

@@ -39,10 +39,10 @@ def go(tab: Page, service: Service, program: dict[str, Any]) -> str:
 
 
 def drawn(tab: Page, program: dict[str, Any], number: int, white: bool) -> NDArray[np.uint8]:
-    """The display's frame as the page draws it, (360, 640, 3)."""
+    """A frame as the page draws it, (360, 640, 3)."""
     url = tab.evaluate(
         """async ([number, white]) => {
-            const page = await import(new URL("/web/clock.js", location.href));
+            const page = await import(new URL("/web/play/border.js", location.href));
             const canvas = Object.assign(document.createElement("canvas"), { width: 640, height: 360 });
             const blob = number < 0 ? null : await (await fetch(`patterns/${number}.png`)).blob();
             const picture = blob && (await createImageBitmap(blob, { colorSpaceConversion: "none" }));
@@ -55,11 +55,11 @@ def drawn(tab: Page, program: dict[str, Any], number: int, white: bool) -> NDArr
     return np.asarray(image.convert("RGB"))
 
 
-def test_the_page_has_the_rules_of_the_clock(tab: Page, service: Service) -> None:
+def test_page_has_the_rules_of_the_border(tab: Page, service: Service) -> None:
     go(tab, service, posted(service))
     rules = tab.evaluate(
         """async ([displays, numbers]) => {
-            const page = await import(new URL("/web/clock.js", location.href));
+            const page = await import(new URL("/web/play/border.js", location.href));
             return {
                 borders: displays.map(([width, height]) => page.borderOn(width, height)),
                 codes: numbers.map(page.code),
@@ -84,7 +84,7 @@ def test_the_page_has_the_rules_of_the_clock(tab: Page, service: Service) -> Non
     assert [(step["seconds"], step["number"], step["white"]) for step in rules["schedule"]] == expected
 
 
-def test_the_page_draws_what_the_clock_draws(tab: Page, service: Service) -> None:
+def test_page_draws_the_border(tab: Page, service: Service) -> None:
     program = posted(service)
     go(tab, service, program)
     shown = Program.model_validate(program["program"])
@@ -103,7 +103,7 @@ def test_the_page_draws_what_the_clock_draws(tab: Page, service: Service) -> Non
 def test_every_pattern_is_shown_in_order_for_its_time(tab: Page, service: Service) -> None:
     program = posted(service)
     go(tab, service, program)
-    # What is on the canvas at each of the display's frames, seen by a loop of its own.
+    # Samples the canvas at every frame of the display, in a loop of its own.
     tab.evaluate(
         """(boxes) => {
             window.seen = [];
@@ -130,7 +130,7 @@ def test_every_pattern_is_shown_in_order_for_its_time(tab: Page, service: Servic
     steps = program_border.schedule(32, 10)
     assert [(s["number"], s["white"]) for s in played["shown"]] == [(s.number, s.white) for s in steps]
 
-    # The numbers as a reader sees them, and black and white of the lead.
+    # The pattern numbers as the reader of the border sees them, and black and white of the lead-in.
     numbers, certain = program_border.read(np.array([cells for *_, cells in seen], float))
     at = np.array([now for now, *_ in seen])
     states = [
@@ -142,7 +142,7 @@ def test_every_pattern_is_shown_in_order_for_its_time(tab: Page, service: Servic
     expected = [(s.number, s.white if s.number == program_border.LEAD else None) for s in steps]
     runs = [(state, [i for i, _ in group]) for state, group in groupby(enumerate(states), key=lambda e: e[1])]
     assert [state for state, _ in runs] == expected
-    # Each is there for its number of refreshes, to one; frames that this machine had no time for are made up for.
+    # Each step lasts its number of refreshes, to within one; frames that this machine missed are accounted for.
     lost = np.concatenate([[0], np.cumsum(np.rint(np.diff(times) / refresh) - 1)])
     before = 0
     for (_, now), (_, after), step in zip(runs[:-1], runs[1:], steps, strict=False):
@@ -162,7 +162,7 @@ def test_every_pattern_is_shown_in_order_for_its_time(tab: Page, service: Servic
     assert record["program"] == program["program"]
 
 
-def test_escape_stops_it_and_it_can_be_shown_again(tab: Page, service: Service) -> None:
+def test_escape_stops_and_program_can_be_played_again(tab: Page, service: Service) -> None:
     go(tab, service, posted(service))
     start = tab.get_by_role("button", name="full screen")
     for _ in range(2):
@@ -175,7 +175,7 @@ def test_escape_stops_it_and_it_can_be_shown_again(tab: Page, service: Service) 
         expect(start).to_be_focused()
 
 
-def test_the_back_button_ends_it_and_keeps_what_is_loaded(tab: Page, service: Service) -> None:
+def test_back_button_stops_and_keeps_loaded_patterns(tab: Page, service: Service) -> None:
     program = posted(service)
     tab.goto(service.url)
     url = go(tab, service, program)
@@ -192,7 +192,7 @@ def test_the_back_button_ends_it_and_keeps_what_is_loaded(tab: Page, service: Se
     expect(tab.get_by_role("heading", name="Captures")).to_be_visible()
 
 
-def test_whoever_leaves_it_stops_it(tab: Page, service: Service) -> None:
+def test_leaving_the_page_stops_the_program(tab: Page, service: Service) -> None:
     program = posted(service)
     go(tab, service, program)
     tab.get_by_role("button", name="full screen").click()
@@ -202,29 +202,29 @@ def test_whoever_leaves_it_stops_it(tab: Page, service: Service) -> None:
         tab.wait_for_timeout(100)
 
 
-def test_a_program_of_another_size_is_made_for_this_screen(tab: Page, service: Service) -> None:
+def test_program_of_another_size_is_fitted_to_this_screen(tab: Page, service: Service) -> None:
     first = go(tab, service, posted(service, monitor={"width": 800, "height": 600}))
-    expect(tab.get_by_text("made for a screen of 800 x 600 pixels; this one has 640 x 360")).to_be_visible()
+    expect(
+        tab.get_by_text("made for a screen of 800 x 600 pixels; this screen has 640 x 360")
+    ).to_be_visible()
     with tab.expect_navigation():
-        tab.get_by_role("button", name="Make it for this screen").click()
+        tab.get_by_role("button", name="Fit it to this screen").click()
     expect(tab.get_by_role("status")).to_have_text("Ready.")
     assert tab.url != first
     expect(tab.get_by_text("32 patterns of 604 x 324 pixels")).to_be_visible()
     expect(tab.locator("#fit")).to_be_hidden()
 
 
-def test_a_key_is_asked_for_where_the_service_wants_one(
-    tab: Page, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_page_asks_for_a_key_where_needed(tab: Page, tmp_path_factory: pytest.TempPathFactory) -> None:
     folder = tmp_path_factory.mktemp("locked") / "data"
     with serving(folder, "--workers", "1", ENVMATTE_KEYS="secret") as locked:
         locked.http.headers["Authorization"] = "Bearer secret"
         program = posted(locked)
         tab.goto(f"{locked.url}/v1/programs/{program['id']}/play")
         key = tab.get_by_label("Key of the service")
-        for text, said in (("wrong", "send a key"), ("ключ", "send a key"), ("secret", "Ready.")):
+        for text, status in (("wrong", "send a key"), ("ключ", "send a key"), ("secret", "Ready.")):
             expect(key).to_be_visible()
             key.fill(text)
             key.press("Enter")
-            expect(tab.get_by_role("status")).to_contain_text(said)
+            expect(tab.get_by_role("status")).to_contain_text(status)
         expect(key).to_be_hidden()

@@ -1,4 +1,4 @@
-"""What a website of others can do, by the browser of somebody on the machine, with a service that has no keys."""
+"""What another website can do, in a browser on this machine, with a service without keys."""
 
 import http.server
 import threading
@@ -30,12 +30,12 @@ def site(tmp_path: Path) -> Iterator[str]:
         thread.join()
 
 
-def test_a_site_sends_nothing_to_a_service_without_keys(tab: Page, service: Service, site: str) -> None:
+def test_foreign_site_cannot_send_to_service_without_keys(tab: Page, service: Service, site: str) -> None:
     url, before = f"{service.url}/v1/programs", service.http.get("/v1/programs").json()
     tab.goto(site)
-    assert tab.evaluate(SEND, [url, ASKED]) == "TypeError"  # of the answer it is not told even the status
+    assert tab.evaluate(SEND, [url, ASKED]) == "TypeError"  # not even the status of the response is visible
     assert service.http.get("/v1/programs").json() == before
-    tab.goto(f"{service.url}/docs")  # where the same call is that of a page of the service
+    tab.goto(f"{service.url}/docs")  # a page of the service may make the same call
     assert tab.evaluate(SEND, [url, ASKED]) in (200, 201)
     made = service.http.get("/v1/programs").json()["programs"]
     assert len(made) > len(before["programs"])
@@ -44,8 +44,8 @@ def test_a_site_sends_nothing_to_a_service_without_keys(tab: Page, service: Serv
 @pytest.mark.parametrize(
     "name", ["evil.example", "evil.example:80", "localhost.evil.example", "10.0.0.1:8000", "[::2]", "["]
 )
-def test_a_name_that_leads_here_is_not_enough(service: Service, name: str) -> None:
-    """As by DNS rebinding, where the site's own name leads to this machine, and its scripts may read answers."""
+def test_foreign_host_name_is_refused(service: Service, name: str) -> None:
+    """As in DNS rebinding: the name of a site resolves to this machine, and its scripts could read responses."""
     for method, path in (
         ("GET", "/v1/captures"),
         ("GET", "/metrics"),
@@ -57,7 +57,7 @@ def test_a_name_that_leads_here_is_not_enough(service: Service, name: str) -> No
 
 
 @pytest.mark.parametrize("name", ["localhost", "127.0.0.1", "127.1.2.3", "[::1]", "glass.localhost"])
-def test_names_of_this_machine_are(service: Service, name: str) -> None:
+def test_own_host_name_is_accepted(service: Service, name: str) -> None:
     port = service.url.rpartition(":")[2]
     for host in (name, f"{name}:{port}"):
         assert service.http.get("/v1/captures", headers={"Host": host}).status_code == 200
@@ -66,5 +66,5 @@ def test_names_of_this_machine_are(service: Service, name: str) -> None:
 
 
 @pytest.mark.parametrize("origin", ["null", "https://evil.example", "http://127.0.0.1:1", "http://[", "x"])
-def test_an_origin_of_others_is_refused(service: Service, origin: str) -> None:
+def test_foreign_origin_is_refused(service: Service, origin: str) -> None:
     check_problem(service.http.post("/v1/jobs", json={}, headers={"Origin": origin}), 403, "foreign-site")

@@ -1,6 +1,6 @@
-// Which view is shown: the part of the URL after `#` says it, so that a reload and the back button keep it.
-import { h, said } from "./lib/dom.js";
-import { taking } from "./film/recorder.js";
+// Shows the view that the part of the URL after `#` names, so that a reload and the back button keep it.
+import { h, problemBox } from "./lib/dom.js";
+import { recordings } from "./lib/recordings.js";
 import { captures } from "./views/captures.js";
 import { capture } from "./views/capture.js";
 import { filming, program } from "./film/program.js";
@@ -9,14 +9,14 @@ import { matte, mattes } from "./views/mattes.js";
 
 const VIEWS = { film: [filming, program], captures: [captures, capture], jobs: [jobs, job], mattes: [mattes, matte] };
 const main = document.getElementById("main");
-const note = document.getElementById("taking");
-const views = new Map(); // by their part of the URL: the one that is shown, and those in which a film is being taken
+const note = document.getElementById("recording");
+const views = new Map(); // by their part of the URL: the one that is shown, and those that record a film
 let shown;
 
-// Whoever leaves a view in which a film is being taken does not end the film: the view goes on, to be shown again.
+// Ends the views that are not shown, except those that record a film: these go on, and are shown again when opened.
 function tidy() {
   for (const [hash, view] of views) {
-    if (view === shown || taking.has(view.signal)) continue;
+    if (view === shown || recordings.has(view.signal)) continue;
     view.stop.abort();
     views.delete(hash);
   }
@@ -24,9 +24,9 @@ function tidy() {
   note.hidden = !away;
   if (away) note.hash = away;
 }
-addEventListener("taking", tidy);
+addEventListener("recording", tidy);
 
-function opened(hash) {
+function open(hash) {
   const stop = new AbortController();
   const view = { stop, signal: stop.signal, element: h("div", { class: "view" }) };
   views.get(hash)?.stop.abort();
@@ -34,11 +34,11 @@ function opened(hash) {
   return view;
 }
 
-async function route(moved) {
+async function route(navigated) {
   const [hash, name, id] = /^#\/(\w+)(?:\/([\w-]+))?$/.exec(location.hash) ?? [];
   if (!VIEWS[name]) return location.replace("#/captures");
   const before = views.get(hash);
-  const view = (shown = taking.has(before?.signal) ? before : opened(hash));
+  const view = (shown = recordings.has(before?.signal) ? before : open(hash));
   tidy();
   for (const link of document.querySelectorAll("nav a")) {
     if (link.hash === `#/${name}`) link.setAttribute("aria-current", "page");
@@ -47,27 +47,27 @@ async function route(moved) {
   main.replaceChildren(view.element);
   main.ariaBusy = "true";
   try {
-    if (view === before) view.again();
-    else view.again = await VIEWS[name][id ? 1 : 0](view.element, view.signal, id);
+    if (view === before) view.resume();
+    else view.resume = await VIEWS[name][id ? 1 : 0](view.element, view.signal, id);
   } catch (error) {
-    if (!view.signal.aborted) view.element.append(said(error));
+    if (!view.signal.aborted) view.element.append(problemBox(error));
   }
   if (view !== shown) return;
   main.ariaBusy = "false";
   const title = main.querySelector("h1");
   document.title = `${title?.textContent ?? "envmatte"} · envmatte`;
-  if (moved) {
+  if (navigated) {
     scrollTo(0, 0);
     main.focus({ preventScroll: true });
   }
 }
 
-// Not by its link, which would take the place of the view in the URL.
+// Moves the focus without following the link, which would replace the view in the URL.
 document.querySelector(".skip").onclick = (event) => {
   event.preventDefault();
   main.focus();
 };
-// A file that misses where it is wanted would take the place of the page.
+// Ignores files dropped beside a drop zone: the browser would leave the page to show them.
 for (const type of ["dragover", "drop"]) {
   addEventListener(type, (event) => {
     if (event.defaultPrevented || !event.dataTransfer.types.includes("Files")) return;

@@ -1,2 +1,2 @@
-// The API's documentation, drawn by Swagger UI from what the service says of itself.
+// The documentation of the API, drawn by Swagger UI from openapi.json.
 globalThis.SwaggerUIBundle({ url: "openapi.json", dom_id: "#docs", deepLinking: true, validatorUrl: null });

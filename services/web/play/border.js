@@ -1,4 +1,4 @@
-// Where the cells of the border lie, what they show, and what is shown when: as workflows/clock.py has it.
+// The border around a program: its cells, what they show, and when. The same as workflows/programs/border.py.
 
 const BITS = 12;
 const TICKS = 8;
@@ -43,7 +43,7 @@ export function schedule(count, rate) {
   return [...lead, ...patterns, ...lead];
 }
 
-// Draws a picture, or the lead's black or white where there is none, in the border.
+// Draws the border around a picture, or around the black or white of the lead-in.
 export function draw(context, border, step, picture) {
   context.fillStyle = "#000";
   context.fillRect(0, 0, border.width, border.height);

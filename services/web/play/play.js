@@ -1,14 +1,14 @@
-// Shows a program full screen, and tells the service how far it is, for a phone that follows.
+// Plays a program full screen, and reports its progress to the service for a phone that follows.
 import { LEAD, LEAD_SECONDS, borderOn, draw, schedule } from "./border.js";
 import { authorization } from "../app/lib/api.js";
 import { CHECKS } from "../app/film/checklist.js";
 
 const COUNTDOWN = 5; // seconds
-const AHEAD = 8; // pictures decoded before they are shown: all of them would fill the memory
-const AT_ONCE = 4; // requests
-const TELL = 2000; // ms between two reports of how far it is
+const AHEAD = 8; // pictures decoded ahead: all of them would fill the memory
+const AT_ONCE = 4; // parallel requests
+const REPORT = 2000; // ms between two reports of progress
 
-// The pictures of a program: all fetched before it starts, the next few of them decoded.
+// The pictures of a program: all are fetched before it starts, the next few are decoded.
 class Pictures {
   #blobs = [];
   #decoded = new Map();
@@ -26,7 +26,7 @@ class Pictures {
     await Promise.all(Array.from({ length: AT_ONCE }, work));
   }
 
-  // Decodes from a number on, and lets go of what is before it.
+  // Decodes the pictures from a number on, and frees those before it.
   async prepare(first) {
     for (const [n, entry] of this.#decoded) {
       if (n < first) {
@@ -50,7 +50,7 @@ class Pictures {
   }
 }
 
-// A page that is hidden or left has none: what stops it is not waited for in vain.
+// The next animation frame. A hidden page has none, so stopping rejects.
 const nextFrame = (stopped) =>
   new Promise((resolve, reject) => {
     if (stopped.aborted) return reject(stopped.reason);
@@ -58,9 +58,9 @@ const nextFrame = (stopped) =>
     stopped.onabort = () => reject(stopped.reason);
   });
 
-// Shows the steps, each for a whole number of the display's refreshes, and none before its picture is there. Where one
-// refresh was missed, the next step makes up for it; where more were, it is as long as any, and the beat starts anew: no
-// step is ever left out. Returns when each of them was first shown.
+// Shows the steps, each for a whole number of the display's refreshes, and none before its picture is decoded. If one
+// refresh is missed, the next step is shorter by it; if more are, the next step has its full length and the beat starts
+// again from there. No step is left out. Returns when each step was first shown.
 async function show(context, border, steps, pictures, refresh, stopped, passed) {
   const shown = [];
   let due = -Infinity;
@@ -74,18 +74,18 @@ async function show(context, border, steps, pictures, refresh, stopped, passed) 
     draw(context, border, step, picture);
     shown.push({ number: step.number, white: step.white, at: now });
     passed(step.number);
-    // On time, the next is due by the steady beat; too late, by a new one.
+    // On time, the next step follows the beat; too late, a new beat starts.
     const start = now < due + 1.5 * refresh ? due : now;
     due = start + Math.max(1, Math.round((step.seconds * 1000) / refresh)) * refresh;
     if (i + 1 < steps.length && steps[i + 1].number !== LEAD) {
-      pictures.prepare(steps[i + 1].number).catch(() => {}); // a picture that fails is waited for, until Escape
+      pictures.prepare(steps[i + 1].number).catch(() => {}); // the program waits for a picture that fails, until Escape
     }
   }
   while ((await nextFrame(stopped)) < due - refresh / 2);
   return shown;
 }
 
-// Counts down, and measures the refresh of the display meanwhile: the median of its frames' distances, in milliseconds.
+// Counts down, and meanwhile measures the refresh interval of the display: the median between frames, in milliseconds.
 async function countDown(element, stopped) {
   const begin = await nextFrame(stopped);
   const times = [begin];
@@ -99,7 +99,7 @@ async function countDown(element, stopped) {
   return distances[Math.floor(distances.length / 2)];
 }
 
-// Gives a canvas as many pixels as the display has under it.
+// Gives a canvas one pixel for each pixel of the display under it.
 async function fill(canvas) {
   const [width, height] = await new Promise((resolve) => {
     const observer = new ResizeObserver(([entry]) => {
@@ -115,14 +115,14 @@ async function fill(canvas) {
     try {
       observer.observe(canvas, { box: "device-pixel-content-box" });
     } catch {
-      observer.observe(canvas); // Safari knows CSS pixels alone
+      observer.observe(canvas); // Safari measures in CSS pixels only
     }
   });
   [canvas.width, canvas.height] = [width, height];
 }
 
 const $ = (id) => document.getElementById(id);
-const say = (text) => ($("status").textContent = text);
+const setStatus = (text) => ($("status").textContent = text);
 const here = new URL(".", location.href);
 const screenSize = () => ({
   width: Math.round(screen.width * devicePixelRatio),
@@ -138,9 +138,9 @@ async function ask(path, options = {}) {
 
 const id = here.pathname.split("/").at(-2);
 
-// What is told is for others to see: the showing goes on without. It gets there from a page that is left, too.
-const tell = (told) =>
-  ask("showing", { method: "PUT", body: JSON.stringify(told), headers: { "Content-Type": "application/json" }, keepalive: true }).catch(() => {});
+// Reports progress to the service. The program continues if that fails; `keepalive` sends it when the page is closed, too.
+const report = (progress) =>
+  ask("showing", { method: "PUT", body: JSON.stringify(progress), headers: { "Content-Type": "application/json" }, keepalive: true }).catch(() => {});
 
 async function open() {
   const program = await (await ask(`../${id}`)).json();
@@ -148,15 +148,15 @@ async function open() {
   $("about").textContent = `${patterns} patterns of ${monitor.width} x ${monitor.height} pixels.`;
   const size = screenSize();
   if (display?.width !== size.width || display?.height !== size.height) {
-    const made = display ? `It is made for a screen of ${display.width} x ${display.height} pixels` : "It has no room";
-    $("misfit").textContent = `${made}; this one has ${size.width} x ${size.height}, so it is stretched and less sharp.`;
+    const made = display ? `This program is made for a screen of ${display.width} x ${display.height} pixels` : "This program has no border";
+    $("misfit").textContent = `${made}; this screen has ${size.width} x ${size.height}, so patterns are stretched and less sharp.`;
     $("fit").hidden = false;
-    $("refit").onclick = () => refit(program.program, size).catch((error) => say(error.message));
+    $("refit").onclick = () => refit(program.program, size).catch((error) => setStatus(error.message));
   }
   const pictures = new Pictures();
-  say("Loading the patterns.");
+  setStatus("Loading the patterns.");
   await pictures.load(patterns, ask, (share) => ($("loaded").value = share));
-  say("Ready.");
+  setStatus("Ready.");
   $("start").disabled = false;
   $("settings").onsubmit = (event) => {
     event.preventDefault();
@@ -176,42 +176,42 @@ async function play(program, pictures, rate) {
   const { signal } = stop;
   const listen = (target, event, listener) => target.addEventListener(event, listener, { signal });
   const end = (why) => stop.abort(new Error(why));
-  const told = { phase: "countdown", patterns_per_second: rate, seconds: COUNTDOWN + LEAD_SECONDS.reduce((sum, one) => sum + one) };
+  const progress = { phase: "countdown", patterns_per_second: rate, seconds: COUNTDOWN + LEAD_SECONDS.reduce((sum, one) => sum + one) };
   let lock;
-  let toldAt = -TELL;
+  let reportedAt = -REPORT;
   $("record").hidden = true;
   $("start").disabled = true;
   try {
     stage.hidden = false;
-    // Where there is no full screen for elements, the stage fills the window.
+    // Without full screen for elements, the stage fills the window.
     const full = await stage.requestFullscreen?.({ navigationUI: "hide" }).then(() => true, () => false);
     lock = await navigator.wakeLock?.request("screen").catch(() => undefined);
     listen(document, "keydown", (event) => event.key === "Escape" && end("Stopped."));
     listen(document, "fullscreenchange", () => full && !document.fullscreenElement && end("Stopped."));
-    // The back button ends the showing, and leaves the page with all that it has loaded.
+    // The back button stops the program without leaving the page and what it has loaded.
     if (!history.state?.showing) history.pushState({ showing: true }, "");
     listen(window, "popstate", () => end("Stopped."));
     listen(document, "visibilitychange", () => document.hidden && end("Stopped: the page was hidden."));
     await pictures.prepare(0);
-    tell(told);
+    report(progress);
     const refresh = await countDown($("countdown"), signal);
     await fill(canvas);
-    listen(window, "resize", () => end("Stopped: the window changed its size."));
+    listen(window, "resize", () => end("Stopped: the window was resized."));
     const border = borderOn(canvas.width, canvas.height);
     if (!border.fits) throw new Error("The window is too small for the border: make it larger.");
     const context = canvas.getContext("2d", { alpha: false });
-    Object.assign(told, { phase: "showing", seconds: 0, border: { width: border.width, height: border.height } });
+    Object.assign(progress, { phase: "showing", seconds: 0, border: { width: border.width, height: border.height } });
     const passed = (number) => {
-      if (number === LEAD || performance.now() < toldAt + TELL) return;
-      toldAt = performance.now();
-      tell({ ...told, shown: number + 1 });
+      if (number === LEAD || performance.now() < reportedAt + REPORT) return;
+      reportedAt = performance.now();
+      report({ ...progress, shown: number + 1 });
     };
     const shown = await show(context, border, schedule(program.patterns, rate), pictures, refresh, signal, passed);
-    told.patterns_per_second = finish(program, border, shown, refresh);
-    tell({ ...told, phase: "shown", shown: program.patterns });
+    progress.patterns_per_second = finish(program, border, shown, refresh);
+    report({ ...progress, phase: "shown", shown: program.patterns });
   } catch (error) {
-    tell({ ...told, phase: "stopped", seconds: 0 });
-    say(error.message);
+    report({ ...progress, phase: "stopped", seconds: 0 });
+    setStatus(error.message);
   } finally {
     stop.abort();
     if (history.state?.showing && !document.hidden) history.back();
@@ -234,7 +234,7 @@ function finish(program, { width, height }, shown, refresh) {
   URL.revokeObjectURL($("capture").href);
   $("capture").href = URL.createObjectURL(new Blob([JSON.stringify(record, null, 1)], { type: "application/json" }));
   $("record").hidden = false;
-  say(`All ${patterns.length} patterns were shown, ${rate} a second. Stop the film.`);
+  setStatus(`All ${patterns.length} patterns were shown, ${rate} a second. Stop recording.`);
   document.dispatchEvent(new CustomEvent("played", { detail: { shown, refresh, record } }));
   return rate;
 }
@@ -249,5 +249,5 @@ $("unlock").onsubmit = (event) => {
 $("checks").append(...CHECKS.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
 $("follow").href = new URL(`/#/film/${id}`, here);
 
-const start = () => open().catch((error) => say(error.message));
+const start = () => open().catch((error) => setStatus(error.message));
 start();

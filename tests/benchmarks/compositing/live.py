@@ -50,17 +50,17 @@ COARSEST = 2
 SOFTWARE = ("swiftshader", "llvmpipe", "software", "basic render")
 BROWSER = "--no-sandbox", "--enable-unsafe-swiftshader"
 OPEN = """async ([id, monitor]) => {
-    const { lightOf, glass } = await import("/web/app/glass.js");
-    const { fetchLive } = await import("/web/app/live.js");
+    const { webglContext, createPainter } = await import("/web/app/composite/webgl.js");
+    const { fetchLive } = await import("/web/app/composite/live.js");
     const found = await fetchLive(id);
-    const gl = lightOf(document.createElement("canvas"));
+    const gl = webglContext(document.createElement("canvas"));
     const told = gl.getExtension("WEBGL_debug_renderer_info");
-    window.bench = { gl, painter: glass(gl, found, monitor) };
+    window.bench = { gl, painter: createPainter(gl, found, monitor) };
     return gl.getParameter(told ? told.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
 }"""
 DRAW = """async ([picture, places]) => {
     const bytes = Uint8Array.from(atob(picture), (one) => one.charCodeAt(0));
-    bench.painter.take(await createImageBitmap(new Blob([bytes]), { premultiplyAlpha: "none" }));
+    bench.painter.setBackdrop(await createImageBitmap(new Blob([bytes]), { premultiplyAlpha: "none" }));
     return places.map((at) => {
         bench.painter.draw(at);
         return bench.gl.canvas.toDataURL("image/png").split(",")[1];

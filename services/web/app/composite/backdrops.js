@@ -1,7 +1,7 @@
-// Backdrops: pictures that are made here, and those that people bring.
+// Backdrops: built-in pictures, and files that users choose.
 
-export const PREVIEW = 640; // pixels of the longer side, of what is sent while a hand moves
-const DRAWABLE = 2048; // and of what this browser draws: as fine as monitors
+export const PREVIEW = 640; // pixels of the longer side, of what is sent while the user moves the backdrop
+const DRAWABLE = 2048; // pixels of the longer side of what this browser draws: as fine as monitors
 
 const canvasOf = (width, height) => Object.assign(document.createElement("canvas"), { width, height });
 
@@ -53,10 +53,10 @@ export async function backdrop(name, width, height) {
   return blobOf(canvas);
 }
 
-// A backdrop that can be chosen is `{name, exact, quick}`: functions that make what the service gets, whole and while a
-// hand moves. With `picture`, this browser can draw it too; `moving` ones play, and `close` lets go of what they hold.
+// A backdrop is `{name, exact, quick}`: two functions that make what the service gets, at full size and while the user
+// moves it. With `picture`, this browser can draw it too; a `moving` one plays; `close` frees what it holds.
 
-// One of those above, for a monitor.
+// A built-in backdrop, with the aspect of a monitor.
 export async function builtIn(name, [wide, high]) {
   const width = Math.min(wide, 1280);
   const picture = canvasOf(width, Math.max(1, Math.round((width * high) / wide)));
@@ -65,12 +65,12 @@ export async function builtIn(name, [wide, high]) {
   return { name, exact: () => blob, quick: () => blob, picture };
 }
 
-// A picture that was brought. Of large ones a small copy is sent while they are moved.
-export async function brought(file) {
+// A picture from a file. Of a large one a small copy is sent while the user moves it.
+export async function fromFile(file) {
   const exact = () => file;
   const name = file.name || "Pasted picture";
   const read = { premultiplyAlpha: "none" };
-  const whole = await createImageBitmap(file, read).catch(() => null); // the browser reads no TIFF and no EXR: the service does
+  const whole = await createImageBitmap(file, read).catch(() => null); // TIFF and EXR, which only the service reads
   if (!whole) return { name, exact, quick: exact };
   const longer = Math.max(whole.width, whole.height);
   let picture = whole;
@@ -84,7 +84,7 @@ export async function brought(file) {
   return { name, exact, quick, picture, close: () => picture.close() };
 }
 
-// What is shown of a picture or a video, no larger than asked for; what is transparent is black, as the service has it.
+// The picture, or the current frame of a video, no larger than `longest`; transparent parts become black, as in the service.
 export function still(picture, width, height, longest, type) {
   const much = Math.min(1, longest / Math.max(width, height));
   const canvas = canvasOf(Math.max(1, Math.round(width * much)), Math.max(1, Math.round(height * much)));

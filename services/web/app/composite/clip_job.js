@@ -1,15 +1,15 @@
-// The glass before a clip: the service composites its frames, and the video comes back.
+// Composites of clips: the service composites every frame, as a job that ends with a video.
 import { ask, save } from "../lib/api.js";
-import { button, h, said } from "../lib/dom.js";
-import { follower } from "../lib/job_progress.js";
+import { button, h, problemBox } from "../lib/dom.js";
+import { followJob } from "../lib/job_progress.js";
 
-// A part of the page for the clip that is chosen; `place` tells where it stands.
-export function clips(matte, place, signal) {
+// The controls for the clip that is chosen; `place` returns where it stands.
+export function clipJob(matte, place, signal) {
   const problem = h("div");
   const progress = h("div", { class: "stack" });
   let chosen;
   const make = button("Make the video", problem, async () => {
-    progress.replaceChildren(h("p", { class: "hint", role: "status" }, "The clip is sent."));
+    progress.replaceChildren(h("p", { class: "hint", role: "status" }, "Sending the clip."));
     try {
       const headers = { "Content-Type": chosen.type || "video/mp4", "Idempotency-Key": crypto.randomUUID?.() ?? String(Math.random()) };
       const path = `v1/mattes/${matte.id}/composite?${new URLSearchParams(place())}`;
@@ -23,13 +23,13 @@ export function clips(matte, place, signal) {
   });
   async function watch(job) {
     const panel = h("div", { class: "stack" });
-    const way = h("p", { class: "row" }, h("a", { href: `#/jobs/${job.id}` }, "Its job"));
+    const way = h("p", { class: "row" }, h("a", { href: `#/jobs/${job.id}` }, "Show the job"));
     progress.replaceChildren(panel, way);
     try {
-      const ended = await follower(panel, job.id, signal, () => {}, job);
+      const ended = await followJob(panel, job.id, signal, () => {}, job);
       if (ended.video) way.prepend(button("Download the video", problem, () => save(ended.video.slice(1), "composite.mp4"), "primary"));
     } catch (error) {
-      if (!signal.aborted) panel.append(said(error));
+      if (!signal.aborted) panel.append(problemBox(error));
     }
   }
   const element = h("div", { class: "stack", hidden: true }, h("p", { class: "row" }, make), problem, progress);

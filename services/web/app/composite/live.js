@@ -1,8 +1,8 @@
-// A matte for the graphics card, as the service encodes it: `workflows/composite/live.py` says how.
+// A matte for the graphics card. `workflows/composite/live/encode.py` encodes it and describes the format.
 import { ask } from "../lib/api.js";
 
 const PLANES = 8; // of a look-up
-const SPARED = 0.01; // of the light: for so little no finer level of the backdrop is drawn
+const SPARED = 0.01; // share of the light: the finest levels of the backdrop are left out if they hold no more than this
 
 export async function fetchLive(id, signal) {
   return decode(await (await ask(`v1/mattes/${id}/live`, { signal })).arrayBuffer());
@@ -13,7 +13,7 @@ function decode(buffer) {
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, start - 4)));
   const { width, height } = header;
   const pixels = width * height;
-  const light = new Float64Array(16); // that is looked up in each level
+  const light = new Float64Array(16); // what is looked up in each level
   const plane = (k) => new Uint8Array(buffer, start + k * pixels, pixels);
   const lookups = Array.from({ length: header.lookups }, (_, k) => {
     const [xHigh, xLow, yHigh, yLow, level, red, green, blue] = Array.from({ length: PLANES }, (_, n) => plane(PLANES * k + n));

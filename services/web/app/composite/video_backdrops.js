@@ -1,18 +1,18 @@
-// Backdrops that move: the camera of this device, and clips.
+// Moving backdrops: the camera of this device, and clips.
 import { Problem } from "../lib/api.js";
 import { PREVIEW, still } from "./backdrops.js";
 
 const WHOLE = 1920; // pixels of the longer side of a frame that is sent as a still
 const REFUSED = {
-  NotAllowedError: "The browser was told not to let this page see through it: allow it at the lock or the camera beside the address, then choose it again.",
-  NotFoundError: "This device has none, or none that is plugged in.",
-  NotReadableError: "Another program uses it: close that one, then choose it again.",
+  NotAllowedError: "The browser does not let this page use the camera. Allow it at the lock or camera symbol beside the address, then choose it again.",
+  NotFoundError: "This device has no camera, or none is plugged in.",
+  NotReadableError: "Another program uses the camera. Close that program, then choose the camera again.",
 };
 
 export async function camera() {
-  const title = "The camera can’t be used";
+  const title = "Cannot use the camera";
   if (!navigator.mediaDevices) {
-    throw new Problem({ title, detail: "Browsers give it only to pages that come over https, or from this very device: open this page at https://…, or at http://localhost." });
+    throw new Problem({ title, detail: "Browsers allow the camera only on pages from https or from this device. Open this page at https://… or at http://localhost." });
   }
   let stream;
   try {
@@ -34,7 +34,7 @@ export async function clip(file) {
   } catch {
     URL.revokeObjectURL(url);
     const none = () => {
-      throw new Problem({ title: "This browser can’t play the clip", detail: "The service may still read it: make the video, and look at that." });
+      throw new Problem({ title: "This browser cannot play the clip", detail: "The service may still read it: make the video and look at that." });
     };
     return { name: file.name, exact: none, quick: none, clip: file };
   }
@@ -48,7 +48,7 @@ async function played(name, load, close) {
   });
   load(video);
   await ready;
-  if (!video.videoWidth) throw new Error("There is no picture in it.");
+  if (!video.videoWidth) throw new Error("The video has no picture.");
   await video.play();
   const shot = (longest, type) => () => still(video, video.videoWidth, video.videoHeight, longest, type);
   return {

@@ -1,10 +1,10 @@
-// The glass drawn by WebGL2: the backdrop's light on a pyramid of textures, then some look-ups in it for each pixel.
-// What is drawn is what `workflows/composite/live.py` describes; light is linear until the last line.
+// Draws the glass by WebGL2: the light of the backdrop as a pyramid of textures, then a few look-ups in it for each pixel.
+// `workflows/composite/live/encode.py` describes the model; light is linear until the last line of the last shader.
 
 const TRIANGLE = `#version 300 es
 void main() { gl_Position = vec4(vec2(gl_VertexID == 1, gl_VertexID == 2) * 4.0 - 1.0, 0, 1); }`;
 
-// The backdrop's light, once a picture: what a software renderer takes longest for is to decode what it samples.
+// Decodes the backdrop to linear light once for each picture: decoding at each sample is slow in software renderers.
 const DECODE = `#version 300 es
 precision highp float;
 uniform sampler2D picture; // which decodes sRGB
@@ -14,7 +14,7 @@ void main() {
   light = vec4(seen.a * seen.rgb, 1);
 }`;
 
-// It over the cells of the first level; beyond it is black.
+// Resamples the backdrop to the cells of the first level; beyond its edges is black.
 const PLACE = `#version 300 es
 precision highp float;
 uniform sampler2D backdrop;
@@ -29,7 +29,7 @@ void main() {
   light = vec4(covered.x * covered.y * textureLod(backdrop, at, blur).rgb, 1);
 }`;
 
-// The next level: every second node, seen with the weights [1, 3, 3, 1] / 8 along each axis, two at a time between them.
+// Halves a level: every second node, with the weights [1, 3, 3, 1] / 8 along each axis, sampling between pairs of nodes.
 const HALVE = `#version 300 es
 precision highp float;
 uniform sampler2D fine;
@@ -73,7 +73,7 @@ void main() {
   colour = vec4(mix(12.92 * seen, 1.055 * pow(seen, vec3(1.0 / 2.4)) - 0.055, greaterThan(seen, vec3(0.0031308))), 1);
 }`;
 
-// A place of the backdrop before the monitor, as `Placement.matrix` has it: from cells to shares of the picture.
+// The matrix of a placement, as `Placement.matrix` computes it: from cells to shares of the picture.
 function placing({ right, down, scale, angle }, [columns, rows], [wide, high]) {
   const turn = (angle * Math.PI) / 180;
   const [cosine, sine] = [Math.cos(turn) / scale, Math.sin(turn) / scale];
@@ -85,14 +85,14 @@ function placing({ right, down, scale, angle }, [columns, rows], [wide, high]) {
   ];
 }
 
-// WebGL2 on a canvas; null where the browser has none, or can't draw into textures of light.
-export function lightOf(canvas) {
+// A WebGL2 context; null where the browser has none, or cannot render to floating-point textures.
+export function webglContext(canvas) {
   const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true });
   return gl?.getExtension("EXT_color_buffer_float") || gl?.getExtension("EXT_color_buffer_half_float") ? gl : null;
 }
 
-// Draws a decoded matte.
-export function glass(gl, matte, monitor) {
+// A painter of a matte that `fetchLive` has decoded.
+export function createPainter(gl, matte, monitor) {
   const { width, height, levels, texture, finest } = matte;
   const made = [];
   const keep = (kind, thing) => (made.push([kind, thing]), thing);
@@ -163,8 +163,8 @@ export function glass(gl, matte, monitor) {
   place.use();
   gl.uniform1i(place.at("backdrop"), BACKDROP);
   return {
-    // Takes a picture, or the frame of a video that is shown now, as the backdrop.
-    take(picture) {
+    // Sets the backdrop: a picture, or the current frame of a video.
+    setBackdrop(picture) {
       gl.activeTexture(gl.TEXTURE0 + PICTURE);
       gl.texImage2D(gl.TEXTURE_2D, 0, gl.SRGB8_ALPHA8, gl.RGBA, gl.UNSIGNED_BYTE, picture);
       const size = [picture.videoWidth ?? picture.width, picture.videoHeight ?? picture.height];
@@ -179,7 +179,7 @@ export function glass(gl, matte, monitor) {
       gl.drawArrays(gl.TRIANGLES, 0, 3);
       gl.generateMipmap(gl.TEXTURE_2D);
     },
-    // `coarser`: of 4 ** coarser pixels one is drawn, from light that is as much coarser.
+    // Draws the glass with the backdrop at a placement. One of 4 ** coarser pixels is drawn, from light that is as much coarser.
     draw(at, coarser = 0) {
       if (!shown[0]) return;
       const first = Math.min(finest + coarser, levels.length - 1);
@@ -189,8 +189,8 @@ export function glass(gl, matte, monitor) {
       const cells = levels[0].map((one) => one / 2 ** first);
       const matrix = placing(at, cells, monitor);
       const pixels = Math.sqrt(Math.abs(matrix[0] * matrix[4] - matrix[1] * matrix[3]) * shown[0] * shown[1]);
-      // A picture as it is has its mean over each cell; the service samples one that is moved between pixels as large as
-      // cells, at four places a cell, which blurs it by as much as a pixel an eighth larger does.
+      // The service takes the mean of a picture over each cell. One that is moved it samples at four places in each cell,
+      // which blurs it by as much as a pixel an eighth larger does.
       const moved = at.right || at.down || at.angle || at.scale !== 1;
       gl.activeTexture(gl.TEXTURE0 + LIGHT);
       place.use();
@@ -198,13 +198,13 @@ export function glass(gl, matte, monitor) {
       gl.uniform2f(place.at("most"), levels[first][0] - 1, levels[first][1] - 1);
       gl.uniform2f(place.at("cells"), 1 / Math.hypot(matrix[0], matrix[3]), 1 / Math.hypot(matrix[1], matrix[4]));
       const blur = Math.log2(pixels * (moved ? 1.125 : 1));
-      gl.uniform1f(place.at("blur"), blur > 0.25 ? blur : 0); // between two levels it takes twice as long
+      gl.uniform1f(place.at("blur"), blur > 0.25 ? blur : 0); // sampling between two levels takes twice as long
       for (let level = first; level < levels.length; level++) {
         gl.bindFramebuffer(gl.FRAMEBUFFER, targets[level]);
         gl.viewport(0, 0, texture[0] >> level, texture[1] >> level);
         if (level > first) {
           if (level === first + 1) halve.use();
-          // Only the finer level may be read while this one is written.
+          // WebGL forbids reading the level that is being written.
           gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_BASE_LEVEL, level - 1);
           gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAX_LEVEL, level - 1);
           gl.uniform2f(halve.at("size"), texture[0] >> (level - 1), texture[1] >> (level - 1));
@@ -222,7 +222,7 @@ export function glass(gl, matte, monitor) {
       gl.uniform1i(seen.at("every"), every);
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     },
-    // Leaves nothing on the graphics card.
+    // Frees everything on the graphics card.
     close() {
       for (const [kind, thing] of made.splice(0)) gl[`delete${kind}`](thing);
     },

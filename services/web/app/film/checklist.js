@@ -1,10 +1,10 @@
-// What to see to before a program is shown.
+// What to check before a program is played.
 export const CHECKS = [
-  "Camera on a tripod, the glass at rest before the screen; the whole screen in view, its edges too.",
-  "Room dark, and nothing bright that the glass could mirror.",
-  "Lock on the camera: exposure, ISO, focus and white balance. White on the screen must not be overexposed.",
-  "A fixed frame rate, of 24 a second or more; no HDR, no stabilisation, no effects of any kind.",
-  "Screen at full brightness; night mode, automatic brightness, dimming and the screen saver off.",
-  "Zoom of the browser at 100 %.",
-  "Start the film, then the program; stop the film when the program has ended.",
+  "Put the camera on a tripod and the glass before the screen, both at rest. The whole screen must be in view, with its edges.",
+  "Darken the room. The glass must mirror nothing bright.",
+  "Lock exposure, ISO, focus and white balance on the camera. White on the screen must not be overexposed.",
+  "Set a fixed frame rate of at least 24 per second. Switch off HDR, stabilisation and all effects.",
+  "Set the screen to full brightness. Switch off night mode, automatic brightness, dimming and the screen saver.",
+  "Set the browser's zoom to 100 %.",
+  "Start recording, then the program. Stop recording when the program has ended.",
 ];

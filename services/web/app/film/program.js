@@ -1,16 +1,16 @@
-// Filming: a program to choose, and one while a monitor shows it: what to see to, how far it is, and the film of it.
+// Filming: the choice of a program, and one program with its checklist, its progress on the monitor, and its film.
 import { getJson, post } from "../lib/api.js";
 import { camera, noCamera } from "./recorder.js";
 import { CHECKS } from "./checklist.js";
-import { badge, duration, empty, facts, h, pause, prose, said, size, when } from "../lib/dom.js";
+import { badge, duration, empty, facts, h, pause, problemBox, prose, size, when } from "../lib/dom.js";
 import { follow } from "../lib/events.js";
-import { isFilm, named, recordOf } from "../upload/film_bundle.js";
+import { isFilm, programName, recordOf } from "../upload/film_bundle.js";
 import { list } from "../lib/list.js";
 import { begin, onDrop, running } from "../upload/upload.js";
 
-const SILENT = 8; // seconds after which a page that shows a program is taken for gone: it tells each 2
-const CUT = "It broke off before the program’s end: this film does not show all of it.";
-const isShown = ({ showing }) => ["countdown", "showing"].includes(showing?.phase) && showing.age_seconds < SILENT + showing.seconds;
+const SILENT = 8; // seconds without a report after which the player page counts as gone; it reports every 2
+const CUT = "The program stopped before its end, so this film does not show all of it.";
+const isPlaying = ({ showing }) => ["countdown", "showing"].includes(showing?.phase) && showing.age_seconds < SILENT + showing.seconds;
 
 export async function filming(main, signal) {
   const { presets } = await getJson("v1/presets", signal);
@@ -24,8 +24,8 @@ export async function filming(main, signal) {
   const form = h("form", { class: "panel" }, h("h2", {}, "Choose a program"),
     h("fieldset", { class: "stack" }, h("legend", {}, "What the monitor shows"), choices),
     h("div", { class: "row" }, h("label", {}, "The monitor’s width", width), h("label", {}, "Height", height), "pixels"),
-    h("p", { class: "hint" }, "As this screen has them. Put in those of another one if the program is shown there."),
-    problem, h("p", { class: "row" }, h("button", { class: "primary" }, "Go on")));
+    h("p", { class: "hint" }, "The size of this screen. Change it if another screen shows the program."),
+    problem, h("p", { class: "row" }, h("button", { class: "primary" }, "Continue")));
   form.onsubmit = async (event) => {
     event.preventDefault();
     problem.replaceChildren();
@@ -34,28 +34,28 @@ export async function filming(main, signal) {
       const made = await post("v1/programs", { preset: form.elements.preset.value, monitor, border: true });
       location.hash = `#/film/${made.id}`;
     } catch (error) {
-      problem.replaceChildren(said(error));
+      problem.replaceChildren(problemBox(error));
     }
   };
   main.append(h("h1", {}, "Filming"),
     h("p", { class: "lead" }, "A monitor behind the glass shows patterns, one after another, and a camera films them."),
-    form, running, await nearby(signal), h("h2", {}, "Programs there are"));
+    form, running, await nearby(signal), h("h2", {}, "Programs"));
   await list(main, signal, {
     page: (after) => getJson(`v1/programs?limit=50${after}`, signal).then((answer) => answer.programs),
-    busy: isShown,
-    none: () => empty("None yet", "Choose one above."),
-    item: (one) => h("a", { class: "card", href: `#/film/${one.id}` }, h("span", { class: "name" }, named(one)), isShown(one) ? badge("running") : h("span"),
+    busy: isPlaying,
+    none: () => empty("No programs yet", "Choose one above."),
+    item: (one) => h("a", { class: "card", href: `#/film/${one.id}` }, h("span", { class: "name" }, programName(one)), isPlaying(one) ? badge("running") : h("span"),
       h("span", { class: "about" }, one.id), when(one.created_at)),
   });
 }
 
-// Where a phone finds this page, to be read off the screen.
+// The address of this page for a phone, to be read off the screen.
 async function nearby(signal) {
   const isOwn = /^(localhost|127\.|\[::1\]$)/.test(location.hostname);
   const { url, problem } = isOwn ? await getJson("v1/network", signal) : { url: location.origin };
   return h("section", { class: "panel" }, h("h2", {}, "On a phone"),
-    url ? [h("p", {}, "A phone in the same network follows along, and uploads its film, at"), h("p", { class: "address" }, `${url}/#/film`),
-        h("p", { class: "hint" }, "There it chooses the program that is shown, the newest first.")]
+    url ? [h("p", {}, "A phone in the same network can follow the program and upload its film at"), h("p", { class: "address" }, `${url}/#/film`),
+        h("p", { class: "hint" }, "Choose the program there; the newest is first.")]
       : h("p", {}, prose(problem), "."));
 }
 
@@ -66,26 +66,26 @@ export async function program(main, signal, id) {
   const about = h("p", { class: "hint" });
   const problem = h("div");
   const live = h("section", { class: "panel" }, h("h2", {}, "On the monitor"), phase, bar, about,
-    h("p", { class: "row" }, h("a", { class: "primary", href: `v1/programs/${id}/play`, target: "_blank", rel: "opener" }, "Show it on this screen")));
+    h("p", { class: "row" }, h("a", { class: "primary", href: `v1/programs/${id}/play`, target: "_blank", rel: "opener" }, "Play it on this screen")));
   const film = (file, about) => begin(file, recordOf(found, found.showing?.patterns_per_second ?? 2), about);
   const why = noCamera();
-  const recorder = why ? null : camera(signal, (file, whole) => film(file, { taken: true, lacks: whole ? "" : CUT }));
+  const recorder = why ? null : camera(signal, (file, whole) => film(file, { unsaved: true, warning: whole ? "" : CUT }));
   const choose = h("input", { type: "file", accept: "video/*", id: "film" });
   const take = ([file]) => {
     problem.replaceChildren();
     if (file && isFilm(file)) film(file);
-    else if (file) problem.replaceChildren(said({ title: "This is no film", detail: `${file.name} is of the kind ${file.type || "unknown"}: choose the video that the camera took.` }));
+    else if (file) problem.replaceChildren(problemBox({ title: "Not a film", detail: `${file.name} has the type ${file.type || "unknown"}. Choose the video that the camera recorded.` }));
   };
   choose.onchange = () => {
     take(choose.files);
     choose.value = "";
   };
-  const zone = h("div", { class: "drop small" }, h("label", { for: "film" }, h("strong", {}, "Choose the film"), " that the camera took of this program, or drop it here"), choose);
+  const zone = h("div", { class: "drop small" }, h("label", { for: "film" }, h("strong", {}, "Choose the film"), " that the camera recorded of this program, or drop it here"), choose);
   onDrop(zone, take);
   const filmed = h("section", { class: "panel" }, h("h2", {}, "The film"), recorder ? recorder.panel : h("p", {}, why), zone, problem, running);
   main.append(
     h("p", { class: "crumb" }, h("a", { href: "#/film" }, "Filming")),
-    h("h1", {}, named(found)),
+    h("h1", {}, programName(found)),
     facts({ Patterns: `${size(found.monitor)} pixels`, "At 2 a second": duration(found.patterns / 2), Made: when(found.created_at) }),
     h("div", { class: "columns" },
       h("section", { class: "panel" }, h("h2", {}, "Before you start"),
@@ -96,41 +96,41 @@ export async function program(main, signal, id) {
   let since = performance.now();
   const age = () => (found.showing?.age_seconds ?? 0) + (performance.now() - since) / 1000;
   const draw = () => {
-    const words = told(found, age());
-    if (phase.textContent !== words.phase) phase.textContent = words.phase;
-    about.textContent = words.about;
-    bar.value = words.shown;
+    const now = describe(found, age());
+    if (phase.textContent !== now.phase) phase.textContent = now.phase;
+    about.textContent = now.about;
+    bar.value = now.shown;
   };
   const changed = (now) => {
     [found, since] = [now, performance.now()];
     draw();
-    const { phase: told } = found.showing ?? {};
-    if (told === "countdown" && age() < SILENT) recorder?.start();
-    if (told === "shown" || told === "stopped") recorder?.stop(told === "shown");
+    const { phase: reported } = found.showing ?? {};
+    if (reported === "countdown" && age() < SILENT) recorder?.start();
+    if (reported === "shown" || reported === "stopped") recorder?.stop(reported === "shown");
   };
-  const lost = (away) => away && (about.textContent = "The service does not answer; it is asked again.");
-  follow(`v1/programs/${id}/events`, signal, changed, { lost }).catch((error) => signal.aborted || live.append(said(error)));
+  const lost = (away) => away && (about.textContent = "The service does not answer; trying again.");
+  follow(`v1/programs/${id}/events`, signal, changed, { lost }).catch((error) => signal.aborted || live.append(problemBox(error)));
   (async () => {
     for (;;) {
       draw();
       await pause(250, signal);
     }
-  })().catch(() => {}); // the view was left
+  })().catch(() => {}); // the user left the view
   return () => {
     filmed.append(running);
-    recorder?.again();
+    recorder?.resume();
   };
 }
 
-// What a monitor shows by now, by what it told some seconds ago.
-function told({ showing, patterns }, age) {
-  if (!showing) return { phase: "Not yet", about: "It starts when the page that shows it is opened on the monitor.", shown: 0 };
+// What the monitor shows now, from what its page reported some seconds ago.
+function describe({ showing, patterns }, age) {
+  if (!showing) return { phase: "Not started", about: "Open the player on the monitor, and start the program there.", shown: 0 };
   const { phase, seconds, shown, patterns_per_second: rate } = showing;
-  if (phase === "shown") return { phase: "All shown", about: `${patterns} patterns, ${rate} a second. Stop the film.`, shown: patterns };
-  if (phase === "stopped") return { phase: "Stopped", about: "It was stopped before its end: start both again, the film first.", shown: 0 };
-  if (age > SILENT + seconds + 1 / rate) return { phase: "Out of sight", about: `The page that shows it has told nothing for ${duration(age)}.`, shown };
+  if (phase === "shown") return { phase: "All shown", about: `${patterns} patterns, ${rate} a second. Stop recording.`, shown: patterns };
+  if (phase === "stopped") return { phase: "Stopped", about: "The program stopped before its end. Start both again, the recording first.", shown: 0 };
+  if (age > SILENT + seconds + 1 / rate) return { phase: "No signal", about: `The player has reported nothing for ${duration(age)}.`, shown };
   const ahead = Math.max(seconds - age, 0);
-  if (ahead) return { phase: `Starts in ${Math.ceil(ahead)}`, about: "Let the camera run by now.", shown: 0 };
+  if (ahead) return { phase: `Starts in ${Math.ceil(ahead)}`, about: "The camera should be recording by now.", shown: 0 };
   const now = Math.min(patterns, Math.floor(shown + Math.max(age - seconds, 0) * rate));
-  return { phase: `${now} of ${patterns}`, about: `About ${duration((patterns - now) / rate)} left. Touch nothing.`, shown: now };
+  return { phase: `${now} of ${patterns}`, about: `About ${duration((patterns - now) / rate)} left. Do not touch anything.`, shown: now };
 }

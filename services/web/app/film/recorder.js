@@ -1,34 +1,31 @@
-// The camera of this device, and a film by it.
-import { h, pause, said } from "../lib/dom.js";
+// Records a film with a camera of this device.
+import { h, pause, problemBox } from "../lib/dom.js";
+import { setRecording } from "../lib/recordings.js";
 
 const TYPES = ["video/mp4;codecs=avc1.640034", "video/mp4;codecs=avc1.42E034", "video/webm;codecs=vp9", "video/webm;codecs=vp8", "video/webm"];
-const BITS = 40e6; // a second: a codec that saves takes decibels off the matte
+const BITS = 40e6; // per second: stronger compression costs the matte decibels
 const LOCKED = { exposureMode: "exposure", whiteBalanceMode: "white balance", focusMode: "focus" };
-const AFTER = 1000; // ms that the film goes on after the program
+const AFTER = 1000; // ms that recording continues after the program
 
-// Why there is none, in words; null where there is one.
+// Why this browser cannot record, in words; null if it can.
 export function noCamera() {
-  if (!isSecureContext) return "Browsers give their camera to pages by https, or of this very device, alone: film with the camera’s own app, and choose the film here.";
-  if (!navigator.mediaDevices?.getUserMedia || !window.MediaRecorder) return "This browser records no films: use the camera’s own app, and choose the film here.";
+  if (!isSecureContext) return "Browsers allow the camera only on pages from https or from this device. Record with the camera’s own app, and choose the film here.";
+  if (!navigator.mediaDevices?.getUserMedia || !window.MediaRecorder) return "This browser cannot record films. Use the camera’s own app, and choose the film here.";
   return null;
 }
 
-// The views, by their signals, in which a film is being taken; what changes here is told as an event of the window.
-export const taking = new Set();
-addEventListener("beforeunload", (event) => taking.size && event.preventDefault());
-
-// A panel to film with; `filmed(file, whole)` is called with every film, `again` when the panel is back in the page.
+// A panel to record with. `filmed(file, whole)` is called with every film; call `resume` when the panel is shown again.
 export function camera(signal, filmed) {
   const picture = h("video", { muted: true, playsinline: true, "aria-label": "What the camera sees" });
   const frame = h("div", { class: "picture", hidden: true }, picture);
-  const told = h("p", { class: "hint", role: "status" });
+  const status = h("p", { class: "hint", role: "status" });
   const problem = h("div");
   const which = h("select", { "aria-label": "Camera", hidden: true });
   const open = h("button", { type: "button", onclick: () => use() }, "Use a camera of this device");
-  const shoot = h("button", { type: "button", class: "primary", hidden: true, onclick: () => (recorder ? stop() : start()) }, "Start filming");
+  const shoot = h("button", { type: "button", class: "primary", hidden: true, onclick: () => (recorder ? stop() : start()) }, "Start recording");
   let stream;
   let recorder;
-  let whole; // whether it was stopped, and did not break off
+  let whole; // whether the program was shown to its end
 
   async function use(deviceId) {
     problem.replaceChildren();
@@ -45,18 +42,19 @@ export function camera(signal, filmed) {
       picture.style.aspectRatio = `${width} / ${height}`;
       const cameras = (await navigator.mediaDevices.enumerateDevices()).filter(({ kind }) => kind === "videoinput");
       which.replaceChildren(...cameras.map(({ deviceId: id, label }, n) => h("option", { value: id, selected: id === used }, label || `Camera ${n + 1}`)));
-      told.textContent = `${width} × ${height} pixels. It starts and stops by itself with the program.`;
+      status.textContent = `${width} × ${height} pixels. Recording starts and stops with the program.`;
       await picture.play();
     } catch (error) {
-      const detail = error.name === "NotAllowedError" ? "Allow it in the browser’s bar, and try again." : error.message;
-      if (!signal.aborted) problem.replaceChildren(said({ title: "The camera can’t be used", detail }));
+      const detail = error.name === "NotAllowedError" ? "Allow it in the browser’s address bar, and try again." : error.message;
+      if (!signal.aborted) problem.replaceChildren(problemBox({ title: "Cannot use the camera", detail }));
     } finally {
       open.disabled = false;
     }
   }
   which.onchange = () => use(which.value);
 
-  // What the camera has set by itself so far stays: what it changes meanwhile would be taken for light.
+  // Keeps the settings that the camera has found: a change during the film would look like a change of light. Returns the
+  // names of those that cannot be locked.
   async function lock(track) {
     const can = track.getCapabilities?.() ?? {};
     const free = [];
@@ -67,11 +65,6 @@ export function camera(signal, filmed) {
     return free;
   }
 
-  const tell = (change) => {
-    taking[change](signal);
-    dispatchEvent(new Event("taking"));
-  };
-
   async function start() {
     if (!stream || recorder) return;
     const type = TYPES.find((one) => MediaRecorder.isTypeSupported(one));
@@ -80,20 +73,20 @@ export function camera(signal, filmed) {
     mine.ondataavailable = ({ data }) => parts.push(data);
     mine.onstop = () => {
       recorder = undefined;
-      shoot.textContent = "Start filming";
+      shoot.textContent = "Start recording";
       which.disabled = false;
-      told.textContent = "Filmed.";
+      status.textContent = "Recorded.";
       const [kind] = mine.mimeType.split(";");
       filmed(new File(parts, `film.${kind.endsWith("mp4") ? "mp4" : "webm"}`, { type: kind }), whole);
-      tell("delete");
+      setRecording(signal, false);
     };
     whole = false;
     mine.start(1000);
-    tell("add");
-    shoot.textContent = "Stop filming";
+    setRecording(signal, true);
+    shoot.textContent = "Stop recording";
     which.disabled = true;
     const free = await lock(stream.getVideoTracks()[0]);
-    told.textContent = free.length ? `Filming. The browser can’t lock ${free.join(", ")} of this camera: see that nothing changes.` : "Filming.";
+    status.textContent = free.length ? `Recording. The browser cannot lock ${free.join(", ")} of this camera: make sure that nothing changes.` : "Recording.";
   }
 
   async function stop(ended = true) {
@@ -109,7 +102,7 @@ export function camera(signal, filmed) {
     stream = undefined;
   }
   signal.addEventListener("abort", close, { once: true });
-  const panel = h("div", { class: "stack" }, h("div", { class: "row" }, open, which, shoot), frame, told, problem);
-  const again = () => picture.play().catch(() => {}); // it stands still out of the page, unlike the film
-  return { panel, start, stop, again };
+  const panel = h("div", { class: "stack" }, h("div", { class: "row" }, open, which, shoot), frame, status, problem);
+  const resume = () => picture.play().catch(() => {}); // the preview stops outside of the page, the recording does not
+  return { panel, start, stop, resume };
 }

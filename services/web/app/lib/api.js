@@ -1,6 +1,6 @@
 // Requests to the service, with the key of this session.
 
-const KEY = "envmatte-key"; // the page that shows programs keeps it under this name too
+const KEY = "envmatte-key"; // the player page keeps it under the same name
 
 export class Problem extends Error {
   constructor({ title, detail, status, field }) {
@@ -9,25 +9,25 @@ export class Problem extends Error {
   }
 }
 
-const AWAY = {
+const UNREACHABLE = {
   status: 0,
   title: "The service does not answer",
-  detail: "See that it runs and that this device is still connected to it, then try again. What was stored is safe.",
+  detail: "Check that it runs and that this device is connected to it, then try again. Nothing stored is lost.",
 };
 
 export const key = () => sessionStorage.getItem(KEY);
 
-// What no header can hold makes another key of it, which is as unknown to the service.
+// Characters that no header can hold are replaced: the key is unknown to the service either way.
 export const authorization = () => (key() ? { Authorization: `Bearer ${key().replace(/[^\x20-\xff]/g, "?")}` } : {});
 
 let asking;
 
-// Asks for a key; all requests that are refused meanwhile wait for the same answer.
+// Asks the user for a key; all requests that are refused meanwhile wait for the same dialog.
 export function unlock(problem) {
   asking ??= new Promise((resolve, reject) => {
     const dialog = document.getElementById("unlock");
     const field = document.getElementById("key");
-    document.getElementById("unlock-why").textContent = key() ? "This key is not known to the service." : "";
+    document.getElementById("unlock-why").textContent = key() ? "The service does not know this key." : "";
     field.value = "";
     dialog.onsubmit = () => {
       sessionStorage.setItem(KEY, field.value.trim());
@@ -35,14 +35,14 @@ export function unlock(problem) {
     };
     dialog.onclose = () => {
       asking = undefined;
-      reject(problem); // unless it was given
+      reject(problem); // has no effect once a key was given
     };
     dialog.showModal();
   });
   return asking;
 }
 
-// An answer, or a Problem as the API words it; a key is asked for where one is needed.
+// Requests a path: resolves with the response, or throws a Problem as the API words it. Asks for a key where needed.
 export async function ask(path, options = {}) {
   for (;;) {
     const used = key();
@@ -50,16 +50,16 @@ export async function ask(path, options = {}) {
     try {
       answer = await fetch(path, { ...options, headers: { ...options.headers, ...authorization() } });
     } catch (error) {
-      throw options.signal?.aborted ? options.signal.reason : new Problem(AWAY);
+      throw options.signal?.aborted ? options.signal.reason : new Problem(UNREACHABLE);
     }
     if (answer.ok) return answer;
-    const problem = new Problem(await described(answer));
+    const problem = new Problem(await describe(answer));
     if (answer.status !== 401) throw problem;
     if (used === key()) await unlock(problem);
   }
 }
 
-async function described(answer) {
+async function describe(answer) {
   const about = answer.headers.get("content-type")?.includes("json") ? await answer.json().catch(() => ({})) : {};
   return { title: answer.statusText || "Refused", detail: `The service answered with ${answer.status}.`, ...about, status: answer.status };
 }
@@ -68,7 +68,7 @@ export const getJson = async (path, signal) => (await ask(path, { signal })).jso
 
 export const getBlob = async (path, signal) => (await ask(path, { signal })).blob();
 
-// Posts JSON; sent twice by a nervous hand or network, it makes one thing.
+// Posts JSON with an Idempotency-Key: a double click or a retry creates one thing.
 export async function post(path, body, once = crypto.randomUUID?.() ?? String(Math.random())) {
   const headers = { "Content-Type": "application/json", "Idempotency-Key": once };
   return (await ask(path, { method: "POST", headers, body: JSON.stringify(body) })).json();
@@ -76,12 +76,12 @@ export async function post(path, body, once = crypto.randomUUID?.() ?? String(Ma
 
 export const call = (method, path) => ask(path, { method });
 
-// What is gone already, by another tab, is deleted too.
+// Deletes; something that another tab has deleted already counts as deleted.
 export const remove = (path) => call("DELETE", path).catch((error) => {
   if (error.status !== 404) throw error;
 });
 
-// Saves what the service answers with. Without a key the browser streams it to the disk by itself.
+// Saves a response as a file. Without a key the browser streams it to the disk itself.
 export async function save(path, name) {
   if (!key()) return saveAs(path, name);
   saveBlob(await getBlob(path), name);

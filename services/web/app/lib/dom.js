@@ -1,4 +1,4 @@
-// Elements, and words for figures.
+// Elements of pages, and text for numbers and times.
 
 export function h(tag, attributes = {}, ...children) {
   const element = document.createElement(tag);
@@ -10,11 +10,11 @@ export function h(tag, attributes = {}, ...children) {
   return element;
 }
 
-// A text with `words` in it as code.
+// A text as elements: what stands between `backticks` is code.
 export const prose = (text) => text.split(/`([^`]*)`/).map((part, i) => (i % 2 ? h("code", {}, part) : part));
 
-// An error as the API words it, or as the browser does.
-export const said = (error) =>
+// A box with an error as the API words it, or as the browser does.
+export const problemBox = (error) =>
   h("div", { class: "problem", role: "alert" }, h("strong", {}, error.title ?? "Something went wrong in this page"),
     h("p", {}, prose(error.detail ?? error.message)));
 
@@ -57,7 +57,7 @@ export const pause = (ms, signal) =>
     signal?.aborted ? stop() : signal?.addEventListener("abort", stop, { once: true });
   });
 
-// One call at a time; of those that come meanwhile, only the newest.
+// Wraps a function so that it runs once at a time; of the calls that come meanwhile, only the newest runs.
 export function newest(work) {
   let next;
   let busy = false;
@@ -77,7 +77,7 @@ export function newest(work) {
   };
 }
 
-// Puts a picture into an `img`, and lets go of the one before.
+// Puts a picture into an `img`, and frees the one before.
 export async function show(image, blob) {
   const url = URL.createObjectURL(blob);
   const before = image.dataset.url;
@@ -87,17 +87,18 @@ export async function show(image, blob) {
   if (before) URL.revokeObjectURL(before);
 }
 
-export function sure(title, text, yes) {
-  const dialog = document.getElementById("sure");
-  document.getElementById("sure-title").textContent = title;
-  document.getElementById("sure-text").textContent = text;
-  document.getElementById("sure-yes").textContent = yes;
+// Asks a question that "yes" or "no" answers; resolves with true for yes.
+export function confirmed(title, text, yes) {
+  const dialog = document.getElementById("confirm");
+  document.getElementById("confirm-title").textContent = title;
+  document.getElementById("confirm-text").textContent = text;
+  document.getElementById("confirm-yes").textContent = yes;
   dialog.returnValue = "no";
   dialog.showModal();
   return new Promise((resolve) => dialog.addEventListener("close", () => resolve(dialog.returnValue === "yes"), { once: true }));
 }
 
-// A button whose work may fail: what went wrong is said in `where`, and it can't be pressed twice.
+// A button that is disabled while its work runs; an error is shown in `where`.
 export function button(text, where, work, kind = "") {
   return h("button", {
     type: "button", class: kind,
@@ -107,7 +108,7 @@ export function button(text, where, work, kind = "") {
       try {
         await work();
       } catch (error) {
-        if (error.name !== "AbortError") where.replaceChildren(said(error));
+        if (error.name !== "AbortError") where.replaceChildren(problemBox(error));
       } finally {
         currentTarget.disabled = false;
       }

@@ -1,14 +1,14 @@
-// What changes, by server-sent events over `fetch`: an EventSource can't send a key.
+// Server-sent events over `fetch`, because an EventSource cannot send a key.
 import { ask } from "./api.js";
 import { pause } from "./dom.js";
 
-const SILENCE = 45_000; // ms; the service sends a comment each 15 s, so that a line cut without a word is noticed
+const SILENCE = 45_000; // ms; the service sends a comment every 15 s, so a longer silence is a broken connection
 const ASLEEP = 20_000; // ms: more than between two of those comments
 const LONGEST = 15_000; // ms between two attempts
 export const ACTIVE = ["queued", "running"];
 
-// Splits a stream of bytes into events, each `{id, data}`.
-export async function* parse(stream, heard = () => {}) {
+// Splits a stream of bytes into events, each `{id, data}`. `onbytes` is called whenever something arrives.
+export async function* parse(stream, onbytes = () => {}) {
   const reader = stream.pipeThrough(new TextDecoderStream()).getReader();
   let rest = "";
   let event = { data: [] };
@@ -16,15 +16,15 @@ export async function* parse(stream, heard = () => {}) {
     for (;;) {
       const { done, value } = await reader.read();
       if (done) return;
-      heard();
+      onbytes();
       const lines = (rest + value).split(/\r\n|\n|\r/);
       rest = lines.pop();
-      yield* taken(lines);
+      yield* eventsOf(lines);
     }
   } finally {
     reader.cancel().catch(() => {});
   }
-  function* taken(lines) {
+  function* eventsOf(lines) {
     for (const line of lines) {
       if (line === "") {
         if (event.data.length) yield { id: event.id, data: event.data.join("\n") };
@@ -38,8 +38,8 @@ export async function* parse(stream, heard = () => {}) {
   }
 }
 
-// Calls `changed(found)` now and whenever what is at `path` has changed, until it is `over`; returns it then. While the
-// service is away `lost(true)` is called, and it is asked for again, ever less often.
+// Calls `changed(found)` with the first state of what `path` streams and with every later one. Returns the state for
+// which `over` is true. When the connection is lost it calls `lost(true)` and connects again, ever less often.
 export async function follow(path, signal, changed, { lost = () => {}, over = () => false } = {}) {
   let seen;
   let wait = 1000;
@@ -55,7 +55,7 @@ export async function follow(path, signal, changed, { lost = () => {}, over = ()
       heardAt = Date.now();
       timer = setTimeout(() => cut.abort(), SILENCE);
     };
-    // A laptop that wakes up has a line that is dead, and timers that stood still.
+    // After sleep, a laptop has a dead connection and timers that stood still.
     const woken = () => !document.hidden && Date.now() - heardAt > ASLEEP && cut.abort();
     document.addEventListener("visibilitychange", woken);
     addEventListener("online", woken);

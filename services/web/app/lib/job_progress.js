@@ -1,12 +1,13 @@
-// How far a job is: bar, stage, the time left, what it waits for, and its log.
+// The progress of a job: bar, stage, time left, what it waits for, and its log.
 import { getJson } from "./api.js";
 import { ACTIVE, follow } from "./events.js";
-import { badge, duration, facts, h, newest, pause, said } from "./dom.js";
+import { badge, duration, facts, h, newest, pause, problemBox } from "./dom.js";
 
 const LOG_EVERY = 2000; // ms
 
-// Fills `panel`, at once if a state is known, and follows the job until it has ended: resolves with it. `changed` is called with every state of it.
-export async function follower(panel, id, signal, changed = () => {}, known = null) {
+// Fills `panel` and follows a job until it has ended; resolves with its last state. `changed` is called with every state,
+// first with the `known` one if given.
+export async function followJob(panel, id, signal, changed = () => {}, known = null) {
   const bar = h("progress", { max: 1, value: 0, "aria-label": "Progress" });
   const stage = h("p", { class: "stage", role: "status" }, " ");
   const waits = h("p", { class: "waits", hidden: true });
@@ -25,16 +26,16 @@ export async function follower(panel, id, signal, changed = () => {}, known = nu
       last = found.at(-1)?.line ?? last;
       if (atEnd) lines.scrollTop = lines.scrollHeight;
       if (!ended) await pause(LOG_EVERY, signal);
-    } catch {} // it is read with the next event
+    } catch {} // the next event reads it again
   });
 
-  const tell = (job) => {
+  const update = (job) => {
     const active = ACTIVE.includes(job.state);
     bar.value = job.progress;
     bar.hidden = !active && job.state !== "failed";
-    stage.replaceChildren(badge(job.state), ` ${words(job)}`);
+    stage.replaceChildren(badge(job.state), ` ${describe(job)}`);
     waits.hidden = !job.waits_for;
-    waits.textContent = job.waits_for ? `Waits: ${job.waits_for}` : "";
+    waits.textContent = job.waits_for ? `Waiting: ${job.waits_for}` : "";
     about.replaceChildren(facts({
       Tiles: job.tiles.total ? `${job.tiles.done} of ${job.tiles.total}` : null,
       Failed: job.tiles.failed || null,
@@ -42,19 +43,19 @@ export async function follower(panel, id, signal, changed = () => {}, known = nu
       Ran: job.run_seconds ? duration(job.run_seconds) : null,
       Waited: job.queued_seconds >= 1 ? duration(job.queued_seconds) : null,
     }));
-    problem.replaceChildren(...(job.problem ? [said(job.problem)] : []));
+    problem.replaceChildren(...(job.problem ? [problemBox(job.problem)] : []));
     read(!active);
     changed(job);
   };
-  if (known) tell(known);
+  if (known) update(known);
   const lost = (away) => {
     panel.classList.toggle("lost", away);
-    if (away) stage.textContent = "The service does not answer; it is asked again. Jobs go on where they stood.";
+    if (away) stage.textContent = "The service does not answer; trying again. Jobs continue where they were.";
   };
-  return follow(`v1/jobs/${id}/events`, signal, tell, { lost, over: (job) => !ACTIVE.includes(job.state) });
+  return follow(`v1/jobs/${id}/events`, signal, update, { lost, over: (job) => !ACTIVE.includes(job.state) });
 }
 
-function words(job) {
+function describe(job) {
   const percent = `${Math.floor(100 * job.progress)} %`;
   if (job.state === "running") {
     const left = job.eta_seconds == null ? "" : `, about ${duration(job.eta_seconds)} left`;

@@ -1,12 +1,12 @@
-// A list that is newest first, looked at again while something in it is under way.
-import { button, h, pause, said } from "./dom.js";
+// A list, newest first, that is refreshed while something in it is in progress.
+import { button, h, pause, problemBox } from "./dom.js";
 
-const LOOK = 5000; // ms
+const REFRESH = 5000; // ms
 
 export async function list(main, signal, { page, busy, none, item }) {
   const items = h("ul", { class: "list" });
   const problem = h("div");
-  const more = button("Older ones", problem, async () => add(await page(`&after=${last.id}`)), "more");
+  const more = button("Show older", problem, async () => add(await page(`&after=${last.id}`)), "more");
   let last;
   let pages = 0;
   const add = (found) => {
@@ -19,19 +19,19 @@ export async function list(main, signal, { page, busy, none, item }) {
   if (!first.length) main.append(none());
   main.append(items, problem, more);
   add(first);
-  watch(first).catch(() => {}); // the view was left
+  watch(first).catch(() => {}); // the user left the view
 
-  // What was scrolled to stays as it is: only the first page is looked at again.
+  // Refreshes the first page only, and only while no further page is shown.
   async function watch(found) {
     while (found.some(busy) && pages === 1) {
-      await pause(LOOK, signal);
+      await pause(REFRESH, signal);
       if (document.hidden) continue;
       try {
         found = await page("");
         problem.replaceChildren();
       } catch (error) {
         signal.throwIfAborted();
-        problem.replaceChildren(said(error));
+        problem.replaceChildren(problemBox(error));
         continue;
       }
       const focused = items.contains(document.activeElement) ? document.activeElement.getAttribute("href") : undefined;

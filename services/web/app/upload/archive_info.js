@@ -1,17 +1,18 @@
-// What a capture's ZIP says of its frames, for the service to refuse too many or too large ones before they come.
+// Reads the number and size of frames from a capture archive, so that the service can refuse too many or too large ones
+// before they are sent.
 const END = 0x06054b50; // signatures of APPNOTE, sect. 4.3
 const ENTRY = 0x02014b50;
-const TAIL = 22 + 65535; // bytes in which the end begins
-const FULL = 2 ** 32 - 1; // a number of 64 bits, elsewhere
+const TAIL = 22 + 65535; // bytes in which the end of the directory begins
+const FULL = 2 ** 32 - 1; // stands for a 64-bit number that is stored elsewhere
 const RECORD = "capture.json";
-const MOST = 8 << 20; // bytes of that
-const HEAD = 1 << 16; // bytes of an image in which its size stands
-const PNG = 0x89504e47; // how images begin
+const MOST = 8 << 20; // bytes of that file
+const HEAD = 1 << 16; // bytes of an image that contain its size
+const PNG = 0x89504e47; // first bytes of images
 const JPEG = 0xffd8;
 
 const view = async (blob) => new DataView(await blob.arrayBuffer());
 
-// The entries of a ZIP by name; none, of one that goes beyond 32 bits.
+// The entries of a ZIP by name; none of a ZIP64 archive.
 async function entries(file) {
   const tail = await view(file.slice(-TAIL));
   let at = tail.byteLength - 22;
@@ -38,7 +39,7 @@ async function read(file, { method, size, at }) {
 
 const patterns = ({ levels, colours, files, count }) => (levels ?? colours ?? files)?.length ?? count;
 
-// Of an image by its first bytes, PNG or JPEG (ITU-T T.81, table B.1).
+// The size of a PNG or JPEG (ITU-T T.81, table B.1) from its first bytes.
 function sizeOf(head) {
   if (head.getUint32(0) === PNG) return { width: head.getUint32(16), height: head.getUint32(20) };
   if (head.getUint16(0) !== JPEG) return {};
@@ -47,19 +48,19 @@ function sizeOf(head) {
   return { width: head.getUint16(at + 7), height: head.getUint16(at + 5) };
 }
 
-// `frames`, and `width` and `height` of the first if that is PNG or JPEG. What can't be told is left out: what is wrong
-// with a file the service says better.
-export async function declared(file) {
-  const told = {};
+// `frames`, and `width` and `height` of the first one if it is PNG or JPEG. What cannot be read is left out; the service
+// reports what is wrong with a file.
+export async function readArchiveInfo(file) {
+  const info = {};
   try {
     const found = await entries(file);
-    if (found[RECORD].size > MOST) return told;
+    if (found[RECORD].size > MOST) return info;
     const record = JSON.parse(await (await read(file, found[RECORD])).text());
-    told.frames = record.frames?.length || record.program.parts.reduce((sum, part) => sum + patterns(part), 0);
+    info.frames = record.frames?.length || record.program.parts.reduce((sum, part) => sum + patterns(part), 0);
     if (record.frames?.length) {
       const image = await read(file, found[record.frames[0].file]);
-      Object.assign(told, sizeOf(await view(image.slice(0, HEAD))));
+      Object.assign(info, sizeOf(await view(image.slice(0, HEAD))));
     }
   } catch {}
-  return told;
+  return info;
 }

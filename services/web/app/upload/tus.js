@@ -1,15 +1,15 @@
 // Resumable uploads by tus 1.0 (https://tus.io/protocols/resumable-upload).
 import { Problem, ask, authorization } from "../lib/api.js";
-import { declared } from "./archive_info.js";
+import { readArchiveInfo } from "./archive_info.js";
 import { pause } from "../lib/dom.js";
 
-const PART = 8 << 20; // bytes of a request: the service takes 10,000 of them
+const PART = 8 << 20; // bytes of a request; the service takes 10,000 of them
 const LONGEST = 30_000; // ms between two attempts
 const TUS = { "Tus-Resumable": "1.0.0" };
-// The service has more than was thought, is full of requests, or is away: what helps is to look how far it is.
-const PASSING = [0, 409, 429, 502, 503, 504];
+// The service has more bytes than assumed, is busy, or is unreachable: ask for the offset and try again.
+const TEMPORARY = [0, 409, 429, 502, 503, 504];
 
-// A request with the bytes that went out told meanwhile, which `fetch` can't.
+// A PATCH request that reports its progress, which `fetch` cannot.
 function patch(path, offset, part, progress, signal) {
   return new Promise((resolve, reject) => {
     const request = new XMLHttpRequest();
@@ -23,7 +23,7 @@ function patch(path, offset, part, progress, signal) {
       const about = { title: "Refused", detail: `The service answered with ${request.status}.`, status: request.status };
       try {
         Object.assign(about, JSON.parse(request.responseText));
-      } catch {} // of something between that is no part of the service
+      } catch {} // from a proxy, which does not answer with JSON
       reject(new Problem(about));
     };
     request.onerror = () => reject(new Problem({ status: 0, title: "The connection broke" }));
@@ -41,7 +41,7 @@ async function offsetOf(id, signal) {
 
 const isCapture = (id, signal) => ask(`v1/captures/${id}`, { signal }).then(() => true, () => false);
 
-// Sends a file, going on where an upload of it stood; returns the upload's id.
+// Sends a file, continuing an upload of it where it was interrupted; returns the id of the upload.
 export async function send(file, remembered, { signal, progress, waiting }) {
   let id = localStorage.getItem(remembered);
   let offset = 0;
@@ -51,8 +51,8 @@ export async function send(file, remembered, { signal, progress, waiting }) {
     try {
       if (lost) offset = await offsetOf(id, signal);
       if (!id) {
-        const told = Object.entries(await declared(file)).map(([name, value]) => `${name} ${btoa(value)}`);
-        const headers = { ...TUS, "Upload-Length": file.size, ...(told.length && { "Upload-Metadata": told.join(",") }) };
+        const metadata = Object.entries(await readArchiveInfo(file)).map(([name, value]) => `${name} ${btoa(value)}`);
+        const headers = { ...TUS, "Upload-Length": file.size, ...(metadata.length && { "Upload-Metadata": metadata.join(",") }) };
         const answer = await ask("v1/uploads", { method: "POST", headers, signal });
         id = answer.headers.get("Location").split("/").at(-1);
         localStorage.setItem(remembered, id);
@@ -60,7 +60,7 @@ export async function send(file, remembered, { signal, progress, waiting }) {
       lost = false;
       waiting(false);
       while (offset < file.size) {
-        const part = await file.slice(offset, offset + PART).arrayBuffer(); // a file that went away is no broken line
+        const part = await file.slice(offset, offset + PART).arrayBuffer(); // throws if the file is gone, which is not a lost connection
         offset = await patch(`v1/uploads/${id}`, offset, part, progress, signal);
         progress(offset);
         wait = 1000;
@@ -71,14 +71,14 @@ export async function send(file, remembered, { signal, progress, waiting }) {
       const isPart = id && !lost;
       lost = Boolean(id);
       if (id && [404, 410].includes(error.status)) {
-        if (await isCapture(id, signal)) return id; // another tab was quicker
-        id = null; // expired: from the start
+        if (await isCapture(id, signal)) return id; // another tab has finished it
+        id = null; // expired: start again
         offset = 0;
         lost = false;
         continue;
       }
-      if (error.status === 401 && isPart) continue; // `ask` will ask for a key, and be refused one by whoever has none
-      if (!PASSING.includes(error.status)) throw error;
+      if (error.status === 401 && isPart) continue; // `ask` asks for a key when it requests the offset
+      if (!TEMPORARY.includes(error.status)) throw error;
       waiting(true, wait);
       await pause(wait, signal);
       wait = Math.min(2 * wait, LONGEST);

@@ -1,36 +1,37 @@
-// Uploads: rows that show how far each is, and where files are dropped or chosen.
+// Uploads: rows with the progress of each, and the zone where files are dropped or chosen.
 import { Problem, post, saveBlob } from "../lib/api.js";
-import { taking } from "../film/recorder.js";
-import { bytes, duration, h, said, sure } from "../lib/dom.js";
-import { askFor, bundle, isFilm } from "./film_bundle.js";
+import { recordings } from "../lib/recordings.js";
+import { bytes, confirmed, duration, h, problemBox } from "../lib/dom.js";
+import { askForRecord, filmArchive, isFilm } from "./film_bundle.js";
 import { send } from "./tus.js";
 import { crc32 } from "./zip.js";
 
-const HEAD = 1 << 20; // bytes of an archive in which its record lies
+const HEAD = 1 << 20; // bytes of an archive that contain its capture.json
 
-// Uploads live longer than the view that shows them: who looks at something else meanwhile finds them again.
+// Uploads outlive the view that shows them; the element moves to the next view that shows uploads.
 export const running = h("div", { class: "uploads" });
-const rows = new Set(); // of each, whether it is `busy`, and `only`: of a film that is nowhere but in this page
-addEventListener("beforeunload", (event) => [...rows].some(({ busy, only }) => busy || only) && event.preventDefault());
+const rows = new Set(); // of each upload, whether it is `busy`, and whether its film is `unsaved`: only in this page
+addEventListener("beforeunload", (event) => [...rows].some(({ busy, unsaved }) => busy || unsaved) && event.preventDefault());
 
-// Uploads a capture's ZIP, or a film: with its record, or whoever dropped it is asked for what it shows. One that was
-// `taken` here can be saved, and is let go of by nobody who was not asked; one that `lacks` something waits for a word.
-export function begin(file, record, { taken = false, lacks = "" } = {}) {
-  const state = { busy: false, only: taken };
+// Uploads a capture archive, or a film with its capture.json; without one, asks which program it shows. A film that is
+// `unsaved` was recorded here: it can be saved, and is deleted only after a question. One with a `warning` waits for
+// "Continue".
+export function begin(file, record, { unsaved = false, warning = "" } = {}) {
+  const state = { busy: false, unsaved };
   const stop = new AbortController();
   const bar = h("progress", { max: 1, value: 0, "aria-label": `Upload of ${file.name}` });
   const status = h("span", { role: "status" }, "Starting");
   const problem = h("div");
   const asked = h("div");
-  const again = h("button", { type: "button", hidden: true, onclick: () => work() }, "Go on");
-  const save = h("button", { type: "button", hidden: !taken, onclick: () => (saveBlob(file, file.name), (state.only = false)) }, "Save the film");
+  const again = h("button", { type: "button", hidden: true, onclick: () => work() }, "Continue");
+  const save = h("button", { type: "button", hidden: !unsaved, onclick: () => (saveBlob(file, file.name), (state.unsaved = false)) }, "Save the film");
   const end = () => (rows.delete(state), row.remove());
   const drop = async () => {
-    if (state.only && !(await sure("Delete this film?", "It is nowhere but in this page: upload it, or save it first.", "Delete it"))) return;
+    if (state.unsaved && !(await confirmed("Delete this film?", "It is only in this page. Upload or save it first to keep it.", "Delete film"))) return;
     stop.abort();
     end();
   };
-  const cancel = h("button", { type: "button", onclick: drop }, taken ? "Delete the film" : "Give up");
+  const cancel = h("button", { type: "button", onclick: drop }, unsaved ? "Delete the film" : "Cancel");
   const row = h("section", { class: "panel", "aria-label": file.name },
     h("p", { class: "row spread" }, h("strong", { class: "name" }, file.name), h("span", { class: "row" }, again, save, cancel)), bar, status, asked, problem);
   running.append(row);
@@ -46,15 +47,15 @@ export function begin(file, record, { taken = false, lacks = "" } = {}) {
     state.busy = true;
     try {
       if (!archive) {
-        status.textContent = "A film";
-        record ??= await askFor(asked, stop.signal);
-        status.textContent = "Putting it into a ZIP";
-        archive = await bundle(file, record, stop.signal);
+        status.textContent = "Film";
+        record ??= await askForRecord(asked, stop.signal);
+        status.textContent = "Making the capture archive";
+        archive = await filmArchive(file, record, stop.signal);
       } else if (!(await startsAsZip(archive))) {
-        const detail = `${file.name} is neither a ZIP nor a film: drop the ZIP that holds capture.json and the frames, or the video that the camera took.`;
-        throw new Problem({ status: 422, title: "This is no capture", detail });
+        const detail = `${file.name} is neither a ZIP nor a film. Drop the ZIP with capture.json and the frames, or the video that the camera recorded.`;
+        throw new Problem({ status: 422, title: "Not a capture", detail });
       }
-      // Of a film, the same with another record would be another archive.
+      // A film with another capture.json is another archive.
       remembered ??= `envmatte-upload ${file.name} ${archive.size} ${file.lastModified} ${record ? await crc32(archive.slice(0, HEAD)) : ""}`;
       const upload = await send(archive, remembered, {
         signal: stop.signal,
@@ -66,38 +67,38 @@ export function begin(file, record, { taken = false, lacks = "" } = {}) {
         },
         waiting: (away, ms) => away && (status.textContent = `The service does not answer; trying again in ${duration(ms / 1000)}`),
       });
-      status.textContent = "Looking into the ZIP";
+      status.textContent = "Checking the archive";
       const made = await post("v1/captures", { upload }, `capture-of-${upload}`);
       localStorage.removeItem(remembered);
       end();
-      if (running.isConnected && !taking.size) location.hash = `#/captures/${made.id}`;
+      if (running.isConnected && !recordings.size) location.hash = `#/captures/${made.id}`;
     } catch (error) {
       if (stop.signal.aborted) return;
-      const hopeless = error.status >= 400 && error.status < 500 && error.status !== 401; // another key may be typed
-      if (hopeless) localStorage.removeItem(remembered);
-      status.textContent = hopeless ? "Refused" : "Stopped; what has come is kept";
-      if (!taken) cancel.textContent = hopeless ? "Dismiss" : "Give up";
-      again.textContent = "Go on";
-      again.hidden = hopeless;
-      problem.replaceChildren(said(/^Not(Found|Readable)Error$/.test(error.name) ? unreadable(file) : error));
+      const refused = error.status >= 400 && error.status < 500 && error.status !== 401; // another key may be typed
+      if (refused) localStorage.removeItem(remembered);
+      status.textContent = refused ? "Refused" : "Stopped; the bytes sent so far are kept";
+      if (!unsaved) cancel.textContent = refused ? "Dismiss" : "Cancel";
+      again.textContent = "Continue";
+      again.hidden = refused;
+      problem.replaceChildren(problemBox(/^Not(Found|Readable)Error$/.test(error.name) ? unreadable(file) : error));
     } finally {
       state.busy = false;
     }
   }
-  if (!lacks) return work();
-  status.textContent = lacks;
-  again.textContent = "Upload it all the same";
+  if (!warning) return work();
+  status.textContent = warning;
+  again.textContent = "Upload anyway";
   again.hidden = false;
 }
 
 const unreadable = ({ name }) => ({
-  title: "The file can’t be read",
-  detail: `${name} was changed, moved or taken out since it was chosen, or is a folder: put it back and go on, or choose it anew.`,
+  title: "Cannot read the file",
+  detail: `${name} was changed, moved or removed after it was chosen, or it is a folder. Put it back and continue, or choose it again.`,
 });
 
 const startsAsZip = async (file) => /^PK[\x03\x05]/.test(await file.slice(0, 4).text());
 
-// Where a ZIP or a film is dropped or chosen.
+// The zone where capture archives and films are dropped or chosen.
 export function dropZone() {
   const take = (files) => [...files].forEach((file) => begin(file));
   const input = h("input", { type: "file", accept: ".zip,application/zip,video/*,.mkv", id: "zip", multiple: true });
@@ -106,8 +107,8 @@ export function dropZone() {
     input.value = "";
   };
   const zone = h("div", { class: "drop" },
-    h("label", { for: "zip" }, h("strong", {}, "Choose a capture’s ZIP or a film"), " or drop it here",
-      h("span", { class: "hint" }, "A ZIP of capture.json and its frames, or the film of a program. An upload that breaks off goes on where it stood.")),
+    h("label", { for: "zip" }, h("strong", {}, "Choose a capture archive or a film"), " or drop it here",
+      h("span", { class: "hint" }, "A ZIP with capture.json and its frames, or the film of a program. An interrupted upload continues where it stopped.")),
     input);
   onDrop(zone, take);
   return h("div", {}, zone, running);

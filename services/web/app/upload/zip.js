@@ -1,8 +1,8 @@
-// A ZIP of files that are stored as they are (APPNOTE, sect. 4.3), put together without being read into memory.
-const PIECE = 4 << 20; // bytes that are summed at once
-const FULL = 2 ** 32 - 1; // stands for a number that is in the extension of 64 bits
-const SHORT = 20; // the version of the format that it takes to read an entry, in tenths
-const LONG = 45; // with that extension
+// Makes a ZIP of uncompressed files (APPNOTE, sect. 4.3) without reading them into memory.
+const PIECE = 4 << 20; // bytes summed at a time
+const FULL = 2 ** 32 - 1; // stands for a number that is in the ZIP64 extension
+const SHORT = 20; // version needed to read an entry, in tenths
+const LONG = 45; // version needed to read a ZIP64 entry
 const SIGNATURES = { local: 0x04034b50, central: 0x02014b50, end: 0x06054b50, end64: 0x06064b50, locator: 0x07064b50 };
 const FIRST_DAY = 0x21; // 1 January 1980: the same files make the same bytes
 
@@ -38,7 +38,7 @@ function write(view, at, fields) {
   }
 }
 
-// What goes into 64 bits of the numbers that are too large for 32 (APPNOTE, sect. 4.5.3).
+// The ZIP64 extension with the numbers that need more than 32 bits (APPNOTE, sect. 4.5.3).
 function extension(...values) {
   const long = values.filter((value) => value >= FULL).map((value) => [8, value]);
   const fields = [[2, 1], [2, sum(long)], ...long];
@@ -47,7 +47,7 @@ function extension(...values) {
   return view.buffer;
 }
 
-// Of files, with `name`, of ASCII, `size` and `crc`: the heads that stand before each, and the end that follows the last.
+// The headers that precede each file, and the directory that follows the last. Files have `name` (ASCII), `size`, `crc`.
 export function framed(files) {
   const heads = [];
   const directory = [];
@@ -71,10 +71,10 @@ export function framed(files) {
   return { heads, end: new Blob([...directory, end]) };
 }
 
-// `files` are pairs of a name, of ASCII, and a Blob.
+// `files` are pairs of an ASCII name and a Blob.
 export async function zip(files, signal) {
-  const told = [];
-  for (const [name, blob] of files) told.push({ name, size: blob.size, crc: await crc32(blob, signal) });
-  const { heads, end } = framed(told);
+  const entries = [];
+  for (const [name, blob] of files) entries.push({ name, size: blob.size, crc: await crc32(blob, signal) });
+  const { heads, end } = framed(entries);
   return new Blob([...files.flatMap(([, blob], n) => [heads[n], blob]), end], { type: "application/zip" });
 }

@@ -1,4 +1,4 @@
-// The captures there are, and the way for another one.
+// The list of captures, and the zone to upload another one.
 import { getJson } from "../lib/api.js";
 import { badge, bytes, empty, h, size, when } from "../lib/dom.js";
 import { list } from "../lib/list.js";
@@ -7,7 +7,7 @@ import { dropZone } from "../upload/upload.js";
 export async function captures(main, signal) {
   main.append(
     h("h1", {}, "Captures"),
-    h("p", { class: "lead" }, "A glass, filmed before a monitor that shows patterns. Add one, and see how it turned out."),
+    h("p", { class: "lead" }, "Films of a glass before a monitor that shows patterns. Upload one to see its report."),
     dropZone(),
   );
   await list(main, signal, {

@@ -1,21 +1,21 @@
-// Jobs: all of them, and one while it runs, its frame filling in tile by tile.
+// Jobs: the list, and one job with its progress; a recovery fills in its frame tile by tile.
 import { ask, call, getJson, post, remove, save } from "../lib/api.js";
 import { backdrop } from "../composite/backdrops.js";
-import { badge, button, empty, facts, h, newest, pause, said, show, sure, when } from "../lib/dom.js";
+import { badge, button, confirmed, empty, facts, h, newest, pause, problemBox, show, when } from "../lib/dom.js";
 import { ACTIVE } from "../lib/events.js";
 import { list } from "../lib/list.js";
-import { follower } from "../lib/job_progress.js";
+import { followJob } from "../lib/job_progress.js";
 
-const LOOK = 2000; // ms between two pictures of what is there
+const REFRESH = 2000; // ms between two pictures of what is recovered
 const LONGER = 640; // pixels of their longer side, at most
-const KINDS = { ingest: "Reading of a capture", recover: "Recovery of a matte", composite: "Composite of a clip" };
+const KINDS = { ingest: "Ingest of a capture", recover: "Recovery of a matte", composite: "Composite of a clip" };
 
 export async function jobs(main, signal) {
   main.append(h("h1", {}, "Jobs"));
   await list(main, signal, {
     page: (after) => getJson(`v1/jobs?limit=50${after}`, signal).then((answer) => answer.jobs),
     busy: (one) => ACTIVE.includes(one.state),
-    none: () => empty("No jobs yet", "Each capture that is added makes one, and each matte."),
+    none: () => empty("No jobs yet", "Each capture and each matte starts one."),
     item: (one) =>
       h("a", { class: "card", href: `#/jobs/${one.id}` }, h("span", { class: "name" }, KINDS[one.kind]), badge(one.state),
         h("span", { class: "about" }, one.problem?.detail ?? (one.state === "running" ? `${one.stage}, ${Math.floor(100 * one.progress)} %` : one.id)),
@@ -31,28 +31,28 @@ export async function job(main, signal, id) {
     await post(`v1/jobs/${id}/retry`);
     watch();
   }, "primary");
-  const drop = button("Delete", problem, async () => {
-    const lost = found.kind === "composite" ? "Its log and its video are gone then." : "Its log is gone then; what it made stays.";
-    if (!(await sure("Delete this job?", lost, "Delete it"))) return;
+  const deletion = button("Delete", problem, async () => {
+    const lost = found.kind === "composite" ? "Its log and its video will be deleted." : "Its log will be deleted; its capture or matte stays.";
+    if (!(await confirmed("Delete this job?", lost, "Delete job"))) return;
     await remove(`v1/jobs/${id}`);
     location.replace("#/jobs");
   }, "quiet");
   const asked = h("details", { class: "panel", hidden: found.kind !== "recover" }, h("summary", {}, "Options"), facts(found.options));
   const links = h("p", { class: "row" });
   const panel = h("section", { class: "panel", "aria-label": "Progress", "data-log": "" });
-  const preview = found.kind === "recover" ? await filling(found, signal) : null;
+  const preview = found.kind === "recover" ? await progressPicture(found, signal) : null;
   main.append(
     h("p", { class: "crumb" }, h("a", { href: "#/jobs" }, "Jobs")),
-    h("div", { class: "row spread" }, h("h1", {}, KINDS[found.kind]), h("span", { class: "row" }, cancel, retry, drop)),
+    h("div", { class: "row spread" }, h("h1", {}, KINDS[found.kind]), h("span", { class: "row" }, cancel, retry, deletion)),
     problem,
     facts({ Asked: when(found.created_at), Capture: found.capture && h("a", { href: `#/captures/${found.capture}` }, found.capture.slice(0, 8)), Method: found.options.method, Quality: found.options.quality }),
     links, h("div", { class: preview ? "columns" : "stack" }, preview?.panel, h("div", { class: "stack" }, panel, asked)),
   );
   watch(found);
 
-  function told(now) {
+  function update(now) {
     cancel.hidden = !ACTIVE.includes(now.state);
-    drop.hidden = ACTIVE.includes(now.state);
+    deletion.hidden = ACTIVE.includes(now.state);
     retry.hidden = now.state !== "failed";
     const made = now.state === "succeeded";
     links.replaceChildren(...[
@@ -60,21 +60,21 @@ export async function job(main, signal, id) {
       made && now.kind === "ingest" && h("a", { class: "primary", href: `#/captures/${now.capture}` }, "Open the capture"),
       made && now.video && button("Download the video", problem, () => save(now.video.slice(1), "composite.mp4"), "primary"),
     ].filter(Boolean));
-    preview?.tell(now);
+    preview?.update(now);
   }
 
   function watch(known) {
     panel.replaceChildren();
-    return follower(panel, id, signal, told, known).catch((error) => {
+    return followJob(panel, id, signal, update, known).catch((error) => {
       if (signal.aborted) return;
-      if (error.status === 404) dispatchEvent(new HashChangeEvent("hashchange")); // deleted meanwhile: there is nothing to show
-      else panel.append(said(error));
+      if (error.status === 404) dispatchEvent(new HashChangeEvent("hashchange")); // deleted meanwhile: show that it is not found
+      else panel.append(problemBox(error));
     });
   }
 }
 
-// The composite of what is recovered so far; what is not yet there is transparent.
-async function filling(found, signal) {
+// The composite of what is recovered so far; the rest is transparent.
+async function progressPicture(found, signal) {
   const { width, height } = await getJson(`v1/captures/${found.capture}`, signal).catch(() => ({}));
   const image = h("img", { alt: "The composite of what is recovered so far", hidden: true });
   const frame = h("div", { class: "picture filling" }, image);
@@ -89,13 +89,13 @@ async function filling(found, signal) {
       const answer = await ask(`v1/mattes/${now.matte}/composite?size=${size}`, { method: "POST", headers, body: await before, signal });
       await show(image, await answer.blob());
       done = now.tiles.done;
-      if (now.state === "running") await pause(LOOK, signal);
+      if (now.state === "running") await pause(REFRESH, signal);
     } catch {
-      await pause(LOOK, signal).catch(() => {}); // nothing to see yet, or the service is away: it is told elsewhere
+      await pause(REFRESH, signal).catch(() => {}); // nothing recovered yet, or the service is away, which the progress panel shows
     }
   });
   return {
     panel: h("section", { class: "panel" }, h("h2", {}, "The frame"), frame),
-    tell: (now) => now.tiles.done > 0 && ["running", "succeeded"].includes(now.state) && look(now),
+    update: (now) => now.tiles.done > 0 && ["running", "succeeded"].includes(now.state) && look(now),
   };
 }

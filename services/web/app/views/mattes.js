@@ -1,7 +1,7 @@
-// Mattes: all of them, and one to composite and to look into.
+// Mattes: the list, and one matte with its composite and layers.
 import { ask, getJson, remove, save } from "../lib/api.js";
 import { backdrop } from "../composite/backdrops.js";
-import { badge, button, empty, facts, h, newest, said, show, size, sure, when } from "../lib/dom.js";
+import { badge, button, confirmed, empty, facts, h, newest, show, size, when } from "../lib/dom.js";
 import { compositing } from "../composite/compositing.js";
 import { layers } from "../composite/layers.js";
 import { list } from "../lib/list.js";
@@ -16,7 +16,7 @@ export async function mattes(main, signal) {
   const draw = newest(async () => {
     while (queue.length && !signal.aborted) await thumb(queue.shift(), signal).catch(() => {});
   });
-  // One after the other, and only of those that are looked at.
+  // Requests thumbnails one after the other, and only of mattes that are in view.
   const seen = new IntersectionObserver((entries) => {
     for (const { isIntersecting, target } of entries) {
       if (!isIntersecting) continue;
@@ -54,8 +54,8 @@ async function thumb(frame, signal) {
 export async function matte(main, signal, id) {
   const found = await getJson(`v1/mattes/${id}`, signal);
   const problem = h("div");
-  const drop = button("Delete", problem, async () => {
-    if (!(await sure("Delete this matte?", "It has to be recovered anew then, or come from an archive of it.", "Delete it"))) return;
+  const deletion = button("Delete", problem, async () => {
+    if (!(await confirmed("Delete this matte?", "You can recover it again from its capture, or import an archive of it.", "Delete matte"))) return;
     await remove(`v1/mattes/${id}`);
     location.replace("#/mattes");
   }, "quiet");
@@ -63,7 +63,7 @@ export async function matte(main, signal, id) {
   archive.hidden = found.state !== "ready";
   main.append(
     h("p", { class: "crumb" }, h("a", { href: "#/mattes" }, "Mattes")),
-    h("div", { class: "row spread" }, h("h1", {}, `Matte ${id.slice(0, 8)}`), h("span", { class: "row" }, badge(found.state), archive, drop)),
+    h("div", { class: "row spread" }, h("h1", {}, `Matte ${id.slice(0, 8)}`), h("span", { class: "row" }, badge(found.state), archive, deletion)),
     problem,
     facts({
       Frame: found.width && `${size(found)} pixels`, Monitor: found.monitor && `${found.monitor.join(" × ")} pixels`,
@@ -73,8 +73,8 @@ export async function matte(main, signal, id) {
       Job: found.job && h("a", { href: `#/jobs/${found.job}` }, found.job.slice(0, 8)),
     }),
   );
-  if (found.state === "ready") return main.append(...(await compositing(found, signal)), layers(found, signal));
-  const text = found.state === "failed" ? "Its recovery has failed; the job says why." : "It is still being recovered; the job shows how far it is.";
-  main.append(h("div", { class: "empty" }, h("strong", {}, "Not there yet"), h("p", {}, text),
-    found.job && h("p", {}, h("a", { href: `#/jobs/${found.job}` }, "See the job"))));
+  if (found.state === "ready") return main.append(compositing(found, signal), layers(found, signal));
+  const text = found.state === "failed" ? "The recovery failed; the job says why." : "The recovery is still running; the job shows its progress.";
+  main.append(h("div", { class: "empty" }, h("strong", {}, "Not ready"), h("p", {}, text),
+    found.job && h("p", {}, h("a", { href: `#/jobs/${found.job}` }, "Show the job"))));
 }

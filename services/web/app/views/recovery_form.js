@@ -1,9 +1,9 @@
-// The start of a recovery. What can be asked for, and what it does, is all from GET /v1/options.
+// The form that starts a recovery. Its options and their descriptions come from GET /v1/options.
 import { getJson, post } from "../lib/api.js";
-import { h, prose, said } from "../lib/dom.js";
+import { h, problemBox, prose } from "../lib/dom.js";
 
 function field(option) {
-  const id = `option-${option.method ?? "any"}-${option.name}`; // two methods may have one of the same name
+  const id = `option-${option.method ?? "any"}-${option.name}`; // two methods may have an option of the same name
   const attributes = { id, name: option.name, "aria-describedby": `${id}-about` };
   let input;
   if (option.values) {
@@ -23,7 +23,7 @@ function field(option) {
   return { option, input, row };
 }
 
-// What was chosen, and nothing of what was left as it is.
+// The options that differ from their defaults.
 function chosen(fields, method) {
   const options = {};
   for (const { option, input } of fields) {
@@ -34,7 +34,7 @@ function chosen(fields, method) {
   return options;
 }
 
-export async function recovery(capture, state, signal) {
+export async function recoveryForm(capture, state, signal) {
   const { options } = await getJson("v1/options", signal);
   const fields = options.map(field);
   const choices = fields.filter(({ option }) => option.values);
@@ -42,10 +42,10 @@ export async function recovery(capture, state, signal) {
   const method = fields.find(({ option }) => option.name === "method").input;
   const problem = h("div");
   const form = h("form", { class: "panel", id: "recovery" }, h("h2", {}, "Recover a matte"),
-    h("p", {}, "For each pixel, from where on the monitor its light comes. ",
-      state === "ingesting" && "It may be asked for now, and begins when the frames are read."),
+    h("p", {}, "Finds, for each pixel, where on the monitor its light comes from. ",
+      state === "ingesting" && "It can be started now, and begins when the frames are read."),
     h("div", { class: "options" }, choices.map(({ row }) => row)),
-    h("details", {}, h("summary", {}, "All options"), h("p", { class: "hint" }, "What is left empty is as the grey figure says, or as the choices above have it."),
+    h("details", {}, h("summary", {}, "All options"), h("p", { class: "hint" }, "An empty field takes the default shown in grey, or what the choices above set."),
       h("div", { class: "options" }, constants.map(({ row }) => row))),
     problem, h("p", { class: "row" }, h("button", { class: "primary" }, "Start")));
   const sort = () => fields.forEach(({ option, row, input }) => {
@@ -64,7 +64,7 @@ export async function recovery(capture, state, signal) {
       const job = await post("v1/jobs", { capture, options: chosen(fields, method.value) });
       location.hash = `#/jobs/${job.id}`;
     } catch (error) {
-      problem.replaceChildren(said(error));
+      problem.replaceChildren(problemBox(error));
       const wrong = fields.find(({ option, input }) => option.name === error.field && !input.disabled)?.input;
       wrong?.setAttribute("aria-invalid", "true");
       wrong?.focus();
@@ -72,7 +72,7 @@ export async function recovery(capture, state, signal) {
       submit.disabled = false;
     }
   };
-  // A field out of its range in a closed disclosure could not be shown to be wrong.
+  // Opens the options when one of them is out of range: a closed section cannot show it.
   form.addEventListener("invalid", () => (form.querySelector("details").open = true), true);
   return form;
 }
