@@ -13,11 +13,11 @@ from playwright.sync_api import Page, expect
 
 from tests.browser.pages import MINUTE, ZIP
 from tests.end_to_end.conftest import BANDS, Service
+from tests.parts.captures import nested_program
 from tests.workflows.ingest.video.camera import Camera, film, lights
 from workflows.images import integer_formats
 from workflows.programs.program import Program
 from workflows.simulation import glass_ball
-from workflows.simulation.scene import nested_program
 
 RATE = 4
 

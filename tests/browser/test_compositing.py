@@ -16,8 +16,9 @@ from playwright.sync_api import Browser, BrowserContext, Page, Route, expect
 
 from tests.browser.pages import PHONE
 from tests.end_to_end.conftest import BANDS, Service, png
+from tests.parts.captures import nested_program
 from workflows.simulation import glass_ball
-from workflows.simulation.scene import nested_program, write_capture
+from workflows.simulation.scene import write_capture
 
 SIZE = 96, 72
 MINUTE = 60_000

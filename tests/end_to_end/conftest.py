@@ -17,12 +17,13 @@ import pytest
 
 from services.client import Client
 from storage.objects.checksums import SUFFIX
+from tests.parts.captures import nested_program
 from tests.services.cluster.clusters import workers
 from workflows.images import integer_formats
 from workflows.images.tone_curves import from_light
 from workflows.programs.program import Program
 from workflows.simulation import glass_ball
-from workflows.simulation.scene import Scene, nested_program, write_capture
+from workflows.simulation.scene import Scene, write_capture
 
 BANDS = ((8, 6, 16), (16, 12, 16), (32, 24, 20))
 

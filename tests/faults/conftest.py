@@ -9,8 +9,9 @@ import pytest
 
 from tests.end_to_end.conftest import BANDS
 from tests.faults.rig import Rig, Row
+from tests.parts.captures import nested_program
 from workflows.simulation import glass_ball
-from workflows.simulation.scene import nested_program, write_capture
+from workflows.simulation.scene import write_capture
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -1,6 +1,5 @@
 """Changes of real files, as they are damaged and as liars make them: the same `Random`, the same bytes."""
 
-import io
 import json
 import re
 import struct
@@ -9,6 +8,8 @@ import zlib
 from collections.abc import Callable, Iterator, Sequence
 from random import Random
 from typing import Any
+
+from tests.parts.captures import zip_bytes
 
 EXTREMES = (0, 1, 2, 0x7F, 0x80, 0xFF, 0x7FFF, 0x8000, 0xFFFF, 0x10000, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)
 """Where counts and lengths run over."""
@@ -214,15 +215,6 @@ def _put(document: Any, way: Sequence[Any], value: Any) -> Any:
     return document
 
 
-def zipped(files: dict[str, bytes], pack: int = zipfile.ZIP_STORED) -> bytes:
-    """A ZIP whose directory and checksums are right, of files of one date."""
-    target = io.BytesIO()
-    with zipfile.ZipFile(target, "w", pack) as archive:
-        for name, data in files.items():
-            archive.writestr(zipfile.ZipInfo(name), data, pack)
-    return target.getvalue()
-
-
 ZIP_MARKS = rb"PK(?:\x01\x02|\x03\x04|\x05\x06|\x06\x06|\x06\x07)"
 
 
@@ -234,8 +226,8 @@ def damaged_zip(
     if random.random() < 0.5:
         name = random.choice([*files])
         files[name] = change(random, name, files[name])
-        return zipped(files, random.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)))
-    whole = zipped(files, random.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)))
+        return zip_bytes(files, random.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)))
+    whole = zip_bytes(files, random.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)))
     return damaged(random, whole, ZIP_MARKS)
 
 

@@ -62,7 +62,7 @@ def _saved(kind: str, mode: str = "RGB", **options: Any) -> bytes:
 
 @cache
 def pngs() -> tuple[bytes, ...]:
-    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    profile = _dated(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
     alpha = np.dstack([PIXELS, PIXELS[:, :, 0]])
     return (
         encode_png(PIXELS),
@@ -77,7 +77,7 @@ def pngs() -> tuple[bytes, ...]:
 
 @cache
 def jpegs() -> tuple[bytes, ...]:
-    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    profile = _dated(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
     return (
         _saved("JPEG", quality=80),
         _saved("JPEG", progressive=True, quality=50),
@@ -222,7 +222,12 @@ def backdrops() -> tuple[bytes, ...]:
 
 def profile() -> bytes:
     """A colour profile of many kinds of tags."""
-    return imagecodecs.cms_profile("srgb")
+    return _dated(imagecodecs.cms_profile("srgb"))
+
+
+def _dated(profile: bytes) -> bytes:
+    """A colour profile with a fixed date of creation (ICC.1, sect. 7.2.8) in place of now."""
+    return profile[:24] + bytes((7, 208, 0, 1, 0, 1)) + bytes(6) + profile[36:]
 
 
 def _clip(container: str, codec: str, form: str, **options: str) -> bytes:

@@ -34,6 +34,7 @@ from storage.objects.checksums import seal
 from storage.objects.store import Objects
 from tests.fuzzing import changes, requests, seeds
 from tests.fuzzing.campaign import GUARDED, KEPT, MEMORY, Refused, Target
+from tests.parts.captures import nested_program, zip_bytes
 from tests.workflows.ingest.video.camera import Camera, capture, film, lights, overstated
 from tests.workflows.mattes.imports.conftest import make_matte, pack_chunk, signed, unpack_chunk, unpacked
 from workflows.composite import composite
@@ -48,7 +49,6 @@ from workflows.mattes.imports.importing import take_in
 from workflows.mattes.options import parse_options
 from workflows.programs.program import Program
 from workflows.simulation.glass_ball import glass_ball
-from workflows.simulation.scene import nested_program
 from workflows.untrusted import zip_files
 from workflows.untrusted.limits import Limits
 
@@ -103,7 +103,7 @@ def make_bundle(random: Random, whole: Files) -> bytes:
     files = seeds.record_files(record)
     if random.random() < 0.3:
         return changes.damaged_zip(random, files, lambda r, name, data: changes.damaged(r, data))
-    return changes.zipped(files | {"capture.json": changes.other_json(random, record)}, zipfile.ZIP_DEFLATED)
+    return zip_bytes(files | {"capture.json": changes.other_json(random, record)}, zipfile.ZIP_DEFLATED)
 
 
 def read_bundle(data: bytes, folder: Path) -> None:
@@ -173,7 +173,7 @@ def make_archive(random: Random, whole: dict[str, bytes]) -> bytes:
     try:
         return signed(files)
     except (ValueError, TypeError, KeyError, RecursionError):  # the manifest itself is changed
-        return changes.zipped(files)
+        return zip_bytes(files)
 
 
 def read_archive(data: bytes, folder: Path) -> None:
@@ -300,7 +300,7 @@ def read_backdrop_clip(data: bytes, folder: Path) -> None:
         objects.delete(stored_composites.path("j"))
 
 
-PROGRAM = nested_program((64, 48), ((4, 3, 10),), levels=3)
+PROGRAM = nested_program((64, 48), bands=((4, 3, 10),), levels=3)
 
 
 def capture_files() -> dict[str, Files]:
@@ -335,7 +335,7 @@ def make_capture(random: Random, whole: dict[str, Files]) -> bytes:
         text = changes.other_json(random, record)
     else:
         files[broken] = damaged_film(random, one) if end == ".mp4" else changes.damaged(random, one)
-    return changes.zipped({"capture.json": text, **files})
+    return zip_bytes({"capture.json": text, **files})
 
 
 def read_capture(data: bytes, folder: Path) -> None:

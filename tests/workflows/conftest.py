@@ -2,7 +2,6 @@
 
 import asyncio
 import hashlib
-import io
 import json
 import zipfile
 from collections.abc import Callable, Iterator
@@ -15,6 +14,7 @@ import pytest
 from storage.layout import captures, uploads
 from storage.layout.captures import Stack
 from storage.objects.store import Objects
+from tests.parts.captures import zip_bytes
 from tests.workflows.images.dngs import dng
 from workflows.ingest import steps as ingest_steps
 from workflows.jobs import Task
@@ -36,19 +36,13 @@ def objects(folder: Path) -> Objects:
 
 @pytest.fixture(scope="session")
 def make_zip() -> Zip:
-    """Makes a bundle of a capture.json and files."""
+    """Makes a capture archive of a capture.json and files."""
 
     def make(
         record: dict[str, Any] | bytes | None, files: dict[str, bytes], pack: int = zipfile.ZIP_STORED
     ) -> bytes:
-        target = io.BytesIO()
-        with zipfile.ZipFile(target, "w", pack) as archive:
-            if record is not None:
-                text = record if isinstance(record, bytes) else json.dumps(record).encode()
-                archive.writestr("capture.json", text)
-            for name, data in files.items():
-                archive.writestr(zipfile.ZipInfo(name), data, pack)
-        return target.getvalue()
+        text = record if isinstance(record, bytes) else json.dumps(record).encode()
+        return zip_bytes({**({} if record is None else {"capture.json": text}), **files}, pack)
 
     return make
 

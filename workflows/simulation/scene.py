@@ -16,10 +16,7 @@ from numpy.typing import NDArray
 from storage.errors import OptionError
 from workflows.images.resample import area_mean
 from workflows.images.tone_curves import from_light, to_light
-from workflows.programs.program import Bernoulli, Constant, Monitor, Program
-
-DEMO_BANDS = ((16, 12, 24), (32, 24, 20), (64, 48, 20), (128, 96, 20), (256, 192, 20), (512, 384, 20))
-"""Columns, rows and number of patterns of grids that nest, for a monitor of 1280 x 960 pixels."""
+from workflows.programs.program import Program
 
 Floats = NDArray[np.float32]
 Frame = NDArray[np.uint8] | NDArray[np.uint16]
@@ -179,33 +176,6 @@ class Scene:
         curve = "srgb" if program.monitor.response == "unknown" else program.monitor.response
         pictures = program.pictures(0, program.count, images)
         return (frame(self.composite(to_light(picture, curve))) for picture in pictures)
-
-
-def nested_program(
-    monitor: tuple[int, int] = (1280, 960),
-    bands: Sequence[tuple[int, int, int]] = DEMO_BANDS,
-    levels: int = 8,
-    seed: int = 7,
-) -> Program:
-    """A program of constant levels and of random grids.
-
-    Parameters
-    ----------
-    monitor : (int, int)
-        Width and height in pixels.
-    bands : sequence of (columns, rows, count)
-        From coarse to fine, each grid a whole multiple of the one before.
-    levels : int
-        Constant levels from 0 to 1, at least 2.
-    seed : int
-        Of the first band; those after it count on from there.
-    """
-    grids = [
-        Bernoulli(kind="bernoulli", columns=columns, rows=rows, count=count, seed=seed + i)
-        for i, (columns, rows, count) in enumerate(bands)
-    ]
-    constant = Constant(kind="constant", levels=tuple(np.linspace(0, 1, levels).round(6).tolist()))
-    return Program(monitor=Monitor(width=monitor[0], height=monitor[1]), parts=(constant, *grids))
 
 
 def write_capture(

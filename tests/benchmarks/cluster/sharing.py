@@ -16,10 +16,11 @@ import numpy as np
 
 from services.client import Client
 from tests.benchmarks.recovery.kits import served, show
+from tests.parts.captures import nested_program
 from workflows.images.integer_formats import decode, encode_png
 from workflows.programs.presets import preset
 from workflows.simulation import glass_ball
-from workflows.simulation.scene import nested_program, write_capture
+from workflows.simulation.scene import write_capture
 
 BANDS = ((8, 6, 16), (16, 12, 16), (32, 24, 20))
 

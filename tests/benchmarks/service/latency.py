@@ -25,8 +25,9 @@ from services.cli.demo_run import service
 from services.client import Client
 from tests.benchmarks.cluster.sharing import BANDS, enlarge
 from tests.benchmarks.recovery.kits import show
+from tests.parts.captures import nested_program
 from workflows.simulation import glass_ball
-from workflows.simulation.scene import nested_program, write_capture
+from workflows.simulation.scene import write_capture
 
 
 async def poll(url: str, path: str, phase: float, until: float, took: list[float]) -> None:

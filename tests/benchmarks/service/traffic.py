@@ -21,11 +21,12 @@ import numpy as np
 
 from services.client import Client
 from tests.end_to_end.conftest import png
+from tests.parts.captures import nested_program
 from tests.workflows.composite.video.test_steps import clip, even, pictures
 from workflows.images import float_formats
 from workflows.images.integer_formats import encode_jpeg
 from workflows.simulation import glass_ball
-from workflows.simulation.scene import nested_program, write_capture
+from workflows.simulation.scene import write_capture
 
 ZIP = {"Content-Type": "application/zip"}
 TUS = {"Tus-Resumable": "1.0.0"}

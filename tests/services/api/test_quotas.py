@@ -17,8 +17,9 @@ from storage.database.engine import open_engine, reading, writing
 from storage.database.owners import bound
 from storage.objects.store import Objects
 from storage.records import api_keys, captures, jobs, mattes
+from tests.parts.captures import nested_program
 from workflows.simulation import glass_ball
-from workflows.simulation.scene import nested_program, write_capture
+from workflows.simulation.scene import write_capture
 
 Serve = Callable[..., TestClient]
 TUS = {"Tus-Resumable": "1.0.0"}

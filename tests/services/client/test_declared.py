@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from services.client._declared import declared
+from tests.parts.captures import nested_program
 from workflows.images import integer_formats
 from workflows.simulation import glass_ball
-from workflows.simulation.scene import nested_program, write_capture
+from workflows.simulation.scene import write_capture
 
 PARTS = [
     {"kind": "constant", "levels": [0, 1]},

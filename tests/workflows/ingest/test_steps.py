@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from storage.errors import CaptureError, Corrupt, OverLimit
 from storage.layout.captures import Stack
 from storage.objects.store import Objects
+from tests.parts.captures import nested_program
 from tests.workflows.ingest import peak
 from tests.workflows.ingest.records import record
 from workflows.images.integer_formats import encode_png
@@ -24,7 +25,7 @@ from workflows.ingest import steps as ingest_steps
 from workflows.jobs import Task
 from workflows.recovery.noise import Noise
 from workflows.simulation.glass_ball import glass_ball
-from workflows.simulation.scene import nested_program, write_capture
+from workflows.simulation.scene import write_capture
 from workflows.untrusted.limits import Limits
 
 Zip = Callable[..., bytes]
@@ -191,7 +192,7 @@ def test_an_unknown_response_is_estimated(
     ingest: Ingest, camera: str, monitor: str, found: dict[str, Any]
 ) -> None:
     scene = glass_ball(40, 30, monitor=(64, 48), rays=4)
-    program = nested_program((64, 48), ((4, 3, 4),), levels=8)
+    program = nested_program((64, 48), bands=((4, 3, 4),), levels=8)
     if monitor == "unknown":
         # Levels that a gamma of 2.2 turns into those that were filmed.
         levels = tuple((np.linspace(0, 1, 8) ** (1 / 2.2)).tolist())
@@ -224,7 +225,7 @@ def test_an_unknown_response_is_estimated(
 def test_the_noise_is_the_cameras(ingest: Ingest) -> None:
     scene = glass_ball(80, 60, monitor=(64, 48), rays=4)
     target = io.BytesIO()
-    write_capture(scene, nested_program((64, 48), ((4, 3, 2),), levels=8), target, noise=2.0, depth=16)
+    write_capture(scene, nested_program((64, 48), bands=((4, 3, 2),), levels=8), target, noise=2.0, depth=16)
     noise = Noise(**ingest("c", target.getvalue()).attributes["noise"])
     for value in (0.05, 0.3, 0.8):
         # The simulated camera's deviation is 0.002 + 0.006 sqrt(value), times `noise`.

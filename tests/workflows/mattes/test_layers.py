@@ -13,6 +13,7 @@ from storage.layout import mattes
 from storage.layout.mattes import Block, Matte
 from storage.objects.store import Objects
 from storage.steps import FINISH, PREPARE
+from tests.parts.captures import nested_program
 from workflows.composite import composite
 from workflows.images import integer_formats
 from workflows.jobs import Task, run
@@ -20,7 +21,7 @@ from workflows.mattes import layers
 from workflows.mattes.layers import confidence
 from workflows.mattes.steps import STEPS
 from workflows.simulation.glass_ball import glass_ball
-from workflows.simulation.scene import nested_program, write_capture
+from workflows.simulation.scene import write_capture
 from workflows.untrusted.limits import Limits
 
 CROSSTALK = [[0.9, 0.1, 0], [0.05, 0.8, 0.15], [0.02, 0.18, 0.8]]
@@ -173,7 +174,7 @@ def test_a_recomposite_from_the_exr_alone_is_as_close_to_the_truth(
     scene = glass_ball(48, 36, monitor=(320, 240), rays=16)
     target = io.BytesIO()
     write_capture(
-        scene, nested_program((320, 240), ((16, 12, 24), (32, 24, 24), (64, 48, 20)), levels=5), target
+        scene, nested_program((320, 240), bands=((16, 12, 24), (32, 24, 24), (64, 48, 20)), levels=5), target
     )
     ingest("c", target.getvalue())
     task = Task("j", "c", "m", {"method": "lobes"}, Limits(1 << 30, 1 << 26))

@@ -16,6 +16,7 @@ from storage.layout import mattes
 from storage.layout.captures import Stack
 from storage.objects.store import Objects
 from storage.steps import FINISH, PREPARE
+from tests.parts.captures import nested_program
 from tests.workflows.ingest.video.camera import Camera, capture, film, lights
 from workflows.composite import composite
 from workflows.images.integer_formats import decode, encode_png
@@ -23,7 +24,7 @@ from workflows.jobs import Task, run
 from workflows.mattes.steps import STEPS
 from workflows.mattes.tiles import cut
 from workflows.simulation.glass_ball import glass_ball
-from workflows.simulation.scene import Scene, nested_program, write_capture
+from workflows.simulation.scene import Scene, write_capture
 from workflows.untrusted.limits import Limits
 
 Zip = Callable[..., bytes]
@@ -57,7 +58,7 @@ def scene() -> Scene:
 @pytest.fixture(scope="module")
 def bundles(scene: Scene) -> dict[bool, bytes]:
     """The ball's capture, without a mask and with one."""
-    program = nested_program((64, 48), ((4, 3, 14), (8, 6, 10)), levels=5)
+    program = nested_program((64, 48), bands=((4, 3, 14), (8, 6, 10)), levels=5)
     made = {}
     for mask in (False, True):
         target = io.BytesIO()
@@ -146,7 +147,7 @@ def test_pixels_outside_the_mask_are_empty(
 def test_a_block_that_the_mask_leaves_out_is_empty(
     recover: Callable[..., tuple[mattes.Matte, int]], scene: Scene, colours: str
 ) -> None:
-    program = nested_program((64, 48), ((4, 3, 14), (8, 6, 10)), levels=5)
+    program = nested_program((64, 48), bands=((4, 3, 14), (8, 6, 10)), levels=5)
     parts = (program.parts[0], *(part.model_copy(update={"colour": colours}) for part in program.parts[1:]))
     corner = np.zeros_like(scene.coverage)
     corner[17:30, 17:30] = 1
@@ -267,7 +268,7 @@ def bracketed(data: bytes, exposures: tuple[float, ...]) -> bytes:
 
 def test_exposures_are_merged_by_what_they_say(objects: Objects, ingest: Ingest) -> None:
     scene = glass_ball(44, 36, monitor=(64, 48), rays=4)
-    program = nested_program((64, 48), ((4, 3, 14), (8, 6, 10)), levels=5)
+    program = nested_program((64, 48), bands=((4, 3, 14), (8, 6, 10)), levels=5)
     target = io.BytesIO()
     write_capture(scene, program, target, noise=0, depth=16, offset=0.003, gain=0.05)
     backdrop = np.random.default_rng(3).random((3, 4, 3), np.float32)
@@ -296,7 +297,7 @@ def test_patterns_that_a_video_lacks_are_done_without(
     make_zip: Zip,
     method: str,
 ) -> None:
-    program = nested_program((64, 48), ((4, 3, 14), (8, 6, 10)), levels=5)
+    program = nested_program((64, 48), bands=((4, 3, 14), (8, 6, 10)), levels=5)
     made = film(lights(scene, program), Camera(hold=0.2, tail=-0.7, options={"crf": "10"}))
     matte, _ = recover(make_zip(*capture(program, made.data, 5)), method=method)
     lacking = Stack(objects, "c").attributes["video"]["missing"]

@@ -3,7 +3,6 @@
 import io
 import json
 import zipfile
-from itertools import pairwise
 from pathlib import Path
 
 import imagecodecs
@@ -11,10 +10,11 @@ import numpy as np
 import pytest
 
 from storage.errors import OptionError
+from tests.parts.captures import nested_program
 from workflows.images.tone_curves import to_light
 from workflows.programs.program import Bernoulli, Constant, Images, Monitor, Program, Stripes
 from workflows.simulation.glass_ball import backdrop, glass_ball
-from workflows.simulation.scene import Scene, nested_program, write_capture
+from workflows.simulation.scene import Scene, write_capture
 
 
 @pytest.fixture(scope="module")
@@ -153,18 +153,9 @@ def test_what_does_not_fit_is_refused_and_nothing_written(
 ) -> None:
     path = tmp_path / "ball.zip"
     with pytest.raises(OptionError, match="monitor of another size"):
-        write_capture(ball, nested_program((64, 48), ((8, 6, 2),)), path)
+        write_capture(ball, nested_program((64, 48), bands=((8, 6, 2),)), path)
     with pytest.raises(OptionError, match="shows 0 images, 1 are given"):
         write_capture(ball, program, path, images=(np.ones((2, 2, 1), np.float32),))
     assert not path.exists()
     with pytest.raises(OptionError, match="no square grid"):
         glass_ball(rays=50)
-
-
-def test_the_demos_program_nests() -> None:
-    program = nested_program()
-    assert program.count == 8 + 24 + 24 + 24 + 26 + 26
-    grids = [(part.columns, part.rows) for part in program.parts if isinstance(part, Bernoulli)]
-    assert all(fine[i] % coarse[i] == 0 for coarse, fine in pairwise(grids) for i in (0, 1))
-    assert program.constants[1][0, 0] == 0
-    assert program.constants[1][-1, 0] == 1

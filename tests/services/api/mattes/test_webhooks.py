@@ -12,8 +12,9 @@ from services.settings import Settings
 from storage.database.engine import open_engine, reading, writing
 from storage.objects.store import Objects
 from storage.records import jobs, mattes
+from tests.parts.captures import nested_program
 from workflows.simulation import glass_ball
-from workflows.simulation.scene import nested_program, write_capture
+from workflows.simulation.scene import write_capture
 
 URL = "http://127.0.0.1:9/told?by=envmatte"
 ZIP = {"Content-Type": "application/zip"}

@@ -8,10 +8,11 @@ import pytest
 from PIL import Image
 
 from storage.layout.captures import Stack
+from tests.parts.captures import nested_program
 from workflows.images.integer_formats import encode_png
 from workflows.ingest.report.contact_sheet import AT_BLACK, AT_WHITE, HEIGHT, WIDTH, contact_sheet
 from workflows.simulation.glass_ball import glass_ball
-from workflows.simulation.scene import nested_program, write_capture
+from workflows.simulation.scene import write_capture
 
 Ingest = Callable[..., Stack]
 
@@ -21,7 +22,7 @@ Ingest = Callable[..., Stack]
 def test_what_is_clipped_is_marked(ingest: Ingest, width: int, height: int, depth: int) -> None:
     target = io.BytesIO()
     scene = glass_ball(width, height, monitor=(64, 48), rays=4)
-    program = nested_program((64, 48), ((4, 3, 4), (8, 6, 5)), levels=3)
+    program = nested_program((64, 48), bands=((4, 3, 4), (8, 6, 5)), levels=3)
     write_capture(scene, program, target, gain=1.2, offset=0.0, noise=0, depth=depth)
     stack = ingest("c", target.getvalue())
     with Image.open(io.BytesIO(contact_sheet(stack))) as sheet:

@@ -4,10 +4,10 @@ from typing import Any
 
 import pytest
 
+from tests.parts.captures import nested_program
 from workflows.ingest.report.expected_psnr import expected
 from workflows.programs.presets import preset
 from workflows.programs.program import Program
-from workflows.simulation.scene import nested_program
 
 SURVEY = {"contrast": 0.81, "deviation": 0.0058}
 """Of a clear ball with usual noise."""
@@ -22,7 +22,7 @@ def ends(program: Program, **other: float) -> tuple[float, float]:
 
 
 def still(blocks: int, count: int = 60) -> Program:
-    return nested_program((1280, 960), ((16, 12, 24), (4 * blocks // 3, blocks, count)), levels=2)
+    return nested_program((1280, 960), bands=((16, 12, 24), (4 * blocks // 3, blocks, count)), levels=2)
 
 
 # PSNR of composites of the ball, the dispersing solid and the frosted lens, see the function's Notes.
@@ -33,7 +33,7 @@ def still(blocks: int, count: int = 60) -> Program:
         (preset("quick"), (47.0, 37.9, 45.0)),
         (preset("sketch"), (40.3, 34.3, 43.4)),
         (preset("paper-250"), (32.6, 36.1, 42.0)),
-        (nested_program((1280, 960), NESTED), (39.1, 38.2, 43.3)),
+        (nested_program((1280, 960), bands=NESTED), (39.1, 38.2, 43.3)),
         (still(48), (25.2, 32.2, 39.8)),
         (still(24, 24), (21.1, 28.2, 38.9)),
     ],

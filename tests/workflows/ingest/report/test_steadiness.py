@@ -14,6 +14,7 @@ from storage.layout import mattes
 from storage.layout.captures import Stack
 from storage.objects.store import Objects
 from storage.steps import PREPARE
+from tests.parts.captures import nested_program
 from workflows.composite import composite
 from workflows.images.integer_formats import encode_png
 from workflows.images.resample import area_mean
@@ -25,7 +26,7 @@ from workflows.mattes.steps import STEPS
 from workflows.programs.presets import preset
 from workflows.programs.program import Program
 from workflows.simulation.glass_ball import glass_ball
-from workflows.simulation.scene import Scene, nested_program, write_capture
+from workflows.simulation.scene import Scene, write_capture
 from workflows.untrusted.limits import Limits
 
 Floats = NDArray[np.float32]
@@ -180,7 +181,7 @@ def test_flicker_is_found_and_taken_out(
 
 def test_too_small_a_frame_tells_nothing(ingest: Ingest) -> None:
     target = io.BytesIO()
-    program = nested_program((64, 48), ((4, 3, 14), (8, 6, 10)), levels=5)
+    program = nested_program((64, 48), bands=((4, 3, 14), (8, 6, 10)), levels=5)
     write_capture(glass_ball(36, 28, monitor=(64, 48), rays=4), program, target, noise=0.5)
     stack = ingest("c", target.getvalue())
     assert stack.attributes["steadiness"] is None

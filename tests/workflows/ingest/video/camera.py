@@ -1,7 +1,6 @@
 """A camera that films a monitor without being synchronised with it, and the truth about its frames."""
 
 import io
-import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -11,6 +10,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
+from tests.parts.captures import zip_bytes
 from workflows.images.tone_curves import from_light, to_light
 from workflows.programs.program import Program
 from workflows.simulation.scene import Scene
@@ -162,10 +162,5 @@ def boxes(video: bytes) -> Iterator[tuple[str, int, int]]:
 
 
 def zipped(record: bytes, files: dict[str, bytes]) -> bytes:
-    """A bundle."""
-    target = io.BytesIO()
-    with zipfile.ZipFile(target, "w") as archive:
-        archive.writestr("capture.json", record)
-        for name, data in files.items():
-            archive.writestr(name, data)
-    return target.getvalue()
+    """A capture archive of a capture.json and files."""
+    return zip_bytes({"capture.json": record, **files})

@@ -11,17 +11,17 @@ import pytest
 from storage.errors import CaptureError
 from storage.layout.captures import Stack
 from storage.objects.store import Objects
+from tests.parts.captures import nested_program
 from tests.workflows.ingest import peak
 from tests.workflows.ingest.video.camera import TICK, Camera, Film, boxes, capture, film, lights, turned
 from workflows.images.tone_curves import from_light
 from workflows.programs.program import Program
 from workflows.simulation.glass_ball import glass_ball
-from workflows.simulation.scene import nested_program
 
 Zip = Callable[..., bytes]
 Ingest = Callable[..., Stack]
 Digests = Callable[[str], dict[str, str]]
-PROGRAM = nested_program((64, 48), ((4, 3, 14), (8, 6, 12), (32, 24, 6)), levels=5)
+PROGRAM = nested_program((64, 48), bands=((4, 3, 14), (8, 6, 12), (32, 24, 6)), levels=5)
 CAMERA = Camera()
 
 

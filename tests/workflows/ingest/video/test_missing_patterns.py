@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from storage.layout.captures import Stack
+from tests.parts.captures import nested_program
 from tests.workflows.ingest.video.camera import Camera, capture, film, lights
 from workflows.ingest.report.report import report
 from workflows.ingest.video.missing_patterns import REMEDIES, by_reason, ranges, remedy
 from workflows.simulation.glass_ball import glass_ball
-from workflows.simulation.scene import nested_program
 
 Zip = Callable[..., bytes]
 Ingest = Callable[..., Stack]
-PROGRAM = nested_program((64, 48), ((4, 3, 14), (8, 6, 12), (32, 24, 6)), levels=5)
+PROGRAM = nested_program((64, 48), bands=((4, 3, 14), (8, 6, 12), (32, 24, 6)), levels=5)
 
 
 @pytest.fixture(scope="module")

@@ -104,7 +104,7 @@ def packed(files: Files, method: int = zipfile.ZIP_STORED) -> bytes:
     target = io.BytesIO()
     with zipfile.ZipFile(target, "w", method) as file:
         for name, data in files.items():
-            file.writestr(name, data)
+            file.writestr(zipfile.ZipInfo(name), data, method)  # of a fixed date
     return target.getvalue()
 
 
