@@ -14,6 +14,7 @@ from sqlalchemy.exc import ArgumentError
 
 from services.runtime.addresses import is_loopback
 from services.runtime.certificates import security_of
+from services.webhooks.signature import signing_key
 from storage.errors import InvalidInput
 from workflows.untrusted.limits import Limits
 
@@ -179,7 +180,10 @@ class Settings(ClusterSettings):
         1 << 30, ge=0, description="Bytes of mattes that a service keeps in memory to composite them again."
     )
     webhook_secret: str | None = Field(
-        None, min_length=16, description="What webhooks are signed with. Without one none are taken."
+        None,
+        min_length=16,
+        description="Signs webhooks: whsec_ and a key in Base64, or any text of 16 characters or more. Without one, "
+        "requests with a webhook are refused.",
     )
     webhook_private: bool = Field(
         False, description="Whether webhooks may be at addresses that are not public, and without TLS."
@@ -191,6 +195,13 @@ class Settings(ClusterSettings):
     def _split(cls, value: object) -> object:
         if isinstance(value, str):
             return tuple(key.strip() for key in value.split(",") if key.strip())
+        return value
+
+    @field_validator("webhook_secret")
+    @classmethod
+    def _stands_for_a_key(cls, value: str | None) -> str | None:
+        if value is not None:
+            signing_key(value)
         return value
 
     @field_validator("database")

@@ -1,7 +1,5 @@
-"""Webhooks: what is to be told when jobs have ended is sent, signed, and again until it is taken."""
+"""Sends webhooks: signs what is queued when a job ends, and sends it again until the receiver accepts it."""
 
-import hashlib
-import hmac
 import http.client
 import logging
 import threading
@@ -14,6 +12,7 @@ from sqlalchemy import Connection, Engine, Row
 
 from services.settings import Settings
 from services.webhooks import safe_http
+from services.webhooks.signature import headers_of, signing_key
 from storage.database.engine import reading, writing
 from storage.errors import NoRoom, NotFound, OptionError, Unavailable
 from storage.records import job_log, jobs, leases, webhook_deliveries
@@ -22,60 +21,48 @@ from storage.records.leases import Superseded
 logger = logging.getLogger(__name__)
 
 POLL = 0.5
-"""Seconds between two looks for what is to be sent."""
+"""Seconds between two queries for deliveries that are due."""
 THREADS = 8
-"""Requests at once: a receiver that is slow holds up one of them."""
+"""Requests at once, so that one slow receiver does not hold up the others."""
 
 
-def check(url: str | None, settings: Settings) -> None:
-    """See that a URL can be a job's webhook.
+def check_webhook(url: str | None, settings: Settings) -> None:
+    """Check that a URL can be a job's webhook; None is fine.
 
     Raises
     ------
     OptionError
-        If it can't, or this service sends none.
+        If it can't, or if the service sends no webhooks.
     """
     if url is None:
         return
     if settings.webhook_secret is None:
         raise OptionError(
-            "this service tells no webhooks, for it has nothing to sign them with: set ENVMATTE_WEBHOOK_SECRET",
+            "this service sends no webhooks because it has no secret to sign them with: set ENVMATTE_WEBHOOK_SECRET",
             field="webhook",
         )
-    safe_http.check(url, private=settings.webhook_private)
-
-
-def signature(secret: str, body: bytes, at: int) -> str:
-    """The header `Envmatte-Signature`: HMAC-SHA256 of the time, a full stop, and the body.
-
-    Parameters
-    ----------
-    at : int
-        The time, in seconds since 1970: a receiver refuses what is old, and so what someone recorded.
-    """
-    digest = hmac.new(secret.encode(), f"{at}.".encode() + body, hashlib.sha256).hexdigest()
-    return f"t={at},v1={digest}"
+    safe_http.check_url(url, private=settings.webhook_private)
 
 
 class Sender:
-    """Sends what is to be sent, until it is stopped, whenever its coordinator holds the lease.
+    """Sends the deliveries that are due, while its coordinator holds the lease; a context manager.
 
     Parameters
     ----------
     settings : Settings
-        With a secret.
+        With a webhook secret.
     engine : sqlalchemy.Engine
     token : callable
-        Tells the coordinator's token, None while it holds no lease.
+        Returns the coordinator's token, None while it holds no lease.
     """
 
     def __init__(self, settings: Settings, engine: Engine, token: Callable[[], int | None]) -> None:
-        self._secret = settings.webhook_secret or ""
+        self._key = signing_key(settings.webhook_secret or "")
         self._private = settings.webhook_private
         self._engine = engine
         self._token = token
         self._stopped = threading.Event()
-        self._under_way: set[Future[None]] = set()
+        self._running: set[Future[None]] = set()
         self._pool = ThreadPoolExecutor(THREADS, thread_name_prefix="webhook")
         self._thread = threading.Thread(target=self._run, name="webhooks")
 
@@ -94,15 +81,15 @@ class Sender:
             if token is None:
                 continue
             try:
-                self._look(token)
+                self._send_due(token)
             except (Unavailable, NoRoom, Superseded) as error:
                 logger.warning("webhooks wait: %s", error)
             except Exception:  # nothing may end this thread
-                logger.exception("the webhooks go on after an error")
+                logger.exception("webhooks continue after an unexpected error")
 
-    def _look(self, token: int) -> None:
-        self._under_way = {future for future in self._under_way if not future.done()}
-        free = THREADS - len(self._under_way)
+    def _send_due(self, token: int) -> None:
+        self._running = {future for future in self._running if not future.done()}
+        free = THREADS - len(self._running)
         with reading(self._engine) as c:
             if not free or not webhook_deliveries.any_due(c):
                 return
@@ -110,39 +97,38 @@ class Sender:
             leases.check(c, token)
             claimed = webhook_deliveries.claim(c, free)
         for row in claimed:
-            self._under_way.add(self._pool.submit(self._attempt, row))
+            self._running.add(self._pool.submit(self._attempt, row))
 
     def _attempt(self, row: Row[Any]) -> None:
-        """Send one, and write down what came of it; what can't be is tried again as if it had not been."""
+        """Send one delivery and record the outcome; if it can't be recorded, the delivery is sent again."""
         body = row.body.encode()
         headers = {
             "Content-Type": "application/json",
             "User-Agent": "envmatte",
-            "Envmatte-Delivery": row.id,
-            "Envmatte-Signature": signature(self._secret, body, int(time.time())),
+            **headers_of(self._key, row.id, int(time.time()), body),
         }
         try:
             status = safe_http.post(row.url, body, headers, private=self._private)
-            taken, outcome = 200 <= status < 300, f"answered with {status}"
+            accepted, outcome = 200 <= status < 300, f"answered with {status}"
         except (OSError, http.client.HTTPException, ValueError) as error:
-            taken, outcome = False, f"no answer: {error}"
+            accepted, outcome = False, f"no answer: {error}"
         try:
             with writing(self._engine) as c:
-                if taken:
+                if accepted:
                     webhook_deliveries.delivered(c, row.id)
                 else:
                     delay = webhook_deliveries.failed(c, row.id, row.attempts)
                     outcome += "; given up" if delay is None else f"; again in {delay:.0f} s"
                 _note(c, row.job, f"webhook, attempt {row.attempts}: {outcome}")
         except (Unavailable, NoRoom) as error:
-            logger.warning("a webhook will be told once more: %s", error)
+            logger.warning("a webhook will be sent again: %s", error)
         except Exception:
-            logger.exception("a webhook will be told once more")
+            logger.exception("a webhook will be sent again")
 
 
 def _note(connection: Connection, job: str, text: str) -> None:
     try:
         jobs.get(connection, job)
-    except NotFound:  # deleted meanwhile
+    except NotFound:  # deleted since
         return
     job_log.note(connection, job, text)

@@ -448,7 +448,7 @@ def make_url(random: Random, whole: Files) -> bytes:
 
 
 def read_url(data: bytes, folder: Path) -> None:
-    safe_http.check(data.decode("utf-8", "replace"), private=bool(data and data[0] & 1))
+    safe_http.check_url(data.decode("utf-8", "replace"), private=bool(data and data[0] & 1))
 
 
 def target(

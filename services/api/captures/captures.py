@@ -17,7 +17,7 @@ from services.api.http.types import After, Limit
 from services.api.quotas import admit, admit_upload
 from services.runtime import tracing
 from services.runtime.problems import WrongMediaType
-from services.webhooks import sender
+from services.webhooks.sender import check_webhook
 from storage.database.engine import reading, writing
 from storage.database.rows import new_id, page
 from storage.database.tables import captures as table
@@ -173,7 +173,7 @@ async def _from_body(
     context: Context, request: Request, name: str, key: str | None, webhook: str | None
 ) -> Row[Any]:
     """Stream the archive into the store; what is cut off, too large or refused leaves nothing."""
-    await anyio.to_thread.run_sync(sender.check, webhook, context.settings)  # which looks its host up
+    await anyio.to_thread.run_sync(check_webhook, webhook, context.settings)  # which looks its host up
     limit = upload_limit(context.settings)
     length = limit.check_announced(request)
     earlier = await anyio.to_thread.run_sync(_find_earlier, context, key)
@@ -197,7 +197,7 @@ async def _from_body(
 def _from_upload(context: Context, wanted: FromUpload, key: str | None) -> Row[Any]:
     """Make a capture from a finished upload, under the same id; a repeat answers with it."""
     upload = wanted.upload
-    sender.check(wanted.webhook, context.settings)
+    check_webhook(wanted.webhook, context.settings)
     earlier = _find_earlier(context, key)
     if earlier is not None:
         return earlier

@@ -18,7 +18,7 @@ from services.api.jobs.wait_reason import reason
 from services.api.quotas import admit
 from services.coordinator.job_kinds import JOB_KINDS
 from services.runtime import tracing
-from services.webhooks import sender
+from services.webhooks.sender import check_webhook
 from storage.database.engine import reading, writing
 from storage.database.rows import new_id, page
 from storage.database.tables import jobs as table
@@ -173,7 +173,7 @@ def post_job(
 ) -> Job:
     """Queue the recovery of a matte; the capture may still be ingesting."""
     options = parse_options(request.options)
-    sender.check(request.webhook, context.settings)
+    check_webhook(request.webhook, context.settings)
 
     def create(c: Connection) -> str:
         capture = captures.get(c, request.capture)

@@ -16,7 +16,7 @@ from services.api.http.media_types import JSON, media_type_of
 from services.api.jobs.jobs import Job
 from services.api.quotas import admit, admit_upload
 from services.runtime import tracing
-from services.webhooks import sender
+from services.webhooks.sender import check_webhook
 from storage.database.engine import reading
 from storage.database.rows import new_id
 from storage.errors import Conflict, Corrupt
@@ -58,7 +58,7 @@ async def composite_clip(
     OptionError
         If the URL can't be told.
     """
-    await anyio.to_thread.run_sync(sender.check, webhook, context.settings)  # which looks its host up
+    await anyio.to_thread.run_sync(check_webhook, webhook, context.settings)  # which looks its host up
     limit = upload_limit(context.settings, "a clip")
     length = limit.check_announced(request)
     key = request.headers.get("idempotency-key", "")[:256]

@@ -253,7 +253,7 @@ def soak(hours: int, minutes: float, folder: Path, seed: int = 1) -> dict[str, A
         "hours": hours,
         "minutes": minutes,
         "done": dict(sorted(town.done.items())),
-        "webhooks": len(told.came),
+        "webhooks": len(told.received),
         "samples": samples,
         "trends": {name: asdict(one) | {"grows": one.grows} for name, one in trends.items()},
         "said": verdict(trends, remains, town.wrong),

@@ -1,4 +1,4 @@
-"""Real receivers of webhooks: small web servers that write down what comes."""
+"""Receivers of webhooks: small web servers that record what they get."""
 
 import ssl
 import threading
@@ -11,10 +11,10 @@ from pathlib import Path
 
 @dataclass
 class Receiver:
-    """A receiver: its URL, and headers and bodies of what came."""
+    """The URL of a receiver, and the headers and bodies of the requests that it got."""
 
     url: str = ""
-    came: list[tuple[dict[str, str], bytes]] = field(default_factory=list)
+    received: list[tuple[dict[str, str], bytes]] = field(default_factory=list)
     news: threading.Event = field(default_factory=threading.Event)
 
 
@@ -22,14 +22,14 @@ class Receiver:
 def receiver(
     status: Callable[[int], int], certificate: Path | None = None, **headers: str
 ) -> Iterator[Receiver]:
-    """A receiver on a free port of loopback that answers its n-th request so; with a certificate, by TLS."""
+    """A receiver on a free port of loopback that answers request n with ``status(n)``; with a certificate, over TLS."""
     found = Receiver()
 
     class Handler(BaseHTTPRequestHandler):
         def do_POST(self) -> None:
             body = self.rfile.read(int(self.headers["Content-Length"]))
-            answer = status(len(found.came))
-            found.came.append((dict(self.headers), body))
+            answer = status(len(found.received))
+            found.received.append((dict(self.headers), body))
             found.news.set()
             self.send_response(answer)
             for name, value in ({"Content-Length": "0"} | headers).items():
@@ -46,7 +46,7 @@ def receiver(
             context.load_cert_chain(certificate)
             server.socket = context.wrap_socket(server.socket, server_side=True)
             scheme = "https"
-        found.url = f"{scheme}://127.0.0.1:{server.server_port}/told?by=envmatte"
+        found.url = f"{scheme}://127.0.0.1:{server.server_port}/webhook?by=envmatte"
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         try:

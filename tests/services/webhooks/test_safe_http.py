@@ -114,23 +114,23 @@ def test_addresses_that_are_not_public(address: str) -> None:
 @pytest.mark.parametrize("url", REFUSED)
 def test_urls_of_such_addresses_are_refused_unless_they_may_be(url: str) -> None:
     with pytest.raises(OptionError, match="ENVMATTE_WEBHOOK_PRIVATE") as caught:
-        safe_http.check(url, private=False)
+        safe_http.check_url(url, private=False)
     assert caught.value.fields == {"field": "webhook"}
-    safe_http.check(url, private=True)
+    safe_http.check_url(url, private=True)
 
 
 @pytest.mark.parametrize("url", NO_URL)
 @pytest.mark.parametrize("private", [False, True])
 def test_what_is_no_webhook_is_refused(url: str, private: bool) -> None:
     with pytest.raises(OptionError, match="https://HOST"):
-        safe_http.check(url, private=private)
+        safe_http.check_url(url, private=private)
 
 
 def test_without_tls_only_where_addresses_may_be_private() -> None:
-    safe_http.check("https://example.com:8443/a?b=c", private=False)
-    safe_http.check("http://example.com/", private=True)
+    safe_http.check_url("https://example.com:8443/a?b=c", private=False)
+    safe_http.check_url("http://example.com/", private=True)
     with pytest.raises(OptionError, match="https://HOST"):
-        safe_http.check("http://example.com/", private=False)
+        safe_http.check_url("http://example.com/", private=False)
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "2130706433", "127.1"])
@@ -139,9 +139,9 @@ def test_nothing_connects_to_an_address_that_is_not_public(host: str) -> None:
         url = found.url.replace("127.0.0.1", host)
         with pytest.raises(safe_http.Refused, match="not public"):
             safe_http.post(url, b"x", {}, private=False)
-        assert found.came == []
+        assert found.received == []
         assert safe_http.post(url, b"x", {"A": "b"}, private=True) == 200
-    ((headers, body),) = found.came
+    ((headers, body),) = found.received
     assert (headers["Host"].rpartition(":")[0], headers["A"], body) == (host, "b", b"x")
 
 
@@ -168,13 +168,13 @@ def test_it_connects_to_the_address_that_was_checked(monkeypatch: pytest.MonkeyP
         url = found.url.replace("127.0.0.1", "rebinding.example")
         assert safe_http.post(url, b"x", {}, private=True) == 200
     assert len(asked) == 1
-    assert found.came[0][0]["Host"].startswith("rebinding.example:")
+    assert found.received[0][0]["Host"].startswith("rebinding.example:")
 
 
 def test_a_redirect_is_not_followed() -> None:
     with receiver(lambda n: 200) as goal, receiver(lambda n: 302, Location=goal.url) as found:
         assert safe_http.post(found.url, b"x", {}, private=True) == 302
-        assert goal.came == []
+        assert goal.received == []
 
 
 @pytest.fixture(scope="module")
@@ -207,13 +207,13 @@ def test_whom_it_talks_to_by_tls_has_to_have_a_certificate(
         assert safe_http.post(named, b"x", {}, private=True) == 200
         with pytest.raises(ssl.SSLCertVerificationError):  # of another name
             safe_http.post(found.url, b"x", {}, private=True)
-    assert len(found.came) == 1
+    assert len(found.received) == 1
 
 
 @given(st.one_of(st.text(), st.text().map("https://{}/".format), st.text().map("https://[{}]:1/".format)))
 def test_whatever_is_given_is_taken_or_refused(url: str) -> None:
     with suppress(OptionError):
-        safe_http.check(url, private=False)
+        safe_http.check_url(url, private=False)
 
 
 @contextmanager

@@ -1,7 +1,5 @@
-"""Who sends webhooks, and what becomes of those that nobody takes."""
+"""Which coordinator sends webhooks, and what happens to those that are not accepted."""
 
-import hashlib
-import hmac
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +8,7 @@ import pytest
 from sqlalchemy import Engine, select
 
 from services.settings import Settings
-from services.webhooks.sender import Sender, signature
+from services.webhooks.sender import Sender
 from storage.database.engine import open_engine, reading, writing
 from storage.database.tables import deliveries as table
 from storage.records import job_log, jobs, leases, webhook_deliveries
@@ -37,8 +35,8 @@ def ended(engine: Engine, url: str) -> str:
     return job
 
 
-def noted(engine: Engine, job: str) -> str:
-    """What a job's log says of its webhook, once it does."""
+def wait_for_log(engine: Engine, job: str) -> str:
+    """Wait until a job's log mentions its webhook, and return that line."""
     deadline = time.monotonic() + 30
     while time.monotonic() < deadline:
         with reading(engine) as c:
@@ -46,7 +44,7 @@ def noted(engine: Engine, job: str) -> str:
         if found:
             return str(found[-1])
         time.sleep(0.05)
-    raise AssertionError("nothing was noted")
+    raise AssertionError("the log does not mention the webhook")
 
 
 def lease(engine: Engine) -> int:
@@ -56,58 +54,55 @@ def lease(engine: Engine) -> int:
     return token
 
 
-def test_only_the_one_that_leads_sends(engine: Engine) -> None:
+def test_only_the_coordinator_with_the_lease_sends(engine: Engine) -> None:
     old, new = lease(engine), lease(engine)
     with receiver(lambda n: 200) as found:
         job = ended(engine, found.url)
         with Sender(settings(), engine, lambda: None), Sender(settings(), engine, lambda: old):
-            time.sleep(1.5)  # three looks
-            assert found.came == []
+            time.sleep(1.5)  # three polls
+            assert found.received == []
         with Sender(settings(), engine, lambda: new):
-            assert noted(engine, job) == "webhook, attempt 1: answered with 200"
+            assert wait_for_log(engine, job) == "webhook, attempt 1: answered with 200"
     with reading(engine) as c:
         assert c.execute(select(table)).all() == []
-    assert len(found.came) == 1
+    assert len(found.received) == 1
 
 
-def test_one_that_nobody_takes_is_given_up(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_delivery_without_answer_is_given_up_after_the_last_attempt(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(webhook_deliveries, "DELAYS", ())
     token = lease(engine)
     with Sender(settings(), engine, lambda: token):
         job = ended(engine, "http://127.0.0.1:9/")
-        assert "no answer: " in (said := noted(engine, job))
-        assert said.endswith("; given up")
+        assert "no answer: " in (line := wait_for_log(engine, job))
+        assert line.endswith("; given up")
     with reading(engine) as c:
         assert c.execute(select(table)).all() == []
 
 
-def test_one_to_an_address_that_is_not_public_is_not_sent(engine: Engine) -> None:
+def test_nothing_is_sent_to_an_address_that_is_not_public(engine: Engine) -> None:
     token = lease(engine)
     with receiver(lambda n: 200) as found, Sender(settings(private=False), engine, lambda: token):
-        said = noted(engine, ended(engine, found.url))
+        line = wait_for_log(engine, ended(engine, found.url))
         assert (
-            said
+            line
             == "webhook, attempt 1: no answer: 127.0.0.1 is at 127.0.0.1, which is not public; again in 5 s"
         )
-        assert found.came == []
+        assert found.received == []
 
 
-def test_slow_receivers_do_not_hold_up_others(engine: Engine) -> None:
+def test_slow_receivers_do_not_delay_others(engine: Engine) -> None:
     token = lease(engine)
 
     def slow(n: int) -> int:
         time.sleep(3)
         return 200
 
-    with receiver(slow) as tardy, receiver(lambda n: 200) as found:
+    with receiver(slow) as slow_one, receiver(lambda n: 200) as found:
         for _ in range(4):
-            ended(engine, tardy.url)
+            ended(engine, slow_one.url)
         with Sender(settings(), engine, lambda: token):
-            assert noted(engine, ended(engine, found.url)).endswith("200")
+            assert wait_for_log(engine, ended(engine, found.url)).endswith("200")
             with reading(engine) as c:
                 assert len(c.execute(select(table)).all()) == 4
-
-
-def test_the_signature_is_of_time_and_body() -> None:
-    digest = hmac.new(SECRET.encode(), b'17.{"a":1}', hashlib.sha256).hexdigest()
-    assert signature(SECRET, b'{"a":1}', 17) == f"t=17,v1={digest}"
