@@ -5,9 +5,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, expect, sync_playwright
 
-from tests.browser.pages import SIZE, opened
+from tests.browser.pages import MINUTE, SIZE, opened
 from tests.end_to_end.conftest import BANDS, Service, serving
 from tests.parts.captures import nested_program
 from workflows.simulation import glass_ball
@@ -20,6 +20,8 @@ ARGUMENTS = [
     "--use-fake-device-for-media-stream",  # a camera that shows a moving picture
     "--use-fake-ui-for-media-stream",  # which every page may use
 ]
+
+expect.set_options(timeout=MINUTE)  # a busy machine may take longer than the usual five seconds
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

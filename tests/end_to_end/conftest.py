@@ -41,7 +41,7 @@ class Service:
     def kill(self) -> None:
         """End the server as a crash would; its workers have to notice by themselves."""
         self.process.kill()
-        self.process.wait(10)
+        self.process.wait(120)
 
     def stored(self) -> set[str]:
         """Every file of the store that belongs to an upload, a capture or a matte; checksums go with their file."""
@@ -78,11 +78,11 @@ def serving(data: Path, *options: str, **environment: str) -> Iterator[Service]:
         assert " at http" in line, (data.parent / f"{data.name}.log").read_text()
         url = line.rsplit(" at ", 1)[1].strip()
         key = environment.get("ENVMATTE_KEYS", "").partition(",")[0] or None
-        with Client(url, key) as client, httpx2.Client(base_url=url, timeout=60) as http:
+        with Client(url, key) as client, httpx2.Client(base_url=url, timeout=120) as http:
             yield Service(process, data, url, client, http)
     finally:
         process.terminate()
-        process.wait(30)
+        process.wait(120)
         process.stdout.close()
 
 

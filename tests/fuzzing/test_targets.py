@@ -42,7 +42,7 @@ def go_wrong(data: bytes, folder: Path) -> None:
         case 1:
             os.abort()
         case 2:
-            bytearray(2 * campaign.MEMORY)[::4096] = b"x" * (campaign.MEMORY // 2048)
+            bytearray(2 * MEMORY)[::4096] = b"x" * (MEMORY // 2048)
         case 3:
             while True:
                 pass
@@ -50,18 +50,20 @@ def go_wrong(data: bytes, folder: Path) -> None:
             raise Refused
 
 
+MEMORY = 16 << 20
+"""Bytes that an execution of it may take: more would take so long on a busy machine that it counts as a hang."""
 EXPECTED = {0: "error", 1: "crash", 2: "memory", 3: "hang"}
 
 
 def test_every_kind_of_failure_is_counted_and_its_input_kept(
     tmp_path: Path,
 ) -> None:
-    wrong = Target("wrong", make, go_wrong)
+    wrong = Target("wrong", make, go_wrong, memory=MEMORY)
     seeds, inputs = range(25), [wrong.input(seed) for seed in range(25)]
     expected = [
         (EXPECTED[data[0] % 12], seed) for seed, data in zip(seeds, inputs, strict=True) if data[0] % 12 < 4
     ]
-    tally = campaign.run(wrong, 0, len(seeds), tmp_path, cpu=0.5)
+    tally = campaign.run(wrong, 0, len(seeds), tmp_path, cpu=1)
     assert [(failure.kind, failure.seed) for failure in tally.failures] == expected
     assert {kind for kind, _ in expected} == {*EXPECTED.values()}
     for failure in tally.failures:

@@ -78,7 +78,7 @@ class Server:
         """Stop the server: transactions under way are rolled back, connections end."""
         if self._process is not None:
             self._process.send_signal(signal.SIGINT)
-            self._process.wait(30)
+            self._process.wait(120)
 
     @contextmanager
     def stopped(self) -> Iterator[None]:

@@ -41,7 +41,7 @@ def s3(s3_server: str, monkeypatch: pytest.MonkeyPatch) -> str:
 
 def _with_bucket(server: "subprocess.Popen[bytes]", log: Path) -> str:
     """Wait until the server says where it listens, and make the bucket."""
-    end = time.monotonic() + 60
+    end = time.monotonic() + 120
     while True:
         said = [word for word in log.read_text().split() if word.startswith("http://127.0.0.1:")]
         if said:

@@ -82,7 +82,7 @@ def test_decoders_end_with_the_service(tmp_path: Path, end: str, environment: di
         assert decoders(service.process)
         tree = children(service.process)
         getattr(service.process, end)()
-        service.process.wait(30)
+        service.process.wait(120)
         wait(lambda: not running(tree))
 
 

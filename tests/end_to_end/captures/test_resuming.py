@@ -5,7 +5,6 @@ import hashlib
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import threading
@@ -25,6 +24,7 @@ from storage.records import uploads
 from tests.end_to_end.captures.test_uploads import CHUNK, TUS, begin, create, gone, offset_of, uploads_of
 from tests.end_to_end.conftest import Service, paused, serving
 from tests.end_to_end.lines import Line
+from tests.parts.processes import interrupt, running
 
 MB = 1_000_000
 SIZES = [50 * MB, pytest.param(1000 * MB, marks=[pytest.mark.exhaustive, pytest.mark.timeout(1800)])]
@@ -159,13 +159,11 @@ def test_an_interrupted_command_goes_on_when_called_again(
     file = large(bundle, tmp_path / "large.zip", 50 * MB)
     with Line(service.url, pace=0.01) as line:
         command = [sys.executable, "-m", "services", "upload", str(file), "--url", line.url]
-        sending = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-        assert sending.stderr is not None
-        while "upload: " not in (said := sending.stderr.readline()) or "upload: 0%" in said:
-            assert sending.poll() is None
-        os.kill(sending.pid, signal.SIGINT)
-        sending.communicate(timeout=20)
-        assert sending.returncode == 130
+        with running(command) as sending:
+            assert sending.stderr is not None
+            while "upload: " not in (said := sending.stderr.readline()) or "upload: 0%" in said:
+                assert sending.poll() is None
+            assert interrupt(sending)[0] == 130
         before = line.carried
         done = subprocess.run(command, capture_output=True, text=True, timeout=120)
         assert done.returncode == 0, done.stderr

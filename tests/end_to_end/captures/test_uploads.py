@@ -48,7 +48,7 @@ def begin(service: Service, where: str, offset: int, length: int, data: bytes) -
     """Start a PATCH, and send only some of its body."""
     host = urlsplit(service.url)
     assert host.hostname is not None
-    connection = HTTPConnection(host.hostname, host.port, timeout=30)
+    connection = HTTPConnection(host.hostname, host.port, timeout=120)
     connection.putrequest("PATCH", where)
     for name, value in (CHUNK | {"Upload-Offset": str(offset), "Content-Length": str(length)}).items():
         connection.putheader(name, value)
@@ -63,7 +63,7 @@ def uploads_of(service: Service) -> set[str]:
 
 def gone(service: Service, upload: str) -> None:
     """Wait until an upload has left nothing: an archive goes once its capture is ready."""
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 120
     while any(upload in name for name in uploads_of(service)):
         assert time.monotonic() < deadline
         time.sleep(0.05)
@@ -217,7 +217,7 @@ def test_the_quota_is_told_before_the_first_byte(tmp_path: Path, bundle: Path) -
         assert service.http.options("/v1/uploads").headers["tus-max-size"] == str(limit)
         host = urlsplit(service.url)
         for length, status, slug in ((limit + 1, 413, "too-large"), (1 << 55, 507, "no-room")):
-            raw = HTTPConnection(host.hostname or "", host.port, timeout=30)
+            raw = HTTPConnection(host.hostname or "", host.port, timeout=120)
             raw.putrequest("POST", "/v1/uploads")
             for name, value in (CHUNK | {"Upload-Length": length, "Content-Length": length}).items():
                 raw.putheader(name, str(value))
@@ -227,7 +227,7 @@ def test_the_quota_is_told_before_the_first_byte(tmp_path: Path, bundle: Path) -
             assert check_problem(problem, status, slug).keys() & {"limit", "missing"}
             raw.close()
         headers = {"Content-Type": "application/zip", "Content-Length": str(1 << 55)}
-        raw = HTTPConnection(host.hostname or "", host.port, timeout=30)
+        raw = HTTPConnection(host.hostname or "", host.port, timeout=120)
         raw.request("POST", "/v1/captures", headers=headers)
         assert raw.getresponse().status == 507
         raw.close()
@@ -258,7 +258,7 @@ def test_what_came_before_a_line_broke_is_kept(service: Service) -> None:
     before = uploads_of(service)
     where = create(service, 4 << 20)
     begin(service, where, 0, 4 << 20, b"a" * (3 << 20)).close()
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 120
     while not (offset := offset_of(service, where)):
         assert time.monotonic() < deadline
         time.sleep(0.01)
@@ -313,7 +313,7 @@ def test_what_came_unverified_is_not_kept(service: Service) -> None:
     )
     with socket.create_connection((host.hostname, host.port)) as raw:
         raw.sendall(f"PATCH {where} HTTP/1.1\r\n{head}\r\n".encode() + b"a" * 300)
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 120
     while uploads_of(service) != before:
         assert time.monotonic() < deadline
         time.sleep(0.01)
@@ -400,7 +400,7 @@ def test_one_that_nobody_goes_on_with_expires(tmp_path: Path) -> None:
             assert patch(service, unfinished, offset, b"x").status_code == 204
             time.sleep(0.5)
         assert service.http.head(finished, headers=TUS).status_code == 404
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + 120
         while service.stored():
             assert time.monotonic() < deadline
             time.sleep(0.1)

@@ -117,7 +117,7 @@ class Locked:
     """A service with keys, and what alice has there."""
 
     service: Service
-    api_keys: dict[str, str]
+    keys: dict[str, str]
     ids: dict[str, str]
 
     def call(self, route: str, key: str | None) -> httpx2.Response:

@@ -1,8 +1,6 @@
 """The command line against a real service."""
 
 import json
-import os
-import signal
 import subprocess
 import sys
 import time
@@ -12,7 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.end_to_end.conftest import Service, png
+from tests.end_to_end.conftest import Service, paused, png
+from tests.parts.processes import interrupt, running
 from workflows.images import integer_formats
 from workflows.programs import presets
 from workflows.programs.preset_names import PRESETS
@@ -72,14 +71,14 @@ def test_a_wrong_command_line_has_exit_code_2(service: Service) -> None:
 
 def test_an_interrupt_stops_the_waiting_and_not_the_job(service: Service, capture: str) -> None:
     command = [sys.executable, "-m", "services", "recover", capture, "--url", service.url]
-    waiting = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     newest = service.http.get("/v1/jobs?limit=1").json()["jobs"][0]["id"]
-    while (job := service.http.get("/v1/jobs?limit=1").json()["jobs"][0])["id"] == newest:
-        time.sleep(0.01)
-    time.sleep(0.3)
-    os.kill(waiting.pid, signal.SIGINT)
-    _, said = waiting.communicate(timeout=20)
-    assert waiting.returncode == 130
+    with paused(service), running(command) as waiting:
+        while (job := service.http.get("/v1/jobs?limit=1").json()["jobs"][0])["id"] == newest:
+            time.sleep(0.01)
+        assert waiting.stderr is not None
+        assert "recovery: 0%" in waiting.stderr.readline()
+        code, said = interrupt(waiting)
+    assert code == 130
     assert "Interrupted" in said
     assert service.client.wait(job["id"])["state"] == "succeeded"
 
@@ -179,11 +178,10 @@ def test_a_film_is_made_of_a_preset_and_of_its_record(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("out", "first"), [("patterns", "1 of 432"), ("patterns.mkv", "1 of 442")])
 def test_interrupted_patterns_leave_nothing(out: str, first: str, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "services", "patterns", "paper-400", str(tmp_path / out)]
-    writing = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    assert writing.stderr is not None
-    assert first in writing.stderr.readline()
-    os.kill(writing.pid, signal.SIGINT)
-    _, said = writing.communicate(timeout=20)
-    assert writing.returncode == 130
+    with running(command) as writing:
+        assert writing.stderr is not None
+        assert first in writing.stderr.readline()
+        code, said = interrupt(writing)
+    assert code == 130
     assert "Interrupted" in said
     assert not list(tmp_path.iterdir())

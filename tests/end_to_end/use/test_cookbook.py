@@ -111,7 +111,7 @@ def machine(script: str, folder: Path, **settings: str) -> Iterator[subprocess.P
         yield process
     finally:
         os.killpg(process.pid, signal.SIGTERM)
-        process.wait(30)
+        process.wait(120)
         assert process.stdout is not None
         process.stdout.close()
 

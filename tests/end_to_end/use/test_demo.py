@@ -12,7 +12,7 @@ from PIL import Image
 
 def test_the_demo_leaves_its_picture(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "services", "demo", "-o", "picture.png", "--keep", "kept", "--json"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=200)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=280)
     assert done.returncode == 0, done.stderr
     figures = json.loads(done.stdout)
     assert figures["psnr_db"] > 26
@@ -36,5 +36,5 @@ def test_the_service_of_one_that_is_killed_ends(tmp_path: Path) -> None:
         family = psutil.Process(demo.pid).children(recursive=True)
         assert len(family) > 1
         demo.kill()
-    _, alive = psutil.wait_procs(family, timeout=60)
+    _, alive = psutil.wait_procs(family, timeout=120)
     assert alive == []

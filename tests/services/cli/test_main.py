@@ -5,7 +5,6 @@ import os
 import re
 import shlex
 import shutil
-import signal
 import subprocess
 import sys
 import threading
@@ -18,6 +17,7 @@ import pytest
 from click.testing import CliRunner
 
 from services.cli.main import main
+from tests.parts.processes import interrupt, running
 from tests.services.client.test_client import JOB, answering, ok, refused, saying
 
 README = (Path(__file__).parents[3] / "README.md").read_text()
@@ -127,11 +127,9 @@ def test_3_out_of_reach_or_asked_to_come_later() -> None:
 
 def interrupted(command: list[str], come: threading.Event) -> tuple[int, str]:
     """Run a command, and interrupt it once something has come."""
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert come.wait(60)
-    os.kill(process.pid, signal.SIGINT)
-    _, said = process.communicate(timeout=60)
-    return process.returncode, said
+    with running(command) as process:
+        assert come.wait(120)
+        return interrupt(process)
 
 
 def test_130_interrupted_layers_leave_nothing(tmp_path: Path) -> None:

@@ -103,7 +103,7 @@ def test_what_the_service_computes_is_waited_for(monkeypatch: pytest.MonkeyPatch
                 self.end_headers()
                 self.wfile.write(b"pixels")
             else:
-                gone.wait(30)
+                gone.wait(120)
 
         def log_message(self, *arguments: object) -> None:
             pass

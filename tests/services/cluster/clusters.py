@@ -13,7 +13,7 @@ import psutil
 from services.decoding.process import NAME
 
 
-def wait(until: Callable[[], object], seconds: float = 90) -> None:
+def wait(until: Callable[[], object], seconds: float = 120) -> None:
     """Wait for something to become true; how long is no matter, but that it does."""
     end = time.monotonic() + seconds
     while not until():

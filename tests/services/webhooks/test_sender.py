@@ -37,7 +37,7 @@ def ended(engine: Engine, url: str) -> str:
 
 def wait_for_log(engine: Engine, job: str) -> str:
     """Wait until a job's log mentions its webhook, and return that line."""
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 120
     while time.monotonic() < deadline:
         with reading(engine) as c:
             found = [row.text for row in job_log.notes(c, job, 0, 100) if "webhook" in row.text]

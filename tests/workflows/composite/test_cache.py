@@ -118,7 +118,7 @@ def test_a_matte_that_is_deleted_while_it_is_read_is_told_to_all(
     cache, gate = Cache(objects, 1 << 20), threading.Event()
 
     def deleted(self: Matte, row: int, column: int) -> Block:
-        gate.wait(10)
+        gate.wait(120)
         cache.forget("m")
         raise Corrupt("some of it is missing")
 

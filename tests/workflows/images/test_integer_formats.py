@@ -171,11 +171,11 @@ def test_a_format_that_is_not_taken_is_refused() -> None:
     ],
 )
 def test_what_is_too_large_is_refused_by_its_header(data: bytes) -> None:
-    start = time.monotonic()
+    start = time.process_time()
     with pytest.raises(ImageError, match=r"too large|takes more than") as caught:
         decode(data, memory=MEMORY)
     assert caught.value.fields == {"limit": MEMORY}
-    assert time.monotonic() - start < 1
+    assert time.process_time() - start < 1
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
@@ -226,7 +226,7 @@ VALID = {
 
 def tried(data: bytes) -> NDArray[Any] | None:
     """What is decoded, None if it is refused; any other error fails the test."""
-    start = time.monotonic()
+    start = time.process_time()
     try:
         got = decode(data, memory=MEMORY)
     except ImageError:
@@ -236,7 +236,7 @@ def tried(data: bytes) -> NDArray[Any] | None:
         assert got.shape[2] in (1, 3)
         assert got.nbytes <= MEMORY
         assert got.dtype in (np.uint8, np.uint16)
-    assert time.monotonic() - start < 5
+    assert time.process_time() - start < 5
     return got
 
 

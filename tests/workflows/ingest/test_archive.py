@@ -202,10 +202,10 @@ def test_names_given_twice_are_refused(make_zip: Zip, name: str) -> None:
 def test_a_zip_bomb_is_refused_by_its_directory(make_zip: Zip) -> None:
     bomb = make_zip(RECORD, FILES | {"frames/zeros.png": bytes(50 << 20)}, zipfile.ZIP_DEFLATED)
     assert len(bomb) < 100_000
-    start = time.monotonic()
+    start = time.process_time()
     error = refused(bomb)
     assert error.fields == {"limit": 1 << 20}
-    assert time.monotonic() - start < 1
+    assert time.process_time() - start < 1
     many = {f"frames/{n}.dat": bytes(1 << 17) for n in range(8)}
     assert refused(make_zip(RECORD, FILES | many, zipfile.ZIP_DEFLATED)).fields == {"limit": 1 << 20}
 
@@ -313,12 +313,12 @@ def test_a_damaged_archive_is_a_capture_error_or_read(
         if case % 7 == 0:
             at = int(rng.integers(len(data)))
             data[at:at] = rng.bytes(9)
-        start = time.monotonic()
+        start = time.process_time()
         refusals += through(bytes(data), io.BytesIO)
         if case % 20 == 0:
             put("damaged", bytes(data))
             through(b"", lambda _: uploads.read(objects, "damaged"))
-        assert time.monotonic() - start < 2
+        assert time.process_time() - start < 2
     assert refusals > 200
 
 
