@@ -4,6 +4,6 @@ PREPARE, FINISH = -2, -1
 """The steps before and after a job's tiles: tiles too, of which nobody counts the pixels."""
 
 
-def name_of(tile: int) -> str:
+def step_name(tile: int) -> str:
     """What people call a tile, or a step around them."""
     return {PREPARE: "preparing", FINISH: "finishing"}.get(tile, f"tile {tile}")

@@ -54,10 +54,10 @@ def identify(settings: Settings, engine: Engine, key: str | None) -> Caller:
         if any(matches):
             return ADMIN
     with reading(engine) as c:
-        row = api_keys.known(c, key) if key is not None else None
+        row = api_keys.find(c, key) if key is not None else None
         if row is not None:
             return Caller(row.owner, row.scope)
-        if not settings.keys and not api_keys.any_was_made(c):
+        if not settings.keys and not api_keys.any_created(c):
             return ANYONE
     raise Unauthorized("send a key of this service: `Authorization: Bearer KEY`")
 
@@ -92,7 +92,7 @@ def is_open(settings: Settings, engine: Engine) -> bool:
     if settings.keys:
         return False
     with reading(engine) as c:
-        return not api_keys.any_was_made(c)
+        return not api_keys.any_created(c)
 
 
 def require_keys_unless_loopback(settings: Settings, engine: Engine) -> None:

@@ -16,7 +16,7 @@ from services.api.auth import ADMIN, Caller, bearer, check_method, identify, req
 from services.api.http.browser_security import require_own_site
 from services.decoding.pool import Decoders
 from services.settings import Settings
-from storage.database.owners import NOBODY, bound
+from storage.database.owners import NOBODY, for_owner
 from storage.errors import Unavailable
 from storage.objects.store import Objects
 from workflows.composite.cache import Cache
@@ -93,7 +93,9 @@ def authorized(request: Request, given: Key) -> Context:
         require_own_site(request)
     check_method(caller, request)
     check_key = partial(identify, context.settings, context.engine, key)
-    return replace(context, engine=bound(context.engine, caller.owner), caller=caller, check_key=check_key)
+    return replace(
+        context, engine=for_owner(context.engine, caller.owner), caller=caller, check_key=check_key
+    )
 
 
 OwnerContext = Annotated[Context, Depends(authorized)]
@@ -111,7 +113,7 @@ AdminContext = Annotated[Context, Depends(_for_admins)]
 
 def _for_anyone(request: Request) -> Context:
     context = _service_context(request)
-    return replace(context, engine=bound(context.engine, NOBODY))
+    return replace(context, engine=for_owner(context.engine, NOBODY))
 
 
 AnonymousContext = Annotated[Context, Depends(_for_anyone)]

@@ -57,12 +57,12 @@ def limits_of(connection: Connection, settings: Settings, *, whole: bool) -> lis
         Whether to tell what all owners have used together.
     """
     used = {
-        "owner_captures": statistics.of_captures_to_be(connection),
-        "owner_jobs": statistics.of_active_jobs(connection),
-        "owner_bytes": statistics.of_bytes(connection),
+        "owner_captures": statistics.captures_and_uploads(connection),
+        "owner_jobs": statistics.active_jobs(connection),
+        "owner_bytes": statistics.stored_bytes(connection),
     }
     if whole:
-        used["store_bytes"] = statistics.of_bytes(connection, all_owners=True)
+        used["store_bytes"] = statistics.stored_bytes(connection, all_owners=True)
     return [
         Limit(
             name, unit, getattr(settings, name), used.get(name), str(Settings.model_fields[name].description)
@@ -89,7 +89,7 @@ def admit(
         Where some time does.
     """
     if captures and settings.owner_captures is not None:
-        value = statistics.of_captures_to_be(connection) + captures
+        value = statistics.captures_and_uploads(connection) + captures
         if value > settings.owner_captures:
             raise NoRoom(
                 f"you may have {settings.owner_captures} captures, uploads under way among them, and this would be the "
@@ -99,7 +99,7 @@ def admit(
                 value=value,
             )
     if jobs and settings.owner_jobs is not None:
-        value = statistics.of_active_jobs(connection) + jobs
+        value = statistics.active_jobs(connection) + jobs
         if value > settings.owner_jobs:
             raise TooMany(
                 f"you may have {settings.owner_jobs} jobs that are queued or running, ingests among them, and this "
@@ -114,7 +114,7 @@ def admit(
     ):
         if most is None:
             continue
-        value = statistics.of_bytes(connection, all_owners=name == "store_bytes") + size
+        value = statistics.stored_bytes(connection, all_owners=name == "store_bytes") + size
         if value > most:
             # Of the whole service only what is missing: the rest is other owners' business.
             raise NoRoom(

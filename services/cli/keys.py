@@ -66,7 +66,7 @@ def make(name: str, owner: str, scope: str, as_json: bool, **given: Any) -> None
     from storage.records import api_keys
 
     with _opened(given) as engine, writing(engine) as connection:
-        key = api_keys.make(connection, name, owner, scope)
+        key = api_keys.create(connection, name, owner, scope)
     made = {"name": name, "owner": owner, "scope": scope, "key": key}
     click.echo(json.dumps(made, indent=2) if as_json else key)
 
@@ -81,7 +81,7 @@ def list_(as_json: bool, **given: Any) -> None:
     from storage.records import api_keys
 
     with _opened(given) as engine, reading(engine) as connection:
-        rows = api_keys.listed(connection)
+        rows = api_keys.list_all(connection)
     found = [
         {
             "name": row.name,

@@ -45,12 +45,12 @@ def _where(command: F) -> F:
 def _opened(given: dict[str, Any]) -> Iterator[tuple["Settings", "Engine", "Objects"]]:
     """The database and the store of an installation that is there, as they are."""
     from services.settings import Settings
-    from storage.maintenance.row_dump import open_as_it_is
+    from storage.maintenance.row_dump import open_without_upgrade
     from storage.objects.store import Objects
 
     with refusals_told():
         settings = Settings(**given_of(given))
-        engine = open_as_it_is(settings.database_url)
+        engine = open_without_upgrade(settings.database_url)
         try:
             yield settings, engine, Objects(settings.store_url)
         finally:
@@ -157,7 +157,7 @@ def restore(source: str, as_json: bool, **given: Any) -> None:
             raise NotFound(f"there is no folder {folder}: name the one that `envmatte backup` wrote to")
         settings = Settings(**given_of(given))
         settings.data.mkdir(parents=True, exist_ok=True)
-        engine = dialects.create(settings.database_url)
+        engine = dialects.make_engine(settings.database_url)
         try:
             with sole_user(settings.data) if settings.alone else nullcontext(), _shown("restore") as progress:
                 came = restore(Objects(source), engine, Objects(settings.store_url), progress)

@@ -86,7 +86,7 @@ class Coordinator:
         self._housekeeping.shutdown(cancel_futures=True)
         if self._token is not None:
             with suppress(Unavailable, NoRoom), writing(self._engine) as c:
-                leases.give_back(c, self._token)
+                leases.release(c, self._token)
 
     @property
     def token(self) -> int | None:
@@ -118,12 +118,12 @@ class Coordinator:
         self._beat_at = now
         if self._token is None:
             with writing(self._engine) as c:
-                self._token = leases.take(c, self._name, seize=self._settings.alone)
+                self._token = leases.acquire(c, self._name, seize=self._settings.alone)
             if self._token is None:
                 return False
             logger.info("%s runs the jobs from now on", self._name)
         with self._writing() as c:
-            leases.beat(c, self._token, self._dispatcher.cluster)
+            leases.renew(c, self._token, self._dispatcher.cluster)
             expired = forget_expired(c)
         for path in expired:
             self._housekeeping.submit(_logged, remove, self._objects, path)
@@ -150,7 +150,7 @@ class Coordinator:
         if self._token is None:
             raise Superseded("this coordinator holds no lease")
         with writing(self._engine) as c:
-            leases.check(c, self._token)
+            leases.require_held(c, self._token)
             yield c
 
     def _step(self) -> None:
@@ -205,15 +205,15 @@ class Coordinator:
             if not JOB_KINDS[row.kind].is_due(c, row):
                 return
         with self._writing() as c:
-            tiles.begin(c, row.id)
+            tiles.add_steps(c, row.id)
             run = self._run_of(c, row)
-            jobs.enter(c, row.id, run.stage)
+            jobs.enter_stage(c, row.id, run.stage)
         run.start = min((other.used() for other in self._runs.values()), default=0.0)
         self._runs[row.id] = run
         logger.info("%s, from the stage %s on", row.kind, run.stage)
 
     def _run_of(self, connection: Connection, row: Row[Any]) -> JobRun:
-        return JobRun.of(row, tiles.to_do(connection, row.id), self._settings.limits)
+        return JobRun.of(row, tiles.remaining(connection, row.id), self._settings.limits)
 
     def _due(self) -> list[JobRun]:
         """The jobs whose outcomes are written now.

@@ -136,7 +136,7 @@ class Recovery(JobKind):
         mattes.change(connection, task.matte, state="failed")
 
     def cancelled(self, connection: Connection, row: Row[Any]) -> None:
-        mattes.forget(connection, row.matte)
+        mattes.delete(connection, row.matte)
 
     def retried(self, connection: Connection, row: Row[Any]) -> None:
         capture = captures.get(connection, row.capture)
@@ -162,7 +162,7 @@ class Composite(JobKind):
             jobs.change(connection, task.job, stored=0)
 
     def cancelled(self, connection: Connection, row: Row[Any]) -> None:
-        tiles.clear(connection, row.id)
+        tiles.delete_all(connection, row.id)
         jobs.change(connection, row.id, stored=0)
 
     def retried(self, connection: Connection, row: Row[Any]) -> None:
@@ -171,7 +171,7 @@ class Composite(JobKind):
         mattes.get(connection, row.matte)
 
     def tidy(self, objects: Objects, row: Row[Any]) -> None:
-        composites.tidy(objects, row.id)
+        composites.remove_inputs(objects, row.id)
 
     def discard(self, objects: Objects, row: Row[Any]) -> None:
         objects.delete(composites.path(row.id))

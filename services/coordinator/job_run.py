@@ -145,10 +145,10 @@ class JobRun:
             for tile, (seconds, result) in results.items()
             if tile < 0 and "missing" not in result
         ]
-        tile_records.finish(connection, self.job, tiles + steps)
+        tile_records.mark_done(connection, self.job, tiles + steps)
         if tiles and self.paced != threads:
             # Not from the first tiles: their workers load what later ones find loaded.
-            self.paced = threads if tile_records.pace(connection, self.job, after=threads) else 0
+            self.paced = threads if tile_records.start_pace(connection, self.job, after=threads) else 0
         for outcome in self.outcomes:
             if outcome.done is not None:
                 continue
@@ -185,24 +185,26 @@ class JobRun:
         EnvmatteError
             If the job fails because of it.
         """
-        tile, error, name = outcome.tile, outcome.error, job_steps.name_of(outcome.tile)
+        tile, error, name = outcome.tile, outcome.error, job_steps.step_name(outcome.tile)
         if outcome.died is not None:  # and can't log it
             with about(self.job, tile):
                 logger.warning("its worker %s died", outcome.died)
         if isinstance(error, EnvmatteError) and not isinstance(error, Unavailable):
             raise error  # the next attempt would fail in the same way
         if error is not None:
-            if tile_records.miss(connection, self.job, tile, repr(error), attempts):
+            if tile_records.record_failure(connection, self.job, tile, repr(error), attempts):
                 return True
             raise GaveUp(f"{name} failed {attempts} times, last with {error!r}") from error
         if outcome.starved:  # because of its tile, and it would be again
-            if tile_records.miss(
+            if tile_records.record_failure(
                 connection, self.job, tile, f"its worker {outcome.died} ran out of memory", attempts
             ):
                 return True
             raise GaveUp(f"{name} ran out of its worker's memory {attempts} times: {REMEDY}")
         if outcome.died is not None:
-            if tile_records.lose(connection, self.job, tile, f"its worker {outcome.died} died", LOSSES):
+            if tile_records.record_loss(
+                connection, self.job, tile, f"its worker {outcome.died} died", LOSSES
+            ):
                 return True
             raise GaveUp(
                 f"{name}: {LOSSES} workers died while doing it. Either a file makes a decoder hang or crash, or their "
@@ -213,23 +215,23 @@ class JobRun:
     def _enter(
         self, connection: Connection, stage: str, to_do: Sequence[int], task: Task | None = None
     ) -> Next:
-        jobs.enter(connection, self.job, stage)
+        jobs.enter_stage(connection, self.job, stage)
         return Next(stage, to_do, task or self.task)
 
     def _prepared(self, connection: Connection, plan: dict[str, Any]) -> Next:
-        tile_records.lay_down(connection, self.job, plan)
+        tile_records.add_plan(connection, self.job, plan)
         row = jobs.get(connection, self.job)
         tracing.waited("queue", row.trace, row.created_at, row.started_at, job=self.job, kind=row.kind)
         self.kind.prepared(connection, self.task, plan)
         for line in plan.get("notes", ()):
-            job_log.note(connection, self.job, line)
+            job_log.add(connection, self.job, line)
         steps = self.kind.steps
         tiles = order(steps, range(plan["tiles"]))
         return self._enter(connection, steps.stage, tiles, replace(self.task, plan=plan))
 
     def _finished(self, connection: Connection, figures: dict[str, Any]) -> Next:
         if missing := figures.get("missing"):
-            again = tile_records.reopen(connection, self.job, missing, LOSSES)
+            again = tile_records.requeue_missing(connection, self.job, missing, LOSSES)
             if len(again) == len(missing):
                 return self._enter(connection, self.kind.steps.stage, again)
             error = GaveUp(

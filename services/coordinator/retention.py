@@ -12,7 +12,7 @@ from storage.database.engine import reading, writing
 from storage.layout import captures, composites, mattes
 from storage.layout import uploads as stored_uploads
 from storage.maintenance import inventory
-from storage.maintenance.inventory import KEPT
+from storage.maintenance.inventory import GRACE_SECONDS
 from storage.objects.store import Objects
 from storage.records import jobs, uploads
 
@@ -27,7 +27,7 @@ def forget_expired(connection: Connection) -> list[str]:
 
     What an active job works on is kept until that has ended.
     """
-    gone = [stored_uploads.path(upload) for upload in uploads.forget_expired(connection)]
+    gone = [stored_uploads.path(upload) for upload in uploads.delete_expired(connection)]
     for table, making, where in (
         (tables.captures, "ingesting", (captures.path, stored_uploads.path)),
         (tables.mattes, "recovering", (mattes.path,)),
@@ -102,7 +102,7 @@ def count(engine: Engine, objects: Objects) -> None:
                 c.execute(update(table).where(*uncounted).values(stored=stored))
 
 
-def sweep(engine: Engine, objects: Objects, seconds: float = KEPT) -> None:
+def sweep(engine: Engine, objects: Objects, seconds: float = GRACE_SECONDS) -> None:
     """Remove what has no row in the database: what killed processes left.
 
     Parameters
@@ -111,11 +111,11 @@ def sweep(engine: Engine, objects: Objects, seconds: float = KEPT) -> None:
         For how long it must not have been written to. 0 is for whoever knows that nobody writes.
     """
     with reading(engine) as c:
-        things = list(inventory.things(c))
+        things = list(inventory.items(c))
     known = {thing.folder for thing in things}
     for folder in inventory.FOLDERS:
         kept = {path.removeprefix(f"{folder}/") for path in known}
-        for name in objects.stale(folder, seconds, but={*kept, "zarr.json"}):
+        for name in objects.stale_names(folder, seconds, but={*kept, "zarr.json"}):
             logger.info("removing %s/%s, which nothing refers to", folder, name)
             objects.delete(f"{folder}/{name}")
     if not seconds:

@@ -14,7 +14,7 @@ from pythonjsonlogger.core import RESERVED_ATTRS
 from pythonjsonlogger.json import JsonFormatter
 
 from services.runtime.process import logger
-from storage.steps import name_of
+from storage.steps import step_name
 
 TEXT = "%(asctime)s %(levelname)s %(name)s %(about)s%(message)s"
 
@@ -36,7 +36,7 @@ def about(job: str, tile: int | None = None) -> Iterator[None]:
     """What is logged inside is about a job, or about a tile or a step of it, and says so."""
     found: dict[str, str | int] = {"job": job}
     if tile is not None:
-        found |= {"tile": tile} if tile >= 0 else {"step": name_of(tile)}
+        found |= {"tile": tile} if tile >= 0 else {"step": step_name(tile)}
     token = _about.set(found)
     try:
         yield

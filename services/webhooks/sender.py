@@ -94,7 +94,7 @@ class Sender:
             if not free or not webhook_deliveries.any_due(c):
                 return
         with writing(self._engine) as c:
-            leases.check(c, token)
+            leases.require_held(c, token)
             claimed = webhook_deliveries.claim(c, free)
         for row in claimed:
             self._running.add(self._pool.submit(self._attempt, row))
@@ -115,9 +115,9 @@ class Sender:
         try:
             with writing(self._engine) as c:
                 if accepted:
-                    webhook_deliveries.delivered(c, row.id)
+                    webhook_deliveries.delete(c, row.id)
                 else:
-                    delay = webhook_deliveries.failed(c, row.id, row.attempts)
+                    delay = webhook_deliveries.schedule_retry(c, row.id, row.attempts)
                     outcome += "; given up" if delay is None else f"; again in {delay:.0f} s"
                 _note(c, row.job, f"webhook, attempt {row.attempts}: {outcome}")
         except (Unavailable, NoRoom) as error:
@@ -131,4 +131,4 @@ def _note(connection: Connection, job: str, text: str) -> None:
         jobs.get(connection, job)
     except NotFound:  # deleted since
         return
-    job_log.note(connection, job, text)
+    job_log.add(connection, job, text)

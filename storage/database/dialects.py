@@ -23,10 +23,10 @@ from storage.errors import DISK_FULL, EnvmatteError, InvalidInput, NoRoom, Unava
 
 logger = logging.getLogger(__name__)
 
-WRITERS = int.from_bytes(b"envmatte")
+WRITE_LOCK = int.from_bytes(b"envmatte")
 """The advisory lock of PostgreSQL that whoever writes holds."""
 
-LINK: dict[str, Any] = {
+CONNECTION: dict[str, Any] = {
     "connect_timeout": 10,
     "keepalives_idle": 10,
     "keepalives_interval": 5,
@@ -35,13 +35,13 @@ LINK: dict[str, Any] = {
 }
 """libpq's settings, where a URL has no others: a link that is cut without a word is given up after some 20 s."""
 
-LIMITS = {
+TIMEOUTS = {
     "lock_timeout": "20s",
     "idle_in_transaction_session_timeout": "10s",  # of a process that is frozen while it has the writers' lock
     "statement_timeout": "60s",
 }
 
-PATIENCE = 10
+BUSY_TIMEOUT = 10
 """Seconds that SQLite waits for a lock."""
 
 READ_ONLY: dict[str, dict[str, Any]] = {
@@ -61,7 +61,7 @@ _SQLITE_AWAY = {
 _POSTGRESQL_AWAY = {"25P03", "25006"}
 
 
-def create(url: str) -> Engine:
+def make_engine(url: str) -> Engine:
     """An engine for a URL, set up for its database; nothing is connected yet.
 
     Raises
@@ -82,7 +82,7 @@ def create(url: str) -> Engine:
             parsed.set(drivername="postgresql+psycopg"),
             pool_pre_ping=True,
             isolation_level="READ COMMITTED",
-            connect_args={name: value for name, value in LINK.items() if name not in parsed.query},
+            connect_args={name: value for name, value in CONNECTION.items() if name not in parsed.query},
         )
         event.listen(engine, "connect", _set_up_postgresql)
     else:  # what was given may hold a password: it is not repeated
@@ -97,9 +97,9 @@ def _set_up_sqlite(connection: Any, record: object) -> None:
     connection.isolation_level = None  # BEGIN is ours, see _begin
     cursor = connection.cursor()
     # FULL: what is committed is on disk, also after a power cut, before anyone is told.
-    for pragma in (f"busy_timeout={PATIENCE * 1000}", "synchronous=FULL", "foreign_keys=ON"):
+    for pragma in (f"busy_timeout={BUSY_TIMEOUT * 1000}", "synchronous=FULL", "foreign_keys=ON"):
         cursor.execute(f"PRAGMA {pragma}")
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + BUSY_TIMEOUT
     while True:
         try:
             cursor.execute("PRAGMA journal_mode=WAL")
@@ -114,7 +114,7 @@ def _set_up_sqlite(connection: Any, record: object) -> None:
 
 def _set_up_postgresql(connection: Any, record: object) -> None:
     with connection.cursor() as cursor:
-        cursor.execute("; ".join(f"SET {name} = '{value}'" for name, value in LIMITS.items()))
+        cursor.execute("; ".join(f"SET {name} = '{value}'" for name, value in TIMEOUTS.items()))
     connection.commit()
 
 
@@ -125,10 +125,10 @@ def _begin(connection: Connection) -> None:
     if connection.dialect.name == "sqlite":
         connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
     elif writes:
-        connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({WRITERS})")
+        connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({WRITE_LOCK})")
 
 
-def meaning(error: SQLAlchemyError) -> EnvmatteError | None:
+def translate(error: SQLAlchemyError) -> EnvmatteError | None:
     """What a database's error means to a caller; None if it is a fault of ours."""
     if isinstance(error, NoConnectionFree):
         return Unavailable(
@@ -163,7 +163,7 @@ def reason(error: BaseException | None) -> str:
     return said.partition("\n")[0]
 
 
-def place(url: URL) -> str:
+def display_url(url: URL) -> str:
     """A URL as it may be shown: without its password, nor options, that may hold one."""
     return url.set(query={}).render_as_string(hide_password=True)
 

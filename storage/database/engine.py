@@ -3,15 +3,10 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from sqlalchemy import (
-    Connection,
-    Engine,
-    event,
-)
+from sqlalchemy import Connection, Engine, event
 from sqlalchemy.exc import SQLAlchemyError
 
 from storage.database import dialects, owners
-from storage.database.dialects import clock as clock
 from storage.errors import Unavailable
 
 
@@ -38,8 +33,8 @@ def open_engine(url: str) -> Engine:
         migrations,  # with alembic, whose import takes a time that no worker should spend
     )
 
-    engine = dialects.create(url)
-    event.listen(engine, "before_execute", owners.narrow, retval=True)
+    engine = dialects.make_engine(url)
+    event.listen(engine, "before_execute", owners.restrict, retval=True)
     try:
         with reading(engine) as connection:
             current = migrations.revision(connection) == migrations.newest()
@@ -51,8 +46,8 @@ def open_engine(url: str) -> Engine:
         if not isinstance(error, Unavailable):
             raise
         raise Unavailable(
-            f"the database {dialects.place(engine.url)} can't be opened: {dialects.reason(error.__cause__)}; see that "
-            "it runs and that its URL is right, and try again"
+            f"cannot open the database {dialects.display_url(engine.url)}: {dialects.reason(error.__cause__)}; "
+            "check that it runs and that its URL is right, and try again"
         ) from error
     return engine
 
@@ -66,7 +61,10 @@ def reading(engine: Engine) -> Iterator[Connection]:
     Unavailable
         If the database can't be reached.
     """
-    with _told(), engine.connect().execution_options(**dialects.READ_ONLY[engine.dialect.name]) as connection:
+    with (
+        _translate_errors(),
+        engine.connect().execution_options(**dialects.READ_ONLY[engine.dialect.name]) as connection,
+    ):
         yield connection
 
 
@@ -81,16 +79,20 @@ def writing(engine: Engine) -> Iterator[Connection]:
     Unavailable
         If the database can't be reached, or others write for too long. Whether it was committed is not known then.
     """
-    with _told(), engine.connect().execution_options(writes=True) as connection, connection.begin():
+    with (
+        _translate_errors(),
+        engine.connect().execution_options(writes=True) as connection,
+        connection.begin(),
+    ):
         yield connection
 
 
 @contextmanager
-def _told() -> Iterator[None]:
+def _translate_errors() -> Iterator[None]:
     try:
         yield
     except SQLAlchemyError as error:
-        told = dialects.meaning(error)
-        if told is None:
+        translated = dialects.translate(error)
+        if translated is None:
             raise
-        raise told from error
+        raise translated from error

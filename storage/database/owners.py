@@ -39,24 +39,24 @@ SECRET = {"keys"}
 E = TypeVar("E", bound=Executable)
 
 
-def bound(engine: Engine, owner: str) -> Engine:
+def for_owner(engine: Engine, owner: str) -> Engine:
     """The same engine, over which only what belongs to an owner can be seen, changed and made."""
     return engine.execution_options(owner=owner)
 
 
-def of_all(statement: E) -> E:
+def across_owners(statement: E) -> E:
     """A statement that concerns the rows of all owners, whoever executes it: for sums that no row can be told from."""
     statement = statement.execution_options(of_all=True)
     return statement
 
 
-def owner_of_new(context: Any) -> str:
+def default_owner(context: Any) -> str:
     """Whose a row is that is inserted: the default of every column ``owner``."""
     owner: str = context.execution_options.get("owner", DEFAULT)
     return owner
 
 
-def narrow(
+def restrict(
     connection: Connection, statement: Any, several: Any, parameters: Any, options: Any
 ) -> tuple[Any, Any, Any]:
     """Narrow a statement to the owner that its connection is bound to: a listener to ``before_execute``."""

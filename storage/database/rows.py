@@ -5,14 +5,8 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import (
-    Connection,
-    Row,
-    Table,
-    select,
-)
+from sqlalchemy import Connection, Row, Table, select
 
-from storage.database.dialects import clock as clock
 from storage.errors import NotFound
 
 

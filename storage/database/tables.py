@@ -18,7 +18,6 @@ from sqlalchemy import (
 )
 
 from storage.database import owners
-from storage.database.dialects import clock as clock
 
 metadata = MetaData()
 logging.getLogger("alembic").setLevel(
@@ -28,7 +27,7 @@ logging.getLogger("alembic").setLevel(
 
 def _owner() -> Column[str]:
     return Column(
-        "owner", String(64), nullable=False, default=owners.owner_of_new, server_default=owners.DEFAULT
+        "owner", String(64), nullable=False, default=owners.default_owner, server_default=owners.DEFAULT
     )
 
 
@@ -199,7 +198,9 @@ deliveries = Table(
 made = Table(
     "made",
     metadata,
-    Column("owner", String(64), primary_key=True, default=owners.owner_of_new, server_default=owners.DEFAULT),
+    Column(
+        "owner", String(64), primary_key=True, default=owners.default_owner, server_default=owners.DEFAULT
+    ),
     Column("key", String(256), primary_key=True),
     Column("call", String(64), primary_key=True),
     Column("id", String(32), nullable=False),

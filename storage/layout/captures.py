@@ -19,7 +19,7 @@ from zarr.storage import MemoryStore
 from storage.errors import Corrupt
 from storage.layout.blocks import block_edge
 from storage.objects.checksums import CODECS
-from storage.objects.store import Objects, together
+from storage.objects.store import Objects, gather
 from storage.objects.zarr_store import EVERY_CHUNK
 
 MEASURED = "measured"
@@ -100,7 +100,7 @@ def create_stack(
 
 def write_slab(objects: Objects, capture: str, first: int, frames: NDArray[np.generic]) -> None:
     """Write a slab of whole frames, from frame ``first`` on."""
-    (stack,) = together(objects.array(f"{path(capture)}/frames"))
+    (stack,) = gather(objects.array(f"{path(capture)}/frames"))
     stack[first : first + len(frames)] = frames
 
 
@@ -128,7 +128,7 @@ class Stack:
         self._frames: zarr.Array[Any]
         self._mask: zarr.Array[Any] | None
         try:
-            group, self._frames, self._mask, measured = together(
+            group, self._frames, self._mask, measured = gather(
                 objects.group(at),
                 objects.array(f"{at}/frames"),
                 if_there(objects.array(f"{at}/mask")),
@@ -154,7 +154,7 @@ class Stack:
         """
         return np.asarray(self._frames[frames, rows, columns])
 
-    def pick(self, frames: list[int], rows: slice, columns: slice) -> NDArray[Any]:
+    def read_frames(self, frames: list[int], rows: slice, columns: slice) -> NDArray[Any]:
         """As `read`, of any frames in any order."""
         return np.asarray(self._frames.oindex[np.array(frames), rows, columns])
 
@@ -163,14 +163,14 @@ class Stack:
     ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """As `read`, and (y, x) bool: the pixels to recover."""
         if self._mask is None:
-            return self.read(rows, columns), self.recovered(rows, columns)
-        values, mask = together(
+            return self.read(rows, columns), self.mask(rows, columns)
+        values, mask = gather(
             self._frames.async_array.getitem((slice(None), rows, columns)),
             self._mask.async_array.getitem((rows, columns)),
         )
         return values, mask
 
-    def recovered(self, rows: slice = slice(None), columns: slice = slice(None)) -> NDArray[np.bool_]:
+    def mask(self, rows: slice = slice(None), columns: slice = slice(None)) -> NDArray[np.bool_]:
         """(y, x) bool: the pixels of a rectangle that are to be recovered."""
         if self._mask is None:
             return np.ones((self.height, self.width), bool)[rows, columns]
@@ -190,7 +190,7 @@ class Stack:
 
     def missing(self) -> list[int]:
         """The slabs of which a chunk is not there, ascending; nothing is read."""
-        stored = self._objects.below(f"{self._path}/frames")
+        stored = self._objects.paths_below(f"{self._path}/frames")
         grid = [
             range(-(-size // chunk))
             for size, chunk in zip(self._frames.shape, self._frames.chunks, strict=True)
@@ -207,11 +207,11 @@ class Stack:
 
     def save(self) -> None:
         """Store what was measured, all at once: nobody ever reads half of it."""
-        together(self._objects.put_group(f"{self._path}/{MEASURED}", self._measured))
+        gather(self._objects.put_group(f"{self._path}/{MEASURED}", self._measured))
 
     def _array(self, name: str) -> zarr.Array[Any]:
         try:
-            (array,) = together(self._objects.array(f"{self._path}/{name}"))
+            (array,) = gather(self._objects.array(f"{self._path}/{name}"))
         except FileNotFoundError as error:
             raise Corrupt(f"{error} of the capture is not in the store; upload it again") from error
         found: zarr.Array[Any] = array

@@ -42,7 +42,7 @@ def missing(objects: Objects, job: str, tiles: int) -> list[int]:
     return [tile for tile in range(tiles) if str(tile) not in stored]
 
 
-def tidy(objects: Objects, job: str) -> None:
+def remove_inputs(objects: Objects, job: str) -> None:
     """Remove what the video was made of."""
     for what in (clip_path(job), ticks_path(job), f"{path(job)}/segments"):
         objects.delete(what)

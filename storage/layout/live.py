@@ -8,21 +8,21 @@ import numpy as np
 
 from storage.errors import Corrupt
 from storage.layout import mattes
-from storage.objects.store import Objects, together
+from storage.objects.store import Objects, gather
 
 
 def read(objects: Objects, matte: str, format: str) -> bytes | None:
     """What is kept of a matte in a format; None if nothing is, or not all of it yet."""
     try:
-        (array,) = together(objects.array(_path(matte, format)))
+        (array,) = gather(objects.array(_path(matte, format)))
         return np.asarray(array[:], np.uint8).tobytes()
     except (FileNotFoundError, Corrupt):
         return None
 
 
-def keep(objects: Objects, matte: str, format: str, data: bytes) -> None:
+def write(objects: Objects, matte: str, format: str, data: bytes) -> None:
     """Keep it, in place of an earlier one."""
-    together(objects.put_array(_path(matte, format), np.frombuffer(data, np.uint8)))
+    gather(objects.put_array(_path(matte, format), np.frombuffer(data, np.uint8)))
 
 
 def _path(matte: str, format: str) -> str:

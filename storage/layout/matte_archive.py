@@ -19,7 +19,7 @@ from storage.errors import Corrupt
 from storage.layout import mattes
 from storage.layout.mattes import CHANNELS, FRAMES, Matte
 from storage.objects.checksums import is_checked, is_intact, unseal
-from storage.objects.store import Objects, together
+from storage.objects.store import Objects, gather
 
 FORMAT = "envmatte-archive/1"
 MANIFEST = "envmatte.json"
@@ -30,26 +30,26 @@ ZIP64 = (1 << 31) - 1
 """Offsets above this are written in more bytes, by zipfile."""
 
 
-def listed(attributes: dict[str, Any]) -> dict[str, Any]:
+def summary(attributes: dict[str, Any]) -> dict[str, Any]:
     """What a manifest says of a matte with these attributes."""
     return {name: attributes[name] for name in (*mattes.FIGURES, "options")}
 
 
-def chunk(name: str, row: int, column: int) -> str:
+def chunk_entry(name: str, row: int, column: int) -> str:
     """The entry of a block of a frame-shaped array."""
     return f"{name}/c/{row}/{column}" + ("/0" if name in CHANNELS else "")
 
 
-def rows(row: int, column: int) -> str:
+def rows_folder(row: int, column: int) -> str:
     """The folder of a block's rows T."""
     return f"T/{row}.{column}"
 
 
-def of_block(row: int, column: int) -> list[str]:
+def block_entries(row: int, column: int) -> list[str]:
     """The entries of a block; the chunks of rows are not there if all of its rows are empty."""
-    T = rows(row, column)
+    T = rows_folder(row, column)
     arrays = (f"{T}/{name}/{part}" for name in ("cell", "weight") for part in ("zarr.json", "c/0"))
-    return [*(chunk(name, row, column) for name in FRAMES), f"{T}/zarr.json", *arrays]
+    return [*(chunk_entry(name, row, column) for name in FRAMES), f"{T}/zarr.json", *arrays]
 
 
 class Archive:
@@ -70,10 +70,10 @@ class Archive:
     def __init__(self, objects: Objects, matte: str) -> None:
         opened = Matte(objects, matte)
         self._objects, self._path = objects, mattes.path(matte)
-        self._record = listed(opened.attributes)
+        self._record = summary(opened.attributes)
         sizes = objects.sizes(self._path)
         blocks = product(range(opened.block_rows), range(opened.block_columns))
-        self._batches = [list(GROUPS), *(of_block(*block) for block in blocks)]
+        self._batches = [list(GROUPS), *(block_entries(*block) for block in blocks)]
         for batch in self._batches:
             may_lack = {name for name in batch if name.startswith("T/") and name.endswith("/c/0")}
             missing = {name for name in batch if f"{self._path}/{name}" not in sizes}
@@ -106,7 +106,7 @@ class Archive:
 
     def _read(self, names: list[str]) -> list[bytes]:
         try:
-            return together(*(self._objects.get(f"{self._path}/{name}") for name in names))
+            return gather(*(self._objects.get(f"{self._path}/{name}") for name in names))
         except FileNotFoundError as error:
             raise self._corrupt(str(error)) from error
 

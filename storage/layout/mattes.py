@@ -34,7 +34,7 @@ from zarr.storage import MemoryStore
 from storage.errors import Corrupt
 from storage.layout.blocks import block_edge
 from storage.objects.checksums import CODECS
-from storage.objects.store import Objects, together
+from storage.objects.store import Objects, gather
 
 FORMAT = "envmatte-matte/1"
 FRAMES = ("S", "rho", "error", "recovered", "shared", "count")
@@ -91,7 +91,7 @@ class Matte:
     def __init__(self, objects: Objects, matte: str) -> None:
         at = path(matte)
         try:
-            group, *frames = together(objects.group(at), *(objects.array(f"{at}/{name}") for name in FRAMES))
+            group, *frames = gather(objects.group(at), *(objects.array(f"{at}/{name}") for name in FRAMES))
         except FileNotFoundError as error:
             raise Corrupt(f"matte {matte} is not in the store; recover it again") from error
         self._objects = objects
@@ -129,14 +129,14 @@ class Matte:
         async def write(name: str) -> None:
             await self._frames[name].async_array.setitem(span, getattr(block, name))
 
-        together(
+        gather(
             self._objects.put_group(rows),
             self._objects.put_array(f"{rows}/cell", block.cell),
             self._objects.put_array(f"{rows}/weight", block.weight),
             *(write(name) for name in FRAMES if name != "count"),
         )
         # ``count`` comes last: a block is written once its counts are there.
-        together(write("count"))
+        gather(write("count"))
 
     def read(self, row: int, column: int) -> Block:
         """Read a block.
@@ -153,7 +153,7 @@ class Matte:
             return await array.async_array.getitem(slice(None))
 
         try:
-            cell, weight, *values = together(
+            cell, weight, *values = gather(
                 of_rows("cell"),
                 of_rows("weight"),
                 *(array.async_array.getitem(span) for array in self._frames.values()),
@@ -177,7 +177,7 @@ class Matte:
 
     def missing(self) -> set[tuple[int, int]]:
         """Rows and columns of the blocks of which something is not there; nothing is read."""
-        stored = self._objects.below(self._path)
+        stored = self._objects.paths_below(self._path)
 
         def is_there(row: int, column: int) -> bool:
             chunks = (

@@ -25,7 +25,7 @@ from storage.database.engine import reading
 from storage.errors import Conflict, Corrupt
 from storage.maintenance import inventory, row_dump
 from storage.maintenance.integrity import Examiner, Finding
-from storage.maintenance.inventory import Thing
+from storage.maintenance.inventory import Item
 from storage.maintenance.row_dump import Line
 from storage.objects.store import Objects
 
@@ -99,7 +99,7 @@ def back_up(
                 "made_at": datetime.now(UTC).isoformat(timespec="seconds"),
                 "ledger": copying.put_ledger(),
             }
-            target.store(MANIFEST, _manifest(header, entries))
+            target.write_raw(MANIFEST, _manifest(header, entries))
             return {"objects": copying.objects, "bytes": copying.bytes, "rows": copying.rows}
     except BaseException:
         for what in (MANIFEST, LEDGER, OBJECTS):
@@ -160,15 +160,15 @@ class _Copying:
         self.revision = ""
         self.count = self.objects = self.bytes = self.rows = 0
 
-    def snapshot(self) -> dict[str, list[Thing]]:
+    def snapshot(self) -> dict[str, list[Item]]:
         """Write down all rows, as they are at one time; returns what they stand for, by family."""
-        families: dict[str, list[Thing]] = {}
+        families: dict[str, list[Item]] = {}
         with reading(self._engine) as c:
             self.revision = migrations.revision(c) or ""
             tables = row_dump.tables_of(c)
             for name, row in row_dump.lines(c, tables):
-                self._rows.write(row_dump.dumped(name, row))
-                for thing in inventory.of_row(c, tables, name, row):
+                self._rows.write(row_dump.to_line(name, row))
+                for thing in inventory.items_of_row(c, tables, name, row):
                     families.setdefault(thing.family, []).append(thing)
         self.count = len(families)
         return families
@@ -176,10 +176,10 @@ class _Copying:
     def take(self, path: str, pieces: Iterator[bytes]) -> None:
         """Copy an object; called by several threads."""
         tally = Tally()
-        self._target.store(f"{OBJECTS}/{path}", tally.passing(pieces))
+        self._target.write_raw(f"{OBJECTS}/{path}", tally.passing(pieces))
         self._of_family.append({"name": path, "size": tally.size, "sha256": tally.sha256})
 
-    def copy(self, examiner: Examiner, family: str, things: list[Thing]) -> None:
+    def copy(self, examiner: Examiner, family: str, things: list[Item]) -> None:
         """Copy what belongs together, as often as it changes meanwhile.
 
         Raises
@@ -213,17 +213,17 @@ class _Copying:
             self.bytes += entry["size"]
         self._of_family.clear()
 
-    def _look_again(self, family: str) -> tuple[list[Line], list[Thing]]:
+    def _look_again(self, family: str) -> tuple[list[Line], list[Item]]:
         """The rows of a family as they are now, and what they stand for."""
         with reading(self._engine) as c:
             tables = row_dump.tables_of(c)
             lines = list(row_dump.lines_of_family(c, tables, family))
-            return lines, [thing for line in lines for thing in inventory.of_row(c, tables, *line)]
+            return lines, [thing for line in lines for thing in inventory.items_of_row(c, tables, *line)]
 
     def put_ledger(self) -> dict[str, Any]:
         """Write the rows of what was copied; returns what the manifest says of them."""
         tally = Tally()
-        self._target.store(LEDGER, tally.passing(self._lines()))
+        self._target.write_raw(LEDGER, tally.passing(self._lines()))
         return {"rows": self.rows, "size": tally.size, "sha256": tally.sha256}
 
     def _lines(self) -> Iterator[bytes]:
@@ -244,4 +244,4 @@ class _Copying:
         for lines in self._anew.values():
             for name, row in lines:
                 self.rows += 1
-                yield row_dump.dumped(name, row)
+                yield row_dump.to_line(name, row)

@@ -15,8 +15,8 @@ from typing import Any, Literal
 from storage.errors import Corrupt
 from storage.layout import composites, uploads
 from storage.layout.captures import MEASURED
-from storage.layout.matte_archive import GROUPS, rows
-from storage.maintenance.inventory import Thing
+from storage.layout.matte_archive import GROUPS, rows_folder
+from storage.maintenance.inventory import Item
 from storage.objects.checksums import BLOCK, SUFFIX, damaged, is_checked, is_intact, remedy, unseal
 from storage.objects.store import Objects
 
@@ -43,7 +43,7 @@ class Finding:
     remedy: str
 
 
-def drain(path: str, pieces: Iterable[bytes]) -> None:
+def discard(path: str, pieces: Iterable[bytes]) -> None:
     """Read an object, and that is all."""
     for _ in pieces:
         pass
@@ -65,7 +65,7 @@ class Examiner:
         checksum, for they were stored before there were checksums.
     """
 
-    def __init__(self, objects: Objects, take: Take = drain) -> None:
+    def __init__(self, objects: Objects, take: Take = discard) -> None:
         self._objects = objects
         self._take = take
         self._pool = ThreadPoolExecutor(THREADS, thread_name_prefix="examiner")
@@ -78,7 +78,7 @@ class Examiner:
     def __exit__(self, *exception: object) -> None:
         self._pool.shutdown(cancel_futures=True)
 
-    def examine(self, thing: Thing) -> list[Finding]:
+    def examine(self, thing: Item) -> list[Finding]:
         """Read a thing, and return what is not as it should be: memory is that of a few chunks, whatever its size."""
         sizes = self._objects.sizes(thing.folder)
         look = self._look_at_arrays if thing.kind in ("capture", "matte") else self._look_at_files
@@ -86,7 +86,7 @@ class Examiner:
         # What is being written may still lack anything, or have more than its rows tell.
         return [one for one in found if thing.state == "whole" or one.what == "damaged"]
 
-    def _look_at_files(self, thing: Thing, sizes: dict[str, int]) -> Iterator[Finding]:
+    def _look_at_files(self, thing: Item, sizes: dict[str, int]) -> Iterator[Finding]:
         expected = []
         if thing.kind == "upload":
             expected = [uploads.part_path(thing.id, name) for name in thing.parts]
@@ -109,12 +109,12 @@ class Examiner:
             self._take(path, iter(lambda: file.read(BLOCK), b""))
             self._count(file.size, file.is_checked)
             if file.is_checked:
-                table = self._objects.load(path + SUFFIX)
+                table = self._objects.read_raw(path + SUFFIX)
                 self._take(path + SUFFIX, iter([table]))
                 self._count(len(table), True)
         return None
 
-    def _look_at_arrays(self, thing: Thing, sizes: dict[str, int]) -> Iterator[Finding]:
+    def _look_at_arrays(self, thing: Item, sizes: dict[str, int]) -> Iterator[Finding]:
         documents: dict[str, dict[str, Any]] = {}
         paths = sorted(path for path in sizes if path.endswith("/zarr.json"))
         yield from self._all(self._look_at_document, [(path, documents) for path in paths])
@@ -136,7 +136,7 @@ class Examiner:
                 yield Finding("unexpected", path, "nothing reads it: remove it from the store")
 
     def _look_at_document(self, path: str, documents: dict[str, dict[str, Any]]) -> Finding | None:
-        data = self._objects.load(path)
+        data = self._objects.read_raw(path)
         document, checked = unseal(path, data)
         self._take(path, iter([data]))
         self._count(len(data), checked)
@@ -148,7 +148,7 @@ class Examiner:
         return None
 
     def _look_at_chunk(self, path: str, checked: bool) -> Finding | None:
-        data = self._objects.load(path)
+        data = self._objects.read_raw(path)
         if checked and not is_intact(data):
             raise damaged(path)
         self._take(path, iter([data]))
@@ -195,7 +195,7 @@ def _parts_of(objects: Objects, archive: str) -> list[str]:
             raise damaged(index) from error
 
 
-def _expected(thing: Thing, documents: dict[str, dict[str, Any]], sizes: Iterable[str]) -> set[str]:
+def _expected(thing: Item, documents: dict[str, dict[str, Any]], sizes: Iterable[str]) -> set[str]:
     """The folders that must have a zarr.json: those of the thing's kind, and those in which something lies."""
     names: list[str] = ["", "frames", MEASURED]
     if thing.kind == "matte":
@@ -204,7 +204,7 @@ def _expected(thing: Thing, documents: dict[str, dict[str, Any]], sizes: Iterabl
         height, width, edge = (figures.get(name) for name in ("height", "width", "block"))
         if all(isinstance(one, int) and one > 0 for one in (height, width, edge)):
             for row, column in product(range(-(-height // edge)), range(-(-width // edge))):
-                T = rows(row, column)
+                T = rows_folder(row, column)
                 names += [T, f"{T}/cell", f"{T}/weight"]
     expected = {f"{thing.folder}/{name}".rstrip("/") for name in names}
     for path in sizes:

@@ -12,7 +12,7 @@ from storage.records.jobs import is_retryable
 
 FOLDERS = ("captures", "mattes", "uploads", "composites")
 """All that there is at the top of the store."""
-KEPT = 3600.0
+GRACE_SECONDS = 3600.0
 """Seconds for which what nothing refers to is left alone: someone may be about to write down that it is there."""
 COLUMNS = {
     "captures": ("id", "state", "problem"),
@@ -24,7 +24,7 @@ COLUMNS = {
 
 
 @dataclass(frozen=True)
-class Thing:
+class Item:
     """What a row stands for in the store.
 
     Attributes
@@ -50,14 +50,14 @@ class Thing:
     parts: tuple[str, ...] = ()
 
 
-def things(connection: Connection, tables: Mapping[str, Table] = metadata.tables) -> Iterator[Thing]:
+def items(connection: Connection, tables: Mapping[str, Table] = metadata.tables) -> Iterator[Item]:
     """All that there is by the database."""
     for name, columns in COLUMNS.items():
         query = select(*(tables[name].c[column] for column in columns))
         if name == "jobs":
             query = query.where(tables[name].c.kind == "composite")
         for row in connection.execute(query).mappings():
-            yield from of_row(connection, tables, name, dict(row))
+            yield from items_of_row(connection, tables, name, dict(row))
 
 
 def family_of(table: str, row: Mapping[str, Any]) -> str | None:
@@ -74,9 +74,9 @@ def family_of(table: str, row: Mapping[str, Any]) -> str | None:
     return None
 
 
-def of_row(
+def items_of_row(
     connection: Connection, tables: Mapping[str, Table], table: str, row: Mapping[str, Any]
-) -> Iterator[Thing]:
+) -> Iterator[Item]:
     """What a row stands for in the store; nothing, of most tables.
 
     Parameters
@@ -90,19 +90,19 @@ def of_row(
     if table == "captures" and (row["state"] != "failed" or is_retryable(row["problem"])):
         id, ready = row["id"], row["state"] == "ready"
         state: Any = {"ready": "whole", "failed": "left"}.get(row["state"], "busy")
-        yield Thing("capture", id, state, captures.path(id), family)
+        yield Item("capture", id, state, captures.path(id), family)
         if not ready:
-            yield Thing("archive", id, "whole", uploads.path(id), family)
+            yield Item("archive", id, "whole", uploads.path(id), family)
     elif table == "mattes":
         id = row["id"]
         state = {"ready": "whole", "failed": "left"}.get(row["state"], "busy")
-        yield Thing("matte", id, state, mattes.path(id), family)
+        yield Item("matte", id, state, mattes.path(id), family)
     elif table == "uploads":
         id, parts = row["id"], tables["upload_parts"]
         names = tuple(connection.scalars(select(parts.c.name).where(parts.c.upload == id)))
-        yield Thing("upload", id, "whole", uploads.path(id), family, names)
+        yield Item("upload", id, "whole", uploads.path(id), family, names)
     elif table == "jobs" and row["kind"] == "composite":
         kept = row["problem"] is None or is_retryable(row["problem"])
         if kept and row["state"] != "cancelled":
             state = {"succeeded": "whole", "failed": "left"}.get(row["state"], "busy")
-            yield Thing("composite", row["id"], state, composites.path(row["id"]), family)
+            yield Item("composite", row["id"], state, composites.path(row["id"]), family)

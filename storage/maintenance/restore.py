@@ -16,8 +16,9 @@ from typing import IO, Any
 from sqlalchemy import Connection, Engine, MetaData, select
 
 from storage.database import dialects, migrations
+from storage.database.dialects import clock
 from storage.database.engine import reading, writing
-from storage.database.tables import clock, metadata
+from storage.database.tables import metadata
 from storage.errors import Conflict, Corrupt, InvalidInput, NoRoom
 from storage.maintenance import row_dump
 from storage.maintenance.backup import FORMAT, LEDGER, MANIFEST, OBJECTS, Tally
@@ -69,9 +70,9 @@ def restore(
     manifest = Manifest(source)
     with reading(engine) as c:
         _see_that_it_is_empty(c)
-    database = dialects.place(engine.url).encode()
+    database = dialects.display_url(engine.url).encode()
     _see_that_nothing_is_stored(objects, database)
-    free = objects.free()
+    free = objects.free_bytes()
     if free is not None and free < manifest.bytes:
         raise NoRoom(
             f"the backup has {manifest.bytes} bytes, and the disk of the store {free} free: free some"
@@ -127,7 +128,7 @@ class Manifest:
                 str(header.get("revision")),
                 _entry(header.get("ledger"), named=False),
             )
-            migrations.check(self.revision, "the backup")
+            migrations.require_known(self.revision, "the backup")
             self._see_that_it_is_whole()
         except FileNotFoundError as error:
             raise Conflict(
@@ -188,7 +189,7 @@ def _copy(
     source: Objects, objects: Objects, manifest: Manifest, progress: Callable[[float, int], None]
 ) -> None:
     def one(entry: dict[str, Any]) -> int:
-        objects.store(entry["name"], _read(source, f"{OBJECTS}/{entry['name']}", entry))
+        objects.write_raw(entry["name"], _read(source, f"{OBJECTS}/{entry['name']}", entry))
         return int(entry["size"])
 
     done, entries = 0, iter(manifest)
@@ -203,7 +204,7 @@ def _read(source: Objects, path: str, entry: dict[str, Any]) -> Iterator[bytes]:
     """The pieces of something in the backup, see `_checked`."""
     try:
         if entry["size"] <= PART:  # most objects are, and one request then
-            yield from _checked(entry, iter([source.load(path, entry["size"])]))
+            yield from _checked(entry, iter([source.read_raw(path, entry["size"])]))
         else:
             with source.reader(path) as reader:
                 yield from _checked(entry, iter(lambda: reader.read(PART), b""))
@@ -254,7 +255,7 @@ def _see_that_nothing_is_stored(objects: Objects, database: bytes) -> None:
 
     If it was one into the same database, which is empty: what is there with another one may be that one's.
     """
-    if MARKER in objects.names("") and objects.load(MARKER) == database:
+    if MARKER in objects.names("") and objects.read_raw(MARKER) == database:
         _clear(objects)
     for folder in FOLDERS:
         there = [name for name in objects.names(folder) if name != "zarr.json"]
@@ -276,7 +277,7 @@ def _read_in(connection: Connection, revision: str, rows: IO[bytes]) -> int:
     there.reflect(connection, only=lambda name, _: name in metadata.tables or name == "alembic_version")
     there.drop_all(connection)
     migrations.upgrade(connection, revision)
-    count = row_dump.read_in(connection, rows)
+    count = row_dump.insert_lines(connection, rows)
     migrations.upgrade(connection)
-    row_dump.number_on(connection)
+    row_dump.continue_numbering(connection)
     return count

@@ -17,13 +17,13 @@ from storage.database.engine import reading
 from storage.database.tables import metadata
 from storage.errors import Conflict, InvalidInput
 
-LEFT_OUT = ("coordinator", "deliveries")
-AT_ONCE = 500
+SKIPPED = ("coordinator", "deliveries")
+BATCH = 500
 """Rows that are held."""
 Line = tuple[str, Mapping[str, Any]]
 
 
-def open_as_it_is(url: str) -> Engine:
+def open_without_upgrade(url: str) -> Engine:
     """Open a database that a service uses, or used, and leave its schema alone.
 
     Raises
@@ -33,8 +33,8 @@ def open_as_it_is(url: str) -> Engine:
     InvalidInput, Unavailable
         As of `storage.database.engine.open_engine`.
     """
-    engine = dialects.create(url)
-    where = dialects.place(engine.url)
+    engine = dialects.make_engine(url)
+    where = dialects.display_url(engine.url)
     file = engine.url.database
     if engine.dialect.name == "sqlite" and not (file and Path(file).is_file()):  # which opening would make
         raise Conflict(
@@ -48,7 +48,7 @@ def open_as_it_is(url: str) -> Engine:
                 f"the database {where} has no tables of envmatte, or those of a very old one: name the one of the "
                 "service, or start `envmatte serve` on it once"
             )
-        migrations.check(revision, "the database")
+        migrations.require_known(revision, "the database")
     except BaseException:
         engine.dispose()
         raise
@@ -70,14 +70,14 @@ def tables_of(connection: Connection) -> Mapping[str, Table]:
 def lines(connection: Connection, tables: Mapping[str, Table]) -> Iterator[Line]:
     """All rows, as the transaction sees them; few of them are held."""
     for name, table in tables.items():
-        if name not in LEFT_OUT:
-            streamed = connection.execution_options(yield_per=AT_ONCE)
+        if name not in SKIPPED:
+            streamed = connection.execution_options(yield_per=BATCH)
             for row in streamed.execute(select(table)).mappings():
                 yield name, dict(row)
 
 
 def lines_of_family(connection: Connection, tables: Mapping[str, Table], family: str) -> Iterator[Line]:
-    """The rows of what is deleted with, or made of, one another, see `storage.maintenance.inventory.Thing`."""
+    """The rows of what is deleted with, or made of, one another, see `storage.maintenance.inventory.Item`."""
     captures, mattes, jobs = (tables[name] for name in ("captures", "mattes", "jobs"))
     uploads, parts = tables["uploads"], tables["upload_parts"]
     of_jobs = or_(jobs.c.capture == family, (jobs.c.capture == "") & (jobs.c.matte == family))
@@ -96,7 +96,7 @@ def lines_of_family(connection: Connection, tables: Mapping[str, Table], family:
             yield table.name, dict(row)
 
 
-def dumped(name: str, row: Mapping[str, Any]) -> bytes:
+def to_line(name: str, row: Mapping[str, Any]) -> bytes:
     """A line."""
     return json.dumps([name, dict(row)], separators=(",", ":")).encode() + b"\n"
 
@@ -111,7 +111,7 @@ def counts(connection: Connection, tables: Mapping[str, Table]) -> dict[str, int
     return {name: count for name, count in found.items() if count}
 
 
-def read_in(connection: Connection, source: Iterable[bytes]) -> int:
+def insert_lines(connection: Connection, source: Iterable[bytes]) -> int:
     """Insert rows into empty tables of the revision that they are of; returns how many.
 
     Jobs that ran are queued: their tiles say how far they were.
@@ -124,11 +124,11 @@ def read_in(connection: Connection, source: Iterable[bytes]) -> int:
     tables = tables_of(connection)
     read = 0
     for name, group in groupby(map(_loaded, source), key=lambda line: line[0]):
-        if name not in tables or name in LEFT_OUT:
+        if name not in tables or name in SKIPPED:
             raise InvalidInput(f"the backup's ledger has rows of a table {name!r}, and there is none")
         table = tables[name]
         rows = (row for _, row in group)
-        while some := list(islice(rows, AT_ONCE)):
+        while some := list(islice(rows, BATCH)):
             for row in some:
                 if row.keys() != set(table.columns.keys()):
                     raise InvalidInput(
@@ -151,7 +151,7 @@ def _loaded(line: bytes) -> tuple[str, dict[str, Any]]:
     return name, row
 
 
-def number_on(connection: Connection) -> None:
+def continue_numbering(connection: Connection) -> None:
     """Have rows that are new numbered after those that were read in; SQLite does so by itself."""
     if connection.dialect.name != "postgresql":
         return

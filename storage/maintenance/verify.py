@@ -13,7 +13,7 @@ from sqlalchemy import Engine
 from storage.database.engine import reading
 from storage.maintenance import inventory, row_dump
 from storage.maintenance.integrity import Examiner, Finding
-from storage.maintenance.inventory import FOLDERS, KEPT, Thing
+from storage.maintenance.inventory import FOLDERS, GRACE_SECONDS, Item
 from storage.objects.store import Objects
 
 AGAIN = 1.0
@@ -53,7 +53,7 @@ def verify(
         Gets the share of the things that were read, and their bytes.
     """
     things = _things(engine)
-    found: dict[Thing, list[Finding]] = {}
+    found: dict[Item, list[Finding]] = {}
     whole = [thing for thing in things if thing.state != "busy"]
     with Examiner(objects) as examiner:
         for n, thing in enumerate(whole):
@@ -73,19 +73,19 @@ def verify(
     return Report(len(whole), len(things) - len(whole), counts, findings)
 
 
-def _things(engine: Engine) -> list[Thing]:
+def _things(engine: Engine) -> list[Item]:
     with reading(engine) as c:
-        return list(inventory.things(c, row_dump.tables_of(c)))
+        return list(inventory.items(c, row_dump.tables_of(c)))
 
 
-def _unexpected(objects: Objects, things: list[Thing]) -> list[Finding]:
+def _unexpected(objects: Objects, things: list[Item]) -> list[Finding]:
     """What no row stands for, and nobody wrote to for a while: a row may be about to come."""
     known = {thing.folder for thing in things}
     remedy = "no row stands for it: a service that runs removes it within an hour"
     return [
         Finding("unexpected", f"{folder}/{name}", remedy)
         for folder in FOLDERS
-        for name in objects.stale(
-            folder, KEPT, but={"zarr.json", *(path.removeprefix(f"{folder}/") for path in known)}
+        for name in objects.stale_names(
+            folder, GRACE_SECONDS, but={"zarr.json", *(path.removeprefix(f"{folder}/") for path in known)}
         )
     ]

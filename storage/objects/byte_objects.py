@@ -8,7 +8,7 @@ import obstore
 from obstore.store import ObjectStore
 
 from storage.objects.checksums import BLOCK, SUFFIX, Buffer, Table, crc32c, damaged, read_table
-from storage.objects.retries import told
+from storage.objects.retries import translate_errors
 
 if TYPE_CHECKING:
     from obstore import AsyncWritableFile
@@ -43,10 +43,10 @@ class Reader(io.RawIOBase):
 
     def __init__(self, store: ObjectStore, path: str) -> None:
         self._store, self._path = store, path
-        with told():
+        with translate_errors():
             self.size: int = obstore.head(store, path)["size"]
         try:
-            self._sums: list[int] | None = read_table(path, load(store, path + SUFFIX), self.size)
+            self._sums: list[int] | None = read_table(path, read_raw(store, path + SUFFIX), self.size)
         except FileNotFoundError:  # it was stored before there were checksums
             self._sums = None
         self._at = 0
@@ -86,28 +86,28 @@ class Reader(io.RawIOBase):
 
     def _read(self, n: int) -> memoryview:
         length = min(BLOCK, self.size - n * BLOCK)
-        with told():
+        with translate_errors():
             data = memoryview(obstore.get_range(self._store, self._path, start=n * BLOCK, length=length))
         if self._sums is not None and crc32c(data) != self._sums[n]:
             raise damaged(self._path)
         return data
 
 
-def load(store: ObjectStore, path: str, most: int | None = None) -> bytes:
-    """See `storage.objects.store.Objects.load`."""
-    with told():
+def read_raw(store: ObjectStore, path: str, most: int | None = None) -> bytes:
+    """See `storage.objects.store.Objects.read_raw`."""
+    with translate_errors():
         found = obstore.get(store, path)
         if most is not None and found.meta["size"] > most:
             raise damaged(path, f"it has more than {most} bytes")
         return found.bytes().to_bytes()
 
 
-def store(store: ObjectStore, path: str, pieces: Iterable[bytes]) -> None:
+def write_raw(store: ObjectStore, path: str, pieces: Iterable[bytes]) -> None:
     """Write the pieces of an object one after another, as they are; left by an error it leaves no object."""
     taken = iter(pieces)
     first = next(taken, b"")
     second = next(taken, None)
-    with told():
+    with translate_errors():
         if second is None:  # most objects are one piece, and one request
             obstore.put(store, path, first)
             return

@@ -31,7 +31,7 @@ UNREACHABLE = re.compile(r"HTTP error|status code: (429|5\d\d)|error sending req
 
 
 @contextmanager
-def told() -> Iterator[None]:
+def translate_errors() -> Iterator[None]:
     """Turns what obstore raises, of several kinds and without a number, to `NoRoom` and `Unavailable`."""
     try:
         yield

@@ -26,22 +26,22 @@ from zarr.storage import ObjectStore as ZarrStore
 from storage.objects import byte_objects, checksums, zarr_store
 from storage.objects.byte_objects import PART, Writer
 from storage.objects.checksums import SUFFIX
-from storage.objects.retries import REQUESTS, RETRIES, told
+from storage.objects.retries import REQUESTS, RETRIES, translate_errors
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Collection, Coroutine, Iterable, Iterator
 
 
-def together(*work: Coroutine[Any, Any, Any]) -> list[Any]:
+def gather(*work: Coroutine[Any, Any, Any]) -> list[Any]:
     """Do what does not wait for one another at once, and return what came of each.
 
     A bucket takes tens of milliseconds to answer, and zarr about one to go over to its thread and back. All of
     it has ended when this returns, or raises the first error.
     """
-    return asyncio.run_coroutine_threadsafe(_all_of(*work), _loop()).result()
+    return asyncio.run_coroutine_threadsafe(_gather(*work), _loop()).result()
 
 
-async def _all_of(*work: Coroutine[Any, Any, Any]) -> list[Any]:
+async def _gather(*work: Coroutine[Any, Any, Any]) -> list[Any]:
     ended = await asyncio.gather(*work, return_exceptions=True)
     for result in ended:
         if isinstance(result, BaseException):
@@ -51,7 +51,7 @@ async def _all_of(*work: Coroutine[Any, Any, Any]) -> list[Any]:
 
 @cache
 def _loop() -> asyncio.AbstractEventLoop:
-    """The loop that `together` runs on, in a thread of its own: a caller may have a loop that must not wait.
+    """The loop that `gather` runs on, in a thread of its own: a caller may have a loop that must not wait.
 
     It is kept because the threads in which zarr compresses are the loop's.
     """
@@ -84,12 +84,12 @@ class Objects:
             self._store = LocalStore.from_url(url, mkdir=True, automatic_cleanup=True)
         else:
             self._store = from_url(url, client_options=REQUESTS, retry_config=RETRIES)
-        self.zarr = zarr_store.Whole(ZarrStore(self._store))
+        self.zarr = zarr_store.StrictStore(ZarrStore(self._store))
         # Every tile opens the same ten arrays anew, to see that they are there; to parse them takes longer.
-        self._array = lru_cache(maxsize=64)(partial(zarr_store.described, self.zarr))
+        self._array = lru_cache(maxsize=64)(partial(zarr_store.open_array, self.zarr))
 
     async def group(self, path: str) -> zarr.Group:
-        """The zarr group at a path, for `together`.
+        """The zarr group at a path, for `gather`.
 
         Raises
         ------
@@ -97,11 +97,11 @@ class Objects:
             If there is none, or it is damaged.
         """
         document = checksums.unseal(f"{path}/zarr.json", await self._document(path))[0]
-        with zarr_store.known(path):
+        with zarr_store.translate_errors_of(path):
             return zarr.Group(zarr.AsyncGroup.from_dict(StorePath(self.zarr, path), document))
 
     async def array(self, path: str) -> zarr.Array[Any]:
-        """The zarr array at a path, to read and to write, for `together`.
+        """The zarr array at a path, to read and to write, for `gather`.
 
         Raises
         ------
@@ -117,13 +117,13 @@ class Objects:
         return document.to_bytes()
 
     async def put_group(self, path: str, attributes: dict[str, Any] | None = None) -> None:
-        """Make a zarr group at a path, for `together`; what is in it already stays."""
+        """Make a zarr group at a path, for `gather`; what is in it already stays."""
         document = {"zarr_format": 3, "node_type": "group", "attributes": attributes or {}}
         group = zarr.AsyncGroup.from_dict(StorePath(self.zarr, path), document)
         await self._put_metadata(path, group)
 
     async def put_array(self, path: str, values: NDArray[Any]) -> None:
-        """Make a zarr array of one dimension and one chunk at a path, in place of an earlier one, for `together`.
+        """Make a zarr array of one dimension and one chunk at a path, in place of an earlier one, for `gather`.
 
         It is what ``zarr.create_array(…, overwrite=True)`` makes there, except for the groups above it, which zarr
         would look at and make: three objects to write, and no moment in which an earlier array is gone.
@@ -134,12 +134,12 @@ class Objects:
             "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": (max(n, 1),)}},
         }
         array = zarr.AsyncArray.from_dict(
-            StorePath(self.zarr, path), zarr_store.metadata_of(values.dtype) | shape
+            StorePath(self.zarr, path), zarr_store.array_metadata(values.dtype) | shape
         )
         array = array.with_config(zarr_store.EVERY_CHUNK)
         # Without values there is no chunk.
         chunk = array.setitem(slice(None), values) if n else self.zarr.delete(f"{path}/c/0")
-        await _all_of(self._put_metadata(path, array), chunk)
+        await _gather(self._put_metadata(path, array), chunk)
 
     async def _put_metadata(self, path: str, node: zarr.AsyncGroup | zarr.AsyncArray[Any]) -> None:
         for name, document in node.metadata.to_buffer_dict(default_buffer_prototype()).items():
@@ -155,7 +155,7 @@ class Objects:
                 assert value is not None
                 await self.zarr.set(f"{path}/{name}", zarr_store.sealed(name, value))
 
-        together(copy())
+        gather(copy())
 
     @asynccontextmanager
     async def write(self, path: str) -> AsyncIterator[Writer]:
@@ -168,7 +168,7 @@ class Objects:
         """
         # Two parts under way bound the memory of an upload to a few parts, whatever its size.
         writer = obstore.open_writer_async(self._store, path, buffer_size=PART, max_concurrency=2)
-        with told():
+        with translate_errors():
             async with writer as file:
                 written = Writer(file)
                 yield written
@@ -189,7 +189,7 @@ class Objects:
         """The same without a buffer, for who reads from the start to the end."""
         return byte_objects.Reader(self._store, path)
 
-    def load(self, path: str, most: int | None = None) -> bytes:
+    def read_raw(self, path: str, most: int | None = None) -> bytes:
         """The bytes of a small object, as they are.
 
         Parameters
@@ -204,11 +204,11 @@ class Objects:
         Corrupt
             If it has more.
         """
-        return byte_objects.load(self._store, path, most)
+        return byte_objects.read_raw(self._store, path, most)
 
-    def store(self, path: str, pieces: Iterable[bytes]) -> None:
+    def write_raw(self, path: str, pieces: Iterable[bytes]) -> None:
         """Write the pieces of an object one after another, as they are: without checksums of its own."""
-        byte_objects.store(self._store, path, pieces)
+        byte_objects.write_raw(self._store, path, pieces)
 
     def put(self, path: str, data: bytes) -> None:
         """Write a small object, whole, and its checksums.
@@ -220,7 +220,7 @@ class Objects:
         """
         table = checksums.Table()
         table.update(data)
-        with told():
+        with translate_errors():
             obstore.put(self._store, path, data)
             with self._gone_without(path):
                 obstore.put(self._store, path + SUFFIX, table.to_bytes())
@@ -235,7 +235,7 @@ class Objects:
             raise
 
     async def get(self, path: str) -> bytes:
-        """The bytes of a small object, for `together`.
+        """The bytes of a small object, for `gather`.
 
         Raises
         ------
@@ -249,23 +249,23 @@ class Objects:
 
     def names(self, folder: str) -> list[str]:
         """What lies directly in a folder, folders and objects, by name; without what holds checksums."""
-        with told():
+        with translate_errors():
             found = obstore.list_with_delimiter(self._store, folder)
         paths = [*found["common_prefixes"], *(meta["path"] for meta in found["objects"])]
         return sorted(path.rsplit("/", 1)[-1] for path in paths if not path.endswith(SUFFIX))
 
-    def below(self, folder: str) -> set[str]:
+    def paths_below(self, folder: str) -> set[str]:
         """The paths of all objects below a folder, however deep; without what holds checksums."""
         return {path for path in self.sizes(folder) if not path.endswith(SUFFIX)}
 
     def sizes(self, folder: str) -> dict[str, int]:
         """The bytes of all objects below a folder, however deep, by their paths; with what holds checksums."""
-        with told():
+        with translate_errors():
             return {
                 meta["path"]: meta["size"] for batch in obstore.list(self._store, folder) for meta in batch
             }
 
-    def stale(self, folder: str, seconds: float, but: Collection[str] = ()) -> list[str]:
+    def stale_names(self, folder: str, seconds: float, but: Collection[str] = ()) -> list[str]:
         """What lies directly in a folder and was not written to for some time, by name: for whoever tidies up.
 
         Parameters
@@ -291,7 +291,7 @@ class Objects:
                 with suppress(FileNotFoundError):
                     newest = max(newest, one.stat().st_mtime)
         else:
-            with told():
+            with translate_errors():
                 found = [meta for batch in obstore.list(self._store, path) for meta in batch]
                 with suppress(FileNotFoundError):  # which a bucket does not list below itself
                     found.append(obstore.head(self._store, path))
@@ -308,7 +308,7 @@ class Objects:
                 target.unlink(missing_ok=True)
                 target.with_name(target.name + SUFFIX).unlink(missing_ok=True)
             return
-        with told():
+        with translate_errors():
             obstore.delete(self._store, [path, path + SUFFIX])  # which a bucket does not list below itself
             for batch in obstore.list(self._store, path, chunk_size=500):
                 obstore.delete(self._store, [meta["path"] for meta in batch])
@@ -324,11 +324,11 @@ class Objects:
             for part in (self._folder / path).rglob("*#*"):
                 part.unlink()
 
-    def free(self) -> int | None:
+    def free_bytes(self) -> int | None:
         """Bytes that the disk of a folder has left; None for a bucket, which has no end."""
         return shutil.disk_usage(self._folder).free if self._folder is not None else None
 
-    def check(self) -> None:
+    def check_reachable(self) -> None:
         """Reach the store once; raises whatever it raises when it can't be reached."""
-        with told():
+        with translate_errors():
             obstore.list_with_delimiter(self._store, None)

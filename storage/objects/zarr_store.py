@@ -16,7 +16,7 @@ from zarr.storage import ObjectStore as ZarrStore
 from storage.errors import Corrupt
 from storage.objects import checksums
 from storage.objects.checksums import CODECS
-from storage.objects.retries import told
+from storage.objects.retries import translate_errors
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -31,16 +31,16 @@ METADATA = ("zarr.json", ".zarray", ".zgroup", ".zattrs", ".zmetadata")
 """Objects that zarr looks for to see whether there is an array or a group: they may be missing."""
 
 
-def described(store: Whole, path: str, data: bytes) -> zarr.Array[Any]:
+def open_array(store: StrictStore, path: str, data: bytes) -> zarr.Array[Any]:
     """The array that a ``zarr.json`` describes."""
     document, _ = checksums.unseal(f"{path}/zarr.json", data)
-    with known(path):
+    with translate_errors_of(path):
         array = zarr.AsyncArray.from_dict(StorePath(store, path), document)
     return zarr.Array(array).with_config(EVERY_CHUNK)
 
 
 @contextmanager
-def known(path: str) -> Iterator[None]:
+def translate_errors_of(path: str) -> Iterator[None]:
     """What describes no array, or group, that zarr knows is `Corrupt`."""
     try:
         yield
@@ -56,13 +56,13 @@ def sealed(name: str, value: Buffer) -> Buffer:
 
 
 @cache
-def metadata_of(dtype: np.dtype[Any]) -> dict[str, Any]:
+def array_metadata(dtype: np.dtype[Any]) -> dict[str, Any]:
     """What zarr writes down about an array of a type, for arrays of any length."""
     array = zarr.create_array(MemoryStore(), shape=(1,), chunks=(1,), dtype=dtype, compressors=CODECS)
     return array.metadata.to_dict()
 
 
-class Whole(WrapperStore[ZarrStore[ObjectStore]]):
+class StrictStore(WrapperStore[ZarrStore[ObjectStore]]):
     """A store for zarr in which a missing chunk is an error: zarr reads it as its fill value, without a word.
 
     What can't be written or reached is told as everywhere here; these are the calls that zarr makes.
@@ -71,28 +71,28 @@ class Whole(WrapperStore[ZarrStore[ObjectStore]]):
     async def get(
         self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
     ) -> Buffer | None:
-        with told():
+        with translate_errors():
             value = await self._store.get(key, prototype, byte_range)
         if value is None and not key.endswith(METADATA):
             raise Corrupt(f"{key} is missing in the store: what it belongs to is damaged, make it again")
         return value
 
     async def set(self, key: str, value: Buffer) -> None:
-        with told():
+        with translate_errors():
             await self._store.set(key, value)
 
     async def set_if_not_exists(self, key: str, value: Buffer) -> None:
-        with told():
+        with translate_errors():
             await self._store.set_if_not_exists(key, value)
 
     async def delete(self, key: str) -> None:
-        with told():
+        with translate_errors():
             await self._store.delete(key)
 
     async def delete_dir(self, prefix: str) -> None:
-        with told():
+        with translate_errors():
             await self._store.delete_dir(prefix)
 
     async def exists(self, key: str) -> bool:
-        with told():
+        with translate_errors():
             return await self._store.exists(key)

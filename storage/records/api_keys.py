@@ -20,11 +20,11 @@ SCOPES = ("read", "write", "admin")
 """What a key allows, each also what the ones before it do: to look; to make and delete; to see the whole service."""
 PREFIX = "envmatte_"
 """By which people, and scanners for leaked secrets, know a key when they see one."""
-LONGEST = 64
+MAX_LENGTH = 64
 """Characters of an owner's name."""
 
 
-def make(connection: Connection, name: str, owner: str, scope: str) -> str:
+def create(connection: Connection, name: str, owner: str, scope: str) -> str:
     """Make a key, and return it: it can't be had again.
 
     Raises
@@ -35,9 +35,9 @@ def make(connection: Connection, name: str, owner: str, scope: str) -> str:
         If there is a key of this name that is not revoked.
     """
     for what, text in (("name", name), ("owner", owner)):
-        if not (text.strip() == text and 0 < len(text) <= LONGEST and text.isprintable()):
+        if not (text.strip() == text and 0 < len(text) <= MAX_LENGTH and text.isprintable()):
             raise InvalidInput(
-                f"{what} {text!r}: give it 1 to {LONGEST} characters, none of them blank at an end"
+                f"{what} {text!r}: give it 1 to {MAX_LENGTH} characters, none of them blank at an end"
             )
     if _active(connection, name) is not None:
         raise Conflict(f"there is a key {name!r} already: revoke it first, or take another name")
@@ -47,18 +47,18 @@ def make(connection: Connection, name: str, owner: str, scope: str) -> str:
     return key
 
 
-def known(connection: Connection, key: str) -> Row[Any] | None:
+def find(connection: Connection, key: str) -> Row[Any] | None:
     """The row of a key, if there is one that is not revoked."""
     query = select(keys).where(keys.c.hash == _hash(key), keys.c.revoked_at.is_(None))
     return connection.execute(query).one_or_none()
 
 
-def any_was_made(connection: Connection) -> bool:
+def any_created(connection: Connection) -> bool:
     """Whether there ever was a key: with the last one revoked a service must not be open again."""
     return connection.scalar(select(keys.c.number).limit(1)) is not None
 
 
-def listed(connection: Connection) -> Sequence[Row[Any]]:
+def list_all(connection: Connection) -> Sequence[Row[Any]]:
     """All keys, oldest first, those that are revoked among them."""
     return connection.execute(select(keys).order_by(keys.c.number)).all()
 

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from sqlalchemy import Connection, Row, delete, insert, select, update
+from sqlalchemy import Connection, Row, insert, select, update
 
 from storage.database.rows import find, lifetime
 from storage.database.tables import captures
@@ -31,6 +31,6 @@ def change(connection: Connection, capture: str, **values: Any) -> None:
     connection.execute(update(captures).where(captures.c.id == capture).values(values))
 
 
-def forget(connection: Connection, capture: str) -> None:
+def delete(connection: Connection, capture: str) -> None:
     """Delete a capture's row."""
-    connection.execute(delete(captures).where(captures.c.id == capture))
+    connection.execute(captures.delete().where(captures.c.id == capture))

@@ -9,12 +9,12 @@ from sqlalchemy import Connection, Row, insert, select
 from storage.database.tables import log
 
 
-def note(connection: Connection, job: str, text: str) -> None:
+def add(connection: Connection, job: str, text: str) -> None:
     """Add a line to a job's log."""
     connection.execute(insert(log).values(job=job, at=time.time(), text=text))
 
 
-def notes(connection: Connection, job: str, after: int, limit: int) -> Sequence[Row[Any]]:
+def lines(connection: Connection, job: str, after: int, limit: int) -> Sequence[Row[Any]]:
     """Lines of a job's log after a line, oldest first."""
     query = select(log).where(log.c.job == job, log.c.line > after).order_by(log.c.line).limit(limit)
     return connection.execute(query).all()

@@ -10,13 +10,12 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import Connection, Row, delete, exists, insert, or_, select, update
+from sqlalchemy import Connection, Row, exists, func, insert, or_, select, update
 
 from storage.database.rows import find, new_id
 from storage.database.tables import captures, jobs, mattes, tiles
 from storage.errors import Conflict
-from storage.records import webhook_deliveries
-from storage.records.job_log import note
+from storage.records import job_log, webhook_deliveries
 
 ACTIVE = ("queued", "running")
 
@@ -60,7 +59,7 @@ def add(
         "created_at": time.time(),
     }
     connection.execute(insert(jobs).values(row))
-    note(connection, job, "queued")
+    job_log.add(connection, job, "queued")
     return job
 
 
@@ -104,7 +103,7 @@ def change(connection: Connection, job: str, **values: Any) -> None:
     connection.execute(update(jobs).where(jobs.c.id == job).values(values))
 
 
-def enter(connection: Connection, job: str, stage: str) -> None:
+def enter_stage(connection: Connection, job: str, stage: str) -> None:
     """Put an active job into a stage; the first one starts it."""
     row = get(connection, job)
     if row.state not in ACTIVE:
@@ -113,7 +112,7 @@ def enter(connection: Connection, job: str, stage: str) -> None:
     values = {"state": "running", "stage": stage, "started_at": row.started_at or now, "stage_at": now}
     values |= {"moved_at": now, "paced_at": None}
     connection.execute(update(jobs).where(jobs.c.id == job).values(values))
-    note(connection, job, stage)
+    job_log.add(connection, job, stage)
 
 
 def end(connection: Connection, job: str, state: str, problem: dict[str, Any] | None = None) -> bool:
@@ -124,7 +123,7 @@ def end(connection: Connection, job: str, state: str, problem: dict[str, Any] | 
         .values(state=state, stage=state, problem=problem, finished_at=time.time())
     )
     if result.rowcount:
-        note(connection, job, f"{state}: {problem['detail']}" if problem else state)
+        job_log.add(connection, job, f"{state}: {problem['detail']}" if problem else state)
         row = get(connection, job)
         if row.webhook:
             webhook_deliveries.add(connection, row)
@@ -146,7 +145,44 @@ def cancel(connection: Connection, job: str) -> None:
         raise Conflict(f"job {job} has {row.state} already and can't be cancelled")
 
 
-def forget(connection: Connection, job: str) -> None:
+def retry(connection: Connection, job: str, *, replan: bool = False, trace: str | None = None) -> None:
+    """Queue a failed job again; the tiles that are done stay done.
+
+    Parameters
+    ----------
+    replan : bool
+        Forget its plan and its tiles, because the plan would be another one today.
+    trace : str, optional
+        The ``traceparent`` of the request that asks for it; default that of the one before.
+
+    Raises
+    ------
+    NotFound
+        If there is none.
+    Conflict
+        If it has not failed.
+    """
+    row = get(connection, job)
+    if row.state != "failed":
+        raise Conflict(f"job {job} is {row.state}; only a failed job can be tried again")
+    if replan:
+        connection.execute(tiles.delete().where(tiles.c.job == job))
+        nothing = {"plan": None, "total": 0, "pixels": 0}
+        connection.execute(update(jobs).where(jobs.c.id == job).values(nothing))
+    connection.execute(
+        update(tiles)
+        .where(tiles.c.job == job, tiles.c.state != "done")
+        .values(state="queued", attempts=0, losses=0)
+    )
+    done = (tiles.c.job == job, tiles.c.tile >= 0, tiles.c.state == "done")
+    values = {"state": "queued", "stage": "waiting", "failed": 0, "problem": None, "finished_at": None}
+    values["trace"] = trace or row.trace
+    values["done"] = connection.scalar(select(func.count()).where(*done))
+    connection.execute(update(jobs).where(jobs.c.id == job).values(values))
+    job_log.add(connection, job, "queued again")
+
+
+def delete(connection: Connection, job: str) -> None:
     """Delete a job that has ended, its tiles and its log.
 
     Raises
@@ -159,4 +195,4 @@ def forget(connection: Connection, job: str) -> None:
     row = get(connection, job)
     if row.state in ACTIVE:
         raise Conflict(f"job {job} is {row.state}; cancel it first")
-    connection.execute(delete(jobs).where(jobs.c.id == job))
+    connection.execute(jobs.delete().where(jobs.c.id == job))

@@ -11,7 +11,8 @@ from typing import Any
 
 from sqlalchemy import Connection, insert, select, update
 
-from storage.database.tables import clock, coordinator
+from storage.database.dialects import clock
+from storage.database.tables import coordinator
 
 SECONDS = 10.0
 """How long a lease holds without a heartbeat."""
@@ -22,7 +23,7 @@ class Superseded(Exception):
 
 
 @dataclass(frozen=True)
-class Sign:
+class Heartbeat:
     """The last sign of life of a coordinator.
 
     Attributes
@@ -40,10 +41,10 @@ class Sign:
     cluster: dict[str, Any]
 
 
-NOBODY: dict[str, Any] = {"workers": [], "problem": None}
+EMPTY_CLUSTER: dict[str, Any] = {"workers": [], "problem": None}
 
 
-def take(connection: Connection, holder: str, *, seize: bool = False) -> int | None:
+def acquire(connection: Connection, holder: str, *, seize: bool = False) -> int | None:
     """Take the lease if it is free or has run out; returns the token, or None while another holds it.
 
     Parameters
@@ -56,17 +57,17 @@ def take(connection: Connection, holder: str, *, seize: bool = False) -> int | N
     row = connection.execute(select(coordinator, clock().label("now"))).one_or_none()
     if row is None:
         now = connection.execute(select(clock())).scalar_one()
-        values = {"id": 1, "token": 1, "holder": holder, "cluster": NOBODY}
+        values = {"id": 1, "token": 1, "holder": holder, "cluster": EMPTY_CLUSTER}
         connection.execute(insert(coordinator).values(beat_at=now, expires_at=now + SECONDS, **values))
         return 1
     if row.holder is not None and row.expires_at > row.now and not seize:
         return None
-    values = {"token": row.token + 1, "holder": holder, "cluster": NOBODY}
+    values = {"token": row.token + 1, "holder": holder, "cluster": EMPTY_CLUSTER}
     connection.execute(update(coordinator).values(beat_at=row.now, expires_at=row.now + SECONDS, **values))
     return int(row.token) + 1
 
 
-def check(connection: Connection, token: int) -> None:
+def require_held(connection: Connection, token: int) -> None:
     """See that the lease is still held by a token.
 
     Raises
@@ -79,29 +80,29 @@ def check(connection: Connection, token: int) -> None:
         raise Superseded("another coordinator drives the jobs now")
 
 
-def beat(connection: Connection, token: int, cluster: dict[str, Any]) -> None:
+def renew(connection: Connection, token: int, cluster: dict[str, Any]) -> None:
     """Extend the lease, and write down the cluster.
 
     Raises
     ------
     Superseded
     """
-    check(connection, token)
+    require_held(connection, token)
     now = clock()
     connection.execute(update(coordinator).values(beat_at=now, expires_at=now + SECONDS, cluster=cluster))
 
 
-def give_back(connection: Connection, token: int) -> None:
+def release(connection: Connection, token: int) -> None:
     """Free the lease for the next, if it is still held."""
     connection.execute(update(coordinator).where(coordinator.c.token == token).values(holder=None))
 
 
-def touch(connection: Connection) -> None:
+def check_writable(connection: Connection) -> None:
     """Write what is there already, to see that the database can be written to."""
     connection.execute(update(coordinator).values(token=coordinator.c.token))
 
 
-def last_sign(connection: Connection) -> Sign | None:
+def last_heartbeat(connection: Connection) -> Heartbeat | None:
     """The last sign of life of a coordinator, if there ever was one."""
     row = connection.execute(select(coordinator, clock().label("now"))).one_or_none()
-    return None if row is None else Sign(row.holder, row.now - row.beat_at, row.cluster)
+    return None if row is None else Heartbeat(row.holder, row.now - row.beat_at, row.cluster)

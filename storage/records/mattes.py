@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from sqlalchemy import Connection, Row, delete, insert, update
+from sqlalchemy import Connection, Row, insert, update
 
 from storage.database.rows import find, lifetime
 from storage.database.tables import mattes
@@ -61,6 +61,6 @@ def change(connection: Connection, matte: str, **values: Any) -> None:
     connection.execute(update(mattes).where(mattes.c.id == matte).values(values))
 
 
-def forget(connection: Connection, matte: str) -> None:
+def delete(connection: Connection, matte: str) -> None:
     """Delete a matte's row."""
-    connection.execute(delete(mattes).where(mattes.c.id == matte))
+    connection.execute(mattes.delete().where(mattes.c.id == matte))

@@ -5,7 +5,7 @@ import json
 import time
 from typing import Any
 
-from sqlalchemy import Connection, Row, delete, insert, select, update
+from sqlalchemy import Connection, Row, insert, select, update
 
 from storage.database.rows import find
 from storage.database.tables import programs as table
@@ -14,12 +14,12 @@ from storage.database.tables import programs as table
 def add(connection: Connection, program: dict[str, Any]) -> str:
     """Write down a program and return its id; the same program has the same id, and is written down once."""
     id = _id(program)
-    if more(connection, program):
+    if added_bytes(connection, program):
         connection.execute(insert(table).values(id=id, program=program, created_at=time.time()))
     return id
 
 
-def more(connection: Connection, program: dict[str, Any]) -> int:
+def added_bytes(connection: Connection, program: dict[str, Any]) -> int:
     """Bytes that writing down a program takes, as `counts.of_bytes` counts them: none if it is there already."""
     known = connection.scalar(select(table.c.id).where(table.c.id == _id(program))) is not None
     return 0 if known else len(json.dumps(program))
@@ -41,12 +41,12 @@ def get(connection: Connection, program: str) -> Row[Any]:
     return find(connection, table, program)
 
 
-def forget(connection: Connection, program: str) -> None:
+def delete(connection: Connection, program: str) -> None:
     """Remove a program's row."""
-    connection.execute(delete(table).where(table.c.id == program))
+    connection.execute(table.delete().where(table.c.id == program))
 
 
-def show(connection: Connection, program: str, showing: dict[str, Any]) -> None:
+def set_showing(connection: Connection, program: str, showing: dict[str, Any]) -> None:
     """Write down how far the showing of a program is, and when that was.
 
     Raises

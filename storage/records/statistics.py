@@ -5,19 +5,20 @@ from typing import Any
 
 from sqlalchemy import Connection, Row, Text, cast, func, select
 
-from storage.database.owners import of_all
+from storage.database.owners import across_owners
 from storage.database.tables import captures, jobs, mattes, programs, tiles, totals, uploads
 from storage.records.jobs import ACTIVE
+from storage.steps import FINISH
 
 
-def of_jobs(connection: Connection) -> Sequence[Row[Any]]:
+def job_counts(connection: Connection) -> Sequence[Row[Any]]:
     """Jobs by ``kind`` and ``state``: how many as ``number``, and their tiles as ``total``, ``done`` and ``failed``."""
     sums = [func.sum(jobs.c[name]).label(name) for name in ("total", "done", "failed")]
     query = select(jobs.c.kind, jobs.c.state, func.count().label("number"), *sums)
     return connection.execute(query.group_by(jobs.c.kind, jobs.c.state)).all()
 
 
-def of_missing(connection: Connection) -> dict[str, int]:
+def missing_tiles(connection: Connection) -> dict[str, int]:
     """Tiles of active jobs that were done and are not in the store, by kind: they are done again."""
     query = (
         select(jobs.c.kind, func.count())
@@ -28,31 +29,31 @@ def of_missing(connection: Connection) -> dict[str, int]:
     return {kind: number for kind, number in connection.execute(query)}
 
 
-def of_work(connection: Connection) -> Sequence[Row[Any]]:
+def work_totals(connection: Connection) -> Sequence[Row[Any]]:
     """What has ever been done by each kind of job, see `storage.database.tables.totals`."""
     return connection.execute(select(totals)).all()
 
 
-def of_captures(connection: Connection) -> Sequence[Row[Any]]:
+def capture_counts(connection: Connection) -> Sequence[Row[Any]]:
     """Captures by ``state``: how many as ``number``, and the ``bytes`` of their archives."""
     sums = (func.count().label("number"), func.sum(captures.c.bytes).label("bytes"))
     return connection.execute(select(captures.c.state, *sums).group_by(captures.c.state)).all()
 
 
-def of_mattes(connection: Connection) -> dict[str, int]:
+def matte_counts(connection: Connection) -> dict[str, int]:
     """Mattes by state."""
     query = select(mattes.c.state, func.count()).group_by(mattes.c.state)
     return {state: number for state, number in connection.execute(query)}
 
 
-def of_uploads(connection: Connection) -> Row[Any]:
+def upload_counts(connection: Connection) -> Row[Any]:
     """Uploads under way: how many as ``number``, bytes of theirs that have ``come``, and that there are, ``length``."""
     come, length = (func.coalesce(func.sum(column), 0) for column in (uploads.c.offset, uploads.c.length))
     query = select(func.count().label("number"), come.label("come"), length.label("length"))
     return connection.execute(query.select_from(uploads)).one()
 
 
-def tiles_a_second(connection: Connection) -> float | None:
+def tiles_per_second(connection: Connection) -> float | None:
     """The pace of all running jobs together, each measured over its present stage; None before there is one."""
     query = select(jobs.c.done - jobs.c.paced_done, jobs.c.moved_at - jobs.c.paced_at).where(
         jobs.c.state == "running", jobs.c.paced_at < jobs.c.moved_at, jobs.c.done < jobs.c.total
@@ -61,17 +62,17 @@ def tiles_a_second(connection: Connection) -> float | None:
     return sum(paces) if paces else None
 
 
-def of_captures_to_be(connection: Connection) -> int:
+def captures_and_uploads(connection: Connection) -> int:
     """Captures, and the uploads under way that may become some."""
     return sum(connection.scalar(select(func.count()).select_from(one)) or 0 for one in (captures, uploads))
 
 
-def of_active_jobs(connection: Connection) -> int:
+def active_jobs(connection: Connection) -> int:
     """Jobs that are queued or running."""
     return connection.scalar(select(func.count()).where(jobs.c.state.in_(ACTIVE))) or 0
 
 
-def of_bytes(connection: Connection, *, all_owners: bool = False) -> int:
+def stored_bytes(connection: Connection, *, all_owners: bool = False) -> int:
     """Bytes in the store: of what is there as they were counted, of what is under way as they were announced.
 
     Programs count too, though they are rows and nothing more: they are as large as who makes them likes, and stay.
@@ -85,4 +86,16 @@ def of_bytes(connection: Connection, *, all_owners: bool = False) -> int:
         func.sum(func.length(cast(programs.c.program, Text))),
     ]
     queries = [select(one) for one in sums]
-    return sum(int(connection.scalar(of_all(query) if all_owners else query) or 0) for query in queries)
+    return sum(
+        int(connection.scalar(across_owners(query) if all_owners else query) or 0) for query in queries
+    )
+
+
+def recent_ingests(connection: Connection, limit: int) -> list[tuple[dict[str, Any], float]]:
+    """Of the last ingests that succeeded: their plans, and the seconds that the step after their tiles took."""
+    step = (tiles.c.job == jobs.c.id) & (tiles.c.tile == FINISH)
+    query = select(jobs.c.plan, tiles.c.seconds).join(tiles, step)
+    query = query.where(jobs.c.kind == "ingest", jobs.c.state == "succeeded", tiles.c.seconds.is_not(None))
+    return [
+        (plan, took) for plan, took in connection.execute(query.order_by(jobs.c.number.desc()).limit(limit))
+    ]

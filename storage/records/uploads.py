@@ -5,16 +5,16 @@ from collections.abc import Sequence
 from itertools import accumulate
 from typing import Any
 
-from sqlalchemy import Connection, Row, delete, func, insert, select, update
+from sqlalchemy import Connection, Row, func, insert, select, update
 
-from storage.database.owners import of_all
+from storage.database.owners import across_owners
 from storage.database.tables import upload_parts as table
 from storage.database.tables import uploads
 from storage.errors import Conflict, NoRoom, NotFound
 from storage.layout.uploads import Part
 from storage.objects.store import Objects
 
-MOST_PARTS = 10_000
+MAX_PARTS = 10_000
 """Parts of one upload: what whoever reads it has to know of it stays below a megabyte."""
 
 
@@ -106,14 +106,14 @@ def parts_of(connection: Connection, upload: str) -> list[Part]:
     return [Part(name, size) for name, size in connection.execute(query)]
 
 
-def forget(connection: Connection, upload: str) -> bool:
+def delete(connection: Connection, upload: str) -> bool:
     """Delete an upload's row; false if there was none."""
-    return bool(connection.execute(delete(uploads).where(uploads.c.id == upload)).rowcount)
+    return bool(connection.execute(uploads.delete().where(uploads.c.id == upload)).rowcount)
 
 
-def forget_expired(connection: Connection) -> list[str]:
+def delete_expired(connection: Connection) -> list[str]:
     """Delete the rows of uploads whose time is over; returns their ids."""
-    query = delete(uploads).where(uploads.c.expires_at <= time.time()).returning(uploads.c.id)
+    query = uploads.delete().where(uploads.c.expires_at <= time.time()).returning(uploads.c.id)
     return list(connection.scalars(query))
 
 
@@ -124,10 +124,10 @@ def check_room(connection: Connection, objects: Objects, length: int) -> None:
     ------
     NoRoom
     """
-    free = objects.free()
+    free = objects.free_bytes()
     if free is None:
         return
-    promised = connection.scalar(of_all(select(func.sum(uploads.c.length - uploads.c.offset)))) or 0
+    promised = connection.scalar(across_owners(select(func.sum(uploads.c.length - uploads.c.offset)))) or 0
     missing = length + int(promised) - free
     if missing > 0:
         raise NoRoom(

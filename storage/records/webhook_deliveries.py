@@ -10,14 +10,14 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from sqlalchemy import Connection, Row, delete, insert, select, update
+from sqlalchemy import Connection, Row, insert, select, update
 
 from storage.database.rows import new_id
 from storage.database.tables import deliveries
 
 DELAYS = (5.0, 30.0, 120.0, 600.0, 3600.0, 3 * 3600.0, 6 * 3600.0, 12 * 3600.0)
 """Seconds from each failed attempt to the next: nine attempts within a day."""
-ATTEMPT = 60.0
+ATTEMPT_SECONDS = 60.0
 """Seconds after which an attempt of which nothing was written down counts as lost with its process."""
 
 
@@ -47,20 +47,20 @@ def claim(connection: Connection, most: int) -> Sequence[Row[Any]]:
     query = select(deliveries.c.id).where(_is_due())
     query = query.order_by(deliveries.c.attempts, deliveries.c.due_at).limit(most)
     claimed = deliveries.c.id.in_(connection.scalars(query).all())
-    values = {"attempts": deliveries.c.attempts + 1, "due_at": time.time() + ATTEMPT}
+    values = {"attempts": deliveries.c.attempts + 1, "due_at": time.time() + ATTEMPT_SECONDS}
     connection.execute(update(deliveries).where(claimed).values(values))
     return connection.execute(select(deliveries).where(claimed)).all()
 
 
-def delivered(connection: Connection, delivery: str) -> None:
+def delete(connection: Connection, delivery: str) -> None:
     """Forget what was taken."""
-    connection.execute(delete(deliveries).where(deliveries.c.id == delivery))
+    connection.execute(deliveries.delete().where(deliveries.c.id == delivery))
 
 
-def failed(connection: Connection, delivery: str, attempts: int) -> float | None:
+def schedule_retry(connection: Connection, delivery: str, attempts: int) -> float | None:
     """Have it tried again; returns the seconds until then, or None if it was given up."""
     if attempts > len(DELAYS):
-        delivered(connection, delivery)
+        delete(connection, delivery)
         return None
     delay = DELAYS[attempts - 1]
     due = update(deliveries).where(deliveries.c.id == delivery).values(due_at=time.time() + delay)

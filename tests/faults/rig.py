@@ -170,7 +170,7 @@ class Rig:
 
     def names(self, matte: str) -> set[str]:
         """Every file of a matte."""
-        return Objects(self.store).below(mattes.path(matte))
+        return Objects(self.store).paths_below(mattes.path(matte))
 
     def disturb(
         self, fault: str, act: Callable[[], object], capture: str, expected: dict[str, str], times: int
@@ -196,7 +196,7 @@ def stored(objects: Objects, folder: str) -> dict[str, str]:
     """A digest of everything below a folder of a store, by its relative name."""
     return {
         path.removeprefix(f"{folder}/"): hashlib.sha256(objects.read(path).read()).hexdigest()
-        for path in sorted(objects.below(folder))
+        for path in sorted(objects.paths_below(folder))
     }
 
 

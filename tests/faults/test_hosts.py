@@ -54,6 +54,6 @@ def workers_of(ledger: Path) -> int:
     """How many workers the coordinator sees."""
     engine = open_engine(f"sqlite:///{ledger}")
     with reading(engine) as c:
-        sign = leases.last_sign(c)
+        sign = leases.last_heartbeat(c)
     engine.dispose()
     return len(sign.cluster["workers"]) if sign else 0

@@ -185,8 +185,8 @@ class Served:
         with writing(engine) as c:
             mattes.add_imported(c, "m", matte.attributes["options"], matte.figures, 1000, None)
             jobs.add(c, "composite", "", {}, "m", None, "v", 1000)
-            tiles.begin(c, "v")
-            job_log.note(c, "v", "a line")
+            tiles.add_steps(c, "v")
+            job_log.add(c, "v", "a line")
             jobs.end(c, "v", "succeeded")
             self.program = programs.add(c, BODIES[JSON[2]]["program"])
             uploads.add(c, "u", 100, "", 1e6, None)

@@ -181,7 +181,7 @@ def read_archive(data: bytes, folder: Path) -> None:
     try:
         matte = take_in(io.BytesIO(data), objects, "n", replace(LIMITS, memory=1 << 20))
     except ArchiveError:
-        assert objects.below("mattes/n") == set()
+        assert objects.paths_below("mattes/n") == set()
         raise
     assert matte.width * matte.height < 1 << 20
     light = np.linspace(0, 1, 5 * 40 * 3, dtype=np.float32).reshape(5, 40, 3)

@@ -76,7 +76,7 @@ def digests(objects: Objects) -> Callable[[str], dict[str, str]]:
     """The objects below a folder of the store, each with the hash of its bytes."""
 
     def of(below: str) -> dict[str, str]:
-        paths = sorted(objects.below(below))
+        paths = sorted(objects.paths_below(below))
         assert paths
         return {
             path.removeprefix(f"{below}/"): hashlib.sha256(objects.read(path).read()).hexdigest()

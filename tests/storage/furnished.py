@@ -50,7 +50,7 @@ def furnish(engine: Engine, objects: Objects) -> None:
         made = stored_mattes.create(objects, matte, height=21, width=40, columns=4, rows=3, **given)
         for row, column in places(made)[: 2 if matte == "r" else None]:
             made.write(row, column, block(*extent(made, row, column), seed=10 * row + column))
-    live.keep(objects, "m", "live-1", rng.bytes(1000))
+    live.write(objects, "m", "live-1", rng.bytes(1000))
     stream(objects, stored_uploads.part_path("i", "all"), ARCHIVE)
     stored_uploads.seal(objects, "i", [Part("all", len(ARCHIVE))])
     for part in ("p", "q"):
@@ -62,7 +62,7 @@ def furnish(engine: Engine, objects: Objects) -> None:
         objects.put(composites.segment_path(job, 0), ARCHIVE[:70])
     with writing(engine) as c:
         write_down(c)
-        api_keys.make(c, "lab", "alice", "write")
+        api_keys.create(c, "lab", "alice", "write")
 
 
 def write_down(c: Connection) -> None:
@@ -85,11 +85,11 @@ def write_down(c: Connection) -> None:
             job=job,
             webhook="https://example.org" if job == "v" else None,
         )
-        tiles.begin(c, job)
+        tiles.add_steps(c, job)
     for job in ("rr", "ii"):
-        jobs.enter(c, job, "recovering")
-        tiles.lay_down(c, job, {"tiles": 6})
-    tiles.finish(c, "rr", [(0, 0.5, 16), (1, 0.25, 16)])
+        jobs.enter_stage(c, job, "recovering")
+        tiles.add_plan(c, job, {"tiles": 6})
+    tiles.mark_done(c, "rr", [(0, 0.5, 16), (1, 0.25, 16)])
     captures.add(c, "c", "ci", name="ball \u2713", bytes=5, frames=6, program={"levels": [0.25, 1e-300]})
     captures.change(c, "c", state="ready", owner="alice")
     captures.add(c, "i", "ii", name="", bytes=len(ARCHIVE), frames=6, program={}, seconds=1e6)
@@ -102,7 +102,7 @@ def write_down(c: Connection) -> None:
     for job in ("ci", "mr", "v"):
         jobs.end(c, job, "succeeded")
     jobs.end(c, "x", "failed", AGAIN)
-    idempotency.remember(c, "key", "POST /v1/captures", "c")
+    idempotency.add(c, "key", "POST /v1/captures", "c")
     programs.add(c, {"any": 1})
 
 
@@ -119,12 +119,12 @@ def stream(objects: Objects, path: str, data: bytes) -> None:
 
 def flip(objects: Objects, path: str, at: float = 0.5) -> None:
     """Flip a bit of an object, as a disk might."""
-    data = bytearray(objects.load(path))
+    data = bytearray(objects.read_raw(path))
     data[min(int(len(data) * at), len(data) - 1)] ^= 0x10
-    objects.store(path, iter([bytes(data)]))
+    objects.write_raw(path, iter([bytes(data)]))
 
 
 def contents(objects: Objects) -> dict[str, bytes]:
     """Every object, by its path."""
     folders = ("captures", "mattes", "uploads", "composites")
-    return {path: objects.load(path) for folder in folders for path in objects.sizes(folder)}
+    return {path: objects.read_raw(path) for folder in folders for path in objects.sizes(folder)}

@@ -79,7 +79,7 @@ def read_light(stack: Stack, span: tuple[slice, slice], program: Program) -> tup
         frame_of: FrameOf = at_rest
     else:
         margin = margin_of(shifts)
-        around, recovered = _around(stack, span, margin), stack.recovered(*span)
+        around, recovered = _around(stack, span, margin), stack.mask(*span)
 
         def in_place(frame: int) -> tuple[Floats, Bools]:
             values, whole = unclipped_light(around[frame], shifts[frame], margin, look_up)

@@ -151,7 +151,7 @@ def delete_capture(context: OwnerContext, id: str) -> None:
         busy = [row.id for row in jobs.active(c) if row.capture == id]
         if busy:
             raise Conflict(f"job {busy[0]} works on capture {id}; cancel it first, or wait for it")
-        captures.forget(c, id)
+        captures.delete(c, id)
     context.objects.delete(stored_captures.path(id))
     stored_uploads.remove(context.objects, id)
 
@@ -219,7 +219,7 @@ def _from_upload(context: Context, wanted: FromUpload, key: str | None) -> Row[A
                 return captures.get(c, upload)
             uploads.get(c, upload)
             if isinstance(error, CaptureError):  # it would be refused again
-                uploads.forget(c, upload)
+                uploads.delete(c, upload)
         if isinstance(error, CaptureError):
             stored_uploads.remove(context.objects, upload)
         raise
@@ -250,7 +250,7 @@ def _register(
         manifest = CaptureArchive(file, context.settings.limits).manifest
 
     def create(c: Connection) -> str:
-        if resumable and not uploads.forget(c, capture):
+        if resumable and not uploads.delete(c, capture):
             raise NotFound(f"upload {capture} is gone")
         size = sum(part.size for part in parts)
         admit(c, context.settings, captures=1, jobs=1, size=size)

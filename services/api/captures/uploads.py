@@ -31,7 +31,7 @@ from storage.errors import InvalidInput, NotFound
 from storage.layout import uploads as stored_uploads
 from storage.layout.uploads import Part
 from storage.records import captures, uploads
-from storage.records.uploads import MOST_PARTS
+from storage.records.uploads import MAX_PARTS
 
 PART = 64 << 20
 """Bytes after which what has come is written down: what a killed server loses of one PATCH, at most."""
@@ -97,10 +97,10 @@ async def append(context: OwnerContext, request: Request, id: str) -> Response:
     _require_chunk(request)
     checksum = Checksum.of(request)
     uploads.check_offset(row, number(request, "Upload-Offset"))
-    if row.parts >= MOST_PARTS:
+    if row.parts >= MAX_PARTS:
         raise InvalidInput(
             f"upload {id} came in {row.parts} pieces, the most there may be; start again with larger ones",
-            limit=MOST_PARTS,
+            limit=MAX_PARTS,
         )
     row = await _append(context, request, row, checksum)
     return Response(status_code=204, headers=_headers(row))
@@ -111,7 +111,7 @@ def delete_upload(context: OwnerContext, id: str) -> None:
     """Give an upload up."""
     with writing(context.engine) as c:
         uploads.get(c, id)
-        uploads.forget(c, id)
+        uploads.delete(c, id)
     stored_uploads.remove(context.objects, id)
 
 
@@ -187,7 +187,7 @@ def _get(context: Context, upload: str) -> Row[Any]:
 def _create(context: Context, length: int, metadata: str, key: str | None) -> tuple[Row[Any], bool]:
     """The upload to send to, and whether it is new: a repeat with the same key goes on with the first one's."""
     with writing(context.engine) as c:
-        expired = uploads.forget_expired(c)
+        expired = uploads.delete_expired(c)
     for upload in expired:
         stored_uploads.remove(context.objects, upload)
     try:

@@ -8,7 +8,7 @@ from sqlalchemy import Connection, Engine
 from sqlalchemy.exc import IntegrityError
 
 from storage.database.engine import reading, writing
-from storage.records.idempotency import made_by, remember
+from storage.records.idempotency import add, find
 
 T = TypeVar("T")
 Read = Callable[[Connection, str], T]
@@ -27,7 +27,7 @@ def find_earlier(engine: Engine, key: str | None, call: str, read: Read[T]) -> T
     if not key:
         return None
     with reading(engine) as c:
-        earlier = made_by(c, key, call)
+        earlier = find(c, key, call)
         return None if earlier is None else read(c, earlier)
 
 
@@ -52,11 +52,11 @@ def idempotent(
     """
     try:
         with writing(engine) as c:
-            created = made_by(c, key, call) if key else None
+            created = find(c, key, call) if key else None
             if created is None:
                 created = create(c)
                 if key:
-                    remember(c, key, call, created)
+                    add(c, key, call, created)
             return read(c, created)
     except IntegrityError:  # a concurrent request with the same key was quicker
         earlier = find_earlier(engine, key, call, read)

@@ -5,7 +5,7 @@ from typing import Any
 
 from sqlalchemy import Connection, Row
 
-from storage.records import tiles
+from storage.records import statistics
 
 TYPICAL = 1.4e-7
 """Seconds of a 2.5 GHz core for a unit of `_survey_of`."""
@@ -39,7 +39,7 @@ def _finishing(connection: Connection, row: Row[Any]) -> float:
     """
     ended = [
         (plan, seconds)
-        for plan, seconds in tiles.finished_ingests(connection, most=8)
+        for plan, seconds in statistics.recent_ingests(connection, limit=8)
         if plan.get("video") == row.plan.get("video")
     ]
     speeds = [TYPICAL, *(seconds / _survey_of(plan) for plan, seconds in ended[:4])]

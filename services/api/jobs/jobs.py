@@ -25,8 +25,7 @@ from storage.database.tables import jobs as table
 from storage.errors import Conflict
 from storage.layout import composites
 from storage.records import captures, job_log, jobs, leases, mattes
-from storage.records import tiles as tile_records
-from storage.records.leases import Sign
+from storage.records.leases import Heartbeat
 from workflows.mattes.options import describe_options, parse_options
 from workflows.programs.program import Program
 
@@ -87,9 +86,9 @@ class Job(BaseModel):
         return cls.of(connection, jobs.get(connection, id))
 
     @classmethod
-    def of(cls, connection: Connection, row: Row[Any], sign: Sign | None = None) -> "Job":
+    def of(cls, connection: Connection, row: Row[Any], sign: Heartbeat | None = None) -> "Job":
         now = time.time()
-        sign = sign or leases.last_sign(connection)
+        sign = sign or leases.last_heartbeat(connection)
         ran = ((row.finished_at or now) - row.started_at) if row.started_at else 0.0
         running = row.state == "running"
         # The step after the last tile counts as one more: only a job that has succeeded is at 1.
@@ -199,7 +198,7 @@ def list_jobs(
 ) -> Jobs:
     """Jobs, newest first."""
     with reading(context.engine) as c:
-        sign = leases.last_sign(c)  # once for all of them
+        sign = leases.last_heartbeat(c)  # once for all of them
         return Jobs(jobs=[Job.of(c, row, sign) for row in page(c, table, limit, after, state=state)])
 
 
@@ -217,7 +216,7 @@ def get_log(
     """What happened to a job, line by line."""
     with reading(context.engine) as c:
         jobs.get(c, id)
-        rows = job_log.notes(c, id, after, limit)
+        rows = job_log.lines(c, id, after, limit)
     return Log(lines=[Line(line=r.line, at=datetime.fromtimestamp(r.at, UTC), text=r.text) for r in rows])
 
 
@@ -238,7 +237,7 @@ def retry_job(context: OwnerContext, id: str) -> Job:
         memory = (row.plan or {}).get("memory", context.settings.ingest_memory)
         if row.state == "failed":
             admit(c, context.settings, jobs=1)
-        tile_records.retry(c, id, anew=memory != context.settings.ingest_memory, trace=tracing.asked_by())
+        jobs.retry(c, id, replan=memory != context.settings.ingest_memory, trace=tracing.asked_by())
         JOB_KINDS[row.kind].retried(c, row)
         return Job.read(c, id)
 
@@ -248,6 +247,6 @@ def delete_job(context: OwnerContext, id: str) -> None:
     """Delete a job that has ended, and its log; its matte stays, the video of a composite goes."""
     with writing(context.engine) as c:
         kind = jobs.get(c, id).kind
-        jobs.forget(c, id)
+        jobs.delete(c, id)
     if kind == "composite":
         context.objects.delete(composites.path(id))

@@ -5,11 +5,11 @@ from typing import Any
 
 from sqlalchemy import Connection, Row, func, select
 
-from storage.database.owners import of_all
+from storage.database.owners import across_owners
 from storage.database.tables import captures
 from storage.database.tables import jobs as table
 from storage.records import jobs
-from storage.records.leases import Sign
+from storage.records.leases import Heartbeat
 
 SILENCE = 15.0
 """Seconds after which a coordinator that gave no sign of life counts as gone."""
@@ -17,7 +17,7 @@ STILL = 30.0
 """Seconds without anything done after which a job says so."""
 
 
-def trouble_of(sign: Sign | None) -> str | None:
+def trouble_of(sign: Heartbeat | None) -> str | None:
     """What is wrong with the coordinator or its cluster, if something is."""
     if sign is None:
         return (
@@ -32,7 +32,7 @@ def trouble_of(sign: Sign | None) -> str | None:
     return problem
 
 
-def reason(connection: Connection, row: Row[Any], sign: Sign | None) -> str | None:
+def reason(connection: Connection, row: Row[Any], sign: Heartbeat | None) -> str | None:
     """What an active job waits for; None while it has what it needs, or has ended."""
     if row.state not in jobs.ACTIVE:
         return None
@@ -49,7 +49,7 @@ def reason(connection: Connection, row: Row[Any], sign: Sign | None) -> str | No
     if still > STILL:
         return f"nothing of it was done in the last {still:.0f} s; a tile takes long, or its worker does not answer"
     query = select(func.count()).where(table.c.state == "running", table.c.id != row.id)
-    others = connection.scalar(of_all(query))
+    others = connection.scalar(across_owners(query))
     if others:
         workers = len(sign.cluster["workers"]) if sign else 0
         return f"it shares {workers} workers with {others} other jobs"

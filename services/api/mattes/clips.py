@@ -137,7 +137,7 @@ def _queue(
         admit(c, context.settings, jobs=1, size=size)
         capture, trace = row.capture or "", tracing.asked_by()
         jobs.add(c, "composite", capture, options, matte, trace, job, size, webhook)
-        tiles.begin(
+        tiles.add_steps(
             c, job
         )  # while it has tiles it has something in the store, see `jobs.cancelled_with_leftovers`
         return job

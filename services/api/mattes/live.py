@@ -41,7 +41,7 @@ async def get_live(context: OwnerContext, id: str, request: Request) -> Response
                 is_ready()  # it may have been deleted meanwhile
                 raise
             with suppress(NoRoom):  # it is there for this caller, and can be made again
-                kept.keep(context.objects, id, encode.FORMAT, made)
+                kept.write(context.objects, id, encode.FORMAT, made)
         return answered(made, "application/octet-stream", tag | {"Content-Encoding": "gzip"})
 
     await anyio.to_thread.run_sync(is_ready)

@@ -80,6 +80,6 @@ def delete_matte(context: OwnerContext, id: str) -> None:
         busy = [job.id for job in jobs.active(c) if job.matte == row.id]
         if busy:
             raise Conflict(f"job {busy[0]} works on matte {id}; cancel it first, or wait for it")
-        mattes.forget(c, id)
+        mattes.delete(c, id)
     context.cache.forget(id)
     context.objects.delete(stored_mattes.path(id))

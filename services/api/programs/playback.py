@@ -31,7 +31,7 @@ async def _told(request: Request) -> Told:
 def put_showing(context: OwnerContext, id: str, told: Annotated[Told, Depends(_told)]) -> None:
     """Tell how far the showing of a program is: its page does, for whoever follows it elsewhere."""
     with writing(context.engine) as c:
-        programs.show(c, id, told.model_dump(mode="json"))
+        programs.set_showing(c, id, told.model_dump(mode="json"))
 
 
 @router.get("/programs/{id}/events", response_class=StreamingResponse)

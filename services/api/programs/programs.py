@@ -174,7 +174,7 @@ def post_program(
     _see_that_it_is_small(shown)
     kept = record(shown)
     with writing(context.engine) as c:
-        if size := programs.more(c, kept):
+        if size := programs.added_bytes(c, kept):
             admit(c, context.settings, size=size)
         id = programs.add(c, kept)
         row = programs.get(c, id)
@@ -201,7 +201,7 @@ def delete_program(context: OwnerContext, id: str) -> None:
     """Delete a program; captures of it keep their own."""
     with writing(context.engine) as c:
         programs.get(c, id)
-        programs.forget(c, id)
+        programs.delete(c, id)
 
 
 def _shown(context: OwnerContext, id: str) -> Shown:

@@ -8,7 +8,7 @@ from services.api.jobs.wait_reason import trouble_of
 from storage.database.engine import reading
 from storage.records import leases, statistics
 from storage.records.jobs import ACTIVE
-from storage.records.leases import Sign
+from storage.records.leases import Heartbeat
 
 router = APIRouter(tags=["system"])
 
@@ -58,11 +58,11 @@ class Cluster(BaseModel):
 def get_cluster(context: AdminContext) -> Cluster:
     """Workers, threads, memory, the queue, and what is wrong if something is."""
     with reading(context.engine) as c:
-        sign = leases.last_sign(c)
-        active = [row for row in statistics.of_jobs(c) if row.state in ACTIVE]
-        missing = sum(statistics.of_missing(c).values())
-        pace = statistics.tiles_a_second(c)
-    seen = (sign or Sign(None, 0, leases.NOBODY)).cluster
+        sign = leases.last_heartbeat(c)
+        active = [row for row in statistics.job_counts(c) if row.state in ACTIVE]
+        missing = sum(statistics.missing_tiles(c).values())
+        pace = statistics.tiles_per_second(c)
+    seen = (sign or Heartbeat(None, 0, leases.EMPTY_CLUSTER)).cluster
     workers = [Worker.model_validate(worker) for worker in seen["workers"]]
     limits = [worker.memory_limit_bytes for worker in workers if worker.memory_limit_bytes]
     return Cluster(

@@ -41,16 +41,16 @@ def readiness(context: AnonymousContext, response: Response) -> Readiness:
 
     def database() -> str:
         with writing(context.engine) as c:  # one that is full can still be read
-            leases.touch(c)
+            leases.check_writable(c)
         return "ok"
 
     def store() -> str:
-        context.objects.check()
+        context.objects.check_reachable()
         return "ok"
 
     def cluster() -> str:
         with reading(context.engine) as c:
-            sign = leases.last_sign(c)
+            sign = leases.last_heartbeat(c)
         return trouble_of(sign) or "ok"
 
     found = {check.__name__: _try(check) for check in (database, store, cluster)}

@@ -15,7 +15,7 @@ from services.api.jobs.wait_reason import trouble_of
 from storage.database.engine import reading
 from storage.records import leases, statistics
 from storage.records.jobs import ACTIVE
-from storage.records.leases import Sign
+from storage.records.leases import Heartbeat
 
 router = APIRouter(tags=["system"])
 KINDS = ("ingest", "recover", "composite")
@@ -46,11 +46,11 @@ def get_metrics(context: AdminContext, request: Request) -> Response:
 
 def _of_the_queue(connection: Connection) -> Iterator[Metric]:
     """Jobs, and the tiles of those that are active."""
-    rows = {(row.kind, row.state): row for row in statistics.of_jobs(connection)}
+    rows = {(row.kind, row.state): row for row in statistics.job_counts(connection)}
     numbers = {(kind, state): 0 for kind in KINDS for state in JOB_STATES}
     numbers |= {labels: row.number for labels, row in rows.items()}
     yield _gauge("jobs", "Jobs there are, by kind and state.", ("kind", "state"), numbers.items())
-    missing = statistics.of_missing(connection)
+    missing = statistics.missing_tiles(connection)
     states: dict[tuple[str, ...], int] = {}
     for kind in KINDS:
         active = [row for (one, state), row in rows.items() if one == kind and state in ACTIVE]
@@ -70,7 +70,7 @@ def _of_the_queue(connection: Connection) -> Iterator[Metric]:
 
 def _of_work(connection: Connection) -> Iterator[Metric]:
     """What has ever been done."""
-    rows = {(row.kind,): row for row in statistics.of_work(connection)}
+    rows = {(row.kind,): row for row in statistics.work_totals(connection)}
     steps = SummaryMetricFamily(
         "envmatte_tile_seconds", "Seconds that workers spent on tiles, those that are done.", labels=["kind"]
     )
@@ -89,13 +89,13 @@ def _of_work(connection: Connection) -> Iterator[Metric]:
 
 def _of_data(connection: Connection) -> Iterator[Metric]:
     """Captures, mattes, uploads."""
-    rows = statistics.of_captures(connection)
+    rows = statistics.capture_counts(connection)
     yield _gauge("captures", "Captures there are.", ("state",), (((r.state,), r.number) for r in rows))
     text = "Bytes of the archives of captures, as they were uploaded."
     yield _gauge("capture_bytes", text, ("state",), (((r.state,), r.bytes) for r in rows))
-    found = statistics.of_mattes(connection)
+    found = statistics.matte_counts(connection)
     yield _gauge("mattes", "Mattes there are.", ("state",), (((k,), n) for k, n in found.items()))
-    uploads = statistics.of_uploads(connection)
+    uploads = statistics.upload_counts(connection)
     yield _one("uploads", "Resumable uploads under way.", uploads.number)
     yield _one("upload_bytes", "Bytes of them that have come.", uploads.come)
     yield _one("upload_length_bytes", "Bytes that they will have.", uploads.length)
@@ -103,9 +103,9 @@ def _of_data(connection: Connection) -> Iterator[Metric]:
 
 def _of_the_cluster(connection: Connection) -> Iterator[Metric]:
     """As its coordinator last saw it."""
-    sign = leases.last_sign(connection)
+    sign = leases.last_heartbeat(connection)
     yield _one("trouble", "1 if nothing can go on, as GET /v1/cluster says in words.", bool(trouble_of(sign)))
-    cluster = (sign or Sign(None, 0, leases.NOBODY)).cluster
+    cluster = (sign or Heartbeat(None, 0, leases.EMPTY_CLUSTER)).cluster
     workers = cluster["workers"]
     yield _one("workers", "Worker processes.", len(workers))
     yield _one("threads", "Threads of theirs.", _sum(workers, "threads"))

@@ -34,7 +34,7 @@ def newest() -> str:
     return head
 
 
-def check(revision: str, what: str) -> None:
+def require_known(revision: str, what: str) -> None:
     """See that a revision is one that this code knows.
 
     Parameters
@@ -65,7 +65,7 @@ def upgrade(connection: Connection, to: str = "head") -> None:
     """
     before = revision(connection)
     if before is not None:
-        check(before, "the database")
+        require_known(before, "the database")
     with _one_at_a_time:
         _config.attributes["connection"] = connection
         try:

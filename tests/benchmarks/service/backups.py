@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from storage.database.dialects import create
+from storage.database.dialects import make_engine
 from storage.database.engine import open_engine, writing
 from storage.layout import captures as stored_captures
 from storage.layout import mattes as stored_mattes
@@ -54,7 +54,7 @@ def main() -> None:
 def _use(codecs: Sequence[object]) -> None:
     for module in (stored_captures, stored_mattes, zarr_store):
         module.CODECS = codecs
-    zarr_store.metadata_of.cache_clear()
+    zarr_store.array_metadata.cache_clear()
 
 
 def _frames() -> np.ndarray:
@@ -110,7 +110,7 @@ def _whole(folder: Path, store: Objects, rounds: int) -> None:
                 "verify": lambda: verify(engine, store),
                 "backup": lambda to=target: back_up(engine, store, to, "0"),
                 "restore": lambda of=target, n=n, to=other: restore(
-                    of, create(f"sqlite:///{folder}/{n}.db"), to
+                    of, make_engine(f"sqlite:///{folder}/{n}.db"), to
                 ),
             }[what]
             best = np.minimum(best, _seconds(act))

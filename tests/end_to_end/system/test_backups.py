@@ -58,9 +58,9 @@ def test_a_job_that_ran_is_finished_where_the_backup_is_restored(
             assert stored(Objects(s3), f"mattes/{matte}") == whole
             assert second.client.capture(uploaded["id"])["name"] == "ball"
             chunk = f"mattes/{matte}/S/c/0/0/0"
-            data_of = bytearray(Objects(s3).load(chunk))
+            data_of = bytearray(Objects(s3).read_raw(chunk))
             data_of[9] ^= 1
-            Objects(s3).store(chunk, iter([bytes(data_of)]))
+            Objects(s3).write_raw(chunk, iter([bytes(data_of)]))
             looked = envmatte("verify", *where, "--json")
             report = json.loads(looked.stdout)
             assert (looked.returncode, report["read"]["unchecked"]) == (1, 0)

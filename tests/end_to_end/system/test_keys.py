@@ -158,7 +158,7 @@ def locked(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[L
     engine = open_engine(f"sqlite:///{data}/envmatte.db")
     with writing(engine) as c:
         for kind, scope in (*SCOPES.items(), ("revoked", "admin")):
-            made[kind] = api_keys.make(c, kind, "bob" if kind.startswith("other") else "alice", scope)
+            made[kind] = api_keys.create(c, kind, "bob" if kind.startswith("other") else "alice", scope)
         api_keys.revoke(c, "revoked")
     engine.dispose()
     with serving(data) as service, Client(service.url, made["write"]) as alice:

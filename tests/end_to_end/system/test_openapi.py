@@ -176,7 +176,7 @@ def test_the_service_is_as_its_document_says(
         if who == "a key to look with":
             engine = open_engine(f"sqlite:///{service.data}/envmatte.db")
             with writing(engine) as c:
-                key = api_keys.make(c, "look", "default", "read")
+                key = api_keys.create(c, "look", "default", "read")
             engine.dispose()
         checks = CHECKS if is_open else LOCKED
         options = ("--phases", "coverage,fuzzing,stateful", "--max-examples", examples)

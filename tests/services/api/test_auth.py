@@ -28,7 +28,7 @@ def test_a_service_that_never_had_a_key_is_open(engine: Engine, tmp_path: Path) 
 
 def test_from_the_first_key_on_it_is_closed_for_good(engine: Engine, tmp_path: Path) -> None:
     with writing(engine) as c:
-        key = api_keys.make(c, "lab", "alice", "read")
+        key = api_keys.create(c, "lab", "alice", "read")
     settings = Settings(data=tmp_path)
     assert identify(settings, engine, key) == Caller("alice", "read")
     with writing(engine) as c:
@@ -41,7 +41,7 @@ def test_from_the_first_key_on_it_is_closed_for_good(engine: Engine, tmp_path: P
 def test_keys_of_the_settings_are_admins_of_the_default_owner(engine: Engine, tmp_path: Path) -> None:
     settings = Settings(data=tmp_path, keys="one,twö")
     with writing(engine) as c:
-        key = api_keys.make(c, "lab", "alice", "write")
+        key = api_keys.create(c, "lab", "alice", "write")
     assert identify(settings, engine, "one") == identify(settings, engine, "twö") == ADMIN
     assert identify(settings, engine, key) == Caller("alice", "write")
     for given in (None, "", "three", "one,twö"):
@@ -57,7 +57,7 @@ def test_a_service_without_keys_stays_on_loopback(host: str, engine: Engine, tmp
         require_keys_unless_loopback(Settings(data=tmp_path, host=host), engine)
     require_keys_unless_loopback(Settings(data=tmp_path, host=host, keys="a-key"), engine)
     with writing(engine) as c:
-        api_keys.make(c, "lab", "alice", "read")
+        api_keys.create(c, "lab", "alice", "read")
         api_keys.revoke(c, "lab")
     require_keys_unless_loopback(Settings(data=tmp_path, host=host), engine)
 

@@ -21,7 +21,7 @@ from workflows.composite.cache import Cache
 def test_download_ends_when_its_key_is_revoked(tmp_path: Path) -> None:
     engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
     with writing(engine) as c:
-        key = api_keys.make(c, "lab", "alice", "read")
+        key = api_keys.create(c, "lab", "alice", "read")
     settings, objects = Settings(data=tmp_path), Objects((tmp_path / "store").as_uri())
     check_key = partial(identify, settings, engine, key)
     decoders = Decoders(settings.backdrop_bytes)  # no process starts before the first picture

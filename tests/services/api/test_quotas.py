@@ -14,7 +14,7 @@ from services.api.app import build_app
 from services.api.quotas import UNITS
 from services.settings import Settings
 from storage.database.engine import open_engine, reading, writing
-from storage.database.owners import bound
+from storage.database.owners import for_owner
 from storage.objects.store import Objects
 from storage.records import api_keys, captures, jobs, mattes
 from tests.parts.captures import nested_program
@@ -40,8 +40,8 @@ def engine(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Engine]:
     sqlite = f"sqlite:///{tmp_path / 'ledger.db'}"
     opened = open_engine(sqlite if request.param == "sqlite" else request.getfixturevalue("postgresql"))
     with writing(opened) as c:
-        tmp_path.joinpath("alice").write_text(api_keys.make(c, "alice", "alice", "write"))
-        tmp_path.joinpath("bob").write_text(api_keys.make(c, "bob", "bob", "admin"))
+        tmp_path.joinpath("alice").write_text(api_keys.create(c, "alice", "alice", "write"))
+        tmp_path.joinpath("bob").write_text(api_keys.create(c, "bob", "bob", "admin"))
     yield opened
     opened.dispose()
 
@@ -148,7 +148,7 @@ def test_jobs_of_an_owner(serve: Serve, bundle: bytes, engine: Engine) -> None:
     refused(answer, 429, "owner_jobs", 2, 3)
     assert int(answer.headers["retry-after"]) > 0
     refused(client.post("/v1/captures", content=bundle, headers=ZIP), 429, "owner_jobs", 2, 3)
-    with writing(bound(engine, "alice")) as c:
+    with writing(for_owner(engine, "alice")) as c:
         mattes.add_imported(c, "m", {}, {})
     video = {"Content-Type": "video/mp4"}
     refused(client.post("/v1/mattes/m/composite", content=b"clip", headers=video), 429, "owner_jobs", 2, 3)

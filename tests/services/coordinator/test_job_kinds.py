@@ -38,7 +38,7 @@ def job(engine: Engine, objects: Objects) -> str:
         mattes.add(c, "m", "cap", "other", {})
         mattes.change(c, "m", state="ready")
         job = jobs.add(c, "composite", "cap", {"transfer": "srgb"}, "m")
-        tiles.begin(c, job)
+        tiles.add_steps(c, job)
     for path in MADE:
         objects.put(path(job), b"any")
     objects.put(composites.segment_path(job, 0), b"any")
@@ -63,9 +63,9 @@ def test_what_is_left_of_a_success_is_the_video(objects: Objects, engine: Engine
     with writing(engine) as c:
         row = jobs.get(c, job)
     JOB_KINDS["composite"].tidy(objects, row)
-    assert objects.below(composites.path(job)) == {composites.video_path(job)}
+    assert objects.paths_below(composites.path(job)) == {composites.video_path(job)}
     JOB_KINDS["composite"].discard(objects, row)
-    assert objects.below(composites.path(job)) == set()
+    assert objects.paths_below(composites.path(job)) == set()
 
 
 @pytest.mark.parametrize(("error", "kept"), [(ClipError("no clip"), False), (GaveUp("again"), True)])
@@ -74,12 +74,12 @@ def test_a_clip_is_kept_for_as_long_as_it_may_be_tried_again(
 ) -> None:
     fail(engine, job, error)
     sweep(engine, objects, seconds=0)
-    assert bool(objects.below(composites.path(job))) == kept
+    assert bool(objects.paths_below(composites.path(job))) == kept
     with writing(engine) as c:
         row = jobs.get(c, job)
         if kept:
             JOB_KINDS["composite"].retried(c, row)
-            mattes.forget(c, "m")
+            mattes.delete(c, "m")
         with pytest.raises(NotFound if kept else Conflict):
             JOB_KINDS["composite"].retried(c, row)
 

@@ -36,9 +36,9 @@ def job(connection: Connection) -> str:
 
 
 def taken_up(connection: Connection, job: str) -> JobRun:
-    tile_records.begin(connection, job)
-    run = JobRun.of(jobs.get(connection, job), tile_records.to_do(connection, job), LIMITS)
-    jobs.enter(connection, job, run.stage)
+    tile_records.add_steps(connection, job)
+    run = JobRun.of(jobs.get(connection, job), tile_records.remaining(connection, job), LIMITS)
+    jobs.enter_stage(connection, job, run.stage)
     return run
 
 
@@ -64,7 +64,7 @@ def working(connection: Connection, job: str, tiles: int = 3) -> JobRun:
 
 
 def lines(connection: Connection, job: str) -> list[str]:
-    return [row.text for row in job_log.notes(connection, job, 0, 100)]
+    return [row.text for row in job_log.lines(connection, job, 0, 100)]
 
 
 def test_from_the_first_step_to_the_last(connection: Connection, job: str) -> None:

@@ -10,7 +10,7 @@ from sqlalchemy import Engine, select, update
 from services.coordinator.retention import count, forget_expired, forget_jobs
 from storage.database import tables
 from storage.database.engine import open_engine, reading, writing
-from storage.database.owners import bound
+from storage.database.owners import for_owner
 from storage.layout import captures as stored_captures
 from storage.layout import composites
 from storage.layout import mattes as stored_mattes
@@ -35,7 +35,7 @@ def objects(tmp_path: Path) -> Objects:
 
 def add(engine: Engine, owner: str, name: str, **times: float) -> None:
     """A capture, a matte of it and an upload, all of one name, their jobs done."""
-    with writing(bound(engine, owner)) as c:
+    with writing(for_owner(engine, owner)) as c:
         for kind, job in (("ingest", f"{name}-i"), ("recover", f"{name}-r")):
             jobs.add(c, kind, name, {}, name, job=job)
             jobs.end(c, job, "succeeded")
@@ -122,11 +122,11 @@ def test_a_job_leaves_after_a_time_and_not_before_what_it_made(engine: Engine, o
         composite = jobs.add(c, "composite", "kept", {}, "kept", job="composite")
         failed = jobs.add(c, "composite", "kept", {}, "kept", job="failed")
         queued = jobs.add(c, "recover", "gone", {}, "gone", job="queued")
-        tiles.lay_down(c, composite, {"tiles": 3})
+        tiles.add_plan(c, composite, {"tiles": 3})
         jobs.end(c, composite, "succeeded")
         jobs.end(c, failed, "failed", {"detail": "", "status": 500})
-        captures.forget(c, "gone")
-        mattes.forget(c, "gone")
+        captures.delete(c, "gone")
+        mattes.delete(c, "gone")
     objects.put(composites.video_path(composite), b"video")
     everything = {"kept-i", "kept-r", "gone-i", "gone-r", composite, failed, queued}
     ended_long_ago(engine)
@@ -134,10 +134,10 @@ def test_a_job_leaves_after_a_time_and_not_before_what_it_made(engine: Engine, o
     forget_jobs(engine, objects, 3600)
     assert listed(engine) == everything
     with writing(engine) as c:
-        tiles.retry(c, failed)
+        jobs.retry(c, failed)
     forget_jobs(engine, objects, 60)
     assert listed(engine) == {"kept-i", "kept-r", failed, queued}
-    assert objects.below("composites") == set()
+    assert objects.paths_below("composites") == set()
     with reading(engine) as c:
         for table in (tables.tiles, tables.log):
             assert set(c.scalars(select(table.c.job))) <= listed(engine)
@@ -145,23 +145,23 @@ def test_a_job_leaves_after_a_time_and_not_before_what_it_made(engine: Engine, o
 
 def test_a_key_is_kept_as_long_as_what_it_made(engine: Engine, objects: Objects) -> None:
     add(engine, "alice", "thing")
-    with writing(bound(engine, "alice")) as c:
+    with writing(for_owner(engine, "alice")) as c:
         for key, made in (("capture", "thing"), ("job", "thing-r"), ("gone", "another")):
-            idempotency.remember(c, key, "POST", made)
+            idempotency.add(c, key, "POST", made)
     forget_jobs(engine, objects, None)
 
     def known() -> list[str | None]:
-        with reading(bound(engine, "alice")) as c:
-            return [idempotency.made_by(c, key, "POST") for key in ("capture", "job", "gone")]
+        with reading(for_owner(engine, "alice")) as c:
+            return [idempotency.find(c, key, "POST") for key in ("capture", "job", "gone")]
 
     assert known() == ["thing", "thing-r", None]
     with writing(engine) as c:
-        jobs.forget(c, "thing-r")
-        captures.forget(c, "thing")
+        jobs.delete(c, "thing-r")
+        captures.delete(c, "thing")
     forget_jobs(engine, objects, None)
     assert known() == ["thing", None, None]  # the matte of this name is there
     with writing(engine) as c:
-        mattes.forget(c, "thing")
+        mattes.delete(c, "thing")
     forget_jobs(engine, objects, None)
     assert known() == [None, None, None]
 
@@ -169,7 +169,7 @@ def test_a_key_is_kept_as_long_as_what_it_made(engine: Engine, objects: Objects)
 def test_bytes_are_counted_once_a_thing_is_whole(engine: Engine, objects: Objects) -> None:
     add(engine, "alice", "a")
     add(engine, "bob", "b")
-    with writing(bound(engine, "alice")) as c:
+    with writing(for_owner(engine, "alice")) as c:
         captures.add(c, "under-way", "j", name="", bytes=1000, frames=1, program={})
         mattes.add(c, "under-way", "a", "j", {})
         uploads.add(c, "u", 20_000, "", 60, None)
@@ -182,19 +182,19 @@ def test_bytes_are_counted_once_a_thing_is_whole(engine: Engine, objects: Object
 
     def stored(owner: str) -> int:
         count(engine, objects)
-        with reading(bound(engine, owner)) as c:
-            return statistics.of_bytes(c)
+        with reading(for_owner(engine, owner)) as c:
+            return statistics.stored_bytes(c)
 
-    each = len(objects.load(f"{stored_mattes.path('a')}/z{SUFFIX}"))  # of the checksums, which count too
+    each = len(objects.read_raw(f"{stored_mattes.path('a')}/z{SUFFIX}"))  # of the checksums, which count too
     assert stored("alice") == 7 + 3 * each + 1000 + 20_000 + 300_000
     assert stored("bob") == 0  # the bytes of its archive count until then
     with writing(engine) as c:
         jobs.end(c, clip, "succeeded")
         jobs.change(c, clip, stored=None)
         captures.change(c, "under-way", state="ready")
-        assert statistics.of_bytes(c, all_owners=True) == statistics.of_bytes(c)
+        assert statistics.stored_bytes(c, all_owners=True) == statistics.stored_bytes(c)
     objects.delete(composites.clip_path(clip))
     objects.put(composites.video_path(clip), bytes(64))
     assert stored("alice") == 7 + 999 + 20_000 + 64 + 5 * each
-    with reading(bound(engine, "bob")) as c:
-        assert statistics.of_bytes(c, all_owners=True) == 7 + 999 + 20_000 + 64 + 5 * each
+    with reading(for_owner(engine, "bob")) as c:
+        assert statistics.stored_bytes(c, all_owners=True) == 7 + 999 + 20_000 + 64 + 5 * each

@@ -40,7 +40,7 @@ def wait_for_log(engine: Engine, job: str) -> str:
     deadline = time.monotonic() + 120
     while time.monotonic() < deadline:
         with reading(engine) as c:
-            found = [row.text for row in job_log.notes(c, job, 0, 100) if "webhook" in row.text]
+            found = [row.text for row in job_log.lines(c, job, 0, 100) if "webhook" in row.text]
         if found:
             return str(found[-1])
         time.sleep(0.05)
@@ -49,7 +49,7 @@ def wait_for_log(engine: Engine, job: str) -> str:
 
 def lease(engine: Engine) -> int:
     with writing(engine) as c:
-        token = leases.take(c, "here", seize=True)
+        token = leases.acquire(c, "here", seize=True)
     assert token is not None
     return token
 

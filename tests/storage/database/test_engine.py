@@ -10,8 +10,9 @@ import pytest
 from sqlalchemy import Connection, Engine, select, text, update
 from sqlalchemy.exc import IntegrityError
 
+from storage.database.dialects import clock
 from storage.database.engine import open_engine, reading, writing
-from storage.database.tables import clock, metadata
+from storage.database.tables import metadata
 from storage.errors import InvalidInput, Unavailable
 from storage.records import job_log, jobs, tiles
 from tests.parts.postgres import Server
@@ -75,13 +76,13 @@ def test_an_exception_rolls_back(engine: Engine) -> None:
 
 def test_a_tile_needs_its_job(engine: Engine) -> None:
     with pytest.raises(IntegrityError), writing(engine) as connection:
-        job_log.note(connection, "none", "a line")
+        job_log.add(connection, "none", "a line")
 
 
 def test_writers_that_read_first_wait_for_each_other(engine: Engine) -> None:
     with writing(engine) as connection:
         job = jobs.add(connection, "ingest", "c", {})
-        tiles.lay_down(connection, job, {"tiles": 40})
+        tiles.add_plan(connection, job, {"tiles": 40})
     failed: list[BaseException] = []
     inside = threading.Barrier(2)
 
@@ -94,7 +95,7 @@ def test_writers_that_read_first_wait_for_each_other(engine: Engine) -> None:
                     seen = jobs.get(connection, job).paced_done
                     time.sleep(0.002)
                     connection.execute(update(metadata.tables["jobs"]).values(paced_done=seen + 1))
-                    tiles.finish(connection, job, [(tile, 0.1, 10)])
+                    tiles.mark_done(connection, job, [(tile, 0.1, 10)])
         except BaseException as error:
             failed.append(error)
 
@@ -107,7 +108,7 @@ def test_writers_that_read_first_wait_for_each_other(engine: Engine) -> None:
     with reading(engine) as connection:
         row = jobs.get(connection, job)
         assert (row.done, row.pixels, row.paced_done) == (40, 400, 40)
-        assert tiles.to_do(connection, job) == []
+        assert tiles.remaining(connection, job) == []
 
 
 def test_a_reader_does_not_wait_for_a_writer(engine: Engine) -> None:
@@ -174,7 +175,7 @@ def test_a_writer_that_waits_too_long_is_told_to_try_again(wait: str, request: p
     ],
 )
 def test_a_database_that_is_not_there(url: str) -> None:
-    with pytest.raises(Unavailable, match=r"can't be opened: .*; see that it runs") as caught:
+    with pytest.raises(Unavailable, match=r"cannot open the database .*; check that it runs") as caught:
         open_engine(url)
     told: BaseException | None = caught.value
     while told is not None:
@@ -226,7 +227,7 @@ def test_what_postgresql_can_not_hold_is_bad_input(postgresql: str) -> None:
 HOLD = """
 import sys
 from sqlalchemy import text
-from storage.database.tables import open_engine, writing
+from storage.database.engine import open_engine, writing
 with writing(open_engine(sys.argv[1])) as connection:
     print("inside", flush=True)
     sys.stdin.readline()

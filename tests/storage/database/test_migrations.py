@@ -16,7 +16,7 @@ from sqlalchemy.exc import DatabaseError, IntegrityError
 
 from storage.database import dialects, migrations
 from storage.database.engine import open_engine, reading, writing
-from storage.database.owners import DEFAULT, bound
+from storage.database.owners import DEFAULT, for_owner
 from storage.database.tables import coordinator, metadata, tiles, totals
 from storage.errors import Conflict, NotFound
 from storage.layout.uploads import Part
@@ -27,8 +27,8 @@ from tests.parts.postgres import Server
 BEFORE_REVISIONS = Path(__file__).with_name("before_revisions.sql")
 OPEN = """
 import sys
-from storage import migrations
-from storage.database.tables import open_engine, reading
+from storage.database import migrations
+from storage.database.engine import open_engine, reading
 print("ready", flush=True)
 sys.stdin.readline()
 engine = open_engine(sys.argv[1])
@@ -38,7 +38,8 @@ with reading(engine) as connection:
 
 LOGGED = """
 import logging, sys
-from storage.database.tables import open_engine
+import storage.database.tables
+from storage.database.engine import open_engine
 logging.basicConfig(level=logging.INFO)
 for _ in range(2):
     open_engine(sys.argv[1]).dispose()
@@ -66,13 +67,13 @@ def old(tmp_path: Path) -> str:
 def bare(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Engine]:
     """An empty database, opened without an upgrade."""
     if request.param == "sqlite":
-        engine = dialects.create(f"sqlite:///{tmp_path}/bare.db")
+        engine = dialects.make_engine(f"sqlite:///{tmp_path}/bare.db")
         yield engine
         engine.dispose()
     else:
         server: Server = request.getfixturevalue("postgresql_server")
         with server.database() as url:
-            engine = dialects.create(url)
+            engine = dialects.make_engine(url)
             yield engine
             engine.dispose()
 
@@ -112,7 +113,7 @@ def test_a_difference_would_be_seen(engine: Engine) -> None:
 
 
 def test_the_first_revision_is_what_there_was_before(old: str, tmp_path: Path) -> None:
-    before, first = dialects.create(old), dialects.create(f"sqlite:///{tmp_path}/first.db")
+    before, first = dialects.make_engine(old), dialects.make_engine(f"sqlite:///{tmp_path}/first.db")
     with writing(first) as connection:
         migrations.upgrade(connection, "0001")
     assert schema(first) == schema(before)
@@ -137,11 +138,11 @@ def test_a_database_older_than_revisions_keeps_its_rows(old: str) -> None:
             ("j", 0, "done", 1, 0.5, 0),
             ("j", 1, "queued", 2, None, 0),
         ]
-        assert [row.line for row in job_log.notes(connection, "j", 0, 10)] == [3]
+        assert [row.line for row in job_log.lines(connection, "j", 0, 10)] == [3]
         for table in (coordinator, totals):
             assert connection.scalar(select(func.count()).select_from(table)) == 0
     with writing(engine) as connection:
-        tile_records.finish(connection, "j", [(1, 0.5, 10)])
+        tile_records.mark_done(connection, "j", [(1, 0.5, 10)])
         assert jobs.get(connection, "j").done == 2
     engine.dispose()
 
@@ -259,7 +260,7 @@ def test_what_was_there_before_owners_is_the_default_owners(bare: Engine) -> Non
         for statement in OF_0004.split(";"):
             connection.exec_driver_sql(statement)
     engine = open_engine(bare.url.render_as_string(hide_password=False))
-    with writing(bound(engine, DEFAULT)) as connection:
+    with writing(for_owner(engine, DEFAULT)) as connection:
         for get, id in ((captures.get, "c"), (mattes.get, "m"), (programs.get, "p"), (jobs.get, "j")):
             row = get(connection, id)
             assert (row.owner, row.created_at, row.number) == (DEFAULT, 1000.5, 1)
@@ -267,21 +268,21 @@ def test_what_was_there_before_owners_is_the_default_owners(bare: Engine) -> Non
         assert tile_records.done(connection, "j") == [0]
         assert uploads.by_key(connection, "again") == uploads.get(connection, "u")
         assert uploads.parts_of(connection, "u") == [Part("a", 1), Part("b", 2)]
-        assert idempotency.made_by(connection, "again", "POST") == "c"
+        assert idempotency.find(connection, "again", "POST") == "c"
         assert programs.add(connection, {"new": 1}) != "p"
-    with pytest.raises(IntegrityError), writing(bound(engine, DEFAULT)) as connection:
-        idempotency.remember(connection, "again", "POST", "d")
-    with pytest.raises(IntegrityError), writing(bound(engine, DEFAULT)) as connection:
+    with pytest.raises(IntegrityError), writing(for_owner(engine, DEFAULT)) as connection:
+        idempotency.add(connection, "again", "POST", "d")
+    with pytest.raises(IntegrityError), writing(for_owner(engine, DEFAULT)) as connection:
         uploads.add(connection, "v", 1, "", 1, "again")
-    with writing(bound(engine, "alice")) as connection:
+    with writing(for_owner(engine, "alice")) as connection:
         for get, id in ((captures.get, "c"), (mattes.get, "m"), (programs.get, "p"), (jobs.get, "j")):
             with pytest.raises(NotFound):
                 get(connection, id)
         assert uploads.by_key(connection, "again") is None
         assert uploads.parts_of(connection, "u") == []
         assert tile_records.done(connection, "j") == []
-        assert idempotency.made_by(connection, "again", "POST") is None
-        idempotency.remember(connection, "again", "POST", "d")
+        assert idempotency.find(connection, "again", "POST") is None
+        idempotency.add(connection, "again", "POST", "d")
         uploads.add(connection, "v", 1, "", 1, "again")
         assert programs.get(connection, programs.add(connection, {"new": 1})).owner == "alice"
     with reading(engine) as connection:

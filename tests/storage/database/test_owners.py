@@ -5,7 +5,7 @@ from sqlalchemy import Engine, Executable, delete, exists, func, insert, select,
 
 from storage.database import tables
 from storage.database.engine import reading, writing
-from storage.database.owners import NOBODY, bound, of_all
+from storage.database.owners import NOBODY, across_owners, for_owner
 from storage.database.rows import page
 from storage.errors import NotFound
 from storage.layout import uploads as stored_uploads
@@ -18,9 +18,9 @@ OWNERS = ("alice", "bob")
 def filled(engine: Engine) -> Engine:
     """A database in which alice and bob have an active job, a capture and an upload each."""
     for owner in OWNERS:
-        with writing(bound(engine, owner)) as c:
+        with writing(for_owner(engine, owner)) as c:
             jobs.add(c, "ingest", f"{owner}-capture", {}, job=f"{owner}-job")
-            tiles.begin(c, f"{owner}-job")
+            tiles.add_steps(c, f"{owner}-job")
             captures.add(c, f"{owner}-capture", f"{owner}-job", name="", bytes=1, frames=1, program={})
             uploads.add(c, f"{owner}-upload", 10, "", 60, "the-same-key")
             uploads.advance(c, f"{owner}-upload", 0, [stored_uploads.Part(owner, 4)], 60)
@@ -29,7 +29,7 @@ def filled(engine: Engine) -> Engine:
 
 def test_lists_and_lookups_are_the_owners(filled: Engine) -> None:
     for owner, other in (OWNERS, OWNERS[::-1]):
-        with reading(bound(filled, owner)) as c:
+        with reading(for_owner(filled, owner)) as c:
             for table, what in ((tables.captures, "capture"), (tables.jobs, "job")):
                 assert [row.id for row in page(c, table, 10, None)] == [f"{owner}-{what}"]
                 with pytest.raises(NotFound):
@@ -44,14 +44,14 @@ def test_lists_and_lookups_are_the_owners(filled: Engine) -> None:
             assert found.owner == owner
     with reading(filled) as c:
         assert [row.owner for row in jobs.active(c)] == list(OWNERS)
-    with reading(bound(filled, NOBODY)) as c:
+    with reading(for_owner(filled, NOBODY)) as c:
         assert jobs.active(c) == []
 
 
 def test_what_belongs_to_a_row_is_its_owners(filled: Engine) -> None:
-    with reading(bound(filled, "alice")) as c:
-        assert [line.text for line in job_log.notes(c, "alice-job", 0, 10)] == ["queued"]
-        assert job_log.notes(c, "bob-job", 0, 10) == []
+    with reading(for_owner(filled, "alice")) as c:
+        assert [line.text for line in job_log.lines(c, "alice-job", 0, 10)] == ["queued"]
+        assert job_log.lines(c, "bob-job", 0, 10) == []
         assert uploads.parts_of(c, "alice-upload") == [stored_uploads.Part("alice", 4)]
         assert uploads.parts_of(c, "bob-upload") == []
         for joined in (
@@ -64,24 +64,24 @@ def test_what_belongs_to_a_row_is_its_owners(filled: Engine) -> None:
 
 
 def test_changes_and_deletions_touch_the_owners_rows_alone(filled: Engine) -> None:
-    with writing(bound(filled, "alice")) as c:
+    with writing(for_owner(filled, "alice")) as c:
         assert c.execute(update(tables.jobs).values(stage="mine")).rowcount == 1
         assert c.execute(update(tables.tiles).values(attempts=7)).rowcount == 2
         assert c.execute(delete(tables.log)).rowcount == 1
-        assert not uploads.forget(c, "bob-upload")
+        assert not uploads.delete(c, "bob-upload")
         assert c.execute(delete(tables.captures)).rowcount == 1
     with reading(filled) as c:
         assert jobs.get(c, "bob-job").stage == "waiting"
-        assert len(job_log.notes(c, "bob-job", 0, 10)) == 1
+        assert len(job_log.lines(c, "bob-job", 0, 10)) == 1
         assert c.scalar(select(func.sum(tables.tiles.c.attempts)).where(tables.tiles.c.job == "bob-job")) == 0
         assert captures.exists(c, "bob-capture")
 
 
 def test_sums_over_all_owners_say_so(filled: Engine) -> None:
     query = select(func.count()).select_from(tables.jobs)
-    with reading(bound(filled, "alice")) as c:
+    with reading(for_owner(filled, "alice")) as c:
         assert c.scalar(query) == 1
-        assert c.scalar(of_all(query)) == 2
+        assert c.scalar(across_owners(query)) == 2
 
 
 @pytest.mark.parametrize(
@@ -107,14 +107,14 @@ def test_sums_over_all_owners_say_so(filled: Engine) -> None:
     ids=lambda statement: " ".join(str(statement).split())[:60],
 )
 def test_what_cannot_be_narrowed_is_refused(engine: Engine, statement: Executable) -> None:
-    with writing(bound(engine, "alice")) as c, pytest.raises(TypeError, match="owner's"):
+    with writing(for_owner(engine, "alice")) as c, pytest.raises(TypeError, match="owner's"):
         c.execute(statement)
 
 
 def test_every_table_is_someones_or_known_to_be_nobodys(engine: Engine) -> None:
     refused = set()
     for name, table in tables.metadata.tables.items():
-        with reading(bound(engine, "alice")) as c:
+        with reading(for_owner(engine, "alice")) as c:
             try:
                 assert c.execute(select(table)).all() == []
             except TypeError:
@@ -124,9 +124,9 @@ def test_every_table_is_someones_or_known_to_be_nobodys(engine: Engine) -> None:
 
 def test_the_coordinator_is_seen_by_all(engine: Engine) -> None:
     with writing(engine) as c:
-        leases.take(c, "me")
-    with writing(bound(engine, NOBODY)) as c:
-        leases.touch(c)
-        sign = leases.last_sign(c)
+        leases.acquire(c, "me")
+    with writing(for_owner(engine, NOBODY)) as c:
+        leases.check_writable(c)
+        sign = leases.last_heartbeat(c)
         assert sign is not None
         assert sign.holder == "me"

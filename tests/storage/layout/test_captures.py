@@ -55,9 +55,9 @@ def test_what_is_written_is_read(objects: Objects, values: NDArray[np.uint16]) -
     np.testing.assert_array_equal(stack.read(), values)
     part = stack.read(slice(5, 33), slice(15, 18), slice(3, 9))
     np.testing.assert_array_equal(part, values[3:9, 5:33, 15:18])
-    picked = stack.pick([9, 0, 4, 4], slice(5, 33), slice(15, 18))
+    picked = stack.read_frames([9, 0, 4, 4], slice(5, 33), slice(15, 18))
     np.testing.assert_array_equal(picked, values[[9, 0, 4, 4], 5:33, 15:18])
-    assert stack.recovered(slice(5, 33), slice(15, 18)).all()
+    assert stack.mask(slice(5, 33), slice(15, 18)).all()
     of_part, mask = stack.read_masked(slice(5, 33), slice(15, 18))
     np.testing.assert_array_equal(of_part, values[:, 5:33, 15:18])
     assert mask.shape == (28, 3)
@@ -92,7 +92,7 @@ def test_masks_and_images_come_back(objects: Objects) -> None:
         write_slab(objects, "c", slab, frames[slab : slab + 4])
     stack = Stack(objects, "c")
     np.testing.assert_array_equal(stack.read_masked()[1], mask)
-    np.testing.assert_array_equal(stack.recovered(slice(3, 9), slice(40, 50)), mask[3:9, 40:50])
+    np.testing.assert_array_equal(stack.mask(slice(3, 9), slice(40, 50)), mask[3:9, 40:50])
     of_part, part = stack.read_masked(slice(3, 9), slice(40, 50))
     np.testing.assert_array_equal(of_part, frames[:, 3:9, 40:])
     np.testing.assert_array_equal(part, mask[3:9, 40:])
@@ -195,7 +195,7 @@ def test_the_record(engine: Engine) -> None:
         row = captures.get(connection, "c1")
         assert (row.state, row.width, row.height) == ("ready", 20, 10)
         assert captures.get(connection, "c2").state == "ingesting"
-        captures.forget(connection, "c1")
+        captures.delete(connection, "c1")
         with pytest.raises(NotFound, match="'c1'"):
             captures.get(connection, "c1")
         assert captures.get(connection, "c2").job == "j2"

@@ -20,8 +20,8 @@ def objects(tmp_path: Path) -> Objects:
 
 def test_what_is_kept_is_read_again_until_the_matte_goes(objects: Objects) -> None:
     assert live.read(objects, "m", FORMAT) is None
-    live.keep(objects, "m", FORMAT, bytes(range(256)))
-    live.keep(objects, "m", FORMAT, b"another")
+    live.write(objects, "m", FORMAT, bytes(range(256)))
+    live.write(objects, "m", FORMAT, b"another")
     assert live.read(objects, "m", FORMAT) == b"another"
     assert live.read(objects, "m", "live-2") is None
     objects.delete(mattes.path("m"))
@@ -29,13 +29,13 @@ def test_what_is_kept_is_read_again_until_the_matte_goes(objects: Objects) -> No
 
 
 def test_what_is_half_written_is_made_again(objects: Objects, tmp_path: Path) -> None:
-    live.keep(objects, "m", FORMAT, b"whole")
+    live.write(objects, "m", FORMAT, b"whole")
     (tmp_path / "mattes/m" / FORMAT / "c/0").unlink()
     assert live.read(objects, "m", FORMAT) is None
 
 
 def test_it_is_an_array_of_the_mattes_group(objects: Objects, tmp_path: Path) -> None:
-    live.keep(objects, "m", FORMAT, b"bytes")
+    live.write(objects, "m", FORMAT, b"bytes")
     group = zarr.open_group(tmp_path / "mattes/m", mode="r")
     assert FORMAT in dict(group.members())
     assert bytes(group[FORMAT][:]) == b"bytes"

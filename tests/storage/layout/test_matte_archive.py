@@ -55,7 +55,7 @@ def test_the_manifest_lists_every_entry_and_nothing_of_where_it_came_from(
         assert archive.testzip() is None
         names = archive.namelist()
         manifest = json.loads(archive.read(MANIFEST))
-        stored = {path.removeprefix("mattes/m/") for path in objects.below("mattes/m")}
+        stored = {path.removeprefix("mattes/m/") for path in objects.paths_below("mattes/m")}
         assert set(names) == stored | {MANIFEST}
         assert names[-1] == MANIFEST
         assert manifest == {

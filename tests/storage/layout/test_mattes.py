@@ -226,7 +226,7 @@ def test_the_record(engine: Engine) -> None:
     with writing(engine) as connection:
         assert mattes.get(connection, "m1").figures == {"block": 16}
         assert mattes.get(connection, "m2").figures is None
-        mattes.forget(connection, "m1")
+        mattes.delete(connection, "m1")
         with pytest.raises(NotFound, match="'m1'"):
             mattes.get(connection, "m1")
         assert mattes.get(connection, "m2").state == "recovering"

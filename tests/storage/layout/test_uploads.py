@@ -86,8 +86,8 @@ def test_one_that_is_gone_is_not_found(engine: Engine) -> None:
     made(engine)
     with writing(engine) as c:
         uploads.advance(c, "u", 0, [Part("a", 7)], DAY)
-        assert uploads.forget(c, "u")
-        assert not uploads.forget(c, "u")
+        assert uploads.delete(c, "u")
+        assert not uploads.delete(c, "u")
         assert c.execute(select(upload_parts)).all() == []
         for call in (
             lambda: uploads.get(c, "u"),
@@ -104,8 +104,8 @@ def test_one_whose_time_is_over_is_gone(engine: Engine) -> None:
     with writing(engine) as c:
         with pytest.raises(NotFound):
             uploads.get(c, "short")
-        assert uploads.forget_expired(c) == ["short"]
-        assert uploads.forget_expired(c) == []
+        assert uploads.delete_expired(c) == ["short"]
+        assert uploads.delete_expired(c) == []
         assert uploads.get(c, "long").id == "long"
 
 
@@ -119,12 +119,12 @@ def test_there_is_one_for_a_key(engine: Engine) -> None:
     with pytest.raises(IntegrityError), writing(engine) as c:
         uploads.add(c, "second", 1, "", DAY, "key")
     with writing(engine) as c:
-        uploads.forget(c, "first")
+        uploads.delete(c, "first")
         uploads.add(c, "second", 1, "", DAY, "key")
 
 
 def test_room_counts_what_is_promised(engine: Engine, objects: Objects) -> None:
-    free = objects.free()
+    free = objects.free_bytes()
     if free is None:  # a bucket has no end
         with engine.connect() as c:
             uploads.check_room(c, objects, 1 << 60)

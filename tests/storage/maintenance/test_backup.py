@@ -19,7 +19,7 @@ from storage.layout import composites
 from storage.maintenance import row_dump
 from storage.maintenance.backup import LEDGER, MANIFEST, back_up
 from storage.maintenance.restore import MARKER, restore
-from storage.maintenance.row_dump import open_as_it_is
+from storage.maintenance.row_dump import open_without_upgrade
 from storage.maintenance.verify import verify
 from storage.objects.store import Objects
 from storage.records import captures, jobs, leases, mattes, tiles
@@ -28,11 +28,11 @@ from tests.storage.furnished import contents, flip, furnish
 Bytes = dict[str, bytes]
 HALF = """
 import os, sys
-from storage import dialects
+from storage.database import dialects
 from storage.objects.store import Objects
 from storage.maintenance.restore import restore
 source, database, store = sys.argv[1:]
-restore(Objects(source), dialects.create(database), Objects(store), lambda share, size: os._exit(9))
+restore(Objects(source), dialects.make_engine(database), Objects(store), lambda share, size: os._exit(9))
 """
 
 
@@ -50,7 +50,7 @@ def target(tmp_path: Path) -> Objects:
 @pytest.fixture
 def elsewhere(tmp_path: Path) -> Iterator[tuple[Engine, Objects]]:
     """An installation that holds nothing yet."""
-    engine = dialects.create(f"sqlite:///{tmp_path}/elsewhere.db")
+    engine = dialects.make_engine(f"sqlite:///{tmp_path}/elsewhere.db")
     yield engine, Objects((tmp_path / "elsewhere").as_uri())
     engine.dispose()
 
@@ -79,7 +79,7 @@ def nothing(engine: Engine, objects: Objects) -> None:
 
 
 def lines_of(target: Objects, name: str = MANIFEST) -> list[bytes]:
-    return target.load(name).splitlines(keepends=True)
+    return target.read_raw(name).splitlines(keepends=True)
 
 
 def sealed(target: Objects, lines: list[bytes]) -> None:
@@ -87,7 +87,7 @@ def sealed(target: Objects, lines: list[bytes]) -> None:
     entries = [json.loads(line) for line in lines[1:-1]]
     digest = hashlib.sha256(b"".join(lines[:-1])).hexdigest()
     last = {"objects": len(entries), "bytes": sum(one["size"] for one in entries), "sha256": digest}
-    target.store(MANIFEST, iter([*lines[:-1], json.dumps(last).encode()]))
+    target.write_raw(MANIFEST, iter([*lines[:-1], json.dumps(last).encode()]))
 
 
 @pytest.mark.parametrize("url", ["sqlite"], indirect=True)
@@ -107,7 +107,7 @@ def test_from_sqlite_and_a_folder_to_postgresql_and_a_bucket_and_back(
     assert made["bytes"] == sum(map(len, contents(objects).values()))
     header = json.loads(lines_of(there)[0])
     assert (header["version"], header["revision"]) == ("1.2.3", migrations.newest())
-    second = dialects.create(postgresql)
+    second = dialects.make_engine(postgresql)
     assert restore(there, second, bucket) == made
     assert rows_of(second) == rows_of(engine)
     assert contents(bucket) == contents(objects)
@@ -128,9 +128,9 @@ def test_from_sqlite_and_a_folder_to_postgresql_and_a_bucket_and_back(
     second.dispose()
     with reading(elsewhere[0]) as c:
         row = jobs.get(c, "rr")
-        assert (row.state, row.done, tiles.to_do(c, "rr")) == ("queued", 2, [2, 3, 4, 5])
+        assert (row.state, row.done, tiles.remaining(c, "rr")) == ("queued", 2, [2, 3, 4, 5])
         tables = row_dump.tables_of(c)
-        for name in row_dump.LEFT_OUT:  # who drives, and what the first service still has to tell
+        for name in row_dump.SKIPPED:  # who drives, and what the first service still has to tell
             assert c.scalar(select(func.count()).select_from(tables[name])) == 0
     with reading(engine) as c:
         assert c.scalar(select(func.count()).select_from(database_tables.deliveries)) == 1
@@ -148,8 +148,8 @@ def test_what_is_deleted_or_ends_meanwhile(
         first.extend(target.names("objects"))
         with writing(engine) as c:
             jobs.cancel(c, "rr")
-            mattes.forget(c, "m")
-            mattes.forget(c, "r")
+            mattes.delete(c, "m")
+            mattes.delete(c, "r")
             captures.change(c, "i", state="ready")
             jobs.end(c, "ii", "succeeded")
             for job in ("v", "w"):
@@ -157,7 +157,7 @@ def test_what_is_deleted_or_ends_meanwhile(
         for path in ("mattes/m", "mattes/r", "uploads/i", "composites/v", "composites/w"):
             furnished.delete(path)
         for path in [path for path in furnished.sizes("captures/c")]:
-            furnished.store(path.replace("/c/", "/i/", 1), iter([furnished.load(path)]))
+            furnished.write_raw(path.replace("/c/", "/i/", 1), iter([furnished.read_raw(path)]))
 
     back_up(engine, furnished, target, "1", meanwhile)
     restore(target, *elsewhere)
@@ -209,11 +209,11 @@ def test_only_into_what_is_empty(
         restore(target, elsewhere[0], furnished)
     used = open_engine(elsewhere[0].url.render_as_string(hide_password=False))
     with writing(used) as c:
-        leases.take(c, "somebody")
+        leases.acquire(c, "somebody")
     with pytest.raises(Conflict, match="a service runs on the installation: stop it"):
         restore(target, *elsewhere)
     with writing(used) as c:
-        leases.give_back(c, 1)
+        leases.release(c, 1)
     restore(target, *elsewhere)
     used.dispose()
 
@@ -256,11 +256,11 @@ def test_what_lies_is_refused_and_leaves_nothing(
         for match, apply in lies.values():
             lines = list(whole)
             apply(lines)
-            sealed(target, lines) if seal else target.store(MANIFEST, iter(lines))
+            sealed(target, lines) if seal else target.write_raw(MANIFEST, iter(lines))
             with pytest.raises((InvalidInput, Conflict), match=match):
                 restore(target, *elsewhere)
             nothing(*elsewhere)
-    target.store(MANIFEST, iter(whole))
+    target.write_raw(MANIFEST, iter(whole))
     for path in ("objects/mattes/m/rho/c/0/0/0", LEDGER):
         flip(target, path)
         with pytest.raises(InvalidInput, match=r"is not what manifest\.jsonl says: it is damaged"):
@@ -275,15 +275,15 @@ def test_what_lies_is_refused_and_leaves_nothing(
         (b"[1]\n", "a line that is no row"),
     ):
         data = b"".join(rows) + row
-        target.store(LEDGER, iter([data]))
+        target.write_raw(LEDGER, iter([data]))
         lines = list(whole)
         change(0, ledger={"size": len(data), "sha256": hashlib.sha256(data).hexdigest()})(lines)
         sealed(target, lines)
         with pytest.raises(InvalidInput, match=match):
             restore(target, *elsewhere)
         nothing(*elsewhere)
-    target.store(LEDGER, iter(rows))
-    target.store(MANIFEST, iter(whole))
+    target.write_raw(LEDGER, iter(rows))
+    target.write_raw(MANIFEST, iter(whole))
     restore(target, *elsewhere)
     assert rows_of(elsewhere[0]) == rows_of(engine)
     assert contents(elsewhere[1]) == contents(furnished)
@@ -301,7 +301,7 @@ def test_one_that_was_killed_holds_nothing_and_is_done_again(
     assert contents(store)
     assert MARKER in store.names("")
     store.put("mattes/x/left", b"of the first")
-    other = dialects.create(f"{second.url.render_as_string()}.other")
+    other = dialects.make_engine(f"{second.url.render_as_string()}.other")
     with pytest.raises(Conflict, match=r"its store .* has \w+/"):  # it may be in use with the first database
         restore(target, other, store)
     other.dispose()
@@ -314,7 +314,7 @@ def test_one_of_an_earlier_revision_is_brought_up_to_date(
     tmp_path: Path, objects: Objects, target: Objects, elsewhere: tuple[Engine, Objects]
 ) -> None:
     url = f"sqlite:///{tmp_path}/old.db"
-    old = dialects.create(url)
+    old = dialects.make_engine(url)
     with writing(old) as c:
         migrations.upgrade(c, "0004")
         c.execute(
@@ -329,8 +329,8 @@ def test_one_of_an_earlier_revision_is_brought_up_to_date(
         c.execute(text("INSERT INTO uploads VALUES ('u', NULL, 1, 2, 1, '', 1000.5, 9e9)"))
         c.execute(text("INSERT INTO upload_parts VALUES ('u', 0, 'p', 1)"))
     old.dispose()
-    objects.store("uploads/u/p.part", iter([b"x"]))
-    opened = open_as_it_is(url)
+    objects.write_raw("uploads/u/p.part", iter([b"x"]))
+    opened = open_without_upgrade(url)
     back_up(opened, objects, target, "1")
     with reading(opened) as c:
         assert migrations.revision(c) == "0004"  # which making a copy before an upgrade is for
@@ -340,7 +340,7 @@ def test_one_of_an_earlier_revision_is_brought_up_to_date(
         assert migrations.revision(c) == migrations.newest()
         row = jobs.get(c, "j")
         assert (row.state, row.stage, row.problem, row.owner) == ("queued", "waiting", None, "default")
-        assert tiles.to_do(c, "j") == [1]
+        assert tiles.remaining(c, "j") == [1]
         assert (
             c.scalar(select(database_tables.jobs.c.id).where(database_tables.jobs.c.problem.is_(None))) == "j"
         )

@@ -13,7 +13,7 @@ from storage.database.engine import open_engine, writing
 from storage.errors import Conflict
 from storage.maintenance import verify as verifying
 from storage.maintenance.integrity import Finding
-from storage.maintenance.row_dump import open_as_it_is
+from storage.maintenance.row_dump import open_without_upgrade
 from storage.maintenance.verify import Report, verify
 from storage.objects.store import Objects
 from storage.records import captures, jobs, mattes
@@ -105,8 +105,8 @@ def test_a_whole_thing_that_is_gone_is_found(engine: Engine, furnished: Objects)
 def test_what_is_deleted_meanwhile_is_no_finding(engine: Engine, furnished: Objects) -> None:
     def meanwhile(share: float, size: int) -> None:
         with writing(engine) as c:
-            captures.forget(c, "c")
-            mattes.forget(c, "m")
+            captures.delete(c, "c")
+            mattes.delete(c, "m")
             c.execute(delete(database_tables.jobs).where(database_tables.jobs.c.id == "v"))
         for folder in ("captures/c", "mattes/m", "composites/v"):
             furnished.delete(folder)
@@ -163,10 +163,10 @@ def test_what_has_no_checksum_is_counted(engine: Engine, furnished: Objects) -> 
 
 def test_a_database_that_is_none_is_refused_and_not_made(tmp_path: Path) -> None:
     with pytest.raises(Conflict, match=r"no database sqlite:.*none\.db: name the one of the service"):
-        open_as_it_is(f"sqlite:///{tmp_path}/none.db")
+        open_without_upgrade(f"sqlite:///{tmp_path}/none.db")
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "empty.db").touch()
     with pytest.raises(Conflict, match="no tables of envmatte"):
-        open_as_it_is(f"sqlite:///{tmp_path}/empty.db")
+        open_without_upgrade(f"sqlite:///{tmp_path}/empty.db")
     open_engine(f"sqlite:///{tmp_path}/some.db").dispose()
-    open_as_it_is(f"sqlite:///{tmp_path}/some.db").dispose()
+    open_without_upgrade(f"sqlite:///{tmp_path}/some.db").dispose()

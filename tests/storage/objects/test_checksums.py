@@ -16,12 +16,12 @@ from storage.layout.captures import Stack
 from storage.layout.matte_archive import Archive
 from storage.layout.mattes import Matte
 from storage.objects.checksums import BLOCK, CODECS, Table, crc32c, is_intact, seal, unseal
-from storage.objects.store import Objects, together
+from storage.objects.store import Objects, gather
 from tests.storage.furnished import ARCHIVE, flip, furnish, stream
 
 READS: dict[str, tuple[str, Callable[[Objects], Any]]] = {
     "frames": ("captures/c/frames/c/0/0/0/0", lambda o: Stack(o, "c").read()),
-    "mask": ("captures/c/mask/c/0/0", lambda o: Stack(o, "c").recovered()),
+    "mask": ("captures/c/mask/c/0/0", lambda o: Stack(o, "c").mask()),
     "images": ("captures/c/images/0/c/0/0/0", lambda o: Stack(o, "c").images()),
     "shares": ("captures/c/shares/c/0/0", lambda o: Stack(o, "c").shares()),
     "manifest": ("captures/c/zarr.json", lambda o: Stack(o, "c")),
@@ -84,7 +84,7 @@ def test_a_stretch_is_read_though_another_block_is_damaged(objects: Objects) -> 
 @pytest.mark.parametrize("cut", [-1, 1])
 def test_another_length_is_damage(objects: Objects, cut: int) -> None:
     stream(objects, "a/b", ARCHIVE[:BLOCK])
-    objects.store("a/b", iter([ARCHIVE[: BLOCK + cut]]))
+    objects.write_raw("a/b", iter([ARCHIVE[: BLOCK + cut]]))
     with pytest.raises(Corrupt, match="a/b is damaged"), objects.read("a/b") as file:
         file.read()
 
@@ -102,16 +102,16 @@ def test_what_was_stored_before_there_were_checksums_is_read(objects: Objects) -
     flip(objects, "captures/c/frames/c/0/0/0/0", 0.0)  # of zstd's magic number
     with pytest.raises(Corrupt, match=r"frames/c/0/0/0/0 is damaged .* upload it again"):
         stack.read()
-    objects.store("uploads/u/p.part", iter([b"any"]))
+    objects.write_raw("uploads/u/p.part", iter([b"any"]))
     assert objects.read("uploads/u/p.part").read() == b"any"
 
 
 def test_any_zarr_reader_checks_chunks(objects: Objects) -> None:
-    together(objects.put_array("a", np.arange(1000)))
-    document = json.loads(objects.load("a/zarr.json"))
+    gather(objects.put_array("a", np.arange(1000)))
+    document = json.loads(objects.read_raw("a/zarr.json"))
     assert [codec["name"] for codec in document["codecs"]] == ["bytes", "zstd", "crc32c"]
     assert [codec.to_dict() for codec in CODECS] == document["codecs"][1:]
-    assert is_intact(objects.load("a/c/0"))
+    assert is_intact(objects.read_raw("a/c/0"))
     assert crc32c(b"123456789") == 0xE3069283  # RFC 3720's check value
 
 

@@ -23,7 +23,7 @@ from storage.errors import Corrupt, Unavailable
 from storage.objects import store as module
 from storage.objects.byte_objects import PART
 from storage.objects.checksums import CODECS
-from storage.objects.store import Objects, together
+from storage.objects.store import Objects, gather
 from storage.objects.zarr_store import EVERY_CHUNK
 
 
@@ -80,7 +80,7 @@ def test_listing_and_deleting(objects: Objects, folder: Path) -> None:
         put(objects, path, b"data")
     assert objects.names("c") == ["1", "10", "2", "file"]
     assert objects.names("none") == []
-    assert objects.below("c/1") == {"c/1/x", "c/1/deep/y"}
+    assert objects.paths_below("c/1") == {"c/1/x", "c/1/deep/y"}
     objects.delete("c/1")
     assert objects.names("c") == ["10", "2", "file"]
     assert not (folder / "c/1").exists()
@@ -94,15 +94,15 @@ def test_a_folder_is_made_and_can_be_opened_again(objects: Objects, folder: Path
     assert folder.is_dir()
     put(objects, "a", b"1")
     again = Objects(folder.as_uri())
-    again.check()
+    again.check_reachable()
     assert again.read("a").read() == b"1"
 
 
 def test_a_group_that_is_not_there(objects: Objects) -> None:
     with pytest.raises(FileNotFoundError):
-        together(objects.group("captures/none"))
+        gather(objects.group("captures/none"))
     with pytest.raises(FileNotFoundError):
-        together(objects.array("captures/none"))
+        gather(objects.array("captures/none"))
 
 
 @pytest.mark.parametrize(
@@ -120,19 +120,19 @@ def test_an_array_put_is_the_one_zarr_makes(
     plain = digests("g")
     objects.delete("g")
     for earlier in (np.arange(9.0), values):
-        together(objects.put_group("g"), objects.put_array("g/a", earlier))
+        gather(objects.put_group("g"), objects.put_array("g/a", earlier))
     assert digests("g") == plain
 
 
 def test_an_array_that_was_made_anew_is_opened_anew(objects: Objects) -> None:
     for values in (np.arange(3), np.arange(7.0)):
-        together(objects.put_array("a", values))
-        (array,) = together(objects.array("a"))
+        gather(objects.put_array("a", values))
+        (array,) = gather(objects.array("a"))
         np.testing.assert_array_equal(array[:], values)
         assert array.dtype == values.dtype
     objects.delete("a")
     with pytest.raises(FileNotFoundError):
-        together(objects.array("a"))
+        gather(objects.array("a"))
 
 
 def test_together_all_ends_before_the_first_error_is_raised() -> None:
@@ -145,10 +145,10 @@ def test_together_all_ends_before_the_first_error_is_raised() -> None:
             raise error
         return seconds
 
-    assert together(work(0.02), work(0.0), work(0.01)) == [0.02, 0.0, 0.01]
+    assert gather(work(0.02), work(0.0), work(0.01)) == [0.02, 0.0, 0.01]
     assert ended == [0.0, 0.01, 0.02]
     with pytest.raises(KeyError):
-        together(work(0.03), work(0.02, KeyError()), work(0.01, ValueError()))
+        gather(work(0.03), work(0.02, KeyError()), work(0.01, ValueError()))
     assert ended[3:] == [0.01, 0.02, 0.03]
 
 
@@ -157,11 +157,11 @@ def test_together_from_threads_and_from_a_running_loop() -> None:
         return 2 * n
 
     async def inside() -> list[int]:
-        return together(double(1), double(2))
+        return gather(double(1), double(2))
 
     assert asyncio.run(inside()) == [2, 4]
     with ThreadPoolExecutor(4) as threads:
-        assert list(threads.map(lambda n: together(double(n)), range(50))) == [[2 * n] for n in range(50)]
+        assert list(threads.map(lambda n: gather(double(n)), range(50))) == [[2 * n] for n in range(50)]
 
 
 def test_a_missing_chunk_is_an_error_and_not_a_zero(objects: Objects, folder: Path) -> None:
@@ -202,13 +202,13 @@ def test_what_nobody_writes_to_is_stale(objects: Objects) -> None:
     put(objects, "c/busy/deep/x", b"1")
     put(objects, "c/busy/zarr.json", b"1")
     put(objects, "c/object", b"1")
-    assert objects.stale("c", 3600) == []
-    assert objects.stale("none", 0) == []
+    assert objects.stale_names("c", 3600) == []
+    assert objects.stale_names("none", 0) == []
     time.sleep(2)  # a bucket's times are whole seconds
     put(objects, "c/busy/deep/x", b"2")
-    assert objects.stale("c", 1.5) == ["object", "old"]
-    assert objects.stale("c", 1.5, but={"old"}) == ["object"]
-    assert objects.stale("c", -10) == ["busy", "object", "old"]
+    assert objects.stale_names("c", 1.5) == ["object", "old"]
+    assert objects.stale_names("c", 1.5, but={"old"}) == ["object"]
+    assert objects.stale_names("c", -10) == ["busy", "object", "old"]
 
 
 def test_a_file_under_way_and_an_empty_folder_count_in_a_folder(objects: Objects, folder: Path) -> None:
@@ -218,7 +218,7 @@ def test_a_file_under_way_and_an_empty_folder_count_in_a_folder(objects: Objects
     (folder / "c" / "empty").mkdir()
     for path in ("c/under way", "c/empty", "c/left"):
         os.utime(folder / path, (1000, 1000))
-    assert objects.stale("c", 3600) == ["empty", "left"]
+    assert objects.stale_names("c", 3600) == ["empty", "left"]
 
 
 @pytest.fixture
@@ -271,18 +271,18 @@ def test_a_bucket_that_cannot_be_reached_is_told_whatever_is_asked(nobody: str) 
     objects = Objects(nobody)
     array = np.zeros(3)
     asked: list[Callable[[], object]] = [
-        objects.check,
+        objects.check_reachable,
         lambda: objects.read("a"),
         lambda: objects.put("a", b"1"),
         lambda: put(objects, "a", b"1"),
         lambda: put(objects, "a", bytes(PART + 1)),
         lambda: objects.names("a"),
-        lambda: objects.below("a"),
-        lambda: objects.stale("a", 1),
+        lambda: objects.paths_below("a"),
+        lambda: objects.stale_names("a", 1),
         lambda: objects.delete("a"),
-        lambda: together(objects.group("a")),
-        lambda: together(objects.array("a")),
-        lambda: together(objects.put_array("a", array)),
+        lambda: gather(objects.group("a")),
+        lambda: gather(objects.array("a")),
+        lambda: gather(objects.put_array("a", array)),
         lambda: zarr.create_array(objects.zarr, name="a", data=array),
         lambda: zarr.open_group(objects.zarr, path="a"),
     ]
@@ -333,5 +333,5 @@ def test_a_bucket_that_goes_away_while_it_is_read(impatient: None, s3: str) -> N
 def test_a_bucket_that_is_not_there_is_no_matter_of_waiting(s3: str) -> None:
     objects = Objects(s3.replace("envmatte", "nobodys"))
     with pytest.raises(Exception, match="NoSuchBucket") as caught:
-        objects.check()
+        objects.check_reachable()
     assert not isinstance(caught.value, Unavailable)

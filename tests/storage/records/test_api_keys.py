@@ -11,27 +11,27 @@ from storage.records import api_keys
 
 def test_a_key_is_known_until_it_is_revoked(engine: Engine) -> None:
     with reading(engine) as c:
-        assert not api_keys.any_was_made(c)
+        assert not api_keys.any_created(c)
     with writing(engine) as c:
-        first, second = api_keys.make(c, "lab", "alice", "write"), api_keys.make(c, "shop", "bob", "read")
+        first, second = api_keys.create(c, "lab", "alice", "write"), api_keys.create(c, "shop", "bob", "read")
     assert first != second
     with reading(engine) as c:
-        row = api_keys.known(c, first)
+        row = api_keys.find(c, first)
         assert row is not None
         assert (row.name, row.owner, row.scope, row.revoked_at) == ("lab", "alice", "write", None)
-        assert api_keys.known(c, first[:-1]) is None
-        assert api_keys.known(c, "\udce4\udcff") is None
+        assert api_keys.find(c, first[:-1]) is None
+        assert api_keys.find(c, "\udce4\udcff") is None
     with writing(engine) as c:
         api_keys.revoke(c, "lab")
     with writing(engine) as c:
-        assert api_keys.known(c, first) is None
-        assert api_keys.known(c, second) is not None
+        assert api_keys.find(c, first) is None
+        assert api_keys.find(c, second) is not None
         with pytest.raises(NotFound, match="lab"):
             api_keys.revoke(c, "lab")
         api_keys.revoke(c, "shop")
-        assert api_keys.any_was_made(c)  # or the service would be open again
-        assert api_keys.make(c, "lab", "alice", "read") != first
-        assert [(row.name, row.revoked_at is None) for row in api_keys.listed(c)] == [
+        assert api_keys.any_created(c)  # or the service would be open again
+        assert api_keys.create(c, "lab", "alice", "read") != first
+        assert [(row.name, row.revoked_at is None) for row in api_keys.list_all(c)] == [
             ("lab", False),
             ("shop", False),
             ("lab", True),
@@ -40,7 +40,7 @@ def test_a_key_is_known_until_it_is_revoked(engine: Engine) -> None:
 
 def test_nothing_that_is_kept_tells_the_key(engine: Engine) -> None:
     with writing(engine) as c:
-        key = api_keys.make(c, "lab", "alice", "write")
+        key = api_keys.create(c, "lab", "alice", "write")
         (row,) = c.execute(select(table)).all()
     assert len(key.removeprefix(api_keys.PREFIX)) == 43  # 256 bits in Base64
     assert key.removeprefix(api_keys.PREFIX) not in str(row)
@@ -48,9 +48,9 @@ def test_nothing_that_is_kept_tells_the_key(engine: Engine) -> None:
 
 def test_a_name_is_used_once_at_a_time(engine: Engine) -> None:
     with writing(engine) as c:
-        api_keys.make(c, "lab", "alice", "write")
+        api_keys.create(c, "lab", "alice", "write")
         with pytest.raises(Conflict, match="revoke it first"):
-            api_keys.make(c, "lab", "bob", "read")
+            api_keys.create(c, "lab", "bob", "read")
 
 
 @pytest.mark.parametrize(
@@ -58,4 +58,4 @@ def test_a_name_is_used_once_at_a_time(engine: Engine) -> None:
 )
 def test_names_that_cannot_be_shown_are_refused(engine: Engine, name: str, owner: str) -> None:
     with writing(engine) as c, pytest.raises(InvalidInput, match="1 to 64 characters"):
-        api_keys.make(c, name, owner, "read")
+        api_keys.create(c, name, owner, "read")

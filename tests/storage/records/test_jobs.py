@@ -21,12 +21,12 @@ def connection(engine: Engine):  # type: ignore[no-untyped-def]
 
 def laid(connection: Connection, tiles: int = 3) -> str:
     job = jobs.add(connection, "recover", "cap", {"method": "lobes"}, matte="mat")
-    tile_records.lay_down(connection, job, {"tiles": tiles, "slab": 9})
+    tile_records.add_plan(connection, job, {"tiles": tiles, "slab": 9})
     return job
 
 
 def lines(connection: Connection, job: str) -> list[str]:
-    return [row.text for row in job_log.notes(connection, job, 0, 100)]
+    return [row.text for row in job_log.lines(connection, job, 0, 100)]
 
 
 def test_a_job_from_queue_to_success(connection: Connection) -> None:
@@ -41,10 +41,10 @@ def test_a_job_from_queue_to_success(connection: Connection) -> None:
     )
     assert row.options == {"tile": 64}
     assert (row.plan, row.started_at, row.finished_at, row.total) == (None, None, None, 0)
-    jobs.enter(connection, job, "preparing")
+    jobs.enter_stage(connection, job, "preparing")
     started = jobs.get(connection, job).started_at
-    tile_records.lay_down(connection, job, {"tiles": 2, "slab": 5})
-    jobs.enter(connection, job, "recovering")
+    tile_records.add_plan(connection, job, {"tiles": 2, "slab": 5})
+    jobs.enter_stage(connection, job, "recovering")
     row = jobs.get(connection, job)
     assert (row.state, row.stage, row.total, row.plan) == (
         "running",
@@ -53,7 +53,7 @@ def test_a_job_from_queue_to_success(connection: Connection) -> None:
         {"tiles": 2, "slab": 5},
     )
     assert row.started_at == started is not None
-    tile_records.finish(connection, job, [(0, 0.5, 100), (1, 0.25, 60)])
+    tile_records.mark_done(connection, job, [(0, 0.5, 100), (1, 0.25, 60)])
     assert jobs.end(connection, job, "succeeded")
     row = jobs.get(connection, job)
     assert (row.state, row.done, row.pixels, row.problem) == ("succeeded", 2, 160, None)
@@ -68,41 +68,41 @@ def test_ids_are_opaque_and_differ() -> None:
 
 
 def test_what_is_not_there(connection: Connection) -> None:
-    for call in (jobs.get, jobs.cancel, tile_records.retry, jobs.forget):
+    for call in (jobs.get, jobs.cancel, jobs.retry, jobs.delete):
         with pytest.raises(NotFound, match="no job 'none'"):
             call(connection, "none")
 
 
 def test_a_plan_is_laid_down_once(connection: Connection) -> None:
     job = laid(connection)
-    tile_records.finish(connection, job, [(1, 0.1, 5)])
-    tile_records.lay_down(connection, job, {"tiles": 7})
+    tile_records.mark_done(connection, job, [(1, 0.1, 5)])
+    tile_records.add_plan(connection, job, {"tiles": 7})
     assert jobs.get(connection, job).total == 3
-    assert tile_records.to_do(connection, job) == [0, 2]
+    assert tile_records.remaining(connection, job) == [0, 2]
 
 
 def test_a_tile_done_twice_counts_once(connection: Connection) -> None:
     job, other = laid(connection), laid(connection)
-    tile_records.finish(connection, job, [(1, 0.1, 50), (1, 0.1, 50)])
-    tile_records.finish(connection, job, [(1, 9.0, 50), (2, 0.1, 30)])
+    tile_records.mark_done(connection, job, [(1, 0.1, 50), (1, 0.1, 50)])
+    tile_records.mark_done(connection, job, [(1, 9.0, 50), (2, 0.1, 30)])
     row = jobs.get(connection, job)
     assert (row.done, row.pixels) == (2, 80)
-    assert tile_records.to_do(connection, job) == [0]
-    assert tile_records.to_do(connection, other) == [0, 1, 2]
+    assert tile_records.remaining(connection, job) == [0]
+    assert tile_records.remaining(connection, other) == [0, 1, 2]
     assert jobs.get(connection, other).done == 0
 
 
 def test_a_tile_is_tried_as_often_as_allowed(connection: Connection) -> None:
     job = laid(connection)
-    assert [tile_records.miss(connection, job, 1, "out of memory", 3) for _ in range(3)] == [
+    assert [tile_records.record_failure(connection, job, 1, "out of memory", 3) for _ in range(3)] == [
         True,
         True,
         False,
     ]
     assert jobs.get(connection, job).failed == 1
-    assert tile_records.to_do(connection, job) == [0, 2]
+    assert tile_records.remaining(connection, job) == [0, 2]
     assert lines(connection, job)[1:] == [f"tile 1, attempt {n} of 3: out of memory" for n in (1, 2, 3)]
-    tile_records.finish(connection, job, [(1, 0.1, 10)])
+    tile_records.mark_done(connection, job, [(1, 0.1, 10)])
     assert jobs.get(connection, job).done == 0
 
 
@@ -114,7 +114,7 @@ def test_a_job_ends_once(connection: Connection, state: str) -> None:
     before = jobs.get(connection, job)
     for again in ("succeeded", "failed", "cancelled"):
         assert not jobs.end(connection, job, again, {"detail": "late"})
-    jobs.enter(connection, job, "recovering")
+    jobs.enter_stage(connection, job, "recovering")
     assert jobs.get(connection, job) == before
     assert before.problem == problem
     assert lines(connection, job)[-1] == ("failed: a chunk is gone" if problem else state)
@@ -139,27 +139,27 @@ def test_cancelling(connection: Connection) -> None:
 
 def test_a_retry_keeps_what_is_done(connection: Connection) -> None:
     job = laid(connection)
-    jobs.enter(connection, job, "recovering")
-    tile_records.finish(connection, job, [(0, 0.1, 10)])
-    tile_records.miss(connection, job, 1, "why", 1)
+    jobs.enter_stage(connection, job, "recovering")
+    tile_records.mark_done(connection, job, [(0, 0.1, 10)])
+    tile_records.record_failure(connection, job, 1, "why", 1)
     jobs.end(connection, job, "failed", {"detail": "a tile failed"})
-    tile_records.retry(connection, job)
+    jobs.retry(connection, job)
     row = jobs.get(connection, job)
     assert (row.state, row.stage, row.done, row.failed, row.pixels) == ("queued", "waiting", 1, 0, 10)
     assert (row.problem, row.finished_at) == (None, None)
-    assert tile_records.to_do(connection, job) == [1, 2]
-    assert tile_records.miss(connection, job, 1, "again", 2)
+    assert tile_records.remaining(connection, job) == [1, 2]
+    assert tile_records.record_failure(connection, job, 1, "again", 2)
 
 
 def test_a_retry_may_begin_anew(connection: Connection) -> None:
     job = laid(connection)
-    tile_records.finish(connection, job, [(0, 0.1, 10)])
+    tile_records.mark_done(connection, job, [(0, 0.1, 10)])
     jobs.end(connection, job, "failed", {"detail": "its slabs were too large"})
-    tile_records.retry(connection, job, anew=True)
+    jobs.retry(connection, job, replan=True)
     row = jobs.get(connection, job)
     assert (row.state, row.plan, row.total, row.done, row.pixels) == ("queued", None, 0, 0, 0)
-    tile_records.lay_down(connection, job, {"tiles": 5})
-    assert tile_records.to_do(connection, job) == [0, 1, 2, 3, 4]
+    tile_records.add_plan(connection, job, {"tiles": 5})
+    assert tile_records.remaining(connection, job) == [0, 1, 2, 3, 4]
 
 
 def test_only_a_failed_job_is_tried_again(connection: Connection) -> None:
@@ -168,15 +168,15 @@ def test_only_a_failed_job_is_tried_again(connection: Connection) -> None:
         if state:
             jobs.end(connection, job, state)
         with pytest.raises(Conflict, match=state or "queued"):
-            tile_records.retry(connection, job)
+            jobs.retry(connection, job)
 
 
 def test_forgetting_takes_tiles_and_log_along(connection: Connection) -> None:
     job, other = laid(connection), laid(connection)
     with pytest.raises(Conflict, match="cancel it first"):
-        jobs.forget(connection, job)
+        jobs.delete(connection, job)
     jobs.cancel(connection, job)
-    jobs.forget(connection, job)
+    jobs.delete(connection, job)
     with pytest.raises(NotFound):
         jobs.get(connection, job)
     for table in (tables.tiles, tables.log):
@@ -187,7 +187,7 @@ def test_forgetting_takes_tiles_and_log_along(connection: Connection) -> None:
 
 def test_active_jobs_are_oldest_first(connection: Connection) -> None:
     made = [laid(connection) for _ in range(4)]
-    jobs.enter(connection, made[2], "recovering")
+    jobs.enter_stage(connection, made[2], "recovering")
     jobs.end(connection, made[1], "failed")
     assert [row.id for row in jobs.active(connection)] == [made[0], made[2], made[3]]
 
@@ -216,31 +216,34 @@ def test_a_page_is_newest_first(connection: Connection) -> None:
 def test_log_lines_after_a_line(connection: Connection) -> None:
     job, other = laid(connection), laid(connection)
     for n in range(5):
-        job_log.note(connection, job, f"line {n}")
-        job_log.note(connection, other, "of another job")
-    read = job_log.notes(connection, job, 0, 3)
+        job_log.add(connection, job, f"line {n}")
+        job_log.add(connection, other, "of another job")
+    read = job_log.lines(connection, job, 0, 3)
     assert [row.text for row in read] == ["queued", "line 0", "line 1"]
-    rest = job_log.notes(connection, job, read[-1].line, 100)
+    rest = job_log.lines(connection, job, read[-1].line, 100)
     assert [row.text for row in rest] == ["line 2", "line 3", "line 4"]
-    assert job_log.notes(connection, job, rest[-1].line, 100) == []
+    assert job_log.lines(connection, job, rest[-1].line, 100) == []
     assert all(a.at <= b.at for a, b in pairwise(read))
 
 
 def test_what_a_key_made(connection: Connection) -> None:
-    assert idempotency.made_by(connection, "key", "POST /v1/jobs") is None
-    idempotency.remember(connection, "key", "POST /v1/jobs", "abc")
-    assert idempotency.made_by(connection, "key", "POST /v1/jobs") == "abc"
-    assert idempotency.made_by(connection, "key", "POST /v1/captures") is None
-    assert idempotency.made_by(connection, "other", "POST /v1/jobs") is None
+    assert idempotency.find(connection, "key", "POST /v1/jobs") is None
+    idempotency.add(connection, "key", "POST /v1/jobs", "abc")
+    assert idempotency.find(connection, "key", "POST /v1/jobs") == "abc"
+    assert idempotency.find(connection, "key", "POST /v1/captures") is None
+    assert idempotency.find(connection, "other", "POST /v1/jobs") is None
 
 
 def test_the_steps_around_the_tiles_are_tried_as_often_as_allowed(connection: Connection) -> None:
     job = laid(connection)
-    tile_records.begin(connection, job)
-    tile_records.begin(connection, job)
-    assert tile_records.to_do(connection, job) == [0, 1, 2]
-    assert [tile_records.miss(connection, job, steps.PREPARE, "why", 2) for _ in range(2)] == [True, False]
-    assert tile_records.miss(connection, job, steps.FINISH, "why", 2)
+    tile_records.add_steps(connection, job)
+    tile_records.add_steps(connection, job)
+    assert tile_records.remaining(connection, job) == [0, 1, 2]
+    assert [tile_records.record_failure(connection, job, steps.PREPARE, "why", 2) for _ in range(2)] == [
+        True,
+        False,
+    ]
+    assert tile_records.record_failure(connection, job, steps.FINISH, "why", 2)
     assert lines(connection, job)[1:] == [
         "preparing, attempt 1 of 2: why",
         "preparing, attempt 2 of 2: why",
@@ -251,54 +254,54 @@ def test_the_steps_around_the_tiles_are_tried_as_often_as_allowed(connection: Co
 
 def test_workers_that_die_are_counted_apart(connection: Connection) -> None:
     job = laid(connection)
-    assert tile_records.lose(connection, job, 1, "it died", 2)
-    assert tile_records.miss(connection, job, 1, "why", 2)
-    assert not tile_records.lose(connection, job, 1, "it died", 2)
+    assert tile_records.record_loss(connection, job, 1, "it died", 2)
+    assert tile_records.record_failure(connection, job, 1, "why", 2)
+    assert not tile_records.record_loss(connection, job, 1, "it died", 2)
     assert lines(connection, job)[1:] == [
         "tile 1, loss 1 of 2: it died",
         "tile 1, attempt 1 of 2: why",
         "tile 1, loss 2 of 2: it died",
     ]
-    assert tile_records.to_do(connection, job) == [0, 2]
+    assert tile_records.remaining(connection, job) == [0, 2]
 
 
 def test_a_tile_that_the_store_lacks_is_done_again_and_counts_once(connection: Connection) -> None:
     job = laid(connection)
-    tile_records.finish(connection, job, [(n, 0.1, 10) for n in range(3)])
-    assert tile_records.reopen(connection, job, [0, 2], 2) == [0, 2]
-    assert tile_records.to_do(connection, job) == [0, 2]
+    tile_records.mark_done(connection, job, [(n, 0.1, 10) for n in range(3)])
+    assert tile_records.requeue_missing(connection, job, [0, 2], 2) == [0, 2]
+    assert tile_records.remaining(connection, job) == [0, 2]
     assert (jobs.get(connection, job).done, jobs.get(connection, job).pixels) == (3, 30)
-    tile_records.finish(connection, job, [(0, 0.1, 10), (2, 0.1, 10)])
+    tile_records.mark_done(connection, job, [(0, 0.1, 10), (2, 0.1, 10)])
     assert (jobs.get(connection, job).done, jobs.get(connection, job).pixels) == (3, 30)
-    assert tile_records.reopen(connection, job, [2], 2) == []
+    assert tile_records.requeue_missing(connection, job, [2], 2) == []
     jobs.end(connection, job, "failed", {"detail": "gone again"})
-    tile_records.retry(connection, job)
+    jobs.retry(connection, job)
     assert jobs.get(connection, job).done == 2
-    tile_records.finish(connection, job, [(2, 0.1, 10)])
+    tile_records.mark_done(connection, job, [(2, 0.1, 10)])
     assert jobs.get(connection, job).done == 3
 
 
 def test_the_pace_is_measured_from_where_tiles_are_done(connection: Connection) -> None:
     job = laid(connection)
-    jobs.enter(connection, job, "recovering")
-    assert not tile_records.pace(connection, job, after=2)
-    tile_records.finish(connection, job, [(0, 0.1, 10), (1, 0.1, 10)])
-    assert tile_records.pace(connection, job, after=2)
+    jobs.enter_stage(connection, job, "recovering")
+    assert not tile_records.start_pace(connection, job, after=2)
+    tile_records.mark_done(connection, job, [(0, 0.1, 10), (1, 0.1, 10)])
+    assert tile_records.start_pace(connection, job, after=2)
     row = jobs.get(connection, job)
     assert row.paced_done == 2
     assert row.moved_at <= row.paced_at
-    jobs.enter(connection, job, "finishing")
+    jobs.enter_stage(connection, job, "finishing")
     assert jobs.get(connection, job).paced_at is None
 
 
 def test_what_was_ever_done_is_added_up(connection: Connection) -> None:
     job, other = laid(connection), laid(connection)
-    tile_records.finish(connection, job, [(0, 0.5, 10), (0, 0.5, 10), (1, 0.25, 20)])
-    tile_records.miss(connection, job, 2, "why", 3)
-    tile_records.finish(connection, other, [(0, 0.25, 5)])
-    tile_records.lose(connection, other, 1, "why", 3)
+    tile_records.mark_done(connection, job, [(0, 0.5, 10), (0, 0.5, 10), (1, 0.25, 20)])
+    tile_records.record_failure(connection, job, 2, "why", 3)
+    tile_records.mark_done(connection, other, [(0, 0.25, 5)])
+    tile_records.record_loss(connection, other, 1, "why", 3)
     jobs.cancel(connection, job)
-    jobs.forget(connection, job)
+    jobs.delete(connection, job)
     (row,) = connection.execute(select(tables.totals))
     assert tuple(row) == ("recover", 3, 1, 1, 35, 1.0)
 
@@ -308,9 +311,9 @@ def test_a_cancelled_composite_has_leftovers_until_its_tiles_are_cleared(connect
     mattes.add(connection, "other", "cap", recovery, {})  # which is being recovered, and is no part of it
     job = jobs.add(connection, "composite", "cap", {"transfer": "srgb"}, "other", job="given")
     assert job == "given"
-    tile_records.begin(connection, job)
+    tile_records.add_steps(connection, job)
     assert jobs.cancelled_with_leftovers(connection) == []
     jobs.cancel(connection, job)
     assert [row.id for row in jobs.cancelled_with_leftovers(connection)] == [job]
-    tile_records.clear(connection, job)
+    tile_records.delete_all(connection, job)
     assert jobs.cancelled_with_leftovers(connection) == []

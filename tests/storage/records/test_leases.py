@@ -5,7 +5,7 @@ import threading
 import pytest
 from sqlalchemy import Engine, func, select, update
 
-from storage.database import tables
+from storage.database import dialects, tables
 from storage.database.engine import reading, writing
 from storage.records import jobs, leases, tiles
 from storage.records.leases import Superseded
@@ -13,12 +13,12 @@ from storage.records.leases import Superseded
 
 def expire(engine: Engine) -> None:
     with writing(engine) as c:
-        c.execute(update(tables.coordinator).values(expires_at=tables.clock() - 1))
+        c.execute(update(tables.coordinator).values(expires_at=dialects.clock() - 1))
 
 
 def take(engine: Engine, holder: str, *, seize: bool = False) -> int | None:
     with writing(engine) as c:
-        return leases.take(c, holder, seize=seize)
+        return leases.acquire(c, holder, seize=seize)
 
 
 def test_one_has_it(engine: Engine) -> None:
@@ -34,14 +34,14 @@ def test_a_lease_that_is_given_back_is_free(engine: Engine) -> None:
     token = take(engine, "first")
     assert token is not None
     with writing(engine) as c:
-        leases.give_back(c, token)
+        leases.release(c, token)
     with writing(engine) as c, pytest.raises(Superseded):
-        leases.check(c, token)
+        leases.require_held(c, token)
     assert take(engine, "second") == token + 1
     with writing(engine) as c:
-        leases.give_back(c, token)  # late
+        leases.release(c, token)  # late
     with writing(engine) as c:
-        leases.check(c, token + 1)
+        leases.require_held(c, token + 1)
 
 
 def test_a_beat_extends_it(engine: Engine) -> None:
@@ -49,10 +49,10 @@ def test_a_beat_extends_it(engine: Engine) -> None:
     assert token is not None
     expire(engine)
     with writing(engine) as c:
-        leases.beat(c, token, {"workers": [{"name": "a"}], "problem": "none"})
+        leases.renew(c, token, {"workers": [{"name": "a"}], "problem": "none"})
     assert take(engine, "second") is None
     with reading(engine) as c:
-        sign = leases.last_sign(c)
+        sign = leases.last_heartbeat(c)
     assert sign is not None
     assert sign.holder == "first"
     assert sign.cluster == {"workers": [{"name": "a"}], "problem": "none"}
@@ -61,7 +61,7 @@ def test_a_beat_extends_it(engine: Engine) -> None:
 
 def test_nobody_ever_had_it(engine: Engine) -> None:
     with reading(engine) as c:
-        assert leases.last_sign(c) is None
+        assert leases.last_heartbeat(c) is None
 
 
 def test_a_late_writers_commit_is_refused(engine: Engine) -> None:
@@ -69,17 +69,17 @@ def test_a_late_writers_commit_is_refused(engine: Engine) -> None:
     assert late is not None
     with writing(engine) as c:
         job = jobs.add(c, "recover", "cap", {}, "mat")
-        tiles.lay_down(c, job, {"tiles": 2})
+        tiles.add_plan(c, job, {"tiles": 2})
     expire(engine)
     token = take(engine, "second")
     with pytest.raises(Superseded), writing(engine) as c:  # noqa: PT012
-        tiles.finish(c, job, [(0, 0.1, 10)])
-        leases.check(c, late)
+        tiles.mark_done(c, job, [(0, 0.1, 10)])
+        leases.require_held(c, late)
     with pytest.raises(Superseded), writing(engine) as c:
-        leases.beat(c, late, {"workers": [], "problem": None})
+        leases.renew(c, late, {"workers": [], "problem": None})
     with reading(engine) as c:
         assert jobs.get(c, job).done == 0
-        sign = leases.last_sign(c)
+        sign = leases.last_heartbeat(c)
     assert sign is not None
     assert (sign.holder, token) == ("second", late + 1)
 

@@ -8,7 +8,7 @@ from sqlalchemy import Connection, Engine, select, update
 
 from storage.database.engine import writing
 from storage.database.tables import deliveries as table
-from storage.records import jobs, tiles, webhook_deliveries
+from storage.records import jobs, webhook_deliveries
 
 
 @pytest.fixture
@@ -19,7 +19,7 @@ def connection(engine: Engine):  # type: ignore[no-untyped-def]
 
 def ended(connection: Connection, state: str = "succeeded", **problem: str) -> str:
     job = jobs.add(connection, "recover", "cap", {}, "mat", webhook="https://example.com/x")
-    jobs.enter(connection, job, "recovering")
+    jobs.enter_stage(connection, job, "recovering")
     assert connection.execute(select(table).where(table.c.job == job)).all() == []
     jobs.end(connection, job, state, problem or None)
     return job
@@ -51,7 +51,7 @@ def test_a_jobs_end_is_to_be_told_once(connection: Connection) -> None:
 
 def test_a_job_that_is_tried_again_is_told_again(connection: Connection) -> None:
     job = ended(connection, "failed", detail="no light")
-    tiles.retry(connection, job)
+    jobs.retry(connection, job)
     jobs.end(connection, job, "succeeded")
     events = [json.loads(row.body)["event"] for row in connection.execute(select(table))]
     assert sorted(events) == ["job.failed", "job.succeeded"]
@@ -87,7 +87,7 @@ def test_attempts_are_spread_over_a_day_and_end(connection: Connection) -> None:
     while not delays or delays[-1] is not None:
         bring_forward(connection)
         (row,) = webhook_deliveries.claim(connection, 1)
-        delays.append(webhook_deliveries.failed(connection, row.id, row.attempts))
+        delays.append(webhook_deliveries.schedule_retry(connection, row.id, row.attempts))
     assert delays == [*webhook_deliveries.DELAYS, None]
     assert delays[:-1] == sorted(set(webhook_deliveries.DELAYS))
     assert sum(webhook_deliveries.DELAYS) <= 86_400
@@ -95,7 +95,7 @@ def test_attempts_are_spread_over_a_day_and_end(connection: Connection) -> None:
 
 
 def test_a_job_that_is_deleted_is_told_nevertheless(connection: Connection) -> None:
-    jobs.forget(connection, ended(connection))
+    jobs.delete(connection, ended(connection))
     (row,) = webhook_deliveries.claim(connection, 1)
-    webhook_deliveries.delivered(connection, row.id)
+    webhook_deliveries.delete(connection, row.id)
     assert connection.execute(select(table)).all() == []

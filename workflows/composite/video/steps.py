@@ -20,7 +20,7 @@ from storage.errors import CaptureError, ClipError, Corrupt
 from storage.layout import composites
 from storage.layout.mattes import Matte
 from storage.objects.byte_objects import PART
-from storage.objects.store import Objects, together
+from storage.objects.store import Objects, gather
 from workflows.composite import composite
 from workflows.composite.backdrop import Backdrop
 from workflows.composite.cache import Cache
@@ -132,7 +132,7 @@ def finish(objects: Objects, task: Task) -> dict[str, Any]:
     with tempfile.TemporaryFile() as file:
         segments.join(found, _ticks(objects, job), plan["last"], Fraction(*plan["tick"]), file)
         file.seek(0)
-        together(_store(objects, composites.video_path(job), file))
+        gather(_store(objects, composites.video_path(job), file))
     return {}
 
 

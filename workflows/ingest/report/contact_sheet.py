@@ -94,7 +94,7 @@ def _shrink(
     band = max(1, 64 // factor)
     for first in range(0, height, band):
         last = min(first + band, height)
-        codes = stack.pick(frames, slice(first * factor, last * factor), slice(0, width * factor))
+        codes = stack.read_frames(frames, slice(first * factor, last * factor), slice(0, width * factor))
         cells = codes.reshape(len(frames), last - first, factor, width, factor, stack.channels)
         light[:, first:last] = look_up[cells].mean(axis=(2, 4))
         high[:, first:last] = (cells == top).any(axis=(2, 4, 5))

@@ -49,7 +49,7 @@ def survey(stack: Stack) -> None:
     brightest: list[NDArray[np.float32]] = []
     pixels = 0
     for rows, columns in _windows(stack):
-        wanted = stack.recovered(rows, columns)
+        wanted = stack.mask(rows, columns)
         if not wanted.any():
             continue
         codes_black, codes_white = (stack.read(rows, columns, slice(n, n + 1))[0] for n in (black, white))
@@ -107,4 +107,4 @@ def _batches(
     step = max(1, BATCH // (16 * size))
     for first in range(0, len(chosen), step):
         at = np.arange(first, min(first + step, len(chosen)))
-        yield at, stack.pick(chosen[at].tolist(), rows, columns)
+        yield at, stack.read_frames(chosen[at].tolist(), rows, columns)

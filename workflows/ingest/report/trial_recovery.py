@@ -91,7 +91,7 @@ class Trial(NamedTuple):
 
 def sampled(stack: Stack) -> Sample | None:
     """Squares spread over what is recovered, and pixels of them; None where there are too few."""
-    wanted = stack.recovered()
+    wanted = stack.mask()
     down, across = (np.arange(_MARGIN, size - _MARGIN - EDGE + 1, EDGE) for size in wanted.shape)
     corners = [(y, x) for y in down.tolist() for x in across.tolist()]
     counts = np.array([np.count_nonzero(wanted[y : y + EDGE, x : x + EDGE]) for y, x in corners], int)

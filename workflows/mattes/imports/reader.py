@@ -65,7 +65,7 @@ class Reader:
             raise refused(
                 "zarr.json", f"blocks of {checked.block} pixels are not those of a frame of this size"
             )
-        if self._listed != matte_archive.listed(self.attributes):
+        if self._listed != matte_archive.summary(self.attributes):
             raise refused(MANIFEST, "it lists another matte than the archive holds")
         self._nodes = Pyramid.over(checked.columns, checked.rows).nodes
         self._check_names(-(-checked.height // self._edge), -(-checked.width // self._edge))
@@ -80,21 +80,23 @@ class Reader:
         count = values["count"]
         entries = int(count.sum(dtype=np.uint64))
         most = self._limits.memory // CHECK_BYTES
-        where = matte_archive.chunk("count", row, column)
+        where = matte_archive.chunk_entry("count", row, column)
         if entries > most:
             raise ArchiveError(
                 f"{where}: the rows T of this block have {entries} cells, more than the {most} allowed",
                 entry=where,
                 limit=most,
             )
-        T = matte_archive.rows(row, column)
+        T = matte_archive.rows_folder(row, column)
         self.compare(f"{T}/zarr.json", _document_of_group())
         cell = self._rows(f"{T}/cell", entries, np.dtype("<u4"))
         weight = self._rows(f"{T}/weight", entries, np.dtype("<f4"))
         block = Block(**values, cell=cell, weight=weight)
         for name, what in faults(block, self._nodes):
             entry = (
-                f"{T}/{name}/c/0" if name in ("cell", "weight") else matte_archive.chunk(name, row, column)
+                f"{T}/{name}/c/0"
+                if name in ("cell", "weight")
+                else matte_archive.chunk_entry(name, row, column)
             )
             raise refused(entry, what)
         return block
@@ -124,7 +126,7 @@ class Reader:
         }
 
     def _frame(self, name: str, row: int, column: int) -> NDArray[Any]:
-        entry = matte_archive.chunk(name, row, column)
+        entry = matte_archive.chunk_entry(name, row, column)
         dtype = np.dtype({"count": "<u4", "recovered": "u1", "shared": "u1"}.get(name, "<f4"))
         shape = (*self._chunk, 3) if name in CHANNELS else self._chunk
         values = self._decode(entry, int(np.prod(shape)), dtype).reshape(shape)
@@ -216,7 +218,7 @@ class Reader:
             raise refused("zarr.json", "the archive has fewer entries than a matte of this size")
         names = {MANIFEST, *GROUPS}
         for row, column in product(range(block_rows), range(block_columns)):
-            names.update(matte_archive.of_block(row, column))
+            names.update(matte_archive.block_entries(row, column))
         for name in sorted(self._entries.keys() - names):
             raise refused(name, "it is nothing that a matte of this size has")
 

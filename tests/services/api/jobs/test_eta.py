@@ -27,10 +27,10 @@ def engine(tmp_path: Path) -> Iterator[Engine]:
 def running(connection: Connection, kind: str, done: int, plan: dict[str, Any] = PLAN, **values: Any) -> str:
     """A job of ten tiles, at a second each: its pace is measured from time 0 and tile 0 on."""
     job = jobs.add(connection, kind, "a-capture", {})
-    tiles.begin(connection, job)
-    jobs.enter(connection, job, "reading")
-    tiles.lay_down(connection, job, plan)
-    tiles.finish(connection, job, [(tile, 1.0, 1) for tile in range(done)])
+    tiles.add_steps(connection, job)
+    jobs.enter_stage(connection, job, "reading")
+    tiles.add_plan(connection, job, plan)
+    tiles.mark_done(connection, job, [(tile, 1.0, 1) for tile in range(done)])
     values = {"paced_at": 0.0, "paced_done": 0, "moved_at": float(done)} | values
     connection.execute(update(tables.jobs).where(tables.jobs.c.id == job).values(values))
     return job
@@ -39,7 +39,7 @@ def running(connection: Connection, kind: str, done: int, plan: dict[str, Any] =
 def ended(connection: Connection, finishing: float, plan: dict[str, Any] = PLAN) -> None:
     """An ingest that has succeeded, its last step after some seconds."""
     job = running(connection, "ingest", 10, plan)
-    tiles.finish(connection, job, [(FINISH, finishing, 0)])
+    tiles.mark_done(connection, job, [(FINISH, finishing, 0)])
     jobs.end(connection, job, "succeeded")
 
 

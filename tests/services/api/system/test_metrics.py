@@ -42,13 +42,13 @@ def job(engine: Engine) -> str:
         captures.add(c, "a-capture", ingest, name="", bytes=123, frames=4, program=PROGRAM)
         jobs.add(c, "recover", "a-capture", {})
         job = jobs.add(c, "recover", "a-capture", {})
-        tile_records.begin(c, job)
-        jobs.enter(c, job, "preparing")
-        tile_records.lay_down(c, job, {"tiles": 10})
-        jobs.enter(c, job, "recovering")
-        tile_records.finish(c, job, [(tile, 0.5, 100) for tile in range(5)])
-        tile_records.reopen(c, job, [1, 2], 8)
-        tile_records.miss(c, job, 7, "it is broken", 1)
+        tile_records.add_steps(c, job)
+        jobs.enter_stage(c, job, "preparing")
+        tile_records.add_plan(c, job, {"tiles": 10})
+        jobs.enter_stage(c, job, "recovering")
+        tile_records.mark_done(c, job, [(tile, 0.5, 100) for tile in range(5)])
+        tile_records.requeue_missing(c, job, [1, 2], 8)
+        tile_records.record_failure(c, job, 7, "it is broken", 1)
     return job
 
 
@@ -78,13 +78,13 @@ def test_without_a_coordinator_there_is_trouble(client: TestClient, engine: Engi
     assert ("envmatte_coordinator_last_sign_seconds",) not in figures(client)
     assert "no coordinator" in client.get("/v1/cluster").json()["problem"]
     with writing(engine) as c:
-        token = leases.take(c, "a-host:1")
+        token = leases.acquire(c, "a-host:1")
         assert token is not None
     assert figures(client)[("envmatte_trouble",)] == 0
     found = client.get("/v1/cluster").json()
     assert (found["coordinator"]["holder"], found["problem"]) == ("a-host:1", None)
     with writing(engine) as c:
-        leases.beat(c, token, {"workers": [], "problem": "no worker is connected"})
+        leases.renew(c, token, {"workers": [], "problem": "no worker is connected"})
     assert figures(client)[("envmatte_trouble",)] == 1
     assert client.get("/v1/cluster").json()["problem"] == "no worker is connected"
 
@@ -92,9 +92,9 @@ def test_without_a_coordinator_there_is_trouble(client: TestClient, engine: Engi
 def test_memory_without_limit_has_none(client: TestClient, engine: Engine) -> None:
     worker = {"address": "tls://a:1", "name": "a", "threads": 1, "memory_bytes": 5, "memory_limit_bytes": 7}
     with writing(engine) as c:
-        token = leases.take(c, "a-host:1")
+        token = leases.acquire(c, "a-host:1")
         assert token is not None
-        leases.beat(c, token, {"workers": [worker, worker | {"memory_limit_bytes": None}], "problem": None})
+        leases.renew(c, token, {"workers": [worker, worker | {"memory_limit_bytes": None}], "problem": None})
     found = client.get("/v1/cluster").json()
     assert (found["memory_bytes"], found["memory_limit_bytes"], found["threads"]) == (10, None, 2)
     assert figures(client)[("envmatte_workers_memory_bytes",)] == 10

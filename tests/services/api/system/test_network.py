@@ -19,7 +19,7 @@ def test_on_loopback_it_says_how_to_start_with_a_key(tmp_path: Path, has: str) -
     key = "given"
     if has == "a key of the database":
         with writing(engine) as c:
-            key = api_keys.make(c, "lab", "alice", "read")
+            key = api_keys.create(c, "lab", "alice", "read")
     app = build_app(settings, engine, Objects((tmp_path / "store").as_uri()))
     answer = (
         TestClient(app, "http://localhost", headers={"Authorization": f"Bearer {key}"})

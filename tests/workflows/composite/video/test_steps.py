@@ -304,7 +304,7 @@ def test_a_segment_that_is_missing_is_named_and_done_again(make: Make, objects: 
 
 def test_a_clip_that_is_gone_is_said(make: Make, objects: Objects) -> None:
     make(clip(pictures(2), even(2)))
-    composites.tidy(objects, "j")
+    composites.remove_inputs(objects, "j")
     assert objects.names(composites.path("j")) == [composites.VIDEO]
     with pytest.raises(Corrupt, match="send it again"):
         video_steps.prepare(objects, Task("j", "c", "m", {}, LIMITS))

@@ -29,7 +29,7 @@ def test_a_damaged_archive_is_refused_or_the_same(
     try:
         take_in(io.BytesIO(bytes(damaged)), objects, "n", LIMITS)
     except ArchiveError:
-        assert objects.below("mattes/n") == set()
+        assert objects.paths_below("mattes/n") == set()
     else:  # what was damaged is nothing of the matte: a date, say
         assert b"".join(Archive(objects, "n")) == archive
         objects.delete("mattes/n")
@@ -50,7 +50,7 @@ def test_damage_that_is_signed_is_refused_or_harmless(
     except (ArchiveError, ValueError) as error:
         if isinstance(error, ValueError):  # of `signed`, which reads the manifest
             assert name == MANIFEST
-        assert objects.below("mattes/n") == set()
+        assert objects.paths_below("mattes/n") == set()
     else:
         np.isfinite(
             composite(take_in(io.BytesIO(b"".join(Archive(objects, "n"))), objects, "o", LIMITS), BACKDROP)

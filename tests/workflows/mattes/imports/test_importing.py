@@ -43,7 +43,7 @@ def bring(objects: Objects, archive: bytes, limits: Limits = LIMITS) -> None:
 def refused(objects: Objects, archive: bytes, match: str, limits: Limits = LIMITS) -> ArchiveError:
     with pytest.raises(ArchiveError, match=match) as caught:
         bring(objects, archive, limits)
-    assert objects.below("mattes/n") == set()
+    assert objects.paths_below("mattes/n") == set()
     return caught.value
 
 
