@@ -1,10 +1,12 @@
 """The app of the HTTP API, with the routes of all resources."""
 
+from typing import Any
+
 from fastapi import Depends, FastAPI
 from sqlalchemy import Engine
 
 from services.api import errors
-from services.api.captures import captures, reports, tus, uploads
+from services.api.captures import captures, manifest_schema, reports, tus, uploads
 from services.api.context import Context, authorized
 from services.api.jobs import events, jobs
 from services.api.mattes import archives, clips, composites, layers, live, mattes
@@ -17,9 +19,18 @@ from storage.objects.store import Objects
 from workflows.composite.cache import Cache
 
 
+class App(FastAPI):
+    """A FastAPI app whose OpenAPI document also has the schema of capture.json."""
+
+    def openapi(self) -> dict[str, Any]:
+        document = super().openapi()
+        document["components"]["schemas"].update(manifest_schema.components())
+        return document
+
+
 def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
     """Build the app. It keeps no state of its own, so any number of apps may serve one database and store."""
-    app = FastAPI(
+    app = App(
         title="envmatte",
         version="1",
         description="Environment mattes of transparent objects, by compressive sensing.",
@@ -40,6 +51,7 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
 
     for router in (
         captures.router,
+        manifest_schema.router,
         reports.router,
         uploads.router,
         jobs.router,

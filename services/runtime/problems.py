@@ -22,6 +22,7 @@ from storage.errors import (
 )
 
 MEDIA_TYPE = "application/problem+json"
+CAPTURE_SCHEMA = "/v1/capture.schema.json"
 
 
 class TooLarge(InvalidInput):
@@ -99,7 +100,10 @@ def problem_of(error: Exception) -> dict[str, Any]:
     known = next(base for base in type(error).__mro__ if base in PROBLEMS)
     status, slug, title = PROBLEMS[known]
     if isinstance(error, EnvmatteError):
-        return problem_detail(status, slug, title, error.detail, **error.fields)
+        detail = error.detail
+        if slug == "bad-capture" and "field" in error.fields:
+            detail += f"; see GET {CAPTURE_SCHEMA} for the schema of capture.json"
+        return problem_detail(status, slug, title, detail, **error.fields)
     # The text of an unexpected error is for the log only: it may hold what callers must not see.
     return problem_detail(
         status, slug, title, f"unexpected {type(error).__name__}; the service's log has the details"
