@@ -14,7 +14,7 @@ from sqlalchemy.exc import ArgumentError
 
 from services.runtime.addresses import is_loopback
 from services.runtime.certificates import security_of
-from services.webhooks.signature import signing_key
+from services.runtime.webhook_signature import signing_key
 from storage.errors import InvalidInput
 from workflows.untrusted.limits import Limits
 

@@ -10,9 +10,9 @@ from typing import Any
 
 from sqlalchemy import Connection, Engine, Row
 
+from services.runtime.webhook_signature import headers_of, signing_key
 from services.settings import Settings
 from services.webhooks import safe_http
-from services.webhooks.signature import headers_of, signing_key
 from storage.database.engine import reading, writing
 from storage.errors import NoRoom, NotFound, OptionError, Unavailable
 from storage.records import job_log, jobs, leases, webhook_deliveries

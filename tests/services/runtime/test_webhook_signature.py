@@ -6,8 +6,8 @@ import time
 import pytest
 from standardwebhooks import Webhook, WebhookVerificationError
 
+from services.runtime.webhook_signature import headers_of, signing_key
 from services.settings import Settings
-from services.webhooks.signature import headers_of, signing_key
 
 PLAIN = "a secret of sixteen and more"
 ENCODED = "whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSw"
