@@ -415,11 +415,3 @@ def test_one_that_is_no_capture_leaves_nothing(service: Service, tmp_path: Path)
         with pytest.raises(ServiceError, match="not a ZIP archive"):
             service.client.upload(broken)
     assert service.stored() == before
-
-
-def test_a_key_is_asked_for(tmp_path: Path, bundle: Path) -> None:
-    with serving(tmp_path / "data", "--workers", "1", ENVMATTE_KEYS="a-key") as service:
-        for method in ("OPTIONS", "POST"):
-            answer = service.http.request(method, "/v1/uploads", headers=TUS | {"Upload-Length": "1"})
-            check_problem(answer, 401, "unauthorized")
-        assert service.client.upload(bundle)["state"] == "ingesting"

@@ -247,14 +247,3 @@ def test_an_open_door_is_refused(tmp_path: Path) -> None:
     assert refused.returncode == 1
     assert "envmatte keys make" in refused.stderr
     assert "ENVMATTE_KEYS" in refused.stderr
-
-
-def test_keys_are_asked_for(tmp_path: Path) -> None:
-    with serving(tmp_path / "data", "--workers", "1", ENVMATTE_KEYS="first-key, second-key") as service:
-        assert service.http.get("/healthz").status_code == 200
-        for headers in ({}, {"Authorization": "Bearer wrong"}, {"Authorization": "Basic first-key"}):
-            answer = service.http.get("/v1/captures", headers=headers)
-            assert (answer.status_code, answer.headers["www-authenticate"]) == (401, "Bearer")
-        for key in ("first-key", "second-key"):
-            answer = service.http.get("/v1/captures", headers={"Authorization": f"Bearer {key}"})
-            assert answer.json() == {"captures": []}

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -18,6 +19,7 @@ from storage.database.engine import open_engine, writing
 from storage.records import api_keys
 from tests.end_to_end.captures.test_bad_input import check_problem
 from tests.end_to_end.conftest import Service, paused, png, serving
+from tests.services.cluster.clusters import wait
 
 HEADERS = {
     "content-security-policy",
@@ -30,6 +32,8 @@ TUS = {"Tus-Resumable": "1.0.0"}
 ZIP = {"Content-Type": "application/zip"}
 SCOPES = {"read": "read", "write": "write", "admin": "admin", "other": "write", "other's admin": "admin"}
 """Of the keys that are good; those of others are bob's, the rest alice's."""
+CONFIGURED = ("first-key", "second-key")
+"""Keys from the service's settings."""
 KINDS = ("none", "wrong", "revoked", *SCOPES)
 
 
@@ -161,7 +165,8 @@ def locked(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[L
             made[kind] = api_keys.create(c, kind, "bob" if kind.startswith("other") else "alice", scope)
         api_keys.revoke(c, "revoked")
     engine.dispose()
-    with serving(data) as service, Client(service.url, made["write"]) as alice:
+    settings = {"ENVMATTE_KEYS": ", ".join(CONFIGURED), "ENVMATTE_LOG_LEVEL": "DEBUG"}
+    with serving(data, **settings) as service, Client(service.url, made["write"]) as alice:
         capture = alice.upload(bundle)
         alice.wait(capture["job"])
         job = alice.wait(alice.recover(capture["id"])["id"])
@@ -224,6 +229,55 @@ def test_every_route_with_every_kind_of_key(locked: Locked) -> None:
             assert not told, (route, kind, "tells of alice's")
     assert wrong == []
     assert len(refused) > 4 * len(CALLS)
+
+
+def test_any_of_the_configured_keys_is_accepted(locked: Locked) -> None:
+    http = locked.service.http
+    assert http.get("/healthz").status_code == 200
+    for headers in ({}, {"Authorization": "Bearer wrong"}, {"Authorization": f"Basic {CONFIGURED[0]}"}):
+        answer = http.get("/v1/captures", headers=headers)
+        assert (answer.status_code, answer.headers["www-authenticate"]) == (401, "Bearer")
+    for key in CONFIGURED:
+        assert http.get("/v1/programs", headers=bearer(key)).json() == {"programs": []}
+
+
+def test_an_upload_needs_a_key(locked: Locked, bundle: Path) -> None:
+    for method in ("OPTIONS", "POST"):
+        answer = locked.service.http.request(method, "/v1/uploads", headers=TUS | {"Upload-Length": "1"})
+        check_problem(answer, 401, "unauthorized")
+    assert locked.service.client.upload(bundle)["state"] == "ingesting"
+
+
+def test_the_cluster_and_the_metrics_need_a_key(locked: Locked, bundle: Path) -> None:
+    """And the log of a service without tracing is text."""
+    service, key = locked.service, bearer(CONFIGURED[0])
+    for path in ("/v1/cluster", "/metrics"):
+        assert service.http.get(path).status_code == 401
+        assert service.http.get(path, headers=key).status_code == 200
+    job = service.client.upload(bundle)["job"]
+    service.client.wait(job)
+    log = service.data.parent / f"{service.data.name}.log"
+    wait(lambda: f"job={job} succeeded" in log.read_text())
+    text = log.read_text()
+    time_and_level = r"^[-\d]+ [:,\d]+ {}"
+    done = rf"{time_and_level.format('DEBUG')} services\.cluster\.task job={job} tile=0 done in"
+    ended = rf"{time_and_level.format('INFO')} services\.coordinator\.job_run job={job} succeeded"
+    assert re.search(done, text, re.MULTILINE)
+    assert re.search(ended, text, re.MULTILINE)
+    assert "opentelemetry" not in text
+
+
+def test_a_program_needs_a_key_except_for_its_page(locked: Locked) -> None:
+    http, key = locked.service.http, bearer(CONFIGURED[0])
+    asked = {"preset": "sketch", "monitor": {"width": 320, "height": 240}}
+    check_problem(http.post("/v1/programs", json=asked), 401, "unauthorized")
+    url = http.post("/v1/programs", json=asked, headers=key).headers["location"]
+    for rest in ("", "/program.json", "/patterns.zip", "/patterns.mp4", "/patterns/0.png"):
+        check_problem(http.get(url + rest), 401, "unauthorized")
+        assert http.get(url + rest, headers=key).status_code == 200
+    page = http.get(f"{url}/play")
+    assert page.headers["content-type"].startswith("text/html")
+    assert http.get(str(httpx2.URL(page.url).join("../../../web/play/play.js"))).status_code == 200
 
 
 def test_the_same_idempotency_key_is_another_owners_own(locked: Locked, bundle: Path) -> None:

@@ -1,8 +1,6 @@
 """What whoever watches a service is told: figures, the cluster, logs and traces, of real jobs."""
 
 import json
-import re
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime
@@ -213,24 +211,3 @@ def test_a_failure_is_seen_in_the_trace(watched: Watched) -> None:
 
 def _of(collector: Collector, job: str) -> list[Any]:
     return [span for span in list(collector.spans) if span.attributes.get("envmatte.job") == job]
-
-
-def test_keys_are_asked_for_by_the_cluster_and_by_the_figures(bundle: Path, tmp_path: Path) -> None:
-    """And in a service that is not asked for traces a caller's goes on all the same; its log is text."""
-    with serving(
-        tmp_path / "data", "--workers", "1", ENVMATTE_KEYS="a-key", ENVMATTE_LOG_LEVEL="DEBUG"
-    ) as service:
-        assert service.http.get("/v1/cluster").status_code == 401
-        assert service.http.get("/metrics").status_code == 401
-        assert service.http.get("/metrics", headers={"Authorization": "Bearer a-key"}).status_code == 200
-        job = service.client.upload(bundle)["job"]
-        service.client.wait(job)
-        end = time.monotonic() + 120
-        log = tmp_path / "data.log"
-        while "succeeded" not in log.read_text():
-            assert time.monotonic() < end
-            time.sleep(0.1)
-    text = log.read_text()
-    assert re.search(rf"^[-\d]+ [:,\d]+ DEBUG services\.step job={job} tile=0 done in", text, re.MULTILINE)
-    assert re.search(rf"^[-\d]+ [:,\d]+ INFO services\.drive job={job} succeeded", text, re.MULTILINE)
-    assert "opentelemetry" not in text

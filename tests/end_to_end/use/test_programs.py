@@ -6,13 +6,12 @@ import zipfile
 from pathlib import Path
 
 import av
-import httpx2
 import numpy as np
 import pytest
 from PIL import Image
 
 from tests.end_to_end.captures.test_bad_input import check_problem
-from tests.end_to_end.conftest import Service, serving
+from tests.end_to_end.conftest import Service
 from workflows.programs import video as program_video
 from workflows.programs.border import Border
 from workflows.programs.files import fitted, pictures, record
@@ -175,20 +174,6 @@ def test_a_deleted_program_is_gone_with_all_its_files(service: Service) -> None:
         check_problem(service.http.get(url + rest), 404, "not-found")
     check_problem(service.http.delete(url), 404, "not-found")
     assert service.http.post("/v1/programs", json=asked).headers["location"] == url
-
-
-def test_a_key_is_asked_for_but_for_the_page(tmp_path: Path) -> None:
-    with serving(tmp_path / "data", ENVMATTE_KEYS="secret") as locked:
-        key = {"Authorization": "Bearer secret"}
-        asked = {"preset": "sketch", "monitor": {"width": 320, "height": 240}}
-        check_problem(locked.http.post("/v1/programs", json=asked), 401, "unauthorized")
-        url = locked.http.post("/v1/programs", json=asked, headers=key).headers["location"]
-        for rest in ("", "/program.json", "/patterns.zip", "/patterns.mp4", "/patterns/0.png"):
-            check_problem(locked.http.get(url + rest), 401, "unauthorized")
-            assert locked.http.get(url + rest, headers=key).status_code == 200
-        page = locked.http.get(f"{url}/play")
-        assert page.headers["content-type"].startswith("text/html")
-        assert locked.http.get(str(httpx2.URL(page.url).join("../../../web/play.js"))).status_code == 200
 
 
 def test_the_display_has_the_monitor_inside(service: Service, program: dict) -> None:
