@@ -1,33 +1,35 @@
-"""`envmatte serve`: the API, a coordinator and the cluster in one process tree; and `envmatte coordinator` alone."""
+"""`envmatte serve`: the API, a coordinator and a cluster in one process tree; and `envmatte coordinator`."""
 
 import signal
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
 from sqlalchemy import Engine
 
 from services.cluster.connect import dispatcher_of
+from services.cluster.dask_config import configure_dask
 from services.coordinator.coordinator import Coordinator
 from services.runtime import tracing
-from services.runtime.logs import log
-from services.runtime.process import share_memory, sole_user
+from services.runtime.data_lock import lock_data
+from services.runtime.logs import configure_logging
+from services.runtime.malloc import limit_arenas
+from services.runtime.signals import exit_on_sigterm
 from services.settings import Settings
 from services.webhooks.sender import Sender
 from storage.database.engine import open_engine
 from storage.objects.store import Objects
 
 GRACE = 3
-"""Seconds that requests under way have to end when the service is asked to stop: an upload may take hours."""
+"""Seconds that requests under way get to finish when the service is asked to stop; an upload may take hours."""
 
 
 def serve(settings: Settings) -> None:
-    """Serve until interrupted; jobs under way go on at the next start, or with another coordinator.
+    """Serve until interrupted. Jobs under way continue at the next start, or with another coordinator.
 
     Raises
     ------
     Conflict
-        If another service has the data folder.
+        If another service uses the data folder.
     """
     # A coordinator alone needs none of these, and starts without them.
     import uvicorn
@@ -42,7 +44,7 @@ def serve(settings: Settings) -> None:
         require_keys_unless_loopback(settings, engine)
         app = build_app(settings, engine, objects)
         stack.callback(app.state.context.decoders.close)
-        # The port is taken before workers start, so that one in use is told at once.
+        # The port is bound before workers start, so that one in use is reported at once.
         config = uvicorn.Config(
             SecurityHeaders(app),
             settings.host,
@@ -55,8 +57,8 @@ def serve(settings: Settings) -> None:
         )
         socket = stack.enter_context(config.bind_socket())
         if settings.coordinate:
-            _drive(stack, settings, engine, objects)
-        socket.listen()  # from here on whoever connects is answered, if not yet at once
+            _run_jobs(stack, settings, engine, objects)
+        socket.listen()  # from here on connections are accepted, and answered soon
         host, port = socket.getsockname()[:2]
         where = settings.data if settings.alone else "jobs"
         print(f"envmatte serves {where} at http://{host}:{port}", flush=True)
@@ -64,15 +66,15 @@ def serve(settings: Settings) -> None:
 
 
 def coordinate(settings: Settings) -> None:
-    """Drive jobs, whenever no other coordinator does, until interrupted."""
+    """Run jobs while no other coordinator does, until interrupted."""
     with _opened(settings, "coordinator") as (stack, engine, objects):
-        _drive(stack, settings, engine, objects)
+        _run_jobs(stack, settings, engine, objects)
         print("envmatte coordinates", flush=True)
         signal.pause()
 
 
-def _drive(stack: ExitStack, settings: Settings, engine: Engine, objects: Objects) -> None:
-    """Drive jobs, and tell webhooks of them, until the stack is unwound."""
+def _run_jobs(stack: ExitStack, settings: Settings, engine: Engine, objects: Objects) -> None:
+    """Run jobs, and call webhooks about them, until the stack is closed."""
     dispatcher = stack.enter_context(dispatcher_of(settings))
     coordinator = stack.enter_context(Coordinator(settings, engine, objects, dispatcher))
     if settings.webhook_secret:
@@ -81,16 +83,17 @@ def _drive(stack: ExitStack, settings: Settings, engine: Engine, objects: Object
 
 @contextmanager
 def _opened(settings: Settings, role: str) -> Iterator[tuple[ExitStack, Engine, Objects]]:
-    """The database and the store, and a stack that is unwound before they are closed."""
-    # uvicorn raises the signal that stopped it once more at its end: what is open here must close before we go.
-    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))
-    share_memory()
-    log(settings.log, settings.log_level, role)
+    """Configure this process, and open the database and the store; the stack is closed before they are."""
+    # uvicorn raises the signal that stopped it again when it ends: everything open here must be closed first.
+    exit_on_sigterm()
+    limit_arenas()
+    configure_logging(settings.log, settings.log_level, role)
+    configure_dask()
     tracing.start(role)
     settings.data.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         if settings.alone:
-            stack.enter_context(sole_user(settings.data))
+            stack.enter_context(lock_data(settings.data))
         engine = open_engine(settings.database_url)
         stack.callback(engine.dispose)
         yield stack, engine, Objects(settings.store_url)

@@ -144,7 +144,7 @@ def restore(source: str, as_json: bool, **given: Any) -> None:
     Database and store may be of other kinds than those it was made of. Every byte is checked on its way. It comes whole
     or not at all; then `envmatte serve` goes on with the jobs that ran.
     """
-    from services.runtime.process import sole_user
+    from services.runtime.data_lock import lock_data
     from services.settings import Settings
     from storage.database import dialects
     from storage.errors import NotFound
@@ -159,7 +159,7 @@ def restore(source: str, as_json: bool, **given: Any) -> None:
         settings.data.mkdir(parents=True, exist_ok=True)
         engine = dialects.make_engine(settings.database_url)
         try:
-            with sole_user(settings.data) if settings.alone else nullcontext(), _shown("restore") as progress:
+            with lock_data(settings.data) if settings.alone else nullcontext(), _shown("restore") as progress:
                 came = restore(Objects(source), engine, Objects(settings.store_url), progress)
         finally:
             engine.dispose()

@@ -59,15 +59,16 @@ def serve(**given: Any) -> None:
 
     Every setting is an environment variable ENVMATTE_… too, and a line in .env; an option here wins.
     """
-    from services.cluster.connect import DECODING, PRELOAD, share_start
+    from services.cluster.dask_config import configure_dask
+    from services.cluster.forkserver import DECODING, PRELOAD, start_forkserver
     from services.settings import Settings
 
     with refusals_told():
         settings = Settings(**given_of(given))
         own = settings.coordinate and settings.cluster is None  # a cluster, whose workers are this process's
-        share_start(
-            DECODING, *([PRELOAD] if own else [])
-        )  # at the same time as this process imports the rest
+        configure_dask()  # which says how processes are started
+        # At the same time as this process imports the rest.
+        start_forkserver(DECODING, *([PRELOAD] if own else []))
         from services.server import serve as run
 
         run(settings)

@@ -1,46 +1,47 @@
-"""`envmatte scheduler`: the dask scheduler of a cluster, which hands tasks to workers and keeps nothing."""
+"""`envmatte scheduler`: the dask scheduler of a cluster, which hands tasks to workers and stores nothing."""
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 from distributed import Scheduler
 
-from services.cluster.connect import SCHEDULER
+from services.cluster.dask_config import SCHEDULER, configure_dask
 from services.runtime.addresses import is_loopback
 from services.runtime.certificates import security_of
-from services.runtime.logs import log
-from services.runtime.process import keep_open
+from services.runtime.logs import configure_logging
+from services.runtime.signals import run_until_signal
 from services.settings import ClusterSettings
 from storage.errors import Conflict, InvalidInput
 
 
 def schedule(settings: ClusterSettings, host: str, port: int) -> None:
-    """Schedule until SIGTERM; prints the address as soon as it listens there.
+    """Run a scheduler until SIGTERM; prints its address as soon as it listens.
 
     Parameters
     ----------
     settings : ClusterSettings
-        Of which the certificates count. Without any there is no TLS.
+        Only the certificates are used. Without any there is no TLS.
     host : str
         Address to listen on.
     port : int
-        0 takes a free one.
+        Port to listen on; 0 takes a free one.
 
     Raises
     ------
     InvalidInput
-        If it should listen on other than loopback without certificates, or they can't be used.
+        If it would listen beyond loopback without certificates, or they can't be used.
     Conflict
         If it can't listen there.
     KeyboardInterrupt
         At SIGINT.
     """
-    log(settings.log, settings.log_level, "scheduler")
+    configure_logging(settings.log, settings.log_level, "scheduler")
+    configure_dask()
     certs = settings.certificates
     if certs is None and not is_loopback(host):
         raise InvalidInput(
-            f"asked to listen on {host} without TLS, where whoever reaches it may run what he likes: make certificates "
-            "with `envmatte certs DIR`, give every process of the cluster a copy with --certs, or listen on 127.0.0.1"
+            f"without TLS, anyone who reaches {host} could run arbitrary code on the cluster. Make certificates with "
+            "`envmatte certs DIR` and give every process of the cluster a copy with --certs, or listen on 127.0.0.1"
         )
     security = security_of(certs) if certs else None
 
@@ -64,4 +65,4 @@ def schedule(settings: ClusterSettings, host: str, port: int) -> None:
         finally:
             await running.close()
 
-    keep_open(scheduler())
+    run_until_signal(scheduler())

@@ -13,10 +13,12 @@ from urllib.parse import urlsplit
 from distributed import Nanny
 from distributed.security import Security
 
-from services.cluster.connect import NO_DASHBOARD, PRELOAD, START, reach, share_start
+from services.cluster.connect import reach
+from services.cluster.dask_config import NO_DASHBOARD, configure_dask
+from services.cluster.forkserver import PRELOAD, START, start_forkserver
 from services.runtime.addresses import is_loopback
-from services.runtime.logs import log
-from services.runtime.process import keep_open
+from services.runtime.logs import configure_logging
+from services.runtime.signals import run_until_signal
 from services.settings import ClusterSettings
 from storage.errors import InvalidInput
 
@@ -44,7 +46,8 @@ def work(settings: ClusterSettings, host: str | None) -> None:
     KeyboardInterrupt
         At SIGINT.
     """
-    log(settings.log, settings.log_level, "nanny")
+    configure_logging(settings.log, settings.log_level, "nanny")
+    configure_dask()
     if settings.cluster is None:
         raise InvalidInput(
             "name the scheduler to work for with --cluster tls://HOST:PORT, or ENVMATTE_CLUSTER"
@@ -55,8 +58,8 @@ def work(settings: ClusterSettings, host: str | None) -> None:
             f"asked to listen on {host} without TLS, where whoever reaches it may run what he likes: name a scheduler "
             "that speaks TLS with --cluster tls://HOST:PORT, or listen on 127.0.0.1"
         )
-    share_start(PRELOAD)
-    keep_open(_Workers(settings.cluster, security, settings, host).running())
+    start_forkserver(PRELOAD)
+    run_until_signal(_Workers(settings.cluster, security, settings, host).running())
 
 
 class _Workers:

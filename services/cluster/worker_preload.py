@@ -19,8 +19,8 @@ import workflows.ingest.steps
 import workflows.mattes.steps  # noqa: F401
 from services.cluster.task import read_key
 from services.runtime import tracing
-from services.runtime.logs import about, log_as_nanny_does
-from services.runtime.process import share_memory
+from services.runtime.logs import about, configure_worker_logging
+from services.runtime.malloc import limit_arenas
 
 logger = logging.getLogger(__name__)
 
@@ -35,8 +35,8 @@ NICE = 10
 def dask_setup(worker: Worker) -> None:
     """Log and trace, and watch for tasks that nobody wants any more while they run."""
     os.nice(NICE)  # of this thread, and those that it starts
-    share_memory()
-    log_as_nanny_does()
+    limit_arenas()
+    configure_worker_logging()
     tracing.start("worker")
     since: dict[str, float] = {}
 

@@ -1,4 +1,4 @@
-"""Logs of every process, as text or JSON, with the job and tile that a line is about."""
+"""Logs of every process, as text or JSON, with the job and the tile that a line is about."""
 
 import logging
 import os
@@ -13,75 +13,75 @@ import dask
 from pythonjsonlogger.core import RESERVED_ATTRS
 from pythonjsonlogger.json import JsonFormatter
 
-from services.runtime.process import logger
 from storage.steps import step_name
 
+logger = logging.getLogger(__name__)
+
 TEXT = "%(asctime)s %(levelname)s %(name)s %(about)s%(message)s"
-
-
+"""Format of a line of text."""
 LEVELS = logging.getLevelNamesMapping()
-
-
-FLOORS = ("services", "workflows", "storage")
-
-
+PACKAGES = ("services", "workflows", "storage")
+"""Our own, which log from the level that is set; other libraries from INFO at the lowest."""
 FIELDS = {"levelname": "level", "name": "logger", "message": "message"}
-
+"""Attributes of a log record in JSON, and what they are called there."""
 
 _about: ContextVar[dict[str, str | int] | None] = ContextVar("about", default=None)
 
 
 @contextmanager
 def about(job: str, tile: int | None = None) -> Iterator[None]:
-    """What is logged inside is about a job, or about a tile or a step of it, and says so."""
-    found: dict[str, str | int] = {"job": job}
+    """Mark all lines logged inside as being about a job, or about a tile or a step of it."""
+    fields: dict[str, str | int] = {"job": job}
     if tile is not None:
-        found |= {"tile": tile} if tile >= 0 else {"step": step_name(tile)}
-    token = _about.set(found)
+        fields |= {"tile": tile} if tile >= 0 else {"step": step_name(tile)}
+    token = _about.set(fields)
     try:
         yield
     finally:
         _about.reset(token)
 
 
-def log(form: str, level: str, role: str) -> None:
-    """Log to stderr; of dask only what somebody has to know. The workers that this process starts do the same.
+def configure_logging(form: str, level: str, role: str) -> None:
+    """Log to stderr, in this process and in the workers that it starts.
 
     Parameters
     ----------
     form : str
-        ``text``, or ``json`` for an object a line: ``time`` (RFC 3339), ``level``, ``logger``, ``message``,
-        ``process``, ``pid``, ``exception`` if there is one, and ``job``, ``tile``, ``step`` where it is `about` one.
+        ``text``, or ``json`` for one object per line: ``time`` (RFC 3339), ``level``, ``logger``, ``message``,
+        ``process``, ``pid``, ``exception`` if there is one, and ``job``, ``tile``, ``step`` if the line is `about` one.
     level : str
-        The lowest that is logged: ``DEBUG``, ``INFO``, ``WARNING``, ``ERROR``.
+        The lowest level that is logged: ``DEBUG``, ``INFO``, ``WARNING``, ``ERROR``.
     role : str
         What kind of process this is.
     """
     handler = logging.StreamHandler()
     handler.addFilter(_add_about)
     handler.setFormatter(_json(role) if form == "json" else logging.Formatter(TEXT))
-    # Of others no more than before: numba alone has a hundred thousand lines about compiling a kernel.
+    # Libraries log from INFO at the lowest: numba alone has a hundred thousand debug lines about compiling a kernel.
     logging.basicConfig(level=max(logging.INFO, LEVELS[level]), handlers=[handler], force=True)
-    for floor in FLOORS:
-        logging.getLogger(floor).setLevel(LEVELS[level])
+    for package in PACKAGES:
+        logging.getLogger(package).setLevel(LEVELS[level])
     logging.captureWarnings(True)
     for name, one in logging.root.manager.loggerDict.items():
-        # dask gives these handlers of their own as soon as it is imported.
+        # On import dask gives these loggers handlers of their own.
         if isinstance(one, logging.Logger) and name.partition(".")[0] in ("distributed", "tornado", "bokeh"):
             one.handlers = [h for h in one.handlers if not isinstance(h, logging.StreamHandler)]
             one.propagate = True
     logging.getLogger("distributed").setLevel(max(logging.WARNING, LEVELS[level]))
-    sys.excepthook = _ended_by
+    logging.getLogger("alembic").setLevel(logging.WARNING)  # it has an INFO line for every step
+    sys.excepthook = _log_uncaught
     threading.excepthook = lambda args: logger.critical(
         "thread %s ended by an error", args.thread, exc_info=args.exc_value
     )
-    # A nanny hands the configuration of dask on to its worker process.
+    # A nanny passes dask's configuration on to its worker process.
     dask.config.set({"envmatte.log": form, "envmatte.log-level": level})
 
 
-def log_as_nanny_does() -> None:
-    """Log in a worker process as the process that started it."""
-    log(dask.config.get("envmatte.log", "text"), dask.config.get("envmatte.log-level", "INFO"), "worker")
+def configure_worker_logging() -> None:
+    """Log in a worker process as the process that started it does."""
+    configure_logging(
+        dask.config.get("envmatte.log", "text"), dask.config.get("envmatte.log-level", "INFO"), "worker"
+    )
 
 
 def _json(role: str) -> logging.Formatter:
@@ -95,13 +95,13 @@ def _json(role: str) -> logging.Formatter:
 
 
 def _add_about(record: logging.LogRecord) -> bool:
-    found = _about.get() or {}
-    record.__dict__ |= found
-    record.about = "".join(f"{name}={value} " for name, value in found.items())
+    fields = _about.get() or {}
+    record.__dict__ |= fields
+    record.about = "".join(f"{name}={value} " for name, value in fields.items())
     return True
 
 
-def _ended_by(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+def _log_uncaught(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
     if isinstance(error, Exception):
         logger.critical("ended by an error", exc_info=(kind, error, trace))
     else:

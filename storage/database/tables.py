@@ -1,7 +1,5 @@
 """The database: its tables, and the engine that opens it."""
 
-import logging
-
 from sqlalchemy import (
     JSON,
     BigInteger,
@@ -20,9 +18,6 @@ from sqlalchemy import (
 from storage.database import owners
 
 metadata = MetaData()
-logging.getLogger("alembic").setLevel(
-    logging.WARNING
-)  # else it has a line for every step, from its import on
 
 
 def _owner() -> Column[str]:

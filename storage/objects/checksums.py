@@ -172,5 +172,7 @@ class _Named(BatchedCodecPipeline):
             raise damaged(batch[0][0].path) from error
 
 
-register_pipeline(_Named)
-zarr.config.set({"codec_pipeline.path": f"{_Named.__module__}.{_Named.__qualname__}"})
+def configure_zarr() -> None:
+    """Have zarr report chunks that can't be read by name, in this process: opening a store does it."""
+    register_pipeline(_Named)
+    zarr.config.set({"codec_pipeline.path": f"{_Named.__module__}.{_Named.__qualname__}"})

@@ -75,6 +75,7 @@ class Objects:
     """
 
     def __init__(self, url: str) -> None:
+        checksums.configure_zarr()
         self.url = url
         self._store: ObjectStore
         self._folder: Path | None = None

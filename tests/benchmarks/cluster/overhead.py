@@ -21,6 +21,7 @@ import psutil
 from sqlalchemy import Connection, event
 
 from services.cluster.connect import connect
+from services.cluster.dask_config import configure_dask
 from services.cluster.dispatcher import Dispatcher
 from services.coordinator.coordinator import Coordinator
 from services.settings import Settings
@@ -70,6 +71,7 @@ def measure(tiles: int, seconds: float, workers: int, threads: int) -> dict[str,
 
         event.listen(engine, "commit", count)
         objects = Objects(settings.store_url)
+        configure_dask()
         simulated.register()
         dispatcher = stack.enter_context(Dispatcher(partial(connect, at, None), settings.store_url))
         while dispatcher.threads < workers * threads:

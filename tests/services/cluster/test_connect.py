@@ -19,7 +19,8 @@ from distributed.comm import connect as open_comm
 from distributed.scheduler import KilledWorker
 from distributed.security import Security
 
-from services.cluster.connect import connect, embedded
+from services.cluster.connect import connect
+from services.cluster.embedded import embedded
 from services.runtime import certificates
 from services.settings import Settings
 from storage.errors import Unavailable

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from distributed import Client, LocalCluster
 
-from services.cluster.connect import Scale, embedded
 from services.cluster.dispatcher import Dispatcher, Flight, Outcome, _blamed
+from services.cluster.embedded import embedded
 from services.cluster.task import key_of, read_key
 from services.settings import Settings
 from storage.errors import Unavailable
@@ -32,28 +32,6 @@ def test_of_what_a_dead_worker_had_the_first_is_to_blame() -> None:
         Outcome("a", 3, died="two", starved=True),
         Outcome("b", 4),
     ]
-
-
-def test_a_cluster_has_as_many_workers_as_are_of_use(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = 0.0
-    monkeypatch.setattr(time, "monotonic", lambda: now)
-    asked: list[int] = []
-    scale = Scale(asked.append, 4)
-    scale(0)
-    now = 400.0
-    scale(0)
-    scale(0)
-    assert asked == [1]
-    scale(3)
-    scale(2)
-    scale(100)
-    assert asked == [1, 3, 4]
-    now = 600.0
-    scale(0)
-    assert asked == [1, 3, 4]
-    now = 701.0
-    scale(0)
-    assert asked == [1, 3, 4, 1]
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from tests.services.runtime.collector import Collector, collecting
 CALLER = "00-0123456789abcdef0123456789abcdef-0123456789abcdef-01"
 REQUEST = f"""
     import asyncio, sys
-    from services import tracing
+    from services.runtime import tracing
     tracing.start("service")
     asked = []
 
@@ -114,7 +114,7 @@ def test_a_job_that_is_tried_again_goes_on_in_the_trace_of_who_asks_for_it(tmp_p
 def spans(collector: Collector, parent: str | None = None, **environment: str) -> list[str]:
     run(
         f"""
-        from services import tracing
+        from services.runtime import tracing
         tracing.start("worker")
         for tile in range(20):
             with tracing.span("recover tile", {parent!r}, job="a-job", tile=tile):
@@ -136,7 +136,7 @@ def test_a_sampler_is_honoured() -> None:
 def test_a_collector_that_is_gone_holds_nothing_up() -> None:
     printed = run(
         f"""
-        from services import tracing
+        from services.runtime import tracing
         tracing.start("worker")
         for tile in range(5000):
             with tracing.span("recover tile", {CALLER!r}, tile=tile):
@@ -161,7 +161,7 @@ def test_time_waited_is_a_span() -> None:
     with collecting() as collector:
         run(
             f"""
-            from services import tracing
+            from services.runtime import tracing
             tracing.start("service")
             tracing.waited("queue", {CALLER!r}, {begin!r}, {begin + 2!r}, job="a-job")
             """,

@@ -1,4 +1,4 @@
-"""What a process of the service does to itself."""
+"""Pools of memory that threads of a process share."""
 
 import subprocess
 import sys
@@ -7,9 +7,9 @@ import pytest
 
 ARENAS = """
 import ctypes, io, os, re, sys, threading
-from services.runtime.process import ARENAS, share_memory
+from services.runtime.malloc import ARENAS, limit_arenas
 
-share_memory()
+limit_arenas()
 together = threading.Barrier(16)
 
 def work() -> None:
@@ -27,11 +27,11 @@ libc.fdopen.restype = ctypes.c_void_p
 stream = ctypes.c_void_p(libc.fdopen(write, b"w"))
 libc.malloc_info(0, stream)
 libc.fclose(stream)
-told = os.fdopen(read).read()
-assert len(re.findall("<heap nr", told)) <= ARENAS, told
+report = os.fdopen(read).read()
+assert len(re.findall("<heap nr", report)) <= ARENAS, report
 """
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="it is glibc that is told")
+@pytest.mark.skipif(sys.platform != "linux", reason="glibc only")
 def test_threads_share_a_few_pools_of_memory() -> None:
     subprocess.run([sys.executable, "-c", ARENAS], check=True, timeout=120)

@@ -1,0 +1,65 @@
+"""How dask is configured in every process of a cluster, and the arguments of its schedulers and workers."""
+
+from typing import Any
+
+import dask
+from distributed import Scheduler
+from distributed.scheduler import DEFAULT_EXTENSIONS
+
+CONFIG: dict[str, Any] = {
+    # A tile of an innocent job must not be blamed for the workers that died with it: the ledger counts its losses.
+    "distributed.scheduler.allowed-failures": 0,
+    # After this long without a sign of life a worker is given up, and its tiles go to others.
+    "distributed.scheduler.worker-ttl": "30 s",
+    # A nanny restarts its worker however long that takes; the embedded cluster would close it for good meanwhile.
+    "distributed.deploy.lost-worker-timeout": "365 days",
+    # Results are numbers: there is nothing to spill. A pause would not help a worker that is short of memory, and it
+    # would keep the tiles that it was given for ever; it is ended and restarted instead.
+    "distributed.worker.memory.target": False,
+    "distributed.worker.memory.spill": False,
+    "distributed.worker.memory.pause": False,
+    "distributed.worker.memory.terminate": 0.95,
+    "distributed.worker.multiprocessing-method": "forkserver",
+    # The last messages of every connection and the last bursts of tasks, which nothing reads; a thousand by default.
+    "distributed.admin.low-level-log-length": 100,
+    "distributed.diagnostics.computations.max-history": 10,
+    # Stacks sampled every 10 ms, which nothing reads either, and the lag of the event loop measured every 20 ms: two
+    # thirds of what an idle service takes.
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "1 s",
+    "distributed.admin.system-monitor.interval": "2 s",
+    "distributed.comm.timeouts.connect": "10 s",
+    "distributed.comm.timeouts.tcp": "15 s",
+    # Every scheduler and worker has an HTTP server, which can't be turned off and has no TLS: it serves nothing, and
+    # listens on loopback only, see `NO_DASHBOARD`.
+    "distributed.scheduler.http.routes": [],
+    "distributed.worker.http.routes": [],
+}
+NO_DASHBOARD: dict[str, Any] = {"dashboard": False, "dashboard_address": "127.0.0.1:0"}
+"""Arguments of every scheduler and worker."""
+
+
+class _NoSpans:
+    """In place of the scheduler's extension for spans, which keeps a record of every burst of tasks for ever.
+
+    Workers count by span too, and so by a single one.
+    """
+
+    def __init__(self, scheduler: Scheduler) -> None:
+        pass
+
+    def observe_tasks(self, *tasks: object, **about: object) -> dict[str, Any]:
+        """Put tasks into no span, and change none of their annotations."""
+        return {}
+
+    def heartbeat(self, worker: object, data: object) -> None:
+        """Ignore what a worker has counted."""
+
+
+SCHEDULER: dict[str, Any] = NO_DASHBOARD | {"extensions": DEFAULT_EXTENSIONS | {"spans": _NoSpans}}
+"""Arguments of every scheduler."""
+
+
+def configure_dask() -> None:
+    """Configure dask in this process, before it has a client, a scheduler or a nanny; nannies pass it on to workers."""
+    dask.config.set(CONFIG)
