@@ -13,13 +13,22 @@ from PIL import Image
 from playwright.sync_api import Page, expect
 
 from tests.end_to_end.conftest import Service, serving
-from workflows.programs import border as program_border
+from workflows.programs.border import (
+    LEAD,
+    MAX_PATTERNS,
+    Border,
+    draw_border,
+    number_cells,
+    read_numbers,
+    schedule,
+    tick_cells,
+)
 from workflows.programs.files import pictures
 from workflows.programs.program import Program
 
 SCREEN = {"width": 640, "height": 360}
 DISPLAYS = [(640, 360), (1920, 1080), (1080, 1920), (3440, 1440), (161, 121), (90, 60), (200, 5000)]
-NUMBERS = [program_border.LEAD, 0, 1, 62, 63, 64, 1023, program_border.MOST - 1]
+NUMBERS = [LEAD, 0, 1, 62, 63, 64, 1023, MAX_PATTERNS - 1]
 
 
 def posted(service: Service, **asked: Any) -> dict[str, Any]:
@@ -71,16 +80,16 @@ def test_page_has_the_rules_of_the_border(tab: Page, service: Service) -> None:
     )
     for (width, height), found in zip(DISPLAYS, rules["borders"], strict=True):
         try:
-            border = program_border.Border(width=width, height=height)
+            border = Border(width=width, height=height)
         except ValueError:
             assert not found["fits"]
             continue
         assert found["fits"]
         for name in ("inner", "top", "bottom", "left", "right"):
             assert np.array_equal(found[name], getattr(border, name))
-    assert np.array_equal(rules["codes"], [program_border.code(number) for number in NUMBERS])
-    assert np.array_equal(rules["ticks"], [program_border.tick(number) for number in NUMBERS])
-    expected = [(step.seconds, step.number, step.white) for step in program_border.schedule(7, 4)]
+    assert np.array_equal(rules["codes"], [number_cells(number) for number in NUMBERS])
+    assert np.array_equal(rules["ticks"], [tick_cells(number) for number in NUMBERS])
+    expected = [(step.seconds, step.number, step.white) for step in schedule(7, 4)]
     assert [(step["seconds"], step["number"], step["white"]) for step in rules["schedule"]] == expected
 
 
@@ -88,15 +97,15 @@ def test_page_draws_the_border(tab: Page, service: Service) -> None:
     program = posted(service)
     go(tab, service, program)
     shown = Program.model_validate(program["program"])
-    border = program_border.Border(**SCREEN)
+    border = Border(**SCREEN)
     for white in (False, True):
         level = np.full((1, 1, 3), 255 * white, np.uint8)
-        np.testing.assert_array_equal(drawn(tab, program, -1, white), program_border.draw(level, -1, border))
+        np.testing.assert_array_equal(drawn(tab, program, -1, white), draw_border(level, -1, border))
     every = list(pictures(shown))
     for number in (0, 6, 20, 31):
         picture = np.broadcast_to(every[number], (*every[number].shape[:2], 3))
         np.testing.assert_array_equal(
-            drawn(tab, program, number, False), program_border.draw(picture, number, border)
+            drawn(tab, program, number, False), draw_border(picture, number, border)
         )
 
 
@@ -120,26 +129,26 @@ def test_every_pattern_is_shown_in_order_for_its_time(tab: Page, service: Servic
             };
             requestAnimationFrame(look);
         }""",
-        program_border.Border(**SCREEN).top,
+        Border(**SCREEN).top,
     )
     tab.get_by_label("Patterns a second").fill("10")
     tab.get_by_role("button", name="full screen").press("Enter")
     played = tab.evaluate("window.played")
     seen = tab.evaluate("window.seen")
     refresh = played["refresh"]
-    steps = program_border.schedule(32, 10)
+    steps = schedule(32, 10)
     assert [(s["number"], s["white"]) for s in played["shown"]] == [(s.number, s.white) for s in steps]
 
     # The pattern numbers as the reader of the border sees them, and black and white of the lead-in.
-    numbers, certain = program_border.read(np.array([cells for *_, cells in seen], float))
+    numbers, certain = read_numbers(np.array([cells for *_, cells in seen], float))
     at = np.array([now for now, *_ in seen])
     states = [
-        (int(number), middle > 127 if number == program_border.LEAD else None)
+        (int(number), middle > 127 if number == LEAD else None)
         for number, (_, middle, _), sure in zip(numbers, seen, certain, strict=True)
         if sure
     ]
     times = at[certain]
-    expected = [(s.number, s.white if s.number == program_border.LEAD else None) for s in steps]
+    expected = [(s.number, s.white if s.number == LEAD else None) for s in steps]
     runs = [(state, [i for i, _ in group]) for state, group in groupby(enumerate(states), key=lambda e: e[1])]
     assert [state for state, _ in runs] == expected
     # Each step lasts its number of refreshes, to within one; frames that this machine missed are accounted for.

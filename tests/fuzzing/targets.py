@@ -43,7 +43,9 @@ from workflows.composite.video import steps as video_steps
 from workflows.images import camera_raw, decode, float_formats, integer_formats
 from workflows.ingest import steps as ingest_steps
 from workflows.ingest.archive import CaptureArchive
-from workflows.ingest.video.decoder import PARTS, Share, opened
+from workflows.ingest.video.decoder import open_clip
+from workflows.ingest.video.frame_means import TOTAL_WEIGHT, Share, mean_frames
+from workflows.ingest.video.signatures import take_signatures
 from workflows.jobs import Task
 from workflows.mattes.imports.importing import take_in
 from workflows.mattes.options import parse_options
@@ -267,16 +269,16 @@ def damaged_film(random: Random, data: bytes) -> bytes:
 
 def read_clip(data: bytes, folder: Path) -> None:
     def clip() -> Any:
-        return opened(io.BytesIO(data), "a.mp4", LIMITS.image)
+        return open_clip(io.BytesIO(data), "a.mp4", LIMITS.image)
 
     with clip() as found:
         ticks, _ = found.ticks(2000)
     assert (np.diff(ticks) > 0).all()
     with clip() as found:
-        signatures, again, large = found.signatures(1 << 20, 0.1)
+        signatures, again, large = take_signatures(found, 1 << 20, 0.1)
     assert len(signatures) == len(again) >= len(large.frames)
     with clip() as found:
-        for picture in found.means([[Share(tick, PARTS)] for tick in ticks[:5].tolist()]):
+        for picture in mean_frames(found, [[Share(tick, TOTAL_WEIGHT)] for tick in ticks[:5].tolist()]):
             assert picture.shape == (found.height, found.width, 3)
             assert picture.nbytes <= LIMITS.image
 

@@ -21,9 +21,11 @@ from workflows.ingest.manifest import MANIFEST
 from workflows.ingest.report.calibration import measure
 from workflows.ingest.report.survey import survey
 from workflows.ingest.video.border_reader import LOOKS
-from workflows.ingest.video.decoder import Share, opened
-from workflows.ingest.video.matching import MOST_PATTERNS, Sorted, sort
+from workflows.ingest.video.decoder import open_clip
+from workflows.ingest.video.frame_means import Share, mean_frames
+from workflows.ingest.video.matching import MAX_PATTERNS, MatchedFrames, match_frames
 from workflows.ingest.video.resemblance import lay_out
+from workflows.ingest.video.signatures import take_signatures
 from workflows.jobs import Steps, Task
 from workflows.programs.program import Images
 from workflows.untrusted.decoder_guard import Guard
@@ -114,7 +116,7 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
 
 def _look(
     archive: CaptureArchive, patterns: Sequence[NDArray[np.float32]], limits: Limits
-) -> tuple[tuple[int, int, int, int], stills.Storage, Sorted | None]:
+) -> tuple[tuple[int, int, int, int], stills.Storage, MatchedFrames | None]:
     """The shape of the stack and how it is stored, and of a video which of its frames show what."""
     manifest = archive.manifest
     if manifest.video is None:
@@ -123,21 +125,21 @@ def _look(
         shape = len(manifest.frames), height, width, channels
         return shape, stills.storage_of(archive, first, limits), None
     program, entry = manifest.program, manifest.video.file
-    if program.count > MOST_PATTERNS:
+    if program.count > MAX_PATTERNS:
         raise CaptureError(
-            f"{entry} shows {program.count} patterns, more than the {MOST_PATTERNS} that are told apart in a video: "
+            f"{entry} shows {program.count} patterns, more than the {MAX_PATTERNS} that are told apart in a video: "
             "send frames, or show fewer",
             entry=entry,
-            limit=MOST_PATTERNS,
+            limit=MAX_PATTERNS,
         )
     curve = "srgb" if program.monitor.response == "unknown" else program.monitor.response
     light = lay_out(program, curve, patterns)
-    with archive.open(entry) as file, opened(file, entry, limits.image) as clip:
+    with archive.open(entry) as file, open_clip(file, entry, limits.image) as clip:
         border, rate = manifest.video.border, manifest.video.patterns_per_second
-        signatures, ticks, large = clip.signatures(
-            limits.memory // 4, math.inf if border is None else 1 / (LOOKS * rate)
+        signatures, ticks, large = take_signatures(
+            clip, limits.memory // 4, math.inf if border is None else 1 / (LOOKS * rate)
         )
-        filmed = sort(
+        filmed = match_frames(
             signatures,
             ticks,
             clip.tick,
@@ -197,8 +199,8 @@ def _pixels(
     if video is not None:
         shares = stack.shares()
         plan = [[Share(*row) for row in shares[shares[:, 0] == n, 1:].tolist()] for n in range(first, last)]
-        with archive.open(video.file) as file, opened(file, video.file, limits.image) as clip:
-            yield from clip.means(plan)
+        with archive.open(video.file) as file, open_clip(file, video.file, limits.image) as clip:
+            yield from mean_frames(clip, plan)
         return
     shape = (stack.height, stack.width, stack.channels)
     storage = stills.Storage(stack.dtype, **stack.attributes["storage"])

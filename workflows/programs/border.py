@@ -34,7 +34,7 @@ from storage.errors import OptionError
 from workflows.programs.parts import Record
 
 BITS = 12
-MOST = 2**BITS - 1
+MAX_PATTERNS = 2**BITS - 1
 """Patterns that can be numbered: code 0 is the lead's."""
 TICKS = 8
 """Times that the tick is repeated along each side."""
@@ -169,9 +169,10 @@ def schedule(count: int, rate: float) -> list[Step]:
     OptionError
         If there are more patterns than can be numbered.
     """
-    if count > MOST:
+    if count > MAX_PATTERNS:
         raise OptionError(
-            f"{count} patterns: a film may have {MOST}, show some of them in another one", limit=MOST
+            f"{count} patterns: a film may have {MAX_PATTERNS}, show some of them in another one",
+            limit=MAX_PATTERNS,
         )
     end = sum(LEAD_SECONDS)
     patterns = [Step(end + n / rate, 1 / rate, n) for n in range(count)]
@@ -184,7 +185,7 @@ def _lead(start: float) -> Iterator[Step]:
         start += seconds
 
 
-def code(number: int) -> NDArray[np.bool_]:
+def number_cells(number: int) -> NDArray[np.bool_]:
     """Which cells along the top and the bottom are lit for a pattern, (2 (BITS + 1),) bool.
 
     Notes
@@ -198,7 +199,7 @@ def code(number: int) -> NDArray[np.bool_]:
     return _pairs([*bits, sum(bits) & 1])
 
 
-def tick(number: int) -> NDArray[np.bool_]:
+def tick_cells(number: int) -> NDArray[np.bool_]:
     """Which cells along each side are lit for a pattern, (2 TICKS,) bool: is number + 1 odd?"""
     return _pairs([(number + 1) & 1] * TICKS)
 
@@ -208,7 +209,7 @@ def _pairs(bits: list[int]) -> NDArray[np.bool_]:
     return np.stack([lit, ~lit], axis=1).ravel()
 
 
-def draw(picture: NDArray[np.uint8], number: int, border: Border) -> NDArray[np.uint8]:
+def draw_border(picture: NDArray[np.uint8], number: int, border: Border) -> NDArray[np.uint8]:
     """A picture on the display with its border.
 
     Parameters
@@ -230,12 +231,12 @@ def draw(picture: NDArray[np.uint8], number: int, border: Border) -> NDArray[np.
         np.arange(width) * picture.shape[1] // width,
     )
     shown[y : y + height, x : x + width] = picture[rows[:, None], columns]
-    number_cells, tick_cells = code(number), tick(number)
+    along, beside = number_cells(number), tick_cells(number)
     for boxes, lit in (
-        (border.top, number_cells),
-        (border.bottom, number_cells),
-        (border.left, tick_cells),
-        (border.right, tick_cells),
+        (border.top, along),
+        (border.bottom, along),
+        (border.left, beside),
+        (border.right, beside),
     ):
         for i in np.flatnonzero(lit):
             left, top, across, down = boxes[i]
@@ -243,7 +244,7 @@ def draw(picture: NDArray[np.uint8], number: int, border: Border) -> NDArray[np.
     return shown
 
 
-def read(light: NDArray[np.floating]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+def read_numbers(light: NDArray[np.floating]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """The patterns' numbers from the cells along an edge, as a camera saw them.
 
     Parameters

@@ -15,7 +15,7 @@ from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTr
 from numpy.typing import NDArray
 
 from storage.errors import OptionError
-from workflows.programs.border import LEAD, Border, draw, schedule
+from workflows.programs.border import LEAD, Border, draw_border, schedule
 from workflows.programs.files import pictures, record
 from workflows.programs.program import Program
 
@@ -120,7 +120,7 @@ def encode(
         for n, step in enumerate(steps):
             level = np.full((1, 1, 1), 255 * step.white, np.uint8)
             picture = level if step.number == LEAD else next(shown)
-            frame = _frame(draw(picture, step.number, border))
+            frame = _frame(draw_border(picture, step.number, border))
             for _ in range(max(round(step.seconds * frame_rate), 1)):
                 frame.pts = at
                 video.mux(stream.encode(frame))

@@ -26,7 +26,7 @@ from storage.database.tables import programs as table
 from storage.errors import NotFound, OptionError
 from storage.records import programs
 from workflows.programs import video
-from workflows.programs.border import MOST, Border
+from workflows.programs.border import MAX_PATTERNS, Border
 from workflows.programs.files import archive, fitted, pictures, png, record
 from workflows.programs.parts import Monitor
 from workflows.programs.preset_names import PRESETS
@@ -89,7 +89,7 @@ class Told(BaseModel):
     phase: Literal["countdown", "showing", "shown", "stopped"]
     patterns_per_second: float = Field(ge=0.01, le=120)
     seconds: float = Field(0, ge=0, le=3600, description="Until the first pattern comes.")
-    shown: int = Field(0, ge=0, le=MOST, description="Patterns that have been shown.")
+    shown: int = Field(0, ge=0, le=MAX_PATTERNS, description="Patterns that have been shown.")
     border: Size | None = Field(
         None,
         description="The display's pixels, once they are known: with it, the film's capture.json is complete.",
@@ -277,7 +277,7 @@ def get_page(id: str) -> FileResponse:
 def _see_that_it_is_small(shown: Shown) -> None:
     pixels = shown.monitor.width * shown.monitor.height
     for much, what, limit in (
-        (shown.count, "patterns", MOST),
+        (shown.count, "patterns", MAX_PATTERNS),
         (pixels, "pixels of the monitor", MOST_PIXELS),
         (pixels * shown.count, "pixels of all patterns together", MOST_WORK),
     ):

@@ -9,19 +9,31 @@ from pydantic import ValidationError
 from scipy.ndimage import gaussian_filter
 
 from storage.errors import OptionError
-from workflows.programs.border import BITS, LEAD, MOST, Border, Box, Step, code, draw, read, schedule, tick
+from workflows.programs.border import (
+    BITS,
+    LEAD,
+    MAX_PATTERNS,
+    Border,
+    Box,
+    Step,
+    draw_border,
+    number_cells,
+    read_numbers,
+    schedule,
+    tick_cells,
+)
 
 DISPLAY = Border(width=640, height=360)
 DISPLAYS = [
     Border(width=w, height=h) for w, h in ((640, 360), (1920, 1080), (1080, 1920), (3440, 1440), (161, 121))
 ]
-NUMBERS = [LEAD, 0, 1, 2, 3, 62, 63, 64, 131, 431, 1023, 2047, MOST - 1]
+NUMBERS = [LEAD, 0, 1, 2, 3, 62, 63, 64, 131, 431, 1023, 2047, MAX_PATTERNS - 1]
 
 
 def shown(number: int, border: Border = DISPLAY) -> NDArray[np.float64]:
     """(height, width) the light of a display, 0 to 1, with a random pattern in the rectangle."""
     picture = np.random.default_rng(number + 1).integers(0, 2, (30, 40, 1), np.uint8) * np.uint8(255)
-    return draw(picture, number, border)[:, :, 0] / 255
+    return draw_border(picture, number, border)[:, :, 0] / 255
 
 
 def seen(light: NDArray[np.float64], boxes: tuple[Box, ...]) -> NDArray[np.float64]:
@@ -61,16 +73,16 @@ def test_where_no_border_fits_is_said(width: int, height: int) -> None:
 
 
 def test_codes_are_all_different_and_neighbours_differ_in_one_bit_and_the_parity() -> None:
-    codes = np.array([code(number) for number in range(LEAD, MOST)])
+    codes = np.array([number_cells(number) for number in range(LEAD, MAX_PATTERNS)])
     assert codes.shape == (2**BITS, 2 * (BITS + 1))
     assert len(np.unique(codes, axis=0)) == 2**BITS
     np.testing.assert_array_equal(codes[:, ::2], ~codes[:, 1::2])
     changed = codes[1:, ::2] != codes[:-1, ::2]
     assert np.all(changed.sum(axis=1) == 2)
     assert changed[:, -1].all()
-    assert [bool(tick(number)[0]) for number in range(LEAD, 3)] == [False, True, False, True]
-    number, certain = read(codes.astype(float))
-    np.testing.assert_array_equal(number, np.arange(LEAD, MOST))
+    assert [bool(tick_cells(number)[0]) for number in range(LEAD, 3)] == [False, True, False, True]
+    number, certain = read_numbers(codes.astype(float))
+    np.testing.assert_array_equal(number, np.arange(LEAD, MAX_PATTERNS))
     assert certain.all()
 
 
@@ -80,7 +92,7 @@ def test_the_picture_is_shown_as_it_is_and_the_light_of_the_border_is_constant(b
     picture = np.random.default_rng(0).integers(0, 256, (h, w, 3), np.uint8)
     light = set()
     for number in NUMBERS:
-        whole = draw(picture, number, border)
+        whole = draw_border(picture, number, border)
         assert whole.shape == (border.height, border.width, 3)
         np.testing.assert_array_equal(whole[y : y + h, x : x + w], picture)
         whole[y : y + h, x : x + w] = 0
@@ -93,7 +105,7 @@ def test_a_smaller_picture_is_stretched_by_repeating_pixels() -> None:
     picture = np.arange(6 * 10, dtype=np.uint8).reshape(6, 10, 1)
     x, y, w, h = border.inner
     np.testing.assert_array_equal(
-        draw(picture, 0, border)[y : y + h, x : x + w], picture.repeat(60, axis=0).repeat(60, axis=1)
+        draw_border(picture, 0, border)[y : y + h, x : x + w], picture.repeat(60, axis=0).repeat(60, axis=1)
     )
 
 
@@ -110,7 +122,7 @@ def test_numbers_are_read_through_blur_gamma_vignetting_and_noise(
         light = gaussian_filter(shown(number), blur * boxes[0][2])
         light = (0.02 + 0.6 * light) * (1 - 0.4 * (x**2 + y**2) / 2)
         filmed = light ** (1 / gamma) + rng.normal(0, 0.03, light.shape)
-        found, certain = read(seen(filmed, boxes))
+        found, certain = read_numbers(seen(filmed, boxes))
         assert (int(found), bool(certain)) == (number, True)
 
 
@@ -119,8 +131,8 @@ def test_a_frame_exposed_across_a_change_reads_as_one_of_both_or_as_uncertain(ga
     rng = np.random.default_rng(6)
     for first, second in pairwise(range(LEAD, 140)):
         for share in np.linspace(0, 1, 21):
-            light = (1 - share) * code(first) + share * code(second)
-            number, certain = read((0.01 + light) ** (1 / gamma) + rng.normal(0, 0.01, light.shape))
+            light = (1 - share) * number_cells(first) + share * number_cells(second)
+            number, certain = read_numbers((0.01 + light) ** (1 / gamma) + rng.normal(0, 0.01, light.shape))
             if certain:
                 assert number == (first if share < 0.5 else second)
             if share in (0, 1):
@@ -132,7 +144,7 @@ def test_a_frame_exposed_across_a_change_reads_as_one_of_both_or_as_uncertain(ga
 def test_a_torn_frame_shows_two_numbers_and_where_it_is_torn() -> None:
     torn = shown(41)
     torn[200:] = shown(42)[200:]
-    assert [int(read(seen(torn, boxes))[0]) for boxes in (DISPLAY.top, DISPLAY.bottom)] == [41, 42]
+    assert [int(read_numbers(seen(torn, boxes))[0]) for boxes in (DISPLAY.top, DISPLAY.bottom)] == [41, 42]
     for side in (DISPLAY.left, DISPLAY.right):
         cells = seen(torn, side)
         odd = cells[::2] > cells[1::2]
@@ -145,7 +157,7 @@ def test_a_film_of_a_camera_that_runs_by_itself_is_read_whole() -> None:
     rate, frames_a_second, exposure, rolling = 2.0, 29.97, 1 / 60, 0.02
     steps = schedule(60, rate)
     starts = np.array([step.start for step in steps])
-    codes = np.array([code(step.number) for step in steps], float)
+    codes = np.array([number_cells(step.number) for step in steps], float)
     numbers = np.array([step.number for step in steps])
 
     def filmed(begin: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -155,7 +167,7 @@ def test_a_film_of_a_camera_that_runs_by_itself_is_read_whole() -> None:
         return (0.03 + 0.5 * shown_then) ** (1 / 2.2) + rng.normal(0, 0.02, (len(begin), codes.shape[1]))
 
     times = 0.011 + np.arange(int(frames_a_second * (steps[-1].start + 0.4))) / frames_a_second
-    (top, sure), (bottom, sure_too) = read(filmed(times)), read(filmed(times + rolling))
+    (top, sure), (bottom, sure_too) = read_numbers(filmed(times)), read_numbers(filmed(times + rolling))
     whole = sure & sure_too & (top == bottom)
     middle = times + (rolling + exposure) / 2
     np.testing.assert_array_equal(top[whole], numbers[np.searchsorted(starts, middle[whole], "right") - 1])
@@ -165,17 +177,17 @@ def test_a_film_of_a_camera_that_runs_by_itself_is_read_whole() -> None:
 @pytest.mark.parametrize("level", [0.0, 0.3])
 def test_no_display_in_view_is_not_certain(level: float) -> None:
     noise = np.random.default_rng(7).normal(level, 0.01, (1000, 2 * (BITS + 1)))
-    assert read(noise)[1].mean() < (0.01 if level == 0 else 0.001)
-    assert not read(np.full((3, 2 * (BITS + 1)), level))[1].any()
+    assert read_numbers(noise)[1].mean() < (0.01 if level == 0 else 0.001)
+    assert not read_numbers(np.full((3, 2 * (BITS + 1)), level))[1].any()
 
 
 def test_one_cell_in_the_shade_is_not_certain() -> None:
-    cells = code(77).astype(float)
+    cells = number_cells(77).astype(float)
     cells[np.flatnonzero(cells)[4]] = 0
-    assert not read(cells)[1]
-    wrong = code(77)
+    assert not read_numbers(cells)[1]
+    wrong = number_cells(77)
     wrong[:2] = ~wrong[:2]
-    assert not read(wrong.astype(float))[1]
+    assert not read_numbers(wrong.astype(float))[1]
 
 
 def test_the_schedule_leads_in_shows_each_pattern_as_long_and_leads_out() -> None:
@@ -190,6 +202,6 @@ def test_the_schedule_leads_in_shows_each_pattern_as_long_and_leads_out() -> Non
 
 
 def test_more_patterns_than_numbers_are_refused() -> None:
-    assert schedule(MOST, 2)[-6].number == MOST - 1
+    assert schedule(MAX_PATTERNS, 2)[-6].number == MAX_PATTERNS - 1
     with pytest.raises(OptionError, match=r"4096 patterns.*4095"):
-        schedule(MOST + 1, 2)
+        schedule(MAX_PATTERNS + 1, 2)

@@ -11,7 +11,7 @@ from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTr
 
 from storage.errors import OptionError
 from workflows.programs import video as program_video
-from workflows.programs.border import LEAD_SECONDS, Border, draw, schedule
+from workflows.programs.border import LEAD_SECONDS, Border, draw_border, schedule
 from workflows.programs.files import fitted, pictures
 from workflows.programs.program import Bernoulli, Constant, Monitor, Program
 
@@ -46,7 +46,7 @@ def test_every_picture_comes_back_for_its_time(
     start = 0.0
     for step in steps:
         level = np.full((1, 1, 1), 255 * step.white, np.uint8)
-        picture = draw(level if step.number < 0 else of_patterns[step.number], step.number, border)
+        picture = draw_border(level if step.number < 0 else of_patterns[step.number], step.number, border)
         within = [
             frame
             for time, frame in frames

@@ -18,7 +18,7 @@ from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTr
 from numpy.typing import NDArray
 
 from storage.errors import Corrupt
-from workflows.ingest.video.decoder import ROUNDED
+from workflows.ingest.video.frame_means import ACCURATE
 
 TRANSFERS = {"srgb": ColorTrc.BT709, "linear": ColorTrc.LINEAR}
 """What a video says of its tone curve. Pictures made for screens go by sRGB, and videos of them say BT.709."""
@@ -69,7 +69,7 @@ def encode(
                 dst_colorspace=Colorspace.ITU709,
                 src_color_range=ColorRange.JPEG,
                 dst_color_range=ColorRange.MPEG,
-                interpolation=ROUNDED,
+                interpolation=ACCURATE,
             )
             frame.pts, frame.time_base = number, Fraction(1, rate)
             video.mux(stream.encode(frame))

@@ -28,7 +28,8 @@ from workflows.composite.placement import Placement
 from workflows.composite.quantise import encode
 from workflows.composite.video import segments
 from workflows.images import tone_curves
-from workflows.ingest.video.decoder import PARTS, Clip, Share, opened
+from workflows.ingest.video.decoder import Clip, open_clip
+from workflows.ingest.video.frame_means import TOTAL_WEIGHT, Share, mean_frames
 from workflows.jobs import Steps, Task
 
 KEPT = 1 << 29
@@ -112,7 +113,7 @@ def work(objects: Objects, task: Task, tile: int) -> int:
         return encode(picture, transfer, np.dtype(np.uint8), 1)[..., :3].astype(np.uint8, copy=False)
 
     with _reading(objects, task) as clip:
-        frames = clip.means([[Share(tick, PARTS)] for tick in ticks.tolist()])
+        frames = mean_frames(clip, [[Share(tick, TOTAL_WEIGHT)] for tick in ticks.tolist()])
         pictures = (shown(frame) for frame in frames)
         segment = segments.encode(pictures, task.plan["rate"], length, transfer)
     objects.put(composites.segment_path(job, tile), segment)
@@ -149,9 +150,9 @@ def _losses(clip: Clip, ticks: NDArray[np.int64], last: int) -> Iterator[str]:
             "damaged there: the frame before stays in their place"
         )
     ends = (int(ticks[-1]) + last) * tick
-    if clip.announced > ends + SHORT:
+    if clip.stated_duration > ends + SHORT:
         yield (
-            f"the clip ends early: it is {clip.announced:.3f} s long by what it says, and its last frame that can be "
+            f"the clip ends early: it should be {clip.stated_duration:.3f} s long, but its last frame that can be "
             f"decoded ends at {ends:.3f} s; the video ends there"
         )
 
@@ -164,7 +165,7 @@ def _reading(objects: Objects, task: Task) -> Iterator[Clip]:
     except FileNotFoundError as error:
         raise Corrupt("the clip is not in the store any more; send it again") from error
     try:
-        with file, opened(file, "the clip", task.limits.image) as clip:
+        with file, open_clip(file, "the clip", task.limits.image) as clip:
             yield clip
     except CaptureError as error:
         fields = {name: value for name, value in error.fields.items() if name != "entry"}

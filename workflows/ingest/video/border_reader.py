@@ -1,4 +1,4 @@
-"""The display in a recording: where its border lies in the frames, and the numbers that it shows."""
+"""Find the display in a recording, and the frames of each pattern by the numbers in its border."""
 
 from collections.abc import Sequence
 
@@ -6,73 +6,73 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, find_objects, label
 
-from workflows.ingest.video.decoder import Large
 from workflows.ingest.video.missing_patterns import Reason
 from workflows.ingest.video.recording import Recording
-from workflows.ingest.video.timing import Found
-from workflows.programs import border as program_border
-from workflows.programs.border import Border, Box
+from workflows.ingest.video.signatures import LargeFrames
+from workflows.ingest.video.timing import FoundPatterns
+from workflows.programs.border import LEAD, TICKS, Border, Box, read_numbers
 
 LOOKS = 6
-"""Frames that are to be looked at for the numbers while a pattern is shown."""
-FEWEST = 8
-"""Plateaus that are needed to tell cells from patterns."""
-MOST = 128
-"""Plateaus from which the display's place is told, at most, and whose numbers are read at once."""
-_PLATEAUS = 2  # for each pattern
-# Of a code: near enough to any camera's curve to compare the cells of a pair.
+"""Large frames to take while a pattern is shown."""
+MIN_PLATEAUS = 8
+"""Plateaus that are needed to tell the border's cells from patterns."""
+BATCH = 128
+"""Plateaus that the display is located by, and whose numbers are read at a time."""
+_PLATEAUS = 2  # for each pattern, at most
+# Light of each code. The curve only has to be close enough to any camera's to compare the cells of a pair.
 _LIGHT = ((np.arange(256) / 255) ** 2.2).astype(np.float32)
-_ALTERNATES = 0.6  # see `_alternation`
-_CONTRAST = 0.15  # of a pixel, as a share of the frame's largest
-_WITHIN = (0.3, 0.5, 0.7)  # of a cell: where it is looked at
-_SIMPLEX = 1.0  # pixels, the first step of the search for the corners
-_MOSTLY = 0.5  # of the plateaus with numbers: that are in order, of a display that was found
+_ALTERNATES = 0.6  # least `_alternation` of the sides
+_CONTRAST = 0.15  # least contrast of a pixel of the sides, as a share of the frame's largest
+_WITHIN = (0.3, 0.5, 0.7)  # where a cell is sampled, along each axis
+_SIMPLEX = 1.0  # pixels: the first step of the search for the corners
+_IN_ORDER = 0.5  # of the plateaus with numbers, this share must be in order
 
 Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
-"""(plateaus, rows, columns) float32: what was seen, about in linear light."""
+"""(plateaus, rows, columns) float32: what the camera saw, in approximately linear light."""
 Points = NDArray[np.float64]
 """(n, 2) float64: x, y in pixels."""
 
 
-def find(recording: Recording, large: Large, border: Border, patterns: int) -> Found | None:
-    """The frames of each pattern, by the numbers in the border.
+def find_by_numbers(
+    recording: Recording, large: LargeFrames, border: Border, patterns: int
+) -> FoundPatterns | None:
+    """Find the frames of each pattern by the numbers in the border.
 
     Parameters
     ----------
     recording : Recording
-    large : Large
-        Some of its frames at a size that shows the cells.
+    large : LargeFrames
     border : Border
         As it was shown.
     patterns : int
-        Of the program.
+        Number of patterns in the program.
 
     Returns
     -------
-    Found or None
+    FoundPatterns or None
         None if the border can't be read: it is out of the picture, too small, or another one.
 
     Notes
     -----
-    The cells of the sides change from each pattern to the next and back: pixels that do so are two columns, whose ends
-    are four points of the display. From there on the homography (Hartley and Zisserman, 2004, ch. 4) that shows the
-    largest differences in all pairs of cells is searched by the simplex of Nelder and Mead (1965). Numbers must ascend
-    in time; what stands out of the longest row that does is a misreading.
+    The cells of the sides alternate from each pattern to the next: pixels that do so form two columns, whose ends are
+    four points of the display. Starting from these, the simplex method of Nelder and Mead (1965) searches for the
+    homography (Hartley and Zisserman, 2004, ch. 4) with the largest differences within all pairs of cells. Numbers must
+    ascend in time; what is not in the longest ascending sequence is a misreading.
     """
     plateaus = [recording.plateau(n) for n in range(len(recording.events) + 1)]
     if len(plateaus) > _PLATEAUS * patterns + 100:
         return None
-    # The first and the last of a plateau may be torn.
+    # The first and the last frame of a plateau may be torn.
     inner = [_among(large, plateau[1:-1]) for plateau in plateaus]
     chosen = [looks if looks.size else _among(large, p) for looks, p in zip(inner, plateaus, strict=True)]
     there = np.flatnonzero([looks.size > 0 for looks in chosen])
     whole = np.flatnonzero([inner[n].size > 0 for n in there])
-    if whole.size < FEWEST:
+    if whole.size < MIN_PLATEAUS:
         return None
     codes = np.stack([np.median(large.grey[chosen[n]], axis=0).astype(np.uint8) for n in there])
-    middle = max((whole.size - MOST) // 2, 0)
-    some = codes[whole[middle : middle + MOST]]
+    middle = max((whole.size - BATCH) // 2, 0)
+    some = codes[whole[middle : middle + BATCH]]
     for quarters in range(4):
         light = _LIGHT[np.rot90(some, quarters, axes=(1, 2))]
         ends = _columns(light)
@@ -80,22 +80,22 @@ def find(recording: Recording, large: Large, border: Border, patterns: int) -> F
             continue
         homography = _adjusted(light, ends, border)
         upright = np.rot90(codes, quarters, axes=(1, 2))
-        parts = (_LIGHT[upright[at : at + MOST]] for at in range(0, len(upright), MOST))
+        parts = (_LIGHT[upright[at : at + BATCH]] for at in range(0, len(upright), BATCH))
         numbers = np.concatenate([_numbers(part, homography, border) for part in parts])
-        numbers[numbers >= patterns] = program_border.LEAD
+        numbers[numbers >= patterns] = LEAD
         row = _ascending(numbers)
-        if len(row) >= max(FEWEST, _MOSTLY * np.count_nonzero(numbers > program_border.LEAD)):
+        if len(row) >= max(MIN_PLATEAUS, _IN_ORDER * np.count_nonzero(numbers > LEAD)):
             return _found(recording, {int(there[at]): int(numbers[at]) for at in row}, patterns)
     return None
 
 
-def _among(large: Large, frames: range) -> NDArray[np.intp]:
-    """Which of the large ones are among some frames."""
+def _among(large: LargeFrames, frames: range) -> NDArray[np.intp]:
+    """The large frames, by their index among these, that lie within a range of frames."""
     return np.flatnonzero((large.frames >= frames.start) & (large.frames < frames.stop))
 
 
 def _columns(light: Floats) -> Points | None:
-    """The ends of the sides' middle lines: left top, left bottom, right top, right bottom."""
+    """The ends of the middle lines of both sides: left top, left bottom, right top, right bottom."""
     column: list[list[tuple[float, float]]] = []
     mask = binary_dilation(_alternation(light) > _ALTERNATES, np.ones((5, 1), bool))
     labels, _ = label(mask, np.ones((3, 3)))
@@ -103,14 +103,14 @@ def _columns(light: Floats) -> Points | None:
     boxes.sort(key=lambda found: found[0][0].start - found[0][0].stop)
     for (rows, _), number in boxes[:2]:
         of_row = [np.flatnonzero(labels[y] == number) for y in range(rows.start, rows.stop)]
-        # less what the dilation added
+        # without the rows that the dilation added
         y = np.arange(rows.start, rows.stop)[2:-2]
         x = np.array([xs.mean() for xs in of_row])[2:-2]
         width = float(np.median([xs.size for xs in of_row]))
-        if y.size < 2 * program_border.TICKS:
+        if y.size < 2 * TICKS:
             return None
         kept = np.abs(x - np.median(x)) < np.inf
-        for _ in range(4):  # the parity's cells lie beside the end of a column
+        for _ in range(4):  # the cells of the parity lie beside the end of a column
             slope, start = np.polyfit(y[kept], x[kept], 1)
             off = np.abs(x - slope * y - start)
             kept = off <= max(2 * float(np.median(off)), 0.35 * width)
@@ -122,9 +122,10 @@ def _columns(light: Floats) -> Points | None:
 
 
 def _alternation(light: Floats) -> Floats:
-    """(rows, columns) float32: 1 where each plateau differs from the next and not from the one after; 0 by chance.
+    """How strictly a pixel alternates between plateaus, (rows, columns) float32.
 
-    It does not count for how long nothing changes.
+    It is 1 where each plateau differs from the next but not from the one after that, and about 0 for random changes.
+    Changes that do not happen are not counted.
     """
     contrast = np.quantile(light, 0.9, axis=0) - np.quantile(light, 0.1, axis=0)
     near = np.abs(light[1:] - light[:-1]).mean(axis=0)
@@ -134,7 +135,7 @@ def _alternation(light: Floats) -> Floats:
 
 
 def _adjusted(light: Floats, ends: Points, border: Border) -> Doubles:
-    """(3, 3) homography from the display's pixels to the frame's, where the cells of the pairs differ most."""
+    """The homography from the display to the frame, (3, 3), that makes the cells of each pair differ most."""
     first, last = border.left[0], border.left[-1]
     top, bottom = first[1], last[1] + last[3]
     left, right = border.thickness / 2, border.width - border.thickness / 2
@@ -146,7 +147,7 @@ def _adjusted(light: Floats, ends: Points, border: Border) -> Doubles:
         return -float(np.abs(pairs[:, ::2] - pairs[:, 1::2]).mean())
 
     simplex = np.concatenate([np.zeros((1, 8)), _SIMPLEX * np.eye(8)])
-    from scipy.optimize import minimize  # half a second to import, and only who ingests a video comes here
+    from scipy.optimize import minimize  # takes half a second to import, and only videos need it
 
     best = minimize(
         alike,
@@ -158,7 +159,7 @@ def _adjusted(light: Floats, ends: Points, border: Border) -> Doubles:
 
 
 def _homography(known: Points, seen: Points) -> Doubles:
-    """(3, 3) float64, from four points to four others."""
+    """The homography that maps four points to four others, (3, 3) float64."""
     rows = []
     for (x, y), (u, v) in zip(known, seen, strict=True):
         rows += [[x, y, 1, 0, 0, 0, -u * x, -u * y], [0, 0, 0, x, y, 1, -v * x, -v * y]]
@@ -167,13 +168,13 @@ def _homography(known: Points, seen: Points) -> Doubles:
 
 
 def _cells(light: Floats, homography: Doubles, cells: Sequence[Box]) -> Doubles:
-    """(plateaus, cells) mean light of the cells' inner halves, between pixels linear; 0 outside of the frame."""
+    """Mean light of the inner half of each cell, (plateaus, cells), interpolated linearly; 0 outside of the frame."""
     box = np.array(cells, float)
     x = box[:, 0, None, None] + box[:, 2, None, None] * np.array(_WITHIN)[:, None]
     y = box[:, 1, None, None] + box[:, 3, None, None] * np.array(_WITHIN)[None, :]
     x, y = np.broadcast_arrays(x, y)
     across, down, scale = np.tensordot(homography, np.stack([x, y, np.ones_like(x)]), 1)
-    # a pixel's value is that of its middle
+    # The value of a pixel belongs to its centre.
     u, v = across / scale - 0.5, down / scale - 0.5
     height, width = light.shape[1:]
     inside = (u > -1) & (v > -1) & (u < width) & (v < height) & (scale > 0)
@@ -186,21 +187,21 @@ def _cells(light: Floats, homography: Doubles, cells: Sequence[Box]) -> Doubles:
 
 
 def _numbers(light: Floats, homography: Doubles, border: Border) -> NDArray[np.intp]:
-    """(plateaus,) the pattern's number, or `LEAD` where there is none, or none that is certain."""
-    read = [program_border.read(_cells(light, homography, cells)) for cells in (border.top, border.bottom)]
+    """The number that each plateau shows, (plateaus,); `LEAD` if there is none, or none that is certain."""
+    read = [read_numbers(_cells(light, homography, cells)) for cells in (border.top, border.bottom)]
     (above, clear_above), (below, clear_below) = read
     number = np.where(clear_above, above, below)
     ticks = _cells(light, homography, (*border.left, *border.right))
     odd = ticks[:, ::2].sum(axis=1) > ticks[:, 1::2].sum(axis=1)
     certain = (clear_above | clear_below) & ~(clear_above & clear_below & (above != below))
-    return np.where(certain & (odd == (number + 1) % 2), number, program_border.LEAD)
+    return np.where(certain & (odd == (number + 1) % 2), number, LEAD)
 
 
 def _ascending(numbers: NDArray[np.intp]) -> list[int]:
-    """Where the longest row of numbers is that never falls; patience sorting (Fredman, 1975)."""
+    """Indices of the longest sequence of numbers that never falls, by patience sorting (Fredman, 1975)."""
     ends: list[int] = []
     before: dict[int, int | None] = {}
-    for at in np.flatnonzero(numbers > program_border.LEAD).tolist():
+    for at in np.flatnonzero(numbers > LEAD).tolist():
         place = int(np.searchsorted([numbers[end] for end in ends], numbers[at], "right"))
         before[at] = ends[place - 1] if place else None
         ends[place : place + 1] = [at]
@@ -212,8 +213,8 @@ def _ascending(numbers: NDArray[np.intp]) -> list[int]:
     return row[::-1]
 
 
-def _found(recording: Recording, seen: dict[int, int], patterns: int) -> Found:
-    """The frames of the plateaus that show a number: of several with the same one, of the longest."""
+def _found(recording: Recording, seen: dict[int, int], patterns: int) -> FoundPatterns:
+    """The frames of each number from the plateaus that show it; from the longest, if several do."""
     frames = [np.zeros(0, np.intp)] * patterns
     weights = [np.zeros(0)] * patterns
     reasons: dict[int, Reason] = {}
@@ -234,9 +235,9 @@ def _found(recording: Recording, seen: dict[int, int], patterns: int) -> Found:
             reasons[number] = Reason.UNNUMBERED
     begins = np.array([recording.times[longest[number].start] for number in sorted(longest)])
     holds = np.diff(begins) / np.diff(sorted(longest))
-    # of the middle half: what was cut out, or stood still, is left aside
+    # The mean of the middle half leaves out what was cut or stood still.
     hold = float(np.sort(holds)[len(holds) // 4 : len(holds) - len(holds) // 4].mean())
-    return Found(
+    return FoundPatterns(
         frames,
         weights,
         reasons,

@@ -1,45 +1,45 @@
-"""What a camera saw of patterns that were shown in a border of numbers, less the border."""
+"""The cells of a frame that see the numbered border, to be left out when patterns are compared."""
 
 from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from workflows.programs import border
+from workflows.programs.border import number_cells, tick_cells
 from workflows.programs.program import Program
 
 FOLLOWS = 0.5
-"""Share of a cell's variance that the numbers' bits explain (adjusted R^2), from which the cell shows the border."""
+"""A cell sees the border if the bits of the numbers explain this share of its variance (adjusted R^2)."""
 
 Doubles = NDArray[np.float64]
 
 
 def without_border(program: Program, looks: Mapping[int, Doubles]) -> dict[int, Doubles]:
-    """Leave out the cells of the frames that show the border.
+    """Leave out the cells of the frames that see the border.
 
-    Its cells are black or white at full contrast, and would outweigh the patterns where looks are compared.
+    The border's cells are black or white at full contrast, and would outweigh the patterns in comparisons.
 
     Parameters
     ----------
     program : Program
     looks : mapping of int to (rows, columns, 3) float64
-        What was seen of patterns, about in linear light.
+        What the camera saw of patterns, in approximately linear light.
 
     Returns
     -------
     dict of int to (cells, 3) float64
-        All cells, if there are too few patterns to tell.
+        All cells if there are too few patterns to decide.
 
     Notes
     -----
-    What a cell of the border shows, and any mixture of several, is linear in the bits of the pattern's number; random
-    patterns know nothing of it. Where in the frame the border lies needs not be known.
+    What a cell of the border shows, and any mixture of such cells, is linear in the bits of the pattern's number, with
+    which random patterns are uncorrelated. It is not necessary to know where in the frame the border lies.
     """
     every = {number: look.reshape(-1, 3) for number, look in looks.items()}
     numbers = [number for number in program.measured.tolist() if number in every]
     if not numbers:
         return every
-    bits = np.array([[*border.code(n), *border.tick(n)] for n in numbers], float)
+    bits = np.array([[*number_cells(n), *tick_cells(n)] for n in numbers], float)
     bits -= bits.mean(axis=0)
     directions, lengths, _ = np.linalg.svd(bits, full_matrices=False)
     directions = directions[:, lengths > 1e-6 * lengths[0]]

@@ -1,4 +1,4 @@
-"""The lead-in and the lead-out of a film: black, white, black, white, black before the patterns and after them."""
+"""Find the lead-in and the lead-out of a film: black, white, black, white, black before and after the patterns."""
 
 from typing import NamedTuple
 
@@ -7,11 +7,11 @@ import numpy as np
 from workflows.ingest.video.recording import Event, Recording
 from workflows.programs.border import LEAD_SECONDS
 
-_OFF = 0.15  # seconds that a change may come early or late
-_ALIKE = 0.15  # difference of two blacks, or of two whites, as a share of that between black and white
+_OFF = 0.15  # seconds that a change may be early or late
+_ALIKE = 0.15  # largest difference of two blacks, or two whites, as a share of that between black and white
 
 
-class Program(NamedTuple):
+class Patterns(NamedTuple):
     """The part of a recording that shows the patterns.
 
     Attributes
@@ -19,7 +19,7 @@ class Program(NamedTuple):
     frames : slice
         From the black before the first pattern until the black after the last one.
     first : int or None
-        The frame among them with which the first pattern begins; None if the lead-in was not found.
+        Index among them of the first pattern's first frame; None if the lead-in was not found.
     ends : bool
         Whether the lead-out was found.
     """
@@ -29,22 +29,22 @@ class Program(NamedTuple):
     ends: bool
 
 
-def find(recording: Recording) -> Program:
+def find_patterns(recording: Recording) -> Patterns:
     """Find the patterns between the lead-in and the lead-out.
 
     Parameters
     ----------
     recording : Recording
-        Of a program that was shown as `workflows.programs.border.schedule` says.
+        Of a program shown as by `workflows.programs.border.schedule`.
 
     Returns
     -------
-    Program
-        All of the recording where neither is found.
+    Patterns
+        All of the recording if neither is found.
 
     Notes
     -----
-    The first pattern may be black like the end of the lead-in: no change shows when it begins. It does so
+    The first pattern may be black like the end of the lead-in, so that no change shows when it begins. It begins
     ``LEAD_SECONDS[-1]`` after the last white.
     """
     times, events = recording.times, recording.events
@@ -60,17 +60,17 @@ def find(recording: Recording) -> Program:
         first = int(np.searchsorted(times, begin)) - start
     if ends:
         stop = int(np.searchsorted(times, middle[leads[-1]] - LEAD_SECONDS[0] / 2))
-    return Program(slice(start, stop), first, ends)
+    return Patterns(slice(start, stop), first, ends)
 
 
-def with_begin(recording: Recording, first: int) -> None:
-    """Put an event where the first pattern begins, in place of what is seen of it."""
+def begin_at(recording: Recording, first: int) -> None:
+    """Replace all events up to frame ``first`` by one at which the first pattern begins."""
     recording.events = [event for event in recording.events if event.first > first]
     recording.events.insert(0, Event(max(first - 1, 0), first))
 
 
 def _is_lead(recording: Recording, middle: np.ndarray, n: int) -> bool:
-    """Whether events n to n + 3 are those of a lead."""
+    """Whether events n to n + 3 are those of a lead-in or a lead-out."""
     if np.any(np.abs(np.diff(middle[n : n + 4]) - LEAD_SECONDS[1:4]) > _OFF):
         return False
     looks = [

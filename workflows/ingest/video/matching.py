@@ -1,6 +1,6 @@
-"""The frames of a video sorted by the patterns that they show, and what to make of those that are not found."""
+"""Match the frames of a video to the patterns that they show, and decide whether enough of them were found."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -8,49 +8,53 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.errors import CaptureError
-from workflows.ingest.video import border_reader, lead_in
-from workflows.ingest.video import resemblance as likeness
+from workflows.ingest.video import lead_in, resemblance
+from workflows.ingest.video.border_reader import find_by_numbers
 from workflows.ingest.video.border_spill import without_border
-from workflows.ingest.video.decoder import PARTS, Large, Share, Signatures
+from workflows.ingest.video.boundaries import Edge
+from workflows.ingest.video.frame_means import TOTAL_WEIGHT, Share
 from workflows.ingest.video.missing_patterns import Reason, by_reason, ranges
 from workflows.ingest.video.recording import Recording
-from workflows.ingest.video.timing import Edge, Found, find
+from workflows.ingest.video.signatures import LargeFrames, Signatures
+from workflows.ingest.video.timing import FoundPatterns, find_by_timing
 from workflows.programs.border import Border
 from workflows.programs.program import Program
 
 Doubles = NDArray[np.float64]
+Refusal = Callable[[str], CaptureError]
+"""Makes the error to raise from what is wrong."""
 
-MOST_PATTERNS = 2000
-"""Of a program that is filmed: sorting takes memory in proportion to their square."""
-LEAST_SHARE = 0.6
-"""Of the patterns that are not constant: with fewer, a recording is refused."""
-LEAST_RESEMBLANCE = 2.5
-"""Standard deviations, see `content.resemblance`."""
+MAX_PATTERNS = 2000
+"""Patterns of a program that is filmed: matching takes memory in proportion to their square."""
+MIN_SHARE = 0.6
+"""A recording with a smaller share of the patterns that are not constant is refusal."""
+MIN_RESEMBLANCE = 2.5
+"""A recording with a smaller `resemblance.score` is refusal."""
 EDGES: tuple[tuple[tuple[Edge, Edge], ...], ...] = (
     (("seen", "seen"), ("hidden", "seen"), ("seen", "hidden"), ("hidden", "hidden")),
     (("seen", "cut"), ("cut", "seen"), ("hidden", "cut"), ("cut", "hidden")),
 )
-"""How the program may begin and end: what is more likely comes first."""
-_AS_LIKELY = 10.0  # difference of the -ln likelihoods of the timing
-_EVENTS = 2  # for each pattern
-_RESTLESS = 5.0  # codes
-_GAMMA = 2.2  # near enough to any camera's curve to compare what it saw
+"""How the program may begin and end, the more likely cases first."""
+_AS_LIKELY = 10.0  # difference of negative log likelihoods up to which timings count as equally likely
+_EVENTS = 2  # for each pattern, at most
+_RESTLESS = 5.0  # codes of noise: nothing stands still
+_GAMMA = 2.2  # close enough to any camera's curve to compare what it saw
 
 
 @dataclass(frozen=True)
-class Sorted:
-    """A recording, sorted.
+class MatchedFrames:
+    """The frames of each pattern, and what to report about them.
 
     Attributes
     ----------
     shares : dict of int to tuple of Share
         The frames of each pattern that was found.
     record : dict
-        What was found, as JSON: ``tick`` in seconds, ``frames`` that were decoded, ``kept``, ``numbered``: whether
-        patterns are told by the numbers in the border, ``first_pattern_seconds``, ``patterns_per_second``,
-        ``resemblance``, and ``missing``: the number of each pattern without frames, and why.
+        What was found, as JSON: ``tick`` in seconds, ``frames`` that were decoded, ``kept`` ones, ``numbered``: whether
+        patterns were found by the numbers in the border, ``first_pattern_seconds``, ``patterns_per_second``,
+        ``resemblance``, and ``missing``: the reason for each pattern without frames.
     notes : list of str
-        The same for people.
+        The same in words.
     """
 
     shares: dict[int, tuple[Share, ...]]
@@ -59,23 +63,23 @@ class Sorted:
 
     @property
     def table(self) -> NDArray[np.int64]:
-        """(k, 3) int64: the shares of the patterns in order, each with the pattern's place among those found."""
+        """All shares, (k, 3) int64: index of the pattern among those found, tick, weight."""
         rows = [(n, *share) for n, shares in enumerate(self.shares.values()) for share in shares]
         return np.array(rows, np.int64)
 
 
-def sort(
+def match_frames(
     signatures: Signatures,
     ticks: NDArray[np.int64],
     tick: float,
     program: Program,
-    light: likeness.Light,
+    light: resemblance.Light,
     rate: float,
     entry: str,
-    large: Large,
+    large: LargeFrames,
     border: Border | None,
-) -> Sorted:
-    """Sort the frames of a recording by the patterns of a program.
+) -> MatchedFrames:
+    """Match the frames of a recording to the patterns of a program.
 
     Parameters
     ----------
@@ -83,18 +87,19 @@ def sort(
     ticks : (frames,) int64
         When each frame is shown.
     tick : float
-        Seconds of a tick.
+        Length of a tick in seconds.
     program : Program
     light : (patterns, rows, columns, 3) float32
-        Of its patterns, see `content.lay_out`.
+        Of its patterns, see `resemblance.lay_out`.
     rate : float
-        Patterns a second, about.
+        About how many patterns were shown in a second.
     entry : str
         The video's name, for errors.
-    large : Large
-        Some of the frames at a size that shows the cells of a border; of no use without one.
+    large : LargeFrames
+        Used with a border only.
     border : Border or None
-        What the patterns were shown in, between a lead-in and a lead-out, see `workflows.programs.border.schedule`.
+        The border that the patterns were shown in, between a lead-in and a lead-out; see
+        `workflows.programs.border.schedule`.
 
     Raises
     ------
@@ -102,26 +107,26 @@ def sort(
         If too little of the program is found.
     """
 
-    def refused(what: str) -> CaptureError:
-        return CaptureError(f"{entry}: {what}", entry=entry)
+    def refusal(reason: str) -> CaptureError:
+        return CaptureError(f"{entry}: {reason}", entry=entry)
 
     recording = Recording(signatures, (ticks - ticks[0]) * tick, 1 / rate)
-    found = border_reader.find(recording, large, border, program.count) if border is not None else None
+    found = find_by_numbers(recording, large, border, program.count) if border is not None else None
     numbered = found is not None
     if found is None:
-        found = _by_timing(recording, rate, program, light, border is not None, refused)
-    looks, resemblance, odd = _compared(recording, found, program, light, border is not None)
+        found = _by_timing(recording, rate, program, light, border is not None, refusal)
+    looks, score, odd = _compare(recording, found, program, light, border is not None)
     reasons = dict(found.reasons)
     for number in odd:
         reasons[number] = Reason.ODD
         del looks[number]
     wrong = np.isin(program.constants[0], odd).mean() > 0.5
-    if wrong or (resemblance is not None and resemblance < LEAST_RESEMBLANCE):
-        raise refused(
-            "what changes in the video does not look like the patterns of the program: see that capture.json has the "
+    if wrong or (score is not None and score < MIN_RESEMBLANCE):
+        raise refusal(
+            "what changes in the video does not look like the patterns of the program: check that capture.json has the "
             "program that was shown, and its patterns_per_second"
         )
-    _see_that_it_is_enough(program, looks, reasons, rate, refused)
+    _require_enough(program, looks, reasons, rate, refusal)
     kept = sorted(looks)
     shares = {number: _shares(ticks[found.frames[number]], found.weights[number]) for number in kept}
     record = {
@@ -131,39 +136,46 @@ def sort(
         "numbered": numbered,
         "first_pattern_seconds": round(found.start, 3),
         "patterns_per_second": round(found.rate, 4),
-        "resemblance": None if resemblance is None else round(resemblance, 1),
+        "resemblance": None if score is None else round(score, 1),
         "missing": {str(number): reason for number, reason in sorted(reasons.items())},
     }
     notes = [_summary(record, len(kept), program.count), *_by_reason(reasons)]
     if border is not None and not numbered:
-        notes.append("the numbers in the border can't be read: patterns are told by the times of the changes")
-    return Sorted(shares, record, notes)
+        notes.append(
+            "the numbers in the border can't be read: patterns are found by the times of the changes"
+        )
+    return MatchedFrames(shares, record, notes)
 
 
 def _by_timing(
-    recording: Recording, rate: float, program: Program, light: likeness.Light, has_lead: bool, refused: Any
-) -> Found:
-    """The frames of each pattern by when the picture changes."""
+    recording: Recording,
+    rate: float,
+    program: Program,
+    light: resemblance.Light,
+    has_lead: bool,
+    refusal: Refusal,
+) -> FoundPatterns:
+    """Find the frames of each pattern by the times of the changes, after a lead-in if there is one."""
     frames, begins, ends = slice(0, len(recording.times)), False, False
     if has_lead:
-        frames, first, ends = lead_in.find(recording)
+        frames, first, ends = lead_in.find_patterns(recording)
         recording = Recording(recording.signatures[frames], recording.times[frames], 1 / rate)
         begins = first is not None
         if first is not None:
-            lead_in.with_begin(recording, first)
+            lead_in.begin_at(recording, first)
     if not recording.events and recording.noise.max(initial=0) > _RESTLESS:
-        raise refused(
+        raise refusal(
             "the picture changes from each frame to the next and never stands still: record more frames a second, show "
-            "fewer patterns, and keep the camera at rest"
+            "fewer patterns a second, and keep the camera at rest"
         )
     if not recording.events:
-        raise refused("nothing changes in the video: film the monitor while it shows the program")
+        raise refusal("nothing changes in the video: film the monitor while it shows the program")
     if len(recording.events) > _EVENTS * program.count + 100:
-        raise refused(
+        raise refusal(
             f"the picture changes {len(recording.events)} times, but the program has {program.count} patterns: keep "
             "the camera, the light and the glass at rest, and cut off what does not belong to the program"
         )
-    found = _best(recording, rate, program, light, has_lead, begins, ends, refused)
+    found = _best(recording, rate, program, light, has_lead, begins, ends, refusal)
     start = found.start + float(recording.times[0])
     return replace(found, frames=[some + frames.start for some in found.frames], start=start)
 
@@ -172,22 +184,22 @@ def _best(
     recording: Recording,
     rate: float,
     program: Program,
-    light: likeness.Light,
+    light: resemblance.Light,
     has_border: bool,
     begins: bool,
     ends: bool,
-    refused: Any,
-) -> Found:
-    """What fits the timing, and of that what looks most like the program.
+    refusal: Refusal,
+) -> FoundPatterns:
+    """Of the matches that fit the timing, choose the one that looks most like the program.
 
-    The whole program; or if that can't be, a part of it: all but its end, or its beginning. Where a lead-in or a
-    lead-out was found, it `begins` or `ends` with the first or the last event.
+    The whole program is tried first, then all of it but its end or its beginning. If a lead-in or a lead-out was found,
+    the program ``begins`` or ``ends`` with the first or the last event.
     """
     flat = light.reshape(len(light), -1)
     same = (flat[1:] == flat[:-1]).all(axis=1)
     for edges in EDGES:
         tried = [
-            find(recording, rate, same, begin, end)
+            find_by_timing(recording, rate, same, begin, end)
             for begin, end in edges
             if (begin == "seen" or not begins) and (end == "seen" or not ends)
         ]
@@ -195,52 +207,57 @@ def _best(
         if fitting:
             break
     else:
-        raise refused(
+        raise refusal(
             f"the {len(recording.events)} changes in the video do not fit {program.count} patterns at {rate:g} a "
-            "second: see that capture.json has the program that was shown and its patterns_per_second, and record "
+            "second: check that capture.json has the program that was shown and its patterns_per_second, and record "
             "all of it in one go, with everything at rest"
         )
     least = min(found.cost for found in fitting)
     likely = [found for found in fitting if found.cost <= least + _AS_LIKELY]
 
-    def score(found: Found) -> float:
-        _, resemblance, odd = _compared(recording, found, program, light, has_border)
-        return (resemblance or 0.0) - len(odd)
+    def quality(found: FoundPatterns) -> float:
+        _, score, odd = _compare(recording, found, program, light, has_border)
+        return (score or 0.0) - len(odd)
 
-    return likely[0] if len(likely) == 1 else max(sorted(likely, key=lambda found: found.cost), key=score)
+    return likely[0] if len(likely) == 1 else max(sorted(likely, key=lambda found: found.cost), key=quality)
 
 
-def _compared(
-    recording: Recording, found: Found, program: Program, light: likeness.Light, has_border: bool
+def _compare(
+    recording: Recording, found: FoundPatterns, program: Program, light: resemblance.Light, has_border: bool
 ) -> tuple[dict[int, Doubles], float | None, list[int]]:
-    """What was seen of each pattern, about in linear light; its resemblance to the program; the odd ones."""
+    """What the camera saw of each pattern, in approximately linear light; the score of that; the odd patterns."""
     looks = {n: (recording.look(f) / 255) ** _GAMMA for n, f in enumerate(found.frames) if f.size}
     if has_border:
         looks = without_border(program, looks)
-    return looks, likeness.resemblance(program, light, looks), likeness.odd(program, light, looks)
+    return looks, resemblance.score(program, light, looks), resemblance.odd_patterns(program, light, looks)
 
 
-def _see_that_it_is_enough(
-    program: Program, looks: Mapping[int, Doubles], reasons: Mapping[int, Reason], rate: float, refused: Any
+def _require_enough(
+    program: Program,
+    looks: Mapping[int, Doubles],
+    reasons: Mapping[int, Reason],
+    rate: float,
+    refusal: Refusal,
 ) -> None:
+    """Require black, white, and most of the other patterns."""
     numbers, sent = program.constants
     there = np.isin(numbers, list(looks))
     why = "; ".join(_by_reason(reasons))
     if not there.any() or (np.ptp(sent[there], axis=0) < np.ptp(sent, axis=0) / 2).any():
-        raise refused(f"the dark and bright constant patterns are not both found: {why}. Record it again")
+        raise refusal(f"the dark and bright constant patterns are not both found: {why}. Record it again")
     share = float(np.isin(program.measured, list(looks)).mean())
-    if share < LEAST_SHARE:
-        raise refused(
+    if share < MIN_SHARE:
+        raise refusal(
             f"only {share:.0%} of the patterns are found: {why}. Record it again, at more frames a second, or show "
             f"fewer than {rate:g} patterns a second"
         )
 
 
 def _shares(ticks: NDArray[np.int64], weights: Doubles) -> tuple[Share, ...]:
-    """Weights as whole parts of `PARTS`, by largest remainders."""
-    exact = PARTS * weights / weights.sum()
+    """Weights as integers that add up to `TOTAL_WEIGHT`, by the largest remainder method."""
+    exact = TOTAL_WEIGHT * weights / weights.sum()
     parts = np.floor(exact).astype(int)
-    parts[np.argsort(parts - exact, kind="stable")[: PARTS - parts.sum()]] += 1
+    parts[np.argsort(parts - exact, kind="stable")[: TOTAL_WEIGHT - parts.sum()]] += 1
     return tuple(Share(int(tick), int(part)) for tick, part in zip(ticks, parts, strict=True) if part)
 
 
@@ -252,7 +269,7 @@ def _summary(record: Mapping[str, Any], kept: int, count: int) -> str:
 
 
 def _by_reason(reasons: Mapping[int, Reason]) -> list[str]:
-    """A line a reason: the patterns that it holds for, as ranges."""
+    """One line for each reason, with the patterns that it applies to as ranges."""
     return [
         f"no frame of pattern{'s' * (len(numbers) > 1)} {ranges(numbers)}: {reason}"
         for numbers, reason in by_reason(reasons)

@@ -1,4 +1,4 @@
-"""Patterns of which a recording has no frame that can be used: in words, and what to do about them."""
+"""Patterns that are missing from a recording: why, and what to do about it."""
 
 from collections.abc import Iterable, Mapping
 from enum import StrEnum
@@ -34,13 +34,13 @@ REMEDIES: dict[str, str] = {
 
 
 def by_reason(reasons: Mapping[int, str]) -> list[tuple[list[int], str]]:
-    """Numbers of patterns, in order, that have a reason in common, and the reason."""
+    """Group the numbers of patterns by reason: ascending numbers, and the reason that they share."""
     ordered = sorted(reasons.items(), key=lambda item: (item[1], item[0]))
     return [([n for n, _ in items], reason) for reason, items in groupby(ordered, key=lambda item: item[1])]
 
 
 def ranges(numbers: Iterable[int]) -> str:
-    """Numbers in order, in words.
+    """Ascending numbers in words, runs as ranges.
 
     Examples
     --------
@@ -57,6 +57,6 @@ def ranges(numbers: Iterable[int]) -> str:
 
 
 def remedy(reasons: Iterable[str]) -> str:
-    """What to do about patterns that have no frame for these reasons."""
+    """What to do about patterns that are missing for these reasons."""
     known = [REMEDIES.get(reason, _LONGER).split("; ") for reason in sorted(reasons)]
     return "film again: " + "; ".join(dict.fromkeys(chain(*known)))

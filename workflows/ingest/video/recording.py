@@ -1,6 +1,7 @@
-"""A recording by small signatures of its frames: where it stands still, and where something changes.
+"""Where a recording stands still, and where it changes, from small signatures of its frames.
 
-It is cut into *plateaus*, runs of frames that look alike, by *events*, in which frame after frame is another.
+*Events*, in which every frame differs from the one before, divide a recording into *plateaus*, runs of frames that look
+alike.
 """
 
 from typing import NamedTuple
@@ -11,26 +12,26 @@ from numpy.typing import NDArray
 Doubles = NDArray[np.float64]
 Integers = NDArray[np.intp]
 
-MOST_FRAMES = 64
-"""That go into one mean: more make it no better than the video's compression allows."""
-_LOUD = 0.98  # quantile of the changes between frames that no noise is as large as
-_QUIET = 0.2  # quantile of the changes between frames that is noise alone
-_CHANGE = 5.0  # times the noise: an event
-_LEAST_CHANGE = 0.6  # codes
-_LEAST_SHARE = 0.015  # of the large changes: what a codec adds to a picture after it has come
-_CLEAN = 3.0  # times the plateaus' own spread: a frame that is not torn
-_LEAST_CLEAN = 0.3  # codes
+MAX_FRAMES = 64
+"""The most frames that go into one mean. Compression noise remains however many there are."""
+_LOUD = 0.98  # this quantile of the changes between frames is larger than any noise
+_QUIET = 0.2  # this quantile of the changes between frames is noise alone
+_CHANGE = 5.0  # an event is a change of at least so many times the noise,
+_LEAST_CHANGE = 0.6  # of so many codes,
+_LEAST_SHARE = 0.015  # and of this share of the large changes: codecs refine a picture after it appears
+_CLEAN = 3.0  # a frame is not torn if it is off by at most so many times the plateau's own spread,
+_LEAST_CLEAN = 0.3  # and the spread is taken for at least so many codes
 
 
 class Event(NamedTuple):
-    """Frames ``first`` and ``last`` look different, and each of those between from its neighbours."""
+    """A change from frame ``first`` to frame ``last``; each frame between differs from its neighbours."""
 
     first: int
     last: int
 
 
 class Recording:
-    """A recording by its frames' signatures.
+    """The events and plateaus of a recording.
 
     Parameters
     ----------
@@ -38,14 +39,14 @@ class Recording:
     times : (frames,) float64
         Seconds, ascending.
     hold : float
-        Seconds that a pattern is shown, about.
+        About how long a pattern is shown, in seconds.
 
     Attributes
     ----------
     events : list of Event
-        In the order of time; before, between and after them are the plateaus.
+        In the order of time; the plateaus lie before, between and after them.
     noise : (frames - 1,) float64
-        Root of the mean square of the change between two frames in the noisiest row, where nothing changes, in codes.
+        Change between two frames while nothing changes: root mean square over the noisiest row, in codes.
     """
 
     def __init__(self, signatures: NDArray[np.uint8], times: Doubles, hold: float) -> None:
@@ -57,7 +58,7 @@ class Recording:
         busy = change > limit
         edges = np.flatnonzero(np.diff(np.concatenate([[False], busy, [False]]).astype(np.int8)))
         events = [Event(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
-        # A key frame may change the noise of all at once: what looks the same before and after was no change.
+        # A key frame may change the noise everywhere: what looks the same before and after is not an event.
         self.events: list[Event] = []
         for n, event in enumerate(events):
             before = range(self.events[-1].last if self.events else 0, event.first + 1)
@@ -73,13 +74,13 @@ class Recording:
         return range(first, last + 1)
 
     def look(self, frames: Integers | range) -> Doubles:
-        """(rows, columns, 3) float64: the median signature of frames, of some of them if they are many."""
-        chosen = np.array(frames)[:: -(-len(frames) // MOST_FRAMES)]
+        """The median signature of frames, or of evenly chosen ones if there are many: (rows, columns, 3) float64."""
+        chosen = np.array(frames)[:: -(-len(frames) // MAX_FRAMES)]
         return np.asarray(np.median(self.signatures[chosen], axis=0), np.float64)
 
     def clean(self, frames: range) -> tuple[Integers, Doubles]:
-        """The frames of a plateau that are like its median in every row, and their weights."""
-        chosen = np.array(frames)[:: -(-len(frames) // MOST_FRAMES)]
+        """The frames of a plateau that resemble its median in every row, and their weights."""
+        chosen = np.array(frames)[:: -(-len(frames) // MAX_FRAMES)]
         middle = self.look(chosen)
         off = np.array([difference(self.signatures[t], middle).max() for t in chosen])
         spread = max(float(np.median(off)), _LEAST_CLEAN)
@@ -88,15 +89,15 @@ class Recording:
 
 
 def difference(one: NDArray[np.generic], other: NDArray[np.generic]) -> Doubles:
-    """(rows,) float64: root of the mean square of the difference of two signatures in each row."""
+    """Root mean square of the difference of two signatures in each row, (rows,) float64."""
     squares = np.subtract(one, other, dtype=np.float64) ** 2
     return np.asarray(np.sqrt(squares.mean(axis=(1, 2))))
 
 
 def _quiet(change: Doubles, times: Doubles, hold: float) -> Doubles:
-    """The changes between frames that are noise alone: a low quantile of those within half a hold.
+    """The noise at each frame: a low quantile of the changes within half a hold before and after.
 
-    The noise of a dark picture is another than that of a bright one.
+    It is local because a dark picture has other noise than a bright one.
     """
     middle = (times[1:] + times[:-1]) / 2
     first, last = (
@@ -104,5 +105,5 @@ def _quiet(change: Doubles, times: Doubles, hold: float) -> Doubles:
         np.searchsorted(middle, middle + hold / 2, "right"),
     )
     noise = np.array([np.quantile(change[a:b], _QUIET) for a, b in zip(first, last, strict=True)])
-    # What a codec leaves as it was has no noise at all for a while.
+    # Where a codec repeats the picture, there is no noise at all for a while.
     return np.asarray(np.maximum(noise, np.median(noise) / 2 if noise.size else 0))

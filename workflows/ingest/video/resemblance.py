@@ -1,4 +1,4 @@
-"""Whether what a recording shows is the program: what was seen of each pattern, against the light of the pattern."""
+"""Whether a recording shows the program: what the camera saw of each pattern, compared with the pattern's light."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -11,19 +11,19 @@ from workflows.programs.program import Bernoulli, Constant, Program
 
 Doubles = NDArray[np.float64]
 Light = NDArray[np.float32]
-"""(patterns, rows, columns, 3) float32: the light of patterns on a grid over the monitor."""
+"""(patterns, rows, columns, 3) float32: the light of each pattern on a grid over the monitor."""
 
 GRIDS = ((4, 3), (8, 6), (16, 12), (32, 24))
-"""On which patterns are compared: how much of the monitor a cell of a frame sees is not known."""
-FEWEST = 8
-"""Patterns of a part that are compared with one another: the orders of fewer look too much alike."""
-_ORDERS = 64
-_ODD = 5.0
-_APART = 0.1
+"""Grids on which patterns are compared: several, because it is not known how much of the monitor a cell sees."""
+MIN_PATTERNS = 8
+"""Patterns that a part must have to be compared: random orders of fewer look too much alike."""
+_ORDERS = 64  # random orders to compare with
+_ODD = 5.0  # times the median squared distance from the part's mean: an odd pattern
+_APART = 0.1  # difference of light from which one constant pattern must look brighter than the other
 
 
 def lay_out(program: Program, curve: Curve, images: Sequence[NDArray[np.float32]] = ()) -> Light:
-    """The light of every pattern of a program on the finest of `GRIDS`."""
+    """Lay the light of every pattern of a program out on the finest of `GRIDS`."""
     columns, rows = GRIDS[-1]
     laid = np.empty((program.count, rows, columns, 3), np.float32)
     for start, part in zip(program.starts, program.parts, strict=False):
@@ -37,28 +37,28 @@ def lay_out(program: Program, curve: Curve, images: Sequence[NDArray[np.float32]
     return laid
 
 
-def resemblance(program: Program, light: Light, looks: Mapping[int, Doubles]) -> float | None:
-    """Whether patterns that are alike look alike, more than they would in another order.
+def score(program: Program, light: Light, looks: Mapping[int, Doubles]) -> float | None:
+    """How much better similar patterns look similar than they would in a random order.
 
     Parameters
     ----------
     program : Program
     light : Light
-        Of all its patterns.
+        Of all its patterns, see `lay_out`.
     looks : mapping of int to (rows, columns, 3) float64
-        What the camera saw of patterns, about in linear light.
+        What the camera saw of patterns, in approximately linear light.
 
     Returns
     -------
     float or None
-        Standard deviations above what random orders of the patterns give; about 0 of another program. None if the
-        program has too few patterns to tell.
+        Standard deviations above the mean of random orders; about 0 for another program. None if the program has too
+        few patterns to compare.
 
     Notes
     -----
-    Within each part, the inner products of the patterns, on several grids, are summed over those of the looks (an
-    alignment of kernels, Cristianini et al., 2001; without the diagonals). Nothing needs to be known of what the cells
-    of a frame see. Parts count by how much of their contrast the grids show.
+    Within each part, the inner products of pairs of patterns, on several grids, are correlated with those of pairs of
+    looks (a kernel alignment without the diagonals, Cristianini et al., 2001). It is not necessary to know what part of
+    the monitor a cell of the frame sees. Parts are weighted by how much of their contrast the grids show.
     """
     total = weights = 0.0
     for numbers in _parts(program, looks):
@@ -80,11 +80,11 @@ def resemblance(program: Program, light: Light, looks: Mapping[int, Doubles]) ->
     return float(total / np.sqrt(weights)) if weights else None
 
 
-def odd(program: Program, light: Light, looks: Mapping[int, Doubles]) -> list[int]:
-    """The patterns that look unlike others of their kind: something was in front, or they are others.
+def odd_patterns(program: Program, light: Light, looks: Mapping[int, Doubles]) -> list[int]:
+    """The patterns that look unlike others of their kind: something was in front, or the program is another one.
 
-    Random patterns that are farther from the mean of their part than any should be, and constant ones that are darker
-    than most of those that are sent less.
+    These are random patterns too far from the mean of their part, and constant ones that look darker than most of the
+    darker ones.
     """
     found = []
     for numbers in _parts(program, looks):
@@ -101,15 +101,15 @@ def odd(program: Program, light: Light, looks: Mapping[int, Doubles]) -> list[in
 
 
 def _parts(program: Program, looks: Mapping[int, Doubles]) -> Iterator[list[int]]:
-    """The patterns seen of each part of random ones that has enough of them."""
+    """For each random part, the numbers of the patterns seen, if there are enough of them."""
     for start, part in zip(program.starts, program.parts, strict=False):
         numbers = [number for number in range(start, start + part.count) if number in looks]
-        if isinstance(part, Bernoulli) and len(numbers) >= FEWEST:
+        if isinstance(part, Bernoulli) and len(numbers) >= MIN_PATTERNS:
             yield numbers
 
 
 def _products(rows: Doubles) -> Doubles:
-    """Inner products of rows that are centred and of unit length, those with themselves left out."""
+    """Inner products of rows, centred and normalised; zero on the diagonal."""
     rows = rows - rows.mean(axis=0)
     rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
     products: Doubles = rows @ rows.T

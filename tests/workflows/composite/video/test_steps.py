@@ -24,7 +24,7 @@ from workflows.composite import composite
 from workflows.composite.video import steps as video_steps
 from workflows.composite.video.steps import STEPS
 from workflows.images.tone_curves import from_light, to_light
-from workflows.ingest.video.decoder import ROUNDED
+from workflows.ingest.video.frame_means import ACCURATE
 from workflows.jobs import Task, run
 from workflows.untrusted.limits import Limits
 
@@ -113,7 +113,7 @@ def clip(
                 format=stream.pix_fmt,
                 dst_colorspace=Colorspace.ITU709,
                 dst_color_range=ColorRange.JPEG if codec == "mjpeg" else ColorRange.MPEG,
-                interpolation=ROUNDED,
+                interpolation=ACCURATE,
             )
             frame.pts, frame.time_base = (
                 int(tick * TICK / stream.codec_context.time_base),
@@ -162,7 +162,7 @@ def frames_of(video: bytes) -> tuple[list[NDArray[np.uint8]], list[Fraction], Fr
         decoded = list(container.decode(stream))
         assert stream.time_base is not None
         assert stream.duration is not None
-        shown = [frame.reformat(format="rgb24", interpolation=ROUNDED).to_ndarray() for frame in decoded]
+        shown = [frame.reformat(format="rgb24", interpolation=ACCURATE).to_ndarray() for frame in decoded]
         times = [frame.pts * stream.time_base for frame in decoded if frame.pts is not None]
         return shown, times, stream.duration * stream.time_base
 

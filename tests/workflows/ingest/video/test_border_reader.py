@@ -9,10 +9,10 @@ import pytest
 from storage.errors import CaptureError
 from storage.layout.captures import Stack
 from tests.workflows.ingest.video.camera import TICK, Camera, Film, capture, film
-from workflows.ingest.video.border_reader import find
-from workflows.ingest.video.decoder import Large
+from workflows.ingest.video.border_reader import find_by_numbers
 from workflows.ingest.video.recording import Recording
-from workflows.programs.border import LEAD, Border, draw, schedule
+from workflows.ingest.video.signatures import LargeFrames
+from workflows.programs.border import LEAD, Border, draw_border, schedule
 from workflows.programs.presets import preset
 from workflows.simulation.glass_ball import glass_ball
 
@@ -61,7 +61,7 @@ def take(make_zip: Callable[..., bytes], ingest: Callable[..., Any]) -> Callable
             if step.number != LEAD:
                 picture = pictures[step.number]
             codes = np.round(255 * picture).astype(np.uint8)
-            light = view(draw(codes, step.number, BORDER).astype(np.float32) / 255)
+            light = view(draw_border(codes, step.number, BORDER).astype(np.float32) / 255)
             glass = ball.truth(np.broadcast_to(picture, (height, width, 3)))
             light[HEIGHT // 4 : HEIGHT // 4 + HEIGHT // 2, WIDTH // 4 : WIDTH // 4 + WIDTH // 2] = glass
             repeats = round(step.seconds / HOLD)
@@ -159,4 +159,4 @@ def test_noise_has_no_numbers() -> None:
     recording = Recording(steps, np.arange(240) / 30, 0.2)
     assert len(recording.events) == 39
     grey = np.repeat(random.integers(0, 256, (40, 96, 128), np.uint8), 6, axis=0)
-    assert find(recording, Large(grey, np.arange(240)), BORDER, 32) is None
+    assert find_by_numbers(recording, LargeFrames(grey, np.arange(240)), BORDER, 32) is None

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from workflows.ingest.video.border_spill import without_border
-from workflows.programs import border
+from workflows.programs.border import BITS, TICKS, number_cells, tick_cells
 from workflows.programs.presets import preset
 
 ROWS, COLUMNS = 12, 16
@@ -16,12 +16,12 @@ def looks(count: int, bordered: bool) -> dict[int, NDArray[np.float64]]:
     random = np.random.Generator(np.random.PCG64(1))
     edge = np.ones((ROWS, COLUMNS), bool)
     edge[1:-1, 1:-1] = False
-    mixture = random.random((np.count_nonzero(edge), 2 * (border.BITS + 1) + 2 * border.TICKS)) ** 8
+    mixture = random.random((np.count_nonzero(edge), 2 * (BITS + 1) + 2 * TICKS)) ** 8
     seen = {}
     for number in range(count):
         look = random.random((ROWS, COLUMNS, 3))
         if bordered:
-            lit = np.concatenate([border.code(number), border.tick(number)])
+            lit = np.concatenate([number_cells(number), tick_cells(number)])
             look[edge] = (mixture @ lit)[:, None] + 0.1 * random.standard_normal((len(mixture), 3))
         seen[number] = look
     return seen

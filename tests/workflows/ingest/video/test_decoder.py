@@ -10,7 +10,9 @@ import pytest
 
 from storage.errors import CaptureError
 from tests.workflows.composite.video.test_steps import clip, even, pictures
-from workflows.ingest.video.decoder import PARTS, Clip, Share
+from workflows.ingest.video.decoder import Clip
+from workflows.ingest.video.frame_means import TOTAL_WEIGHT, Share, mean_frames
+from workflows.ingest.video.signatures import take_signatures
 
 
 @pytest.mark.parametrize(
@@ -42,8 +44,8 @@ def test_a_mean_has_the_colours_that_were_filmed(
             box.mux(stream.encode(frame))
         box.mux(stream.encode())
     film = Clip(io.BytesIO(target.getvalue()), "clip", 1 << 24)
-    _, ticks, _ = film.signatures(1 << 24)
-    (mean,) = film.means([[Share(int(ticks[2]), 100), Share(int(ticks[5]), PARTS - 100)]])
+    _, ticks, _ = take_signatures(film, 1 << 24)
+    (mean,) = mean_frames(film, [[Share(int(ticks[2]), 100), Share(int(ticks[5]), TOTAL_WEIGHT - 100)]])
     film.close()
     middles = mean[8::16, 8::16]
     np.testing.assert_array_equal(middles[0, :2], [[65535] * 3, [0] * 3])  # to the end of the scale: clipped
@@ -68,7 +70,7 @@ def test_a_decoder_is_gone_when_its_clip_is() -> None:
             opened = Clip(io.BytesIO(data), "clip", 1 << 24)
             if used:
                 ticks, _ = opened.ticks(99)
-                list(opened.means([[Share(tick, PARTS)] for tick in ticks[:5].tolist()]))
+                list(mean_frames(opened, [[Share(tick, TOTAL_WEIGHT)] for tick in ticks[:5].tolist()]))
             assert len(decoding()) > len(before)
             opened.close()
             del opened

@@ -268,7 +268,7 @@ def test_more_patterns_than_are_sorted_are_refused(take: Callable[..., Stack], f
 
 
 def test_more_frames_than_are_sorted_are_refused(take: Callable[..., Stack], filmed: Film) -> None:
-    with pytest.raises(CaptureError, match="which is the most that is sorted"):
+    with pytest.raises(CaptureError, match="the most that can be matched"):
         take(filmed.data, memory=1 << 20)
 
 

@@ -1,0 +1,115 @@
+"""Weighted means of a video's frames: one RGB image of 16 bits for each pattern."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from av.video.frame import VideoFrame
+from av.video.reformatter import ColorRange, Interpolation
+from numpy.typing import NDArray
+
+from storage.errors import CaptureError
+from workflows.ingest.video.decoder import Clip, tick_of
+
+PLANAR = {
+    "gray": "gray16le",
+    **{
+        name: f"yuv{kind}p16le"
+        for kind in (420, 422, 444)
+        for name in (f"yuv{kind}p", f"yuvj{kind}p", *(f"yuv{kind}p{bits}le" for bits in (10, 12, 16)))
+    },
+}
+"""Pixel formats whose planes are averaged as they are, and the same formats with 16 bits a value."""
+ACCURATE = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
+"""Without these flags, swscale makes colours half a code too dark."""
+TOTAL_WEIGHT = 257
+"""The sum of the weights of a pattern's frames: 257 times a code of 8 bits is the same code in 16 bits."""
+
+
+class Share(NamedTuple):
+    """A frame that goes into a pattern's mean: its time in ticks, and its weight out of `TOTAL_WEIGHT`."""
+
+    tick: int
+    weight: int
+
+
+def mean_frames(clip: Clip, plan: Sequence[Sequence[Share]]) -> Iterator[NDArray[np.uint16]]:
+    """Weighted means of frames, averaged in the colour system of the video and then converted to RGB.
+
+    Parameters
+    ----------
+    clip : Clip
+    plan : sequence of sequences of Share
+        The frames of each mean, in the order of time; weights add up to `TOTAL_WEIGHT`.
+
+    Yields
+    ------
+    (height, width, 3) uint16
+        Upright; 65535 for a code of 255.
+
+    Raises
+    ------
+    CaptureError
+        If a frame can't be decoded again.
+    """
+    frames = clip.frames_from(plan[0][0].tick)
+    frame = next(frames, None)
+    for shares in plan:
+        sums: list[NDArray[Any]] = []
+        for tick, weight in shares:
+            while frame is not None and tick_of(frame) < tick:
+                frame = next(frames, None)
+            if frame is None or frame.pts != tick:
+                raise CaptureError(
+                    f"{clip.entry}: a frame at {tick * clip.tick:.3f} s can't be decoded again: the video is "
+                    "damaged there. Copy it again from the camera",
+                    entry=clip.entry,
+                )
+            seen = frame if frame.format.name in PLANAR else frame.reformat(format="yuv444p16le")
+            planes = _planes(seen)
+            if not sums:
+                # TOTAL_WEIGHT times a code of 8 bits just fits into 16.
+                kind = np.uint16 if planes[0].dtype == np.uint8 else np.uint32
+                sums = [np.zeros(plane.shape, kind) for plane in planes]
+            for total, plane in zip(sums, planes, strict=True):
+                total += np.multiply(plane, weight, dtype=total.dtype)
+        yield np.ascontiguousarray(np.rot90(_to_rgb(sums, seen), clip.quarter_turns))
+
+
+def _planes(frame: VideoFrame) -> list[NDArray[Any]]:
+    """The planes of a frame in a `PLANAR` format, each (rows, columns)."""
+    kind: np.dtype[Any] = np.dtype("u1" if frame.format.components[0].bits == 8 else "<u2")
+    return [
+        np.frombuffer(memoryview(plane), kind).reshape(plane.height, plane.line_size // kind.itemsize)[
+            :, : plane.width
+        ]
+        for plane in frame.planes
+    ]
+
+
+def _to_rgb(sums: Sequence[NDArray[Any]], like: VideoFrame) -> NDArray[np.uint16]:
+    """(height, width, 3) RGB of planes times `TOTAL_WEIGHT`, in the colour system of the frame ``like``.
+
+    Notes
+    -----
+    Limited range (ITU-R BT.709, sect. 6.10: black 16, white 235, colours 112 about 128) is stretched to full range
+    here: swscale takes the white of 16 bits for a little less than white, so that it would never be clipped.
+    """
+    name, bits = like.format.name, like.format.components[0].bits
+    full = like.color_range == ColorRange.JPEG or name.startswith(("gray", "yuvj"))
+    step = 2.0 ** (bits - 8)
+    mean = VideoFrame(like.width, like.height, PLANAR[name])
+    mean.colorspace, mean.color_range = like.colorspace, ColorRange.JPEG
+    for at, (total, plane) in enumerate(zip(sums, mean.planes, strict=True)):
+        # The code of black, or of grey in a colour plane; the codes from black to white; the result for `zero`.
+        zero, span, level = (128 * step, 224 * step, 32768) if at else (16 * step, 219 * step, 0)
+        if full:
+            zero, span = (128 * step if at else 0, 2.0**bits - 1)
+        scaled = (total / np.float32(TOTAL_WEIGHT) - np.float32(zero)) * np.float32(
+            65535 / span
+        ) + np.float32(level)
+        rows = np.zeros((plane.height, plane.line_size // 2), "<u2")
+        rows[:, : plane.width] = np.rint(np.clip(scaled, 0, 65535))
+        plane.update(rows.tobytes())
+    rgb = mean.reformat(format="rgb48le", interpolation=ACCURATE)
+    return np.asarray(rgb.to_ndarray(), np.uint16)
