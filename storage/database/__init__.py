@@ -1,1 +1,1 @@
-"""The database: its tables, engine, revisions and the rule of who sees what."""
+"""The database: tables, engine, schema revisions, and row-level access by owner."""

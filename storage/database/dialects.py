@@ -1,4 +1,4 @@
-"""What SQLite and PostgreSQL do differently: how they are opened, how a transaction begins, what their errors mean."""
+"""Differences between SQLite and PostgreSQL: connecting, beginning a transaction, and the meaning of errors."""
 
 import logging
 import sqlite3
@@ -24,7 +24,7 @@ from storage.errors import DISK_FULL, EnvmatteError, InvalidInput, NoRoom, Unava
 logger = logging.getLogger(__name__)
 
 WRITE_LOCK = int.from_bytes(b"envmatte")
-"""The advisory lock of PostgreSQL that whoever writes holds."""
+"""Number of the PostgreSQL advisory lock that every writing transaction holds."""
 
 CONNECTION: dict[str, Any] = {
     "connect_timeout": 10,
@@ -33,41 +33,41 @@ CONNECTION: dict[str, Any] = {
     "keepalives_count": 2,
     "tcp_user_timeout": 20_000,
 }
-"""libpq's settings, where a URL has no others: a link that is cut without a word is given up after some 20 s."""
+"""Connection settings of libpq, unless the URL sets them: a connection that is cut silently fails after about 20 s."""
 
 TIMEOUTS = {
     "lock_timeout": "20s",
-    "idle_in_transaction_session_timeout": "10s",  # of a process that is frozen while it has the writers' lock
+    "idle_in_transaction_session_timeout": "10s",  # for a process that freezes while it holds the write lock
     "statement_timeout": "60s",
 }
 
 BUSY_TIMEOUT = 10
-"""Seconds that SQLite waits for a lock."""
+"""Seconds that SQLite waits for a lock before it fails."""
 
 READ_ONLY: dict[str, dict[str, Any]] = {
     "sqlite": {},
     "postgresql": {"isolation_level": "REPEATABLE READ", "postgresql_readonly": True},
 }
-"""Options of a connection whose reads all see the database at one time, as SQLite's always do."""
+"""Options of a connection whose queries all see the same snapshot, as SQLite's always do."""
 
-_SQLITE_AWAY = {
+_SQLITE_UNAVAILABLE = {
     sqlite3.SQLITE_BUSY,
     sqlite3.SQLITE_LOCKED,
     sqlite3.SQLITE_CANTOPEN,
     sqlite3.SQLITE_IOERR,
     sqlite3.SQLITE_PROTOCOL,
 }
-# A session that was ended for being idle within a transaction; a server that was made another's standby.
-_POSTGRESQL_AWAY = {"25P03", "25006"}
+# A session ended for being idle in a transaction; a server that has become a read-only standby.
+_POSTGRESQL_UNAVAILABLE = {"25P03", "25006"}
 
 
 def make_engine(url: str) -> Engine:
-    """An engine for a URL, set up for its database; nothing is connected yet.
+    """An engine for a URL, configured for its kind of database; it connects on first use.
 
     Raises
     ------
     InvalidInput
-        If it is no URL of a SQLite or PostgreSQL database.
+        If the URL does not name a SQLite or PostgreSQL database.
     """
     try:
         parsed = make_url(url)
@@ -85,7 +85,7 @@ def make_engine(url: str) -> Engine:
             connect_args={name: value for name, value in CONNECTION.items() if name not in parsed.query},
         )
         event.listen(engine, "connect", _set_up_postgresql)
-    else:  # what was given may hold a password: it is not repeated
+    else:  # do not repeat the URL: it may contain a password
         raise InvalidInput(
             "the database's URL must be sqlite:////folder/file.db or postgresql://user:password@host:port/database"
         )
@@ -94,9 +94,9 @@ def make_engine(url: str) -> Engine:
 
 
 def _set_up_sqlite(connection: Any, record: object) -> None:
-    connection.isolation_level = None  # BEGIN is ours, see _begin
+    connection.isolation_level = None  # _begin issues BEGIN itself
     cursor = connection.cursor()
-    # FULL: what is committed is on disk, also after a power cut, before anyone is told.
+    # FULL: a commit returns once its data survives a power cut.
     for pragma in (f"busy_timeout={BUSY_TIMEOUT * 1000}", "synchronous=FULL", "foreign_keys=ON"):
         cursor.execute(f"PRAGMA {pragma}")
     deadline = time.monotonic() + BUSY_TIMEOUT
@@ -105,7 +105,7 @@ def _set_up_sqlite(connection: Any, record: object) -> None:
             cursor.execute("PRAGMA journal_mode=WAL")
             break
         except sqlite3.OperationalError as error:
-            # Of those that turn a new file to WAL at once SQLite refuses all but one, without waiting.
+            # If several connections switch a new file to WAL at once, SQLite refuses all but one without waiting.
             if error.sqlite_errorcode & 0xFF != sqlite3.SQLITE_BUSY or time.monotonic() > deadline:
                 raise
             time.sleep(0.01)
@@ -119,8 +119,8 @@ def _set_up_postgresql(connection: Any, record: object) -> None:
 
 
 def _begin(connection: Connection) -> None:
-    # A transaction that reads before it writes must hold the lock from the start: SQLite refuses the write at
-    # once whenever another writer came in between, without waiting for busy_timeout, and PostgreSQL overwrites.
+    # A transaction that reads before it writes must hold the lock from the start. If another writer came in between,
+    # SQLite would refuse the write immediately, without waiting for busy_timeout, and PostgreSQL would overwrite it.
     writes = connection.get_execution_options().get("writes", False)
     if connection.dialect.name == "sqlite":
         connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
@@ -129,47 +129,45 @@ def _begin(connection: Connection) -> None:
 
 
 def translate(error: SQLAlchemyError) -> EnvmatteError | None:
-    """What a database's error means to a caller; None if it is a fault of ours."""
+    """The error of `storage.errors` that a database error stands for; None if it is a programming error."""
     if isinstance(error, NoConnectionFree):
-        return Unavailable(
-            "more is asked of the database at once than it is set up for; try again in a few seconds"
-        )
+        return Unavailable("all database connections are in use; try again in a few seconds")
     if not isinstance(error, DBAPIError):
         return None
-    if isinstance(error, DataError):  # a NUL in a text, a text too long: what SQLite would have kept
-        return InvalidInput(f"the database can't hold what was sent: {reason(error)}")
+    if isinstance(error, DataError):  # a NUL in a text, or a text that is too long; SQLite would accept both
+        return InvalidInput(f"the database cannot store this value: {reason(error)}")
     if isinstance(error.orig, sqlite3.Error):
-        code = getattr(error.orig, "sqlite_errorcode", 0) & 0xFF  # the rest says more about the same
-        full, away = code == sqlite3.SQLITE_FULL, code in _SQLITE_AWAY
+        code = getattr(error.orig, "sqlite_errorcode", 0) & 0xFF  # the low byte is the primary code
+        full, unavailable = code == sqlite3.SQLITE_FULL, code in _SQLITE_UNAVAILABLE
     else:
         state = getattr(error.orig, "sqlstate", None)
         full = state == "53100"
-        away = (
+        unavailable = (
             isinstance(error, (OperationalError, InterfaceError))
             or error.connection_invalidated
-            or state in _POSTGRESQL_AWAY
+            or state in _POSTGRESQL_UNAVAILABLE
         )
     if full:
         return NoRoom(DISK_FULL)
-    if away:
-        logger.warning("the database can't be reached: %s", reason(error))
-        return Unavailable("the database can't be reached or is busy for now; try again in a few seconds")
+    if unavailable:
+        logger.warning("the database cannot be reached: %s", reason(error))
+        return Unavailable("the database cannot be reached or is busy; try again in a few seconds")
     return None
 
 
 def reason(error: BaseException | None) -> str:
-    """The first line of what the driver says, which holds no password."""
-    said = str(error.orig if isinstance(error, DBAPIError) else error)
-    return said.partition("\n")[0]
+    """The first line of a driver's error message, which contains no password."""
+    message = str(error.orig if isinstance(error, DBAPIError) else error)
+    return message.partition("\n")[0]
 
 
 def display_url(url: URL) -> str:
-    """A URL as it may be shown: without its password, nor options, that may hold one."""
+    """A URL for people to read: without its password and its options, which may contain one."""
     return url.set(query={}).render_as_string(hide_password=True)
 
 
 class clock(FunctionElement[float]):
-    """The database's clock as an SQL expression: seconds since 1970, which go on within a transaction."""
+    """The database's clock as an SQL expression: seconds since 1970, advancing within a transaction."""
 
     type = Float()
     inherit_cache = True

@@ -1,4 +1,4 @@
-"""The engine that opens a database, and its transactions."""
+"""Opening the database, and its read and write transactions."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -7,11 +7,12 @@ from sqlalchemy import Connection, Engine, event
 from sqlalchemy.exc import SQLAlchemyError
 
 from storage.database import dialects, owners
+from storage.database.revision import NEWEST, revision
 from storage.errors import Unavailable
 
 
 def open_engine(url: str) -> Engine:
-    """Open a database, and bring its schema up to date; any number of processes may do so at once.
+    """Open a database and upgrade its schema if needed; several processes may do so at the same time.
 
     Parameters
     ----------
@@ -21,50 +22,46 @@ def open_engine(url: str) -> Engine:
     Raises
     ------
     InvalidInput
-        If it is no such URL.
+        If the URL does not name a SQLite or PostgreSQL database.
     Conflict
         If a newer envmatte has used the database.
     Unavailable
-        If the database can't be reached.
+        If the database cannot be reached.
     NoRoom
         If its disk is full.
     """
-    from storage.database import (
-        migrations,  # with alembic, whose import takes a time that no worker should spend
-    )
-
     engine = dialects.make_engine(url)
     event.listen(engine, "before_execute", owners.restrict, retval=True)
     try:
         with reading(engine) as connection:
-            current = migrations.revision(connection) == migrations.newest()
+            current = revision(connection) == NEWEST
         if not current:
+            from storage.database import migrations  # imports alembic, which few processes need
+
             with writing(engine) as connection:
                 migrations.upgrade(connection)
     except BaseException as error:
         engine.dispose()
         if not isinstance(error, Unavailable):
             raise
+        where, why = dialects.display_url(engine.url), dialects.reason(error.__cause__)
         raise Unavailable(
-            f"cannot open the database {dialects.display_url(engine.url)}: {dialects.reason(error.__cause__)}; "
-            "check that it runs and that its URL is right, and try again"
+            f"cannot open the database {where}: {why}; check that it runs and that its URL is right, and try again"
         ) from error
     return engine
 
 
 @contextmanager
 def reading(engine: Engine) -> Iterator[Connection]:
-    """A transaction that only reads: all of it sees the database as it was at one time.
+    """A read-only transaction: all of its queries see the database at one point in time.
 
     Raises
     ------
     Unavailable
-        If the database can't be reached.
+        If the database cannot be reached.
     """
-    with (
-        _translate_errors(),
-        engine.connect().execution_options(**dialects.READ_ONLY[engine.dialect.name]) as connection,
-    ):
+    options = dialects.READ_ONLY[engine.dialect.name]
+    with _translate_errors(), engine.connect().execution_options(**options) as connection:
         yield connection
 
 
@@ -77,7 +74,8 @@ def writing(engine: Engine) -> Iterator[Connection]:
     NoRoom
         If the disk is full.
     Unavailable
-        If the database can't be reached, or others write for too long. Whether it was committed is not known then.
+        If the database cannot be reached, or the wait for other writers takes too long. The transaction may have been
+        committed or not.
     """
     with (
         _translate_errors(),

@@ -1,12 +1,12 @@
-"""Whose things are whose, by one rule: what is done over an engine that is bound to an owner concerns his rows alone.
+"""Row-level access: over an engine that is bound to an owner, statements see and change only that owner's rows.
 
-`bound` gives such an engine. Of whatever statement is executed over it the listener here narrows every table: one with
-a column ``owner`` to the rows of that owner, one that refers to such a table to the rows that belong to those, and what
-is inserted is his. So no query, and no route, can forget to ask. What can't be narrowed with certainty is refused with
-a `TypeError`, for it is a fault of ours: text, tables of the whole service, subqueries. An outer join becomes an inner
-one.
+`for_owner` returns such an engine. A listener rewrites every statement that is executed over it: a table with a column
+``owner`` is restricted to the owner's rows, a table with a foreign key to such a table to the rows that belong to
+those, and inserted rows get the owner. So no query and no route can forget the check. A statement that cannot be
+restricted with certainty raises `TypeError`, because it is a programming error: text, tables of the whole service,
+subqueries. An outer join becomes an inner join.
 
-An engine that is not bound sees the rows of all owners: it is for the coordinator, and for whoever runs the service.
+An engine without an owner sees the rows of all owners. The coordinator and the command line use it.
 """
 
 from typing import Any, TypeVar
@@ -28,30 +28,30 @@ from sqlalchemy.sql import visitors
 from sqlalchemy.sql.selectable import AliasedReturnsRows, SelectBase
 
 DEFAULT = "default"
-"""Whose everything is in a service without keys, by keys of the settings, and from before there were owners."""
+"""The owner of everything in a service without keys, of keys from the settings, and of rows older than owners are."""
 NOBODY = ""
-"""An owner of nothing."""
+"""An owner that owns nothing."""
 SHARED = {"coordinator"}
-"""Tables that tell nothing of anyone's, and that all may see."""
+"""Tables that hold nothing of any owner and that every owner may read."""
 SECRET = {"keys"}
-"""Tables that no owner may see, though every row has one."""
+"""Tables that no owner may read, although their rows have an owner."""
 
 E = TypeVar("E", bound=Executable)
 
 
 def for_owner(engine: Engine, owner: str) -> Engine:
-    """The same engine, over which only what belongs to an owner can be seen, changed and made."""
+    """The same engine, restricted to reading, changing and inserting rows of one owner."""
     return engine.execution_options(owner=owner)
 
 
 def across_owners(statement: E) -> E:
-    """A statement that concerns the rows of all owners, whoever executes it: for sums that no row can be told from."""
-    statement = statement.execution_options(of_all=True)
+    """The same statement over the rows of all owners: for sums, which reveal no single row."""
+    statement = statement.execution_options(across_owners=True)
     return statement
 
 
 def default_owner(context: Any) -> str:
-    """Whose a row is that is inserted: the default of every column ``owner``."""
+    """The owner of an inserted row: the default of every column ``owner``."""
     owner: str = context.execution_options.get("owner", DEFAULT)
     return owner
 
@@ -59,21 +59,21 @@ def default_owner(context: Any) -> str:
 def restrict(
     connection: Connection, statement: Any, several: Any, parameters: Any, options: Any
 ) -> tuple[Any, Any, Any]:
-    """Narrow a statement to the owner that its connection is bound to: a listener to ``before_execute``."""
+    """Listener to ``before_execute``: restrict a statement to the owner that its engine is bound to."""
     owner = options.get("owner")
-    if owner is not None and not options.get("of_all"):
-        statement = _narrowed(statement, owner)
+    if owner is not None and not options.get("across_owners"):
+        statement = _restricted(statement, owner)
     return statement, several, parameters
 
 
-def _narrowed(statement: Any, owner: str) -> Any:
+def _restricted(statement: Any, owner: str) -> Any:
     tables = _tables_of(statement)
     if isinstance(statement, Insert):
         return statement
     for table in tables:
-        mine = _mine(table, owner)
-        if mine is not None:
-            statement = statement.where(mine)
+        condition = _owned(table, owner)
+        if condition is not None:
+            statement = statement.where(condition)
     return statement
 
 
@@ -83,21 +83,23 @@ def _tables_of(statement: Any) -> list[Table]:
     Raises
     ------
     TypeError
-        If a criterion on each of them would not do.
+        If a condition on each of them would not restrict the statement.
     """
     if not isinstance(statement, (Select, Insert, Update, Delete)):
-        raise TypeError(f"an owner's statement is a select, insert, update or delete, not {type(statement)}")
+        raise TypeError(f"an owner may only select, insert, update and delete, not execute {type(statement)}")
     tables: dict[Table, None] = {}
     for element in visitors.iterate(statement):
         if isinstance(element, Table):
             tables[element] = None
         elif isinstance(element, (SelectBase, AliasedReturnsRows, TextClause)) and element is not statement:
-            raise TypeError(f"an owner's statement has no {type(element)} in it: it could not be narrowed")
+            raise TypeError(
+                f"an owner's statement must not contain {type(element)}, which cannot be restricted"
+            )
     return list(tables)
 
 
-def _mine(table: Table, owner: str) -> ColumnElement[bool] | None:
-    """What is true of the rows of a table that belong to an owner; None where all may see all of them."""
+def _owned(table: Table, owner: str) -> ColumnElement[bool] | None:
+    """The condition that selects an owner's rows of a table; None for a table that every owner may read."""
     if table.name in SHARED:
         return None
     if "owner" in table.c and table.name not in SECRET:
@@ -106,4 +108,4 @@ def _mine(table: Table, owner: str) -> ColumnElement[bool] | None:
         parent = key.column.table.alias()
         if "owner" in parent.c:
             return exists().where(parent.c[key.column.name] == key.parent, parent.c.owner == owner)
-    raise TypeError(f"the table {table.name} is of the whole service, and no owner's")
+    raise TypeError(f"the table {table.name} belongs to the whole service, not to an owner")

@@ -1,4 +1,4 @@
-"""Rows of tables that have ids: new ids, lookups, pages."""
+"""Rows of tables that have ids: new ids, lookup by id, and pages."""
 
 import secrets
 import time
@@ -11,12 +11,12 @@ from storage.errors import NotFound
 
 
 def new_id() -> str:
-    """An opaque, URL-safe id that can't be guessed."""
+    """A random, URL-safe id that cannot be guessed."""
     return secrets.token_hex(10)
 
 
 def lifetime(seconds: float | None) -> dict[str, float | None]:
-    """The times of a row that is made now, and kept for so long, or until it is deleted."""
+    """``created_at`` and ``expires_at`` of a row created now; it never expires if `seconds` is None."""
     now = time.time()
     return {"created_at": now, "expires_at": None if seconds is None else now + seconds}
 
@@ -32,26 +32,26 @@ def find(connection: Connection, table: Table, id: str) -> Row[Any]:
     row = connection.execute(select(table).where(table.c.id == id)).one_or_none()
     if row is None:
         one = table.name.removesuffix("s")
-        raise NotFound(f"there is no {one} {id!r}; GET /v1/{table.name} lists those there are")
+        raise NotFound(f"there is no {one} {id!r}; GET /v1/{table.name} lists them")
     return row
 
 
 def page(
     connection: Connection, table: Table, limit: int, after: str | None, **equal: str | None
 ) -> Sequence[Row[Any]]:
-    """Rows of a table with ids and numbers, newest first.
+    """One page of a table's rows, newest first; the table has the columns ``id`` and ``number``.
 
     Parameters
     ----------
     after : str, optional
-        The id of the last row of the page before.
+        The id of the last row of the previous page.
     **equal : str or None
-        Columns that must have a value; None asks for any.
+        Values that columns must have; None matches any value.
 
     Raises
     ------
     NotFound
-        If there is no row ``after``.
+        If there is no row with the id ``after``.
     """
     query = select(table).order_by(table.c.number.desc()).limit(limit)
     for column, value in equal.items():
@@ -61,7 +61,8 @@ def page(
         number = connection.scalar(select(table.c.number).where(table.c.id == after))
         if number is None:
             raise NotFound(
-                f"there is no {after!r} to go on after; leave `after` out to start again", field="after"
+                f"there is no {after!r} to continue after; omit `after` to start with the newest",
+                field="after",
             )
         query = query.where(table.c.number < number)
     return connection.execute(query).all()

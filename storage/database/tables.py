@@ -1,4 +1,4 @@
-"""The database: its tables, and the engine that opens it."""
+"""The tables of the database."""
 
 from sqlalchemy import (
     JSON,
@@ -20,9 +20,14 @@ from storage.database import owners
 metadata = MetaData()
 
 
-def _owner() -> Column[str]:
+def _owner(*, primary_key: bool = False) -> Column[str]:
     return Column(
-        "owner", String(64), nullable=False, default=owners.default_owner, server_default=owners.DEFAULT
+        "owner",
+        String(64),
+        nullable=False,
+        primary_key=primary_key,
+        default=owners.default_owner,
+        server_default=owners.DEFAULT,
     )
 
 
@@ -43,7 +48,7 @@ captures = Table(
     Column("created_at", Float, nullable=False),
     _owner(),
     Column("expires_at", Float, index=True),
-    Column("stored", BigInteger),  # bytes that it takes in the store; null until they were counted
+    Column("stored", BigInteger),  # bytes in the store; null until counted
     Index("captures_by_owner", "owner", "number"),
 )
 
@@ -52,7 +57,7 @@ mattes = Table(
     metadata,
     Column("number", Integer, primary_key=True, autoincrement=True),
     Column("id", String(32), nullable=False, unique=True),
-    Column("capture", String(32)),  # neither of one that came in an archive
+    Column("capture", String(32)),  # capture and job are null for an imported matte
     Column("job", String(32)),
     Column("state", String(16), nullable=False),
     Column("options", JSON, nullable=False),
@@ -60,7 +65,7 @@ mattes = Table(
     Column("created_at", Float, nullable=False),
     _owner(),
     Column("expires_at", Float, index=True),
-    Column("stored", BigInteger),  # as of a capture
+    Column("stored", BigInteger),  # as for a capture
     Index("mattes_by_owner", "owner", "number"),
 )
 
@@ -71,9 +76,9 @@ programs = Table(
     Column("id", String(32), nullable=False),
     Column("program", JSON, nullable=False),
     Column("created_at", Float, nullable=False),
-    Column("showing", JSON(none_as_null=True)),  # what the page that shows it last told, and when
+    Column("showing", JSON(none_as_null=True)),  # playback progress, as the player last reported it
     _owner(),
-    UniqueConstraint("owner", "id"),  # which is the same of whoever made the same program
+    UniqueConstraint("owner", "id"),  # the id is a hash of the program, so two owners may share it
     Index("programs_by_owner", "owner", "number"),
 )
 
@@ -85,7 +90,7 @@ jobs = Table(
     Column("kind", String(16), nullable=False),
     Column("state", String(16), nullable=False, index=True),
     Column("stage", String(16), nullable=False),
-    Column("capture", String(32), nullable=False),  # empty of a composite of a matte that has none
+    Column("capture", String(32), nullable=False),  # empty for a composite of an imported matte
     Column("matte", String(32)),
     Column("options", JSON, nullable=False),
     Column("plan", JSON(none_as_null=True)),
@@ -97,15 +102,15 @@ jobs = Table(
     Column("created_at", Float, nullable=False),
     Column("started_at", Float),
     Column("finished_at", Float),
-    Column("stage_at", Float),  # when the present stage was entered
-    Column("moved_at", Float),  # when last something of it got done
-    Column("paced_at", Float),  # the pace of tiles is measured from here: when, and how many were done
+    Column("stage_at", Float),  # when the current stage began
+    Column("moved_at", Float),  # when a tile was last done
+    Column("paced_at", Float),  # when measuring the pace began, and how many tiles were done then
     Column("paced_done", Integer, nullable=False, server_default="0"),
     Column("trace", String(64)),  # the request's traceparent (W3C)
     _owner(),
-    Column("stored", BigInteger),  # as of a capture: of a composite, which has no other record
+    Column("stored", BigInteger),  # bytes in the store, of a composite
     Index("jobs_by_owner", "owner", "number"),
-    Column("webhook", Text),  # the URL that is told when it has ended
+    Column("webhook", Text),  # URL to notify when the job has ended
 )
 
 tiles = Table(
@@ -116,7 +121,7 @@ tiles = Table(
     Column("state", String(16), nullable=False),
     Column("attempts", Integer, nullable=False),
     Column("seconds", Float),
-    Column("losses", Integer, nullable=False, server_default="0"),  # how often its worker died
+    Column("losses", Integer, nullable=False, server_default="0"),  # how often its worker died or lost it
     Index("tiles_by_state", "job", "state"),
 )
 
@@ -134,12 +139,12 @@ coordinator = Table(
     metadata,
     Column("id", Integer, primary_key=True),
     Column("token", Integer, nullable=False),  # grows by one at each takeover
-    Column("holder", String(64)),  # the process that drives
+    Column("holder", String(64)),  # the process that runs the jobs
     Column("expires_at", Float, nullable=False),
     Column("beat_at", Float, nullable=False),
-    Column("cluster", JSON, nullable=False),  # what the holder last saw: workers, problem
+    Column("cluster", JSON, nullable=False),  # as the holder last saw it: workers, problem
 )
-"""One row: the lease of the coordinator. Its times are by the database's clock."""
+"""One row: the lease of the coordinator, with times by the database's clock. See `storage.records.leases`."""
 
 totals = Table(
     "totals",
@@ -151,7 +156,7 @@ totals = Table(
     Column("pixels", BigInteger, nullable=False),
     Column("seconds", Float, nullable=False),
 )
-"""What has ever been done by each kind of job, also by those that are deleted: for metrics."""
+"""Work done so far by each kind of job, deleted jobs included: for metrics."""
 
 uploads = Table(
     "uploads",
@@ -181,26 +186,24 @@ deliveries = Table(
     "deliveries",
     metadata,
     Column("id", String(32), primary_key=True),
-    Column("job", String(32), nullable=False),  # which may be deleted before it is told
+    Column("job", String(32), nullable=False),  # may be deleted before the delivery
     Column("url", Text, nullable=False),
     Column("body", Text, nullable=False),
     Column("attempts", Integer, nullable=False),
     Column("due_at", Float, nullable=False, index=True),
     Column("created_at", Float, nullable=False),
 )
-"""What is to be told to webhooks: a row until it is delivered or given up."""
+"""Webhook deliveries that are still to be made. See `storage.records.webhook_deliveries`."""
 
 made = Table(
     "made",
     metadata,
-    Column(
-        "owner", String(64), primary_key=True, default=owners.default_owner, server_default=owners.DEFAULT
-    ),
+    _owner(primary_key=True),
     Column("key", String(256), primary_key=True),
     Column("call", String(64), primary_key=True),
     Column("id", String(32), nullable=False),
 )
-"""What a POST with an Idempotency-Key made, so that a repeat answers with the same."""
+"""What each Idempotency-Key has created, so that a repeated request gets the same response."""
 
 keys = Table(
     "keys",
@@ -213,4 +216,4 @@ keys = Table(
     Column("created_at", Float, nullable=False),
     Column("revoked_at", Float),
 )
-"""API keys, see `storage.records.api_keys`."""
+"""API keys. See `storage.records.api_keys`."""

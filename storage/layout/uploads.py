@@ -7,17 +7,22 @@ archive that is complete gets an index, ``uploads/ID/parts.json``, for workers, 
 id and its place as a capture.
 """
 
+from __future__ import annotations
+
 import io
 import json
 from bisect import bisect_right
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 from storage.errors import Corrupt
-from storage.objects.store import Objects
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from storage.objects.store import Objects
 
 INDEX = "parts.json"
 

@@ -20,8 +20,8 @@ from typing import IO, Any
 
 from sqlalchemy import Engine
 
-from storage.database import migrations
 from storage.database.engine import reading
+from storage.database.revision import revision
 from storage.errors import Conflict, Corrupt
 from storage.maintenance import inventory, row_dump
 from storage.maintenance.integrity import Examiner, Finding
@@ -164,7 +164,7 @@ class _Copying:
         """Write down all rows, as they are at one time; returns what they stand for, by family."""
         families: dict[str, list[Item]] = {}
         with reading(self._engine) as c:
-            self.revision = migrations.revision(c) or ""
+            self.revision = revision(c) or ""
             tables = row_dump.tables_of(c)
             for name, row in row_dump.lines(c, tables):
                 self._rows.write(row_dump.to_line(name, row))

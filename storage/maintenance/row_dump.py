@@ -14,6 +14,7 @@ from sqlalchemy import JSON, Connection, Engine, MetaData, Table, func, insert, 
 
 from storage.database import dialects, migrations
 from storage.database.engine import reading
+from storage.database.revision import revision
 from storage.database.tables import metadata
 from storage.errors import Conflict, InvalidInput
 
@@ -42,13 +43,13 @@ def open_without_upgrade(url: str) -> Engine:
         )
     try:
         with reading(engine) as c:
-            revision = migrations.revision(c)
-        if revision is None:
+            found = revision(c)
+        if found is None:
             raise Conflict(
                 f"the database {where} has no tables of envmatte, or those of a very old one: name the one of the "
                 "service, or start `envmatte serve` on it once"
             )
-        migrations.require_known(revision, "the database")
+        migrations.require_known(found, "the database")
     except BaseException:
         engine.dispose()
         raise

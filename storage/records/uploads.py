@@ -1,9 +1,11 @@
 """Rows of uploads under way: their offsets, parts and expiry."""
 
+from __future__ import annotations
+
 import time
 from collections.abc import Sequence
 from itertools import accumulate
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import Connection, Row, func, insert, select, update
 
@@ -12,7 +14,9 @@ from storage.database.tables import upload_parts as table
 from storage.database.tables import uploads
 from storage.errors import Conflict, NoRoom, NotFound
 from storage.layout.uploads import Part
-from storage.objects.store import Objects
+
+if TYPE_CHECKING:
+    from storage.objects.store import Objects
 
 MAX_PARTS = 10_000
 """Parts of one upload: what whoever reads it has to know of it stays below a megabyte."""

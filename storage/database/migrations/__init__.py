@@ -1,7 +1,8 @@
-"""The database's schema, revision after revision: how a database of any age becomes what this code works with.
+"""Schema migrations: they bring a database of any age to the tables that this code works with.
 
-A change of the tables in `storage.database.tables` is a new file in ``versions``; a revision is never edited. None
-can be taken back: an upgrade that fails or is interrupted leaves the schema as it was, and one that went well stays.
+A change of `storage.database.tables` needs a new file in ``versions`` and its number in `storage.database.revision`;
+a released revision is never edited. There are no downgrades. An upgrade is one transaction: if it fails or is
+interrupted, the schema stays as it was.
 """
 
 import logging
@@ -9,54 +10,48 @@ from threading import Lock
 
 from alembic import command
 from alembic.config import Config
-from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from sqlalchemy import Connection
 
+from storage.database.revision import NEWEST, revision
 from storage.errors import Conflict
 
 logger = logging.getLogger(__name__)
 
 _config = Config()
 _config.set_main_option("script_location", "storage.database:migrations")
-_one_at_a_time = Lock()  # alembic keeps the upgrade that goes on in globals
+_lock = Lock()  # alembic keeps the running upgrade in globals
 
 
-def revision(connection: Connection) -> str | None:
-    """The revision that a database's schema has; None if it has none, or is older than revisions are."""
-    return MigrationContext.configure(connection).get_current_revision()
+def known() -> set[str]:
+    """All revisions that this code can upgrade."""
+    return {script.revision for script in ScriptDirectory.from_config(_config).walk_revisions()}
 
 
-def newest() -> str:
-    """The revision that this code works with."""
-    head = ScriptDirectory.from_config(_config).get_current_head()
-    assert head is not None
-    return head
-
-
-def require_known(revision: str, what: str) -> None:
-    """See that a revision is one that this code knows.
+def require_known(found: str, what: str) -> None:
+    """Refuse a revision that this code does not know.
 
     Parameters
     ----------
+    found : str
+        The revision.
     what : str
-        Has the revision: ``the database`` say.
+        What has this revision, for the message: ``the database`` or ``the backup``.
 
     Raises
     ------
     Conflict
-        If it is newer.
+        If the revision is of a newer envmatte.
     """
-    known = {script.revision for script in ScriptDirectory.from_config(_config).walk_revisions()}
-    if revision not in known:
+    if found not in known():
         raise Conflict(
-            f"{what} is of a newer envmatte: it has revision {revision}, and this one knows those up to "
-            f"{newest()}; install the newer envmatte, or use another {what.split()[-1]}"
+            f"{what} was written by a newer envmatte: it has revision {found}, and this envmatte knows revisions up "
+            f"to {NEWEST}; install the newer envmatte, or use another {what.split()[-1]}"
         )
 
 
-def upgrade(connection: Connection, to: str = "head") -> None:
-    """Bring a database's schema up to a revision, within the connection's transaction.
+def upgrade(connection: Connection, to: str = NEWEST) -> None:
+    """Upgrade a database's schema to a revision, within the connection's transaction.
 
     Raises
     ------
@@ -66,7 +61,7 @@ def upgrade(connection: Connection, to: str = "head") -> None:
     before = revision(connection)
     if before is not None:
         require_known(before, "the database")
-    with _one_at_a_time:
+    with _lock:
         _config.attributes["connection"] = connection
         try:
             command.upgrade(_config, to)
@@ -74,4 +69,4 @@ def upgrade(connection: Connection, to: str = "head") -> None:
             del _config.attributes["connection"]
     after = revision(connection)
     if after != before:
-        logger.info("the database's schema is upgraded from revision %s to %s", before or "none", after)
+        logger.info("upgraded the database schema from revision %s to %s", before or "none", after)

@@ -1,4 +1,4 @@
-"""What alembic runs to migrate; see `storage.database.migrations.upgrade`."""
+"""The script that alembic runs for an upgrade; see `storage.database.migrations.upgrade`."""
 
 from alembic import context
 

@@ -17,6 +17,7 @@ from sqlalchemy.exc import DatabaseError, IntegrityError
 from storage.database import dialects, migrations
 from storage.database.engine import open_engine, reading, writing
 from storage.database.owners import DEFAULT, for_owner
+from storage.database.revision import NEWEST, revision
 from storage.database.tables import coordinator, metadata, tiles, totals
 from storage.errors import Conflict, NotFound
 from storage.layout.uploads import Part
@@ -27,13 +28,13 @@ from tests.parts.postgres import Server
 BEFORE_REVISIONS = Path(__file__).with_name("before_revisions.sql")
 OPEN = """
 import sys
-from storage.database import migrations
 from storage.database.engine import open_engine, reading
+from storage.database.revision import revision
 print("ready", flush=True)
 sys.stdin.readline()
 engine = open_engine(sys.argv[1])
 with reading(engine) as connection:
-    print(migrations.revision(connection))
+    print(revision(connection))
 """
 
 LOGGED = """
@@ -101,7 +102,7 @@ def schema(engine: Engine) -> dict[str, Any]:
 
 def test_the_newest_revision_has_the_tables_of_the_code(engine: Engine) -> None:
     with reading(engine) as connection:
-        assert migrations.revision(connection) == migrations.newest()
+        assert revision(connection) == NEWEST == max(migrations.known())
         assert differences(connection) == []
     assert set(schema(engine)) == set(metadata.tables)
 
@@ -174,7 +175,7 @@ def test_an_upgrade_that_fails_leaves_the_old_schema(bare: Engine) -> None:
         open_engine(url)
     assert schema(bare) == before
     with writing(bare) as connection:
-        assert migrations.revision(connection) == "0001"
+        assert revision(connection) == "0001"
         connection.execute(text("DROP TABLE totals"))
     engine = open_engine(url)
     with reading(engine) as connection:
@@ -189,7 +190,7 @@ def test_a_newer_database_is_refused_and_left_alone(engine: Engine, url: str) ->
     with pytest.raises(Conflict, match=r"revision 9999, .* up to \d{4}; install the newer envmatte"):
         open_engine(url)
     with reading(engine) as connection:
-        assert migrations.revision(connection) == "9999"
+        assert revision(connection) == "9999"
         assert differences(connection) == []
 
 
@@ -205,14 +206,14 @@ def test_processes_that_open_it_at_once_upgrade_it_once(bare: Engine) -> None:
         process.stdin.write("\n")
         process.stdin.flush()
     told = [process.communicate(timeout=60) for process in processes]
-    assert told == [(f"{migrations.newest()}\n", "")] * 2
+    assert told == [(f"{NEWEST}\n", "")] * 2
     with reading(bare) as connection:
         assert differences(connection) == []
 
 
 def test_an_upgrade_is_logged_in_a_line_of_ours(old: str) -> None:
     done = subprocess.run([sys.executable, "-c", LOGGED, old], capture_output=True, text=True, check=True)
-    upgraded = f"the database's schema is upgraded from revision none to {migrations.newest()}"
+    upgraded = f"upgraded the database schema from revision none to {NEWEST}"
     assert (done.stdout, done.stderr) == ("", f"INFO:storage.database.migrations:{upgraded}\n")
 
 

@@ -14,6 +14,7 @@ from sqlalchemy import Engine, delete, func, select, text
 from storage.database import dialects, migrations
 from storage.database import tables as database_tables
 from storage.database.engine import open_engine, reading, writing
+from storage.database.revision import NEWEST, revision
 from storage.errors import Conflict, Corrupt, InvalidInput
 from storage.layout import composites
 from storage.maintenance import row_dump
@@ -106,7 +107,7 @@ def test_from_sqlite_and_a_folder_to_postgresql_and_a_bucket_and_back(
     assert told[-1] == (1.0, made["bytes"])
     assert made["bytes"] == sum(map(len, contents(objects).values()))
     header = json.loads(lines_of(there)[0])
-    assert (header["version"], header["revision"]) == ("1.2.3", migrations.newest())
+    assert (header["version"], header["revision"]) == ("1.2.3", NEWEST)
     second = dialects.make_engine(postgresql)
     assert restore(there, second, bucket) == made
     assert rows_of(second) == rows_of(engine)
@@ -231,7 +232,10 @@ LIES: dict[str, tuple[str, Callable[[list[bytes]], None]]] = {
     "one less": ("cut short, or was changed", lambda lines: lines.__delitem__(4)),
     "empty": ("cut short, or was changed", lambda lines: lines.clear()),
     "format": ("the format 'x', and this envmatte knows", change(0, format="x")),
-    "revision": ("the backup is of a newer envmatte: it has revision 9999", change(0, revision="9999")),
+    "revision": (
+        "the backup was written by a newer envmatte: it has revision 9999",
+        change(0, revision="9999"),
+    ),
 }
 SEALED: dict[str, tuple[str, Callable[[list[bytes]], None]]] = {
     "above": ("names 'captures/../../x', which is no object", change(3, name="captures/../../x")),
@@ -333,11 +337,11 @@ def test_one_of_an_earlier_revision_is_brought_up_to_date(
     opened = open_without_upgrade(url)
     back_up(opened, objects, target, "1")
     with reading(opened) as c:
-        assert migrations.revision(c) == "0004"  # which making a copy before an upgrade is for
+        assert revision(c) == "0004"  # which making a copy before an upgrade is for
     opened.dispose()
     restore(target, *elsewhere)
     with reading(elsewhere[0]) as c:
-        assert migrations.revision(c) == migrations.newest()
+        assert revision(c) == NEWEST
         row = jobs.get(c, "j")
         assert (row.state, row.stage, row.problem, row.owner) == ("queued", "waiting", None, "default")
         assert tiles.remaining(c, "j") == [1]

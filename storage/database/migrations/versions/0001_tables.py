@@ -1,6 +1,6 @@
 """The tables as they were before there were revisions.
 
-A database of that time has them, or those of them that its code knew: what is there stays.
+A database from that time has all or some of them; existing tables stay as they are.
 """
 
 from alembic import op
@@ -12,7 +12,7 @@ down_revision = None
 
 
 def upgrade() -> None:
-    """Make the tables and indices that are missing."""
+    """Create the missing tables and indices."""
     _table(
         "captures",
         Column("number", Integer, primary_key=True, autoincrement=True),

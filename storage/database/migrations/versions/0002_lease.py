@@ -1,4 +1,4 @@
-"""The coordinator's lease, what a job's stall and pace are told from, and totals."""
+"""The coordinator's lease, columns for the pace and stalls of jobs, and totals."""
 
 from alembic import op
 from sqlalchemy import JSON, BigInteger, Column, Float, Integer, String
@@ -8,7 +8,7 @@ down_revision = "0001"
 
 
 def upgrade() -> None:
-    """Add the columns; the coordinator's row held the last sign of life alone, and is made anew."""
+    """Add the columns; recreate the coordinator's table, which held only its last heartbeat."""
     op.drop_table("coordinator")
     op.create_table(
         "coordinator",

@@ -1,4 +1,4 @@
-"""The attempts at a job's steps are counted with those at its tiles."""
+"""Failed attempts at a job's steps are counted with its tiles."""
 
 from alembic import op
 
@@ -7,5 +7,5 @@ down_revision = "0002"
 
 
 def upgrade() -> None:
-    """Drop the column that counted them before."""
+    """Drop the column that counted them per job."""
     op.drop_column("jobs", "misses")

@@ -1,4 +1,4 @@
-"""A matte that came in an archive has no capture and no job."""
+"""An imported matte has no capture and no job."""
 
 from alembic import op
 from sqlalchemy import String
@@ -8,7 +8,7 @@ down_revision = "0003"
 
 
 def upgrade() -> None:
-    """Let both be null; SQLite makes the table anew for it."""
+    """Make both columns nullable; SQLite copies the table for that."""
     with op.batch_alter_table("mattes") as table:
         for column in ("capture", "job"):
             table.alter_column(column, existing_type=String(32), nullable=True)

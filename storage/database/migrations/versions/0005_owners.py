@@ -1,6 +1,6 @@
-"""Everything has an owner, keys are kept here, captures and mattes may expire, and their bytes are counted.
+"""Owners, API keys, expiry of captures and mattes, and their size in the store.
 
-What was there before belongs to the default owner.
+Existing rows belong to the default owner.
 """
 
 from alembic import op
@@ -9,12 +9,12 @@ from sqlalchemy import BigInteger, Column, Float, Integer, MetaData, String, Tab
 revision = "0005"
 down_revision = "0004"
 
-# The names that PostgreSQL gave what had none: SQLite's tables are made anew, and find it by these.
+# The names that PostgreSQL gives to unnamed constraints. SQLite copies the table, and alembic finds them by these.
 NAMES = {"uq": "%(table_name)s_%(column_0_name)s_key", "pk": "%(table_name)s_pkey"}
 
 
 def upgrade() -> None:
-    """Add the table and the columns; what is unique is so for an owner."""
+    """Add the table and the columns; unique constraints now hold per owner."""
     op.create_table(
         "keys",
         Column("number", Integer, primary_key=True, autoincrement=True),
@@ -34,11 +34,11 @@ def upgrade() -> None:
         op.create_index(f"ix_{name}_expires_at", name, ["expires_at"])
     _unique_by_owner("programs", "id")
     op.create_index("programs_by_owner", "programs", ["owner", "number"])
-    _made_by_owner()
+    _idempotency_keys_by_owner()
     parts = Table("upload_parts", MetaData(), autoload_with=op.get_bind())
     known = op.get_bind().execute(select(parts)).mappings().all()
     _unique_by_owner("uploads", "key")
-    # With the table that SQLite dropped went what refers to it.
+    # SQLite dropped the uploads table to copy it, which deleted the rows that refer to it.
     if known and op.get_bind().scalar(select(parts).limit(1)) is None:
         op.get_bind().execute(insert(parts), [dict(part) for part in known])
 
@@ -54,7 +54,7 @@ def _unique_by_owner(name: str, column: str) -> None:
         table.create_unique_constraint(f"{name}_owner_{column}_key", ["owner", column])
 
 
-def _made_by_owner() -> None:
+def _idempotency_keys_by_owner() -> None:
     with op.batch_alter_table("made", naming_convention=NAMES) as table:
         table.add_column(_owner())
         table.drop_constraint("made_pkey", type_="primary")

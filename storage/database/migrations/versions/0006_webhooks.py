@@ -1,4 +1,4 @@
-"""Webhooks: the URL that a job has, and what is to be sent."""
+"""Webhooks: a job's URL, and the deliveries to make."""
 
 from alembic import op
 from sqlalchemy import Column, Float, Integer, String, Text

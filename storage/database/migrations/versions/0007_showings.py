@@ -1,4 +1,4 @@
-"""A program has what the page that shows it last told."""
+"""A program has the playback progress that its player last reported."""
 
 import sqlalchemy as sa
 from alembic import op
