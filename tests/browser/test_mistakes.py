@@ -233,7 +233,7 @@ def test_file_removed_during_upload_is_named(desk: Page, service: Service, tmp_p
         "card.zip was changed, moved or removed", timeout=MINUTE
     )
     (tmp_path / "elsewhere").rename(film)
-    desk.get_by_role("button", name="Continue").click()
+    desk.get_by_role("button", name="Continue", exact=True).click()
     while not held:
         desk.wait_for_timeout(50)
     assert held[0].request.header_value("upload-offset") == str(8 << 20)
@@ -263,7 +263,7 @@ def test_wrong_key_then_key_revoked_during_upload(browser: Browser, ball: Path, 
         expect(row).to_contain_text("the bytes sent so far are kept")
         expect(unknown).to_be_hidden()
         page.unroute("**/v1/uploads/*")
-        row.get_by_role("button", name="Continue").click()
+        row.get_by_role("button", name="Continue", exact=True).click()
         key.fill("first")
         page.keyboard.press("Enter")
         expect(page.get_by_role("heading", name="a ball")).to_be_visible(timeout=MINUTE)
@@ -282,7 +282,7 @@ def test_full_disk_is_reported_and_upload_continues_with_room(
             expect(page.get_by_role("alert")).to_contain_text("There is no room for it")
             expect(page.get_by_role("alert")).to_contain_text(re.compile("delete|room|free"))
             ballast.unlink()
-            page.get_by_role("button", name="Continue").click()
+            page.get_by_role("button", name="Continue", exact=True).click()
             expect(page).to_have_url(re.compile(r"#/captures/\w+"), timeout=MINUTE)
             expect(page.get_by_role("heading", name="a ball")).to_be_visible()
 
