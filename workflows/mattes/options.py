@@ -1,211 +1,90 @@
-"""The options of recovery: the one place that says what there is, in which range, and which method it belongs to."""
+"""The options of recovery jobs: parsed, checked and described.
 
-from typing import Any, Literal
+What a method's own options are, their defaults, ranges and descriptions are declared beside the method, in
+`workflows.recovery.lobes.options` and `workflows.recovery.dgsr.options`. The models here are made from that.
+"""
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from typing import Any, ClassVar, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
 
 from storage.errors import OptionError
+from workflows.recovery.dgsr.options import DgsrOptions
+from workflows.recovery.lobes.options import FAST, FINE, LobesOptions
+from workflows.recovery.options import declared_options, make_options
+
+_FAST = {name: value for name, value in FAST._asdict().items() if value != getattr(FINE, name)}
 
 
 class RecoveryOptions(BaseModel):
-    """What a recovery job may be asked for, whatever its method; each method adds its constants."""
+    """Options of every recovery job; each method's model adds its own."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    declared: ClassVar[type[LobesOptions | DgsrOptions]]
 
     method: str
     tile: int | None = Field(
         None,
         ge=16,
         le=1024,
-        description="Edge of the squares that the frame is cut into, one task each, in pixels, rounded up to whole "
-        "blocks of the matte. Left out: one block. The matte does not depend on it.",
+        description="Edge of the square tiles that the frame is cut into, in pixels, rounded up to whole blocks of the "
+        "matte. Each tile is one task. The default is one block. The matte does not depend on it.",
     )
 
     @property
-    def constants(self) -> dict[str, Any]:
-        """The method's own options: keyword arguments of its `recover`."""
-        return self.model_dump(exclude={*RecoveryOptions.model_fields, "quality"})
+    def of_method(self) -> LobesOptions | DgsrOptions:
+        """The method's own options, as its `recover` takes them."""
+        return make_options(self.declared, dict(self))
 
 
-def _least_contrast() -> Any:
-    return Field(
-        3.0,
-        ge=0,
-        le=100,
-        description="A channel whose rho is below this many standard deviations of a mid-grey value says nothing "
-        "of T: its row is left empty.",
-    )
-
-
-FAST = {"most_lobes": 2, "resolution": 0.8, "steps": 4, "beam": 3, "doubt": 0.03, "passes": 1, "gradients": 8}
-"""What `quality` fast stands for."""
-
-
-class LobesOptions(RecoveryOptions):
-    """A few oriented Gaussian lobes and the posterior mean of T about them; any program; one T where channels agree."""
-
-    method: Literal["lobes"] = "lobes"
+class _LobesQuality(RecoveryOptions):
     quality: Literal["fine", "fast"] = Field(
         "fine",
-        description="`fast` takes half of the time for two and a half decibels: it is "
-        + ", ".join(f"`{name}` {value}" for name, value in FAST.items())
-        + " where these are left out.",
+        description="`fast` takes half of the time and costs two and a half decibels. It changes the defaults: "
+        + ", ".join(f"`{name}` {value}" for name, value in _FAST.items())
+        + ".",
     )
-    most_lobes: int = Field(3, ge=1, le=16, description="Most lobes of a T.")
-    fit_resolution: float = Field(
-        0.65,
-        ge=0.5,
-        le=4,
-        description="Standard deviations of a lobe across, in spacings of the nodes that it lies on, at least, while "
-        "it is fitted. It may be up to twice as many.",
-    )
-    resolution: float = Field(1.1, ge=0.5, le=4, description="The same of the T that is recovered.")
-    rounds: int = Field(
-        1,
-        ge=1,
-        le=100,
-        description="Most rounds of a fit, after each of which the measurements are weighed again.",
-    )
-    steps: int = Field(9, ge=1, le=1000, description="Most steps of Levenberg and Marquardt's in a round.")
-    tolerance: float = Field(
-        2.0, ge=0, le=100, description="A round ends when a step takes less than this off chi-square."
-    )
-    beam: int = Field(
-        4, ge=1, le=64, description="Nodes of a grid that are looked into when another lobe is searched for."
-    )
-    doubt: float = Field(
-        0.01,
-        ge=0,
-        le=1,
-        description="Lobes are fitted once more, from what the measurements say about them, where they leave out "
-        "more than this: the variance of a black-and-white pattern (-1 to 1) beside them; 1 is a single ray, "
-        "unseen.",
-    )
-    passes: int = Field(
-        2, ge=1, le=20, description="How often T is replaced by its posterior mean, each time about the last."
-    )
-    gradients: int = Field(9, ge=1, le=1000, description="Most conjugate gradients in each of them.")
-    disagreement: float = Field(
-        1.5,
-        ge=0,
-        le=1e6,
-        description="One T serves all channels until their chi-square a degree of freedom exceeds this; then each has "
-        "its own. For grey patterns; under coloured ones likelihood decides.",
-    )
-    least_weight: float = Field(1e-4, ge=0, le=0.1, description="Entries of T below this are dropped.")
-    least_contrast: float = _least_contrast()
 
     @model_validator(mode="before")
     @classmethod
-    def _hurry(cls, given: Any) -> Any:
-        return FAST | given if isinstance(given, dict) and given.get("quality") == "fast" else given
+    def _apply_quality(cls, given: Any) -> Any:
+        return _FAST | given if isinstance(given, dict) and given.get("quality") == "fast" else given
 
 
-class DgsrOptions(RecoveryOptions):
-    """The paper's NN-DGSR (Sect. 4.2 and 5.1): non-negative dynamic group sparsity, filtered by oriented Gaussians."""
-
-    method: Literal["nn-dgsr"] = "nn-dgsr"
-    prior: Literal["gaussian", "none"] = Field(
-        "gaussian",
-        description="`gaussian` fits oriented Gaussians to the clusters of T and filters T by them (Sect. 4.2.2); "
-        "`none` leaves T as the search found it.",
+def _model(
+    method: str, declared: type[LobesOptions | DgsrOptions], base: type[RecoveryOptions] = RecoveryOptions
+) -> type[RecoveryOptions]:
+    """The model of a method's options."""
+    fields: dict[str, Any] = {"method": (Literal[method], method)}
+    for option in declared_options(declared):
+        limits: dict[str, Any] = {"ge": option.range.least, "le": option.range.most} if option.range else {}
+        fields[option.name] = option.type, Field(option.default, description=option.description, **limits)
+    model: type[RecoveryOptions] = create_model(
+        declared.__name__, __base__=base, __doc__=declared.__doc__, **fields
     )
-    levels: Literal["hierarchical", "direct"] = Field(
-        "hierarchical",
-        description="`hierarchical` goes from grid to finer grid, with only the children of a level's cells as "
-        "unknowns of the next (Sect. 4.2.3); `direct` solves the finest level at once, with all of its cells: much "
-        "slower.",
-    )
-    channels: Literal["apart", "joint"] = Field(
-        "apart",
-        description="`apart` recovers a T for each channel, as in the paper; `joint` one for the three, their "
-        "measurements weighed by inverse variance: for glass without dispersion.",
-    )
-    sparsity: float = Field(
-        0.2,
-        ge=0.01,
-        le=1,
-        description="Most cells that the search lights at the finest level, as a share of the measurements; the "
-        "paper takes a fifth.",
-    )
-    growth: float = Field(
-        1.25,
-        ge=1,
-        le=100,
-        description="Factor by which the sparsity grows, from one cell, until more cells explain no more.",
-    )
-    sum_tolerance: float = Field(
-        0.02,
-        ge=0,
-        le=1,
-        description="The sparsity grows on while the L1 norm of T is further than this from one.",
-    )
-    least_group: float = Field(
-        0.02,
-        ge=0,
-        le=1,
-        description="A cell is refined if its weight plus half of its eight neighbours' is more than this.",
-    )
-    rounds: int = Field(
-        10, ge=1, le=1000, description="Most rounds of lighting and pruning cells at one sparsity."
-    )
-    stall: float = Field(
-        0.01,
-        ge=0,
-        le=1,
-        description="Rounds, and fits of the Gaussians, end when one takes less than this share off the squared "
-        "residual.",
-    )
-    sweeps: int = Field(
-        30, ge=1, le=10_000, description="Most sweeps of coordinate descent in a least squares."
-    )
-    tolerance: float = Field(
-        1e-4, ge=0, le=1, description="Sweeps end when one changes no entry of T by more than this."
-    )
-    clusters: int = Field(
-        3,
-        ge=1,
-        le=8,
-        description="Most clusters of a T that a Gaussian is fitted to; the paper finds no more than 3.",
-    )
-    reach: float = Field(
-        3.0,
-        ge=1,
-        le=6,
-        description="What is further than this many standard deviations from all Gaussians is taken out.",
-    )
-    fits: int = Field(
-        8, ge=1, le=100, description="Most times that Gaussians are fitted to T and T is filtered by them."
-    )
-    steps: int = Field(30, ge=1, le=1000, description="Most conjugate gradients in filtering T.")
-    precision: float = Field(
-        0.03,
-        ge=0,
-        le=1,
-        description="Conjugate gradients end when this share of the right-hand side is left.",
-    )
-    least_contrast: float = _least_contrast()
+    model.declared = declared
+    return model
 
 
-METHODS: tuple[type[RecoveryOptions], ...] = (LobesOptions, DgsrOptions)
-"""The methods there are, the default first."""
+METHODS = (_model("lobes", LobesOptions, _LobesQuality), _model("nn-dgsr", DgsrOptions))
+"""A model for each method; the first is the default."""
 
 
 def parse_options(given: dict[str, Any]) -> RecoveryOptions:
-    """Options as they are sent.
+    """Parse the options of a request.
 
     Returns
     -------
     RecoveryOptions
-        Of the class of its method.
+        The model of the method that `given` names.
 
     Raises
     ------
     OptionError
-        Naming the first option that does not exist, belongs to another method or is out of range.
+        Names the first option that does not exist, belongs to another method or is out of range.
     """
-    wanted = given.get("method", _name(METHODS[0]))
-    method = next((method for method in METHODS if _name(method) == wanted), None)
+    name = given.get("method", _name(METHODS[0]))
+    method = next((method for method in METHODS if _name(method) == name), None)
     if method is None:
         known = ", ".join(_name(method) for method in METHODS)
         raise OptionError(f"option 'method': must be one of {known}", field="method")
@@ -213,13 +92,16 @@ def parse_options(given: dict[str, Any]) -> RecoveryOptions:
         return method.model_validate(given)
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-        name = str(first["loc"][0])
-        raise OptionError(_refusal(method, name), field=name) from error
+        option = str(first["loc"][0])
+        raise OptionError(_explain(method, option), field=option) from error
 
 
 def describe_options() -> list[dict[str, Any]]:
-    """Every option, those of all methods first: name, method it belongs to, type, default, range, what it does."""
-    kinds = " ".join(f"`{_name(method)}`: {method.__doc__}" for method in METHODS)
+    """Describe every option: name, method, type, default, range or values, and what it does.
+
+    Options of every method come first; their `method` is None.
+    """
+    summaries = " ".join(f"`{_name(method)}`: {method.__doc__}" for method in METHODS)
     choice = {
         "name": "method",
         "method": None,
@@ -228,7 +110,7 @@ def describe_options() -> list[dict[str, Any]]:
         "values": [_name(method) for method in METHODS],
         "minimum": None,
         "maximum": None,
-        "description": f"How T is recovered. {kinds}",
+        "description": f"How T is recovered. {summaries}",
     }
     common = [name for name in RecoveryOptions.model_fields if name != "method"]
     return [
@@ -243,28 +125,28 @@ def _name(method: type[RecoveryOptions]) -> str:
 
 
 def _own(method: type[RecoveryOptions]) -> list[str]:
-    """The options that are the method's and not every method's."""
+    """The options that only some methods have."""
     return [name for name in method.model_fields if name not in RecoveryOptions.model_fields]
 
 
 def _describe(method: type[RecoveryOptions], name: str) -> dict[str, Any]:
     schema = method.model_json_schema()["properties"][name]
-    # The value may be left out of some: the schema is then one of two, and the other is null.
-    kind = next(kind for kind in schema.get("anyOf", [schema]) if kind["type"] != "null")
+    # an option that may be null has two schemas, one of them null's
+    value = next(value for value in schema.get("anyOf", [schema]) if value["type"] != "null")
     return {
         "name": name,
         "method": _name(method),
-        "type": kind["type"],
+        "type": value["type"],
         "default": schema["default"],
-        "values": kind.get("enum"),
-        "minimum": kind.get("minimum"),
-        "maximum": kind.get("maximum"),
+        "values": value.get("enum"),
+        "minimum": value.get("minimum"),
+        "maximum": value.get("maximum"),
         "description": schema["description"],
     }
 
 
-def _refusal(method: type[RecoveryOptions], name: str) -> str:
-    """What to say of an option that the method's class refused."""
+def _explain(method: type[RecoveryOptions], name: str) -> str:
+    """Why the method's model refused an option."""
     if name in method.model_fields:
         option = _describe(method, name)
         if option["values"]:

@@ -17,6 +17,7 @@ from workflows.mattes.options import RecoveryOptions
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out, pyramid_of
 from workflows.recovery.dgsr import recover as dgsr
+from workflows.recovery.dgsr.options import DgsrOptions
 from workflows.recovery.lobes import recover as lobes
 from workflows.recovery.noise import Noise
 from workflows.recovery.normalise import normalise
@@ -90,15 +91,15 @@ def _recover_block(
     shown = program.measured
     measurements = np.ascontiguousarray(light[:, shown])
     given = (noise, usable[:, shown], worth[:, shown])
-    if options.method == "nn-dgsr":
+    method = options.of_method
+    if isinstance(method, DgsrOptions):
         sensing = sensing_of(objects, capture)
-        transport = dgsr.recover(measurements, photometry, sensing, *given, **options.constants)
-        measured = normalise(measurements, photometry, noise, options.constants["least_contrast"], *given[1:])
+        transport = dgsr.recover(measurements, photometry, sensing, *given, method)
+        measured = normalise(measurements, photometry, noise, method.constants.least_contrast, *given[1:])
         error = dgsr.error_of(transport, photometry, measured, sensing)
     else:
-        transport, photometry, error = lobes.recover(
-            measurements, photometry, patterns_of(objects, capture), *given, **options.constants
-        )
+        patterns = patterns_of(objects, capture)
+        transport, photometry, error = lobes.recover(measurements, photometry, patterns, *given, method)
 
     def spread(values: NDArray[Scalar], *channels: int) -> NDArray[Scalar]:
         """Values of the recovered pixels, and zeros for the others."""

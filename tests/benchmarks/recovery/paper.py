@@ -41,6 +41,7 @@ from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out
 from workflows.recovery.dgsr import recover as dgsr
 from workflows.recovery.dgsr.groups import Rows
+from workflows.recovery.dgsr.options import DgsrOptions
 from workflows.recovery.lobes import recover as lobes
 from workflows.recovery.noise import Noise
 from workflows.recovery.normalise import normalise
@@ -218,7 +219,7 @@ def figures_4_and_5(kit: ModuleType, scenes: dict[str, Any]) -> list[dict[str, A
         of_images = []
         for name, scene in scenes.items():
             take = film(kit, scene, [COARSE, (*FINE, images)])
-            plain = measure(kit, take, partial(dgsr.recover, prior="none"))
+            plain = measure(kit, take, partial(dgsr.recover, options=DgsrOptions(prior="none")))
             filtered = measure(kit, take, dgsr.recover)
             of_images.append({"grid": grid_errors(kit, scene), "none": plain, "gaussian": filtered})
             rows.append({"images": images, "scene": name} | _compared(of_images[-1:]))
@@ -251,7 +252,7 @@ def table_2(kit: ModuleType, scenes: dict[str, Any]) -> list[dict[str, Any]]:
         for name, take in takes.items():
             row: dict[str, Any] = {"prior": prior, "scene": name}
             for levels in ("hierarchical", "direct"):
-                recover = partial(dgsr.recover, prior=prior, levels=levels)  # type: ignore[arg-type]
+                recover = partial(dgsr.recover, options=DgsrOptions(prior, levels))  # type: ignore[arg-type]
                 found = measure(kit, take, recover)
                 row |= {f"{levels} s / 1,000": found["seconds"], f"{levels} mse": found["mse"]}
             rows.append(row)
@@ -271,10 +272,19 @@ def _lobes(
 def methods(kit: ModuleType, scenes: dict[str, Any]) -> list[dict[str, Any]]:
     """All methods on the same frames."""
     runs: dict[str, tuple[str, Recover]] = {
-        "nn-dgsr, no prior, apart": ("hierarchical", partial(dgsr.recover, prior="none")),
-        "nn-dgsr, no prior, joint": ("hierarchical", partial(dgsr.recover, prior="none", channels="joint")),
+        "nn-dgsr, no prior, apart": (
+            "hierarchical",
+            partial(dgsr.recover, options=DgsrOptions(prior="none")),
+        ),
+        "nn-dgsr, no prior, joint": (
+            "hierarchical",
+            partial(dgsr.recover, options=DgsrOptions(prior="none", channels="joint")),
+        ),
         "nn-dgsr, gaussian, apart": ("hierarchical", dgsr.recover),
-        "nn-dgsr, gaussian, joint": ("hierarchical", partial(dgsr.recover, channels="joint")),
+        "nn-dgsr, gaussian, joint": (
+            "hierarchical",
+            partial(dgsr.recover, options=DgsrOptions(channels="joint")),
+        ),
         "matching pursuit (scikit-learn)": ("hierarchical", rival(pursuit, "hierarchical")),
         "matching pursuit (scikit-learn) ": ("direct", rival(pursuit, "direct")),
         "non-negative lasso (scikit-learn)": ("hierarchical", rival(lasso, "hierarchical")),

@@ -1,44 +1,69 @@
-"""The options of recovery: parsed, refused by name, and described."""
+"""The options of recovery: parsed, refused by name, and described from one declaration."""
 
 import inspect
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 
 from storage.errors import OptionError
-from workflows.mattes.options import (
-    METHODS,
-    DgsrOptions,
-    LobesOptions,
-    RecoveryOptions,
-    describe_options,
-    parse_options,
-)
+from workflows.mattes.options import METHODS, RecoveryOptions, describe_options, parse_options
 from workflows.recovery.dgsr import recover as dgsr
+from workflows.recovery.dgsr.options import Constants, DgsrOptions
 from workflows.recovery.lobes import recover as lobes
+from workflows.recovery.lobes.options import FAST, LobesOptions
+from workflows.recovery.options import declared_options
 
 
-def test_nothing_asked_for_is_the_defaults() -> None:
-    assert parse_options({}) == LobesOptions(tile=None)
-    assert parse_options({"method": "nn-dgsr", "tile": 64}) == DgsrOptions(tile=64)
-    assert parse_options({"method": "nn-dgsr", "sparsity": 0.1}) == DgsrOptions(sparsity=0.1)
+def test_missing_options_have_their_defaults() -> None:
+    lobes_model, dgsr_model = METHODS
+    assert parse_options({}) == lobes_model.model_validate({"tile": None})
+    assert parse_options({"method": "nn-dgsr", "tile": 64}) == dgsr_model.model_validate({"tile": 64})
+    assert parse_options({"method": "nn-dgsr", "sparsity": 0.1}) == dgsr_model.model_validate(
+        {"sparsity": 0.1}
+    )
 
 
-def test_what_is_kept_of_options_gives_the_same_options() -> None:
+def test_stored_options_parse_to_the_same_options() -> None:
     for method in METHODS:
-        options = method(tile=32)  # type: ignore[call-arg]
+        options = method.model_validate({"tile": 32})
         assert parse_options(options.model_dump(mode="json")) == options
 
 
-@pytest.mark.parametrize(("options", "recover"), [(LobesOptions, lobes.recover), (DgsrOptions, dgsr.recover)])
-def test_constants_are_the_methods_keyword_arguments(
-    options: Callable[[], RecoveryOptions], recover: Callable[..., object]
+@pytest.mark.parametrize(
+    ("method", "recover", "kind"),
+    [(METHODS[0], lobes.recover, LobesOptions), (METHODS[1], dgsr.recover, DgsrOptions)],
+)
+def test_models_documentation_and_recover_share_one_declaration(
+    method: type[RecoveryOptions], recover: Callable[..., object], kind: type[tuple[Any, ...]]
 ) -> None:
-    parameters = inspect.signature(recover).parameters.values()
-    keywords = {p.name: p.default for p in parameters if p.kind is inspect.Parameter.KEYWORD_ONLY}
-    assert options().constants == keywords
+    assert method.declared is kind
+    assert inspect.signature(recover).parameters["options"].default == kind()
+    name = method.model_fields["method"].default
+    assert parse_options({"method": name}).of_method == kind()
+    documented = {option["name"]: option for option in describe_options() if option["method"] == name}
+    for option in declared_options(kind):
+        field = documented[option.name]
+        assert field["description"] == option.description
+        assert field["default"] == option.default
+        if option.range:
+            assert (field["minimum"], field["maximum"]) == option.range
+            assert option.range.least <= option.default <= option.range.most
+        else:
+            assert field["values"] == list(get_args(option.type))
+
+
+def test_values_reach_recover() -> None:
+    assert parse_options({"most_lobes": 5, "tile": 32}).of_method == LobesOptions(most_lobes=5)
+    given = {"method": "nn-dgsr", "prior": "none", "clusters": 2}
+    assert parse_options(given).of_method == DgsrOptions(prior="none", constants=Constants(clusters=2))
+
+
+def test_fast_replaces_defaults_only() -> None:
+    assert parse_options({"quality": "fast"}).of_method == FAST
+    assert parse_options({"quality": "fast", "steps": 7}).of_method == FAST._replace(steps=7)
+    assert parse_options({"quality": "fine"}).of_method == LobesOptions()
 
 
 @pytest.mark.parametrize(
@@ -57,7 +82,7 @@ def test_constants_are_the_methods_keyword_arguments(
         ({"": 1}, ""),
     ],
 )
-def test_a_refusal_names_the_option(given: dict[str, Any], field: str) -> None:
+def test_error_names_the_option(given: dict[str, Any], field: str) -> None:
     with pytest.raises(OptionError) as caught:
         parse_options(given)
     assert caught.value.fields == {"field": field}
@@ -79,19 +104,19 @@ def test_a_refusal_names_the_option(given: dict[str, Any], field: str) -> None:
         ),
     ],
 )
-def test_a_refusal_says_what_is_right(given: dict[str, Any], detail: str) -> None:
+def test_error_says_what_is_allowed(given: dict[str, Any], detail: str) -> None:
     with pytest.raises(OptionError) as caught:
         parse_options(given)
     assert caught.value.detail == detail
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_an_unknown_option_is_told_those_there_are(method: type[RecoveryOptions]) -> None:
+def test_error_for_an_unknown_option_lists_the_known_ones(method: type[RecoveryOptions]) -> None:
     with pytest.raises(OptionError, match=", ".join(method.model_fields)):
         parse_options({"method": method.model_fields["method"].default, "tyle": 64})
 
 
-def test_every_option_is_described_once_a_method_as_it_is_parsed() -> None:
+def test_every_option_is_described_once_per_method_as_it_is_parsed() -> None:
     described = {(option["method"], option["name"]): option for option in describe_options()}
     assert len(described) == len(describe_options())
     common = set(RecoveryOptions.model_fields)

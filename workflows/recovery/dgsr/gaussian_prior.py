@@ -1,7 +1,6 @@
 """The paper's Gaussian prior: oriented Gaussians fitted on the fly to the clusters of a T, and T filtered by them."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -9,23 +8,13 @@ from numpy.typing import NDArray
 
 from workflows.recovery.clusters import LEAST_MASS, PARAMETERS, add_moments, merge_clusters, spread
 from workflows.recovery.dgsr.groups import Rows
+from workflows.recovery.dgsr.options import Constants
 from workflows.recovery.dgsr.pursuit import System
 from workflows.recovery.solvers import inner, posterior_mean, stack_rows, subtract
 
 
-class Filter(NamedTuple):
-    """The constants of :func:`~workflows.recovery.dgsr.recover.recover` that the Gaussian prior needs."""
-
-    clusters: int
-    reach: float
-    fits: int
-    stall: float
-    steps: int
-    precision: float
-
-
 @njit(nogil=True, cache=True)
-def filter_rows(system: System, found: Rows, given: Filter) -> Rows:
+def filter_rows(system: System, found: Rows, constants: Constants) -> Rows:
     """Filter sparse rows by Gaussians, those that they explain better than the row's own cells do.
 
     Parameters
@@ -33,7 +22,7 @@ def filter_rows(system: System, found: Rows, given: Filter) -> Rows:
     system : System
     found : Rows
         A cell of weight 0 was a candidate.
-    given : Filter
+    constants : Constants
 
     Returns
     -------
@@ -48,7 +37,7 @@ def filter_rows(system: System, found: Rows, given: Filter) -> Rows:
     light, columns, rows, source, scale, target, variance = system
     begin, cell, weight = found
     channels = scale.shape[1] // light.shape[2]
-    field = np.zeros((given.clusters, rows, columns), np.float32)
+    field = np.zeros((constants.clusters, rows, columns), np.float32)
     n = source.size
     new_begin = np.zeros(n + 1, np.int64)
     new_cell, new_weight = np.empty(1024, np.int32), np.empty(1024, np.float32)
@@ -68,7 +57,7 @@ def filter_rows(system: System, found: Rows, given: Filter) -> Rows:
             plain = m * math.log(max(inner(residual, residual) / m, variance[p]))
             plain += 2 * math.log(max(own.size, 2)) * lit.size
             score, filtered_cell, filtered = filter_row(
-                seen, scale[p], target[p], variance[p], columns, kept_cell, kept, given, field
+                seen, scale[p], target[p], variance[p], columns, kept_cell, kept, constants, field
             )
             if score < plain:
                 kept_cell, kept = filtered_cell, filtered
@@ -91,7 +80,7 @@ def filter_row(
     columns: int,
     cell: NDArray[np.int32],
     weight: NDArray[np.float32],
-    given: Filter,
+    constants: Constants,
     field: NDArray[np.float32],
 ) -> tuple[float, NDArray[np.int32], NDArray[np.float32]]:
     """Filter a T by oriented Gaussians, again and again fitted to its clusters.
@@ -108,7 +97,7 @@ def filter_row(
         Columns of the grid.
     cell, weight : (s,) int32, float32
         The T to start from, s at least 1, of positive weights.
-    given : Filter
+    constants : Constants
     field : (clusters, rows, columns) float32
         Working space, all zero before and after.
 
@@ -128,7 +117,8 @@ def filter_row(
 
     The clusters are Ward's, from every cell its own to `clusters` and fewer; the best number is kept.
     """
-    clusters, reach, fits, stall, steps, precision = given
+    clusters, reach, fits, stall = constants.clusters, constants.reach, constants.fits, constants.stall
+    steps, precision = constants.steps, constants.precision
     n = inner(scale, scale)
     moments = np.zeros((cell.size, PARAMETERS))
     for j in range(cell.size):

@@ -7,6 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from workflows.recovery.dgsr.groups import Rows, group_sums
+from workflows.recovery.dgsr.options import Constants
 from workflows.recovery.solvers import descend, inner, stack_rows
 
 
@@ -37,20 +38,8 @@ class System(NamedTuple):
     variance: NDArray[np.float64]
 
 
-class Pursuit(NamedTuple):
-    """The constants of :func:`~workflows.recovery.dgsr.recover.recover` that the search needs."""
-
-    sparsity: float
-    growth: float
-    sum_tolerance: float
-    rounds: int
-    stall: float
-    sweeps: int
-    tolerance: float
-
-
 @njit(nogil=True, cache=True)
-def grow_rows(system: System, found: Rows, finest: bool, pursuit: Pursuit) -> None:
+def grow_rows(system: System, found: Rows, finest: bool, constants: Constants) -> None:
     """Fit the weights of sparse rows to measurements by NN-DGSR, from zero.
 
     Parameters
@@ -60,11 +49,11 @@ def grow_rows(system: System, found: Rows, finest: bool, pursuit: Pursuit) -> No
         Candidates; weights are overwritten.
     finest : bool
         Whether to stop growing, and to drop cells, where more cells explain nothing.
-    pursuit : Pursuit
+    constants : Constants
     """
     light, columns, rows, source, scale, target, _ = system
     begin, cell, weight = found
-    sparsity, growth, sum_tolerance, rounds, stall, sweeps, tolerance = pursuit
+    sweeps, tolerance = constants.sweeps, constants.tolerance
     field = np.zeros((rows + 2, columns + 2), np.float32)
     channels = scale.shape[1] // light.shape[2]
     for p in range(source.size):
@@ -75,7 +64,7 @@ def grow_rows(system: System, found: Rows, finest: bool, pursuit: Pursuit) -> No
         if s == 0 or m <= 0:
             continue
         seen = light[source[p] : source[p] + channels]
-        most = min(max(int(sparsity * m), 1) if finest else max(int(m), 1), s)
+        most = min(max(int(constants.sparsity * m), 1) if finest else max(int(m), 1), s)
         residual = target[p].copy()
         left = inner(residual, residual)
         price = 2 * np.log(max(s, 2))
@@ -84,7 +73,7 @@ def grow_rows(system: System, found: Rows, finest: bool, pursuit: Pursuit) -> No
         k = 1
         while True:
             before, cells = left, np.count_nonzero(best)
-            for _ in range(rounds):
+            for _ in range(constants.rounds):
                 correlate(seen, own, scale[p], residual, proxy)
                 for j in range(s):
                     proxy[j] = max(best[j] + proxy[j] / m, 0)
@@ -96,7 +85,7 @@ def grow_rows(system: System, found: Rows, finest: bool, pursuit: Pursuit) -> No
                 choose_groups(own, x, k, columns, field, chosen)
                 pruned = solve_chosen(seen, own, scale[p], target[p], chosen, x, sweeps, tolerance)
                 now = inner(pruned, pruned)
-                stalled = now >= (1 - stall) * left
+                stalled = now >= (1 - constants.stall) * left
                 if now < left:
                     residual, left = pruned, now
                     for j in range(s):
@@ -105,10 +94,10 @@ def grow_rows(system: System, found: Rows, finest: bool, pursuit: Pursuit) -> No
                     break
             gain = m * np.log(before / max(left, 1e-30))
             enough = gain <= price * (np.count_nonzero(best) - cells)
-            settled = finest and enough and abs(best.sum() - 1) <= sum_tolerance
+            settled = finest and enough and abs(best.sum() - 1) <= constants.sum_tolerance
             if settled or k == most:
                 break
-            k = min(max(k + 1, int(k * growth)), most)
+            k = min(max(k + 1, int(k * constants.growth)), most)
         if finest:
             group_sums(own, best, columns, field, proxy)
             for j in range(s):

@@ -1,13 +1,12 @@
 """The paper's recovery: non-negative dynamic group sparsity (NN-DGSR), with and without its Gaussian prior."""
 
-from typing import Literal
-
 import numpy as np
 from numpy.typing import NDArray
 
-from workflows.recovery.dgsr.gaussian_prior import Filter, filter_rows
+from workflows.recovery.dgsr.gaussian_prior import filter_rows
 from workflows.recovery.dgsr.groups import Rows
-from workflows.recovery.dgsr.pursuit import Pursuit, System, grow_rows
+from workflows.recovery.dgsr.options import DEFAULT, DgsrOptions
+from workflows.recovery.dgsr.pursuit import System, grow_rows
 from workflows.recovery.noise import Noise
 from workflows.recovery.normalise import Measured, expected_error, normalise
 from workflows.recovery.photometry import Photometry
@@ -29,24 +28,7 @@ def recover(
     noise: Noise,
     usable: NDArray[np.bool_] | None = None,
     frames: NDArray[np.number] | None = None,
-    *,
-    prior: Literal["gaussian", "none"] = "gaussian",
-    levels: Literal["hierarchical", "direct"] = "hierarchical",
-    channels: Literal["apart", "joint"] = "apart",
-    sparsity: float = 0.2,
-    growth: float = 1.25,
-    sum_tolerance: float = 0.02,
-    least_group: float = 0.02,
-    rounds: int = 10,
-    stall: float = 0.01,
-    sweeps: int = 30,
-    tolerance: float = 1e-4,
-    clusters: int = 3,
-    reach: float = 3.0,
-    fits: int = 8,
-    steps: int = 30,
-    precision: float = 0.03,
-    least_contrast: float = 3.0,
+    options: DgsrOptions = DEFAULT,
 ) -> Transport:
     """Recover T by NN-DGSR (Duan, Cai and Zheng, "Compressive environment matting", 2015, Sect. 4.2 and 5.1).
 
@@ -64,42 +46,7 @@ def recover(
         False where a measurement says nothing, as where the camera clipped it; all say something if left out.
     frames : (m,) or (n, m, 3) number, optional
         Frames averaged into each measurement; one each if left out.
-    prior : {"gaussian", "none"}
-        Whether T is filtered by oriented Gaussians fitted to its clusters (Sect. 4.2.2).
-    levels : {"hierarchical", "direct"}
-        Level by level, with only the children of a level's cells as unknowns of the next (Sect. 4.2.3); or the
-        finest level at once, with all of its cells.
-    channels : {"apart", "joint"}
-        A T for each channel, as in the paper, or one for the three.
-    sparsity : float
-        Most cells that the search lights at the finest level, as a share of the measurements. Coarser levels may
-        have as many as measurements: they only have to find the cells, and one missed there is lost.
-    growth : float
-        Factor by which the sparsity grows, from one cell, until more cells explain no more.
-    sum_tolerance : float
-        The sparsity grows on while the L1 norm of T is further than this from one.
-    least_group : float
-        A cell is refined if its weight plus half of its eight neighbours' is more than this.
-    rounds : int
-        Most rounds of lighting and pruning cells at one sparsity.
-    stall : float
-        Rounds, and fits of the Gaussians, end when one takes less than this share off the squared residual.
-    sweeps : int
-        Most sweeps of coordinate descent in a least squares.
-    tolerance : float
-        They end when one changes no entry of T by more than this.
-    clusters : int
-        Most clusters of a T that a Gaussian is fitted to.
-    reach : float
-        What is further than this many standard deviations from all Gaussians is taken out.
-    fits : int
-        Most times that Gaussians are fitted to T and T is filtered by them.
-    steps : int
-        Most conjugate gradients in filtering T.
-    precision : float
-        They end when this share of the right-hand side is left.
-    least_contrast : float
-        A channel whose rho is below this many standard deviations of a mid-grey value gets an empty row.
+    options : DgsrOptions
 
     Returns
     -------
@@ -129,17 +76,16 @@ def recover(
     weights by it would favour those that came out dark. Joint channels weigh by their mean inverse variance; seen
     under grey patterns they become one measurement, else their rows are stacked.
     """
-    measured = normalise(measurements, photometry, noise, least_contrast, usable, frames)
+    constants = options.constants
+    measured = normalise(measurements, photometry, noise, constants.least_contrast, usable, frames)
     value, weight = _weigh(measured.value[..., :-2], measured.variance[..., :-2])
-    pursuit = Pursuit(sparsity, growth, sum_tolerance, rounds, stall, sweeps, tolerance)
-    by = Filter(clusters, reach, fits, stall, steps, precision)
-    used = sensing.levels if levels == "hierarchical" else sensing.levels[-1:]
+    used = sensing.levels if options.levels == "hierarchical" else sensing.levels[-1:]
     parts = []
     for first in range(0, max(len(value), 1), _BLOCK):
         block = slice(first, first + _BLOCK)
         alive = weight[block].max(axis=2, initial=0) > 0
         index = np.full(alive.shape, -1)
-        if channels == "joint":
+        if options.channels == "joint":
             pixel = np.flatnonzero(alive.any(axis=1))
             channel = np.zeros_like(pixel)
             index[pixel] = np.arange(pixel.size)[:, np.newaxis]
@@ -149,7 +95,7 @@ def recover(
         rows = Rows.whole(pixel.size, used[0])
         for i, level in enumerate(used):
             if i > 0:
-                rows = rows.split(used[i - 1], level, least_group, reach=0)
+                rows = rows.split(used[i - 1], level, constants.least_group, reach=0)
             finest = level is used[-1]
             light = np.ascontiguousarray(level.light)
             source = np.zeros_like(channel) if len(light) == 1 else channel
@@ -157,13 +103,13 @@ def recover(
                 value[block][..., level.patterns],
                 weight[block][..., level.patterns],
                 pixel,
-                None if channels == "joint" else channel,
+                None if options.channels == "joint" else channel,
                 grey=len(light) == 1,
             )
             system = System(light, level.columns, level.rows, source, scale, target, variance)
-            grow_rows(system, rows, finest, pursuit)
-            if finest and prior == "gaussian":
-                rows = filter_rows(system, rows, by)
+            grow_rows(system, rows, finest, constants)
+            if finest and options.prior == "gaussian":
+                rows = filter_rows(system, rows, constants)
         parts.append(rows.transport(used[-1], np.where(alive, index, -1)))
     return Transport.concatenate(parts)
 
@@ -259,7 +205,8 @@ def _rows_of(
         value = (weight * value)[pixel].sum(axis=1) / np.where(total > 0, total, 1)
         weight = total
     else:
-        value, weight = value[pixel].reshape(pixel.size, -1), weight[pixel].reshape(pixel.size, -1)
+        size = 3 * value.shape[2]
+        value, weight = value[pixel].reshape(pixel.size, size), weight[pixel].reshape(pixel.size, size)
     # one axis at a time over contiguous memory: the order of the sum is the same in any batch
     value, weight = np.ascontiguousarray(value), np.ascontiguousarray(weight)
     count = np.maximum((weight > 0).sum(axis=1), 1)

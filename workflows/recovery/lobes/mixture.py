@@ -15,28 +15,13 @@ from numpy.typing import NDArray
 
 from workflows.recovery.lobes.footprint import NODES, PARAMETERS, Shown, combine, fit_level, load, sample
 from workflows.recovery.lobes.likelihood import price, weigh
+from workflows.recovery.lobes.options import LobesOptions
 from workflows.recovery.pyramid import Grids
 from workflows.recovery.solvers import inner
 
 # Levenberg-Marquardt: the damping at the start, its factors after a step that failed or that did not, and most tries.
 _DAMPING, _HARDER, _EASIER, _TRIES = 1e-2, 8.0, 0.15, 4
 _LEAST_WEIGHT, _MOST_WEIGHT = 1e-3, 1.2
-
-
-class Effort(NamedTuple):
-    """The constants of :func:`~workflows.recovery.lobes.recover.recover` that the kernels need."""
-
-    most_lobes: int
-    fit_resolution: float
-    resolution: float
-    rounds: int
-    steps: int
-    tolerance: float
-    beam: int
-    doubt: float
-    passes: int
-    gradients: int
-    least_weight: float
 
 
 class Mixture(NamedTuple):
@@ -192,7 +177,7 @@ def refine(
     variance: NDArray[np.float32],
     mixture: Mixture,
     k: int,
-    effort: Effort,
+    options: LobesOptions,
     bound: float,
 ) -> tuple[float, float, NDArray[np.float32], NDArray[np.float32]]:
     """Fit all parameters of k lobes by Levenberg and Marquardt's method, from what they are.
@@ -205,7 +190,7 @@ def refine(
     mixture : Mixture
         Changed.
     k : int
-    effort : Effort
+    options : LobesOptions
         Of which this takes `fit_resolution`, `rounds`, `steps` and `tolerance`.
     bound : float
         Rounds end when the objective and the price are above it.
@@ -231,11 +216,11 @@ def refine(
     new = Mixture(mixture.lobes.copy(), mixture.level.copy(), mixture.offset.copy())
     predict(shown, mixture, k, room, response, f)
     kappa, objective = weigh(y, f, variance, groups, n, precision)
-    for _ in range(effort.rounds):
+    for _ in range(options.rounds):
         before = objective
         damping = _DAMPING
         chi = misfit(y, f, precision, residual)
-        for _ in range(effort.steps):
+        for _ in range(options.steps):
             for g in range(groups):
                 for j in range(M):
                     inside = g * (m + 2) <= j < (g + 1) * (m + 2)
@@ -262,7 +247,7 @@ def refine(
                     copy_mixture(k, groups, mixture, new)
                     for g in range(groups):
                         new.offset[g] += change[g]
-                    step(new, change[groups:], grids, effort.fit_resolution)
+                    step(new, change[groups:], grids, options.fit_resolution)
                     predict(shown, new, k, room, response, f)
                     now = misfit(y, f, precision, residual)
                     better = now < chi
@@ -274,7 +259,7 @@ def refine(
                 break
             damping = max(damping * _EASIER, 1e-5)
             copy_mixture(k, groups, new, mixture)
-            if chi - now < effort.tolerance:
+            if chi - now < options.tolerance:
                 break
             chi = now
         kappa, objective = weigh(y, f, variance, groups, n, precision)

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from workflows.recovery.lobes.footprint import NODES, PARAMETERS, Shown
 from workflows.recovery.lobes.likelihood import price
-from workflows.recovery.lobes.mixture import Effort, Mixture, copy_mixture
+from workflows.recovery.lobes.mixture import Mixture, copy_mixture
 from workflows.recovery.lobes.nodes import gather_lobes, rows_of, spread_lobes
+from workflows.recovery.lobes.options import LobesOptions
 from workflows.recovery.lobes.posterior import update
 from workflows.recovery.lobes.search import fit
 from workflows.recovery.normalise import Measured
@@ -28,7 +29,7 @@ def fit_again(
     mixture: Mixture,
     k: int,
     worth: float,
-    effort: Effort,
+    options: LobesOptions,
     node: NDArray[np.int64],
     weight: NDArray[np.float32],
     room: NDArray[np.float32],
@@ -47,7 +48,7 @@ def fit_again(
     k : int
     worth : float
         -2 ln likelihood of the lobes.
-    effort : Effort
+    options : LobesOptions
     node, weight, room
         Working space: for all lobes' nodes, and the rows of these.
 
@@ -59,12 +60,12 @@ def fit_again(
     grids, groups = shown.grids, shown.groups
     tried = Mixture(mixture.lobes.copy(), mixture.level.copy(), mixture.offset.copy())
     end = np.empty(k, np.int64)
-    n = spread_lobes(grids, tried, k, effort.resolution, node, weight, end)
+    n = spread_lobes(grids, tried, k, options.resolution, node, weight, end)
     A = room[: n * y.size].reshape(n, y.size)
     rows_of(shown, node, n, A)
-    update(A, weight[:n], y, variance, groups, tried.offset, 1, effort.gradients)
-    gather_lobes(grids, node, weight, end, tried, k, effort.fit_resolution)
-    found, _, new = fit(shown, y, variance, tried, k, effort)
+    update(A, weight[:n], y, variance, groups, tried.offset, 1, options.gradients)
+    gather_lobes(grids, node, weight, end, tried, k, options.fit_resolution)
+    found, _, new = fit(shown, y, variance, tried, k, options)
     if new + price(grids, tried.level, found) >= worth + price(grids, mixture.level, k):
         return k, worth
     copy_mixture(found, groups, tried, mixture)
@@ -90,7 +91,7 @@ def recover_pixels(
     joint: Measured,
     own: Measured,
     apart: NDArray[np.bool_],
-    effort: Effort,
+    options: LobesOptions,
     response: NDArray[np.float32],
     kappa: NDArray[np.float64],
     misfit: NDArray[np.float64],
@@ -109,7 +110,7 @@ def recover_pixels(
         Those of each channel, (n, 3, m + 2).
     apart : (n,) bool
         Whether each channel gets its own T; under patterns of three colours found out here, and written.
-    effort : Effort
+    options : LobesOptions
     response : (n, 3, m + 2) float32
         Written: what the measurements would be before T.
     kappa, misfit : (n, 3) float64
@@ -123,7 +124,7 @@ def recover_pixels(
     weight : (count.sum(),) float32
     """
     pixels, size = joint.value.shape
-    m, most = own.value.shape[2] - 2, effort.most_lobes
+    m, most = own.value.shape[2] - 2, options.most_lobes
     groups = code.shape[1] // m
     lobes, level, k = np.empty((4, most, PARAMETERS)), np.empty((4, most), np.int64), np.zeros(4, np.int64)
     offset, worth = np.zeros((4, 3)), np.zeros(4)
@@ -154,10 +155,10 @@ def recover_pixels(
                 k[c] = k[lead]
                 copy_mixture(k[lead], 0, Mixture(lobes[lead], level[lead], offset[lead]), mixture)
             shown, y, variance = measurements_of(grids, code, joint, own, p, c)
-            k[c], left_out, worth[c] = fit(shown, y, variance, mixture, k[c], effort)
-            if left_out > effort.doubt:
+            k[c], left_out, worth[c] = fit(shown, y, variance, mixture, k[c], options)
+            if left_out > options.doubt:
                 k[c], worth[c] = fit_again(
-                    shown, y, variance, mixture, k[c], worth[c], effort, node, weight, room
+                    shown, y, variance, mixture, k[c], worth[c], options, node, weight, room
                 )
         if groups == 3:
             # Bayes' information criterion, with a kappa each; the channels' lobes are near the common ones
@@ -170,11 +171,11 @@ def recover_pixels(
                 continue
             shown, y, variance = measurements_of(grids, code, joint, own, p, c)
             mixture = Mixture(lobes[c], level[c], offset[c])
-            n = spread_lobes(grids, mixture, k[c], effort.resolution, node, weight, end)
+            n = spread_lobes(grids, mixture, k[c], options.resolution, node, weight, end)
             A = room[: n * y.size].reshape(n, y.size)
             rows_of(shown, node, n, A)
             left_out, missed = update(
-                A, weight[:n], y, variance, shown.groups, mixture.offset, effort.passes, effort.gradients
+                A, weight[:n], y, variance, shown.groups, mixture.offset, options.passes, options.gradients
             )
             f = np.zeros_like(y)
             for i in range(n):
@@ -189,7 +190,7 @@ def recover_pixels(
                 all_nodes = np.concatenate((all_nodes, np.empty_like(all_nodes)))
                 all_weights = np.concatenate((all_weights, np.empty_like(all_weights)))
             for i in range(n):
-                if weight[i] >= effort.least_weight:
+                if weight[i] >= options.least_weight:
                     all_nodes[written], all_weights[written] = node[i], weight[i]
                     count[p, c % 3] += 1
                     written += 1

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from workflows.recovery.lobes.mixture import Effort
+from workflows.recovery.lobes.options import FINE, LobesOptions
 from workflows.recovery.lobes.pixels import recover_pixels
 from workflows.recovery.noise import Noise
 from workflows.recovery.normalise import Measured, expected_error, normalise, refit
@@ -42,20 +42,7 @@ def recover(
     noise: Noise,
     usable: NDArray[np.bool_] | None = None,
     frames: NDArray[np.number] | None = None,
-    *,
-    most_lobes: int = 3,
-    fit_resolution: float = 0.65,
-    resolution: float = 1.1,
-    rounds: int = 1,
-    steps: int = 9,
-    tolerance: float = 2.0,
-    beam: int = 4,
-    doubt: float = 0.01,
-    passes: int = 2,
-    gradients: int = 9,
-    disagreement: float = 1.5,
-    least_weight: float = 1e-4,
-    least_contrast: float = 3.0,
+    options: LobesOptions = FINE,
 ) -> Recovery:
     """Recover T as a few oriented Gaussian lobes, and then as what the measurements say about these.
 
@@ -73,30 +60,7 @@ def recover(
         False where a value says nothing, as where the camera clipped it.
     frames : (m,) or (n, m, 3) number, optional
         Frames averaged into each value, above 0; one each if left out.
-    most_lobes : int
-        Most lobes of a T.
-    fit_resolution, resolution : float
-        Standard deviations of a lobe across, in spacings of the nodes that it lies on, at least: while it is
-        fitted, and in the end. They may be up to twice as many.
-    rounds, steps : int
-        Most rounds of a fit, after each of which the measurements are weighed again, and most steps in one.
-    tolerance : float
-        A round ends when a step takes less than this off chi-square.
-    beam : int
-        Nodes of a grid that are looked into for another lobe.
-    doubt : float
-        Lobes are fitted once more where they leave out more than this: the variance that a pattern of full contrast
-        has beside them, 1 if T is a single ray.
-    passes : int
-        How often T is replaced by its posterior mean.
-    gradients : int
-        Most conjugate gradients in each of them.
-    disagreement : float
-        One T serves all channels until their chi-square a degree of freedom exceeds this.
-    least_weight : float
-        Entries of T below this are dropped.
-    least_contrast : float
-        A channel whose rho is below this many standard deviations of a mid-grey value gets an empty row.
+    options : LobesOptions
 
     Returns
     -------
@@ -120,20 +84,14 @@ def recover(
     n, m = len(measurements), patterns.count
     if measurements.shape != (n, m, 3):
         raise ValueError(f"measurements must be (n, {m}, 3), not {measurements.shape}")
-    effort = Effort(
-        most_lobes, fit_resolution, resolution, rounds, steps, tolerance, beam, doubt, passes, gradients,
-        least_weight,
-    )  # fmt: skip
-    measured = normalise(measurements, photometry, noise, least_contrast, usable, frames)
+    measured = normalise(measurements, photometry, noise, options.least_contrast, usable, frames)
     response, kappa, misfit = np.zeros_like(measured.value), np.zeros((n, 3)), np.zeros((n, 3))
     parts = []
     for first in range(0, max(n, 1), _BLOCK):
         block = slice(first, first + _BLOCK)
         of_block = Measured(measured.value[block], measured.variance[block])
         parts.append(
-            _recover_block(
-                patterns, of_block, effort, disagreement, response[block], kappa[block], misfit[block]
-            )
+            _recover_block(patterns, of_block, options, response[block], kappa[block], misfit[block])
         )
     better = refit(photometry, measured, response, kappa)
     return Recovery(Transport.concatenate(parts), better, expected_error(better, measured, misfit))
@@ -142,8 +100,7 @@ def recover(
 def _recover_block(
     patterns: Patterns,
     measured: Measured,
-    effort: Effort,
-    disagreement: float,
+    options: LobesOptions,
     response: NDArray[np.float32],
     kappa: NDArray[np.float64],
     misfit: NDArray[np.float64],
@@ -154,7 +111,7 @@ def _recover_block(
     own = Measured(measured.value[alive], measured.variance[alive])
     if patterns.channels == 1:
         joint = _mean(own)
-        apart = _disagree(own, joint.value, disagreement)
+        apart = _disagree(own, joint.value, options.disagreement)
     else:
         n, channels, m = own.value.shape
         joint = Measured(own.value.reshape(n, channels * m), own.variance.reshape(n, channels * m))
@@ -162,7 +119,7 @@ def _recover_block(
     counts = np.zeros((len(apart), 3), np.int64)
     seen, left_out, missed = np.zeros_like(own.value), np.zeros(counts.shape), np.zeros(counts.shape)
     node, weight = recover_pixels(
-        patterns.pyramid.arrays, patterns.code, joint, own, apart, effort, seen, left_out, missed, counts
+        patterns.pyramid.arrays, patterns.code, joint, own, apart, options, seen, left_out, missed, counts
     )
     response[alive], kappa[alive], misfit[alive] = seen, left_out, missed
     count, shared = np.zeros((alive.size, 3), np.int64), np.zeros(alive.size, bool)
@@ -175,7 +132,7 @@ def _recover_block(
     begin = np.flatnonzero(new)
     merged = np.add.reduceat(weight, begin) if begin.size else weight
     count = np.bincount(row[begin], minlength=count.size).reshape(count.shape)
-    return Transport.from_rows(columns, rows, count, node[begin], merged, shared, effort.least_weight)
+    return Transport.from_rows(columns, rows, count, node[begin], merged, shared, options.least_weight)
 
 
 def _mean(own: Measured) -> Measured:

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from workflows.recovery.lobes.footprint import PARAMETERS, Shown, fit_level
 from workflows.recovery.lobes.likelihood import price, weigh
-from workflows.recovery.lobes.mixture import Effort, Mixture, copy_mixture, refine
+from workflows.recovery.lobes.mixture import Mixture, copy_mixture, refine
+from workflows.recovery.lobes.options import LobesOptions
 
 # Rounds of a further lobe go on while it is no worse than this behind in -2 ln likelihood.
 _HOPE = 30.0
@@ -134,7 +135,7 @@ def fit(
     variance: NDArray[np.float32],
     mixture: Mixture,
     k: int,
-    effort: Effort,
+    options: LobesOptions,
 ) -> tuple[int, float, float]:
     """Fit as many lobes to a pixel as pay for themselves.
 
@@ -143,9 +144,9 @@ def fit(
     shown, y, variance
         As in :func:`~workflows.recovery.lobes.mixture.refine`.
     mixture : Mixture
-        The first k lobes are the start; changed. There is room for `effort.most_lobes`.
+        The first k lobes are the start; changed. There is room for `options.most_lobes`.
     k : int
-    effort : Effort
+    options : LobesOptions
 
     Returns
     -------
@@ -160,14 +161,14 @@ def fit(
         # light from everywhere: of a pattern its mean, about nothing
         f[g * (m + 2) + m], f[g * (m + 2) + m + 1] = -1.0, 1.0
     if k > 0:
-        kappa, objective, f, precision = refine(shown, y, variance, mixture, k, effort, _NEVER)
+        kappa, objective, f, precision = refine(shown, y, variance, mixture, k, options, _NEVER)
         objective += price(grids, mixture.level, k)
     else:
         kappa, objective = weigh(y, f, variance, groups, groups, precision)
         objective = _NEVER
     tried = Mixture(mixture.lobes.copy(), mixture.level.copy(), mixture.offset.copy())
-    while k < effort.most_lobes:
-        at, column, row, gain, amount = search(shown, y, f, precision, effort.beam)
+    while k < options.most_lobes:
+        at, column, row, gain, amount = search(shown, y, f, precision, options.beam)
         if k > 0 and gain < 2 * (PARAMETERS - 2):
             break
         if at < 0:  # nothing says anything: light from everywhere
@@ -180,9 +181,9 @@ def fit(
         lobe = tried.lobes[k]
         lobe[0], lobe[1], lobe[2] = share, (column + 0.5) * spacing, (row + 0.5) * spacing
         lobe[3], lobe[4], lobe[5] = 0.8 * spacing, 0.0, 0.8 * spacing
-        tried.level[k] = fit_level(lobe, at, grids.columns, effort.fit_resolution)
+        tried.level[k] = fit_level(lobe, at, grids.columns, options.fit_resolution)
         new_kappa, new, new_f, new_precision = refine(
-            shown, y, variance, tried, k + 1, effort, objective + _HOPE
+            shown, y, variance, tried, k + 1, options, objective + _HOPE
         )
         new += price(grids, tried.level, k + 1)
         if new >= objective:

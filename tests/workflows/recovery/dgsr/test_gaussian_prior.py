@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from workflows.recovery.dgsr import recover as dgsr
+from workflows.recovery.dgsr.options import Constants, DgsrOptions
 
 COLUMNS, ROWS = 32, 24
 COLUMN = np.arange(ROWS * COLUMNS) % COLUMNS
@@ -42,7 +43,9 @@ def test_the_prior_cuts_the_error_of_lobes_from_few_measurements(sensing_of, obs
     truth = lobes(12, 1)
     sensing = sensing_of([(8, 6, 24), (COLUMNS, ROWS, 60)], 3)
     measurements, photometry, noise = observe(sensing, truth)
-    plain = errors(dgsr.recover(measurements, photometry, sensing, noise, prior="none"), truth)
+    plain = errors(
+        dgsr.recover(measurements, photometry, sensing, noise, options=DgsrOptions(prior="none")), truth
+    )
     filtered = errors(dgsr.recover(measurements, photometry, sensing, noise), truth)
     assert filtered.mean() < 0.5 * plain.mean()
 
@@ -60,8 +63,22 @@ def test_what_fits_no_gaussian_is_taken_out(sensing_of, observe, lobes):
     truth = lobes(6, 2)
     sensing = sensing_of([(8, 6, 24), (COLUMNS, ROWS, 60)], 5)
     scene = observe(sensing, truth)
-    near = rows_of(dgsr.recover(scene[0], scene[1], sensing, scene[2], reach=2.0)) > 0
-    far = rows_of(dgsr.recover(scene[0], scene[1], sensing, scene[2], reach=4.0)) > 0
+    near = (
+        rows_of(
+            dgsr.recover(
+                scene[0], scene[1], sensing, scene[2], options=DgsrOptions(constants=Constants(reach=2.0))
+            )
+        )
+        > 0
+    )
+    far = (
+        rows_of(
+            dgsr.recover(
+                scene[0], scene[1], sensing, scene[2], options=DgsrOptions(constants=Constants(reach=4.0))
+            )
+        )
+        > 0
+    )
     assert near.sum() < 0.7 * far.sum()
 
 
@@ -71,7 +88,16 @@ def test_one_cluster_is_all_there_may_be(sensing_of, observe, lobes):
     measurements, photometry, noise = observe(sensing, truth)
 
     def error(clusters):
-        return errors(dgsr.recover(measurements, photometry, sensing, noise, clusters=clusters), truth).mean()
+        return errors(
+            dgsr.recover(
+                measurements,
+                photometry,
+                sensing,
+                noise,
+                options=DgsrOptions(constants=Constants(clusters=clusters)),
+            ),
+            truth,
+        ).mean()
 
     assert error(2) < 0.5 * error(1)
 
@@ -85,13 +111,13 @@ def test_bad_input_gives_finite_rows(spoil, sensing_of, observe, prior, channels
     sensing = sensing_of([(8, 6, 24), (COLUMNS, ROWS, 40)], 6, channels=colours)
     measurements, photometry, noise = observe(sensing, truth)
     measurements, photometry = spoil(measurements, photometry, -1e30)
-    options = {"prior": prior, "channels": channels, "levels": levels, "least_contrast": 0.0}
-    found = dgsr.recover(measurements, photometry, sensing, noise, **options)
+    options = DgsrOptions(prior, levels, channels, Constants(least_contrast=0.0))
+    found = dgsr.recover(measurements, photometry, sensing, noise, options=options)
     assert np.isfinite(found.weight).all()
     assert (found.count[[1, 9, 10]] == 0).all()
     assert found.count[5, 1] == 0
     assert (found.count[5, [0, 2]] > 0).all()
-    clean = dgsr.recover(*observe(sensing, truth)[:2], sensing, noise, **options)
+    clean = dgsr.recover(*observe(sensing, truth)[:2], sensing, noise, options=options)
     np.testing.assert_allclose(rows_of(found)[2:4] @ COLUMN, rows_of(clean)[2:4] @ COLUMN, atol=1.5)
 
 
@@ -101,7 +127,7 @@ def test_a_program_too_small_gives_finite_rows(sensing_of, observe, prior, bands
     truth = lobes(3, 8)
     sensing = sensing_of(bands, 2)
     measurements, photometry, noise = observe(sensing, truth)
-    found = dgsr.recover(measurements, photometry, sensing, noise, prior=prior)
+    found = dgsr.recover(measurements, photometry, sensing, noise, options=DgsrOptions(prior=prior))
     assert np.isfinite(found.weight).all()
 
 
@@ -112,7 +138,7 @@ def test_patterns_that_are_all_the_same(sensing_of, observe, prior, light, lobes
     for level in sensing.levels:
         level.light[:] = light
     measurements, photometry, noise = observe(sensing, lobes(3, 8))
-    found = dgsr.recover(measurements, photometry, sensing, noise, prior=prior)
+    found = dgsr.recover(measurements, photometry, sensing, noise, options=DgsrOptions(prior=prior))
     assert np.isfinite(found.weight).all()
 
 
@@ -120,7 +146,7 @@ def test_joint_channels_share_a_t_and_use_every_measurement(sensing_of, observe,
     truth = lobes(8, 4)
     sensing = sensing_of([(8, 6, 24), (COLUMNS, ROWS, 40)], 8, channels=3)
     measurements, photometry, noise = observe(sensing, truth, rho=[0.9, 0.3, 0.5])
-    joint = dgsr.recover(measurements, photometry, sensing, noise, channels="joint")
+    joint = dgsr.recover(measurements, photometry, sensing, noise, options=DgsrOptions(channels="joint"))
     np.testing.assert_array_equal(rows_of(joint)[:, 0], rows_of(joint)[:, 2])
     apart = dgsr.recover(measurements, photometry, sensing, noise)
     assert errors(joint, truth).mean() < 0.7 * errors(apart, truth).mean()

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from workflows.recovery.dgsr.groups import Rows
-from workflows.recovery.dgsr.pursuit import Pursuit, System, choose_groups, correlate, grow_rows
+from workflows.recovery.dgsr.options import Constants
+from workflows.recovery.dgsr.pursuit import System, choose_groups, correlate, grow_rows
 
 COLUMNS, ROWS = 8, 6
 
@@ -60,5 +61,5 @@ def test_measurements_of_scale_zero_change_nothing(finest):
         np.tile(np.arange(truth.size, dtype=np.int32), 2),
         np.empty(2 * truth.size, np.float32),
     )
-    grow_rows(system, found, finest, Pursuit(0.2, 1.25, 0.02, 10, 0.01, 30, 1e-4))
+    grow_rows(system, found, finest, Constants())
     np.testing.assert_allclose(found.weight.reshape(2, -1), [truth, truth], atol=0.01)

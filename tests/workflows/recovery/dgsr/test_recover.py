@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 
 from workflows.recovery.dgsr import recover as dgsr
+from workflows.recovery.dgsr.options import DgsrOptions
 from workflows.recovery.photometry import Photometry
 from workflows.recovery.sensing import Sensing
 
 METHODS = {
     "dgsr": dgsr.recover,
-    "dgsr-plain": partial(dgsr.recover, prior="none"),
-    "dgsr-direct": partial(dgsr.recover, levels="direct"),
-    "dgsr-joint": partial(dgsr.recover, channels="joint"),
-    "dgsr-plain-direct-joint": partial(dgsr.recover, prior="none", levels="direct", channels="joint"),
+    "dgsr-plain": partial(dgsr.recover, options=DgsrOptions(prior="none")),
+    "dgsr-direct": partial(dgsr.recover, options=DgsrOptions(levels="direct")),
+    "dgsr-joint": partial(dgsr.recover, options=DgsrOptions(channels="joint")),
+    "dgsr-plain-direct-joint": partial(dgsr.recover, options=DgsrOptions("none", "direct", "joint")),
 }
 BANDS = [(8, 6, 24), (32, 24, 120)]
 COLUMNS, ROWS = 32, 24
@@ -139,8 +140,9 @@ def test_rows_are_clean(recover, sensing_of, observe):
     assert found.cell.dtype == np.uint32
 
 
-def test_no_pixels(recover, sensing_of, observe):
-    sensing = sensing_of(BANDS, 9)
+@pytest.mark.parametrize("colours", [1, 3])
+def test_no_pixels(recover, sensing_of, observe, colours):
+    sensing = sensing_of(BANDS, 9, channels=colours)
     found = recover(*args(observe(sensing, mixture(0)), sensing))
     assert found.count.shape == (0, 3)
 

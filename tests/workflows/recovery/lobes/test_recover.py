@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from workflows.recovery.lobes import recover as lobes
+from workflows.recovery.lobes.options import FINE, LobesOptions
 from workflows.recovery.noise import Noise
 from workflows.recovery.photometry import Photometry, fit_photometry
 from workflows.recovery.sensing import Patterns
@@ -60,9 +61,9 @@ def moments(T):
     return np.stack([cx, cy, T @ x**2 - cx**2, T @ (x * y) - cx * cy, T @ y**2 - cy**2], axis=-1)
 
 
-def recovered(patterns, scene, **options):
+def recovered(patterns, scene, options=FINE):
     measurements, photometry, noise = scene
-    return lobes.recover(measurements, photometry, patterns, noise, **options)
+    return lobes.recover(measurements, photometry, patterns, noise, options=options)
 
 
 def part_of(photometry, part):
@@ -119,7 +120,7 @@ def test_what_lobes_do_not_say_the_posterior_mean_does(patterns, observe):
     L = rng.integers(0, 2, (20, 6, 8)).repeat(8, axis=1).repeat(8, axis=2).reshape(20, -1)
 
     def error(passes):
-        found = recovered(patterns, scene, most_lobes=1, passes=passes).transport
+        found = recovered(patterns, scene, LobesOptions(most_lobes=1, passes=passes)).transport
         return np.sqrt(np.mean(((dense(patterns, found) - T) @ L.T) ** 2))
 
     assert error(3) < 0.4 * error(0)
@@ -291,7 +292,9 @@ def test_bad_input_gives_finite_rows(spoil, request, colours, varied, observe):
     measurements, photometry, noise = observe(shown, varied)
     measurements, photometry = spoil(measurements, photometry, -1e3)
     for least_contrast in (3.0, 0.0):
-        found = lobes.recover(measurements, photometry, shown, noise, least_contrast=least_contrast)
+        found = lobes.recover(
+            measurements, photometry, shown, noise, options=LobesOptions(least_contrast=least_contrast)
+        )
         assert np.isfinite(found.transport.weight).all()
         sane = [0, 2, 5]
         error = np.abs(dense(shown, found.transport) - varied).sum(axis=2)

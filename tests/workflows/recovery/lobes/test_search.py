@@ -7,12 +7,13 @@ import pytest
 from numpy.typing import NDArray
 
 from workflows.recovery.lobes.footprint import PARAMETERS, Shown, bump_variance
-from workflows.recovery.lobes.mixture import Effort, Mixture
+from workflows.recovery.lobes.mixture import Mixture
+from workflows.recovery.lobes.options import LobesOptions
 from workflows.recovery.lobes.search import fit, search
 
 COLUMNS, ROWS, MOST = 64, 48, 3
 SIGMA = 0.01
-EFFORT = Effort(
+OPTIONS = LobesOptions(
     most_lobes=MOST,
     fit_resolution=0.8,
     resolution=1.3,
@@ -70,7 +71,7 @@ def measure(patterns):
 def fitted(shown):
     def run(y, variance, most=MOST):
         mixture = Mixture(np.zeros((MOST, PARAMETERS)), np.zeros(MOST, np.int64), np.zeros(1))
-        k, kappa, objective = fit(shown, y, variance, mixture, 0, EFFORT._replace(most_lobes=most))
+        k, kappa, objective = fit(shown, y, variance, mixture, 0, OPTIONS._replace(most_lobes=most))
         order = np.argsort(-mixture.lobes[:k, 0], kind="stable")
         return Fitted(mixture.lobes[order], mixture.level[order], mixture.offset, kappa, objective)
 
