@@ -14,7 +14,7 @@ from services.runtime.data_lock import lock_data
 from services.runtime.logs import configure_logging
 from services.runtime.malloc import limit_arenas
 from services.runtime.signals import exit_on_sigterm
-from services.settings import Settings
+from services.settings import CoordinatorSettings, Settings
 from services.webhooks.sender import Sender
 from storage.database.engine import open_engine
 from storage.objects.store import Objects
@@ -65,7 +65,7 @@ def serve(settings: Settings) -> None:
         uvicorn.Server(config).run(sockets=[socket])
 
 
-def coordinate(settings: Settings) -> None:
+def coordinate(settings: CoordinatorSettings) -> None:
     """Run jobs while no other coordinator does, until interrupted."""
     with _opened(settings, "coordinator") as (stack, engine, objects):
         _run_jobs(stack, settings, engine, objects)
@@ -73,7 +73,7 @@ def coordinate(settings: Settings) -> None:
         signal.pause()
 
 
-def _run_jobs(stack: ExitStack, settings: Settings, engine: Engine, objects: Objects) -> None:
+def _run_jobs(stack: ExitStack, settings: CoordinatorSettings, engine: Engine, objects: Objects) -> None:
     """Run jobs, and call webhooks about them, until the stack is closed."""
     dispatcher = stack.enter_context(dispatcher_of(settings))
     coordinator = stack.enter_context(Coordinator(settings, engine, objects, dispatcher))
@@ -82,7 +82,7 @@ def _run_jobs(stack: ExitStack, settings: Settings, engine: Engine, objects: Obj
 
 
 @contextmanager
-def _opened(settings: Settings, role: str) -> Iterator[tuple[ExitStack, Engine, Objects]]:
+def _opened(settings: CoordinatorSettings, role: str) -> Iterator[tuple[ExitStack, Engine, Objects]]:
     """Configure this process, and open the database and the store; the stack is closed before they are."""
     # uvicorn raises the signal that stopped it again when it ends: everything open here must be closed first.
     exit_on_sigterm()

@@ -1,77 +1,115 @@
-"""The settings of the service: one object, built at the edge and passed in."""
+"""The settings of the service: one object, built where a process starts and passed on.
+
+Every setting is an environment variable ``ENVMATTE_…`` and a line in the file ``.env``; an option of the command line
+wins. What only some settings need is imported where they are checked, so that `envmatte serve --help` is quick.
+"""
 
 import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from urllib.parse import urlsplit
 
-from distributed.security import Security
-from distributed.system import MEMORY_LIMIT
-from pydantic import Field, field_validator, model_validator
-from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
-from sqlalchemy import make_url
-from sqlalchemy.exc import ArgumentError
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from services.runtime.addresses import is_loopback
-from services.runtime.certificates import security_of
+from services.runtime.environment import DATA, PREFIX, database_url, read_environment
 from services.runtime.webhook_signature import signing_key
 from storage.errors import InvalidInput
 from workflows.untrusted.limits import Limits
 
+if TYPE_CHECKING:
+    from distributed.security import Security
 
-class ClusterSettings(BaseSettings):
-    """What every process of a cluster is told; each an environment variable ``ENVMATTE_…`` and a line in ``.env``."""
 
-    model_config = SettingsConfigDict(
-        env_prefix="ENVMATTE_",
-        env_file=".env",
-        env_ignore_empty=True,  # as compose passes on what is not set
-        extra="ignore",
-        frozen=True,
-    )
+def _setting(default: Any, description: str, *, unset: str = "", **constraints: Any) -> Any:
+    """A field of a settings model.
 
-    data: Path = Field(Path("envmatte-data"), description="Folder of the database and of everything stored.")
-    cluster: str | None = Field(
+    Parameters
+    ----------
+    default : object or callable
+        The default, or what makes it of the fields before this one.
+    unset : str
+        What the default comes to, in words, where the value doesn't say it.
+    **constraints
+        As `pydantic.Field` takes them.
+    """
+    made = {"default_factory": default} if callable(default) else {"default": default}
+    return Field(**made, description=description, json_schema_extra={"unset": unset}, **constraints)
+
+
+def _memory_per_worker(settings: dict[str, Any]) -> int:
+    from distributed.system import MEMORY_LIMIT
+
+    return int(MEMORY_LIMIT // settings["workers"])
+
+
+class DataSettings(BaseModel):
+    """The folder that every process of an installation starts from."""
+
+    model_config = ConfigDict(frozen=True, defer_build=True)
+
+    def __init__(self, **given: Any) -> None:
+        super().__init__(**read_environment(type(self).model_fields) | given)
+
+    data: Path = _setting(DATA, "Folder of the database and of everything stored.")
+
+
+class SchedulerSettings(DataSettings):
+    """The settings of `envmatte scheduler`."""
+
+    certs: Path | None = _setting(
         None,
-        description="Address of a dask scheduler, tls://HOST:PORT, or tcp://127.0.0.1:PORT on one machine. "
-        "Without one the service has a cluster of its own.",
+        "Folder of the cluster's certificates, made by `envmatte certs`.",
+        unset="`certs` in the data folder, if it exists",
     )
-    certs: Path | None = Field(
+    log: Literal["text", "json"] = _setting(
+        "text", "Format of the logs on stderr: text, or json (one object per line)."
+    )
+    log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = _setting(
+        "INFO", "Lowest level that is logged. DEBUG logs every tile."
+    )
+
+    @property
+    def certificates(self) -> Path | None:
+        """The folder of the certificates, or None if there is none."""
+        default = self.data / "certs"
+        return self.certs or (default if default.is_dir() else None)
+
+
+class ClusterSettings(SchedulerSettings):
+    """The settings of `envmatte worker`."""
+
+    cluster: str | None = _setting(
         None,
-        description="Folder that `envmatte certs` made, for a cluster. Default: certs in the data folder, if there.",
+        "Address of a dask scheduler: tls://HOST:PORT, or tcp://127.0.0.1:PORT on one machine.",
+        unset="none: the service starts a cluster of its own",
     )
-    workers: int = Field(
-        default_factory=lambda: os.cpu_count() or 1,
+    workers: int = _setting(
+        lambda: os.cpu_count() or 1,
+        "Worker processes on this machine, one thread each.",
+        unset="one per core",
         ge=1,
-        description="Worker processes on this machine, one thread each. Default: one a core.",
     )
-    worker_memory: int = Field(
-        default_factory=lambda settings: MEMORY_LIMIT // settings["workers"],
+    worker_memory: int = _setting(
+        _memory_per_worker,
+        "Bytes of memory a worker process may use before it is ended and started again; 0 sets no limit.",
+        unset="the machine's memory divided by the workers",
         ge=0,
-        description="Bytes that a worker process may take before it is ended and started again; 0 sets no limit. "
-        "Default: the machine's memory, shared out among the workers.",
-    )
-
-    log: Literal["text", "json"] = Field(
-        "text", description="Form of the logs on stderr: text, or json, an object a line."
-    )
-    log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = Field(
-        "INFO", description="The lowest level that is logged; debug has a line for every tile."
     )
 
     @model_validator(mode="after")
-    def _trusted(self) -> "ClusterSettings":
-        """No address without TLS but on loopback, and none with TLS but with certificates."""
+    def _check_trusted(self) -> "ClusterSettings":
+        """Allow TCP only on loopback, and TLS only with usable certificates."""
         if self.cluster is None:
             return self
         url = urlsplit(self.cluster)
-        if url.scheme not in ("tcp", "tls") or not url.hostname or not _port(url.netloc):
+        if url.scheme not in ("tcp", "tls") or not url.hostname or not _has_port(url.netloc):
             raise ValueError(f"cluster {self.cluster!r}: give it as tls://HOST:PORT, or tcp://127.0.0.1:PORT")
         if url.scheme == "tcp" and not is_loopback(url.hostname):
             raise ValueError(
-                f"cluster {self.cluster}: without TLS only on loopback, for whoever reaches it may run what he likes: "
-                "make certificates with `envmatte certs DIR`, give every process of the cluster a copy with --certs, "
-                f"and name it tls://{url.netloc}"
+                f"cluster {self.cluster}: plain TCP is allowed on loopback only, because anyone who reaches the "
+                "scheduler can run arbitrary code on the cluster. Make certificates with `envmatte certs DIR`, give "
+                f"every process of the cluster a copy with --certs, and use tls://{url.netloc}"
             )
         if url.scheme == "tls":
             try:
@@ -80,14 +118,8 @@ class ClusterSettings(BaseSettings):
                 raise ValueError(error.detail) from error
         return self
 
-    @property
-    def certificates(self) -> Path | None:
-        """The folder of the certificates, or None if there is none."""
-        made = self.data / "certs"
-        return self.certs or (made if made.is_dir() else None)
-
-    def security(self) -> Security | None:
-        """What this process needs to talk to the cluster; None for one without TLS.
+    def security(self) -> "Security | None":
+        """The TLS configuration with which dask connects to the cluster; None for a cluster without TLS.
 
         Raises
         ------
@@ -98,117 +130,71 @@ class ClusterSettings(BaseSettings):
             return None
         if self.certificates is None:
             raise InvalidInput(
-                f"cluster {self.cluster} speaks TLS, and there are no certificates: name the folder that "
+                f"cluster {self.cluster} uses TLS, and there are no certificates: name the folder that "
                 "`envmatte certs` made for it with --certs"
             )
+        from services.runtime.certificates import security_of
+
         return security_of(self.certificates)
 
 
-class Settings(ClusterSettings):
-    """All of them."""
+class CoordinatorSettings(ClusterSettings):
+    """The settings of `envmatte coordinator`."""
 
-    database: str | None = Field(
+    database: str | None = _setting(
         None,
-        description="URL of the database, postgresql://USER:PASSWORD@HOST/NAME or sqlite:////FILE. "
-        "Default: a file in the data folder.",
+        "URL of the database: postgresql://USER:PASSWORD@HOST/NAME or sqlite:////FILE.",
+        unset="a SQLite file in the data folder",
     )
-    store: str | None = Field(
+    store: str | None = _setting(
         None,
-        description="URL of the object store, s3://BUCKET/PREFIX or file:///FOLDER. Default: in the data folder.",
+        "URL of the object store: s3://BUCKET/PREFIX or file:///FOLDER.",
+        unset="a folder in the data folder",
     )
-    coordinate: bool = Field(True, description="Whether this process drives jobs, and not the API alone.")
-    host: str = Field("127.0.0.1", description="Address to listen on. Other than loopback only with keys.")
-    port: int = Field(8000, ge=0, le=65535, description="Port to listen on; 0 takes a free one.")
-    keys: Annotated[tuple[str, ...], NoDecode] = Field(
-        (),
-        description="API keys, separated by commas, besides those of `envmatte keys`: of scope admin and the default "
-        "owner. With none at all the service is open, and on loopback alone.",
-    )
-    upload_bytes: int = Field(
-        8 << 30, ge=1, description="Bytes of the largest archive or clip that is taken."
-    )
-    upload_seconds: int = Field(
-        86_400, ge=1, description="How long a resumable upload is kept after the last byte of it came."
-    )
-    capture_seconds: int | None = Field(
-        None,
-        ge=1,
-        description="How long a capture is kept from when it was made. Default: until it is deleted.",
-    )
-    matte_seconds: int | None = Field(
-        None,
-        ge=1,
-        description="How long a matte is kept from when it was asked for. Default: until it is deleted.",
-    )
-    job_seconds: int | None = Field(
-        None,
-        ge=1,
-        description="How long a job is kept after it has ended, with its log, and the video of a composite; that of an "
-        "ingest or a recovery at least as long as the capture or the matte. Default: until it is deleted.",
-    )
-    capture_frames: int = Field(20_000, ge=1, description="Frames of a capture.")
-    capture_pixels: int = Field(100_000_000, ge=1, description="Pixels of a frame of a capture.")
-    owner_captures: int | None = Field(
-        None,
-        ge=1,
-        description="Captures that an owner may have, uploads under way among them. Default: no limit.",
-    )
-    owner_jobs: int | None = Field(
-        None,
-        ge=1,
-        description="Jobs of an owner that may be queued or running at once, ingests among them. Default: no limit.",
-    )
-    owner_bytes: int | None = Field(
-        None, ge=1, description="Bytes stored that an owner may have. Default: no limit."
-    )
-    store_bytes: int | None = Field(
-        None,
-        ge=1,
-        description="Bytes stored that all owners together may have. Default: what the disk has room for.",
-    )
-    unpacked_bytes: int = Field(64 << 30, ge=1, description="Bytes that an archive may unpack to.")
-    ingest_memory: int = Field(
+    attempts: int = _setting(3, "How often a tile is tried before its job fails.", ge=1)
+    ingest_memory: int = _setting(
         512 << 20,
+        "Bytes of frames a worker may hold while it ingests, for captures of any length. A single frame may take a "
+        "quarter of it. Compression needs about 50 MB more.",
         ge=1 << 20,
-        description="Bytes of frames that one worker may hold while it ingests, whatever the size of the stack, "
-        "besides some 50 MB that compressing takes; a single frame may take a quarter of them.",
     )
-    backdrop_bytes: int = Field(
-        128 << 20, ge=1, description="Bytes that a backdrop may have, as it is sent and again decoded."
-    )
-    matte_memory: int = Field(
-        1 << 30, ge=0, description="Bytes of mattes that a service keeps in memory to composite them again."
-    )
-    webhook_secret: str | None = Field(
+    unpacked_bytes: int = _setting(64 << 30, "Bytes that a capture archive may unpack to.", ge=1)
+    capture_frames: int = _setting(20_000, "Frames of a capture, at most.", ge=1)
+    capture_pixels: int = _setting(100_000_000, "Pixels of a frame, at most.", ge=1)
+    job_seconds: int | None = _setting(
         None,
+        "How long an ended job is kept, in seconds, with its log and, for a composite, its video. The job of a "
+        "capture or a matte is kept at least as long as these.",
+        unset="until it is deleted",
+        ge=1,
+    )
+    webhook_secret: str | None = _setting(
+        None,
+        "Signs webhooks: whsec_ and a key in Base64, or any text of 16 characters or more.",
+        unset="none: requests with a webhook are refused",
         min_length=16,
-        description="Signs webhooks: whsec_ and a key in Base64, or any text of 16 characters or more. Without one, "
-        "requests with a webhook are refused.",
     )
-    webhook_private: bool = Field(
-        False, description="Whether webhooks may be at addresses that are not public, and without TLS."
+    webhook_private: bool = _setting(
+        False, "Whether webhooks may go to addresses that are not public, and without TLS."
     )
-    attempts: int = Field(3, ge=1, description="How often a tile is tried before its job fails.")
-
-    @field_validator("keys", mode="before")
-    @classmethod
-    def _split(cls, value: object) -> object:
-        if isinstance(value, str):
-            return tuple(key.strip() for key in value.split(",") if key.strip())
-        return value
 
     @field_validator("webhook_secret")
     @classmethod
-    def _stands_for_a_key(cls, value: str | None) -> str | None:
+    def _check_webhook_secret(cls, value: str | None) -> str | None:
         if value is not None:
             signing_key(value)
         return value
 
     @field_validator("database")
     @classmethod
-    def _database_known(cls, value: str | None) -> str | None:
+    def _check_database(cls, value: str | None) -> str | None:
+        if value is None:
+            return value
+        from sqlalchemy import make_url
+        from sqlalchemy.exc import ArgumentError
+
         try:
-            known = value is None or make_url(value).get_backend_name() in ("sqlite", "postgresql")
+            known = make_url(value).get_backend_name() in ("sqlite", "postgresql")
         except ArgumentError:
             known = False
         if not known:  # without showing the URL, which may hold a password
@@ -217,27 +203,27 @@ class Settings(ClusterSettings):
 
     @field_validator("store")
     @classmethod
-    def _store_known(cls, value: str | None) -> str | None:
+    def _check_store(cls, value: str | None) -> str | None:
         url = urlsplit(value or "file:///")
-        if not (url.scheme == "file" and not url.netloc and url.path) and not (
-            url.scheme == "s3" and url.netloc
-        ):
+        folder = url.scheme == "file" and not url.netloc and url.path
+        bucket = url.scheme == "s3" and url.netloc
+        if not folder and not bucket:
             raise ValueError(f"{value!r}: give it as s3://BUCKET/PREFIX or file:///FOLDER")
         return value
 
     @model_validator(mode="after")
-    def _store_shared(self) -> "Settings":
+    def _check_store_is_shared(self) -> "CoordinatorSettings":
         if self.cluster and self.store is None and not is_loopback(str(urlsplit(self.cluster).hostname)):
             raise ValueError(
-                f"the workers of {self.cluster} can't reach a folder of this machine: name the store that they share "
+                f"the workers of {self.cluster} can't reach a folder of this machine: name a store that they share "
                 "with it, s3://BUCKET/PREFIX or file:///FOLDER, with --store"
             )
         return self
 
     @property
     def database_url(self) -> str:
-        """Where the ledger is, as SQLAlchemy takes it."""
-        return self.database or f"sqlite:///{self.data.resolve() / 'envmatte.db'}"
+        """Where the database is, as SQLAlchemy takes it."""
+        return database_url(self.data, self.database)
 
     @property
     def store_url(self) -> str:
@@ -246,12 +232,12 @@ class Settings(ClusterSettings):
 
     @property
     def alone(self) -> bool:
-        """Whether all that belongs to the service is in its data folder: then no other can have a part in it."""
+        """Whether the data folder holds all of the service, so that no other service may use it."""
         return self.cluster is None and self.database is None and self.store is None
 
     @property
     def limits(self) -> Limits:
-        """What a bundle may cost."""
+        """Limits of a capture archive."""
         return Limits(
             unpacked=self.unpacked_bytes,
             memory=self.ingest_memory,
@@ -260,7 +246,105 @@ class Settings(ClusterSettings):
         )
 
 
-def _port(netloc: str) -> bool:
+class Settings(CoordinatorSettings):
+    """The settings of `envmatte serve`: all of them."""
+
+    coordinate: bool = _setting(True, "Whether this process also runs jobs, or only the API.")
+    host: str = _setting("127.0.0.1", "Address to listen on. Any other than loopback requires API keys.")
+    port: int = _setting(8000, "Port to listen on; 0 takes a free one.", ge=0, le=65535)
+    keys: tuple[str, ...] = _setting(
+        (),
+        "API keys, separated by commas, in addition to those of `envmatte keys`. They have scope admin and owner "
+        "`default`. Without any key the service is open to all, on loopback only.",
+        unset="none",
+    )
+    upload_bytes: int = _setting(8 << 30, "Largest capture archive or clip, in bytes.", ge=1)
+    upload_seconds: int = _setting(
+        86_400, "How long an unfinished upload is kept after its last byte arrived, in seconds.", ge=1
+    )
+    capture_seconds: int | None = _setting(
+        None,
+        "How long a capture is kept after it was created, in seconds.",
+        unset="until it is deleted",
+        ge=1,
+    )
+    matte_seconds: int | None = _setting(
+        None,
+        "How long a matte is kept after it was requested, in seconds.",
+        unset="until it is deleted",
+        ge=1,
+    )
+    owner_captures: int | None = _setting(
+        None, "Captures of one owner, at most, including uploads under way.", unset="no limit", ge=1
+    )
+    owner_jobs: int | None = _setting(
+        None,
+        "Jobs of one owner that may be queued or running at once, including ingests.",
+        unset="no limit",
+        ge=1,
+    )
+    owner_bytes: int | None = _setting(None, "Bytes stored for one owner, at most.", unset="no limit", ge=1)
+    store_bytes: int | None = _setting(
+        None, "Bytes stored for all owners together, at most.", unset="what the disk has room for", ge=1
+    )
+    backdrop_bytes: int = _setting(128 << 20, "Largest backdrop, in bytes, both as a file and decoded.", ge=1)
+    matte_memory: int = _setting(1 << 30, "Bytes of mattes kept in memory for further composites.", ge=0)
+
+    @field_validator("keys", mode="before")
+    @classmethod
+    def _split(cls, value: object) -> object:
+        if isinstance(value, str):
+            return tuple(key.strip() for key in value.split(",") if key.strip())
+        return value
+
+
+GROUPS = {
+    "Storage": ("data", "database", "store"),
+    "Cluster": ("cluster", "certs", "workers", "worker_memory", "coordinate", "attempts", "ingest_memory"),
+    "API": ("host", "port", "keys", "matte_memory"),
+    "Limits": ("upload_bytes", "unpacked_bytes", "capture_frames", "capture_pixels", "backdrop_bytes"),
+    "Quotas": ("owner_captures", "owner_jobs", "owner_bytes", "store_bytes"),
+    "Retention": ("upload_seconds", "capture_seconds", "matte_seconds", "job_seconds"),
+    "Webhooks": ("webhook_secret", "webhook_private"),
+    "Logging": ("log", "log_level"),
+}
+"""The settings in the order in which people read about them."""
+
+
+class Setting(NamedTuple):
+    """A setting as people read about it."""
+
+    variable: str
+    default: str
+    description: str
+    group: str
+
+
+def describe_settings(model: type[DataSettings] = Settings) -> list[Setting]:
+    """The settings of a model: environment variable, default, description and group."""
+    described = []
+    for group, names in GROUPS.items():
+        for name in names:
+            if name in model.model_fields:
+                field = model.model_fields[name]
+                assert isinstance(field.json_schema_extra, dict)
+                default = str(field.json_schema_extra["unset"]) or _text(field.default)
+                described.append(Setting(PREFIX + name.upper(), default, str(field.description), group))
+    return described
+
+
+def _text(value: object) -> str:
+    """A default as people write it; large powers of two in binary units as well."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, int):
+        for shift, unit in ((30, "GiB"), (20, "MiB")):
+            if value >= 1 << shift and value % (1 << shift) == 0:
+                return f"{value} ({value >> shift} {unit})"
+    return str(value)
+
+
+def _has_port(netloc: str) -> bool:
     """Whether a host comes with a port."""
     try:
         return bool(urlsplit(f"//{netloc}").port)

@@ -4,26 +4,32 @@ from pathlib import Path
 
 import click
 
-from services.cli.output import as_json, example, say, write
+from services.cli.options import as_json
+from services.cli.output import example, print_result, write
 
 
 @click.command(epilog=example("envmatte demo --keep demo"))
 @click.option(
-    "-o", "--output", type=click.Path(dir_okay=False, path_type=Path), default=Path("envmatte-demo.png")
+    "-o",
+    "--output",
+    type=click.Path(dir_okay=False, path_type=Path),
+    default=Path("envmatte-demo.png"),
+    show_default=True,
+    help="PNG to write.",
 )
 @click.option(
     "--keep",
     type=click.Path(file_okay=False, path_type=Path),
-    help="Folder to leave the capture and backdrop in.",
+    help="Folder to keep the capture and the backdrop in.",
 )
-@click.option("--workers", type=int, help="Worker processes of the demo's service.")
-@click.option("--url", help="Of a service that runs, to use in place of one of the demo's own.")
+@click.option("--workers", type=int, help="Worker processes of the demo's service. Default: one per core.")
+@click.option("--url", help="URL of a running service to use instead of starting one.")
 @click.option("--key", envvar="ENVMATTE_KEY", help="API key of that service.")
 @as_json
 def demo(
     output: Path, keep: Path | None, workers: int | None, url: str | None, key: str | None, as_json: bool
 ) -> None:
-    """Trace a glass ball, film it, serve, upload, recover, composite: all of it, in a picture."""
+    """Show everything in one picture: trace a glass ball, simulate its capture, upload, recover and composite it."""
     from services.cli.demo_run import run
 
     picture, figures = run(workers, keep, url=url, key=key)
@@ -31,4 +37,4 @@ def demo(
     if not as_json:
         for name, value in figures.items():
             click.echo(f"{name}: {value}")
-    say({"output": str(output), **figures}, as_json, "output")
+    print_result({"output": str(output), **figures}, as_json, "output")

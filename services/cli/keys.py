@@ -1,4 +1,4 @@
-"""`envmatte keys`: for whoever runs the service, who has its database."""
+"""`envmatte keys`: API keys, made in the service's database by those who run it."""
 
 import json
 from collections.abc import Iterator
@@ -9,74 +9,74 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from services.cli.output import as_json, example
-from services.cli.processes import given_of, refusals_told
+from services.cli import options
+from services.cli.options import as_json, drop_unset
+from services.cli.output import example, print_result
+from storage.errors import InvalidInput
 
 if TYPE_CHECKING:
     from sqlalchemy import Engine
 
 SCOPES = ("read", "write", "admin")
-_data = click.option("--data", type=click.Path(path_type=Path), help="Folder of the service's data.")
-_database = click.option(
-    "--database", help="Its database, if that is another: postgresql://USER:PASSWORD@HOST/NAME."
-)
 
 
 @contextmanager
 def _opened(given: dict[str, Any]) -> Iterator["Engine"]:
-    from services.settings import Settings
+    from services.runtime import environment
     from storage.database.engine import open_engine
 
-    with refusals_told():
-        settings = Settings(**given_of(given))
-        if settings.database is None:
-            settings.data.mkdir(parents=True, exist_ok=True)
-        engine = open_engine(settings.database_url)
-        try:
-            yield engine
-        finally:
-            engine.dispose()
+    found = environment.read_environment(("data", "database")) | drop_unset(given)
+    data, database = Path(found.get("data", environment.DATA)), found.get("database")
+    if database is None:
+        data.mkdir(parents=True, exist_ok=True)
+    try:
+        engine = open_engine(environment.database_url(data, database))
+    except InvalidInput as error:
+        raise click.UsageError(error.detail) from error
+    try:
+        yield engine
+    finally:
+        engine.dispose()
 
 
 @click.group(epilog=example("envmatte keys list"))
 def keys() -> None:
-    """Make, list and revoke API keys, in the service's database: while it runs, or before.
+    """Make, list and revoke API keys in the service's database.
 
-    From the first key on, every call takes one.
+    This works while the service runs and before it starts. Once there is a key, every request needs one.
     """
 
 
 @keys.command(epilog=example("envmatte keys make lab --owner alice"))
 @click.argument("name")
-@click.option("--owner", default="default", show_default=True, help="Whose things the key is for.")
+@click.option("--owner", default="default", show_default=True, help="Owner of what is made with the key.")
 @click.option(
     "--scope",
     type=click.Choice(SCOPES),
     default="write",
     show_default=True,
-    help="read: to look; write: to make and delete as well; admin: to see the whole service as well, its cluster and "
-    "figures, but no other owner's things.",
+    help="read: view; write: also create and delete; admin: also view the cluster and the metrics. No scope gives "
+    "access to what belongs to other owners.",
 )
-@_data
-@_database
+@options.data
+@options.database
 @as_json
 def make(name: str, owner: str, scope: str, as_json: bool, **given: Any) -> None:
-    """Make a key, and show it: this once, for only a hash of it is kept."""
+    """Make a key and print it. It is shown only once: the database keeps a hash of it."""
     from storage.database.engine import writing
     from storage.records import api_keys
 
     with _opened(given) as engine, writing(engine) as connection:
         key = api_keys.create(connection, name, owner, scope)
-    made = {"name": name, "owner": owner, "scope": scope, "key": key}
-    click.echo(json.dumps(made, indent=2) if as_json else key)
+    print_result({"name": name, "owner": owner, "scope": scope, "key": key}, as_json, "key")
 
 
 @keys.command("list", epilog=example("envmatte keys list --json"))
-@_data
-@_database
+@options.data
+@options.database
 @as_json
 def list_(as_json: bool, **given: Any) -> None:
-    """List keys, oldest first: name, owner, scope, when they were made and revoked."""
+    """List keys, oldest first: name, owner, scope, and when they were made and revoked."""
     from storage.database.engine import reading
     from storage.records import api_keys
 
@@ -101,11 +101,11 @@ def list_(as_json: bool, **given: Any) -> None:
 
 @keys.command(epilog=example("envmatte keys revoke lab"))
 @click.argument("name")
-@_data
-@_database
+@options.data
+@options.database
 @as_json
 def revoke(name: str, as_json: bool, **given: Any) -> None:
-    """Revoke a key: it stops working at once."""
+    """Revoke a key. It stops working at once."""
     from storage.database.engine import writing
     from storage.records import api_keys
 

@@ -1,46 +1,71 @@
-"""The command `envmatte`.
-
-Exit codes: 0 done; 1 the service refused, the job failed, a file can't be written, or something stored is damaged;
-2 the command line was wrong; 3 the service can't be reached, or asks to be tried again later; 130 interrupted, and
-nothing is left half done.
-"""
+"""The command `envmatte`: all of its commands, and what errors end it with."""
 
 import sys
+from typing import Any
 
 import click
 from click.shell_completion import get_completion_class
 
-from services.cli import maintenance, patterns, processes, remote
+from services.cli import maintenance, patterns, processes, remote, setup
+from services.cli.demo import demo
 from services.cli.keys import keys
 from services.cli.output import example
 from services.client import Busy, ServiceError, Unreachable
+from storage.errors import EnvmatteError
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]}, epilog=example("envmatte demo"))
+class _Main(click.Group):
+    def invoke(self, context: click.Context) -> Any:
+        """Run a command; what the service's own code or its settings refuse becomes an error message."""
+        try:
+            return super().invoke(context)
+        except EnvmatteError as error:
+            raise click.ClickException(error.detail) from error
+        except ValueError as error:
+            from pydantic import ValidationError
+
+            if isinstance(error, ValidationError):
+                first = error.errors()[0]
+                field = ".".join(map(str, first["loc"]))
+                raise click.UsageError(f"{field} {first['msg']}".strip()) from error
+            raise
+
+
+@click.group(
+    cls=_Main, context_settings={"help_option_names": ["-h", "--help"]}, epilog=example("envmatte demo")
+)
 @click.version_option(package_name="envmatte")
 def main() -> None:
-    """Environment mattes: film glass before a monitor, put it in front of anything.
+    """Environment mattes: film glass in front of a monitor, put it in front of anything.
 
     Exit codes: 0 done; 1 the service refused, a job failed, a file can't be written, or something stored is damaged;
-    2 wrong command line; 3 the service can't be reached, or asks to be tried again later; 130 interrupted.
+    2 wrong command line; 3 the service can't be reached, or asks to try again later; 130 interrupted.
     """
 
 
 @main.command(epilog=example('eval "$(envmatte completion bash)"', "envmatte completion fish | source"))
 @click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
 def completion(shell: str) -> None:
-    """Print what makes a shell complete the commands and options of envmatte; have it run at the shell's start."""
+    """Print a script that completes commands and options. Run it when your shell starts."""
     kind = get_completion_class(shell)
     assert kind is not None
     click.echo(kind(main, {}, "envmatte", "_ENVMATTE_COMPLETE").source())
 
 
-for command in (*processes.COMMANDS, keys, *maintenance.COMMANDS, *remote.COMMANDS, *patterns.COMMANDS):
+for command in (
+    *processes.COMMANDS,
+    *setup.COMMANDS,
+    keys,
+    *maintenance.COMMANDS,
+    *remote.COMMANDS,
+    demo,
+    patterns.patterns,
+):
     main.add_command(command)
 
 
 def run() -> None:
-    """The entry point: what the service refuses becomes a message and an exit code."""
+    """The entry point: every error becomes a message and an exit code."""
     try:
         main(standalone_mode=False, prog_name="envmatte")
     except ServiceError as error:

@@ -1,17 +1,13 @@
-"""What the commands of `envmatte` have in common: examples, files written whole, what is printed."""
+"""What commands write: examples in their help, results on standard output, files."""
 
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, BinaryIO
 
 import click
-
-F = TypeVar("F", bound=Callable[..., Any])
-
-as_json = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
 
 
 def example(*lines: str, more: str = "") -> str:
@@ -19,20 +15,25 @@ def example(*lines: str, more: str = "") -> str:
     return "\b\nExample:\n" + "\n".join(f"  {line}" for line in lines) + (f"\n\n{more}" if more else "")
 
 
-def say(found: Mapping[str, Any], as_json: bool, *names: str) -> None:
-    """Print all there is as JSON, or some of it for the next command."""
-    click.echo(json.dumps(found, indent=2) if as_json else " ".join(str(found[name]) for name in names))
+def print_result(result: Mapping[str, Any], as_json: bool, *names: str) -> None:
+    """Print all of a result as JSON, or some of its values for the next command."""
+    click.echo(json.dumps(result, indent=2) if as_json else " ".join(str(result[name]) for name in names))
+
+
+def print_summary(result: Mapping[str, Any], as_json: bool, summary: str) -> None:
+    """Print a result as JSON, with a summary, or the summary alone."""
+    print_result({**result, "told": summary}, as_json, "told")
 
 
 def write(path: Path, data: bytes) -> None:
     """Write a file whole or not at all."""
-    with whole(path) as file:
+    with open_whole(path) as file:
         file.write(data)
 
 
 @contextmanager
-def whole(path: Path) -> Iterator[BinaryIO]:
-    """A file that is written whole or not at all, so that an interrupt leaves nothing half done."""
+def open_whole(path: Path) -> Iterator[BinaryIO]:
+    """Open a file that appears only once all of it is written."""
     part = path.with_name(path.name + ".part")
     try:
         with part.open("wb") as file:

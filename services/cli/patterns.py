@@ -1,13 +1,12 @@
-"""The commands of `envmatte` that make things here: patterns to show, and the demo."""
+"""`envmatte patterns`: writes the patterns of a program as a video or as pictures."""
 
 import re
 from pathlib import Path
 
 import click
 
-from services.cli.demo import demo
-from services.cli.output import as_json, example, say
-from services.cli.processes import first_of
+from services.cli.options import as_json
+from services.cli.output import example, print_result
 from services.cli.progress import Progress
 from workflows.programs.preset_names import PRESETS
 
@@ -17,7 +16,7 @@ def _size(context: click.Context, parameter: click.Parameter, text: str | None) 
         return None
     found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
     if not found:
-        raise click.BadParameter("give it as WIDTHxHEIGHT in pixels, 1280x960 say")
+        raise click.BadParameter("give it as WIDTHxHEIGHT in pixels, for example 1280x960")
     return int(found[1]), int(found[2])
 
 
@@ -33,27 +32,25 @@ def _size(context: click.Context, parameter: click.Parameter, text: str | None) 
     "--monitor",
     metavar="WIDTHxHEIGHT",
     callback=_size,
-    help="The monitor's pixels: each of them must show one of the picture's. Left out: 1280x960 "
-    "for a preset, and for a file the program's own.",
+    help="Size of the monitor in pixels; each must show one pixel of the picture. Default: 1280x960 "
+    "for a preset, the program's own size for a file.",
 )
 @click.option(
     "--rate",
     type=click.FloatRange(0.1, 30),
     default=2.0,
     show_default=True,
-    help="Of a video: patterns a second.",
+    help="Patterns per second of a video.",
 )
 @as_json
 def patterns(program: str, out: Path, monitor: tuple[int, int] | None, rate: float, as_json: bool) -> None:
-    """Write the patterns of PROGRAM, a preset or a JSON file with a program.
+    """Write the patterns of PROGRAM, a preset or a JSON file with a program, to OUT.
 
-    \b
-    OUT ending in .mp4 or .mkv: a video of them, with a border and a lead-in that make a film of it certain to
-    read, and beside it the capture.json for the film. Needs a player that decodes in software, VLC or mpv say.
-    Anything else: a new folder, with a PNG of each pattern, and program.json for the capture.
+    If OUT ends in .mp4 or .mkv, it is a video, with a border and a lead-in by which a film of it can be read, and the
+    capture.json for that film is written beside it. Play it with software decoding, as VLC and mpv can.
+
+    Otherwise OUT is a new folder with a PNG of each pattern, and program.json for the capture.
     """
-    from pydantic import ValidationError
-
     from storage.errors import EnvmatteError
     from workflows.programs import files
     from workflows.programs import video as program_video
@@ -70,15 +67,10 @@ def patterns(program: str, out: Path, monitor: tuple[int, int] | None, rate: flo
                 program_video.write(shown, out, rate, progress)
             else:
                 files.write(shown, out, progress)
-    except ValidationError as error:
-        raise click.UsageError(first_of(error)) from error
     except EnvmatteError as error:
         raise click.UsageError(error.detail) from error
     except OSError as error:
         raise click.ClickException(f"{out} can't be written: {error.strerror}") from error
     kind, source = "video" if video else "folder", "preset" if program in PRESETS else "program"
     size = [shown.monitor.width, shown.monitor.height]
-    say({kind: str(out), source: program, "monitor": size, "patterns": shown.count}, as_json, kind)
-
-
-COMMANDS = (demo, patterns)
+    print_result({kind: str(out), source: program, "monitor": size, "patterns": shown.count}, as_json, kind)

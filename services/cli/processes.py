@@ -1,143 +1,131 @@
-"""The commands of `envmatte` by which processes of a service are run."""
+"""The commands of `envmatte` that run processes of a service, and the settings in their help."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-from services.cli.output import as_json, example, say
-
-if TYPE_CHECKING:
-    from pydantic import ValidationError
+from services.cli.options import drop_unset
+from services.cli.output import example
 
 _certs = click.option(
     "--certs",
     type=click.Path(path_type=Path),
-    help="Folder of the cluster's certificates, see `envmatte certs`.",
+    help="Folder of the cluster's certificates, made by `envmatte certs`.",
 )
 
 
-def given_of(options: dict[str, Any]) -> dict[str, Any]:
-    """The options that were given: for all others the environment counts."""
-    return {name: value for name, value in options.items() if value is not None}
+class _ProcessCommand(click.Command):
+    """A command whose help ends with the settings of its process."""
+
+    def __init__(self, *args: Any, settings: str, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._settings = settings
+
+    def format_epilog(self, context: click.Context, formatter: click.HelpFormatter) -> None:
+        super().format_epilog(context, formatter)
+        from services import settings
+
+        described = settings.describe_settings(getattr(settings, self._settings))
+        with formatter.section("Settings"):
+            formatter.write_text(
+                "Environment variables, or lines of the file .env in the working directory. The environment wins over "
+                "the file, and an option above wins over both."
+            )
+        for group in dict.fromkeys(one.group for one in described):
+            with formatter.section(group):
+                formatter.write_dl(
+                    [
+                        (one.variable, f"{one.description}  [default: {one.default}]")
+                        for one in described
+                        if one.group == group
+                    ]
+                )
 
 
-@contextmanager
-def refusals_told() -> Iterator[None]:
-    """What a process of the service refuses becomes a message and an exit code."""
-    from pydantic import ValidationError
-
-    from storage.errors import EnvmatteError
-
-    try:
-        yield
-    except ValidationError as error:
-        raise click.UsageError(first_of(error)) from error
-    except EnvmatteError as error:
-        raise click.ClickException(error.detail) from error
-
-
-def first_of(error: "ValidationError") -> str:
-    """The first thing that is wrong, in words."""
-    first = error.errors()[0]
-    return f"{'.'.join(map(str, first['loc']))} {first['msg']}".strip()
-
-
-@click.command(epilog=example("envmatte serve --data data --port 8000"))
+@click.command(
+    cls=_ProcessCommand, settings="Settings", epilog=example("envmatte serve --data data --port 8000")
+)
 @click.option("--data", type=click.Path(path_type=Path), help="Folder of the database and everything stored.")
 @click.option("--host", help="Address to listen on.")
 @click.option("--port", type=int, help="Port to listen on; 0 takes a free one.")
 @click.option("--workers", type=int, help="Worker processes.")
-@click.option("--cluster", help="Scheduler of a cluster to use instead: tls://HOST:PORT.")
+@click.option("--cluster", help="Scheduler of a cluster to use: tls://HOST:PORT.")
 @_certs
 @click.option("--database", help="Database to use: postgresql://USER:PASSWORD@HOST/NAME.")
 @click.option("--store", help="Store to use: s3://BUCKET/PREFIX or file:///FOLDER.")
 def serve(**given: Any) -> None:
-    """Run the service: API, database, store and a cluster of this machine, unless others are named.
-
-    Every setting is an environment variable ENVMATTE_… too, and a line in .env; an option here wins.
-    """
+    """Run the service: API and web app, with database, store and workers on this machine unless others are named."""
     from services.cluster.dask_config import configure_dask
     from services.cluster.forkserver import DECODING, PRELOAD, start_forkserver
     from services.settings import Settings
 
-    with refusals_told():
-        settings = Settings(**given_of(given))
-        own = settings.coordinate and settings.cluster is None  # a cluster, whose workers are this process's
-        configure_dask()  # which says how processes are started
-        # At the same time as this process imports the rest.
-        start_forkserver(DECODING, *([PRELOAD] if own else []))
-        from services.server import serve as run
+    settings = Settings(**drop_unset(given))
+    starts_workers = settings.coordinate and settings.cluster is None
+    configure_dask()  # which says how processes are started
+    # At the same time as this process imports the rest.
+    start_forkserver(DECODING, *([PRELOAD] if starts_workers else []))
+    from services.server import serve as run
 
-        run(settings)
+    run(settings)
 
 
-@click.command(epilog=example("envmatte coordinator --cluster tls://HOST:8786 --certs certs"))
+@click.command(
+    cls=_ProcessCommand,
+    settings="CoordinatorSettings",
+    epilog=example("envmatte coordinator --cluster tls://HOST:8786 --certs certs"),
+)
 @click.option("--cluster", help="Scheduler to hand work to: tls://HOST:PORT.")
 @_certs
 @click.option("--database", help="Database that the API uses: postgresql://USER:PASSWORD@HOST/NAME.")
-@click.option("--store", help="Store that all of them use: s3://BUCKET/PREFIX or file:///FOLDER.")
+@click.option("--store", help="Store that all processes use: s3://BUCKET/PREFIX or file:///FOLDER.")
 def coordinator(**given: Any) -> None:
-    """Run a coordinator without an API: it drives jobs whenever no other coordinator does."""
+    """Run a coordinator without an API. Of several, one runs the jobs, and another takes over when it dies."""
     from services.server import coordinate
-    from services.settings import Settings
+    from services.settings import CoordinatorSettings
 
-    with refusals_told():
-        coordinate(Settings(**given_of(given)))
+    coordinate(CoordinatorSettings(**drop_unset(given)))
 
 
-@click.command(epilog=example("envmatte scheduler --host 0.0.0.0 --certs certs"))
+@click.command(
+    cls=_ProcessCommand,
+    settings="SchedulerSettings",
+    epilog=example("envmatte scheduler --host 0.0.0.0 --certs certs"),
+)
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
 @click.option(
     "--port", type=int, default=8786, show_default=True, help="Port to listen on; 0 takes a free one."
 )
 @_certs
 def scheduler(host: str, port: int, **given: Any) -> None:
-    """Run the scheduler of a cluster, for workers and services of many machines.
+    """Run the scheduler of a cluster, for workers and services on several machines.
 
-    With certificates it speaks TLS; without it listens on loopback alone.
+    With certificates it uses TLS; without, it listens on loopback only.
     """
     from services.cluster.scheduler import schedule
-    from services.settings import ClusterSettings
+    from services.settings import SchedulerSettings
 
-    with refusals_told():
-        schedule(ClusterSettings(**given_of(given)), host, port)
+    schedule(SchedulerSettings(**drop_unset(given)), host, port)
 
 
-@click.command(epilog=example("envmatte worker --cluster tls://HOST:8786 --certs certs"))
+@click.command(
+    cls=_ProcessCommand,
+    settings="ClusterSettings",
+    epilog=example("envmatte worker --cluster tls://HOST:8786 --certs certs"),
+)
 @click.option("--cluster", help="Scheduler to work for: tls://HOST:PORT, or tcp://127.0.0.1:PORT.")
 @_certs
-@click.option("--workers", type=int, help="Worker processes. Default: one a core.")
-@click.option("--host", help="Address to listen on. Default: that by which the scheduler is reached.")
+@click.option("--workers", type=int, help="Worker processes. Default: one per core.")
+@click.option("--host", help="Address to listen on. Default: the one from which the scheduler is reached.")
 def worker(host: str | None, **given: Any) -> None:
     """Run workers of a cluster on this machine.
 
-    They wait for the scheduler as long as it takes, and join it again whenever it was gone.
+    They wait until the scheduler can be reached, and join it again after it was away.
     """
     from services.cluster.worker import work
     from services.settings import ClusterSettings
 
-    with refusals_told():
-        work(ClusterSettings(**given_of(given)), host)
+    work(ClusterSettings(**drop_unset(given)), host)
 
 
-@click.command(epilog=example("envmatte certs certs"))
-@click.argument("folder", type=click.Path(file_okay=False, path_type=Path), metavar="DIR")
-@as_json
-def certs(folder: Path, as_json: bool) -> None:
-    """Make the certificates of a cluster in DIR.
-
-    Every process of the cluster gets a copy with --certs; whoever has one may run what he likes on all of its
-    machines. Where there is a whole set already it stays.
-    """
-    from services.runtime.certificates import make
-
-    with refusals_told():
-        made = make(folder)
-    told = f"{folder}: made, copy it to every host" if made else f"{folder}: there already, and stays"
-    say({"folder": str(folder), "made": made, "told": told}, as_json, "told")
-
-
-COMMANDS = (serve, coordinator, scheduler, worker, certs)
+COMMANDS = (serve, coordinator, scheduler, worker)

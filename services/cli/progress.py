@@ -9,16 +9,16 @@ import click
 from services.client import Job
 
 STEP = 0.25
-"""How far it goes between two plain lines."""
+"""Progress between two plain lines."""
 
 
 class Progress:
-    """Shows how far something is, on standard error."""
+    """Shows the progress of one thing on standard error."""
 
     def __init__(self, what: str) -> None:
         self._what = what
         self._bar: Any = None
-        self._said = -1.0
+        self._printed = -1.0
 
     def __enter__(self) -> Self:
         if sys.stderr.isatty():
@@ -39,12 +39,12 @@ class Progress:
             self._bar.__exit__(kind, error, trace)
 
     def show(self, share: float, text: str = "") -> None:
-        """Show a share of 0 to 1, and what is going on."""
+        """Show a share of 0 to 1 and what is being done."""
         if self._bar is not None:
             self._bar.update(round(share * 1000) - self._bar.pos, text)
             self._bar.render_progress()  # update alone shows no new text where the share stands still
-        elif share >= self._said + STEP or (share == 1 and self._said < 1):
-            self._said = share
+        elif share >= self._printed + STEP or (share == 1 and self._printed < 1):
+            self._printed = share
             click.echo(f"{self._what}: {share:.0%} {text}".rstrip(), err=True)
 
     def job(self, job: Job) -> None:

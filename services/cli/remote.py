@@ -1,42 +1,41 @@
-"""The commands of `envmatte` that talk to a service: a thin skin on `services.client`."""
+"""The commands of `envmatte` that talk to a service, through `services.client`."""
 
 import json
 import os
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 
-from services.cli import output as cli_output
-from services.cli.output import example, say, whole, write
+from services.cli import options
+from services.cli.output import example, open_whole, print_result, write
 from services.cli.progress import Progress
 from services.client import Client
 
 F = TypeVar("F", bound=Callable[..., Any])
-KINDS = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".exr": "image/x-exr"}
-"""Of pictures, by the ends of their files' names."""
+MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".exr": "image/x-exr"}
+"""Of composites, by the ends of file names."""
 LAYERS = ("all.exr", "stmap.exr", "S.png", "rho.png", "alpha.png", "confidence.png")
-Given = click.Path(exists=True, dir_okay=False, path_type=Path)
-Written = click.Path(dir_okay=False, path_type=Path)
+InputFile = click.Path(exists=True, dir_okay=False, path_type=Path)
+OutputFile = click.Path(dir_okay=False, path_type=Path)
 
 
 def _remote(command: F) -> F:
-    """Options of every command that talks to a service."""
+    """Add the options of every command that talks to a service."""
     url = click.option(
         "--url",
         envvar="ENVMATTE_URL",
         default="http://127.0.0.1:8000",
         show_default=True,
-        help="Of the service.",
+        help="URL of the service.",
     )
-    key = click.option("--key", envvar="ENVMATTE_KEY", help="API key, if the service asks for one.")
-    return url(key(cli_output.as_json(command)))
+    key = click.option("--key", envvar="ENVMATTE_KEY", help="API key, if the service requires one.")
+    return url(key(options.as_json(command)))
 
 
 def _webhook(command: F) -> F:
-    return click.option("--webhook", metavar="URL", help="URL that is told when the job has ended.")(command)
+    return click.option("--webhook", metavar="URL", help="URL to notify when the job has ended.")(command)
 
 
 def _client(url: str, key: str | None) -> Client:
@@ -47,14 +46,14 @@ def _client(url: str, key: str | None) -> Client:
 
 
 @click.command(epilog=example("envmatte upload film.zip --name 'glass ball'"))
-@click.argument("file", type=Given)
-@click.option("--name", default="", help="A name for people.")
+@click.argument("file", type=InputFile)
+@click.option("--name", default="", help="Name of the capture in lists.")
 @_webhook
 @_remote
 def upload(file: Path, name: str, webhook: str | None, url: str, key: str | None, as_json: bool) -> None:
-    """Upload a capture and wait until it is ingested; prints its id.
+    """Upload a capture and wait until it is ingested. Prints the capture's id.
 
-    Called again for the same file after an interrupt, it goes on where it stood.
+    After an interrupt, the same command resumes the upload.
     """
     with _client(url, key) as client:
         with Progress("upload") as bar:
@@ -63,33 +62,37 @@ def upload(file: Path, name: str, webhook: str | None, url: str, key: str | None
             )
         with Progress("ingest") as bar:
             client.wait(capture, progress=bar.job)
-        say(client.capture(capture).answer, as_json, "id")
+        print_result(client.capture(capture).answer, as_json, "id")
 
 
 @click.command(epilog=example("envmatte recover CAPTURE --option quality=fast"))
 @click.argument("capture")
-@click.option("--method", help="lobes or nn-dgsr.")
+@click.option("--method", help="Recovery method: lobes or nn-dgsr.")
 @click.option(
-    "--option", "options", multiple=True, metavar="NAME=VALUE", help="Any option of GET /v1/options."
+    "--option",
+    "pairs",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="Recovery option, see GET /v1/options. May be repeated.",
 )
-@click.option("--detach", is_flag=True, help="Print the job and do not wait for it.")
+@click.option("--detach", is_flag=True, help="Print the job's id and do not wait.")
 @_webhook
 @_remote
 def recover(
     capture: str,
     method: str | None,
-    options: tuple[str, ...],
+    pairs: tuple[str, ...],
     detach: bool,
     webhook: str | None,
     url: str,
     key: str | None,
     as_json: bool,
 ) -> None:
-    """Recover the matte of a capture, and wait for it; prints the matte's id.
+    """Recover the matte of a capture and wait for it. Prints the matte's id.
 
-    An interrupt ends the waiting and not the job.
+    An interrupt ends the waiting, but not the job.
     """
-    chosen = dict(_pair(option) for option in options) | ({"method": method} if method else {})
+    chosen = dict(_parse_option(pair) for pair in pairs) | ({"method": method} if method else {})
     with _client(url, key) as client:
         job = client.recover(capture, webhook=webhook, **chosen)
         if not detach:
@@ -97,9 +100,12 @@ def recover(
                 with Progress("recovery") as bar:
                     job = client.wait(job, progress=bar.job)
             except KeyboardInterrupt:
-                click.echo(f"The job goes on: envmatte wait {job.id}, or envmatte cancel {job.id}", err=True)
+                click.echo(
+                    f"The job continues: envmatte wait {job.id}, or envmatte cancel {job.id}",
+                    err=True,
+                )
                 raise
-    say(job.answer, as_json, "id" if detach else "matte")
+    print_result(job.answer, as_json, "id" if detach else "matte")
 
 
 @click.command(epilog=example("envmatte status JOB"))
@@ -108,79 +114,78 @@ def recover(
 def status(job: str, url: str, key: str | None, as_json: bool) -> None:
     """Show a job: its state, stage and progress."""
     with _client(url, key) as client:
-        say(client.job(job).answer, as_json, "state", "stage", "progress")
+        print_result(client.job(job).answer, as_json, "state", "stage", "progress")
 
 
 @click.command(epilog=example("envmatte wait JOB"))
 @click.argument("job")
 @_remote
 def wait(job: str, url: str, key: str | None, as_json: bool) -> None:
-    """Wait until a job has ended; prints its state."""
+    """Wait until a job has ended. Prints its state."""
     with _client(url, key) as client, Progress("job") as bar:
-        say(client.wait(job, progress=bar.job).answer, as_json, "state")
+        print_result(client.wait(job, progress=bar.job).answer, as_json, "state")
 
 
 @click.command(epilog=example("envmatte cancel JOB"))
 @click.argument("job")
 @_remote
 def cancel(job: str, url: str, key: str | None, as_json: bool) -> None:
-    """Cancel a job; prints its state."""
+    """Cancel a job. Prints its state."""
     with _client(url, key) as client:
-        say(client.cancel(job).answer, as_json, "state")
+        print_result(client.cancel(job).answer, as_json, "state")
 
 
 @click.command(epilog=example("envmatte composite MATTE backdrop.png -o composite.png"))
 @click.argument("matte")
-@click.argument("backdrop", type=Given)
+@click.argument("backdrop", type=InputFile)
 @click.option(
     "-o",
     "--output",
-    type=Written,
+    type=OutputFile,
     required=True,
-    help="PNG, JPEG or EXR to write, or MP4 of a clip, by the end of its name.",
+    help="File to write: .png, .jpg or .exr; .mp4 for a clip.",
 )
 @click.option("--transfer", type=click.Choice(["srgb", "linear"]), default="srgb", show_default=True)
-@click.option("--right", type=float, help="The backdrop's move to the right, in widths of the monitor.")
-@click.option("--down", type=float, help="Its move down, in heights of the monitor.")
-@click.option("--scale", type=float, help="By how much it is larger.")
-@click.option("--angle", type=float, help="By how much it is turned, in degrees, clockwise.")
-@click.option("--webhook", metavar="URL", help="Of a clip: URL that is told when the job has ended.")
+@click.option("--right", type=float, help="Move the backdrop to the right, in monitor widths.")
+@click.option("--down", type=float, help="Move the backdrop down, in monitor heights.")
+@click.option("--scale", type=float, help="Scale the backdrop by this factor.")
+@click.option("--angle", type=float, help="Rotate the backdrop clockwise, in degrees.")
+@click.option("--webhook", metavar="URL", help="For a clip: URL to notify when the job has ended.")
 @_remote
 def composite(
-    matte: str, backdrop: Path, output: Path, url: str, key: str | None, as_json: bool, **wanted: Any
+    matte: str, backdrop: Path, output: Path, url: str, key: str | None, as_json: bool, **params: Any
 ) -> None:
     """Put a matte in front of a backdrop, a picture or a clip.
 
-    A clip, told by its first bytes, is composited by a job, frame by frame, and written once that is done; an
-    interrupt cancels the job.
+    A clip (a video file) is composited by a job, frame by frame. An interrupt cancels the job.
     """
-    given = {name: value for name, value in wanted.items() if value is not None}
-    ends = [".mp4"] if _is_clip(backdrop) else list(KINDS)
+    given = options.drop_unset(params)
+    ends = [".mp4"] if _is_clip(backdrop) else list(MEDIA_TYPES)
     if output.suffix.lower() not in ends:
-        raise click.BadParameter(f"{output}: its name must end in {', '.join(ends)}", param_hint="--output")
+        raise click.BadParameter(f"{output}: the name must end in {', '.join(ends)}", param_hint="--output")
     with _client(url, key) as client:
         if _is_clip(backdrop):
             _composite_clip(client, matte, backdrop, output, given)
         else:
-            kind = KINDS[output.suffix.lower()]
+            kind = MEDIA_TYPES[output.suffix.lower()]
             write(output, client.composite(matte, backdrop, kind=kind, **given))
-    say({"output": str(output)}, as_json, "output")
+    print_result({"output": str(output)}, as_json, "output")
 
 
-def _composite_clip(client: Client, matte: str, clip: Path, output: Path, wanted: dict[str, Any]) -> None:
-    job = client.composite_clip(matte, clip, **wanted)
+def _composite_clip(client: Client, matte: str, clip: Path, output: Path, params: dict[str, Any]) -> None:
+    job = client.composite_clip(matte, clip, **params)
     try:
         with Progress("composite") as bar:
             client.wait(job, progress=bar.job)
     except KeyboardInterrupt:
         client.cancel(job)
         raise
-    with whole(output) as file:
+    with open_whole(output) as file:
         client.video(job, file)
 
 
 def _is_clip(file: Path) -> bool:
-    """Whether a file begins as MP4 and MOV do, MKV and WebM, or AVI."""
+    """Whether a file's first bytes are those of MP4 or MOV, MKV or WebM, or AVI."""
     with file.open("rb") as source:
         start = source.read(12)
     return (
@@ -192,23 +197,23 @@ def _is_clip(file: Path) -> bool:
 
 @click.command(epilog=example("envmatte export MATTE -o matte.zip"))
 @click.argument("matte")
-@click.option("-o", "--output", type=Written, required=True, help="ZIP to write.")
+@click.option("-o", "--output", type=OutputFile, required=True, help="ZIP to write.")
 @_remote
 def export(matte: str, output: Path, url: str, key: str | None, as_json: bool) -> None:
-    """Write a matte to a file, for `envmatte import` elsewhere or for any zarr reader."""
+    """Write a matte to a file, for `envmatte import` elsewhere or any zarr reader."""
     with _client(url, key) as client, Progress("export") as bar:
         client.export(matte, output, progress=lambda done, size: bar.show(done / size))
-    say({"output": str(output)}, as_json, "output")
+    print_result({"output": str(output)}, as_json, "output")
 
 
 @click.command("import", epilog=example("envmatte import matte.zip"))
-@click.argument("file", type=Given)
+@click.argument("file", type=InputFile)
 @_remote
 def import_(file: Path, url: str, key: str | None, as_json: bool) -> None:
-    """Bring a matte that `envmatte export` wrote; prints its id here."""
+    """Import a matte that `envmatte export` wrote. Prints its new id."""
     with _client(url, key) as client, Progress("import") as bar:
         matte = client.import_matte(file, progress=lambda sent, size: bar.show(sent / size))
-    say(matte.answer, as_json, "id")
+    print_result(matte.answer, as_json, "id")
 
 
 @click.command(epilog=example("envmatte layers MATTE layers"))
@@ -218,21 +223,23 @@ def import_(file: Path, url: str, key: str | None, as_json: bool) -> None:
 def layers(matte: str, folder: Path, url: str, key: str | None, as_json: bool) -> None:
     """Write the layers of a matte for other tools to FOLDER: all.exr, stmap.exr, and 16-bit PNGs.
 
-    They are put there once all of them have come.
+    The files appear once all of them are complete.
     """
+    import tempfile
+
     with _client(url, key) as client:
-        client.matte(matte)  # before a folder is made
+        client.matte(matte)  # fails before a folder is made
         folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as coming:
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as part:
             for name in LAYERS:
-                Path(coming, name).write_bytes(client.layer(matte, name))
+                Path(part, name).write_bytes(client.layer(matte, name))
             folder.mkdir(exist_ok=True)
             for name in LAYERS:
-                os.replace(Path(coming, name), folder / name)
-    say({"folder": str(folder), "layers": LAYERS}, as_json, "folder")
+                os.replace(Path(part, name), folder / name)
+    print_result({"folder": str(folder), "layers": LAYERS}, as_json, "folder")
 
 
-def _pair(option: str) -> tuple[str, Any]:
+def _parse_option(option: str) -> tuple[str, Any]:
     name, equals, value = option.partition("=")
     if not equals:
         raise click.UsageError(f"--option {option}: give it as NAME=VALUE")

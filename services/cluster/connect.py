@@ -14,7 +14,7 @@ from tornado.ioloop import IOLoop
 
 from services.cluster.dispatcher import Dispatcher
 from services.cluster.embedded import Scale, embedded
-from services.settings import Settings
+from services.settings import CoordinatorSettings
 from storage.errors import Unavailable
 
 PATIENCE = 5
@@ -79,7 +79,7 @@ def _loop() -> IOLoop:
 
 
 @contextmanager
-def dispatcher_of(settings: Settings) -> Iterator[Dispatcher]:
+def dispatcher_of(settings: CoordinatorSettings) -> Iterator[Dispatcher]:
     """A dispatcher for the cluster that the settings name, reachable yet or not, or for an embedded one."""
     if settings.cluster:
         remote = partial(connect, settings.cluster, settings.security())

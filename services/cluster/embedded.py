@@ -8,14 +8,14 @@ from distributed import LocalCluster
 
 from services.cluster.dask_config import SCHEDULER
 from services.cluster.forkserver import PRELOAD, START, start_forkserver
-from services.settings import Settings
+from services.settings import CoordinatorSettings
 
 IDLE = 300.0
 """Seconds without a job after which all workers but one stop. A worker holds 70 MB, and more while it works."""
 
 
 @contextmanager
-def embedded(settings: Settings) -> Iterator[LocalCluster]:
+def embedded(settings: CoordinatorSettings) -> Iterator[LocalCluster]:
     """Start a scheduler and worker processes on loopback, and stop them on exit."""
     start_forkserver(PRELOAD)
     with LocalCluster(

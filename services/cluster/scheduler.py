@@ -10,16 +10,16 @@ from services.runtime.addresses import is_loopback
 from services.runtime.certificates import security_of
 from services.runtime.logs import configure_logging
 from services.runtime.signals import run_until_signal
-from services.settings import ClusterSettings
+from services.settings import SchedulerSettings
 from storage.errors import Conflict, InvalidInput
 
 
-def schedule(settings: ClusterSettings, host: str, port: int) -> None:
+def schedule(settings: SchedulerSettings, host: str, port: int) -> None:
     """Run a scheduler until SIGTERM; prints its address as soon as it listens.
 
     Parameters
     ----------
-    settings : ClusterSettings
+    settings : SchedulerSettings
         Only the certificates are used. Without any there is no TLS.
     host : str
         Address to listen on.

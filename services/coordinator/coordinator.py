@@ -23,7 +23,7 @@ from services.coordinator.job_kinds import JOB_KINDS
 from services.coordinator.job_run import JobRun, write_failure
 from services.coordinator.retention import count, forget_expired, forget_jobs, remove, sweep
 from services.runtime.logs import about
-from services.settings import Settings
+from services.settings import CoordinatorSettings
 from storage.database.engine import reading, writing
 from storage.errors import EnvmatteError, GaveUp, NoRoom, Unavailable
 from storage.objects.store import Objects
@@ -51,13 +51,15 @@ class Coordinator:
 
     Parameters
     ----------
-    settings : Settings
+    settings : CoordinatorSettings
     engine : sqlalchemy.Engine
     objects : Objects
     dispatcher : Dispatcher
     """
 
-    def __init__(self, settings: Settings, engine: Engine, objects: Objects, dispatcher: Dispatcher) -> None:
+    def __init__(
+        self, settings: CoordinatorSettings, engine: Engine, objects: Objects, dispatcher: Dispatcher
+    ) -> None:
         self._settings = settings
         self._engine = engine
         self._objects = objects

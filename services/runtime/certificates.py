@@ -13,6 +13,7 @@ import os
 import ssl
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature
@@ -20,9 +21,11 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
-from distributed.security import Security
 
 from storage.errors import Conflict, InvalidInput
+
+if TYPE_CHECKING:
+    from distributed.security import Security
 
 CA, CERT, KEY = "ca.pem", "cert.pem", "key.pem"
 LIFETIME = timedelta(days=3650)
@@ -90,7 +93,7 @@ def make(certs: Path) -> bool:
     return True
 
 
-def security_of(certs: Path) -> Security:
+def security_of(certs: Path) -> "Security":
     """What dask needs to let in members of a cluster alone, and to be let in.
 
     Parameters
@@ -121,6 +124,8 @@ def security_of(certs: Path) -> Security:
                 f"{one.not_valid_after_utc:%Y-%m-%d}, and today is {now:%Y-%m-%d}: see that the clock is right, or "
                 "make them anew with `envmatte certs DIR` and copy them to every host of the cluster"
             )
+    from distributed.security import Security  # with all of dask, which `envmatte certs` needs nothing of
+
     return Security(
         require_encryption=True,
         tls_ca_file=ca,

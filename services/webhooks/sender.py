@@ -11,7 +11,7 @@ from typing import Any
 from sqlalchemy import Connection, Engine, Row
 
 from services.runtime.webhook_signature import headers_of, signing_key
-from services.settings import Settings
+from services.settings import CoordinatorSettings
 from services.webhooks import safe_http
 from storage.database.engine import reading, writing
 from storage.errors import NoRoom, NotFound, OptionError, Unavailable
@@ -26,7 +26,7 @@ THREADS = 8
 """Requests at once, so that one slow receiver does not hold up the others."""
 
 
-def check_webhook(url: str | None, settings: Settings) -> None:
+def check_webhook(url: str | None, settings: CoordinatorSettings) -> None:
     """Check that a URL can be a job's webhook; None is fine.
 
     Raises
@@ -49,14 +49,16 @@ class Sender:
 
     Parameters
     ----------
-    settings : Settings
+    settings : CoordinatorSettings
         With a webhook secret.
     engine : sqlalchemy.Engine
     token : callable
         Returns the coordinator's token, None while it holds no lease.
     """
 
-    def __init__(self, settings: Settings, engine: Engine, token: Callable[[], int | None]) -> None:
+    def __init__(
+        self, settings: CoordinatorSettings, engine: Engine, token: Callable[[], int | None]
+    ) -> None:
         self._key = signing_key(settings.webhook_secret or "")
         self._private = settings.webhook_private
         self._engine = engine

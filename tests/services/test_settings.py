@@ -6,7 +6,7 @@ import pytest
 from pydantic import ValidationError
 
 from services.runtime import certificates as certificate_files
-from services.settings import ClusterSettings, Settings
+from services.settings import GROUPS, ClusterSettings, SchedulerSettings, Settings, describe_settings
 
 
 @pytest.fixture(autouse=True)
@@ -32,6 +32,23 @@ def test_what_is_empty_is_not_set(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv(f"ENVMATTE_{name.upper()}", "")
     assert Settings() == unset
     assert unset.webhook_secret is None
+
+
+def test_every_setting_is_described_once() -> None:
+    described = describe_settings()
+    assert sorted(one.variable for one in described) == sorted(
+        f"ENVMATTE_{name.upper()}" for name in Settings.model_fields
+    )
+    assert all(one.default and one.description.endswith(".") for one in described)
+    assert list(dict.fromkeys(one.group for one in described)) == list(GROUPS)
+    defaults = {one.variable: one.default for one in described}
+    assert defaults["ENVMATTE_UPLOAD_BYTES"] == "8589934592 (8 GiB)"
+    assert (defaults["ENVMATTE_COORDINATE"], defaults["ENVMATTE_OWNER_JOBS"]) == ("true", "no limit")
+
+
+def test_a_process_has_only_the_settings_that_it_reads() -> None:
+    described = [one.variable for one in describe_settings(SchedulerSettings)]
+    assert described == ["ENVMATTE_DATA", "ENVMATTE_CERTS", "ENVMATTE_LOG", "ENVMATTE_LOG_LEVEL"]
 
 
 def test_paths_with_odd_names_make_urls_that_lead_back(tmp_path: Path) -> None:
@@ -86,7 +103,7 @@ def test_certificates_are_looked_for_in_the_data_folder(certificates: Path, tmp_
 
 @pytest.mark.parametrize("address", ["tcp://192.0.2.1:8786", "tcp://scheduler:8786", "tcp://0.0.0.0:8786"])
 def test_a_cluster_without_tls_stays_on_loopback(address: str) -> None:
-    with pytest.raises(ValidationError, match=r"make certificates with `envmatte certs"):
+    with pytest.raises(ValidationError, match=r"Make certificates with `envmatte certs"):
         ClusterSettings(cluster=address)
 
 

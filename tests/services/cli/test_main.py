@@ -16,11 +16,20 @@ import click
 import pytest
 from click.testing import CliRunner
 
+from services.cli import remote
 from services.cli.main import main
+from services.settings import (
+    ClusterSettings,
+    CoordinatorSettings,
+    SchedulerSettings,
+    Settings,
+    describe_settings,
+)
 from tests.parts.processes import interrupt, running
 from tests.services.client.test_client import JOB, answering, ok, refused, saying
 
-README = (Path(__file__).parents[3] / "README.md").read_text()
+ROOT = Path(__file__).parents[3]
+README = (ROOT / "README.md").read_text()
 COMMAND = [sys.executable, "-m", "services"]
 PROCESSES = {"serve", "coordinator", "scheduler", "worker", "completion"}
 """Commands that have no answer to print as JSON."""
@@ -40,6 +49,21 @@ def commands(group: click.Group = main, *above: str) -> Iterator[tuple[str, clic
 
 
 ALL = dict(commands())
+HEAVY = {"alembic", "dask", "distributed", "numba", "numpy", "zarr"}
+"""Libraries that take long to import, and that no quick command needs."""
+ELSEWHERE = ["--url", "http://127.0.0.1:9"]
+REMOTE = {
+    "upload": ["film.zip"],
+    "recover": ["c"],
+    "status": ["j"],
+    "wait": ["j"],
+    "cancel": ["j"],
+    "composite": ["m", "backdrop.png", "-o", "composite.png"],
+    "export": ["m", "-o", "matte.zip"],
+    "import": ["matte.zip"],
+    "layers": ["m", "layers"],
+}
+"""Arguments of every command that talks to a service."""
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -191,6 +215,58 @@ def test_130_an_interrupted_recovery_says_how_to_go_on_with_its_job() -> None:
     assert code == 130
     assert "envmatte wait j" in said
     assert not any("cancel" in call["call"] for call in calls)
+
+
+@pytest.mark.parametrize("width", [80, 100])
+@pytest.mark.parametrize(
+    ("command", "model"),
+    [
+        ("serve", Settings),
+        ("coordinator", CoordinatorSettings),
+        ("scheduler", SchedulerSettings),
+        ("worker", ClusterSettings),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_the_help_of_a_process_lists_its_settings(
+    command: str, model: type[SchedulerSettings], width: int
+) -> None:
+    text = CliRunner().invoke(main, [command, "--help"], terminal_width=width).output
+    assert max(map(len, text.splitlines())) <= width
+    words = " ".join(text.split())
+    described = describe_settings(model)
+    assert set(re.findall(r"\bENVMATTE_\w+", text)) == {one.variable for one in described}
+    for one in described:
+        assert f"{one.variable} {one.description} [default: {one.default}]" in words
+
+
+def imported(*arguments: str, folder: Path) -> set[str]:
+    """The top-level modules that a command imports while it runs."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-X", "importtime", "-m", "services", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=folder, env=environment)
+    assert done.returncode in (0, 3), done.stderr[-2000:]
+    return {line.rpartition("|")[2].strip().partition(".")[0] for line in done.stderr.splitlines()}
+
+
+@pytest.mark.parametrize("command", [["--help"], ["serve", "--help"], ["demo", "--help"]], ids=" ".join)
+def test_help_imports_nothing_heavy(command: list[str], tmp_path: Path) -> None:
+    assert "click" in (found := imported(*command, folder=tmp_path))
+    assert not found & (HEAVY | {"sqlalchemy", "httpx2"})
+
+
+def test_listing_keys_imports_nothing_heavy(tmp_path: Path) -> None:
+    imported("keys", "make", "lab", folder=tmp_path)  # makes the database, with alembic
+    assert "sqlalchemy" in (found := imported("keys", "list", folder=tmp_path))
+    assert not found & (HEAVY | {"pydantic"})
+
+
+@pytest.mark.parametrize("name", [str(command.name) for command in remote.COMMANDS])
+def test_commands_that_talk_to_a_service_import_nothing_heavy(name: str, tmp_path: Path) -> None:
+    for file in ("film.zip", "matte.zip", "backdrop.png"):
+        (tmp_path / file).write_bytes(b"any")
+    assert "httpx2" in (found := imported(name, *REMOTE[name], *ELSEWHERE, folder=tmp_path))
+    assert not found & (HEAVY | {"sqlalchemy", "pydantic"})
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

@@ -1,0 +1,39 @@
+"""The environment: which variables and lines of .env count, and where the database is by them."""
+
+from pathlib import Path
+
+import pytest
+
+from services.runtime.environment import database_url, read_environment
+
+NAMES = {"port", "worker_memory"}
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in NAMES:
+        monkeypatch.delenv(f"ENVMATTE_{name.upper()}", raising=False)
+
+
+def test_a_variable_wins_over_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert read_environment(NAMES) == {}
+    Path(".env").write_text("ENVMATTE_PORT=1\nENVMATTE_WORKER_MEMORY=2\nENVMATTE_OTHER=3\nPORT=4\n")
+    monkeypatch.setenv("ENVMATTE_PORT", "5")
+    assert read_environment(NAMES) == {"port": "5", "worker_memory": "2"}
+
+
+def test_an_empty_value_counts_as_not_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    Path(".env").write_text("ENVMATTE_PORT=1\nENVMATTE_WORKER_MEMORY=\n")
+    monkeypatch.setenv("ENVMATTE_PORT", "")
+    assert read_environment(NAMES) == {"port": "1"}
+
+
+def test_case_does_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("Envmatte_Port", "1")
+    assert read_environment(NAMES) == {"port": "1"}
+
+
+def test_the_database_is_in_the_data_folder_unless_named(tmp_path: Path) -> None:
+    assert database_url(Path("data"), None) == f"sqlite:///{tmp_path}/data/envmatte.db"
+    assert database_url(Path("data"), "postgresql://host/name") == "postgresql://host/name"
