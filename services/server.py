@@ -37,9 +37,9 @@ def serve(settings: Settings) -> None:
     from services.api.app import build_app
     from services.api.auth import require_keys_unless_loopback
     from services.api.http.browser_security import SecurityHeaders
-    from services.api.http.slow_clients import Connection, allow_many
+    from services.api.http.slow_clients import Connection, raise_file_limit
 
-    allow_many()
+    raise_file_limit()
     with _opened(settings, "service") as (stack, engine, objects):
         require_keys_unless_loopback(settings, engine)
         app = build_app(settings, engine, objects)

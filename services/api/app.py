@@ -6,11 +6,11 @@ from fastapi import Depends, FastAPI
 from sqlalchemy import Engine
 
 from services.api import errors
-from services.api.captures import captures, manifest_schema, reports, tus, uploads
+from services.api.captures import captures, creation, manifest_schema, reports, tus, uploads
 from services.api.context import Context, authorized
 from services.api.jobs import events, jobs
 from services.api.mattes import archives, clips, composites, layers, live, mattes
-from services.api.programs import playback, programs
+from services.api.programs import pattern_files, playback, programs
 from services.api.system import cluster, health, limits, metrics, network, pages
 from services.decoding.pool import Decoders
 from services.runtime import tracing
@@ -51,6 +51,7 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
 
     for router in (
         captures.router,
+        creation.router,
         manifest_schema.router,
         reports.router,
         uploads.router,
@@ -63,13 +64,14 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
         layers.router,
         live.router,
         programs.router,
+        pattern_files.router,
         limits.router,
         playback.router,
         cluster.router,
         network.router,
     ):
         app.include_router(router, prefix="/v1", dependencies=[Depends(authorized)])
-    app.include_router(programs.page, prefix="/v1")
+    app.include_router(pattern_files.page, prefix="/v1")
     app.include_router(health.router)
     app.include_router(metrics.router)
     app.include_router(pages.page)

@@ -1,4 +1,4 @@
-"""What an owner may have, and what the service holds: looked at before anything is taken."""
+"""Limits of owners and of the whole service, checked before anything is accepted."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -15,12 +15,14 @@ Unit = Literal["bytes", "frames", "pixels", "captures", "jobs", "seconds"]
 
 @dataclass(frozen=True)
 class Limit:
-    """A limit: the setting of its name says how much; None sets none.
+    """A limit, from the setting of the same name.
 
     Attributes
     ----------
+    limit : int, optional
+        None if there is none.
     used : int, optional
-        What of it is used, if it is one of all together.
+        How much is in use, if the limit is for all items together.
     """
 
     name: str
@@ -45,23 +47,23 @@ UNITS: dict[str, Unit] = {
     "matte_seconds": "seconds",
     "job_seconds": "seconds",
 }
-"""The settings that are limits."""
+"""The settings that are limits, with their units."""
 
 
-def limits_of(connection: Connection, settings: Settings, *, whole: bool) -> list[Limit]:
-    """Every limit, and what the owner that a connection is bound to has used of it.
+def limits_of(connection: Connection, settings: Settings, *, all_owners: bool) -> list[Limit]:
+    """All limits, with how much of each the owner of a connection uses.
 
     Parameters
     ----------
-    whole : bool
-        Whether to tell what all owners have used together.
+    all_owners : bool
+        Whether to include how much all owners use together.
     """
     used = {
         "owner_captures": statistics.captures_and_uploads(connection),
         "owner_jobs": statistics.active_jobs(connection),
         "owner_bytes": statistics.stored_bytes(connection),
     }
-    if whole:
+    if all_owners:
         used["store_bytes"] = statistics.stored_bytes(connection, all_owners=True)
     return [
         Limit(
@@ -74,25 +76,25 @@ def limits_of(connection: Connection, settings: Settings, *, whole: bool) -> lis
 def admit(
     connection: Connection, settings: Settings, *, captures: int = 0, jobs: int = 0, size: int = 0
 ) -> None:
-    """See that an owner may have so much more; in the transaction that writes it down it holds for certain.
+    """Check that an owner may have more. Within the transaction that adds it, the result is certain.
 
     Parameters
     ----------
     size : int
-        Bytes; 0 still asks that the limits are not passed yet.
+        Bytes; with 0, the limits must still not be exceeded already.
 
     Raises
     ------
     NoRoom
-        Where something has to be deleted first.
+        If something must be deleted first.
     TooMany
-        Where some time does.
+        If the owner must wait first.
     """
     if captures and settings.owner_captures is not None:
         value = statistics.captures_and_uploads(connection) + captures
         if value > settings.owner_captures:
             raise NoRoom(
-                f"you may have {settings.owner_captures} captures, uploads under way among them, and this would be the "
+                f"you may have {settings.owner_captures} captures, unfinished uploads included, and this would be the "
                 f"{value}th; delete some first",
                 name="owner_captures",
                 limit=settings.owner_captures,
@@ -102,8 +104,8 @@ def admit(
         value = statistics.active_jobs(connection) + jobs
         if value > settings.owner_jobs:
             raise TooMany(
-                f"you may have {settings.owner_jobs} jobs that are queued or running, ingests among them, and this "
-                f"would be the {value}th; wait for one, or cancel one",
+                f"you may have {settings.owner_jobs} queued or running jobs, ingests included, and this would be the "
+                f"{value}th; wait for one to end, or cancel one",
                 name="owner_jobs",
                 limit=settings.owner_jobs,
                 value=value,
@@ -116,10 +118,10 @@ def admit(
             continue
         value = statistics.stored_bytes(connection, all_owners=name == "store_bytes") + size
         if value > most:
-            # Of the whole service only what is missing: the rest is other owners' business.
+            # For the whole service only what is missing: its usage would reveal that of other owners.
             raise NoRoom(
-                f"{whose} {most} bytes stored, and {value - most} more than that would be; delete captures, mattes, "
-                "videos, uploads or programs first",
+                f"{whose} {most} bytes stored, and this would be {value - most} more; delete captures, mattes, videos, "
+                "uploads or programs first",
                 name=name,
                 limit=most,
                 value=value if name == "owner_bytes" else size,
@@ -136,7 +138,7 @@ def admit_upload(
     captures: int = 0,
     jobs: int = 0,
 ) -> None:
-    """The same of something that is to be sent, before it is: with that the disk has room for its bytes.
+    """Check the same before something is uploaded, and that the disk has room for its bytes.
 
     Raises
     ------

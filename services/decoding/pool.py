@@ -1,14 +1,14 @@
-"""Pictures that strangers send are decoded in processes that the service can lose.
+"""A pool of child processes that decode untrusted pictures.
 
-A decoder is native code, and a file may crash it, keep it for ever, or have it take all memory. So each picture goes to
-a child process, forked from the one that workers are forked from, that has limits of memory and of time, and the worst
-that comes of it is that its own request is refused.
+Decoders are native code: a hostile file may crash one, hang it, or make it use all memory. So each picture is decoded
+in a child process with limits of memory and time. If the child fails, only its own request is refused. Children are
+forked from the fork server that workers are forked from.
 """
 
 import logging
 import threading
 
-from services.decoding.process import AGAIN, Decoder, Refused
+from services.decoding.process import ADVICE, Decoder, Refused
 from storage.errors import ImageError, Unavailable
 from workflows.images.decode import Transfer
 from workflows.images.float_formats import Floats
@@ -18,36 +18,38 @@ from workflows.untrusted import decoder_guard
 logger = logging.getLogger(__name__)
 
 SECONDS = 20.0
-"""That decoding a picture may take, if it may have `USUAL` bytes or less; more in proportion."""
-USUAL = 128 << 20
+"""Time to decode a picture of up to `USUAL_BYTES`; a larger limit of bytes gives proportionally more time."""
+USUAL_BYTES = 128 << 20
 
 
 class Decoders:
-    """Child processes that decode pictures, as many as are asked for at once, each of which is kept for the next.
+    """Child processes that decode pictures: one for each concurrent request, kept for later requests.
 
     Parameters
     ----------
     memory : int
         Bytes that a decoded picture may take.
     seconds : float, optional
-        That decoding one may take; default by the memory.
+        Time to decode one picture. Default: in proportion to ``memory``.
     """
 
     def __init__(self, memory: int, seconds: float | None = None) -> None:
         self._memory = memory
-        self._seconds = SECONDS * max(memory / USUAL, 1) if seconds is None else seconds
+        self._seconds = SECONDS * max(memory / USUAL_BYTES, 1) if seconds is None else seconds
         self._lock = threading.Lock()
         self._idle: list[Decoder] = []
         self._children: set[Decoder] = set()
         self._closed = False
 
     def decode(self, data: bytes, transfer: Transfer) -> Codes | Floats:
-        """Decode a picture, as `pictures.decode`; for any number of threads.
+        """Decode a picture, as `workflows.images.decode.decode` does. Any number of threads may call it.
 
         Raises
         ------
         ImageError
-            Also if it takes too long, or ends the process that decodes it.
+            If the picture can't be decoded, takes too long, or ends the process that decodes it.
+        Unavailable
+            If the pool is closed.
         """
         child = self._take()
         try:
@@ -57,25 +59,27 @@ class Decoders:
                 self._children.discard(child)
             ended = child.end()
             if isinstance(error, TimeoutError):
-                logger.warning("a picture of %d bytes took its decoder too long", len(data))
+                logger.warning("decoding a picture of %d bytes took too long", len(data))
                 raise ImageError(
-                    f"decoding the image takes more than {self._seconds:g} s: send a smaller one, or {AGAIN}"
+                    f"decoding the image takes more than {self._seconds:g} s: send a smaller one, or {ADVICE}"
                 ) from error
             if isinstance(error, OSError | EOFError | ValueError):
                 logger.warning("a picture of %d bytes ended its decoder: %s, %r", len(data), ended, error)
                 raise ImageError(
-                    f"decoding the image ended the process that did it ({ended}): {AGAIN}"
+                    f"decoding the image ended the process of the decoder ({ended}): {ADVICE}"
                 ) from error
             raise
         with self._lock:
             if not self._closed:
-                self._idle.append(child)  # the last one used is the next: it has in memory what it needs
+                self._idle.append(
+                    child
+                )  # the most recently used child is taken next: its memory is still mapped
         if isinstance(answer, Refused):
             raise ImageError(answer.detail, **({} if answer.limit is None else {"limit": answer.limit}))
         return answer
 
     def close(self) -> None:
-        """End the children, whatever they are doing."""
+        """Kill all children, also busy ones."""
         with self._lock:
             self._closed = True
             children = list(self._children)
@@ -83,17 +87,17 @@ class Decoders:
             child.end()
 
     def _take(self) -> Decoder:
-        """A child that has nothing to do."""
+        """Take an idle child, or start one."""
         while (child := self._idle_one()) is not None:
             if child.is_waiting():
                 return child
-            logger.warning("a decoder that had nothing to do is gone: %s", child.end())
+            logger.warning("an idle decoder has ended: %s", child.end())
             with self._lock:
                 self._children.discard(child)
         child = Decoder(decoder_guard.room(self._memory))
         with self._lock:
             self._children.add(child)
-        if self._closed:  # meanwhile
+        if self._closed:  # while the child was started
             child.end()
             raise _stopping()
         return child
@@ -106,4 +110,4 @@ class Decoders:
 
 
 def _stopping() -> Unavailable:
-    return Unavailable("the service is being stopped; send it again to the next one")
+    return Unavailable("the service is being stopped; send the request again later")

@@ -1,7 +1,7 @@
-"""A process that decodes one picture after another: its side, and that of whoever asks.
+"""A process that decodes one picture after another: the service's side of it, and the child's.
 
-What it is told, and what it says, is a few fields of JSON and the bytes of a picture or of pixels. What it says is
-checked and never unpickled: who takes a decoder over has that process, and not the service.
+Requests and answers are a few fields of JSON, followed by the bytes of a picture or of pixels. Answers are validated
+and never unpickled: an attacker who takes over a decoder controls that process, but not the service.
 """
 
 import ctypes
@@ -27,17 +27,17 @@ from workflows.images.float_formats import Floats
 from workflows.images.integer_formats import Codes
 from workflows.untrusted.decoder_guard import in_use
 
-SPARE = 5.0
-"""Seconds more, after which a decoder whose service is gone ends by itself, whatever it is doing."""
-KEPT = 32 << 20
-"""Bytes of memory that it keeps for the next picture."""
+SPARE_SECONDS = 5.0
+"""Time beyond a picture's limit after which a decoder ends itself, in case the service is gone."""
+KEPT_BYTES = 32 << 20
+"""Freed memory that a decoder keeps for the next picture."""
 NAME = "decoder"
-"""What `ps -o comm` and `top` show of it."""
-AGAIN = "save it anew with another program, or in another format"
+"""Name of the process in `ps -o comm` and `top`."""
+ADVICE = "save it again with another program or in another format"
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of mallopt(3)
 _HEAD = struct.Struct("<I")
 _HEAD_BYTES = 1 << 16
-_BUFFER = 1 << 18  # bytes on their way between two processes, which then change places less often
+_BUFFER = 1 << 18  # of the socket, in bytes: large, for fewer context switches
 
 Side = Annotated[int, Field(ge=1)]
 Channels = Annotated[int, Field(ge=1, le=4)]
@@ -47,8 +47,8 @@ class _Strict(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class _Asked(_Strict):
-    """What a child is told before the bytes of a picture."""
+class _Request(_Strict):
+    """Sent to a child before the bytes of a picture."""
 
     size: int
     transfer: Transfer
@@ -57,7 +57,7 @@ class _Asked(_Strict):
 
 
 class _Decoded(_Strict):
-    """What a child says before the values of pixels."""
+    """Sent by a child before the values of the pixels."""
 
     height: Side
     width: Side
@@ -66,14 +66,14 @@ class _Decoded(_Strict):
 
 
 class Refused(_Strict):
-    """What it says of a picture that can't be used, as `ImageError` has it."""
+    """Sent by a child for a picture that can't be decoded: the fields of an `ImageError`."""
 
     detail: Annotated[str, Field(max_length=10_000)]
     limit: int | None = None
 
 
 class _Answer(_Strict):
-    said: _Decoded | Refused
+    result: _Decoded | Refused
 
 
 class Decoder:
@@ -82,15 +82,17 @@ class Decoder:
     Parameters
     ----------
     memory : int
-        Bytes that it may take more than when it starts.
+        Bytes that the process may allocate after its start.
     """
 
     def __init__(self, memory: int) -> None:
-        self._socket, theirs = socket.socketpair()
+        self._socket, child_socket = socket.socketpair()
         try:
-            with theirs:
+            with child_socket:
                 context = multiprocessing.get_context("forkserver")
-                self._process = context.Process(target=_serve, args=(theirs, memory), name=NAME, daemon=True)
+                self._process = context.Process(
+                    target=_serve, args=(child_socket, memory), name=NAME, daemon=True
+                )
                 self._process.start()
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
         except BaseException:
@@ -98,7 +100,7 @@ class Decoder:
             raise
 
     def is_waiting(self) -> bool:
-        """Whether it lives, and says nothing that it was not asked."""
+        """Whether the process is alive and has sent nothing unasked."""
         self._socket.setblocking(False)
         try:
             self._socket.recv(1, socket.MSG_PEEK)
@@ -109,74 +111,72 @@ class Decoder:
         return False
 
     def ask(self, data: bytes, transfer: Transfer, memory: int, seconds: float) -> Codes | Floats | Refused:
-        """Have a picture decoded.
+        """Have the child decode a picture.
 
         Raises
         ------
         TimeoutError
             If it takes too long.
         OSError, EOFError
-            If the child is gone.
+            If the child has ended.
         ValueError
-            If it answers what it never should.
+            If its answer is invalid.
         """
-        until = time.monotonic() + seconds
-        asked = _Asked(size=len(data), transfer=transfer, memory=memory, seconds=seconds)
+        deadline = time.monotonic() + seconds
+        request = _Request(size=len(data), transfer=transfer, memory=memory, seconds=seconds)
         self._socket.settimeout(seconds)
-        self._socket.sendall(_framed(asked))
-        self._socket.settimeout(_left(until))
+        self._socket.sendall(_framed(request))
+        self._socket.settimeout(_remaining(deadline))
         self._socket.sendall(data)
-        said = _Answer.model_validate_json(_read_head(self._socket, until)).said
-        if isinstance(said, Refused):
-            return said
-        shape, dtype = (said.height, said.width, said.channels), np.dtype(said.dtype)
-        if said.height * said.width * said.channels * dtype.itemsize > memory:
-            raise ValueError(
-                f"{shape} values of {dtype} are more than the {memory} bytes that it was allowed"
-            )
-        if dtype == np.float32 and said.channels not in (1, 3):
-            raise ValueError(f"float pixels have no {said.channels} channels")
+        result = _Answer.model_validate_json(_read_head(self._socket, deadline)).result
+        if isinstance(result, Refused):
+            return result
+        shape, dtype = (result.height, result.width, result.channels), np.dtype(result.dtype)
+        if result.height * result.width * result.channels * dtype.itemsize > memory:
+            raise ValueError(f"{shape} values of {dtype} take more than the limit of {memory} bytes")
+        if dtype == np.float32 and result.channels not in (1, 3):
+            raise ValueError(f"float pixels can't have {result.channels} channels")
         pixels = np.empty(shape, dtype)
-        _fill(self._socket, pixels.data.cast("B"), until)
+        _fill(self._socket, pixels.data.cast("B"), deadline)
         return pixels
 
     def end(self) -> str:
-        """Kill it, unless it is gone, and say what it died of."""
+        """Kill the process if it is alive; returns how it ended."""
         self._process.kill()
-        self._process.join(SPARE)
+        self._process.join(SPARE_SECONDS)
         self._socket.close()
         code = self._process.exitcode
         return _signal_of(-code) if code is not None and code < 0 else f"exit code {code}"
 
 
 def _serve(connection: socket.socket, memory: int) -> None:
-    """What a child does: decode, until the service hangs up."""
+    """Decode pictures in the child process until the service closes the socket."""
     _keep_memory()
-    gc.freeze()  # what it was forked with: a collection would look at all of it, and so have it copied, some 60 MB
+    gc.freeze()  # a collection would touch, and so copy, all memory shared with the fork server: about 60 MB
     _confine(memory)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
     with connection:
         while True:
             try:
-                asked = _Asked.model_validate_json(_read_head(connection))
-                # Ended by the system: a decoder that hangs may let nothing else of this process run.
-                signal.setitimer(signal.ITIMER_REAL, asked.seconds + SPARE)
-                data = connection.recv(asked.size, socket.MSG_WAITALL)
+                request = _Request.model_validate_json(_read_head(connection))
+                # The kernel ends the process then: while native code hangs, no Python code runs here.
+                signal.setitimer(signal.ITIMER_REAL, request.seconds + SPARE_SECONDS)
+                data = connection.recv(request.size, socket.MSG_WAITALL)
             except (EOFError, ConnectionError):
                 return
             values = memoryview(b"")
-            said: _Decoded | Refused
+            result: _Decoded | Refused
             try:
-                pixels = decode.decode(data, asked.transfer, memory=asked.memory)
+                pixels = decode.decode(data, request.transfer, memory=request.memory)
                 height, width, channels = pixels.shape
                 size = {"height": height, "width": width, "channels": channels}
-                said = _Decoded.model_validate(size | {"dtype": pixels.dtype.name})
+                result = _Decoded.model_validate(size | {"dtype": pixels.dtype.name})
                 values = pixels.data.cast("B")
                 del pixels
-            except Exception as error:  # of others than ours, it is not known what they hold
-                said = _refusal(error)
+            except Exception as error:
+                result = _refusal(error)
             try:
-                connection.sendall(_framed(_Answer(said=said)))
+                connection.sendall(_framed(_Answer(result=result)))
                 connection.sendall(values)
             except ConnectionError:
                 return
@@ -185,35 +185,35 @@ def _serve(connection: socket.socket, memory: int) -> None:
 
 
 def _refusal(error: Exception) -> Refused:
-    """What to say of an error."""
+    """The answer for an error; only errors of ours are passed on as they are."""
     if isinstance(error, MemoryError) or isinstance(error.__cause__, MemoryError):
-        return Refused(detail=f"decoding the image takes too much memory: send a smaller one, or {AGAIN}")
+        return Refused(detail=f"decoding the image takes too much memory: send a smaller one, or {ADVICE}")
     if isinstance(error, ImageError):
         limit = error.fields.get("limit")
         return Refused(detail=error.detail[:10_000], limit=limit if isinstance(limit, int) else None)
-    return Refused(detail=f"the image can't be decoded: {error!r:.1000}; {AGAIN}")
+    return Refused(detail=f"the image can't be decoded: {error!r:.1000}; {ADVICE}")
 
 
 def _confine(memory: int) -> None:
-    """Take from this process what a decoder does not need."""
-    # A terminal sends it to all: the service ends its children.
+    """Limit this process to what a decoder needs."""
+    # A terminal sends SIGINT to all processes; the service ends its children itself.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     limits = {resource.RLIMIT_CORE: 0, resource.RLIMIT_FSIZE: 0}
     if sys.platform == "linux":
         Path("/proc/self/comm").write_text(NAME)
         limits[resource.RLIMIT_DATA] = in_use() + memory
-    for limit, most in limits.items():
+    for limit, value in limits.items():
         _, hard = resource.getrlimit(limit)
-        most = most if hard == resource.RLIM_INFINITY else min(most, hard)
-        resource.setrlimit(limit, (most, most))
+        value = value if hard == resource.RLIM_INFINITY else min(value, hard)
+        resource.setrlimit(limit, (value, value))
 
 
 def _keep_memory() -> None:
-    """Have glibc keep some of what is freed: to get it anew for each small picture takes a third of the time."""
-    with suppress(AttributeError, OSError):  # with another library of C
+    """Have glibc keep some freed memory: otherwise small pictures spend a third of their time on allocation."""
+    with suppress(AttributeError, OSError):  # another C library
         library = ctypes.CDLL(None)
         for option in (_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD):
-            library.mallopt(option, KEPT)
+            library.mallopt(option, KEPT_BYTES)
 
 
 def _framed(message: BaseModel) -> bytes:
@@ -221,33 +221,33 @@ def _framed(message: BaseModel) -> bytes:
     return _HEAD.pack(len(text)) + text
 
 
-def _read_head(connection: socket.socket, until: float | None = None) -> bytes:
+def _read_head(connection: socket.socket, deadline: float | None = None) -> bytes:
     head = bytearray(_HEAD.size)
-    _fill(connection, memoryview(head), until)
+    _fill(connection, memoryview(head), deadline)
     (size,) = _HEAD.unpack(head)
     if size > _HEAD_BYTES:
         raise ValueError(f"a head of {size} bytes")
     text = bytearray(size)
-    _fill(connection, memoryview(text), until)
+    _fill(connection, memoryview(text), deadline)
     return bytes(text)
 
 
-def _fill(connection: socket.socket, buffer: memoryview, until: float | None = None) -> None:
-    """Fill a buffer with what comes."""
+def _fill(connection: socket.socket, buffer: memoryview, deadline: float | None = None) -> None:
+    """Fill a buffer from a connection."""
     while buffer:
-        if until is not None:
-            connection.settimeout(_left(until))
+        if deadline is not None:
+            connection.settimeout(_remaining(deadline))
         count = connection.recv_into(buffer)
         if not count:
-            raise EOFError("the other side has hung up")
+            raise EOFError("the connection was closed")
         buffer = buffer[count:]
 
 
-def _left(until: float) -> float:
-    left = until - time.monotonic()
-    if left <= 0:
+def _remaining(deadline: float) -> float:
+    remaining = deadline - time.monotonic()
+    if remaining <= 0:
         raise TimeoutError
-    return left
+    return remaining
 
 
 def _signal_of(number: int) -> str:

@@ -395,7 +395,7 @@ def read_headers(data: bytes, folder: Path) -> None:
     readers: dict[str, Callable[[], object]] = {
         "upload-checksum": lambda: tus.Checksum.of(request),
         "upload-metadata": lambda: tus.metadata_of(request),
-        "upload-length": lambda: tus.number(request, "Upload-Length"),
+        "upload-length": lambda: tus.byte_count(request, "Upload-Length"),
         "content-type": lambda: require_media_type(request, tus.CHUNK, "the bytes of an upload"),
         "accept": lambda: preferred(request.headers["accept"], composites_api.ANSWERS),
     }

@@ -1,4 +1,4 @@
-"""Reports on captures over HTTP."""
+"""Reports on captures over HTTP: how the frames turned out."""
 
 from fastapi import APIRouter, Response
 
@@ -16,14 +16,14 @@ router = APIRouter(tags=["captures"])
 
 @router.get("/captures/{id}/report")
 def get_report(context: OwnerContext, id: str) -> Report:
-    """How a capture turned out, and what to do better."""
+    """The quality of a capture, and how to improve it."""
     stack = _stack(context, id)
     return report(stack.attributes, stack.frames)
 
 
 @router.get("/captures/{id}/contact-sheet.png", response_class=Response)
 def get_contact_sheet(context: OwnerContext, id: str) -> Response:
-    """Some of a capture's frames: what is clipped at white is red, at black blue."""
+    """Some of a capture's frames in one picture: red where they are clipped at white, blue where clipped at black."""
     return answered(contact_sheet(_stack(context, id)), "image/png")
 
 
@@ -31,5 +31,5 @@ def _stack(context: Context, id: str) -> Stack:
     with reading(context.engine) as c:
         row = captures.get(c, id)
     if row.state != "ready":
-        raise Conflict(f"capture {id} is {row.state}; it can be looked at once it is ready")
+        raise Conflict(f"capture {id} is {row.state}; its report is there once it is ready")
     return Stack(context.objects, id)

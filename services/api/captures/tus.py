@@ -1,4 +1,4 @@
-"""What tus 1.0 says about headers: which are sent with every answer, and how those of a request are read."""
+"""Headers of tus 1.0, the protocol of resumable uploads: those of every answer, and those of requests parsed."""
 
 import base64
 import binascii
@@ -19,11 +19,11 @@ ALGORITHMS = ("sha1", "sha256")
 CHUNK = "application/offset+octet-stream"
 METADATA_BYTES = 8192
 DECLARED = ("frames", "width", "height")
-"""Names by which a client may say how many frames a capture has, and of how many pixels."""
+"""Names in Upload-Metadata for the number of frames of a capture, and for their size in pixels."""
 
 
 class Protocol:
-    """What tus asks of every exchange, an answer with a problem included."""
+    """Middleware that adds the headers of tus to every answer below /v1/uploads, also to problems."""
 
     def __init__(self, app: "ASGIApp") -> None:
         self._app = app
@@ -33,32 +33,32 @@ class Protocol:
             await self._app(scope, receive, send)
             return
 
-        async def tell(message: "Message") -> None:
+        async def send_with_headers(message: "Message") -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
                 headers["Tus-Resumable"] = headers["Tus-Version"] = VERSION
             await send(message)
 
-        # For clients whose surroundings let only GET and POST through.
+        # For clients behind proxies that pass on only GET and POST.
         method = Headers(scope=scope).get("x-http-method-override", scope["method"])
-        await self._app({**scope, "method": method.upper()}, receive, tell)
+        await self._app({**scope, "method": method.upper()}, receive, send_with_headers)
 
 
-def version_spoken(
-    tus_resumable: Annotated[str | None, Header(description="The version of tus that is spoken.")] = None,
+def require_version(
+    tus_resumable: Annotated[str | None, Header(description="Version of tus that the client uses.")] = None,
 ) -> None:
-    """Refuse another version than the one spoken here.
+    """Check that the client uses the version of tus that the service supports.
 
     Raises
     ------
     WrongVersion
     """
     if tus_resumable != VERSION:
-        raise WrongVersion(f"send `Tus-Resumable: {VERSION}`, the version of tus spoken here")
+        raise WrongVersion(f"send `Tus-Resumable: {VERSION}`, the version of tus that this service supports")
 
 
 class Checksum:
-    """What a body should hash to, as an ``Upload-Checksum`` header says."""
+    """The checksum that a body should have, by its ``Upload-Checksum`` header."""
 
     def __init__(self, algorithm: str, digest: bytes) -> None:
         self._hash = hashlib.new(algorithm, usedforsecurity=False)
@@ -67,7 +67,7 @@ class Checksum:
 
     @classmethod
     def of(cls, request: Request) -> "Checksum | None":
-        """The checksum of a request, if it has one.
+        """Parse the checksum of a request, None if it has none.
 
         Raises
         ------
@@ -79,13 +79,13 @@ class Checksum:
         algorithm, _, text = header.partition(" ")
         if algorithm not in ALGORITHMS:
             raise BadHeader(
-                f"Upload-Checksum: {algorithm!r} is not taken; use {' or '.join(ALGORITHMS)}",
+                f"Upload-Checksum: {algorithm!r} is not supported; use {' or '.join(ALGORITHMS)}",
                 field="Upload-Checksum",
             )
         return cls(algorithm, _base64(text, "Upload-Checksum"))
 
     def check(self) -> None:
-        """Compare it with what has come.
+        """Compare the checksum with the bytes that came.
 
         Raises
         ------
@@ -93,26 +93,26 @@ class Checksum:
         """
         if self._hash.digest() != self._digest:
             raise ChecksumMismatch(
-                "the bytes that came are not those that the checksum was made of; none was kept, send them again"
+                "the bytes that came do not match Upload-Checksum; none of them was kept, send them again"
             )
 
 
-def number(request: Request, name: str) -> int:
-    """The bytes that a header of a request gives.
+def byte_count(request: Request, name: str) -> int:
+    """Parse a header that is a number of bytes.
 
     Raises
     ------
     BadHeader
-        If it is missing, or no number from 0 to 10**18 - 1.
+        If it is missing, or not a number from 0 to 10**18 - 1.
     """
     text = request.headers.get(name, "")
     if not (text.isascii() and text.isdigit() and len(text) <= 18):
-        raise BadHeader(f"{name}: {text or 'nothing'!r} is no number of bytes; send one", field=name)
+        raise BadHeader(f"{name}: {text or 'nothing'!r} is not a number of bytes; send one", field=name)
     return int(text)
 
 
 def metadata_of(request: Request) -> str:
-    """The ``Upload-Metadata`` of a request: pairs of a key and, in Base64, a value, checked and kept as they are.
+    """Check the ``Upload-Metadata`` of a request, pairs of a key and a value in Base64; returns it unchanged.
 
     Raises
     ------
@@ -121,7 +121,9 @@ def metadata_of(request: Request) -> str:
     text = request.headers.get("upload-metadata", "")
     if len(text) > METADATA_BYTES:
         raise BadHeader(
-            f"Upload-Metadata may have {METADATA_BYTES} bytes", field="Upload-Metadata", limit=METADATA_BYTES
+            f"Upload-Metadata may have at most {METADATA_BYTES} bytes",
+            field="Upload-Metadata",
+            limit=METADATA_BYTES,
         )
     pairs = [pair.strip().partition(" ") for pair in text.split(",")] if text else []
     for key, _, value in pairs:
@@ -129,24 +131,24 @@ def metadata_of(request: Request) -> str:
         if not key.isascii():
             raise BadHeader(f"Upload-Metadata: {key!r} is not ASCII", field="Upload-Metadata")
     if len({key for key, _, _ in pairs} - {""}) < len(pairs):
-        raise BadHeader("Upload-Metadata: a key is empty, or there twice", field="Upload-Metadata")
+        raise BadHeader("Upload-Metadata: a key is empty or repeated", field="Upload-Metadata")
     return text
 
 
 def declared(metadata: str) -> dict[str, int]:
-    """What an ``Upload-Metadata`` that `metadata_of` has checked says of a capture's frames, by `DECLARED` names.
+    """The numbers in an ``Upload-Metadata`` that `metadata_of` has checked, by those names of `DECLARED` that it has.
 
     Raises
     ------
     BadHeader
-        If it is no number from 0 to 10**18 - 1.
+        If one is not a number from 0 to 10**18 - 1.
     """
     pairs = (pair.strip().partition(" ") for pair in metadata.split(","))
     texts = {name: base64.b64decode(value) for name, _, value in pairs if name in DECLARED}
     for name, text in texts.items():
         if not (text.isdigit() and len(text) <= 18):
             raise BadHeader(
-                f"Upload-Metadata: {name} is {text!r}; send a number, or leave it out",
+                f"Upload-Metadata: {name} is {text!r}; send a number or leave it out",
                 field="Upload-Metadata",
             )
     return {name: int(text) for name, text in texts.items()}

@@ -15,10 +15,10 @@ from services.api.captures.tus import (
     CHUNK,
     EXTENSIONS,
     Checksum,
+    byte_count,
     declared,
     metadata_of,
-    number,
-    version_spoken,
+    require_version,
 )
 from services.api.context import Context, OwnerContext
 from services.api.http.bodies import BodyLimit, has_body, upload_limit
@@ -34,21 +34,21 @@ from storage.records import captures, uploads
 from storage.records.uploads import MAX_PARTS
 
 PART = 64 << 20
-"""Bytes after which what has come is written down: what a killed server loses of one PATCH, at most."""
+"""Bytes after which a part is recorded: the most that a killed server loses of one PATCH."""
 
 router = APIRouter(prefix="/uploads", tags=["uploads"])
-Spoken = Depends(version_spoken)
+Versioned = Depends(require_version)
 
 
 @router.options("", status_code=204, response_class=Response)
 def get_protocol(context: OwnerContext, response: Response) -> None:
-    """What is spoken here: version, extensions, and the bytes of the largest upload."""
+    """What the service supports: version, extensions, and the largest upload in bytes."""
     response.headers["Tus-Extension"] = EXTENSIONS
     response.headers["Tus-Checksum-Algorithm"] = ",".join(ALGORITHMS)
     response.headers["Tus-Max-Size"] = str(context.settings.upload_bytes)
 
 
-@router.post("", status_code=201, dependencies=[Spoken], response_class=Response)
+@router.post("", status_code=201, dependencies=[Versioned], response_class=Response)
 async def create_upload(
     context: OwnerContext,
     request: Request,
@@ -56,10 +56,10 @@ async def create_upload(
 ) -> Response:
     """Start an upload of `Upload-Length` bytes; the body may be the first of them.
 
-    `frames`, `width` and `height` in `Upload-Metadata`, where a client knows them of a capture, are held against the
-    limits before any byte comes. What does come is checked all the same.
+    A client that knows `frames`, `width` and `height` of the capture can send them in `Upload-Metadata`: they are
+    checked against the limits before any bytes are sent. The capture itself is checked in any case.
     """
-    length = number(request, "Upload-Length")
+    length = byte_count(request, "Upload-Length")
     upload_limit(context.settings).check(length)
     checksum = Checksum.of(request)
     with_body = has_body(request)
@@ -77,7 +77,7 @@ async def create_upload(
     return Response(status_code=201, headers={"Location": f"/v1/uploads/{row.id}"} | _headers(row))
 
 
-@router.head("/{id}", dependencies=[Spoken], response_class=Response)
+@router.head("/{id}", dependencies=[Versioned], response_class=Response)
 def get_upload(context: OwnerContext, id: str) -> Response:
     """How far an upload is: `Upload-Offset` of `Upload-Length` bytes."""
     with reading(context.engine) as c:
@@ -86,29 +86,29 @@ def get_upload(context: OwnerContext, id: str) -> Response:
     return Response(headers=headers | ({"Upload-Metadata": row.metadata} if row.metadata else {}))
 
 
-@router.patch("/{id}", status_code=204, dependencies=[Spoken], response_class=Response)
+@router.patch("/{id}", status_code=204, dependencies=[Versioned], response_class=Response)
 async def append(context: OwnerContext, request: Request, id: str) -> Response:
     """Send the bytes of an upload from `Upload-Offset` on.
 
-    What has come of a body that breaks off is kept, unless it has an `Upload-Checksum`: then it is kept
-    whole or not at all.
+    If the connection breaks, the bytes that came are kept. A body with an `Upload-Checksum` is kept whole or not at
+    all.
     """
     row = await anyio.to_thread.run_sync(_get, context, id)
     _require_chunk(request)
     checksum = Checksum.of(request)
-    uploads.check_offset(row, number(request, "Upload-Offset"))
+    uploads.check_offset(row, byte_count(request, "Upload-Offset"))
     if row.parts >= MAX_PARTS:
         raise InvalidInput(
-            f"upload {id} came in {row.parts} pieces, the most there may be; start again with larger ones",
+            f"upload {id} has come in {row.parts} pieces, the most there may be; start again with larger ones",
             limit=MAX_PARTS,
         )
     row = await _append(context, request, row, checksum)
     return Response(status_code=204, headers=_headers(row))
 
 
-@router.delete("/{id}", status_code=204, dependencies=[Spoken], response_class=Response)
+@router.delete("/{id}", status_code=204, dependencies=[Versioned], response_class=Response)
 def delete_upload(context: OwnerContext, id: str) -> None:
-    """Give an upload up."""
+    """Delete an upload."""
     with writing(context.engine) as c:
         uploads.get(c, id)
         uploads.delete(c, id)
@@ -116,10 +116,10 @@ def delete_upload(context: OwnerContext, id: str) -> None:
 
 
 async def _append(context: Context, request: Request, row: Row[Any], checksum: Checksum | None) -> Row[Any]:
-    """Store a body from an upload's offset on; returns the row as it is then."""
+    """Append a body to an upload; returns its row after that."""
     limit = BodyLimit(
         row.length,
-        f"upload {row.id} was to have {row.length} bytes, and more have come; send no more than the rest",
+        f"upload {row.id} has a length of {row.length} bytes, and more have come; send no more than the rest",
     )
     limit.check_announced(request, row.offset)
     # A client that falls silent is disconnected, see `services.api.http.slow_clients`.
@@ -145,16 +145,17 @@ async def _append(context: Context, request: Request, row: Row[Any], checksum: C
                         raise
             stored[-1] = Part(name, size)
             if not size:
-                nothing = stored_uploads.part_path(row.id, stored.pop().name)
-                await anyio.to_thread.run_sync(context.objects.delete, nothing)
+                empty = stored_uploads.part_path(row.id, stored.pop().name)
+                await anyio.to_thread.run_sync(context.objects.delete, empty)
             if not checksum:
                 offset = await anyio.to_thread.run_sync(_advance, context, row.id, offset, stored)
                 stored = []
         if checksum:
             checksum.check()
             await anyio.to_thread.run_sync(_advance, context, row.id, offset, stored)
-    except Exception:  # not when cancelled, where `_advance` may still be at work: the next start sweeps then
-        await anyio.to_thread.run_sync(_take_back, context, row.id, stored)
+    except Exception:
+        # Not when cancelled: `_advance` may still be running in its thread. Then the next start removes the parts.
+        await anyio.to_thread.run_sync(_remove_unrecorded, context, row.id, stored)
         raise
     return await anyio.to_thread.run_sync(_get, context, row.id)
 
@@ -165,8 +166,8 @@ def _advance(context: Context, upload: str, offset: int, stored: list[Part]) -> 
         return uploads.advance(c, upload, offset, stored, context.settings.upload_seconds)
 
 
-def _take_back(context: Context, upload: str, stored: list[Part]) -> None:
-    """Remove parts that were not written down; all there is, if their upload was deleted meanwhile."""
+def _remove_unrecorded(context: Context, upload: str, stored: list[Part]) -> None:
+    """Remove parts that were stored but not recorded, and all other parts too if the upload has been deleted."""
     for part in stored:
         context.objects.delete(stored_uploads.part_path(upload, part.name))
     try:
@@ -185,7 +186,10 @@ def _get(context: Context, upload: str) -> Row[Any]:
 
 
 def _create(context: Context, length: int, metadata: str, key: str | None) -> tuple[Row[Any], bool]:
-    """The upload to send to, and whether it is new: a repeat with the same key goes on with the first one's."""
+    """Create an upload, or find the one that an earlier request with the same key created; returns whether it is new.
+
+    Unlike other keys, that of an upload can be used again once the upload is gone.
+    """
     with writing(context.engine) as c:
         expired = uploads.delete_expired(c)
     for upload in expired:
@@ -199,7 +203,7 @@ def _create(context: Context, length: int, metadata: str, key: str | None) -> tu
             upload = new_id()
             uploads.add(c, upload, length, metadata, context.settings.upload_seconds, key)
             return uploads.get(c, upload), True
-    except IntegrityError:  # the repeat came at the same time
+    except IntegrityError:  # a concurrent request with the same key was quicker
         with reading(context.engine) as c:
             row = uploads.by_key(c, key) if key else None
         if row is None:

@@ -12,10 +12,12 @@ from pydantic import BaseModel, ValidationError
 
 from services.runtime.problems import TooLarge
 from services.settings import Settings
+from storage.layout.uploads import Part, part_path
 from storage.objects.store import Objects
 
 SPOOLED = 1 << 20
 """Bytes of a body that are kept in memory; a larger one is written to a temporary file."""
+ONLY_PART = "all"
 Model = TypeVar("Model", bound=BaseModel)
 
 
@@ -103,6 +105,18 @@ def upload_limit(settings: Settings, what: str = "an archive") -> BodyLimit:
 def has_body(request: Request) -> bool:
     """Whether a request has a body, by its headers."""
     return request.headers.get("content-length", "0") != "0" or "transfer-encoding" in request.headers
+
+
+async def store_as_upload(request: Request, objects: Objects, upload: str, limit: BodyLimit) -> Part:
+    """Stream a body into the store as the only part of an upload.
+
+    Raises
+    ------
+    TooLarge
+        As soon as more bytes than the limit have come.
+    """
+    size = await store_body(request, objects, part_path(upload, ONLY_PART), limit)
+    return Part(ONLY_PART, size)
 
 
 async def store_body(request: Request, objects: Objects, path: str, limit: BodyLimit) -> int:

@@ -1,4 +1,4 @@
-"""Responses that do not stay in memory, and what headers and times look like."""
+"""Responses from temporary files, entity tags and times."""
 
 import tempfile
 from contextlib import ExitStack
@@ -11,31 +11,36 @@ from fastapi.responses import StreamingResponse
 from starlette.datastructures import Headers
 from starlette.types import Receive, Scope, Send
 
-HELD = 1 << 18
-"""Bytes of an answer that are kept in memory while it is taken, and that are read of a file at once."""
+MEMORY_BYTES = 1 << 18
+"""The largest answer kept in memory while it is sent, and the size of the pieces read from a file."""
 
 
 def answered(data: bytes, media_type: str, headers: dict[str, str] | None = None) -> Response:
-    """An answer, a large one from a temporary file: any number may be taken slowly. Not for the loop's thread."""
-    if len(data) <= HELD:
+    """A response from bytes. Large ones go through a temporary file, so that many slow clients take little memory.
+
+    It may write to a disk, so don't call it in the event loop.
+    """
+    if len(data) <= MEMORY_BYTES:
         return Response(data, headers=headers, media_type=media_type)
     with ExitStack() as stack:
         file = stack.enter_context(tempfile.TemporaryFile())
         file.write(data)
         file.seek(0)
-        stack.pop_all()  # now it is the answer's to close
+        stack.pop_all()  # the response closes it
     return FromFile(file, len(data), media_type, headers)
 
 
 class FromFile(StreamingResponse):
-    """The bytes of a file, which is closed whatever becomes of the connection."""
+    """A response that streams a file and closes it, also when the connection breaks."""
 
     def __init__(
         self, file: IO[bytes], size: int, media_type: str, headers: dict[str, str] | None = None
     ) -> None:
         length = {"Content-Length": str(size)}
         super().__init__(
-            iter(partial(file.read, HELD), b""), headers=(headers or {}) | length, media_type=media_type
+            iter(partial(file.read, MEMORY_BYTES), b""),
+            headers=(headers or {}) | length,
+            media_type=media_type,
         )
         self._file = file
 
@@ -47,10 +52,10 @@ class FromFile(StreamingResponse):
 
 
 def time_of(seconds: float | None) -> datetime | None:
-    """A time of the database as answers have it."""
+    """A time in the database as a time in an answer."""
     return None if seconds is None else datetime.fromtimestamp(seconds, UTC)
 
 
 def is_known(headers: Headers, tag: str) -> bool:
-    """Whether the caller has what a tag stands for (If-None-Match, RFC 9110, sect. 13.1.2)."""
-    return tag in [one.strip() for one in headers.get("if-none-match", "").split(",")]
+    """Whether the caller already has the answer with an entity tag (If-None-Match, RFC 9110, sect. 13.1.2)."""
+    return tag in [text.strip() for text in headers.get("if-none-match", "").split(",")]

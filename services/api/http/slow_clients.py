@@ -1,4 +1,4 @@
-"""Connections of the service's port: who is slow must not keep others out, nor have the service hold much for him."""
+"""Connections that are closed when a client is too slow, so that slow clients do not use up files and memory."""
 
 import asyncio
 import fcntl
@@ -14,31 +14,30 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 logger = logging.getLogger(__name__)
 
 HEAD = 15.0
-"""Seconds that the head of a request may take, from the connection or from its first byte on."""
-PATIENCE = 30.0
-"""Seconds between two looks at whether the other side sends the body that it began, and takes the answer that it
-asked for."""
-LEAST = 1000
-"""Bytes of it that must have gone over from one look to the next, some 33 a second: no network is as slow."""
+"""Seconds in which the head of a request must arrive, from the connection or from its first byte on."""
+CHECK_SECONDS = 30.0
+"""Seconds between two checks that the client goes on to send its request's body, and to read the answer."""
+MIN_BYTES = 1000
+"""Bytes that must have been transferred between two checks: about 33 per second, less than any network gives."""
 
 
 class Connection(H11Protocol):
-    """A connection that is closed if the other side does not do its part.
+    """A connection of uvicorn that is closed if the client stops sending or reading.
 
-    uvicorn waits for ever for a connection's first request, for the rest of a head or of a body that has begun, and for
-    an answer to be taken: each wait holds one of the files that this process may have open, and what it has of the
-    answer. A body that is given up is a `ClientDisconnect` to whom reads it.
+    uvicorn waits without limit for a connection's first request, for the rest of a head or a body, and for the client
+    to read an answer. Each wait holds one of the files that this process may have open, and the answer's bytes. When
+    a connection is closed, reading its body raises `ClientDisconnect`.
     """
 
-    _overdue: asyncio.TimerHandle | None = None
-    _looking: asyncio.TimerHandle | None = None
+    _head_timer: asyncio.TimerHandle | None = None
+    _check_timer: asyncio.TimerHandle | None = None
     _received = 0
-    _seen: "tuple[int, int, object, int]" = (0, 0, None, 0)
+    _last: "tuple[int, int, object, int]" = (0, 0, None, 0)
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(_Counting(transport))  # type: ignore[arg-type]
         self._watch()
-        self._looking = self.loop.call_later(PATIENCE, self._look)
+        self._check_timer = self.loop.call_later(CHECK_SECONDS, self._check)
 
     def data_received(self, data: bytes) -> None:
         self._received += len(data)
@@ -48,41 +47,43 @@ class Connection(H11Protocol):
     def connection_lost(self, exc: Exception | None) -> None:
         super().connection_lost(exc)
         self._forget()
-        if self._looking is not None:
-            self._looking.cancel()
+        if self._check_timer is not None:
+            self._check_timer.cancel()
 
     def _watch(self) -> None:
         if self.conn.their_state is not h11.IDLE or self.transport.is_closing():
             self._forget()
-        elif self._overdue is None:
-            self._overdue = self.loop.call_later(HEAD, self.transport.close)
+        elif self._head_timer is None:
+            self._head_timer = self.loop.call_later(HEAD, self.transport.close)
 
     def _forget(self) -> None:
-        if self._overdue is not None:
-            self._overdue.cancel()
-            self._overdue = None
+        if self._head_timer is not None:
+            self._head_timer.cancel()
+            self._head_timer = None
 
-    def _look(self) -> None:
-        """Give the connection up if since the last look the other side has not done what it had to."""
+    def _check(self) -> None:
+        """Close the connection if the client has not made progress since the last check."""
         transport: Any = self.transport
         unsent = transport.unsent()
-        taken = transport.written - unsent
-        body = self.cycle if self._is_owed_a_body() else None
-        before, had_taken, of, had_received = self._seen
-        is_stuck = unsent and taken - had_taken < min(before, LEAST)
-        is_silent = body is not None and body is of and self._received - had_received < LEAST
+        sent = transport.written - unsent
+        request = self.cycle if self._expects_body() else None
+        last_unsent, last_sent, last_request, last_received = self._last
+        is_stuck = unsent and sent - last_sent < min(last_unsent, MIN_BYTES)
+        is_silent = (
+            request is not None and request is last_request and self._received - last_received < MIN_BYTES
+        )
         if is_stuck or is_silent:
             logger.info(
-                "gave up a connection: %s",
-                "nobody takes the answer" if is_stuck else "the body does not go on",
+                "closed a connection: %s",
+                "the client does not read the answer" if is_stuck else "the client stopped sending the body",
             )
             transport.abort()
             return
-        self._seen = unsent, taken, body, self._received
-        self._looking = self.loop.call_later(PATIENCE, self._look)
+        self._last = unsent, sent, request, self._received
+        self._check_timer = self.loop.call_later(CHECK_SECONDS, self._check)
 
-    def _is_owed_a_body(self) -> bool:
-        """Whether the other side is to send, and nothing here keeps it from that."""
+    def _expects_body(self) -> bool:
+        """Whether the client has to send a body, and nothing on this side keeps it from that."""
         return (
             self.conn.their_state is h11.SEND_BODY
             and not self.flow.read_paused
@@ -105,13 +106,13 @@ class _Counting:
         self._transport.write(data)
 
     def unsent(self) -> int:
-        """Bytes that have not reached the other side: here, and with the system."""
-        with_system = fcntl.ioctl(self.get_extra_info("socket").fileno(), termios.TIOCOUTQ, bytes(4))
-        held: int = self.get_write_buffer_size() + struct.unpack("i", with_system)[0]
-        return held
+        """Bytes that have not reached the client: in this process, and in the kernel."""
+        in_kernel = fcntl.ioctl(self.get_extra_info("socket").fileno(), termios.TIOCOUTQ, bytes(4))
+        unsent: int = self.get_write_buffer_size() + struct.unpack("i", in_kernel)[0]
+        return unsent
 
 
-def allow_many() -> None:
-    """Let this process have as many connections and files open as the system allows it, not some thousand."""
-    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+def raise_file_limit() -> None:
+    """Raise the limit of open files and connections to the most that the system allows this process."""
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))

@@ -1,4 +1,4 @@
-"""When a job will have succeeded: by the pace of its tiles, and by how long the step after them took other jobs."""
+"""Time until a job succeeds, by the pace of its tiles and by how long the last step took in earlier jobs."""
 
 from statistics import median_low
 from typing import Any
@@ -8,7 +8,7 @@ from sqlalchemy import Connection, Row
 from storage.records import statistics
 
 TYPICAL = 1.4e-7
-"""Seconds of a 2.5 GHz core for a unit of `_survey_of`."""
+"""Seconds per unit of `_report_work` on a 2.5 GHz core."""
 
 
 def seconds_left(connection: Connection, row: Row[Any], now: float) -> float | None:
@@ -23,8 +23,8 @@ def seconds_left(connection: Connection, row: Row[Any], now: float) -> float | N
         return None
     finishing = _finishing(connection, row) if row.kind == "ingest" else 0.0
     if row.done == row.total:
-        begun = now - row.stage_at if row.stage == "finishing" else 0.0
-        return max(finishing - begun, 0.0)
+        elapsed = now - row.stage_at if row.stage == "finishing" else 0.0
+        return max(finishing - elapsed, 0.0)
     if row.paced_at is None or row.done <= row.paced_done:
         return None
     pace = (row.moved_at - row.paced_at) / (row.done - row.paced_done)
@@ -32,20 +32,20 @@ def seconds_left(connection: Connection, row: Row[Any], now: float) -> float | N
 
 
 def _finishing(connection: Connection, row: Row[Any]) -> float:
-    """Seconds that an ingest will take after its last tile, to find out how the capture turned out.
+    """Seconds that an ingest will take after its last tile, for the report on the capture.
 
-    At the speed of those before it, as far as there are any: the middle one, for the first that a machine ever does
-    compiles its kernels, and others met a machine that was busy. Videos, stored in 16 bits, go by videos.
+    It uses the median speed of the last few ingests: the first one on a machine compiles its kernels, and others may
+    have run on a busy machine. Videos are stored in 16 bits and are compared only with videos.
     """
     ended = [
         (plan, seconds)
         for plan, seconds in statistics.recent_ingests(connection, limit=8)
         if plan.get("video") == row.plan.get("video")
     ]
-    speeds = [TYPICAL, *(seconds / _survey_of(plan) for plan, seconds in ended[:4])]
-    return _survey_of(row.plan) * median_low(speeds)
+    speeds = [TYPICAL, *(seconds / _report_work(plan) for plan, seconds in ended[:4])]
+    return _report_work(row.plan) * median_low(speeds)
 
 
-def _survey_of(plan: dict[str, Any]) -> float:
-    """Work of `workflows.ingest.report.survey`: pixels of its windows in all frames, and of its trial."""
+def _report_work(plan: dict[str, Any]) -> float:
+    """Pixels that the report works on: the windows of `workflows.ingest.report.survey` in all frames, and its trial."""
     return float(plan["frames"] * (min(plan["width"], 384) * min(plan["height"], 384) + 100_000))

@@ -1,4 +1,4 @@
-"""What changes, followed by server-sent events: each time that it has, all of it."""
+"""Server-sent events: a stream that sends a resource whole, now and each time that it changes."""
 
 import hashlib
 import time
@@ -22,88 +22,92 @@ from storage.records import jobs
 router = APIRouter(tags=["jobs"])
 MEDIA_TYPE = "text/event-stream"
 T = TypeVar("T", bound=BaseModel)
-LOOK = 0.5
-"""Seconds between two looks at a job."""
-ALIVE = 15.0
-"""Seconds without an event after which a comment is sent, so that nobody between takes the connection for dead."""
+POLL = 0.5
+"""Seconds between two reads of a resource."""
+KEEP_ALIVE = 15.0
+"""Seconds without an event after which a comment is sent, so that no proxy closes the connection as idle."""
 CLOCKS = {"queued_seconds", "run_seconds", "eta_seconds"}
-"""What changes though nothing happens."""
+"""Fields that change with time alone: they cause no event."""
 
 
 @router.get(
     "/jobs/{id}/events",
     response_class=StreamingResponse,
     responses={
-        200: {"content": {MEDIA_TYPE: {}}, "description": "An event each time that the job has changed"},
-        204: {"description": "It has ended, and the caller has seen it: an `EventSource` asks no more"},
+        200: {"content": {MEDIA_TYPE: {}}, "description": "An event each time that the job changes"},
+        204: {"description": "The job has ended and the caller has seen it: an `EventSource` stops asking"},
     },
 )
 async def follow_job(
     context: OwnerContext, id: str, last_event_id: Annotated[str | None, Header(max_length=256)] = None
 ) -> Response:
-    """The job, now and each time that it has changed, until it has ended; every event is all of it.
+    """The job, now and each time that it changes, until it has ended. Every event is the whole job.
 
-    With `Last-Event-ID`, which an `EventSource` sends when it comes back, the first event is the first that is new.
+    With `Last-Event-ID`, which an `EventSource` sends when it reconnects, the stream starts with the first new event.
     """
     job = await anyio.to_thread.run_sync(_read, context, id)
-    if _is_over(job) and _mark(job) == last_event_id:
+    if _has_ended(job) and _event_id(job) == last_event_id:
         return Response(status_code=204)
-    return stream(lambda: _read(context, id), job, _mark, last_event_id, _is_over)
+    return stream(lambda: _read(context, id), job, _event_id, last_event_id, _has_ended)
 
 
 def stream(
     read: Callable[[], T],
-    found: T,
-    mark: Callable[[T], str],
-    seen: str | None,
-    is_over: Callable[[T], bool] = lambda found: False,
+    current: T,
+    event_id: Callable[[T], str],
+    last_event_id: str | None,
+    has_ended: Callable[[T], bool] = lambda current: False,
 ) -> StreamingResponse:
-    """Server-sent events of something: an event each time that its mark is another one.
+    """Send a resource as server-sent events: one each time that its event id changes.
 
     Parameters
     ----------
     read : callable
-        Reads it anew, in a thread.
-    found : pydantic.BaseModel
-        As it was read just now.
-    mark : callable
-        The id of the event that it makes.
-    seen : str, optional
-        The mark that the caller has had.
-    is_over : callable
-        Whether it will not change any more: then the stream ends.
+        Reads the resource again, in a thread.
+    current : pydantic.BaseModel
+        The resource as it was read just now.
+    event_id : callable
+        Returns the id of the event for a state of the resource.
+    last_event_id : str, optional
+        Id of the last event that the caller has.
+    has_ended : callable
+        Whether the resource will not change any more; then the stream ends.
     """
     return StreamingResponse(
-        _events(read, found, mark, seen, is_over),
+        _events(read, current, event_id, last_event_id, has_ended),
         media_type=MEDIA_TYPE,
         headers={"Cache-Control": "no-store"},
     )
 
 
 async def _events(
-    read: Callable[[], T], found: T, mark: Callable[[T], str], seen: str | None, is_over: Callable[[T], bool]
+    read: Callable[[], T],
+    current: T,
+    event_id: Callable[[T], str],
+    last_event_id: str | None,
+    has_ended: Callable[[T], bool],
 ) -> AsyncIterator[bytes]:
     sent_at = time.monotonic()
     while True:
-        now = mark(found)
-        if now != seen:
-            yield format_sse_event(data_str=found.model_dump_json(), id=now)
-            seen, sent_at = now, time.monotonic()
-        elif time.monotonic() - sent_at > ALIVE:
+        id = event_id(current)
+        if id != last_event_id:
+            yield format_sse_event(data_str=current.model_dump_json(), id=id)
+            last_event_id, sent_at = id, time.monotonic()
+        elif time.monotonic() - sent_at > KEEP_ALIVE:
             yield b": nothing new\n\n"
             sent_at = time.monotonic()
-        if is_over(found):
+        if has_ended(current):
             return
-        await anyio.sleep(LOOK)
+        await anyio.sleep(POLL)
         try:
-            found = await anyio.to_thread.run_sync(read)
-        except (NotFound, Unauthorized):  # deleted meanwhile, or the caller's key revoked
+            current = await anyio.to_thread.run_sync(read)
+        except (NotFound, Unauthorized):  # deleted, or the caller's key was revoked
             return
-        except Unavailable:  # the database is away, and comes back
+        except Unavailable:  # the database may come back
             continue
 
 
-def _is_over(job: Job) -> bool:
+def _has_ended(job: Job) -> bool:
     return job.state not in jobs.ACTIVE
 
 
@@ -113,6 +117,6 @@ def _read(context: Context, id: str) -> Job:
         return Job.read(c, id)
 
 
-def _mark(job: Job) -> str:
-    """The id of the event that a job as it is now makes."""
+def _event_id(job: Job) -> str:
+    """The id of the event for a state of a job."""
     return hashlib.blake2b(job.model_dump_json(exclude=CLOCKS).encode(), digest_size=8).hexdigest()

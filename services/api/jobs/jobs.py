@@ -1,4 +1,4 @@
-"""Jobs over HTTP."""
+"""Jobs over HTTP: start, list, read, cancel, retry and delete them."""
 
 import time
 from datetime import UTC, datetime
@@ -36,12 +36,12 @@ State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 
 
 class JobRequest(BaseModel):
-    """What to recover, and how."""
+    """The capture to recover a matte from, and the options."""
 
     model_config = ConfigDict(extra="forbid")
     capture: str
     options: dict[str, Any] = Field(default_factory=dict, description="GET /v1/options lists them.")
-    webhook: str | None = Field(None, description="URL, https, that is told when the job has ended.")
+    webhook: str | None = Field(None, description="URL, https, that is notified when the job has ended.")
 
 
 async def _job_request(request: Request) -> JobRequest:
@@ -49,7 +49,7 @@ async def _job_request(request: Request) -> JobRequest:
 
 
 class Tiles(BaseModel):
-    """Pieces of a job's work: squares of a matte, slabs of frames, or stretches of a clip."""
+    """Parts of a job's work: squares of a matte, slabs of frames, or segments of a clip."""
 
     total: int
     done: int
@@ -91,11 +91,11 @@ class Job(BaseModel):
         sign = sign or leases.last_heartbeat(connection)
         ran = ((row.finished_at or now) - row.started_at) if row.started_at else 0.0
         running = row.state == "running"
-        # The step after the last tile counts as one more: only a job that has succeeded is at 1.
+        # The step after the last tile counts as one more tile, so only a job that has succeeded is at 1.
         progress = 1.0 if row.state == "succeeded" else row.done / (row.total + 1) if row.total else 0.0
         return cls(
             **{name: getattr(row, name) for name in ("id", "kind", "state", "stage", "pixels", "matte")},
-            capture=row.capture or None,  # a composite of a matte that came in an archive has none
+            capture=row.capture or None,  # the composite of an imported matte has none
             progress=progress,
             tiles=Tiles(total=row.total, done=row.done, failed=row.failed),
             eta_seconds=seconds_left(connection, row, now) if running else None,
@@ -121,7 +121,7 @@ class Jobs(BaseModel):
 
 
 class Option(BaseModel):
-    """An option of recovery; `method` is null if it is one of every method's."""
+    """An option of recovery; `method` is null if every method has it."""
 
     name: str
     method: str | None
@@ -134,7 +134,7 @@ class Option(BaseModel):
 
 
 class Options(BaseModel):
-    """Every option of recovery."""
+    """All options of recovery."""
 
     options: list[Option]
 
@@ -155,7 +155,7 @@ class Log(BaseModel):
 
 @router.get("/options")
 def list_options() -> Options:
-    """Every option of recovery."""
+    """All options of recovery."""
     return Options.model_validate({"options": describe_options()})
 
 
@@ -178,7 +178,7 @@ def post_job(
         capture = captures.get(c, request.capture)
         if capture.state == "failed":
             raise Conflict(f"capture {capture.id} failed: {capture.problem['detail']}")
-        # Grids that do not nest are refused now, and not by the job.
+        # Grids that do not nest are refused here, not by the job.
         Program.model_validate(capture.program).bands()
         admit(c, context.settings, jobs=1)
         matte = new_id()
@@ -213,7 +213,7 @@ def get_job(context: OwnerContext, id: str) -> Job:
 def get_log(
     context: OwnerContext, id: str, limit: Limit = 1000, after: Annotated[int, Query(ge=0, lt=1 << 63)] = 0
 ) -> Log:
-    """What happened to a job, line by line."""
+    """The log of a job, line by line."""
     with reading(context.engine) as c:
         jobs.get(c, id)
         rows = job_log.lines(c, id, after, limit)
@@ -222,7 +222,7 @@ def get_log(
 
 @router.post("/jobs/{id}/cancel")
 def cancel_job(context: OwnerContext, id: str) -> Job:
-    """Cancel a job; what it wrote is removed as soon as its running tasks have ended."""
+    """Cancel a job. What it has written is removed as soon as its running tasks have ended."""
     with writing(context.engine) as c:
         jobs.cancel(c, id)
         return Job.read(c, id)
@@ -230,10 +230,10 @@ def cancel_job(context: OwnerContext, id: str) -> Job:
 
 @router.post("/jobs/{id}/retry", status_code=202)
 def retry_job(context: OwnerContext, id: str) -> Job:
-    """Queue a failed job again; the tiles that are done are kept, unless `ENVMATTE_INGEST_MEMORY` has changed."""
+    """Queue a failed job again. Finished tiles are kept, unless `ENVMATTE_INGEST_MEMORY` has changed."""
     with writing(context.engine) as c:
         row = jobs.get(c, id)
-        # Slabs of an ingest are as large as the memory allows, and want to be smaller where that was too much.
+        # The memory determines the size of an ingest's slabs. If it was too much, new slabs must be smaller.
         memory = (row.plan or {}).get("memory", context.settings.ingest_memory)
         if row.state == "failed":
             admit(c, context.settings, jobs=1)
@@ -244,7 +244,7 @@ def retry_job(context: OwnerContext, id: str) -> Job:
 
 @router.delete("/jobs/{id}", status_code=204)
 def delete_job(context: OwnerContext, id: str) -> None:
-    """Delete a job that has ended, and its log; its matte stays, the video of a composite goes."""
+    """Delete a job that has ended, with its log and the video of a composite. Its matte stays."""
     with writing(context.engine) as c:
         kind = jobs.get(c, id).kind
         jobs.delete(c, id)

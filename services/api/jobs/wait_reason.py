@@ -1,4 +1,4 @@
-"""What a job waits for, in words: nothing waits in silence."""
+"""Why a job waits, in words, so that no job waits without a reason."""
 
 import time
 from typing import Any
@@ -12,13 +12,13 @@ from storage.records import jobs
 from storage.records.leases import Heartbeat
 
 SILENCE = 15.0
-"""Seconds after which a coordinator that gave no sign of life counts as gone."""
-STILL = 30.0
-"""Seconds without anything done after which a job says so."""
+"""Seconds without a sign of life after which a coordinator counts as gone."""
+NO_PROGRESS = 30.0
+"""Seconds without progress after which a job says so."""
 
 
 def trouble_of(sign: Heartbeat | None) -> str | None:
-    """What is wrong with the coordinator or its cluster, if something is."""
+    """What is wrong with the coordinator or its cluster; None if nothing is."""
     if sign is None:
         return (
             "no coordinator has ever given a sign of life; start `envmatte serve` or `envmatte coordinator`"
@@ -26,14 +26,14 @@ def trouble_of(sign: Heartbeat | None) -> str | None:
     if sign.seconds > SILENCE or sign.holder is None:
         return (
             f"no coordinator has given a sign of life for {sign.seconds:.0f} s; start `envmatte serve` or "
-            "`envmatte coordinator`, or see what keeps it from the database"
+            "`envmatte coordinator`, or check that it can reach the database"
         )
     problem: str | None = sign.cluster["problem"]
     return problem
 
 
 def reason(connection: Connection, row: Row[Any], sign: Heartbeat | None) -> str | None:
-    """What an active job waits for; None while it has what it needs, or has ended."""
+    """Why an active job waits; None if it does not wait, or has ended."""
     if row.state not in jobs.ACTIVE:
         return None
     trouble = trouble_of(sign)
@@ -44,10 +44,10 @@ def reason(connection: Connection, row: Row[Any], sign: Heartbeat | None) -> str
         if state == "ingesting":
             return f"its capture {row.capture} is being ingested"
     if row.state == "queued":
-        return "the coordinator takes it up within a second"
+        return "the coordinator starts it within a second"
     still = time.time() - row.moved_at
-    if still > STILL:
-        return f"nothing of it was done in the last {still:.0f} s; a tile takes long, or its worker does not answer"
+    if still > NO_PROGRESS:
+        return f"no progress in the last {still:.0f} s: a tile takes long, or its worker does not answer"
     query = select(func.count()).where(table.c.state == "running", table.c.id != row.id)
     others = connection.scalar(across_owners(query))
     if others:

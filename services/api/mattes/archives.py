@@ -1,4 +1,4 @@
-"""Archives of mattes over HTTP: one leaves, and comes back."""
+"""Archives of mattes over HTTP: download a matte, and import it into another service."""
 
 from typing import Any
 
@@ -7,9 +7,8 @@ from fastapi import APIRouter, Request, Response
 from fastapi.responses import StreamingResponse
 from sqlalchemy import Connection, Row
 
-from services.api.captures.captures import ONLY
 from services.api.context import Context, OwnerContext
-from services.api.http.bodies import store_body, upload_limit
+from services.api.http.bodies import store_as_upload, upload_limit
 from services.api.http.idempotency import IdempotencyKey, find_earlier, idempotent
 from services.api.http.media_types import ZIP, require_media_type
 from services.api.mattes.mattes import Matte
@@ -34,10 +33,10 @@ CALL = "POST /v1/mattes"
     responses={200: {"content": {ZIP: {}}, "description": "The archive"}},
 )
 def get_archive(context: OwnerContext, id: str) -> StreamingResponse:
-    """All of a matte in one ZIP, which any zarr reader opens, and which `POST /v1/mattes` takes elsewhere.
+    """A whole matte as one ZIP. Any zarr reader can open it, and `POST /v1/mattes` of another service can import it.
 
-    The same matte makes the same bytes. Where the matte is deleted or the key revoked meanwhile, the connection ends
-    early.
+    The same matte always gives the same bytes. If the matte is deleted or the key revoked during the download, the
+    connection ends early.
     """
     with reading(context.engine) as c:
         mattes.get_ready(c, id)
@@ -57,9 +56,9 @@ def get_archive(context: OwnerContext, id: str) -> StreamingResponse:
 async def post_archive(
     context: OwnerContext, request: Request, response: Response, idempotency_key: IdempotencyKey = None
 ) -> Matte:
-    """Make a matte of an archive: the body is what `GET /v1/mattes/{id}/archive` gave.
+    """Import a matte: the body is an archive from `GET /v1/mattes/{id}/archive`.
 
-    All of it is checked before the answer, which takes some seconds for each 100 MB.
+    The whole archive is checked before the answer, which takes some seconds for each 100 MB.
     """
     require_media_type(request, ZIP, "the archive of a matte")
     row = await _from_body(context, request, idempotency_key)
@@ -68,7 +67,7 @@ async def post_archive(
 
 
 async def _from_body(context: Context, request: Request, key: str | None) -> Row[Any]:
-    """Stream an archive into the store, and make a matte of it; the archive is gone in the end."""
+    """Stream an archive into the store and import its matte; the archive is removed in any case."""
     limit = upload_limit(context.settings)
     length = limit.check_announced(request)
     earlier = await anyio.to_thread.run_sync(find_earlier, context.engine, key, CALL, mattes.get)
@@ -77,26 +76,27 @@ async def _from_body(context: Context, request: Request, key: str | None) -> Row
     await anyio.to_thread.run_sync(_admit, context, length)
     matte = new_id()
     try:
-        size = await store_body(request, context.objects, stored_uploads.part_path(matte, ONLY), limit)
-        row = await anyio.to_thread.run_sync(_import, context, matte, size, key, limiter=context.imports)
+        part = await store_as_upload(request, context.objects, matte, limit)
+        row = await anyio.to_thread.run_sync(_import, context, matte, part, key, limiter=context.imports)
     finally:
-        # One that a killed server leaves, and half of its matte, are swept: nothing refers to them.
+        # If the server is killed, the coordinator sweeps the archive and half a matte: nothing refers to them.
         await anyio.to_thread.run_sync(stored_uploads.remove, context.objects, matte)
     return row
 
 
-def _import(context: Context, matte: str, size: int, key: str | None) -> Row[Any]:
+def _import(context: Context, matte: str, part: Part, key: str | None) -> Row[Any]:
+    """Import the matte of an archive that is stored."""
     context.check_key()
     objects = context.objects
-    stored_uploads.seal(objects, matte, [Part(ONLY, size)])
+    stored_uploads.seal(objects, matte, [part])
     with stored_uploads.read(objects, matte) as file:
-        made = take_in(file, objects, matte, context.settings.limits)
+        imported = take_in(file, objects, matte, context.settings.limits)
     stored = sum(objects.sizes(stored_mattes.path(matte)).values())
     kept = context.settings.matte_seconds
 
     def create(c: Connection) -> str:
         admit(c, context.settings, size=stored)
-        mattes.add_imported(c, matte, made.attributes["options"], made.figures, stored, kept)
+        mattes.add_imported(c, matte, imported.attributes["options"], imported.figures, stored, kept)
         return matte
 
     try:
@@ -105,7 +105,7 @@ def _import(context: Context, matte: str, size: int, key: str | None) -> Row[Any
         # After any other error the row may have been written; if it was not, the coordinator sweeps the matte.
         objects.delete(stored_mattes.path(matte))
         raise
-    if row.id != matte:  # a repeat with the same key was quicker
+    if row.id != matte:  # a concurrent request with the same key was quicker
         objects.delete(stored_mattes.path(matte))
     return row
 
@@ -113,4 +113,4 @@ def _import(context: Context, matte: str, size: int, key: str | None) -> Row[Any
 def _admit(context: Context, length: int) -> None:
     with reading(context.engine) as c:
         admit(c, context.settings, size=length)
-        uploads.check_room(c, context.objects, 2 * length)  # the archive, and the matte beside it
+        uploads.check_room(c, context.objects, 2 * length)  # the archive, and the matte

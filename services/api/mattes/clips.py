@@ -1,4 +1,4 @@
-"""Composites of clips over HTTP: a job that makes a video, and the video."""
+"""Composites of clips over HTTP: a job composites the frames, and its video can be downloaded."""
 
 import re
 from collections.abc import Iterator
@@ -26,39 +26,40 @@ from storage.records import jobs, mattes, tiles
 router = APIRouter(tags=["jobs"])
 CALL = "POST /v1/mattes/{id}/composite"
 PIECE = 1 << 20
-"""Bytes of a video that are read at once."""
+"""Bytes of a video that are read from the store at once."""
 RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 
 
 def is_clip(request: Request) -> bool:
-    """Whether a request brings a clip, and not a picture."""
+    """Whether the body of a request is a clip, not a picture."""
     return media_type_of(request).startswith("video/")
 
 
 async def composite_clip(
     context: Context, request: Request, matte: str, options: dict[str, Any], webhook: str | None
 ) -> Response:
-    """Queue the composite of a clip, the body of a request, which is streamed into the store.
+    """Stream a clip, the body of a request, into the store, and queue the job that composites it.
 
     Parameters
     ----------
     options : dict
         ``transfer``, and ``placement`` as `Placement` takes it.
     webhook : str, optional
-        URL that is told when the job has ended.
+        URL that is notified when the job has ended.
 
     Raises
     ------
     TooLarge
-        Before the first byte if its length is said, else as soon as more than ENVMATTE_UPLOAD_BYTES have come.
+        Before the first byte if the request announces its length, else as soon as more than ENVMATTE_UPLOAD_BYTES
+        have come.
     NoRoom
         If the store has no room for it.
     Conflict
         If the matte is not ready.
     OptionError
-        If the URL can't be told.
+        If the URL can't be a webhook.
     """
-    await anyio.to_thread.run_sync(check_webhook, webhook, context.settings)  # which looks its host up
+    await anyio.to_thread.run_sync(check_webhook, webhook, context.settings)  # may resolve the URL's host
     limit = upload_limit(context.settings, "a clip")
     length = limit.check_announced(request)
     key = request.headers.get("idempotency-key", "")[:256]
@@ -70,10 +71,10 @@ async def composite_clip(
             size = await store_body(request, context.objects, composites.clip_path(id), limit)
             job = await anyio.to_thread.run_sync(_queue, context, id, matte, options, key, size, webhook)
         except Exception:
-            # Not when cancelled, where `_queue` may still be at work: what has no job the coordinator sweeps.
+            # Not when cancelled: `_queue` may still be running in its thread. The coordinator sweeps clips without job.
             await anyio.to_thread.run_sync(context.objects.delete, composites.path(id))
             raise
-        if job.id != id:  # a repeat with the same key was quicker
+        if job.id != id:  # a concurrent request with the same key was quicker
             await anyio.to_thread.run_sync(context.objects.delete, composites.path(id))
     headers = {"Location": f"/v1/jobs/{job.id}"}
     return Response(job.model_dump_json(), 202, headers, media_type=JSON)
@@ -84,16 +85,16 @@ async def composite_clip(
     response_class=Response,
     responses={
         200: {"content": {"video/mp4": {}}, "description": "The video"},
-        206: {"content": {"video/mp4": {}}, "description": "A part of it, by `Range`"},
+        206: {"content": {"video/mp4": {}}, "description": "The part that `Range` asks for"},
     },
 )
 def get_video(context: OwnerContext, id: str, request: Request) -> Response:
-    """The video that a composite job has made: H.264 in MP4, with the times of the clip's frames, without sound."""
+    """The video of a composite job: H.264 in MP4, with the frame times of the clip, without sound."""
     with reading(context.engine) as c:
         row = jobs.get(c, id)
     if row.kind != "composite" or row.state != "succeeded":
         raise Conflict(
-            f"job {id} is {row.state}, and has no video; a composite of a clip has one once it has succeeded"
+            f"job {id} is {row.state} and has no video; a composite of a clip has one once it has succeeded"
         )
     try:
         file = context.objects.read(composites.video_path(id))
@@ -114,7 +115,7 @@ def get_video(context: OwnerContext, id: str, request: Request) -> Response:
 
 
 def _admit(context: Context, matte: str, length: int) -> None:
-    """Check, before a clip is sent, that its matte is ready and that there is room for it."""
+    """Check, before a clip is sent, that its matte is ready and that the limits leave room for it."""
     with reading(context.engine) as c:
         mattes.get_ready(c, matte)
         admit_upload(c, context.settings, context.objects, length, jobs=1)
@@ -129,7 +130,7 @@ def _queue(
     size: int,
     webhook: str | None,
 ) -> Job:
-    """Add the job of a clip that is stored; returns it, or that of a repeat with the same key that was quicker."""
+    """Add the job for a stored clip; returns it, or the job of a concurrent request with the same key."""
     context.check_key()
 
     def create(c: Connection) -> str:
@@ -146,10 +147,10 @@ def _queue(
 
 
 def _span(text: str, size: int) -> tuple[int, int]:
-    """The bytes that a Range asks for (RFC 9110, sect. 14.2), from the first up to one past the last.
+    """The bytes that a Range header asks for (RFC 9110, sect. 14.2): the first, and one past the last.
 
-    All of them where it is none, of more than one part, or beyond 10**18: an answer may ignore it. Past the end if
-    there are none.
+    A server may ignore a Range: one that is malformed, has several parts or goes beyond 10**18 gives all bytes. One
+    without any byte of the video gives a start at or past its end.
     """
     found = RANGE.fullmatch(text.strip())
     if found is None or not any(found.groups()):

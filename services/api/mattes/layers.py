@@ -1,4 +1,4 @@
-"""Layers of mattes for other tools, and single pixels looked into, over HTTP."""
+"""Layers of mattes for other programs, and the transport of single pixels, over HTTP."""
 
 from collections.abc import Callable
 from functools import partial
@@ -21,7 +21,7 @@ from workflows.mattes.pixel_picture import picture
 
 router = APIRouter(tags=["mattes"])
 MOST_BYTES = 1 << 30
-"""Of the values of all layers of a matte, which are in memory at once."""
+"""The most memory that `all.exr` may take: the values of all layers are in memory at once."""
 MEDIA_TYPES = {"png": "image/png", "exr": "image/x-exr"}
 FILES: dict[str, Callable[[stored_mattes.Matte], bytes]] = {
     f"{name}.{kind}": partial(make, name=name)
@@ -30,15 +30,20 @@ FILES: dict[str, Callable[[stored_mattes.Matte], bytes]] = {
 } | {"stmap.exr": layers.stmap}
 ALL = "all.exr"
 Lobes = Annotated[
-    int, Query(ge=1, le=layers.MOST_LOBES, description="Lobes of a pixel; more are merged into these.")
+    int,
+    Query(
+        ge=1,
+        le=layers.MOST_LOBES,
+        description="The most lobes of a pixel; further ones are merged into these.",
+    ),
 ]
 X = Annotated[int, Query(description="The pixel's column, from 0 at the left.")]
 Y = Annotated[int, Query(description="The pixel's row, from 0 at the top.")]
 
 
 class Cell(BaseModel):
-    """A cell that light comes from, by its centre on the monitor, 0 to 1, v up; the middle of a smooth bump three times
-    as large if ``level`` is not 0."""
+    """A cell of the monitor that light comes from. Its centre is from 0 to 1, with v up. If ``level`` is not 0, it is
+    the middle of a smooth bump three times as large."""
 
     u: float
     v: float
@@ -49,8 +54,8 @@ class Cell(BaseModel):
 
 
 class Lobe(BaseModel):
-    """A Gaussian: centre as of a cell, standard deviations along its axes in widths of the monitor, and the angle of
-    the first of them, in radians counter-clockwise from the u axis."""
+    """A Gaussian: its centre, as of a cell; the standard deviations along its axes, in widths of the monitor; and the
+    angle of its first axis, in radians counter-clockwise from the u axis."""
 
     u: float
     v: float
@@ -61,7 +66,7 @@ class Lobe(BaseModel):
 
 
 class Transport(BaseModel):
-    """Where the light of a pixel comes from, cells and lobes heaviest first; without any if it was not recovered."""
+    """Where the light of a pixel comes from: cells and lobes, heaviest first; none if the pixel was not recovered."""
 
     x: int
     y: int
@@ -82,9 +87,9 @@ async def get_layer(
     context: OwnerContext, id: str, file: str, request: Request, lobes: Lobes = layers.LOBES
 ) -> Response:
     """A layer: `S`, `rho`, `alpha` or `confidence`, as `.png` (16 bits, linear, clipped to 0 to 1) or `.exr`;
-    `stmap.exr`; or `all.exr`, all of it with the lobes of each pixel."""
+    `stmap.exr`; or `all.exr`, all layers with the lobes of each pixel."""
     if file not in FILES and file != ALL:
-        raise NotFound(f"no layer is called {file}: there are {', '.join([*FILES, ALL])}")
+        raise NotFound(f"there is no layer {file}; the layers are {', '.join([*FILES, ALL])}")
 
     matte = await anyio.to_thread.run_sync(_matte, context, id)
     tag = {"ETag": f'"{id}-{file}-{lobes}"'}  # a matte never changes once it is ready
@@ -95,11 +100,11 @@ async def get_layer(
         kind = MEDIA_TYPES[file.rpartition(".")[2]]
         if file != ALL:
             return answered(FILES[file](matte), kind, tag)
-        much = layers.bytes_of_everything(matte.width, matte.height, lobes)
-        if much > MOST_BYTES:
+        size = layers.bytes_of_everything(matte.width, matte.height, lobes)
+        if size > MOST_BYTES:
             raise InvalidInput(
-                f"all layers with {lobes} lobes take {much} bytes, and may take {MOST_BYTES}: ask for fewer lobes, "
-                "or for the layers one by one",
+                f"all layers with {lobes} lobes take {size} bytes, and the limit is {MOST_BYTES}: ask for fewer "
+                "lobes, or for the layers one by one",
                 field="lobes",
                 limit=MOST_BYTES,
             )
@@ -110,7 +115,7 @@ async def get_layer(
 
 @router.get("/mattes/{id}/transport")
 def get_transport(context: OwnerContext, id: str, x: X, y: Y, lobes: Lobes = layers.LOBES) -> Transport:
-    """Where the light of a pixel comes from: cells of the monitor and their weights by channel, and lobes."""
+    """Where the light of a pixel comes from: cells of the monitor with their weights by channel, and lobes."""
     pixel = look_into(_matte(context, id), x, y, lobes)
     return Transport(
         x=x,
@@ -140,7 +145,7 @@ def get_transport(context: OwnerContext, id: str, x: X, y: Y, lobes: Lobes = lay
 async def get_transport_picture(
     context: OwnerContext, id: str, x: X, y: Y, lobes: Lobes = layers.LOBES
 ) -> Response:
-    """The same as a picture: the monitor, a close-up with the lobes as ellipses, and the channels apart."""
+    """The transport of a pixel as a picture: the monitor, a close-up with the lobes as ellipses, and each channel."""
 
     def draw() -> bytes:
         return picture(look_into(_matte(context, id), x, y, lobes))

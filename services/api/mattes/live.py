@@ -1,4 +1,4 @@
-"""Mattes for graphics hardware over HTTP, which the web app draws while a hand moves the backdrop."""
+"""Mattes for graphics hardware over HTTP: the web app draws them while the user moves the backdrop."""
 
 from contextlib import suppress
 
@@ -9,7 +9,7 @@ from services.api.context import OwnerContext
 from services.api.http.responses import answered, is_known
 from storage.database.engine import reading
 from storage.errors import Corrupt, NoRoom
-from storage.layout import live as kept
+from storage.layout import live as stored_live
 from storage.records import mattes
 from workflows.composite.live import encode
 from workflows.composite.threads import CORES
@@ -21,31 +21,33 @@ router = APIRouter(tags=["mattes"])
     "/mattes/{id}/live",
     response_class=Response,
     responses={
-        200: {"content": {"application/octet-stream": {}}, "description": "The matte, as gzip encodes it"}
+        200: {"content": {"application/octet-stream": {}}, "description": "The matte, compressed by gzip"}
     },
 )
 async def get_live(context: OwnerContext, id: str, request: Request) -> Response:
-    """The matte as a few look-ups a pixel in mip-mapped textures, with S, rho and alpha: what a graphics card draws the
-    glass with before any backdrop. It is made when it is first asked for, and kept."""
+    """The matte for a graphics card: a few look-ups per pixel in mip-mapped textures, with S, rho and alpha.
 
-    def is_ready() -> None:
+    It is computed for the first request and kept in the store.
+    """
+
+    def require_ready() -> None:
         with reading(context.engine) as c:
             mattes.get_ready(c, id)
 
-    def find() -> Response:
-        made = kept.read(context.objects, id, encode.FORMAT)
-        if made is None:
+    def load() -> Response:
+        encoded = stored_live.read(context.objects, id, encode.FORMAT)
+        if encoded is None:
             try:
-                made = encode.encode_live(context.cache.matte(id), CORES)
+                encoded = encode.encode_live(context.cache.matte(id), CORES)
             except Corrupt:
-                is_ready()  # it may have been deleted meanwhile
+                require_ready()  # it may have been deleted meanwhile
                 raise
-            with suppress(NoRoom):  # it is there for this caller, and can be made again
-                kept.write(context.objects, id, encode.FORMAT, made)
-        return answered(made, "application/octet-stream", tag | {"Content-Encoding": "gzip"})
+            with suppress(NoRoom):  # the answer needs no room, and it can be encoded again
+                stored_live.write(context.objects, id, encode.FORMAT, encoded)
+        return answered(encoded, "application/octet-stream", tag | {"Content-Encoding": "gzip"})
 
-    await anyio.to_thread.run_sync(is_ready)
+    await anyio.to_thread.run_sync(require_ready)
     tag = {"ETag": f'"{id}-{encode.FORMAT}"'}  # a matte never changes once it is ready
     if is_known(request.headers, tag["ETag"]):
         return Response(status_code=304, headers=tag)
-    return await anyio.to_thread.run_sync(find, limiter=context.layers)
+    return await anyio.to_thread.run_sync(load, limiter=context.layers)

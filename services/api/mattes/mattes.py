@@ -1,4 +1,4 @@
-"""Mattes over HTTP."""
+"""Mattes over HTTP: list, read and delete them."""
 
 from datetime import UTC, datetime
 from typing import Any, Literal
@@ -21,7 +21,7 @@ router = APIRouter(tags=["mattes"])
 
 
 class Matte(BaseModel):
-    """A matte; one that came in an archive has no capture and no job."""
+    """A matte; an imported one has no capture and no job."""
 
     id: str
     state: Literal["recovering", "ready", "failed"]
@@ -79,7 +79,7 @@ def delete_matte(context: OwnerContext, id: str) -> None:
         row = mattes.get(c, id)
         busy = [job.id for job in jobs.active(c) if job.matte == row.id]
         if busy:
-            raise Conflict(f"job {busy[0]} works on matte {id}; cancel it first, or wait for it")
+            raise Conflict(f"job {busy[0]} is using matte {id}; cancel it first, or wait for it")
         mattes.delete(c, id)
     context.cache.forget(id)
     context.objects.delete(stored_mattes.path(id))

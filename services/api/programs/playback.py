@@ -1,4 +1,4 @@
-"""How far the page is that shows a program: it tells it here, and a phone or a camera follows."""
+"""Playback of a program over HTTP: its page reports how far it is, and a phone or a camera follows."""
 
 import hashlib
 from typing import Annotated
@@ -10,43 +10,43 @@ from fastapi.responses import StreamingResponse
 from services.api.context import OwnerContext
 from services.api.http.bodies import read_json, schema_of
 from services.api.jobs.events import stream
-from services.api.programs.programs import Program, Told, get_program
+from services.api.programs.programs import PlaybackState, Program, get_program
 from storage.database.engine import writing
 from storage.records import programs
 
 router = APIRouter(tags=["programs"])
-TOLD_BYTES = 4 << 10
+REQUEST_BYTES = 4 << 10
 
 
-async def _told(request: Request) -> Told:
-    return await read_json(request, Told, TOLD_BYTES)
+async def _state(request: Request) -> PlaybackState:
+    return await read_json(request, PlaybackState, REQUEST_BYTES)
 
 
 @router.put(
     "/programs/{id}/showing",
     status_code=204,
-    dependencies=[Depends(get_program)],  # one that is unknown is told before what is wrong with the body
-    openapi_extra={"requestBody": {"content": {"application/json": {"schema": schema_of(Told)}}}},
+    dependencies=[Depends(get_program)],  # an unknown program is reported before a bad body
+    openapi_extra={"requestBody": {"content": {"application/json": {"schema": schema_of(PlaybackState)}}}},
 )
-def put_showing(context: OwnerContext, id: str, told: Annotated[Told, Depends(_told)]) -> None:
-    """Tell how far the showing of a program is: its page does, for whoever follows it elsewhere."""
+def put_showing(context: OwnerContext, id: str, state: Annotated[PlaybackState, Depends(_state)]) -> None:
+    """Report how far the playback of a program is: its page does so, for clients that follow it."""
     with writing(context.engine) as c:
-        programs.set_showing(c, id, told.model_dump(mode="json"))
+        programs.set_showing(c, id, state.model_dump(mode="json"))
 
 
 @router.get("/programs/{id}/events", response_class=StreamingResponse)
 async def follow_program(
     context: OwnerContext, id: str, last_event_id: Annotated[str | None, Header(max_length=256)] = None
 ) -> Response:
-    """The program, now and each time that its page has told how far it is, as server-sent events."""
+    """The program, now and each time that its page reports how far it is, as server-sent events."""
 
     def read() -> Program:
         context.check_key()
         return get_program(context, id)
 
-    return stream(read, await anyio.to_thread.run_sync(read), _mark, last_event_id)
+    return stream(read, await anyio.to_thread.run_sync(read), _event_id, last_event_id)
 
 
-def _mark(program: Program) -> str:
-    told = program.model_dump_json(include={"showing"}, exclude={"showing": {"age_seconds"}})
-    return hashlib.blake2b(told.encode(), digest_size=8).hexdigest()
+def _event_id(program: Program) -> str:
+    showing = program.model_dump_json(include={"showing"}, exclude={"showing": {"age_seconds"}})
+    return hashlib.blake2b(showing.encode(), digest_size=8).hexdigest()

@@ -1,4 +1,4 @@
-"""What works on jobs, and what there is to do, over HTTP."""
+"""Workers, the queue and the coordinator over HTTP."""
 
 from fastapi import APIRouter
 from pydantic import BaseModel, Field
@@ -20,25 +20,27 @@ class Worker(BaseModel):
     name: str
     threads: int
     memory_bytes: int
-    memory_limit_bytes: int | None = Field(description="It is ended short of it; none if null.")
+    memory_limit_bytes: int | None = Field(
+        description="The worker is ended before it takes more; null if there is no limit."
+    )
 
 
 class Queue(BaseModel):
-    """What there is to do."""
+    """Jobs and tiles that are queued or running."""
 
     jobs_queued: int
     jobs_running: int
-    tiles_to_do: int = Field(description="Of running jobs: how many a queued one will have is not known yet.")
-    tiles_under_way: int = Field(description="That the cluster has, steps before and after tiles among them.")
-    tiles_per_second: float | None = Field(description="Of all running jobs; null until it was measured.")
+    tiles_to_do: int = Field(description="Of running jobs only: a queued job has no tiles yet.")
+    tiles_under_way: int = Field(description="Tiles that the cluster has, and steps before and after tiles.")
+    tiles_per_second: float | None = Field(description="Of all running jobs together; null until measured.")
 
 
 class Coordinator(BaseModel):
-    """The process that drives jobs."""
+    """The process that runs jobs on the cluster."""
 
-    holder: str | None = Field(description="Host and process id; null once it has stopped.")
+    holder: str | None = Field(description="Its host and process id; null if it has stopped.")
     last_sign_seconds: float | None = Field(
-        description="Since its last sign of life; null if there was none."
+        description="Seconds since its last sign of life; null if there was none."
     )
 
 
@@ -51,12 +53,12 @@ class Cluster(BaseModel):
     memory_limit_bytes: int | None
     queue: Queue
     coordinator: Coordinator
-    problem: str | None = Field(description="Why nothing goes on, in words.")
+    problem: str | None = Field(description="Why jobs do not progress, in words; null if they do.")
 
 
 @router.get("/cluster")
 def get_cluster(context: AdminContext) -> Cluster:
-    """Workers, threads, memory, the queue, and what is wrong if something is."""
+    """Workers, threads, memory, the queue, and what is wrong, if anything."""
     with reading(context.engine) as c:
         sign = leases.last_heartbeat(c)
         active = [row for row in statistics.job_counts(c) if row.state in ACTIVE]

@@ -1,4 +1,4 @@
-"""Whether the service lives, and whether it can work."""
+"""Health checks: whether the service is alive, and whether it can work."""
 
 from collections.abc import Callable
 from typing import Literal
@@ -15,13 +15,13 @@ router = APIRouter(tags=["system"])
 
 
 class Health(BaseModel):
-    """The service lives."""
+    """The service is alive."""
 
     status: Literal["alive"] = "alive"
 
 
 class Readiness(BaseModel):
-    """What the service needs, each ``ok`` or what is wrong with it."""
+    """What the service depends on: each is ``ok``, or the text says what is wrong."""
 
     ready: bool
     database: str
@@ -31,7 +31,7 @@ class Readiness(BaseModel):
 
 @router.get("/healthz")
 def health() -> Health:
-    """Whether the service lives."""
+    """Whether the service is alive."""
     return Health()
 
 
@@ -40,7 +40,7 @@ def readiness(context: AnonymousContext, response: Response) -> Readiness:
     """Whether the database, the store and the cluster can be reached; 503 if not."""
 
     def database() -> str:
-        with writing(context.engine) as c:  # one that is full can still be read
+        with writing(context.engine) as c:  # a write: a full database can still be read
             leases.check_writable(c)
         return "ok"
 

@@ -1,4 +1,4 @@
-"""Limits over HTTP."""
+"""Limits of the service and of its owners, over HTTP."""
 
 from fastapi import APIRouter
 from pydantic import BaseModel, Field
@@ -11,17 +11,19 @@ router = APIRouter(tags=["system"])
 
 
 class Limit(BaseModel):
-    """A limit; `ENVMATTE_` and its name in capitals is the setting."""
+    """A limit. Its setting is `ENVMATTE_` and the name in capitals."""
 
     name: str
     unit: Unit
-    limit: int | None = Field(description="Null if there is none.")
-    used: int | None = Field(description="Of it, now; null where it is one of each thing, or of all owners.")
+    limit: int | None = Field(description="Null if unlimited.")
+    used: int | None = Field(
+        description="How much is in use; null if the limit is for each item, or for all owners together."
+    )
     description: str
 
 
 class Limits(BaseModel):
-    """What the caller may, and has."""
+    """The caller's owner and scope, and the limits."""
 
     owner: str
     scope: str
@@ -30,9 +32,9 @@ class Limits(BaseModel):
 
 @router.get("/limits")
 def get_limits(context: OwnerContext) -> Limits:
-    """Every limit, and what of it the caller's owner has used; of the whole service for admins alone."""
+    """All limits, and how much of each the caller's owner uses. Admins also see how much the whole service uses."""
     caller = context.caller
     with reading(context.engine) as c:
-        found = limits_of(c, context.settings, whole=caller.may("admin"))
-    limits = [Limit.model_validate(one, from_attributes=True) for one in found]
+        found = limits_of(c, context.settings, all_owners=caller.may("admin"))
+    limits = [Limit.model_validate(limit, from_attributes=True) for limit in found]
     return Limits(owner=caller.owner, scope=caller.scope, limits=limits)

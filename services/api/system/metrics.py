@@ -1,4 +1,4 @@
-"""Figures for Prometheus, from the database: whichever process of the service is asked, they are the same."""
+"""Metrics for Prometheus, from the database, so that every process of the service reports the same."""
 
 from collections.abc import Iterable, Iterator
 from typing import Any
@@ -23,8 +23,8 @@ JOB_STATES = ("queued", "running", "succeeded", "failed", "cancelled")
 Labelled = Iterable[tuple[tuple[str, ...], float]]
 
 
-class _Found(Collector):
-    """Metrics that were found already."""
+class _Fixed(Collector):
+    """A collector of metrics that exist already."""
 
     def __init__(self, metrics: list[Metric]) -> None:
         self._metrics = metrics
@@ -35,9 +35,9 @@ class _Found(Collector):
 
 @router.get("/metrics", response_class=Response)
 def get_metrics(context: AdminContext, request: Request) -> Response:
-    """Figures for Prometheus, of the whole service."""
+    """Metrics of the whole service for Prometheus."""
     with reading(context.engine) as c:
-        found = _Found([*_of_the_queue(c), *_of_work(c), *_of_data(c), *_of_the_cluster(c)])
+        found = _Fixed([*_of_the_queue(c), *_of_work(c), *_of_data(c), *_of_the_cluster(c)])
     registry = CollectorRegistry()
     registry.register(found)
     encode, media_type = choose_encoder(request.headers.get("accept", ""))
@@ -45,11 +45,11 @@ def get_metrics(context: AdminContext, request: Request) -> Response:
 
 
 def _of_the_queue(connection: Connection) -> Iterator[Metric]:
-    """Jobs, and the tiles of those that are active."""
+    """Jobs, and the tiles of active jobs."""
     rows = {(row.kind, row.state): row for row in statistics.job_counts(connection)}
     numbers = {(kind, state): 0 for kind in KINDS for state in JOB_STATES}
     numbers |= {labels: row.number for labels, row in rows.items()}
-    yield _gauge("jobs", "Jobs there are, by kind and state.", ("kind", "state"), numbers.items())
+    yield _gauge("jobs", "Jobs by kind and state.", ("kind", "state"), numbers.items())
     missing = statistics.missing_tiles(connection)
     states: dict[tuple[str, ...], int] = {}
     for kind in KINDS:
@@ -57,30 +57,30 @@ def _of_the_queue(connection: Connection) -> Iterator[Metric]:
         total, done, failed = (
             sum(getattr(row, name) for row in active) for name in ("total", "done", "failed")
         )
-        again = missing.get(kind, 0)  # which count as done otherwise: progress never goes back
+        again = missing.get(kind, 0)  # elsewhere they count as done, so that progress never goes back
         by_state = {"queued": total - done - failed, "done": done - again, "failed": failed, "missing": again}
         states |= {(kind, state): number for state, number in by_state.items()}
     yield _gauge(
         "tiles",
-        "Tiles of queued and running jobs. Missing: done, not to be found in the store, done again.",
+        "Tiles of queued and running jobs. Missing: were done, but are not in the store and are done again.",
         ("kind", "state"),
         states.items(),
     )
 
 
 def _of_work(connection: Connection) -> Iterator[Metric]:
-    """What has ever been done."""
+    """Work done so far."""
     rows = {(row.kind,): row for row in statistics.work_totals(connection)}
     steps = SummaryMetricFamily(
-        "envmatte_tile_seconds", "Seconds that workers spent on tiles, those that are done.", labels=["kind"]
+        "envmatte_tile_seconds", "Seconds that workers spent on finished tiles.", labels=["kind"]
     )
     for labels, row in rows.items():
         steps.add_metric(labels, row.tiles, row.seconds)
     yield steps
     for name, column, text in (
-        ("pixels", "pixels", "Pixels done: of frames read, of mattes recovered, of frames composited."),
-        ("tile_failures", "misses", "Attempts at a tile or a step that failed."),
-        ("tile_losses", "losses", "Tiles and steps that were lost, with their worker or in the store."),
+        ("pixels", "pixels", "Pixels done: of frames ingested, mattes recovered and frames composited."),
+        ("tile_failures", "misses", "Failed attempts at a tile or a step."),
+        ("tile_losses", "losses", "Tiles and steps lost with their worker or in the store."),
     ):
         yield _counter(
             name, text, ("kind",), {key: getattr(row, column) for key, row in rows.items()}.items()
@@ -88,33 +88,35 @@ def _of_work(connection: Connection) -> Iterator[Metric]:
 
 
 def _of_data(connection: Connection) -> Iterator[Metric]:
-    """Captures, mattes, uploads."""
+    """Captures, mattes and uploads."""
     rows = statistics.capture_counts(connection)
-    yield _gauge("captures", "Captures there are.", ("state",), (((r.state,), r.number) for r in rows))
-    text = "Bytes of the archives of captures, as they were uploaded."
+    yield _gauge("captures", "Captures by state.", ("state",), (((r.state,), r.number) for r in rows))
+    text = "Bytes of the uploaded archives of captures."
     yield _gauge("capture_bytes", text, ("state",), (((r.state,), r.bytes) for r in rows))
     found = statistics.matte_counts(connection)
-    yield _gauge("mattes", "Mattes there are.", ("state",), (((k,), n) for k, n in found.items()))
+    yield _gauge("mattes", "Mattes by state.", ("state",), (((k,), n) for k, n in found.items()))
     uploads = statistics.upload_counts(connection)
     yield _one("uploads", "Resumable uploads under way.", uploads.number)
-    yield _one("upload_bytes", "Bytes of them that have come.", uploads.come)
-    yield _one("upload_length_bytes", "Bytes that they will have.", uploads.length)
+    yield _one("upload_bytes", "Bytes that have been uploaded so far.", uploads.come)
+    yield _one("upload_length_bytes", "Bytes that these uploads will have.", uploads.length)
 
 
 def _of_the_cluster(connection: Connection) -> Iterator[Metric]:
-    """As its coordinator last saw it."""
+    """The cluster as its coordinator last saw it."""
     sign = leases.last_heartbeat(connection)
-    yield _one("trouble", "1 if nothing can go on, as GET /v1/cluster says in words.", bool(trouble_of(sign)))
+    yield _one("trouble", "1 if jobs can't progress; GET /v1/cluster says why.", bool(trouble_of(sign)))
     cluster = (sign or Heartbeat(None, 0, leases.EMPTY_CLUSTER)).cluster
     workers = cluster["workers"]
     yield _one("workers", "Worker processes.", len(workers))
-    yield _one("threads", "Threads of theirs.", _sum(workers, "threads"))
+    yield _one("threads", "Threads of all workers.", _sum(workers, "threads"))
     yield _one("workers_memory_bytes", "Memory of all workers.", _sum(workers, "memory_bytes"))
-    text = "What they may take before they are ended, together; 0 if there is no limit."
+    text = "Memory limit of all workers together; 0 if there is none."
     yield _one("workers_memory_limit_bytes", text, _sum(workers, "memory_limit_bytes"))
-    yield _one("tiles_under_way", "Tiles and steps that the cluster has.", cluster.get("under_way", 0))
+    yield _one(
+        "tiles_under_way", "Tiles and steps that the cluster is working on.", cluster.get("under_way", 0)
+    )
     if sign is not None:
-        text = "Seconds since a coordinator gave a sign of life."
+        text = "Seconds since the last sign of life of a coordinator."
         yield _one("coordinator_last_sign_seconds", text, sign.seconds)
 
 

@@ -1,4 +1,4 @@
-"""Under which addresses other devices reach the service: a phone that follows what the monitor shows."""
+"""The address at which other devices reach the service, such as a phone that follows the playback of a program."""
 
 import socket
 
@@ -11,33 +11,35 @@ from services.runtime.addresses import is_loopback
 
 router = APIRouter(tags=["system"])
 ELSEWHERE = "192.0.2.1", 9
-"""An address that is nobody's (RFC 5737): the way to it starts at this machine's own address. Nothing is sent."""
+"""An address reserved for documentation (RFC 5737). Routing to it reveals this machine's own; nothing is sent."""
 ANY = ("0.0.0.0", "::")
 
 
 class Network(BaseModel):
-    """Where a device of the same network finds the service."""
+    """The address of the service for devices on the same network."""
 
-    url: str | None = Field(description="Of the web app; null if there is none.")
-    problem: str | None = Field(description="Why there is none, and what to do, in words.")
+    url: str | None = Field(description="URL of the web app; null if other devices can't reach it.")
+    problem: str | None = Field(description="Why they can't, and what to do, in words.")
 
 
 @router.get("/network")
 def get_network(context: OwnerContext, request: Request) -> Network:
-    """The address of the web app for other devices of the local network, or why there is none."""
+    """The address of the web app for other devices on the local network, or why there is none."""
     host, port = context.settings.host, request.scope["server"][1]
     if is_loopback(host):
-        engine = request.app.state.context.engine  # the caller's shows no keys
+        engine = request.app.state.context.engine  # the caller's own engine can't read keys
         key = "make a key with `envmatte keys make NAME`, and " if is_open(context.settings, engine) else ""
         return Network(
             url=None,
-            problem=f"The service listens on {host} alone, where no other device can reach it: {key}start it as "
+            problem=f"The service listens on {host} only, where no other device can reach it: {key}start it with "
             "`envmatte serve --host 0.0.0.0`",
         )
     if host in ANY:
         own = _own_address()
         if own is None:
-            return Network(url=None, problem="This machine is on no network: connect it to the phone's")
+            return Network(
+                url=None, problem="This machine is not on a network: connect it to that of the phone"
+            )
         host = own
     return Network(url=f"http://{f'[{host}]' if ':' in host else host}:{port}", problem=None)
 

@@ -1,4 +1,4 @@
-"""The pages: the web app at `/`, the API's documentation at `/docs`, and the browser's files below `/web`."""
+"""Pages for browsers: the web app at `/`, the API's documentation at `/docs`, and their files below `/web`."""
 
 from collections.abc import Mapping
 from importlib.resources import files
@@ -11,7 +11,7 @@ from starlette.staticfiles import StaticFiles
 
 page = APIRouter()
 WEB = Path(__file__).parents[2] / "web"
-"""The browser's files."""
+"""Files for browsers."""
 POLICY = "; ".join(
     (
         "default-src 'none'",
@@ -25,13 +25,13 @@ POLICY = "; ".join(
         "frame-ancestors 'none'",
     )
 )
-"""What the page may do: run and fetch what this service serves, and show pictures and videos of its own (`blob:`)."""
-# Asked for again each time, and answered with 304: after an upgrade no file of the old app is mixed with the new.
+"""Pages may load and fetch only from this service, and show pictures and videos that they make (`blob:`)."""
+# Browsers ask again each time, and get a 304: after an upgrade old files never mix with new ones.
 FRESH = {"Cache-Control": "no-cache"}
 
 
 class Files(StaticFiles):
-    """The browser's files."""
+    """Static files that browsers revalidate each time."""
 
     def file_response(self, *args: Any, **options: Any) -> Response:
         answer = super().file_response(*args, **options)
@@ -41,18 +41,18 @@ class Files(StaticFiles):
 
 HEADERS: Mapping[str, str] = FRESH | {"Content-Security-Policy": POLICY}
 SWAGGER = Path(str(files("fastapi_offline"))) / "static"
-"""Swagger UI, which FastAPI's own page would have fetched from another host, and run among our pages."""
-# Its style sheet has pictures in it.
+"""Swagger UI, served from here: FastAPI's own page would load it from another host."""
+# Its style sheet embeds pictures.
 DOCS = {**HEADERS, "Content-Security-Policy": POLICY.replace("img-src 'self'", "img-src 'self' data:")}
 
 
 @page.get("/", include_in_schema=False, response_class=FileResponse)
 def get_app() -> FileResponse:
-    """The app. It holds nothing of the service: asked for without a key, it asks for one."""
+    """The web app. The page itself needs no key: it asks the user for one if the API needs it."""
     return FileResponse(WEB / "app" / "index.html", media_type="text/html", headers=HEADERS)
 
 
 @page.get("/docs", include_in_schema=False, response_class=FileResponse)
 def get_docs() -> FileResponse:
-    """The API's documentation, by Swagger UI."""
+    """The API's documentation, in Swagger UI."""
     return FileResponse(WEB / "docs" / "index.html", media_type="text/html", headers=DOCS)

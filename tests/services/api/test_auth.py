@@ -1,4 +1,4 @@
-"""Who may call what, by keys: against a real database."""
+"""Keys and what they allow, with a real database."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,12 +21,12 @@ def engine(tmp_path: Path) -> Iterator[Engine]:
     engine.dispose()
 
 
-def test_a_service_that_never_had_a_key_is_open(engine: Engine, tmp_path: Path) -> None:
+def test_service_that_never_had_a_key_is_open(engine: Engine, tmp_path: Path) -> None:
     assert identify(Settings(data=tmp_path), engine, None) == ANYONE
     assert identify(Settings(data=tmp_path), engine, "any") == ANYONE
 
 
-def test_from_the_first_key_on_it_is_closed_for_good(engine: Engine, tmp_path: Path) -> None:
+def test_service_stays_closed_after_its_last_key_is_revoked(engine: Engine, tmp_path: Path) -> None:
     with writing(engine) as c:
         key = api_keys.create(c, "lab", "alice", "read")
     settings = Settings(data=tmp_path)
@@ -50,7 +50,7 @@ def test_keys_of_the_settings_are_admins_of_the_default_owner(engine: Engine, tm
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1", "example.org"])
-def test_a_service_without_keys_stays_on_loopback(host: str, engine: Engine, tmp_path: Path) -> None:
+def test_service_without_keys_must_listen_on_loopback(host: str, engine: Engine, tmp_path: Path) -> None:
     with pytest.raises(
         InvalidInput, match=r"`envmatte keys make NAME`, set ENVMATTE_KEYS .* or listen on 127"
     ):
@@ -67,8 +67,9 @@ def test_loopback_needs_no_key(host: str, engine: Engine, tmp_path: Path) -> Non
     require_keys_unless_loopback(Settings(data=tmp_path, host=host), engine)
 
 
-def test_scopes_grow() -> None:
+def test_each_scope_includes_the_smaller_ones() -> None:
     allowed = {
-        scope: [one for one in api_keys.SCOPES if Caller("o", scope).may(one)] for scope in api_keys.SCOPES
+        scope: [other for other in api_keys.SCOPES if Caller("o", scope).may(other)]
+        for scope in api_keys.SCOPES
     }
     assert allowed == {"read": ["read"], "write": ["read", "write"], "admin": ["read", "write", "admin"]}

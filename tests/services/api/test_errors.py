@@ -1,4 +1,4 @@
-"""Errors as answers: what a status needs besides the problem detail."""
+"""Errors as answers: headers that a status needs besides the problem detail."""
 
 import pytest
 from fastapi import FastAPI
@@ -17,7 +17,7 @@ from storage.errors import EnvmatteError, NotFound, Unavailable
         (NotFound("there is none"), 404, None),
     ],
 )
-def test_an_error_comes_with_the_header_of_its_status(
+def test_error_is_answered_with_the_header_of_its_status(
     error: EnvmatteError, status: int, header: tuple[str, str] | None
 ) -> None:
     app = FastAPI()

@@ -1,4 +1,4 @@
-"""Limits: refused before a byte is taken, and told with their names: the app, a real ledger and a real store."""
+"""Limits: refused before any byte is stored, with the limit's name; the app with a real database and store."""
 
 import base64
 import json
@@ -27,8 +27,8 @@ ZIP = {"Content-Type": "application/zip"}
 
 
 @pytest.fixture(scope="module")
-def bundle(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    path = tmp_path_factory.mktemp("bundle") / "ball.zip"
+def archive(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    path = tmp_path_factory.mktemp("archive") / "ball.zip"
     write_capture(
         glass_ball.glass_ball(24, 16, rays=1), nested_program(bands=((8, 6, 16),), levels=2), path, name="b"
     )
@@ -48,7 +48,7 @@ def engine(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Engine]:
 
 @pytest.fixture
 def serve(engine: Engine, tmp_path: Path) -> Serve:
-    """The API of a service with some limits, and no coordinator: jobs stay queued."""
+    """Serves the API with some limits and without a coordinator, so that jobs stay queued."""
 
     def serve(owner: str = "alice", **limits: int) -> TestClient:
         app = build_app(Settings(data=tmp_path, **limits), engine, Objects((tmp_path / "store").as_uri()))
@@ -76,9 +76,9 @@ def refused(answer: Any, status: int, name: str, limit: int, value: int) -> dict
 
 def used(client: TestClient) -> dict[str, int | None]:
     return {
-        one["name"]: one["used"]
-        for one in client.get("/v1/limits").json()["limits"]
-        if one["used"] is not None
+        limit["name"]: limit["used"]
+        for limit in client.get("/v1/limits").json()["limits"]
+        if limit["used"] is not None
     }
 
 
@@ -86,75 +86,75 @@ def create(client: TestClient, length: int) -> Any:
     return client.post("/v1/uploads", headers=TUS | {"Upload-Length": str(length)})
 
 
-def test_all_limits_are_told_with_what_is_used(serve: Serve, bundle: bytes) -> None:
+def test_all_limits_are_listed_with_their_usage(serve: Serve, archive: bytes) -> None:
     alice, bob = (
         serve(owner_captures=7, store_bytes=1 << 30),
         serve("bob", owner_captures=7, store_bytes=1 << 30),
     )
     assert used(alice) == {"owner_captures": 0, "owner_jobs": 0, "owner_bytes": 0}
-    assert alice.post("/v1/captures", content=bundle, headers=ZIP).status_code == 201
+    assert alice.post("/v1/captures", content=archive, headers=ZIP).status_code == 201
     assert create(alice, 1000).status_code == 201
-    size = len(bundle) + 1000
+    size = len(archive) + 1000
     assert used(alice) == {"owner_captures": 2, "owner_jobs": 1, "owner_bytes": size}
     assert used(bob) == {"owner_captures": 0, "owner_jobs": 0, "owner_bytes": 0, "store_bytes": size}
-    told = alice.get("/v1/limits").json()
-    assert (told["owner"], told["scope"]) == ("alice", "write")
-    found = {one["name"]: one["limit"] for one in told["limits"]}
+    listed = alice.get("/v1/limits").json()
+    assert (listed["owner"], listed["scope"]) == ("alice", "write")
+    found = {limit["name"]: limit["limit"] for limit in listed["limits"]}
     assert found.keys() == UNITS.keys()
     assert (found["upload_bytes"], found["owner_captures"], found["owner_jobs"]) == (8 << 30, 7, None)
-    assert all(one["description"] for one in told["limits"])
+    assert all(limit["description"] for limit in listed["limits"])
 
 
-def test_bytes_of_an_upload(serve: Serve, bundle: bytes, tmp_path: Path) -> None:
+def test_bytes_of_an_upload(serve: Serve, archive: bytes, tmp_path: Path) -> None:
     client = serve(upload_bytes=100)
     refused(create(client, 101), 413, "upload_bytes", 100, 101)
     assert create(client, 100).status_code == 201
     for url, headers in (("/v1/captures", ZIP), ("/v1/mattes", ZIP)):
-        refused(client.post(url, content=bundle, headers=headers), 413, "upload_bytes", 100, len(bundle))
+        refused(client.post(url, content=archive, headers=headers), 413, "upload_bytes", 100, len(archive))
     assert files(tmp_path) == []
 
 
-def test_captures_of_an_owner(serve: Serve, bundle: bytes, tmp_path: Path) -> None:
+def test_captures_of_an_owner(serve: Serve, archive: bytes, tmp_path: Path) -> None:
     client, bob = serve(owner_captures=2), serve("bob", owner_captures=2)
-    capture = client.post("/v1/captures", content=bundle, headers=ZIP).json()
+    capture = client.post("/v1/captures", content=archive, headers=ZIP).json()
     assert create(client, 10).status_code == 201
     before = files(tmp_path)
     detail = refused(create(client, 10), 507, "owner_captures", 2, 3)["detail"]
     assert "delete some first" in detail
-    refused(client.post("/v1/captures", content=bundle, headers=ZIP), 507, "owner_captures", 2, 3)
+    refused(client.post("/v1/captures", content=archive, headers=ZIP), 507, "owner_captures", 2, 3)
     assert files(tmp_path) == before
-    assert bob.post("/v1/captures", content=bundle, headers=ZIP).status_code == 201
+    assert bob.post("/v1/captures", content=archive, headers=ZIP).status_code == 201
     client.post(f"/v1/jobs/{capture['job']}/cancel")
     assert client.delete(f"/v1/captures/{capture['id']}").status_code == 204
-    assert client.post("/v1/captures", content=bundle, headers=ZIP).status_code == 201
+    assert client.post("/v1/captures", content=archive, headers=ZIP).status_code == 201
 
 
-def test_an_upload_counts_as_the_capture_that_it_becomes(serve: Serve, bundle: bytes) -> None:
-    client = serve(owner_captures=1, owner_bytes=len(bundle))
-    where = create(client, len(bundle)).headers["location"]
+def test_unfinished_upload_counts_as_a_capture(serve: Serve, archive: bytes) -> None:
+    client = serve(owner_captures=1, owner_bytes=len(archive))
+    where = create(client, len(archive)).headers["location"]
     chunk = TUS | {"Content-Type": "application/offset+octet-stream", "Upload-Offset": "0"}
-    assert client.patch(where, content=bundle, headers=chunk).status_code == 204
+    assert client.patch(where, content=archive, headers=chunk).status_code == 204
     body = {"upload": where.rsplit("/", 1)[1]}
     assert client.post("/v1/captures", json=body).status_code == 201
     assert used(client)["owner_captures"] == 1
 
 
-def test_jobs_of_an_owner(serve: Serve, bundle: bytes, engine: Engine) -> None:
+def test_jobs_of_an_owner(serve: Serve, archive: bytes, engine: Engine) -> None:
     client, bob = serve(owner_jobs=2), serve("bob", owner_jobs=2)
-    capture = client.post("/v1/captures", content=bundle, headers=ZIP).json()
+    capture = client.post("/v1/captures", content=archive, headers=ZIP).json()
     wanted = {"capture": capture["id"]}
     job = client.post("/v1/jobs", json=wanted).json()["id"]
     answer = client.post("/v1/jobs", json=wanted)
     refused(answer, 429, "owner_jobs", 2, 3)
     assert int(answer.headers["retry-after"]) > 0
-    refused(client.post("/v1/captures", content=bundle, headers=ZIP), 429, "owner_jobs", 2, 3)
+    refused(client.post("/v1/captures", content=archive, headers=ZIP), 429, "owner_jobs", 2, 3)
     with writing(for_owner(engine, "alice")) as c:
         mattes.add_imported(c, "m", {}, {})
     video = {"Content-Type": "video/mp4"}
     refused(client.post("/v1/mattes/m/composite", content=b"clip", headers=video), 429, "owner_jobs", 2, 3)
     with writing(engine) as c:
         jobs.end(c, job, "failed", {"detail": "", "status": 500})
-    assert bob.post("/v1/captures", content=bundle, headers=ZIP).status_code == 201
+    assert bob.post("/v1/captures", content=archive, headers=ZIP).status_code == 201
     assert client.post("/v1/jobs", json=wanted).status_code == 202
     refused(client.post(f"/v1/jobs/{job}/retry"), 429, "owner_jobs", 2, 3)
     clip = serve().post("/v1/mattes/m/composite", content=b"clip", headers=video)
@@ -164,10 +164,10 @@ def test_jobs_of_an_owner(serve: Serve, bundle: bytes, engine: Engine) -> None:
 
 
 @pytest.mark.parametrize(("name", "others"), [("owner_bytes", False), ("store_bytes", True)])
-def test_bytes_stored(serve: Serve, bundle: bytes, tmp_path: Path, name: str, others: bool) -> None:
-    size = len(bundle)
+def test_bytes_stored(serve: Serve, archive: bytes, tmp_path: Path, name: str, others: bool) -> None:
+    size = len(archive)
     alice, bob = serve(**{name: 2 * size}), serve("bob", **{name: 2 * size})
-    capture = alice.post("/v1/captures", content=bundle, headers=ZIP).json()["id"]
+    capture = alice.post("/v1/captures", content=archive, headers=ZIP).json()["id"]
     assert create(bob, size).status_code == 201
     before = files(tmp_path)
     problem = create(alice, size + 1).json()
@@ -175,15 +175,15 @@ def test_bytes_stored(serve: Serve, bundle: bytes, tmp_path: Path, name: str, ot
     assert problem["missing"] == (size + 1 if others else 1)
 
     def pieces() -> Iterator[bytes]:
-        yield bundle  # of a length that is not said before: it is refused once it has come
+        yield archive  # without announced length: it is refused once it has come
 
-    answers = [alice.post("/v1/captures", content=content, headers=ZIP) for content in (bundle, pieces())]
+    answers = [alice.post("/v1/captures", content=content, headers=ZIP) for content in (archive, pieces())]
     assert [answer.status_code for answer in answers] == [507 if others else 201, 507]
     if others:
         assert files(tmp_path) == before
-        problem = alice.post("/v1/mattes", content=bundle, headers=ZIP).json()
+        problem = alice.post("/v1/mattes", content=archive, headers=ZIP).json()
         assert (problem["status"], problem["name"]) == (507, name)
-        assert str(3 * size) not in problem["detail"]  # what bob has is not told
+        assert str(3 * size) not in problem["detail"]  # does not reveal what bob has
     assert alice.get(f"/v1/captures/{capture}").status_code == 200
 
 
@@ -217,28 +217,30 @@ def test_bytes_of_programs(serve: Serve, name: str, others: bool) -> None:
     assert [one["id"] for one in alice.get("/v1/programs").json()["programs"]] == [
         answer.json()["id"] for answer in (second, first)
     ]
-    assert alice.post("/v1/programs", json=asked(1)).json() == first.json()  # a repeat takes nothing
+    assert alice.post("/v1/programs", json=asked(1)).json() == first.json()  # a repeat takes no room
     assert alice.delete(f"/v1/programs/{first.json()['id']}").status_code == 204
     assert alice.post("/v1/programs", json=asked(3)).status_code == 201
 
 
-def test_frames_of_a_capture(serve: Serve, bundle: bytes, tmp_path: Path) -> None:
+def test_frames_of_a_capture(serve: Serve, archive: bytes, tmp_path: Path) -> None:
     client = serve(capture_frames=17)
-    refused(client.post("/v1/captures", content=bundle, headers=ZIP), 413, "capture_frames", 17, 18)
-    where = create(client, len(bundle)).headers["location"]
+    refused(client.post("/v1/captures", content=archive, headers=ZIP), 413, "capture_frames", 17, 18)
+    where = create(client, len(archive)).headers["location"]
     chunk = TUS | {"Content-Type": "application/offset+octet-stream", "Upload-Offset": "0"}
-    client.patch(where, content=bundle, headers=chunk)
+    client.patch(where, content=archive, headers=chunk)
     body = {"upload": where.rsplit("/", 1)[1]}
     refused(client.post("/v1/captures", json=body), 413, "capture_frames", 17, 18)
     assert files(tmp_path) == []  # it would be refused again
-    assert serve(capture_frames=18).post("/v1/captures", content=bundle, headers=ZIP).status_code == 201
+    assert serve(capture_frames=18).post("/v1/captures", content=archive, headers=ZIP).status_code == 201
 
 
-def test_frames_that_are_declared_are_refused_before_they_come(serve: Serve, tmp_path: Path) -> None:
+def test_declared_frames_are_checked_before_the_upload(serve: Serve, tmp_path: Path) -> None:
     client = serve(capture_frames=17, capture_pixels=384)
 
-    def declaring(**told: object) -> Any:
-        pairs = (f"{name} {base64.b64encode(str(value).encode()).decode()}" for name, value in told.items())
+    def declaring(**declared: object) -> Any:
+        pairs = (
+            f"{name} {base64.b64encode(str(value).encode()).decode()}" for name, value in declared.items()
+        )
         return client.post(
             "/v1/uploads", headers=TUS | {"Upload-Length": "10", "Upload-Metadata": ", ".join(pairs)}
         )
@@ -254,9 +256,9 @@ def test_frames_that_are_declared_are_refused_before_they_come(serve: Serve, tmp
         assert declaring(**fine).status_code == 201
 
 
-def test_when_it_expires_is_told(serve: Serve, bundle: bytes, engine: Engine) -> None:
+def test_expiry_is_in_the_answers(serve: Serve, archive: bytes, engine: Engine) -> None:
     client = serve(capture_seconds=60, matte_seconds=3600)
-    capture = client.post("/v1/captures", content=bundle, headers=ZIP).json()
+    capture = client.post("/v1/captures", content=archive, headers=ZIP).json()
     matte = client.post("/v1/jobs", json={"capture": capture["id"]}).json()["matte"]
     with reading(engine) as c:
         for seconds, row in ((60, captures.get(c, capture["id"])), (3600, mattes.get(c, matte))):
@@ -265,5 +267,5 @@ def test_when_it_expires_is_told(serve: Serve, bundle: bytes, engine: Engine) ->
         found = client.get(url).json()
         assert found["expires_at"].endswith("Z")
         assert found["expires_at"] > found["created_at"]
-    forever = serve().post("/v1/captures", content=bundle, headers=ZIP).json()
+    forever = serve().post("/v1/captures", content=archive, headers=ZIP).json()
     assert forever["expires_at"] is None

@@ -1,4 +1,4 @@
-"""Pictures decoded in child processes: the same pixels, and children that die, hang, grow or lie."""
+"""Pictures decoded in child processes: the same pixels, and children that die, hang, use memory or send garbage."""
 
 import io
 import pickle
@@ -28,19 +28,15 @@ PIXELS = np.random.default_rng(0).integers(0, 256, (30, 40, 3), np.uint8)
 
 
 def children() -> list[psutil.Process]:
-    """The decoders of this process."""
-    found = []
-    for one in running(psutil.Process().children(recursive=True)):
-        if one.name() == NAME:
-            found.append(one)
-    return found
+    """The decoder processes of this process."""
+    return [child for child in running(psutil.Process().children(recursive=True)) if child.name() == NAME]
 
 
 @pytest.fixture
 def decoders() -> Iterator[Decoders]:
-    made = Decoders(MEMORY)
-    yield made
-    made.close()
+    decoders = Decoders(MEMORY)
+    yield decoders
+    decoders.close()
     assert not children()
 
 
@@ -75,7 +71,7 @@ PNG = integer_formats.encode_png(PIXELS)
     ],
     ids=lambda data: data[:4].hex(),
 )
-def test_the_same_pixels_come_back(decoders: Decoders, data: bytes) -> None:
+def test_child_decodes_the_same_pixels(decoders: Decoders, data: bytes) -> None:
     found = decoders.decode(data, "srgb")
     expected = decode.decode(data, "srgb", memory=MEMORY)
     assert found.dtype == expected.dtype
@@ -85,16 +81,16 @@ def test_the_same_pixels_come_back(decoders: Decoders, data: bytes) -> None:
 @pytest.mark.parametrize(
     "data", [b"", b"no picture", PNG[:-30], saved("PNG", np.zeros((4000, 5000, 3), np.uint8))]
 )
-def test_what_is_refused_is_refused_alike(decoders: Decoders, data: bytes) -> None:
+def test_child_refuses_with_the_same_error(decoders: Decoders, data: bytes) -> None:
     with pytest.raises(ImageError) as expected:
         decode.decode(data, "srgb", memory=MEMORY)
     with pytest.raises(ImageError) as found:
         decoders.decode(data, "srgb")
     assert (found.value.detail, found.value.fields) == (expected.value.detail, expected.value.fields)
-    assert len(children()) == 1  # which goes on
+    assert len(children()) == 1  # it is still usable
 
 
-def test_as_many_as_are_asked_for_and_each_is_kept(decoders: Decoders) -> None:
+def test_children_are_started_as_needed_and_kept(decoders: Decoders) -> None:
     assert not children()
     for _ in range(5):
         decoders.decode(PNG, "srgb")
@@ -105,15 +101,15 @@ def test_as_many_as_are_asked_for_and_each_is_kept(decoders: Decoders) -> None:
     assert 1 <= len(children()) <= 4
 
 
-def asked(decoders: Decoders, after: Callable[[psutil.Process], None]) -> str:
-    """What is said of a picture whose decoder is stopped when it comes, and then something done to."""
+def refusal_by_stopped_child(decoders: Decoders, after: Callable[[psutil.Process], None]) -> str:
+    """The error about a picture whose decoder is suspended, and then has something done to it."""
     decoders.decode(PNG, "srgb")
     (child,) = children()
     child.suspend()
     with ThreadPoolExecutor(2) as threads:
         both = [threads.submit(decoders.decode, PNG, "srgb") for _ in range(2)]
         (done,), (left,) = futures.wait(both, return_when=futures.FIRST_COMPLETED)
-        np.testing.assert_array_equal(done.result(), PIXELS)  # by another one
+        np.testing.assert_array_equal(done.result(), PIXELS)  # by another child
         after(child)
         with pytest.raises(ImageError) as refused:
             left.result()
@@ -122,18 +118,18 @@ def asked(decoders: Decoders, after: Callable[[psutil.Process], None]) -> str:
     return refused.value.detail
 
 
-def test_one_that_is_killed_costs_its_picture_alone(decoders: Decoders) -> None:
-    assert "(SIGKILL)" in asked(decoders, lambda child: child.kill())
+def test_killed_child_fails_only_its_own_picture(decoders: Decoders) -> None:
+    assert "(SIGKILL)" in refusal_by_stopped_child(decoders, lambda child: child.kill())
 
 
-def test_one_that_hangs_is_given_up() -> None:
+def test_child_that_hangs_is_ended_after_the_time_limit() -> None:
     impatient = Decoders(MEMORY, seconds=8)
-    assert "takes more than 8 s" in asked(impatient, lambda child: None)
+    assert "takes more than 8 s" in refusal_by_stopped_child(impatient, lambda child: None)
     impatient.close()
     assert not children()
 
 
-def test_one_that_dies_while_it_has_nothing_to_do_costs_nothing(decoders: Decoders) -> None:
+def test_idle_child_that_dies_is_replaced(decoders: Decoders) -> None:
     decoders.decode(PNG, "srgb")
     (child,) = children()
     child.kill()
@@ -141,7 +137,7 @@ def test_one_that_dies_while_it_has_nothing_to_do_costs_nothing(decoders: Decode
     np.testing.assert_array_equal(decoders.decode(PNG, "srgb"), PIXELS)
 
 
-def test_memory_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_child_has_a_memory_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(decoder_guard, "COPIES", 0)
     monkeypatch.setattr(decoder_guard, "BESIDES", 32 << 20)
     confined = Decoders(1 << 30)
@@ -152,8 +148,8 @@ def test_memory_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
     confined.close()
 
 
-def test_the_largest_that_is_allowed_has_room() -> None:
-    """16 bits, transparent and with a profile, which takes the most copies."""
+def test_largest_allowed_picture_fits_in_memory() -> None:
+    """16 bits with transparency and a colour profile: the case with the most copies."""
     noise = np.random.default_rng(1).integers(0, 1 << 16, (1000, 2000, 4), np.uint16)
     data = tiff(
         noise, compression="zlib", extrasamples=["unassalpha"], iccprofile=imagecodecs.cms_profile("adobergb")
@@ -167,13 +163,13 @@ def framed(text: bytes) -> bytes:
     return struct.pack("<I", len(text)) + text
 
 
-LIES = [
+BAD_ANSWERS = [
     pickle.dumps(print),
-    framed(pickle.dumps({"said": None})),
+    framed(pickle.dumps({"result": None})),
     framed(b"{}"),
     struct.pack("<I", 1 << 31),
     *(
-        framed(b'{"said": {"height": %s, "width": 40, "channels": 3, "dtype": "%s"}}' % head)
+        framed(b'{"result": {"height": %s, "width": 40, "channels": 3, "dtype": "%s"}}' % head)
         for head in (
             (b"100000", b"float32"),
             (b"-1", b"uint8"),
@@ -183,41 +179,36 @@ LIES = [
             (b'30, "more": 1', b"uint8"),
         )
     ),
-    framed(b'{"said": {"height": 30, "width": 40, "channels": 3, "dtype": "uint8"}}') + b"too few",
-    framed(b'{"said": {"height": 30, "width": 40, "channels": 4, "dtype": "float32"}}'),
-    framed(b'{"said": {"detail": 3}}'),
-    framed(b'{"said": {"detail": "no", "status": 200}}'),
+    framed(b'{"result": {"height": 30, "width": 40, "channels": 3, "dtype": "uint8"}}') + b"too few",
+    framed(b'{"result": {"height": 30, "width": 40, "channels": 4, "dtype": "float32"}}'),
+    framed(b'{"result": {"detail": 3}}'),
+    framed(b'{"result": {"detail": "no", "status": 200}}'),
     b"",
 ]
 
 
-def liar(number: int, connection: socket.socket, memory: int) -> None:
-    """A decoder that somebody has taken over."""
-    with connection:
-        connection.recv(1 << 16)
-        connection.sendall(LIES[number])
-
-
-class Liar:
-    """What a child runs in place of decoding; it goes there by its name, as all that runs there does."""
+class CompromisedDecoder:
+    """Runs in a child in place of the decoder; pickled by name, so it must be a class of this module."""
 
     def __init__(self, number: int) -> None:
         self.number = number
 
     def __call__(self, connection: socket.socket, memory: int) -> None:
-        liar(self.number, connection, memory)
+        with connection:
+            connection.recv(1 << 16)
+            connection.sendall(BAD_ANSWERS[self.number])
 
 
-@pytest.mark.parametrize("number", range(len(LIES)))
+@pytest.mark.parametrize("number", range(len(BAD_ANSWERS)))
 def test_what_one_answers_is_not_believed(
     decoders: Decoders, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
-    monkeypatch.setattr(process, "_serve", Liar(number))
+    monkeypatch.setattr(process, "_serve", CompromisedDecoder(number))
     with pytest.raises(ImageError, match="ended the process"):
         decoders.decode(PNG, "srgb")
 
 
-def test_whoever_comes_after_the_end_is_told(decoders: Decoders) -> None:
+def test_closed_pool_is_unavailable(decoders: Decoders) -> None:
     decoders.decode(PNG, "srgb")
     decoders.close()
     assert not children()
@@ -225,7 +216,7 @@ def test_whoever_comes_after_the_end_is_told(decoders: Decoders) -> None:
         decoders.decode(PNG, "srgb")
 
 
-def test_a_child_is_confined(decoders: Decoders) -> None:
+def test_child_has_resource_limits(decoders: Decoders) -> None:
     decoders.decode(PNG, "srgb")
     (child,) = children()
     assert child.rlimit(psutil.RLIMIT_CORE) == (0, 0)

@@ -1,4 +1,4 @@
-"""Requests to URLs that strangers name: which are made, and how little of an answer they wait for."""
+"""Requests to URLs from untrusted callers: which are refused, and how little of the answer is read."""
 
 import socket
 import ssl
@@ -59,7 +59,7 @@ NOT_PUBLIC = [
     "ff02::1",
     "100::1",
 ]
-REFUSED = [
+PRIVATE_URLS = [
     "https://127.0.0.1/",
     "https://127.0.0.1:8000/x",
     "https://2130706433/",
@@ -76,7 +76,7 @@ REFUSED = [
     "https://localhost./",
     "https://a.LOCALHOST/",
 ]
-NO_URL = [
+MALFORMED = [
     "",
     "example.com",
     "ftp://example.com/",
@@ -102,31 +102,31 @@ NO_URL = [
 
 
 @pytest.mark.parametrize("address", PUBLIC)
-def test_public_addresses(address: str) -> None:
+def test_address_is_public(address: str) -> None:
     assert safe_http.is_public(address)
 
 
 @pytest.mark.parametrize("address", NOT_PUBLIC)
-def test_addresses_that_are_not_public(address: str) -> None:
+def test_address_is_not_public(address: str) -> None:
     assert not safe_http.is_public(address)
 
 
-@pytest.mark.parametrize("url", REFUSED)
-def test_urls_of_such_addresses_are_refused_unless_they_may_be(url: str) -> None:
+@pytest.mark.parametrize("url", PRIVATE_URLS)
+def test_url_of_private_address_is_refused_unless_allowed(url: str) -> None:
     with pytest.raises(OptionError, match="ENVMATTE_WEBHOOK_PRIVATE") as caught:
         safe_http.check_url(url, private=False)
     assert caught.value.fields == {"field": "webhook"}
     safe_http.check_url(url, private=True)
 
 
-@pytest.mark.parametrize("url", NO_URL)
+@pytest.mark.parametrize("url", MALFORMED)
 @pytest.mark.parametrize("private", [False, True])
-def test_what_is_no_webhook_is_refused(url: str, private: bool) -> None:
+def test_malformed_url_is_refused(url: str, private: bool) -> None:
     with pytest.raises(OptionError, match="https://HOST"):
         safe_http.check_url(url, private=private)
 
 
-def test_without_tls_only_where_addresses_may_be_private() -> None:
+def test_tls_is_required_unless_private_addresses_are_allowed() -> None:
     safe_http.check_url("https://example.com:8443/a?b=c", private=False)
     safe_http.check_url("http://example.com/", private=True)
     with pytest.raises(OptionError, match="https://HOST"):
@@ -145,7 +145,7 @@ def test_nothing_connects_to_an_address_that_is_not_public(host: str) -> None:
     assert (headers["Host"].rpartition(":")[0], headers["A"], body) == (host, "b", b"x")
 
 
-def test_a_name_with_one_address_that_is_not_public_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_name_with_one_private_address_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     def both(*arguments: object, **options: object) -> list[tuple[object, ...]]:
         return [(2, 1, 6, "", ("93.184.216.34", 0)), (10, 1, 6, "", ("::1", 0, 0, 0))]
 
@@ -154,32 +154,32 @@ def test_a_name_with_one_address_that_is_not_public_is_refused(monkeypatch: pyte
         safe_http.post("https://example.com/", b"", {}, private=False)
 
 
-def test_it_connects_to_the_address_that_was_checked(monkeypatch: pytest.MonkeyPatch) -> None:
-    real, asked = socket.getaddrinfo, []
+def test_request_goes_to_the_address_that_was_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    real, lookups = socket.getaddrinfo, []
 
     def rebinding(host: str, *arguments: object, **options: object) -> object:
         if host == "rebinding.example":
-            asked.append(host)
-            return real("127.0.0.1" if len(asked) == 1 else "127.0.0.2", *arguments, **options)  # type: ignore[arg-type]
+            lookups.append(host)
+            return real("127.0.0.1" if len(lookups) == 1 else "127.0.0.2", *arguments, **options)  # type: ignore[arg-type]
         return real(host, *arguments, **options)  # type: ignore[arg-type]
 
     monkeypatch.setattr(socket, "getaddrinfo", rebinding)
     with receiver(lambda n: 200) as found:
         url = found.url.replace("127.0.0.1", "rebinding.example")
         assert safe_http.post(url, b"x", {}, private=True) == 200
-    assert len(asked) == 1
+    assert len(lookups) == 1
     assert found.received[0][0]["Host"].startswith("rebinding.example:")
 
 
-def test_a_redirect_is_not_followed() -> None:
-    with receiver(lambda n: 200) as goal, receiver(lambda n: 302, Location=goal.url) as found:
+def test_redirect_is_not_followed() -> None:
+    with receiver(lambda n: 200) as target, receiver(lambda n: 302, Location=target.url) as found:
         assert safe_http.post(found.url, b"x", {}, private=True) == 302
-        assert goal.received == []
+        assert target.received == []
 
 
 @pytest.fixture(scope="module")
 def certificate(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A file with a key and a certificate of localhost, signed by itself."""
+    """A file with a key and a self-signed certificate for localhost."""
     key, name = ec.generate_private_key(ec.SECP256R1()), x509.Name([])
     now = datetime.now(UTC)
     made = (
@@ -196,36 +196,34 @@ def certificate(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
-def test_whom_it_talks_to_by_tls_has_to_have_a_certificate(
-    certificate: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_server_needs_a_valid_certificate(certificate: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with receiver(lambda n: 200, certificate=certificate) as found:
         named = found.url.replace("127.0.0.1", "localhost")
         with pytest.raises(ssl.SSLCertVerificationError):
             safe_http.post(named, b"x", {}, private=True)
         monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
         assert safe_http.post(named, b"x", {}, private=True) == 200
-        with pytest.raises(ssl.SSLCertVerificationError):  # of another name
+        with pytest.raises(ssl.SSLCertVerificationError):  # the certificate is for another name
             safe_http.post(found.url, b"x", {}, private=True)
     assert len(found.received) == 1
 
 
 @given(st.one_of(st.text(), st.text().map("https://{}/".format), st.text().map("https://[{}]:1/".format)))
-def test_whatever_is_given_is_taken_or_refused(url: str) -> None:
+def test_any_text_is_accepted_or_refused(url: str) -> None:
     with suppress(OptionError):
         safe_http.check_url(url, private=False)
 
 
 @contextmanager
-def talking(say: Callable[[socket.socket], None]) -> Iterator[str]:
-    """A server that reads a request and says something of its own."""
+def answering(send: Callable[[socket.socket], None]) -> Iterator[str]:
+    """A server that reads a request and answers with any bytes."""
     with socket.create_server(("127.0.0.1", 0)) as server:
 
         def serve() -> None:
             connection, _ = server.accept()
             with connection, suppress(OSError):
                 connection.recv(65536)
-                say(connection)
+                send(connection)
 
         thread = threading.Thread(target=serve)
         thread.start()
@@ -233,33 +231,33 @@ def talking(say: Callable[[socket.socket], None]) -> Iterator[str]:
         thread.join()
 
 
-def test_one_who_drips_an_answer_is_given_up() -> None:
+def test_server_that_sends_single_bytes_times_out() -> None:
     def drip(connection: socket.socket) -> None:
         connection.sendall(b"HTTP/1.1 200 OK\r\n")
         while True:
             connection.sendall(b"X: y\r\n"[:1])
             threading.Event().wait(0.05)
 
-    with talking(drip) as url, pytest.raises(TimeoutError, match=r"0\.5 s"):
+    with answering(drip) as url, pytest.raises(TimeoutError, match=r"0\.5 s"):
         safe_http.post(url, b"x", {}, private=True, seconds=0.5)
 
 
 @pytest.mark.parametrize("line", [b"x" * 100_000 + b"\r\n", b"X: y\r\n" * 10_000], ids=["long", "many"])
-def test_an_answer_is_not_read_without_end(line: bytes) -> None:
+def test_endless_head_is_not_read(line: bytes) -> None:
     def flood(connection: socket.socket) -> None:
         connection.sendall(b"HTTP/1.1 200 OK\r\n")
         while True:
             connection.sendall(line)
 
-    with talking(flood) as url, pytest.raises((OSError, safe_http.http.client.HTTPException)):
+    with answering(flood) as url, pytest.raises((OSError, safe_http.http.client.HTTPException)):
         safe_http.post(url, b"x", {}, private=True)
 
 
-def test_a_body_without_end_is_not_read() -> None:
+def test_endless_body_is_not_read() -> None:
     def flood(connection: socket.socket) -> None:
         connection.sendall(b"HTTP/1.1 204 No Content\r\nTransfer-Encoding: chunked\r\n\r\n")
         while True:
             connection.sendall(b"ffff\r\n" + bytes(0xFFFF) + b"\r\n")
 
-    with talking(flood) as url:
+    with answering(flood) as url:
         assert safe_http.post(url, b"x", {}, private=True) == 204

@@ -1,4 +1,4 @@
-"""Who takes his answer slowly, or never, or begins a body and falls silent, on a real port."""
+"""Clients that read slowly or never, or stop in the middle of a body, on a real port."""
 
 import contextlib
 import socket
@@ -22,14 +22,14 @@ from storage.objects.store import Objects
 from tests.services.api.mattes.archives import archive
 from tests.services.cluster.clusters import wait
 
-PATIENCE = 1.0
+CHECK_SECONDS = 1.0
 SIZE = 1200, 800
-"""Of a matte whose layers are some 10 MB."""
+"""Of a matte whose layers have about 10 MB."""
 
 
 @dataclass
 class Served:
-    """An API without a coordinator, in this process."""
+    """An API without a coordinator, served by this process."""
 
     server: uvicorn.Server
     port: int
@@ -38,7 +38,7 @@ class Served:
 
     @property
     def count(self) -> int:
-        """Its connections."""
+        """Number of open connections."""
         return len(self.server.server_state.connections)
 
     def ask(self, path: str) -> httpx2.Response:
@@ -46,7 +46,7 @@ class Served:
 
     @contextlib.contextmanager
     def connected(self, sent: bytes, room: int = 1 << 14) -> Iterator[socket.socket]:
-        """A connection that has little room for answers, and has sent something."""
+        """A connection with a small receive buffer that has sent something."""
         with socket.socket() as connection:
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, room)
             connection.settimeout(60)
@@ -63,7 +63,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     app = build_app(settings, engine, Objects(settings.store_url))
     config = uvicorn.Config(app, port=0, http=Connection, log_config=None, lifespan="off")
     with pytest.MonkeyPatch.context() as patch, config.bind_socket() as bound:
-        patch.setattr(slow_clients, "PATIENCE", PATIENCE)
+        patch.setattr(slow_clients, "CHECK_SECONDS", CHECK_SECONDS)
         server = uvicorn.Server(config)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [bound]})
         thread.start()
@@ -87,12 +87,12 @@ def get(path: str) -> bytes:
 
 
 def rest(connection: socket.socket) -> bytes:
-    """All that comes until the other side is gone."""
-    came = b""
+    """Everything that comes until the server closes the connection."""
+    received = b""
     with contextlib.suppress(ConnectionResetError):
         while part := connection.recv(1 << 16):
-            came += part
-    return came
+            received += part
+    return received
 
 
 def test_answers_that_nobody_takes_are_held_on_disk_and_given_up(
@@ -103,44 +103,46 @@ def test_answers_that_nobody_takes_are_held_on_disk_and_given_up(
     assert whole.status_code == 200
     assert whole.headers["content-length"] == str(len(whole.content))
     assert len(whole.content) > 6_000_000
-    monkeypatch.setattr(slow_clients, "PATIENCE", 30.0)  # at first: all of them are there at once
+    monkeypatch.setattr(
+        slow_clients, "CHECK_SECONDS", 30.0
+    )  # long enough for all connections to be open at once
     process, count = psutil.Process(), 12
     before = process.memory_info().rss
     with contextlib.ExitStack() as stack:
-        held = [stack.enter_context(served.connected(get(path))) for _ in range(count)]
-        for one in held:
+        connections = [stack.enter_context(served.connected(get(path))) for _ in range(count)]
+        for one in connections:
             assert one.recv(12) == b"HTTP/1.1 200"
         grown = process.memory_info().rss - before
         assert grown < count * len(whole.content) // 2, grown
         assert served.ask(path).content == whole.content
     wait(lambda: served.count == 0)
-    monkeypatch.setattr(slow_clients, "PATIENCE", PATIENCE)
+    monkeypatch.setattr(slow_clients, "CHECK_SECONDS", CHECK_SECONDS)
     with served.connected(get(path)) as one:
         wait(lambda: served.count == 1)
         wait(lambda: served.count == 0)
         assert len(rest(one)) < len(whole.content) // 2
 
 
-def test_a_byte_now_and_then_is_not_enough(served: Served) -> None:
+def test_client_that_reads_single_bytes_is_disconnected(served: Served) -> None:
     with served.connected(get(f"/v1/mattes/{served.matte}/layers/S.exr")) as one:
         wait(lambda: one.recv(1) and served.count == 0)
 
 
-def test_who_is_slow_but_goes_on_gets_all_of_it(served: Served) -> None:
+def test_slow_client_that_keeps_reading_gets_the_whole_answer(served: Served) -> None:
     path = f"/v1/mattes/{served.matte}/archive"
     sent = get(path).replace(b"\r\n\r\n", b"\r\nConnection: close\r\n\r\n")
     size = int(served.ask(path).headers["content-length"])
-    begun = time.monotonic()
+    started = time.monotonic()
     with served.connected(sent) as one:
-        came = 0
+        received = 0
         while part := one.recv(1 << 16):
-            came += len(part)
+            received += len(part)
             time.sleep(0.02)
-    assert came > size
-    assert time.monotonic() - begun > 2 * PATIENCE
+    assert received > size
+    assert time.monotonic() - started > 2 * CHECK_SECONDS
 
 
-def test_a_half_closed_connection_that_takes_nothing_is_given_up(served: Served) -> None:
+def test_half_closed_connection_that_reads_nothing_is_closed(served: Served) -> None:
     with served.connected(get(f"/v1/mattes/{served.matte}/archive")) as one:
         assert one.recv(12) == b"HTTP/1.1 200"
         one.shutdown(socket.SHUT_WR)
@@ -153,7 +155,7 @@ def head(method: str, path: str, **headers: str) -> bytes:
     return "\r\n".join([*lines, "", ""]).encode()
 
 
-@pytest.mark.parametrize("crumbs", [b"", b"x"], ids=["silent", "a byte now and then"])
+@pytest.mark.parametrize("trickle", [b"", b"x"], ids=["silent", "single bytes"])
 @pytest.mark.parametrize(
     ("path", "kind"),
     [
@@ -164,20 +166,22 @@ def head(method: str, path: str, **headers: str) -> bytes:
         ("/v1/mattes/MATTE/composite", "video/mp4"),
     ],
 )
-def test_a_body_that_does_not_go_on_is_given_up(served: Served, path: str, kind: str, crumbs: bytes) -> None:
+def test_client_that_stops_sending_its_body_is_disconnected(
+    served: Served, path: str, kind: str, trickle: bytes
+) -> None:
     before = files(served)
     sent = head("POST", path.replace("MATTE", served.matte), Content_Type=kind) + b"{" * 2000
     with served.connected(sent) as one:
         wait(lambda: served.count == 1)
         with contextlib.suppress(ConnectionError):
             while served.count:
-                one.sendall(crumbs)
+                one.sendall(trickle)
                 time.sleep(0.1)
         assert rest(one) == b""
     wait(lambda: files(served) == before)
 
 
-def test_of_an_upload_what_has_come_is_kept(served: Served) -> None:
+def test_upload_keeps_the_bytes_that_came_before_the_disconnect(served: Served) -> None:
     tus = {"Tus-Resumable": "1.0.0", "Upload-Length": "1000000"}
     where = httpx2.post(f"http://127.0.0.1:{served.port}/v1/uploads", headers=tus).headers["location"]
     kind = {"Content_Type": "application/offset+octet-stream", "Upload_Offset": "0", "Tus_Resumable": "1.0.0"}
@@ -191,23 +195,23 @@ def test_of_an_upload_what_has_come_is_kept(served: Served) -> None:
     wait(lambda: offset() == "3000")
 
 
-def test_a_body_that_is_slow_but_goes_on_is_taken(served: Served) -> None:
+def test_slow_client_that_keeps_sending_is_served(served: Served) -> None:
     size = 1_000_000
     sent = head("POST", f"/v1/mattes/{served.matte}/composite", Connection="close")
-    begun = time.monotonic()
+    started = time.monotonic()
     with served.connected(sent) as one:
         for _ in range(50):
             one.sendall(bytes(size // 50))
             time.sleep(0.06)
         assert rest(one).startswith(b"HTTP/1.1 422")
-    assert time.monotonic() - begun > 2 * PATIENCE
+    assert time.monotonic() - started > 2 * CHECK_SECONDS
 
 
-def test_a_stream_of_events_that_has_nothing_to_say_lives_on(served: Served) -> None:
-    made = httpx2.post(f"http://127.0.0.1:{served.port}/v1/programs", json={"preset": "sketch"}).json()
-    with served.connected(get(f"/v1/programs/{made['id']}/events")) as one:
+def test_stream_without_events_stays_open(served: Served) -> None:
+    program = httpx2.post(f"http://127.0.0.1:{served.port}/v1/programs", json={"preset": "sketch"}).json()
+    with served.connected(get(f"/v1/programs/{program['id']}/events")) as one:
         assert one.recv(12) == b"HTTP/1.1 200"
-        time.sleep(4 * PATIENCE)
+        time.sleep(4 * CHECK_SECONDS)
         assert served.count == 1
 
 

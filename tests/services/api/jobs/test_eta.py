@@ -1,4 +1,4 @@
-"""When a job will have succeeded, as the ledger tells it."""
+"""Time until a job succeeds, from the rows of a database."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,7 +25,7 @@ def engine(tmp_path: Path) -> Iterator[Engine]:
 
 
 def running(connection: Connection, kind: str, done: int, plan: dict[str, Any] = PLAN, **values: Any) -> str:
-    """A job of ten tiles, at a second each: its pace is measured from time 0 and tile 0 on."""
+    """A job with ten tiles of one second each, whose pace is measured from time 0 and tile 0 on."""
     job = jobs.add(connection, kind, "a-capture", {})
     tiles.add_steps(connection, job)
     jobs.enter_stage(connection, job, "reading")
@@ -37,7 +37,7 @@ def running(connection: Connection, kind: str, done: int, plan: dict[str, Any] =
 
 
 def ended(connection: Connection, finishing: float, plan: dict[str, Any] = PLAN) -> None:
-    """An ingest that has succeeded, its last step after some seconds."""
+    """Add an ingest that has succeeded, with the duration of its last step."""
     job = running(connection, "ingest", 10, plan)
     tiles.mark_done(connection, job, [(FINISH, finishing, 0)])
     jobs.end(connection, job, "succeeded")
@@ -47,7 +47,7 @@ def left(connection: Connection, job: str, now: float) -> float | None:
     return seconds_left(connection, jobs.get(connection, job), now)
 
 
-def test_a_recovery_goes_on_at_its_pace(engine: Engine) -> None:
+def test_recovery_continues_at_its_pace(engine: Engine) -> None:
     with writing(engine) as c:
         job = running(c, "recover", 2)
         assert left(c, job, 2.0) == pytest.approx(8)
@@ -56,7 +56,7 @@ def test_a_recovery_goes_on_at_its_pace(engine: Engine) -> None:
         assert left(c, running(c, "recover", 2, paced_at=None), 2.0) is None
 
 
-def test_an_ingest_has_a_step_after_its_tiles(engine: Engine) -> None:
+def test_ingest_has_a_step_after_its_tiles(engine: Engine) -> None:
     with writing(engine) as c:
         assert left(c, running(c, "ingest", 2), 2.0) == pytest.approx(8 + FINISHING)
         job = running(c, "ingest", 10, stage="finishing", stage_at=10.0)
@@ -65,10 +65,10 @@ def test_an_ingest_has_a_step_after_its_tiles(engine: Engine) -> None:
         assert left(c, running(c, "ingest", 10), 11.0) == pytest.approx(FINISHING)
 
 
-def test_that_step_takes_what_it_took_others(engine: Engine) -> None:
+def test_last_step_takes_as_long_as_in_earlier_ingests(engine: Engine) -> None:
     with writing(engine) as c:
         job = running(c, "ingest", 10)
-        ended(c, 60.0)  # the first on a machine compiles, and is no measure
+        ended(c, 60.0)  # the first one on a machine compiles kernels, so it must not count much
         assert left(c, job, 11.0) == pytest.approx(FINISHING)
         ended(c, 3.0)
         assert left(c, job, 11.0) == pytest.approx(3.0)

@@ -1,4 +1,4 @@
-"""Mattes that nothing was filmed for, as archives."""
+"""Archives of synthetic mattes."""
 
 from pathlib import Path
 
@@ -11,9 +11,9 @@ from storage.objects.store import Objects
 
 
 def archive(folder: Path, width: int, height: int) -> bytes:
-    """The archive of a matte of noise, which no picture file packs, and through which no light comes."""
+    """The archive of an opaque matte of noise, which no picture format can compress."""
     objects = Objects(folder.as_uri())
-    made = mattes.create(
+    matte = mattes.create(
         objects,
         "plain",
         width=width,
@@ -25,13 +25,13 @@ def archive(folder: Path, width: int, height: int) -> bytes:
         options={"method": "lobes"},
     )
     rng = np.random.default_rng(0)
-    for row in range(made.block_rows):
-        for column in range(made.block_columns):
-            shape = tuple(span.stop - span.start for span in made.span(row, column))
+    for row in range(matte.block_rows):
+        for column in range(matte.block_columns):
+            shape = tuple(span.stop - span.start for span in matte.span(row, column))
             S = rng.random((*shape, 3), np.float32)
             flags, zero = np.ones(shape, bool), np.zeros(shape, np.float32)
             empty = np.zeros(0, np.uint32), np.zeros(0, np.float32)
-            made.write(
+            matte.write(
                 row, column, Block(S, 0 * S, zero, flags, ~flags, np.zeros(S.shape, np.uint32), *empty)
             )
     return b"".join(Archive(objects, "plain"))

@@ -1,4 +1,4 @@
-"""Ranges of a video: whatever is asked for, there is an answer."""
+"""Ranges of a video: every Range header has an answer."""
 
 import pytest
 
@@ -14,12 +14,12 @@ from services.api.mattes.clips import _span
         ("bytes=-0", (10, 10)),
         ("bytes=20-", (20, 10)),
         (f"bytes={10**18 - 1}-", (10**18 - 1, 10)),
-        (f"bytes={'9' * 5000}-", (0, 10)),  # more digits than Python makes a number of
+        (f"bytes={'9' * 5000}-", (0, 10)),  # more digits than Python converts to an int
         (f"bytes=-{'9' * 5000}", (0, 10)),
         (f"bytes=0-{'9' * 5000}", (0, 10)),
         ("bytes=0-1,3-4", (0, 10)),
         ("bytes=-", (0, 10)),
     ],
 )
-def test_what_a_range_asks_for(text: str, span: tuple[int, int]) -> None:
+def test_range_is_parsed(text: str, span: tuple[int, int]) -> None:
     assert _span(text, 10) == span

@@ -1,4 +1,4 @@
-"""Webhooks that are named beside a body which is no JSON: the app, a real ledger and a real store."""
+"""Webhooks given in the query, beside a body that is not JSON: the app with a real database and store."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +16,7 @@ from tests.parts.captures import nested_program
 from workflows.simulation import glass_ball
 from workflows.simulation.scene import write_capture
 
-URL = "http://127.0.0.1:9/told?by=envmatte"
+URL = "http://127.0.0.1:9/webhook?by=envmatte"
 ZIP = {"Content-Type": "application/zip"}
 VIDEO = {"Content-Type": "video/mp4"}
 
@@ -31,7 +31,7 @@ def engine(tmp_path: Path) -> Iterator[Engine]:
 
 
 @pytest.fixture
-def bundle(tmp_path: Path) -> bytes:
+def archive(tmp_path: Path) -> bytes:
     program = nested_program(bands=((8, 6, 16),), levels=2)
     write_capture(glass_ball.glass_ball(24, 16, rays=1), program, tmp_path / "ball.zip")
     return (tmp_path / "ball.zip").read_bytes()
@@ -49,30 +49,30 @@ def webhook_of(engine: Engine, job: str) -> str | None:
         return jobs.get(c, job).webhook
 
 
-def test_captures_and_clips_take_one(engine: Engine, bundle: bytes, tmp_path: Path) -> None:
+def test_captures_and_clips_take_a_webhook(engine: Engine, archive: bytes, tmp_path: Path) -> None:
     http = client(engine, tmp_path, private=True)
-    for told in ({"webhook": URL}, {}):
-        capture = http.post("/v1/captures", content=bundle, headers=ZIP, params=told)
-        assert webhook_of(engine, capture.json()["job"]) == told.get("webhook")
-        clip = http.post("/v1/mattes/m/composite", content=b"clip", headers=VIDEO, params=told)
+    for query in ({"webhook": URL}, {}):
+        capture = http.post("/v1/captures", content=archive, headers=ZIP, params=query)
+        assert webhook_of(engine, capture.json()["job"]) == query.get("webhook")
+        clip = http.post("/v1/mattes/m/composite", content=b"clip", headers=VIDEO, params=query)
         assert clip.status_code == 202
-        assert webhook_of(engine, clip.json()["id"]) == told.get("webhook")
+        assert webhook_of(engine, clip.json()["id"]) == query.get("webhook")
         assert clip.json()["options"].keys() == {"transfer", "placement"}
 
 
-def test_an_address_that_is_not_public_is_refused(engine: Engine, bundle: bytes, tmp_path: Path) -> None:
-    http, told = client(engine, tmp_path, private=False), {"webhook": URL.replace("http:", "https:")}
+def test_private_address_is_refused(engine: Engine, archive: bytes, tmp_path: Path) -> None:
+    http, query = client(engine, tmp_path, private=False), {"webhook": URL.replace("http:", "https:")}
     for url, body, headers in (
-        ("/v1/captures", bundle, ZIP),
+        ("/v1/captures", archive, ZIP),
         ("/v1/mattes/m/composite", b"clip", VIDEO),
     ):
-        answer = http.post(url, content=body, headers=headers, params=told)
+        answer = http.post(url, content=body, headers=headers, params=query)
         assert (answer.status_code, answer.json()["field"]) == (422, "webhook")
     assert http.get("/v1/jobs").json() == {"jobs": []}
     assert [path for path in (tmp_path / "store").rglob("*") if path.is_file()] == []
 
 
-def test_a_still_has_no_job_to_tell_of(engine: Engine, tmp_path: Path) -> None:
+def test_still_takes_no_webhook(engine: Engine, tmp_path: Path) -> None:
     answer = client(engine, tmp_path, private=True).post(
         "/v1/mattes/m/composite", content=b"picture", params={"webhook": URL}
     )

@@ -1,4 +1,4 @@
-"""Figures and the cluster from a ledger alone: what is counted, and by how many short queries."""
+"""Metrics and the state of the cluster, from the rows of a database, with few short queries."""
 
 import time
 from collections.abc import Iterator
@@ -36,7 +36,7 @@ def client(engine: Engine, tmp_path: Path) -> Iterator[TestClient]:
 
 @pytest.fixture
 def job(engine: Engine) -> str:
-    """A recovery of 10 tiles: five done, of which two have gone missing, and one failed."""
+    """A recovery with 10 tiles: five done, of which two are missing from the store, and one failed."""
     with writing(engine) as c:
         ingest = jobs.add(c, "ingest", "a-capture", {})
         captures.add(c, "a-capture", ingest, name="", bytes=123, frames=4, program=PROGRAM)
@@ -52,7 +52,7 @@ def job(engine: Engine) -> str:
     return job
 
 
-def figures(client: TestClient) -> dict[tuple[str, ...], float]:
+def metrics(client: TestClient) -> dict[tuple[str, ...], float]:
     return {
         (sample.name, *(sample.labels[name] for name in sorted(sample.labels))): sample.value
         for family in text_string_to_metric_families(client.get("/metrics").text)
@@ -61,7 +61,7 @@ def figures(client: TestClient) -> dict[tuple[str, ...], float]:
 
 
 def test_tiles_are_counted_by_state(client: TestClient, job: str) -> None:
-    found = figures(client)
+    found = metrics(client)
     tiles = {s: found["envmatte_tiles", "recover", s] for s in ("queued", "done", "failed", "missing")}
     assert tiles == {"queued": 4, "done": 3, "failed": 1, "missing": 2}
     assert found["envmatte_tile_seconds_count", "recover"] == 5
@@ -73,23 +73,23 @@ def test_tiles_are_counted_by_state(client: TestClient, job: str) -> None:
     assert found["envmatte_capture_bytes", "ingesting"] == 123
 
 
-def test_without_a_coordinator_there_is_trouble(client: TestClient, engine: Engine) -> None:
-    assert figures(client)[("envmatte_trouble",)] == 1
-    assert ("envmatte_coordinator_last_sign_seconds",) not in figures(client)
+def test_trouble_is_reported_without_a_coordinator(client: TestClient, engine: Engine) -> None:
+    assert metrics(client)[("envmatte_trouble",)] == 1
+    assert ("envmatte_coordinator_last_sign_seconds",) not in metrics(client)
     assert "no coordinator" in client.get("/v1/cluster").json()["problem"]
     with writing(engine) as c:
         token = leases.acquire(c, "a-host:1")
         assert token is not None
-    assert figures(client)[("envmatte_trouble",)] == 0
+    assert metrics(client)[("envmatte_trouble",)] == 0
     found = client.get("/v1/cluster").json()
     assert (found["coordinator"]["holder"], found["problem"]) == ("a-host:1", None)
     with writing(engine) as c:
         leases.renew(c, token, {"workers": [], "problem": "no worker is connected"})
-    assert figures(client)[("envmatte_trouble",)] == 1
+    assert metrics(client)[("envmatte_trouble",)] == 1
     assert client.get("/v1/cluster").json()["problem"] == "no worker is connected"
 
 
-def test_memory_without_limit_has_none(client: TestClient, engine: Engine) -> None:
+def test_memory_limit_is_null_if_one_worker_has_none(client: TestClient, engine: Engine) -> None:
     worker = {"address": "tls://a:1", "name": "a", "threads": 1, "memory_bytes": 5, "memory_limit_bytes": 7}
     with writing(engine) as c:
         token = leases.acquire(c, "a-host:1")
@@ -97,10 +97,10 @@ def test_memory_without_limit_has_none(client: TestClient, engine: Engine) -> No
         leases.renew(c, token, {"workers": [worker, worker | {"memory_limit_bytes": None}], "problem": None})
     found = client.get("/v1/cluster").json()
     assert (found["memory_bytes"], found["memory_limit_bytes"], found["threads"]) == (10, None, 2)
-    assert figures(client)[("envmatte_workers_memory_bytes",)] == 10
+    assert metrics(client)[("envmatte_workers_memory_bytes",)] == 10
 
 
-def test_the_queue_has_what_is_to_do_and_its_pace(client: TestClient, engine: Engine, job: str) -> None:
+def test_queue_counts_tiles_and_measures_their_pace(client: TestClient, engine: Engine, job: str) -> None:
     queue = client.get("/v1/cluster").json()["queue"]
     assert (queue["jobs_queued"], queue["jobs_running"], queue["tiles_to_do"]) == (2, 1, 6)
     assert queue["tiles_per_second"] is None
@@ -110,12 +110,12 @@ def test_the_queue_has_what_is_to_do_and_its_pace(client: TestClient, engine: En
     assert client.get("/v1/cluster").json()["queue"]["tiles_per_second"] == pytest.approx(0.5, rel=0.05)
 
 
-def test_no_query_goes_over_all_tiles(client: TestClient, engine: Engine, job: str) -> None:
-    """However many jobs there are it takes the same few, and of tiles only those that an index leads to."""
-    asked: list[tuple[str, object]] = []
-    event.listen(engine, "before_cursor_execute", lambda *a: asked.append((a[2], a[3])))
+def test_few_queries_and_none_scans_all_tiles(client: TestClient, engine: Engine, job: str) -> None:
+    """The number of queries does not depend on the number of jobs, and tiles are read through an index."""
+    executed: list[tuple[str, object]] = []
+    event.listen(engine, "before_cursor_execute", lambda *a: executed.append((a[2], a[3])))
     client.get("/metrics")
-    queries = [(query, given) for query, given in asked if query.startswith("SELECT")]
+    queries = [(query, given) for query, given in executed if query.startswith("SELECT")]
     assert len(queries) <= 8
     with engine.connect() as c:
         for query, given in queries:

@@ -1,4 +1,4 @@
-"""The address for other devices, and what to do where there is none."""
+"""The address for other devices, or what to do if there is none."""
 
 from pathlib import Path
 
@@ -12,12 +12,12 @@ from storage.objects.store import Objects
 from storage.records import api_keys
 
 
-@pytest.mark.parametrize("has", ["no key", "a key of the settings", "a key of the database"])
-def test_on_loopback_it_says_how_to_start_with_a_key(tmp_path: Path, has: str) -> None:
+@pytest.mark.parametrize("keys", ["no key", "a key of the settings", "a key of the database"])
+def test_loopback_service_says_how_to_become_reachable(tmp_path: Path, keys: str) -> None:
     engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
-    settings = Settings(data=tmp_path, keys="given" if has == "a key of the settings" else ())
+    settings = Settings(data=tmp_path, keys="given" if keys == "a key of the settings" else ())
     key = "given"
-    if has == "a key of the database":
+    if keys == "a key of the database":
         with writing(engine) as c:
             key = api_keys.create(c, "lab", "alice", "read")
     app = build_app(settings, engine, Objects((tmp_path / "store").as_uri()))
@@ -28,6 +28,6 @@ def test_on_loopback_it_says_how_to_start_with_a_key(tmp_path: Path, has: str) -
     )
     engine.dispose()
     assert answer["url"] is None
-    assert "127.0.0.1 alone" in answer["problem"]
+    assert "127.0.0.1 only" in answer["problem"]
     assert "`envmatte serve --host 0.0.0.0`" in answer["problem"]
-    assert ("envmatte keys make" in answer["problem"]) == (has == "no key")
+    assert ("envmatte keys make" in answer["problem"]) == (keys == "no key")

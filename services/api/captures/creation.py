@@ -1,0 +1,184 @@
+"""Creating captures over HTTP: from a capture archive as the body, or from a finished upload."""
+
+from typing import Annotated, Any
+
+import anyio.to_thread
+from fastapi import APIRouter, Query, Request, Response
+from pydantic import BaseModel, ConfigDict, Field
+from sqlalchemy import Connection, Row
+
+from services.api.captures.captures import Capture
+from services.api.context import Context, OwnerContext
+from services.api.http.bodies import read_json, schema_of, store_as_upload, upload_limit
+from services.api.http.idempotency import IdempotencyKey, find_earlier, idempotent
+from services.api.http.media_types import JSON, ZIP, media_type_of
+from services.api.quotas import admit, admit_upload
+from services.runtime import tracing
+from services.runtime.problems import WrongMediaType
+from services.webhooks.sender import check_webhook
+from storage.database.engine import reading, writing
+from storage.database.rows import new_id
+from storage.errors import CaptureError, Conflict, NotFound
+from storage.layout import uploads as stored_uploads
+from storage.layout.uploads import Part
+from storage.records import captures, jobs, uploads
+from workflows.ingest.archive import CaptureArchive
+
+router = APIRouter(tags=["captures"])
+CALL = "POST /v1/captures"
+FROM_UPLOAD_BYTES = 1 << 16
+
+
+class FromUpload(BaseModel):
+    """A finished upload to create a capture from."""
+
+    model_config = ConfigDict(extra="forbid")
+    upload: str
+    name: str = Field("", max_length=200)
+    webhook: str | None = Field(
+        None, description="URL, https, that is notified when the capture is ingested."
+    )
+
+
+@router.post(
+    "/captures",
+    status_code=201,
+    openapi_extra={
+        "requestBody": {
+            "content": {
+                ZIP: {"schema": {"type": "string", "format": "binary"}},
+                JSON: {"schema": schema_of(FromUpload)},
+            }
+        }
+    },
+)
+async def upload(
+    context: OwnerContext,
+    request: Request,
+    response: Response,
+    name: Annotated[str, Query(max_length=200, description="A name for people.")] = "",
+    webhook: Annotated[
+        str | None, Query(description="URL, https, that is notified when the capture is ingested.")
+    ] = None,
+    idempotency_key: IdempotencyKey = None,
+) -> Capture:
+    """Create a capture. The body is its ZIP, in the format envmatte-capture/1, or names the upload that holds the ZIP.
+
+    `name` and `webhook` of the query are for a ZIP; JSON has its own.
+    """
+    media_type = media_type_of(request)
+    if media_type == JSON:
+        given = await read_json(request, FromUpload, FROM_UPLOAD_BYTES)
+        row = await anyio.to_thread.run_sync(
+            _from_upload, context, given, idempotency_key, limiter=context.captures
+        )
+    elif media_type == ZIP:
+        row = await _from_body(context, request, name, idempotency_key, webhook)
+    else:
+        raise WrongMediaType(
+            f"send the ZIP of a capture as {ZIP}, not as {media_type or 'nothing'}, or the id of a finished upload "
+            f"as {JSON}"
+        )
+    response.headers["Location"] = f"/v1/captures/{row.id}"
+    return Capture.of(row)
+
+
+async def _from_body(
+    context: Context, request: Request, name: str, key: str | None, webhook: str | None
+) -> Row[Any]:
+    """Stream the archive into the store and create its capture; if anything fails, nothing is kept."""
+    await anyio.to_thread.run_sync(check_webhook, webhook, context.settings)  # may resolve the URL's host
+    limit = upload_limit(context.settings)
+    length = limit.check_announced(request)
+    earlier = await anyio.to_thread.run_sync(_find_earlier, context, key)
+    if earlier is not None:
+        return earlier
+    await anyio.to_thread.run_sync(_admit, context, length)
+    capture = new_id()
+    try:
+        parts = [await store_as_upload(request, context.objects, capture, limit)]
+        args = context, capture, parts, name, key, False, webhook
+        row = await anyio.to_thread.run_sync(_register, *args, limiter=context.captures)
+    except Exception:
+        # Not when cancelled: `_register` may still be running in its thread. Then the next start removes the bytes.
+        await anyio.to_thread.run_sync(stored_uploads.remove, context.objects, capture)
+        raise
+    if row.id != capture:  # a concurrent request with the same key was quicker
+        await anyio.to_thread.run_sync(stored_uploads.remove, context.objects, capture)
+    return row
+
+
+def _from_upload(context: Context, given: FromUpload, key: str | None) -> Row[Any]:
+    """Create a capture from a finished upload, with the same id; a repeated request is answered with it."""
+    upload = given.upload
+    check_webhook(given.webhook, context.settings)
+    earlier = _find_earlier(context, key)
+    if earlier is not None:
+        return earlier
+    with reading(context.engine) as c:
+        if captures.exists(c, upload):
+            return captures.get(c, upload)
+        row = uploads.get(c, upload)
+        parts = uploads.parts_of(c, upload)
+    if row.offset < row.length:
+        raise Conflict(
+            f"upload {upload} has {row.offset} of its {row.length} bytes; send the rest first",
+            offset=row.offset,
+        )
+    try:
+        return _register(context, upload, parts, given.name, key, True, given.webhook)
+    except (CaptureError, NotFound, FileNotFoundError) as error:
+        with writing(context.engine) as c:
+            if captures.exists(c, upload):  # a concurrent request was quicker
+                return captures.get(c, upload)
+            uploads.get(c, upload)
+            if isinstance(error, CaptureError):  # it would be refused again
+                uploads.delete(c, upload)
+        if isinstance(error, CaptureError):
+            stored_uploads.remove(context.objects, upload)
+        raise
+
+
+def _find_earlier(context: Context, key: str | None) -> Row[Any] | None:
+    return find_earlier(context.engine, key, CALL, captures.get)
+
+
+def _admit(context: Context, length: int) -> None:
+    with reading(context.engine) as c:
+        admit_upload(c, context.settings, context.objects, length, captures=1, jobs=1)
+
+
+def _register(
+    context: Context,
+    capture: str,
+    parts: list[Part],
+    name: str,
+    key: str | None,
+    resumable: bool,
+    webhook: str | None,
+) -> Row[Any]:
+    """Check a complete archive, and add the rows of its capture and of the ingest job."""
+    context.check_key()
+    stored_uploads.seal(context.objects, capture, parts)
+    with stored_uploads.read(context.objects, capture) as file:
+        manifest = CaptureArchive(file, context.settings.limits).manifest
+
+    def create(c: Connection) -> str:
+        if resumable and not uploads.delete(c, capture):
+            raise NotFound(f"upload {capture} does not exist any more")
+        size = sum(part.size for part in parts)
+        admit(c, context.settings, captures=1, jobs=1, size=size)
+        job = jobs.add(c, "ingest", capture, {}, trace=tracing.asked_by(), webhook=webhook)
+        captures.add(
+            c,
+            capture,
+            job,
+            name=name or manifest.name,
+            seconds=context.settings.capture_seconds,
+            bytes=size,
+            frames=len(manifest.frames) or manifest.program.count,
+            program=manifest.program.model_dump(mode="json"),
+        )
+        return capture
+
+    return idempotent(context.engine, key, CALL, captures.get, create)

@@ -1,0 +1,90 @@
+"""Parameters of a composite, as a request gives them."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from storage.errors import OptionError
+from workflows.composite.placement import Placement
+
+Distance = Annotated[float, Field(ge=1e-6, le=1e6)]
+"""In any unit. Far beyond these limits rays overflow."""
+
+
+class CompositeParams(BaseModel):
+    """What of a composite to compute, and how."""
+
+    model_config = ConfigDict(extra="forbid")
+    transfer: Literal["srgb", "linear"] = Field(
+        "srgb", description="How the backdrop, and an answer of 8 or 16 bits, encode light."
+    )
+    x: int = Field(0, ge=0, description="First column of a crop, in pixels of the matte.")
+    y: int = Field(0, ge=0, description="First row of the crop.")
+    width: int | None = Field(None, ge=1, description="Width of the crop; by default up to the edge.")
+    height: int | None = Field(None, ge=1, description="Height of the crop; by default up to the edge.")
+    size: int | None = Field(
+        None, ge=1, description="Longer side of the answer in pixels, to scale it down. Never scales up."
+    )
+    quality: int = Field(90, ge=1, le=100, description="Quality of a JPEG.")
+    right: float = Field(
+        0, ge=-100, le=100, description="Moves the backdrop to the right, in widths of the monitor."
+    )
+    down: float = Field(0, ge=-100, le=100, description="Moves the backdrop down, in heights of the monitor.")
+    scale: float = Field(1, ge=0.01, le=100, description="Enlarges the backdrop by this factor.")
+    angle: float = Field(0, ge=-360, le=360, description="Turns the backdrop, in degrees clockwise.")
+
+    depth: Distance | None = Field(
+        None, description="Distance of the backdrop from the object, if it is not where the monitor was."
+    )
+    distance: Distance | None = Field(
+        None, description="Distance of the monitor from the object in the capture, in the same unit."
+    )
+    camera: Distance | None = Field(None, description="Distance of the camera from the object.")
+    other: str | None = Field(
+        None,
+        description="In place of `camera`: a matte of the same object, with the monitor at another distance.",
+    )
+    other_distance: Distance | None = Field(
+        None, description="Distance of the monitor in that other capture."
+    )
+    webhook: str | None = Field(
+        None, description="For a clip: URL, https, that is notified when the job has ended."
+    )
+
+    @model_validator(mode="after")
+    def _depth_is_complete(self) -> "CompositeParams":
+        given = [
+            name
+            for name in ("distance", "camera", "other", "other_distance")
+            if getattr(self, name) is not None
+        ]
+        complete = given in (["distance", "camera"], ["distance", "other", "other_distance"])
+        if (self.depth is not None) != bool(given) or (given and not complete):
+            raise ValueError(
+                "a backdrop at another depth takes depth, distance and camera, or depth, distance, other and "
+                "other_distance"
+            )
+        if self.other_distance is not None and self.other_distance == self.distance:
+            raise ValueError("the two distances must differ")
+        return self
+
+    @property
+    def placement(self) -> Placement | None:
+        """Where the backdrop is; None if it is where the monitor was."""
+        placement = Placement(self.right, self.down, self.scale, self.angle)
+        return None if placement == Placement() else placement
+
+    def clip_options(self) -> dict[str, Any]:
+        """The options of a clip's job.
+
+        Raises
+        ------
+        OptionError
+            If a parameter is given that only stills have.
+        """
+        placement = {"right": self.right, "down": self.down, "scale": self.scale, "angle": self.angle}
+        for name in self.model_fields_set - placement.keys() - {"transfer", "webhook"}:
+            raise OptionError(
+                f"{name} is for stills: a clip takes transfer, {', '.join(placement)}", field=name
+            )
+        return {"transfer": self.transfer, "placement": placement}

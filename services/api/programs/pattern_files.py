@@ -1,0 +1,86 @@
+"""Pictures and videos of pattern programs over HTTP, drawn for each request, and the page that plays a program."""
+
+import os
+import tempfile
+from collections.abc import AsyncIterator
+from contextlib import ExitStack
+from typing import IO, Annotated
+
+import anyio.to_thread
+from fastapi import APIRouter, Depends, Query, Response
+from fastapi.responses import FileResponse, StreamingResponse
+
+from services.api.context import OwnerContext
+from services.api.http.responses import FromFile, answered
+from services.api.system.pages import HEADERS, WEB
+from storage.database.engine import reading
+from storage.errors import NotFound
+from storage.records import programs
+from workflows.programs import video
+from workflows.programs.files import archive, pictures, png
+from workflows.programs.program import Program
+
+router = APIRouter(tags=["programs"])
+page = APIRouter(tags=["programs"])
+
+
+def _read(context: OwnerContext, id: str) -> Program:
+    with reading(context.engine) as c:
+        return Program.model_validate(programs.get(c, id).program)
+
+
+Stored = Annotated[Program, Depends(_read)]
+
+
+@router.get("/programs/{id}/patterns/{n}.png", response_class=Response)
+async def get_pattern(context: OwnerContext, program: Stored, n: int) -> Response:
+    """A pattern as the monitor shows it."""
+    if not 0 <= n < program.count:
+        raise NotFound(f"this program has the patterns 0 to {program.count - 1}", field="n")
+
+    def draw() -> Response:
+        return answered(png(next(pictures(program, n, n + 1))), "image/png")
+
+    return await anyio.to_thread.run_sync(draw, limiter=context.pictures)
+
+
+@router.get("/programs/{id}/patterns.zip", response_class=StreamingResponse)
+async def get_patterns(context: OwnerContext, program: Stored) -> StreamingResponse:
+    """`program.json` and a numbered PNG of each pattern, drawn while they are sent."""
+    parts = archive(program)
+
+    async def stream() -> AsyncIterator[bytes]:
+        while part := await anyio.to_thread.run_sync(next, parts, b"", limiter=context.pictures):
+            yield part
+
+    return StreamingResponse(stream(), media_type="application/zip")
+
+
+@router.get("/programs/{id}/patterns.mp4", response_class=StreamingResponse)
+async def get_film(
+    context: OwnerContext,
+    program: Stored,
+    rate: Annotated[
+        float, Query(ge=video.SLOWEST, le=video.FASTEST, description="Patterns per second.")
+    ] = 2.0,
+) -> StreamingResponse:
+    """A video of the lead-in, the patterns in a border, and the lead-out. It is encoded before the answer begins."""
+
+    def encode() -> tuple[IO[bytes], int]:
+        with ExitStack() as stack:
+            file = stack.enter_context(tempfile.TemporaryFile())
+            video.encode(program, file, rate)
+            size = file.seek(0, os.SEEK_END)
+            file.seek(0)
+            stack.pop_all()  # the answer closes it
+        return file, size
+
+    file, size = await anyio.to_thread.run_sync(encode, limiter=context.films)
+    return FromFile(file, size, "video/mp4")
+
+
+@page.get("/programs/{id}/play", response_class=FileResponse)
+def get_page(id: str) -> FileResponse:
+    """The page that plays a program full screen. The page itself needs no key: it fetches the program, and asks the
+    user for a key if that takes one."""
+    return FileResponse(WEB / "play" / "play.html", media_type="text/html", headers=HEADERS)
