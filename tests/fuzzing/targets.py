@@ -20,7 +20,7 @@ from starlette.requests import Request
 
 from services.api.captures import tus
 from services.api.http.media_types import preferred, require_media_type
-from services.api.http.responses import is_known
+from services.api.http.responses import etag_matches
 from services.api.mattes import clips as clips_api
 from services.api.mattes import composites as composites_api
 from services.runtime.problems import problem_of
@@ -390,7 +390,7 @@ def read_headers(data: bytes, folder: Path) -> None:
     start, end = clips_api._span(request.headers.get("range", ""), 1000)
     assert start >= 0
     assert start >= 1000 or start < end <= 1000
-    is_known(request.headers, '"abc"')
+    etag_matches(request.headers, '"abc"')
     TRACEPARENT.fullmatch(request.headers.get("traceparent", ""))
     readers: dict[str, Callable[[], object]] = {
         "upload-checksum": lambda: tus.Checksum.of(request),

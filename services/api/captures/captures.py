@@ -8,7 +8,7 @@ from pydantic import BaseModel
 from sqlalchemy import Row
 
 from services.api.context import OwnerContext
-from services.api.http.responses import answered, time_of
+from services.api.http.responses import bytes_response, utc_time
 from services.api.http.types import After, Limit
 from storage.database.engine import reading, writing
 from storage.database.rows import page
@@ -50,7 +50,7 @@ class Capture(BaseModel):
             },
             report=f"/v1/captures/{row.id}/report" if row.state == "ready" else None,
             created_at=datetime.fromtimestamp(row.created_at, UTC),
-            expires_at=time_of(row.expires_at),
+            expires_at=utc_time(row.expires_at),
         )
 
 
@@ -102,4 +102,4 @@ def get_frame(context: OwnerContext, id: str, n: int) -> Response:
     if not 0 <= n < row.frames:
         raise NotFound(f"capture {id} has the frames 0 to {row.frames - 1}", field="n")
     frame = Stack(context.objects, id).read(frames=slice(n, n + 1))[0]
-    return answered(encode_png(frame), "image/png")
+    return bytes_response(encode_png(frame), "image/png")

@@ -3,7 +3,7 @@
 from fastapi import APIRouter, Response
 
 from services.api.context import Context, OwnerContext
-from services.api.http.responses import answered
+from services.api.http.responses import bytes_response
 from storage.database.engine import reading
 from storage.errors import Conflict
 from storage.layout.captures import Stack
@@ -24,7 +24,7 @@ def get_report(context: OwnerContext, id: str) -> Report:
 @router.get("/captures/{id}/contact-sheet.png", response_class=Response)
 def get_contact_sheet(context: OwnerContext, id: str) -> Response:
     """Some of a capture's frames in one picture: red where they are clipped at white, blue where clipped at black."""
-    return answered(contact_sheet(_stack(context, id)), "image/png")
+    return bytes_response(contact_sheet(_stack(context, id)), "image/png")
 
 
 def _stack(context: Context, id: str) -> Stack:

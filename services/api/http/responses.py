@@ -15,7 +15,7 @@ MEMORY_BYTES = 1 << 18
 """The largest answer kept in memory while it is sent, and the size of the pieces read from a file."""
 
 
-def answered(data: bytes, media_type: str, headers: dict[str, str] | None = None) -> Response:
+def bytes_response(data: bytes, media_type: str, headers: dict[str, str] | None = None) -> Response:
     """A response from bytes. Large ones go through a temporary file, so that many slow clients take little memory.
 
     It may write to a disk, so don't call it in the event loop.
@@ -27,10 +27,10 @@ def answered(data: bytes, media_type: str, headers: dict[str, str] | None = None
         file.write(data)
         file.seek(0)
         stack.pop_all()  # the response closes it
-    return FromFile(file, len(data), media_type, headers)
+    return FileStreamResponse(file, len(data), media_type, headers)
 
 
-class FromFile(StreamingResponse):
+class FileStreamResponse(StreamingResponse):
     """A response that streams a file and closes it, also when the connection breaks."""
 
     def __init__(
@@ -51,11 +51,11 @@ class FromFile(StreamingResponse):
             self._file.close()
 
 
-def time_of(seconds: float | None) -> datetime | None:
+def utc_time(seconds: float | None) -> datetime | None:
     """A time in the database as a time in an answer."""
     return None if seconds is None else datetime.fromtimestamp(seconds, UTC)
 
 
-def is_known(headers: Headers, tag: str) -> bool:
+def etag_matches(headers: Headers, tag: str) -> bool:
     """Whether the caller already has the answer with an entity tag (If-None-Match, RFC 9110, sect. 13.1.2)."""
     return tag in [text.strip() for text in headers.get("if-none-match", "").split(",")]

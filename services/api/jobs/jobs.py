@@ -11,7 +11,7 @@ from sqlalchemy import Connection, Row
 from services.api.context import OwnerContext
 from services.api.http.bodies import read_json, schema_of
 from services.api.http.idempotency import IdempotencyKey, idempotent
-from services.api.http.responses import time_of
+from services.api.http.responses import utc_time
 from services.api.http.types import After, Limit
 from services.api.jobs.eta import seconds_left
 from services.api.jobs.wait_reason import reason
@@ -109,8 +109,8 @@ class Job(BaseModel):
             if row.kind == "composite" and row.state == "succeeded"
             else None,
             created_at=datetime.fromtimestamp(row.created_at, UTC),
-            started_at=time_of(row.started_at),
-            finished_at=time_of(row.finished_at),
+            started_at=utc_time(row.started_at),
+            finished_at=utc_time(row.finished_at),
         )
 
 

@@ -17,7 +17,7 @@ from services.api.context import Context, OwnerContext
 from services.api.errors import answer as answer_problem
 from services.api.http.bodies import spool_body
 from services.api.http.media_types import preferred
-from services.api.http.responses import answered, is_known
+from services.api.http.responses import bytes_response, etag_matches
 from services.api.jobs.jobs import Job
 from services.api.mattes import clips
 from services.api.mattes.composite_params import CompositeParams
@@ -146,7 +146,7 @@ def _answer(
     inputs = f"{state.id} {sorted(state.blocks or ())} {media_type} {params.model_dump_json()} ".encode()
     tag = f'"{hashlib.blake2b(inputs + hashlib.blake2b(data).digest(), digest_size=16).hexdigest()}"'
     extra = {"ETag": tag, "Envmatte-Recovered": f"{state.share:.4f}"}
-    if is_known(headers, tag):
+    if etag_matches(headers, tag):
         return answer_problem(
             problem_of(NotNeeded(f"the caller already has this composite: {tag}")), {"ETag": tag}
         )
@@ -166,7 +166,7 @@ def _answer(
     if params.size is not None:
         picture = shrink(picture, params.size)
     answer = timed("encode", lambda: _encoded(picture, backdrop, media_type, params))
-    return answered(answer, media_type, extra | {"Server-Timing": ", ".join(times)})
+    return bytes_response(answer, media_type, extra | {"Server-Timing": ", ".join(times)})
 
 
 def _rays(context: Context, state: MatteState, params: CompositeParams) -> Rays:

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel
 
 from services.api.context import Context, OwnerContext
-from services.api.http.responses import answered, is_known
+from services.api.http.responses import bytes_response, etag_matches
 from services.api.http.types import Colour, Pair
 from storage.database.engine import reading
 from storage.errors import InvalidInput, NotFound
@@ -93,13 +93,13 @@ async def get_layer(
 
     matte = await anyio.to_thread.run_sync(_matte, context, id)
     tag = {"ETag": f'"{id}-{file}-{lobes}"'}  # a matte never changes once it is ready
-    if is_known(request.headers, tag["ETag"]):
+    if etag_matches(request.headers, tag["ETag"]):
         return Response(status_code=304, headers=tag)
 
     def encode() -> Response:
         kind = MEDIA_TYPES[file.rpartition(".")[2]]
         if file != ALL:
-            return answered(FILES[file](matte), kind, tag)
+            return bytes_response(FILES[file](matte), kind, tag)
         size = layers.bytes_of_everything(matte.width, matte.height, lobes)
         if size > MOST_BYTES:
             raise InvalidInput(
@@ -108,7 +108,7 @@ async def get_layer(
                 field="lobes",
                 limit=MOST_BYTES,
             )
-        return answered(layers.everything(matte, lobes), kind, tag)
+        return bytes_response(layers.everything(matte, lobes), kind, tag)
 
     return await anyio.to_thread.run_sync(encode, limiter=context.layers)
 

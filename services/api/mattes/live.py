@@ -6,7 +6,7 @@ import anyio.to_thread
 from fastapi import APIRouter, Request, Response
 
 from services.api.context import OwnerContext
-from services.api.http.responses import answered, is_known
+from services.api.http.responses import bytes_response, etag_matches
 from storage.database.engine import reading
 from storage.errors import Corrupt, NoRoom
 from storage.layout import live as stored_live
@@ -44,10 +44,10 @@ async def get_live(context: OwnerContext, id: str, request: Request) -> Response
                 raise
             with suppress(NoRoom):  # the answer needs no room, and it can be encoded again
                 stored_live.write(context.objects, id, encode.FORMAT, encoded)
-        return answered(encoded, "application/octet-stream", tag | {"Content-Encoding": "gzip"})
+        return bytes_response(encoded, "application/octet-stream", tag | {"Content-Encoding": "gzip"})
 
     await anyio.to_thread.run_sync(require_ready)
     tag = {"ETag": f'"{id}-{encode.FORMAT}"'}  # a matte never changes once it is ready
-    if is_known(request.headers, tag["ETag"]):
+    if etag_matches(request.headers, tag["ETag"]):
         return Response(status_code=304, headers=tag)
     return await anyio.to_thread.run_sync(load, limiter=context.layers)

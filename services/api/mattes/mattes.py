@@ -8,7 +8,7 @@ from pydantic import BaseModel
 from sqlalchemy import Row
 
 from services.api.context import OwnerContext
-from services.api.http.responses import time_of
+from services.api.http.responses import utc_time
 from services.api.http.types import After, Limit, Pair
 from storage.database.engine import reading, writing
 from storage.database.rows import page
@@ -43,7 +43,7 @@ class Matte(BaseModel):
             **{name: getattr(row, name) for name in ("id", "state", "capture", "job", "options")},
             **figures,
             created_at=datetime.fromtimestamp(row.created_at, UTC),
-            expires_at=time_of(row.expires_at),
+            expires_at=utc_time(row.expires_at),
         )
 
 

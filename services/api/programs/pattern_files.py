@@ -11,7 +11,7 @@ from fastapi import APIRouter, Depends, Query, Response
 from fastapi.responses import FileResponse, StreamingResponse
 
 from services.api.context import OwnerContext
-from services.api.http.responses import FromFile, answered
+from services.api.http.responses import FileStreamResponse, bytes_response
 from services.api.system.pages import HEADERS, WEB
 from storage.database.engine import reading
 from storage.errors import NotFound
@@ -39,7 +39,7 @@ async def get_pattern(context: OwnerContext, program: Stored, n: int) -> Respons
         raise NotFound(f"this program has the patterns 0 to {program.count - 1}", field="n")
 
     def draw() -> Response:
-        return answered(png(next(pictures(program, n, n + 1))), "image/png")
+        return bytes_response(png(next(pictures(program, n, n + 1))), "image/png")
 
     return await anyio.to_thread.run_sync(draw, limiter=context.pictures)
 
@@ -76,7 +76,7 @@ async def get_film(
         return file, size
 
     file, size = await anyio.to_thread.run_sync(encode, limiter=context.films)
-    return FromFile(file, size, "video/mp4")
+    return FileStreamResponse(file, size, "video/mp4")
 
 
 @page.get("/programs/{id}/play", response_class=FileResponse)
