@@ -103,6 +103,7 @@ def test_upload_report_recovery_and_composite(tab: Page, service: Service, ball:
     assert 10 * np.log10(255**2 / error) > 28
 
 
+@pytest.mark.slow
 def test_backdrop_moves_by_mouse_and_keys(tab: Page, service: Service, ready: tuple[str, str]) -> None:
     tab.goto(f"{service.url}/#/mattes/{ready[1]}")
     status = tab.get_by_text("exact")
@@ -143,6 +144,7 @@ def test_backdrop_moves_by_mouse_and_keys(tab: Page, service: Service, ready: tu
         assert download.value.path().read_bytes().startswith(magic)
 
 
+@pytest.mark.slow
 def test_layers_and_lobes_of_a_pixel(tab: Page, service: Service, ready: tuple[str, str]) -> None:
     tab.goto(f"{service.url}/#/mattes/{ready[1]}")
     for name in ("S", "alpha", "confidence", "rho"):
@@ -163,6 +165,7 @@ def test_layers_and_lobes_of_a_pixel(tab: Page, service: Service, ready: tuple[s
     expect(tab.get_by_alt_text("pixel (0, 0)")).to_be_visible()
 
 
+@pytest.mark.slow
 def test_layers_for_other_tools_are_downloaded(tab: Page, service: Service, ready: tuple[str, str]) -> None:
     tab.goto(f"{service.url}/#/mattes/{ready[1]}")
     for name in ("all.exr", "stmap.exr"):
@@ -173,6 +176,7 @@ def test_layers_for_other_tools_are_downloaded(tab: Page, service: Service, read
         assert download.value.path().read_bytes() == wanted
 
 
+@pytest.mark.slow
 def test_matte_is_downloaded_and_deleted_items_are_gone(
     tab: Page, service: Service, ready: tuple[str, str], ball: Path
 ) -> None:
@@ -198,6 +202,7 @@ def test_matte_is_downloaded_and_deleted_items_are_gone(
         assert service.http.get(f"/v1/{kind}/{id}").status_code == 404
 
 
+@pytest.mark.slow
 def test_expiry_dates_are_shown(
     browser: Browser, tab: Page, service: Service, ready: tuple[str, str], ball: Path, tmp_path: Path
 ) -> None:

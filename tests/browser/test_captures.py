@@ -19,6 +19,8 @@ from workflows.images import integer_formats
 from workflows.programs.program import Program
 from workflows.simulation import glass_ball
 
+pytestmark = pytest.mark.slow
+
 RATE = 4
 
 

@@ -20,6 +20,8 @@ from tests.parts.captures import nested_program
 from workflows.simulation import glass_ball
 from workflows.simulation.scene import write_capture
 
+pytestmark = pytest.mark.slow
+
 SIZE = 96, 72
 MINUTE = 60_000
 READY = "This browser draws the glass while you move"

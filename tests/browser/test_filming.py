@@ -3,11 +3,14 @@
 import re
 from pathlib import Path
 
+import pytest
 from playwright.sync_api import Browser, Page, Route, expect
 
 from tests.browser.pages import MINUTE, PHONE, ZIP, asks_before_closing, opened
 from tests.end_to_end.conftest import Service
 from workflows.programs.program import Program
+
+pytestmark = pytest.mark.slow
 
 SCREEN = {"width": 640, "height": 360}
 SHORT = {

@@ -10,6 +10,8 @@ from playwright.sync_api import Browser, Page, expect
 from tests.browser.pages import MINUTE
 from tests.end_to_end.conftest import Service, paused, serving
 
+pytestmark = pytest.mark.slow
+
 
 def test_invalid_option_is_explained(desk: Page, service: Service, ready: tuple[str, str]) -> None:
     desk.goto(f"{service.url}/#/captures/{ready[0]}")

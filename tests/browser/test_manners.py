@@ -12,6 +12,8 @@ from playwright.sync_api import Browser, Page, expect
 from tests.browser.pages import PHONE, is_fitting, opened
 from tests.end_to_end.conftest import Service
 
+pytestmark = pytest.mark.slow
+
 WEB = Path(__file__).parents[2] / "services" / "web"
 SERIOUS = ("serious", "critical")
 SHIFTS = """

@@ -17,6 +17,8 @@ from tests.browser.pages import MINUTE, ZIP, asks_before_closing, opened
 from tests.end_to_end.conftest import Service, paused, serving
 from tests.parts.disks import small_disk
 
+pytestmark = pytest.mark.slow
+
 DISK = 48 << 20
 
 

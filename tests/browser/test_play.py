@@ -26,6 +26,8 @@ from workflows.programs.border import (
 from workflows.programs.files import pictures
 from workflows.programs.program import Program
 
+pytestmark = pytest.mark.slow
+
 SCREEN = {"width": 640, "height": 360}
 DISPLAYS = [(640, 360), (1920, 1080), (1080, 1920), (3440, 1440), (161, 121), (90, 60), (200, 5000)]
 NUMBERS = [LEAD, 0, 1, 62, 63, 64, 1023, MAX_PATTERNS - 1]

@@ -125,6 +125,7 @@ def test_a_worker_is_ended_before_kubernetes_ends_its_pod() -> None:
     assert 0.95 * int(environment("envmatte-worker")["ENVMATTE_WORKER_MEMORY"]) < limit - (200 << 20)
 
 
+@pytest.mark.slow
 def test_its_commands_make_a_cluster_and_its_probes_find_it_well(tmp_path: Path) -> None:
     certs = tmp_path / "certs"
     make(certs)

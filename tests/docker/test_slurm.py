@@ -20,7 +20,7 @@ from workflows.programs.presets import preset
 from workflows.simulation import glass_ball
 from workflows.simulation.scene import write_capture
 
-pytestmark = pytest.mark.timeout(600)
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 SCRIPT = Path(__file__).parents[2] / "docker" / "slurm.sh"
 CONFIGURATION = """

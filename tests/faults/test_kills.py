@@ -41,6 +41,7 @@ def test_a_killed_scheduler(known: Known, table: list[Row], times: int) -> None:
     check(table, row)
 
 
+@pytest.mark.slow
 def test_a_killed_service_that_drives(known: Known, table: list[Row], times: int) -> None:
     rig = known.rig
     row = known.disturb("SIGKILL of API and coordinator", lambda: rig.restart(rig.driver()), times)
@@ -66,6 +67,7 @@ def test_a_frozen_worker(known: Known, table: list[Row]) -> None:
     check(table, row)
 
 
+@pytest.mark.slow
 def test_a_cancelled_job_frees_its_workers_and_what_it_wrote(known: Known) -> None:
     rig = known.rig
     # One tile of nn-dgsr that takes minutes.

@@ -53,6 +53,7 @@ def test_a_decoder_that_is_killed_costs_one_request(service: Service, matte: str
     assert asked(service, matte).content == expected
 
 
+@pytest.mark.slow
 def test_a_decoder_that_hangs_is_given_up_and_others_are_answered_meanwhile(
     service: Service, matte: str
 ) -> None:
@@ -69,6 +70,7 @@ def test_a_decoder_that_hangs_is_given_up_and_others_are_answered_meanwhile(
         wait(lambda: not running([one]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("end", "environment"),
     [("terminate", {}), ("kill", {}), ("kill", {"ENVMATTE_COORDINATE": "false"})],
@@ -93,6 +95,7 @@ def taken_at_most(one: psutil.Process) -> int:
     return int(found[1]) << 10
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="it is Linux that limits what a process takes")
 def test_a_film_that_takes_all_memory_to_decode_fails_alone(
     bundle: Path, program: Program, tmp_path: Path

@@ -63,6 +63,7 @@ def sha256(file: Path) -> str:
         return hashlib.file_digest(source, "sha256").hexdigest()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", SIZES)
 def test_the_client_outlives_a_hundred_cuts(
     service: Service, bundle: Path, tmp_path: Path, size: int
@@ -153,6 +154,7 @@ def test_a_server_that_is_killed_costs_nothing(bundle: Path, tmp_path: Path) -> 
             assert not uploads_of(second)
 
 
+@pytest.mark.slow
 def test_an_interrupted_command_goes_on_when_called_again(
     service: Service, bundle: Path, tmp_path: Path
 ) -> None:
@@ -259,6 +261,7 @@ upload.start();
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [{}, {"chunk": 50_000}, {"chunk": 50_000, "during": True}, {"chunk": 50_000, "stop": True}],

@@ -211,6 +211,7 @@ def test_what_is_refused(service: Service) -> None:
     assert service.http.delete(where, headers=TUS).status_code == 204
 
 
+@pytest.mark.slow
 def test_the_quota_is_told_before_the_first_byte(tmp_path: Path, bundle: Path) -> None:
     limit = 1 << 58
     with serving(tmp_path / "data", "--workers", "1", ENVMATTE_UPLOAD_BYTES=str(limit)) as service:
@@ -234,6 +235,7 @@ def test_the_quota_is_told_before_the_first_byte(tmp_path: Path, bundle: Path) -
         assert service.stored() == set()
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_up_is_told_and_loses_nothing(tmp_path: Path) -> None:
     with (
         small_disk(tmp_path / "disk", 48 << 20) as disk,
@@ -392,6 +394,7 @@ def test_one_that_is_deleted_is_gone(service: Service) -> None:
     assert uploads_of(service) <= before  # of which some may have been ingested meanwhile
 
 
+@pytest.mark.slow
 def test_one_that_nobody_goes_on_with_expires(tmp_path: Path) -> None:
     with serving(tmp_path / "data", "--workers", "1", ENVMATTE_UPLOAD_SECONDS="2") as service:
         unfinished, finished = create(service, 10), create(service, 3)

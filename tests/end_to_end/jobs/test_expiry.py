@@ -21,6 +21,7 @@ def disk(service: Service) -> int:
     return used
 
 
+@pytest.mark.slow
 def test_what_has_expired_leaves_the_disk_and_what_a_job_needs_does_not(bundle: Path, tmp_path: Path) -> None:
     """Both expire while they are made, long before the recovery begins, and it succeeds all the same."""
     with serving(

@@ -76,6 +76,7 @@ def test_a_server_killed_during_ingest_goes_on(
         assert files_of(second, job["matte"]) == files_of(service, matte)
 
 
+@pytest.mark.slow
 def test_the_bytes_do_not_depend_on_tiles_or_workers(
     service: Service, matte: str, bundle: Path, tmp_path: Path
 ) -> None:
@@ -121,6 +122,7 @@ def test_a_cancelled_ingest_leaves_nothing(service: Service, capture: str, bundl
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 def test_an_ingest_that_failed_for_no_fault_of_the_capture_can_be_retried(
     bundle: Path, tmp_path: Path
 ) -> None:
@@ -185,6 +187,7 @@ def test_a_damaged_matte_is_said_to_be_damaged(service: Service, capture: str) -
         (folder / name).write_bytes(data)
 
 
+@pytest.mark.slow
 def test_a_tile_that_always_fails_fails_its_job_and_retry_goes_on(
     service: Service, matte: str, bundle: Path
 ) -> None:

@@ -38,6 +38,7 @@ def lines(service: Service, job: str) -> list[str]:
     return [line["text"] for line in log if "webhook" in line["text"]]
 
 
+@pytest.mark.slow
 def test_what_fails_first_comes_over_a_kill_and_signed(bundle: Path, tmp_path: Path) -> None:
     with receiver(lambda n: 500 if n == 0 else 200) as found:
         with serving(tmp_path / "data", "--workers", "1", **ALLOWED) as first:

@@ -38,6 +38,7 @@ def archive(service: Service, matte: str, tmp_path_factory: pytest.TempPathFacto
     return path
 
 
+@pytest.mark.slow
 def test_a_matte_comes_to_another_service_as_it_was(
     service: Service, elsewhere: Service, matte: str, tmp_path: Path
 ) -> None:
@@ -78,6 +79,7 @@ def test_the_answer_is_a_file_with_a_name_and_a_size(service: Service, matte: st
     check_problem(service.http.get("/v1/mattes/none/archive"), 404, "not-found")
 
 
+@pytest.mark.slow
 def test_a_repeat_with_the_same_key_makes_nothing_twice(elsewhere: Service, archive: Path) -> None:
     headers = ZIP | {"Idempotency-Key": "once"}
     first, again = (
@@ -94,6 +96,7 @@ def test_a_repeat_with_the_same_key_makes_nothing_twice(elsewhere: Service, arch
     assert elsewhere.stored() == set()
 
 
+@pytest.mark.slow
 def test_what_lies_is_refused_and_leaves_nothing(elsewhere: Service, archive: Path, tmp_path: Path) -> None:
     with zipfile.ZipFile(archive) as file:
         files = {name: file.read(name) for name in file.namelist()}
@@ -157,6 +160,7 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "matte.zip"
 
 
+@pytest.mark.slow
 def test_a_matte_deleted_while_it_is_sent_ends_the_connection(
     elsewhere: Service, large: Path, tmp_path: Path
 ) -> None:

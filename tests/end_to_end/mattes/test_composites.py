@@ -240,6 +240,7 @@ def test_a_bomb_is_refused_before_it_goes_off(service: Service, matte: str) -> N
     assert "cut off or damaged" in cut["detail"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "requests", [600, pytest.param(10_000, marks=[pytest.mark.exhaustive, pytest.mark.timeout(3600)])]
 )

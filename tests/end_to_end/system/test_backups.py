@@ -24,6 +24,7 @@ def tiles_done(service: Service, job: str) -> int:
     return int(service.client.job(job)["tiles"]["done"])
 
 
+@pytest.mark.slow
 def test_a_job_that_ran_is_finished_where_the_backup_is_restored(
     bundle: Path, s3: str, postgresql_server: Server, tmp_path: Path
 ) -> None:

@@ -35,6 +35,7 @@ def answer(connection: socket.socket) -> bytes:
     return came
 
 
+@pytest.mark.slow
 def test_thousands_that_say_nothing_keep_nobody_out_and_are_closed(service: Service) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     count = min(10_000, hard - 1000)  # of this process, and as many of the service's own
@@ -65,6 +66,7 @@ def test_thousands_that_say_nothing_keep_nobody_out_and_are_closed(service: Serv
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
+@pytest.mark.slow
 def test_a_head_that_comes_byte_by_byte_is_not_waited_for(service: Service) -> None:
     begun = time.monotonic()
     with connected(service) as (slow,):

@@ -308,6 +308,7 @@ def test_the_same_program_is_kept_for_each_owner(locked: Locked) -> None:
     check_problem(http.get(url, headers=bearer(locked.keys["other"])), 404, "not-found")
 
 
+@pytest.mark.slow
 def test_a_revoked_key_ends_what_goes_on(locked: Locked, bundle: Path) -> None:
     service, data = locked.service, locked.service.data
     made = command(data, "make", "passing", "--owner", "carol", "--json")

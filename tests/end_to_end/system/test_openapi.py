@@ -156,6 +156,7 @@ def made_in(answers: Counter[str]) -> set[str]:
     return {call for call, status in MAKING.items() if answers[f"{call} {status}"]}
 
 
+@pytest.mark.slow
 def test_a_few_calls_of_each_route(bundle: Path, tmp_path: Path) -> None:
     """What fits into every run: the same few each time."""
     with serving(tmp_path / "data", "--workers", "1", ENVMATTE_KEYS=SECRET) as service:

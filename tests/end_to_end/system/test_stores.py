@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import pytest
+
 from services.runtime import certificates
 from storage.objects.store import Objects
 from tests.end_to_end.conftest import Service, digests, serving
@@ -9,6 +11,7 @@ from tests.faults.rig import stored
 from tests.services.cluster.clusters import address, started
 
 
+@pytest.mark.slow
 def test_a_matte_is_the_same_in_a_bucket_and_in_a_folder(
     service: Service, matte: str, bundle: Path, s3: str, tmp_path: Path
 ) -> None:

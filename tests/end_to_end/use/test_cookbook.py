@@ -15,6 +15,7 @@ from pathlib import Path
 import av
 import httpx2
 import numpy as np
+import pytest
 
 from services.client import Client
 from tests.end_to_end.conftest import Service, png
@@ -60,6 +61,7 @@ def test_the_tasks() -> None:
     assert "curl" not in "".join(RECIPES.values())
 
 
+@pytest.mark.slow
 def test_from_a_film_to_a_folder_of_composites(service: Service, tmp_path: Path) -> None:
     show, pack = (block.replace("1920x1080", "320x240") for block in blocks("Film"))
     within = {"cwd": tmp_path, "env": environment(service.url), "check": True, "timeout": 240}
@@ -121,6 +123,7 @@ def free_port() -> int:
         return int(taken.getsockname()[1])
 
 
+@pytest.mark.slow
 def test_three_machines(bundle: Path, tmp_path: Path) -> None:
     port = free_port()
     first, others = (

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 
+@pytest.mark.slow
 def test_the_demo_leaves_its_picture(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "services", "demo", "-o", "picture.png", "--keep", "kept", "--json"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=280)
@@ -23,6 +24,7 @@ def test_the_demo_leaves_its_picture(tmp_path: Path) -> None:
     assert "done" in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends a process with its parent")
 def test_the_service_of_one_that_is_killed_ends(tmp_path: Path) -> None:
     script = (

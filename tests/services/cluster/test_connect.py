@@ -214,6 +214,7 @@ def test_of_tasks_that_are_over_next_to_nothing_is_kept(cluster: Cluster, client
     assert sum(client.run(counted).values()) < before + 50
 
 
+@pytest.mark.slow
 def test_memory_has_an_end_and_a_task_that_takes_it_all_is_blamed_at_once(
     cluster: Cluster, client: Client, tmp_path: Path
 ) -> None:
@@ -234,6 +235,7 @@ def test_memory_has_an_end_and_a_task_that_takes_it_all_is_blamed_at_once(
         wait(lambda: workers(process) and workers(process) != before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_workers_that_are_asked_to_end_leave_nothing(
     cluster: Cluster, client: Client, tmp_path: Path, number: signal.Signals
@@ -255,6 +257,7 @@ def test_workers_that_are_asked_to_end_leave_nothing(
     assert "Traceback" not in cluster.log[-2000:]
 
 
+@pytest.mark.slow
 def test_workers_that_are_still_starting_end_when_they_are_asked(cluster: Cluster, tmp_path: Path) -> None:
     with working(cluster.folder, cluster.address, "--workers", "2", TMPDIR=str(tmp_path)) as process:
         wait(lambda: len(workers(process)) == 2)
@@ -265,6 +268,7 @@ def test_workers_that_are_still_starting_end_when_they_are_asked(cluster: Cluste
         wait(lambda: not running(tree))
 
 
+@pytest.mark.slow
 def test_workers_die_with_their_nanny(cluster: Cluster, client: Client) -> None:
     with working(cluster.folder, cluster.address, "--workers", "2") as process:
         wait(lambda: len(client.nthreads()) == WORKERS + 2)
@@ -285,6 +289,7 @@ def test_waiting_workers_end_when_they_are_asked(folder: Path, number: signal.Si
         assert process.wait(60) == (0 if number == signal.SIGTERM else 130)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_scheduler_ends_when_it_is_asked(folder: Path, number: signal.Signals) -> None:
     with scheduling(folder, host="127.0.0.1") as process:

@@ -235,6 +235,7 @@ with writing(open_engine(sys.argv[1])) as connection:
 """
 
 
+@pytest.mark.slow
 def test_a_writer_that_is_frozen_is_shut_out(postgresql: str) -> None:
     engine = open_engine(postgresql)
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}

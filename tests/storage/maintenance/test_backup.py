@@ -177,6 +177,7 @@ def test_what_is_deleted_or_ends_meanwhile(
             assert jobs.get(c, "ii").state == "succeeded"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["flipped", "gone"])
 def test_what_is_damaged_is_no_backup(engine: Engine, furnished: Objects, target: Objects, how: str) -> None:
     path = "mattes/m/S/c/1/2/0"
@@ -188,6 +189,7 @@ def test_what_is_damaged_is_no_backup(engine: Engine, furnished: Objects, target
     assert target.names("") == []
 
 
+@pytest.mark.slow
 def test_only_into_what_is_empty(
     engine: Engine, furnished: Objects, target: Objects, elsewhere: tuple[Engine, Objects]
 ) -> None:

@@ -53,6 +53,7 @@ def test_all_is_as_it_was_written(engine: Engine, furnished: Objects) -> None:
     assert told[-1] == (1.0, report.read["bytes"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("url", ["sqlite"], indirect=True)
 def test_a_bit_of_any_object_is_found(engine: Engine, furnished: Objects) -> None:
     paths = [path for path in contents(furnished) if not NOT_READ.match(path)]

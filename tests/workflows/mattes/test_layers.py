@@ -168,6 +168,7 @@ def recomposite(channels: Layers, crosstalk: NDArray[np.float64], backdrop: NDAr
     return S + (rho * arrived) @ crosstalk.T
 
 
+@pytest.mark.slow
 def test_a_recomposite_from_the_exr_alone_is_as_close_to_the_truth(
     objects: Objects, ingest: Callable[..., object]
 ) -> None:

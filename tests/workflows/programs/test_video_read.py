@@ -35,8 +35,8 @@ def prepared(folder: Path) -> Stack:
     return Stack(objects, "c")
 
 
-@pytest.mark.parametrize("name", ["default", "quick", "sketch"])
-@pytest.mark.parametrize("size", [(384, 288), (640, 480)], ids=str)
+@pytest.mark.parametrize("name", [pytest.param("default", marks=pytest.mark.slow), "quick", "sketch"])
+@pytest.mark.parametrize("size", [(384, 288), pytest.param((640, 480), marks=pytest.mark.slow)], ids=str)
 def test_every_pattern_is_found(name: str, size: tuple[int, int], tmp_path: Path) -> None:
     program = fitted(name, size, bordered=True)
     video.write(program, tmp_path / "film.mp4", RATE, lambda done, of: None)
@@ -48,7 +48,7 @@ def test_every_pattern_is_found(name: str, size: tuple[int, int], tmp_path: Path
     np.testing.assert_array_equal(shown, at)
 
 
-@pytest.mark.parametrize("name", ["default", "quick"])
+@pytest.mark.parametrize("name", [pytest.param("default", marks=pytest.mark.slow), "quick"])
 def test_the_film_of_another_program_is_refused(name: str, tmp_path: Path) -> None:
     video.write(fitted(name, (384, 288), bordered=True), tmp_path / "film.mp4", RATE, lambda done, of: None)
     record = json.loads((tmp_path / "film.json").read_text())

@@ -95,6 +95,7 @@ def rest(connection: socket.socket) -> bytes:
     return received
 
 
+@pytest.mark.slow
 def test_answers_that_nobody_takes_are_held_on_disk_and_given_up(
     served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -128,6 +129,7 @@ def test_client_that_reads_single_bytes_is_disconnected(served: Served) -> None:
         wait(lambda: one.recv(1) and served.count == 0)
 
 
+@pytest.mark.slow
 def test_slow_client_that_keeps_reading_gets_the_whole_answer(served: Served) -> None:
     path = f"/v1/mattes/{served.matte}/archive"
     sent = get(path).replace(b"\r\n\r\n", b"\r\nConnection: close\r\n\r\n")

@@ -131,6 +131,7 @@ def test_what_is_steady_is_left_alone(ingest: Ingest, objects: Objects, digests:
     assert stack.attributes["shifts"] is stack.attributes["gains"] is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ball", "pixels", "jumps", "gain"),
     [
@@ -158,6 +159,7 @@ def test_drift_is_found_and_taken_out(
     assert with_it > without + gain
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ball", "percent", "gain"),
     [pytest.param("default", 3.0, 3, marks=pytest.mark.exhaustive), ("quick", 8.0, 6)],

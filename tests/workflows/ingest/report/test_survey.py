@@ -59,6 +59,7 @@ def test_a_good_capture_is_good(ingest: Ingest, bundle: bytes) -> None:
     assert "no difference to black and white" in found["monitor_curve"].message
 
 
+@pytest.mark.slow
 def test_a_white_that_is_clipped_asks_for_less_exposure(ingest: Ingest, bundle: bytes) -> None:
     made, found = reported(ingest, filmed(bundle, gain=1.3))
     assert made.level == found["exposure"].level == "bad"
@@ -77,12 +78,14 @@ def test_a_dark_white_asks_for_more_exposure(
     assert more in found["exposure"].remedy
 
 
+@pytest.mark.slow
 def test_a_clipped_black_is_found(ingest: Ingest, bundle: bytes) -> None:
     made, found = reported(ingest, filmed(bundle, less=9))
     assert found["black"].level == "bad"
     assert made.clipping.black > 0.9
 
 
+@pytest.mark.slow
 def test_more_noise_and_fewer_patterns_promise_less(ingest: Ingest, bundle: bytes) -> None:
     def promised(data: bytes) -> tuple[float, float]:
         quality = reported(ingest, data)[0].quality
@@ -99,6 +102,7 @@ def test_more_noise_and_fewer_patterns_promise_less(ingest: Ingest, bundle: byte
     assert best[0] < best[1] < 60
 
 
+@pytest.mark.slow
 def test_a_curve_that_is_assumed_is_a_warning(ingest: Ingest, bundle: bytes) -> None:
     made, found = reported(ingest, filmed(bundle, response="unknown"))
     assert made.camera.source == "assumed"

@@ -88,6 +88,7 @@ def wrong(stack: Stack, made: Film, numbers: list[int]) -> list[tuple[int, int]]
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("camera", "corners"),
     [
@@ -122,6 +123,7 @@ def test_every_number_is_read(take: Callable[..., Any], camera: Camera, corners:
     )
 
 
+@pytest.mark.slow
 def test_what_is_cut_out_costs_its_patterns_alone(take: Callable[..., Any]) -> None:
     stack, made, numbers = take(Camera(hold=HOLD, cut=(7.0, 9.0)))
     gone = [numbers[k] for k in np.flatnonzero((made.starts[1:] > 7.0) & (made.starts[:-1] < 9.0))]
@@ -131,6 +133,7 @@ def test_what_is_cut_out_costs_its_patterns_alone(take: Callable[..., Any]) -> N
     assert set(missing) <= set(gone)
 
 
+@pytest.mark.slow
 def test_a_hand_costs_the_patterns_behind_it(take: Callable[..., Any]) -> None:
     stack, made, numbers = take(Camera(hold=HOLD, hand=(7.0, 8.0)))
     behind = [numbers[k] for k in np.flatnonzero((made.starts[1:] > 7.0) & (made.starts[:-1] < 8.0))]
@@ -139,6 +142,7 @@ def test_a_hand_costs_the_patterns_behind_it(take: Callable[..., Any]) -> None:
     assert {pattern for pattern, _ in wrong(stack, made, numbers)} <= set(behind)
 
 
+@pytest.mark.slow
 def test_without_its_sides_in_the_picture_the_times_tell(take: Callable[..., Any]) -> None:
     stack, made, numbers = take(
         Camera(hold=HOLD, jitter=0.02), ((-20, 14), (-18, 156), (240, 24), (235, 150))

@@ -37,6 +37,7 @@ def take(make_zip: Callable[..., bytes], ingest: Callable[..., Any]) -> Callable
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

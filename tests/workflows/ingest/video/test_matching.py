@@ -272,6 +272,7 @@ def test_more_frames_than_are_sorted_are_refused(take: Callable[..., Stack], fil
         take(filmed.data, memory=1 << 20)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="the resident peak is read from Linux's /proc")
 def test_a_long_video_takes_no_more_memory_than_is_allowed(
     make_zip: Zip, put: Callable[[str, bytes], None], objects: Objects, light: list[np.ndarray]
