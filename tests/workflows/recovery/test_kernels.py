@@ -38,8 +38,8 @@ def within(kernel: Dispatcher) -> set[Dispatcher]:
 
 def test_kernels_that_several_others_share_are_compiled_when_they_are_loaded() -> None:
     modules = [
-        importlib.import_module(f"{recovery.__name__}.{found.name}")
-        for found in pkgutil.iter_modules(recovery.__path__)
+        importlib.import_module(found.name)
+        for found in pkgutil.walk_packages(recovery.__path__, f"{recovery.__name__}.")
     ]
     plain = [
         value

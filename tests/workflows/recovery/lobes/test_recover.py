@@ -134,7 +134,7 @@ def test_lobes_that_miss_are_fitted_again(patterns, truth, observe):
     scene = observe(patterns, T)
 
     def error(doubt):
-        found = recovered(patterns, scene, doubt=doubt, steps=4).transport
+        found = recovered(patterns, scene, LobesOptions(doubt=doubt, steps=4)).transport
         return np.mean((dense(patterns, found) - T) ** 2)
 
     assert error(0.01) < 0.8 * error(1.0)
@@ -170,8 +170,8 @@ def test_channels_that_agree_share_a_t(request, colours, shape, truth, observe):
 
 def test_disagreement_says_when(patterns, varied, observe):
     scene = observe(patterns, varied)
-    assert not recovered(patterns, scene, disagreement=0.0).transport.shared.any()
-    assert recovered(patterns, scene, disagreement=1e6).transport.shared.all()
+    assert not recovered(patterns, scene, LobesOptions(disagreement=0.0)).transport.shared.any()
+    assert recovered(patterns, scene, LobesOptions(disagreement=1e6)).transport.shared.all()
 
 
 def test_patterns_improve_s_and_rho(patterns, truth, observe):
@@ -239,7 +239,9 @@ def test_rows_are_clean(patterns, varied, observe):
 @pytest.mark.parametrize("least", [0.0, 1e-3])
 def test_least_weight_says_what_is_kept(patterns, truth, observe, least):
     scene = observe(patterns, truth((33.1, 24.8, 12.0, 8.0)))
-    found = recovered(patterns, scene, least_weight=least, fit_resolution=4.0, resolution=4.0).transport
+    found = recovered(
+        patterns, scene, LobesOptions(least_weight=least, fit_resolution=4.0, resolution=4.0)
+    ).transport
     assert found.weight.min() >= least
     assert found.weight.min() < max(1.2 * least, 1e-4)
 
