@@ -5,6 +5,7 @@ and never unpickled: an attacker who takes over a decoder controls that process,
 """
 
 import ctypes
+import errno
 import gc
 import multiprocessing
 import resource
@@ -167,7 +168,7 @@ def _serve(connection: socket.socket, memory: int) -> None:
             values = memoryview(b"")
             result: _Decoded | Refused
             try:
-                pixels = decode.decode(data, request.transfer, memory=request.memory)
+                pixels = _decode(data, request.transfer, request.memory)
                 height, width, channels = pixels.shape
                 size = {"height": height, "width": width, "channels": channels}
                 result = _Decoded.model_validate(size | {"dtype": pixels.dtype.name})
@@ -182,6 +183,16 @@ def _serve(connection: socket.socket, memory: int) -> None:
                 return
             del values, data
             signal.setitimer(signal.ITIMER_REAL, 0)
+
+
+def _decode(data: bytes, transfer: Transfer, memory: int) -> Codes | Floats:
+    try:
+        return decode.decode(data, transfer, memory=memory)
+    except ImageError as error:
+        if getattr(error.__cause__, "errno", None) != errno.EFBIG:
+            raise
+    # numba has compiled a kernel and may not write it to its cache here. The kernel is in memory now.
+    return decode.decode(data, transfer, memory=memory)
 
 
 def _refusal(error: Exception) -> Refused:

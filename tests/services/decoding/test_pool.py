@@ -1,5 +1,6 @@
 """Pictures decoded in child processes: the same pixels, and children that die, hang, use memory or send garbage."""
 
+import errno
 import io
 import pickle
 import socket
@@ -214,6 +215,22 @@ def test_closed_pool_is_unavailable(decoders: Decoders) -> None:
     assert not children()
     with pytest.raises(Unavailable, match="stopped"):
         decoders.decode(PNG, "srgb")
+
+
+def test_kernel_that_can_not_be_cached_is_used_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a new installation: numba adds a compiled kernel before it fails to write the cache."""
+    real, failures = decode.decode, [errno.EFBIG]
+
+    def failing_once(data: bytes, transfer: decode.Transfer, *, memory: int) -> object:
+        if failures:
+            raise ImageError("the image is damaged") from OSError(failures.pop(), "File too large")
+        return real(data, transfer, memory=memory)
+
+    monkeypatch.setattr(decode, "decode", failing_once)
+    np.testing.assert_array_equal(process._decode(PNG, "srgb", MEMORY), PIXELS)
+    failures.append(errno.EIO)
+    with pytest.raises(ImageError, match="damaged"):
+        process._decode(PNG, "srgb", MEMORY)
 
 
 def test_child_has_resource_limits(decoders: Decoders) -> None:
