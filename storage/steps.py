@@ -1,9 +1,9 @@
-"""The steps of a job that are not tiles."""
+"""The steps of a job besides its tiles: prepare and finish."""
 
 PREPARE, FINISH = -2, -1
-"""The steps before and after a job's tiles: tiles too, of which nobody counts the pixels."""
+"""Numbers of the steps before and after a job's tiles. They are recorded like tiles, but have no pixels."""
 
 
 def step_name(tile: int) -> str:
-    """What people call a tile, or a step around them."""
+    """Name of a tile, or of the step before or after them, for people."""
     return {PREPARE: "preparing", FINISH: "finishing"}.get(tile, f"tile {tile}")

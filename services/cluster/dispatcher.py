@@ -1,8 +1,8 @@
-"""What goes to dask, and what comes back: tiles of jobs, and what became of them.
+"""The dispatcher: submits tiles of jobs to dask, and collects their outcomes.
 
-Nothing here waits for the cluster, but for results that are there already: a thread of its own holds the connection,
-makes it anew whenever it is lost, and looks at the workers. What was under way on a connection that is lost is
-reported as gone. dask's own callbacks are taken for no more than a hint to look.
+Its methods never wait for the cluster, except for results that are already there. A thread of its own holds the
+connection, reconnects whenever it is lost, and watches the workers. Tiles that were under way on a lost connection are
+reported as gone. dask's own callbacks are only hints to look.
 """
 
 import logging
@@ -25,31 +25,33 @@ from workflows.jobs import Steps, Task
 logger = logging.getLogger(__name__)
 
 LOOK = 1.0
-"""Seconds between two looks at the cluster."""
+"""Seconds between two polls of the cluster."""
 ANSWER = 5.0
-"""Seconds that the scheduler has to answer, and a worker to hand over the small result of what is done."""
+"""Seconds that the scheduler has to answer, and a worker to send the small result of a tile."""
 MEMORY = "worker-restart-memory"
-"""The topic under which a nanny tells the scheduler that it ends its worker for the memory that it takes."""
+"""The topic under which a nanny reports to the scheduler that it ends its worker for taking too much memory."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a tile.
+    """What became of a tile that was submitted.
 
     Attributes
     ----------
-    job, tile
-        Whose it is.
+    job : str
+    tile : int
     done : (float, object), optional
         What `workflows.jobs.run` returned.
     error : Exception, optional
-        What it raised.
+        What the tile raised.
     died : str, optional
-        The address of the worker that died of it, as far as can be told.
+        The address of the worker that died while working on it.
     starved : bool
-        Whether that worker was ended because it took more memory than it may.
+        Whether that worker was ended because it exceeded its memory limit.
 
-    Without any of these it is gone for no fault of its own: with its worker, its scheduler or the connection.
+    Notes
+    -----
+    With none of these the tile is gone through no fault of its own: with its worker, its scheduler or the connection.
     """
 
     job: str
@@ -62,7 +64,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Flight:
-    """A tile under way: the ``number`` says in which order they were handed over."""
+    """A tile under way; ``number`` is its place in the order of submission."""
 
     job: str
     tile: int
@@ -70,7 +72,7 @@ class Flight:
 
 
 class Dispatcher:
-    """Hands tiles to a dask cluster.
+    """Submits tiles to a dask cluster.
 
     Parameters
     ----------
@@ -79,7 +81,7 @@ class Dispatcher:
     store : str
         URL of the object store that workers read and write.
     scale : callable, optional
-        Told how many workers are of use, where they can be had for the asking.
+        Is called with the number of tiles to do, if workers of the cluster can be started and stopped.
     """
 
     def __init__(
@@ -92,11 +94,11 @@ class Dispatcher:
         self._flights: dict[Future, Flight] = {}
         self._number = count()
         self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._keep, name="dispatcher")
+        self._thread = threading.Thread(target=self._watch, name="dispatcher")
         self.news = threading.Event()
-        """Set when something may have become of a tile, or of the cluster."""
+        """Set when a tile may have an outcome, or the cluster may have changed."""
         self.cluster: dict[str, Any] = {"workers": [], "problem": "the scheduler has not been reached yet"}
-        """As last seen: the ``workers``, the tiles ``under_way``, and ``problem``, what is wrong in words or None."""
+        """As last seen: ``workers``, the number of tiles ``under_way``, and ``problem``, a sentence or None."""
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -112,55 +114,56 @@ class Dispatcher:
 
     @property
     def threads(self) -> int:
-        """Of all workers."""
+        """Number of threads of all workers."""
         return sum(worker["threads"] for worker in self.cluster["workers"])
 
     @property
     def free(self) -> int:
-        """How many more tiles the cluster is to have: one for each thread.
+        """How many more tiles the cluster can take: it gets one for each thread.
 
-        None waits there: who comes next is decided when a thread is free, and who dies is known to die of what it has.
+        No tile waits there. So the next job is chosen when a thread is free, and a worker that dies had just the tile
+        that it worked on.
         """
         return self.threads - sum(not future.done() for future in self._flights) if self._usable() else 0
 
     def submit(self, steps: Steps, task: Task, tile: int, trace: str | None = None) -> bool:
-        """Hand over a tile, and the trace that it is part of; `collect` says what became of it.
+        """Submit a tile, and the trace that it is part of; `collect` returns its outcome.
 
-        False if it can't be, because the scheduler is being lost.
+        Returns False if the connection to the scheduler is being lost.
         """
         client, number = self._usable(), next(self._number)
         flight = Flight(task.job, tile, number)
         if client is None:
             return False
         key = key_of(steps.kind, task.job, tile)
-        # By default what is submitted within 100 ms of one another runs in any order: `_blamed` goes by this one.
+        # By default tasks submitted within 100 ms run in any order; `_blamed` relies on the order of submission.
         try:
             future = client.submit(
                 run, steps, self._store, task, tile, trace, key=key, pure=False, fifo_timeout="0 ms"
             )
         except Exception as error:
-            logger.warning("nothing can be handed over: %r", error)
+            logger.warning("can't submit a tile: %r", error)
             return False
         self._flights[future] = flight
         future.add_done_callback(lambda _: self.news.set())
         return True
 
     def under_way(self, job: str) -> int:
-        """How many tiles of a job are."""
+        """How many tiles of a job the cluster works on."""
         return sum(flight.job == job for flight in self._flights.values())
 
     def drop(self, job: str) -> None:
-        """Forget a job's tasks; its workers end those that run (`services.cluster.worker_preload`)."""
+        """Cancel the tasks of a job; workers end those that run (`services.cluster.worker_preload`)."""
         dropped = [future for future, flight in self._flights.items() if flight.job == job]
         for future in dropped:
             del self._flights[future]
         client = self._usable()
         if client is not None and dropped:
-            with suppress(Exception):  # a client that is being lost: they are released with it
+            with suppress(Exception):  # if the client is being lost, they are released with it
                 client.cancel(dropped, force=True)
 
     def collect(self) -> list[Outcome]:
-        """What became of tiles since the last call."""
+        """The outcomes of tiles since the last call."""
         ended = {future: self._flights.pop(future) for future in list(self._flights) if future.done()}
         if not ended:
             return []
@@ -178,12 +181,12 @@ class Dispatcher:
         return outcomes + _blamed(dead, self._starved() if dead else ())
 
     def want(self, tiles: int) -> None:
-        """Say how many tiles there are to do, those under way included."""
+        """Announce how many tiles there are to do, those under way included."""
         if self._scale is not None:
             self._scale(tiles)
 
     def _results(self, finished: list[Future]) -> dict[Future, tuple[float, Any]]:
-        """The results of those that are done, as far as they can still be had."""
+        """The results of tasks that are finished, as far as they can still be fetched."""
         client = self._usable()
         if client is None or not finished:
             return {}
@@ -191,27 +194,27 @@ class Dispatcher:
             return dict(
                 zip(finished, client.sync(client._gather, finished, callback_timeout=ANSWER), strict=True)
             )
-        except Exception as error:  # a worker that is gone, or frozen: what it had is done again
-            logger.warning("%d results can't be had: %r", len(finished), error)
+        except Exception as error:  # a worker is gone, or frozen: its tiles are done again
+            logger.warning("can't fetch %d results: %r", len(finished), error)
             return {}
 
     def _starved(self) -> set[str]:
-        """The workers that were ended for their memory, as far as their nannies have told the scheduler."""
+        """The workers that were ended for their memory, as reported by their nannies to the scheduler."""
         client: Any = self._usable()
         if client is None:
             return set()
         try:
-            told = client.sync(client.scheduler.events, topic=MEMORY, callback_timeout=ANSWER)
+            events = client.sync(client.scheduler.events, topic=MEMORY, callback_timeout=ANSWER)
         except Exception as error:
-            logger.warning("what workers died of can't be had: %r", error)
+            logger.warning("can't fetch why workers died: %r", error)
             return set()
-        return {event["worker"] for _, event in told}
+        return {event["worker"] for _, event in events}
 
     def _usable(self) -> Client | None:
         client = self._client
         return client if client is not None and client.status == "running" else None
 
-    def _keep(self) -> None:
+    def _watch(self) -> None:
         while True:
             cluster = self._look()
             changed = cluster["problem"] != self.cluster["problem"] or self.threads != sum(
@@ -257,22 +260,22 @@ def _worker(address: str, found: dict[str, Any]) -> dict[str, Any]:
 
 
 def _error_of(future: Future) -> Exception | None:
-    """What a tile raised; None if it is gone without."""
+    """What a tile raised; None if it is gone without an error."""
     if future.status != "error":
         return None
     try:
         error = future.exception(timeout=ANSWER)
     except (TimeoutError, CancelledError):
         return None
-    except Exception as unread:  # it can't be read here: it is an error all the same
+    except Exception as unread:  # it can't be unpickled here, but it is an error all the same
         return unread
     return error if isinstance(error, Exception) else None
 
 
 def _blamed(dead: Iterable[tuple[Flight, str]], starved: Container[str] = ()) -> list[Outcome]:
-    """Who is to blame for the death of a worker: the tile that it had.
+    """Outcomes of the tiles of dead workers: each blames the tile that it worked on.
 
-    Where workers go, one may for a moment have two: then the tile that it had got first, for that one ran.
+    While workers come and go, one may have two tiles for a moment. Then the one submitted first ran.
     """
     ran: dict[str, int] = {}
     for flight, address in dead:
@@ -286,6 +289,6 @@ def _blamed(dead: Iterable[tuple[Flight, str]], starved: Container[str] = ()) ->
 
 
 def _close(client: Client) -> None:
-    """Close a client that may have nobody to say goodbye to."""
+    """Close a client whose scheduler may be gone."""
     with suppress(Exception):
         client.close(timeout=1)

@@ -1,4 +1,4 @@
-"""What a dask task runs: a step of a job, known by its ids to the worker's log and to the trace of the request."""
+"""The function that a dask task runs: one step of a job, with its ids in the worker's log and in the trace."""
 
 import logging
 import re
@@ -21,18 +21,18 @@ KEY = re.compile(r"[a-z]+-([0-9a-f]+)-(-?\d+)-[0-9a-f]+")
 
 
 def key_of(kind: str, job: str, tile: int) -> str:
-    """A name for a task, another one each time."""
+    """A key for a dask task, a different one each time."""
     return f"{kind}-{job}-{tile}-{uuid4().hex[:8]}"
 
 
 def read_key(key: str) -> tuple[str, int] | None:
-    """The job and the tile of a task by its name; None if it has another kind of name."""
+    """The job and the tile of a dask task, from its key; None for a key that `key_of` did not make."""
     found = KEY.fullmatch(key)
     return (found[1], int(found[2])) if found else None
 
 
 def run(steps: Steps, store: str, task: Task, tile: int, trace: str | None) -> tuple[float, Any]:
-    """As `workflows.jobs.run`.
+    """Run one step of a job in a worker; returns what `workflows.jobs.run` does.
 
     Parameters
     ----------
@@ -41,14 +41,14 @@ def run(steps: Steps, store: str, task: Task, tile: int, trace: str | None) -> t
     trace : str, optional
         The ``traceparent`` of the request that asked for the job.
     """
-    which = {"tile": tile} if tile >= 0 else {}
+    attributes = {"tile": tile} if tile >= 0 else {}
     name = f"{steps.kind} {NAMES.get(tile, 'tile')}"
-    with about(task.job, tile), tracing.span(name, trace, job=task.job, kind=steps.kind, **which):
+    with about(task.job, tile), tracing.span(name, trace, job=task.job, kind=steps.kind, **attributes):
         try:
             seconds, result = jobs.run(steps, _objects(store), task, tile)
         except EnvmatteError as error:
             logger.warning("failed: %s", error.detail, exc_info=True)
-            # It alone is sent back: an error of a library that it comes of may not survive the way, nor it with that.
+            # Sent back without its cause: an error of a library may not be picklable, and would take this one with it.
             error.__cause__ = error.__context__ = None
             raise
         except Exception:
@@ -60,5 +60,5 @@ def run(steps: Steps, store: str, task: Task, tile: int, trace: str | None) -> t
 
 @lru_cache(maxsize=1)
 def _objects(url: str) -> Objects:
-    """The store of this worker process."""
+    """The object store of this worker process."""
     return Objects(url)

@@ -25,9 +25,9 @@ from storage.errors import InvalidInput
 logger = logging.getLogger(__name__)
 
 PAUSE = 1.0
-"""Seconds between two tries to join, and between two looks whether a worker process is there."""
+"""Seconds between two attempts to join, and between two checks that a worker process is alive."""
 SAY = 30.0
-"""Seconds between two words about a scheduler that does not answer."""
+"""Seconds between two log lines about a scheduler that does not answer."""
 
 
 def work(settings: ClusterSettings, host: str | None) -> None:
@@ -37,12 +37,12 @@ def work(settings: ClusterSettings, host: str | None) -> None:
     ----------
     settings : ClusterSettings
     host : str, optional
-        Address to listen on, for the scheduler and other workers. Default: that by which the scheduler is reached.
+        Address to listen on, for the scheduler and other workers. Default: the one that reaches the scheduler.
 
     Raises
     ------
     InvalidInput
-        If no cluster is named, or it should listen on other than loopback without TLS.
+        If no cluster is named, or it would listen beyond loopback without TLS.
     KeyboardInterrupt
         At SIGINT.
     """
@@ -55,15 +55,15 @@ def work(settings: ClusterSettings, host: str | None) -> None:
     security = settings.security()
     if security is None and not is_loopback(host or "127.0.0.1"):
         raise InvalidInput(
-            f"asked to listen on {host} without TLS, where whoever reaches it may run what he likes: name a scheduler "
-            "that speaks TLS with --cluster tls://HOST:PORT, or listen on 127.0.0.1"
+            f"without TLS, anyone who reaches {host} could run arbitrary code on this machine. Name a scheduler that "
+            "has TLS with --cluster tls://HOST:PORT, or listen on 127.0.0.1"
         )
     start_forkserver(PRELOAD)
     run_until_signal(_Workers(settings.cluster, security, settings, host).running())
 
 
 class _Workers:
-    """Nannies in this process, each with a worker process of its own that it starts again when it dies."""
+    """Nannies in this process. Each has a worker process, which it restarts when it dies."""
 
     def __init__(
         self, scheduler: str, security: Security | None, settings: ClusterSettings, host: str | None
@@ -88,25 +88,23 @@ class _Workers:
                     task.cancel()
                 await asyncio.gather(*kept, return_exceptions=True)
                 for process in multiprocessing.active_children():
-                    process.kill()  # a nanny that has not started yet can't end its own
+                    process.kill()  # a nanny that is still starting can't end its own
 
     async def _keep(self, scratch: str) -> None:
-        """Have one nanny, and another one whenever it ends, as it does with its scheduler."""
+        """Keep one nanny running: start another when it ends, as it does when its scheduler does."""
         while not self._ending:
             await self._find_scheduler()
             try:
-                await self._have_nanny(scratch)
+                await self._run_nanny(scratch)
             except Exception as error:
-                if (
-                    self._ending
-                ):  # closing a nanny that has not started fails, and takes the place of the cancellation
+                if self._ending:  # closing a nanny that is starting raises in place of the cancellation
                     return
                 logger.warning("a worker could not join %s: %r; trying again", self._scheduler, error)
             await asyncio.sleep(PAUSE)
 
     async def _find_scheduler(self) -> None:
         """Wait until the scheduler answers, for ever."""
-        async with self._looking:  # one after another, so that it is said once
+        async with self._looking:  # one nanny at a time, so that it is logged once
             while True:
                 try:
                     await reach(self._scheduler, self._security, "worker")
@@ -121,11 +119,11 @@ class _Workers:
                         self._said_at = -SAY
                     return
 
-    async def _have_nanny(self, scratch: str) -> None:
+    async def _run_nanny(self, scratch: str) -> None:
         nanny = Nanny(
             self._scheduler,
             nthreads=1,
-            # Without one it would listen on every address that the machine has.
+            # Without a host it would listen on all addresses of the machine.
             host=self._host or _address_towards(self._scheduler),
             security=self._security,
             memory_limit=self._settings.worker_memory,
@@ -140,7 +138,7 @@ class _Workers:
             logger.info("worker %s has joined %s", nanny.worker_address, self._scheduler)
             finished = asyncio.create_task(nanny.finished())
             alive_at = time.monotonic()
-            # A nanny that could not start its process again goes on without one, and would do so for ever.
+            # A nanny that could not restart its process would continue without one for ever.
             while not finished.done() and time.monotonic() - alive_at < 2 * START:
                 await asyncio.wait([finished], timeout=PAUSE)
                 if nanny.is_alive():
@@ -151,7 +149,7 @@ class _Workers:
 
 
 def _address_towards(address: str) -> str:
-    """The address of this machine by which it reaches another; no byte is sent."""
+    """The address of this machine that reaches another machine; nothing is sent."""
     url = urlsplit(address)
     family, kind, protocol, _, there = socket.getaddrinfo(url.hostname, url.port, type=socket.SOCK_DGRAM)[0]
     with socket.socket(family, kind, protocol) as towards:

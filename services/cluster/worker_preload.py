@@ -1,7 +1,8 @@
-"""What dask runs in every worker process at its start: `distributed` calls `dask_setup`.
+"""The start of every worker process: `distributed` imports this module and calls `dask_setup`.
 
-A task can't be stopped, and one that nobody wants any more (its job was cancelled, its coordinator or its scheduler is
-gone) may run on for long, and write what nobody will remove. So its process ends with it, and the nanny starts another.
+dask can't stop a running task. One that is no longer wanted, because its job was cancelled or its coordinator or
+scheduler is gone, could run for long and write files that are never removed. So the worker process ends itself, and its
+nanny starts another.
 """
 
 import logging
@@ -13,7 +14,7 @@ from distributed import Worker
 from distributed.core import Status
 from tornado.ioloop import PeriodicCallback
 
-# All steps, because importing their kernels takes seconds: the first task of a worker must not wait for it.
+# All steps: importing their kernels takes seconds, and the first task of a worker must not wait for it.
 import workflows.composite.video.steps
 import workflows.ingest.steps
 import workflows.mattes.steps  # noqa: F401
@@ -25,22 +26,22 @@ from services.runtime.malloc import limit_arenas
 logger = logging.getLogger(__name__)
 
 LOOK = 0.2
-"""Seconds between two looks at what runs."""
+"""Seconds between two checks of what runs."""
 PATIENCE = 0.5
-"""Seconds that a task may run on after it was cancelled."""
+"""Seconds that a task may continue after it was cancelled."""
 NICE = 10
-"""Of workers: a job takes a while anyway, and who asks for a composite beside it, or uses the machine, won't wait."""
+"""Niceness of workers: a job takes minutes, while composites and other users of the machine should not wait."""
 
 
 def dask_setup(worker: Worker) -> None:
-    """Log and trace, and watch for tasks that nobody wants any more while they run."""
-    os.nice(NICE)  # of this thread, and those that it starts
+    """Configure this worker process, and end it when a task runs that is no longer wanted."""
+    os.nice(NICE)  # of this thread and the ones it starts
     limit_arenas()
     configure_worker_logging()
     tracing.start("worker")
     since: dict[str, float] = {}
 
-    def look() -> None:
+    def end_strays() -> None:
         now = time.monotonic()
         ending = worker.status in (Status.closing, Status.closed)
         strays = {task.key for task in worker.state.executing if ending or task.state == "cancelled"}
@@ -50,8 +51,8 @@ def dask_setup(worker: Worker) -> None:
             if now - since.setdefault(key, now) > PATIENCE:
                 found = read_key(key)
                 with about(*found) if found else nullcontext():
-                    logger.info("nobody wants it any more, and it runs on: ending this process")
+                    logger.info("ending this process: its task was cancelled and still runs")
                 os._exit(1)
 
-    # Not one of the worker's own, which stop as soon as it begins to close.
-    PeriodicCallback(look, 1000 * LOOK).start()
+    # Not one of the worker's own callbacks, which stop when it begins to close.
+    PeriodicCallback(end_strays, 1000 * LOOK).start()

@@ -21,7 +21,7 @@ from sqlalchemy import Connection, Engine, Row
 from services.cluster.dispatcher import Dispatcher
 from services.coordinator.job_kinds import JOB_KINDS
 from services.coordinator.job_run import JobRun, write_failure
-from services.coordinator.retention import count, forget_expired, forget_jobs, remove, sweep
+from services.coordinator.retention import count_bytes, delete_expired, delete_old_jobs, remove, sweep
 from services.runtime.logs import about
 from services.settings import CoordinatorSettings
 from storage.database.engine import reading, writing
@@ -40,8 +40,8 @@ WRITE = 0.25
 """Seconds between two writes of progress, whatever the number of jobs and tiles."""
 DYING = 1.2
 """Seconds until no worker works on a cancelled job any more, see `services.cluster.worker_preload`."""
-FORGET = 30.0
-"""Seconds between two searches for jobs to delete."""
+DELETE = 30.0
+"""Seconds between two searches for old jobs to delete."""
 SWEEP = 3600.0
 """Seconds between two sweeps of the store."""
 
@@ -70,7 +70,7 @@ class Coordinator:
         self._discards: deque[tuple[float, Row[Any]]] = deque()
         """Jobs whose files are to be removed: the earliest time, and the job's row."""
         self._troubles: Counter[str] = Counter()
-        self._beat_at = self._forgot_at = self._swept_at = self._wrote_at = self._read_at = -1e9
+        self._beat_at = self._deleted_at = self._swept_at = self._wrote_at = self._read_at = -1e9
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._loop, name="coordinator")
         self._housekeeping = ThreadPoolExecutor(1, thread_name_prefix="housekeeping")
@@ -126,17 +126,17 @@ class Coordinator:
             logger.info("%s runs the jobs from now on", self._name)
         with self._writing() as c:
             leases.renew(c, self._token, self._dispatcher.cluster)
-            expired = forget_expired(c)
+            expired = delete_expired(c)
         for path in expired:
             self._housekeeping.submit(_logged, remove, self._objects, path)
-        if now - self._forgot_at > FORGET:
-            self._forgot_at = now
+        if now - self._deleted_at > DELETE:
+            self._deleted_at = now
             kept = self._settings.job_seconds
-            self._housekeeping.submit(_logged, forget_jobs, self._engine, self._objects, kept)
+            self._housekeeping.submit(_logged, delete_old_jobs, self._engine, self._objects, kept)
         if now - self._swept_at > SWEEP:
             self._swept_at = now
             self._housekeeping.submit(_logged, sweep, self._engine, self._objects)
-            self._housekeeping.submit(_logged, count, self._engine, self._objects)
+            self._housekeeping.submit(_logged, count_bytes, self._engine, self._objects)
         return True
 
     def _stand_down(self) -> None:
@@ -264,9 +264,9 @@ class Coordinator:
         with reading(self._engine) as c:
             row = jobs.get(c, job)
         if row.state == "succeeded":
-            self._housekeeping.submit(_logged, JOB_KINDS[row.kind].tidy, self._objects, row)
-            self._housekeeping.submit(_logged, count, self._engine, self._objects)
-        elif row.state == "failed" and JOB_KINDS[row.kind].discards(row.problem):
+            self._housekeeping.submit(_logged, JOB_KINDS[row.kind].remove_inputs, self._objects, row)
+            self._housekeeping.submit(_logged, count_bytes, self._engine, self._objects)
+        elif row.state == "failed" and JOB_KINDS[row.kind].removes_failed(row.problem):
             self._discards.append((time.monotonic() + DYING, row))
 
     def _clean_up(self, row: Row[Any]) -> None:
@@ -281,7 +281,7 @@ class Coordinator:
         now = time.monotonic()
         while self._discards and self._discards[0][0] <= now:
             _, row = self._discards.popleft()
-            self._housekeeping.submit(_logged, JOB_KINDS[row.kind].discard, self._objects, row)
+            self._housekeeping.submit(_logged, JOB_KINDS[row.kind].remove_files, self._objects, row)
 
     def _submit(self) -> None:
         """Submit tiles for all free threads, first of the job that has used the fewest worker seconds.

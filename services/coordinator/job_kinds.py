@@ -1,4 +1,4 @@
-"""The registry of job kinds: the steps that workers run, and what each kind means to the ledger and the store."""
+"""The registry of job kinds: the steps of each, and what its jobs change in the database and the store."""
 
 from typing import Any
 
@@ -35,44 +35,44 @@ class JobKind:
     steps: Steps
 
     def is_due(self, connection: Connection, row: Row[Any]) -> bool:
-        """Whether a queued job may begin.
+        """Whether a queued job may start now.
 
         Raises
         ------
         EnvmatteError
-            If it never will.
+            If it can never start.
         """
         return True
 
     def prepared(self, connection: Connection, task: Task, plan: dict[str, Any]) -> None:
-        """Its plan is made."""
+        """Record that a job has its plan."""
 
     def succeeded(self, connection: Connection, task: Task, figures: dict[str, Any]) -> None:
-        """It has succeeded."""
+        """Record that a job succeeded."""
 
     def failed(self, connection: Connection, task: Task, problem: Problem) -> None:
-        """It has failed."""
+        """Record that a job failed."""
 
     def cancelled(self, connection: Connection, row: Row[Any]) -> None:
-        """It was cancelled. After this `storage.records.jobs.cancelled_with_leftovers` does not list it."""
+        """Record that a job was cancelled, so that `jobs.cancelled_with_leftovers` does not list it any more."""
 
     def retried(self, connection: Connection, row: Row[Any]) -> None:
-        """It is queued again, having failed.
+        """Record that a failed job is queued again.
 
         Raises
         ------
         EnvmatteError
-            If it can't be.
+            If it can't be retried.
         """
 
-    def tidy(self, objects: Objects, row: Row[Any]) -> None:
-        """Remove what nobody needs once it has succeeded."""
+    def remove_inputs(self, objects: Objects, row: Row[Any]) -> None:
+        """Remove what a job that succeeded no longer needs."""
 
-    def discard(self, objects: Objects, row: Row[Any]) -> None:
-        """Remove all that it wrote, and what it was given."""
+    def remove_files(self, objects: Objects, row: Row[Any]) -> None:
+        """Remove the input of a job, and everything it wrote."""
 
-    def discards(self, problem: Problem) -> bool:
-        """Whether a job that failed leaves nothing that may be of use."""
+    def removes_failed(self, problem: Problem) -> bool:
+        """Whether a job that failed with this problem is of no further use, and its files are removed."""
         return False
 
 
@@ -94,7 +94,7 @@ class Ingest(JobKind):
             task.capture,
             state="failed",
             problem=problem,
-            stored=0 if self.discards(problem) else None,
+            stored=0 if self.removes_failed(problem) else None,
         )
 
     def cancelled(self, connection: Connection, row: Row[Any]) -> None:
@@ -104,17 +104,17 @@ class Ingest(JobKind):
     def retried(self, connection: Connection, row: Row[Any]) -> None:
         capture = captures.get(connection, row.capture)
         if not is_retryable(capture.problem):
-            raise Conflict(f"capture {capture.id} can't be used, and nothing of it was kept; upload it again")
+            raise Conflict(f"capture {capture.id} can't be used and was not kept; upload it again")
         captures.change(connection, capture.id, state="ingesting", problem=None, stored=None)
 
-    def tidy(self, objects: Objects, row: Row[Any]) -> None:
+    def remove_inputs(self, objects: Objects, row: Row[Any]) -> None:
         uploads.remove(objects, row.capture)
 
-    def discard(self, objects: Objects, row: Row[Any]) -> None:
+    def remove_files(self, objects: Objects, row: Row[Any]) -> None:
         objects.delete(stored_captures.path(row.capture))
         uploads.remove(objects, row.capture)
 
-    def discards(self, problem: Problem) -> bool:
+    def removes_failed(self, problem: Problem) -> bool:
         return not is_retryable(problem)
 
 
@@ -142,10 +142,10 @@ class Recovery(JobKind):
         capture = captures.get(connection, row.capture)
         if capture.state == "failed":
             raise Conflict(f"capture {capture.id} failed: {capture.problem['detail']}")
-        mattes.get(connection, row.matte)  # it may have expired, or been deleted
+        mattes.get(connection, row.matte)  # raises if it has expired or been deleted
         mattes.change(connection, row.matte, state="recovering", stored=None)
 
-    def discard(self, objects: Objects, row: Row[Any]) -> None:
+    def remove_files(self, objects: Objects, row: Row[Any]) -> None:
         objects.delete(stored_mattes.path(row.matte))
 
 
@@ -158,7 +158,7 @@ class Composite(JobKind):
         jobs.change(connection, task.job, stored=None)
 
     def failed(self, connection: Connection, task: Task, problem: Problem) -> None:
-        if self.discards(problem):
+        if self.removes_failed(problem):
             jobs.change(connection, task.job, stored=0)
 
     def cancelled(self, connection: Connection, row: Row[Any]) -> None:
@@ -166,17 +166,17 @@ class Composite(JobKind):
         jobs.change(connection, row.id, stored=0)
 
     def retried(self, connection: Connection, row: Row[Any]) -> None:
-        if self.discards(row.problem):
-            raise Conflict(f"the clip of job {row.id} can't be used, and was not kept; send another one")
+        if self.removes_failed(row.problem):
+            raise Conflict(f"the clip of job {row.id} can't be used and was not kept; send another one")
         mattes.get(connection, row.matte)
 
-    def tidy(self, objects: Objects, row: Row[Any]) -> None:
+    def remove_inputs(self, objects: Objects, row: Row[Any]) -> None:
         composites.remove_inputs(objects, row.id)
 
-    def discard(self, objects: Objects, row: Row[Any]) -> None:
+    def remove_files(self, objects: Objects, row: Row[Any]) -> None:
         objects.delete(composites.path(row.id))
 
-    def discards(self, problem: Problem) -> bool:
+    def removes_failed(self, problem: Problem) -> bool:
         return not is_retryable(problem)
 
 

@@ -1,4 +1,4 @@
-"""What the coordinator removes from the store: what has expired, and what nothing refers to. And what it counts."""
+"""Housekeeping: removes what has expired and what nothing refers to, and counts the bytes of what is stored."""
 
 import logging
 import time
@@ -19,13 +19,13 @@ from storage.records import jobs, uploads
 logger = logging.getLogger(__name__)
 
 MOST = 1000
-"""Rows that are deleted in one transaction: others wait for it."""
+"""Rows that are deleted in one transaction, while other writers wait."""
 
 
-def forget_expired(connection: Connection) -> list[str]:
-    """Delete the rows of uploads, captures and mattes whose time is over; returns where they lie in the store.
+def delete_expired(connection: Connection) -> list[str]:
+    """Delete the rows of expired uploads, captures and mattes; returns their folders in the store.
 
-    What an active job works on is kept until that has ended.
+    What an active job works on is kept until the job has ended.
     """
     gone = [stored_uploads.path(upload) for upload in uploads.delete_expired(connection)]
     for table, making, where in (
@@ -42,16 +42,16 @@ def forget_expired(connection: Connection) -> list[str]:
     return gone
 
 
-def forget_jobs(engine: Engine, objects: Objects, seconds: float | None) -> None:
-    """Delete some of the jobs that are kept no longer, and the Idempotency-Keys of what is gone.
+def delete_old_jobs(engine: Engine, objects: Objects, seconds: float | None) -> None:
+    """Delete some of the jobs that ended long ago, and Idempotency-Keys of what no longer exists.
 
-    With a job go its tiles and its log, and the video of a composite, of which it is the only record. An ingest stays
-    as long as its capture, a recovery as long as its matte.
+    A job is deleted with its tiles, its log and the video of a composite, of which it is the only record. An ingest is
+    kept as long as its capture, a recovery as long as its matte.
 
     Parameters
     ----------
     seconds : float, optional
-        How long jobs are kept after they have ended; for ever if None.
+        How long jobs are kept after they have ended; None keeps them for ever.
     """
     job, key = tables.jobs, tables.made
     of_capture = exists().where(tables.captures.c.id == job.c.capture)
@@ -59,7 +59,7 @@ def forget_jobs(engine: Engine, objects: Objects, seconds: float | None) -> None
     in_use = ((job.c.kind == "ingest") & of_capture) | ((job.c.kind == "recover") & of_matte)
     made = [exists().where(table.c.id == key.c.id) for table in (tables.captures, tables.mattes, job)]
     gone = select(key.c.id).where(*(~one for one in made)).limit(MOST)
-    with reading(engine) as c:  # nobody waits while it looks through all of them
+    with reading(engine) as c:  # other writers need not wait while this scans all rows
         keys = c.scalars(gone).all()
         jobs_over: Sequence[str] = ()
         over = job.c.finished_at <= time.time() - (seconds or 0)
@@ -69,7 +69,7 @@ def forget_jobs(engine: Engine, objects: Objects, seconds: float | None) -> None
         return
     with writing(engine) as c:
         c.execute(delete(key).where(key.c.id.in_(keys)))
-        # One that was tried again meanwhile has not ended.
+        # A job that was retried meanwhile has not ended.
         deleted = delete(job).where(job.c.id.in_(jobs_over), over).returning(job.c.id, job.c.kind)
         composed = [row.id for row in c.execute(deleted) if row.kind == "composite"]
     for one in composed:
@@ -77,14 +77,14 @@ def forget_jobs(engine: Engine, objects: Objects, seconds: float | None) -> None
 
 
 def remove(objects: Objects, path: str) -> None:
-    """Remove what a row that is deleted stood for."""
-    with suppress(OSError):  # someone writes there still: he removes it himself, or a sweep does
+    """Remove the files of a deleted row."""
+    with suppress(OSError):  # something is still written there: its writer removes it, or a sweep does
         objects.delete(path)
 
 
-def count(engine: Engine, objects: Objects) -> None:
-    """Count the bytes of what is new in the store, and write them down: limits go by them."""
-    for table, whole, folders in (
+def count_bytes(engine: Engine, objects: Objects) -> None:
+    """Record how many bytes new captures, mattes and videos have in the store; quotas use these numbers."""
+    for table, is_complete, folders in (
         (tables.captures, tables.captures.c.state != "ingesting", (captures.path, stored_uploads.path)),
         (tables.mattes, tables.mattes.c.state != "recovering", (mattes.path,)),
         (
@@ -94,25 +94,25 @@ def count(engine: Engine, objects: Objects) -> None:
         ),
     ):
         with reading(engine) as c:
-            new = c.scalars(select(table.c.id).where(whole, table.c.stored.is_(None))).all()
+            new = c.scalars(select(table.c.id).where(is_complete, table.c.stored.is_(None))).all()
         for one in new:
             stored = sum(sum(objects.sizes(path(one)).values()) for path in folders)
             with writing(engine) as c:
-                uncounted = (table.c.id == one, whole, table.c.stored.is_(None))
+                uncounted = (table.c.id == one, is_complete, table.c.stored.is_(None))
                 c.execute(update(table).where(*uncounted).values(stored=stored))
 
 
 def sweep(engine: Engine, objects: Objects, seconds: float = GRACE_SECONDS) -> None:
-    """Remove what has no row in the database: what killed processes left.
+    """Remove what has no row in the database: killed processes have left it.
 
     Parameters
     ----------
     seconds : float
-        For how long it must not have been written to. 0 is for whoever knows that nobody writes.
+        For how long nothing was written to it. Pass 0 only if nothing can be writing.
     """
     with reading(engine) as c:
-        things = list(inventory.items(c))
-    known = {thing.folder for thing in things}
+        items = list(inventory.items(c))
+    known = {item.folder for item in items}
     for folder in inventory.FOLDERS:
         kept = {path.removeprefix(f"{folder}/") for path in known}
         for name in objects.stale_names(folder, seconds, but={*kept, "zarr.json"}):
@@ -121,6 +121,6 @@ def sweep(engine: Engine, objects: Objects, seconds: float = GRACE_SECONDS) -> N
     if not seconds:
         objects.sweep("uploads")
         objects.sweep("composites")
-        for thing in things:
-            if thing.kind == "upload":
-                stored_uploads.sweep(objects, thing.id, thing.parts)
+        for item in items:
+            if item.kind == "upload":
+                stored_uploads.sweep(objects, item.id, item.parts)

@@ -1,12 +1,12 @@
-"""Certificates of a cluster: whoever has the folder belongs to it, and nobody else gets in.
+"""Certificates of a cluster: only processes with a copy of the folder can join it.
 
 ::
 
-    ca.pem      the certificate of the cluster's own authority, whose key was thrown away
-    cert.pem    the one certificate that it signed, of schedulers, workers and clients alike
-    key.pem     its key: who has it may run what he likes on every machine of the cluster
+    ca.pem      the certificate of the cluster's own authority, whose key is not kept
+    cert.pem    the only certificate that it signed, used by schedulers, workers and clients
+    key.pem     its key: anyone with it can run arbitrary code on every machine of the cluster
 
-A host is added by copying the folder to it; to renew them all, they are made anew.
+To add a host, copy the folder to it. To renew the certificates, make a new folder and copy it to every host.
 """
 
 import os
@@ -30,16 +30,16 @@ if TYPE_CHECKING:
 CA, CERT, KEY = "ca.pem", "cert.pem", "key.pem"
 LIFETIME = timedelta(days=3650)
 SKEW = timedelta(days=1)
-"""How far the clock of a host may be behind that of the one where certificates are made."""
+"""How far the clock of a host may be behind the clock of the host where the certificates were made."""
 
 
 def make(certs: Path) -> bool:
-    """Make the certificates of a cluster in a folder; false if a whole set that can be used is there already.
+    """Make the certificates of a cluster in a folder; returns False if it has a complete, valid set already.
 
     Raises
     ------
     Conflict
-        If something is there that is not a whole set, or one that has expired: it is not overwritten.
+        If the folder has an incomplete or expired set, which is not overwritten.
     """
     there = [name for name in (CA, CERT, KEY) if (certs / name).exists()]
     if there:
@@ -47,7 +47,7 @@ def make(certs: Path) -> bool:
             security_of(certs)
         except InvalidInput as error:
             raise Conflict(
-                f"{certs} has {', '.join(there)} already, which are not overwritten, and can't be used: "
+                f"{certs} has {', '.join(there)} already, which can't be used and are not overwritten: "
                 f"{error.detail}. Remove them first, or name another folder"
             ) from error
         return False
@@ -83,7 +83,7 @@ def make(certs: Path) -> bool:
     )
     secret = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
     certs.mkdir(parents=True, exist_ok=True)
-    # The key last: what an interrupt leaves is not a whole set, and is told as such.
+    # The key last: after an interrupt the set is incomplete, and is reported so.
     for file, data in (
         (CA, root.sign(authority, SHA256()).public_bytes(Encoding.PEM)),
         (CERT, issued.sign(authority, SHA256()).public_bytes(Encoding.PEM)),
@@ -94,35 +94,35 @@ def make(certs: Path) -> bool:
 
 
 def security_of(certs: Path) -> "Security":
-    """What dask needs to let in members of a cluster alone, and to be let in.
+    """The TLS settings of a member of a cluster, which accepts other members only.
 
     Parameters
     ----------
     certs : Path
-        Folder that `make` made.
+        Folder made by `make`.
 
     Raises
     ------
     InvalidInput
-        If a file is missing, can't be read or belongs to another set, or the certificates have expired.
+        If a file is missing or unreadable, or belongs to another set, or the certificates have expired.
     """
     ca, cert, key = (str((certs / name).resolve()) for name in (CA, CERT, KEY))
     try:
         root, issued = (x509.load_pem_x509_certificate(Path(file).read_bytes()) for file in (ca, cert))
         issued.verify_directly_issued_by(root)
         ssl.create_default_context().load_cert_chain(cert, key)
-    except OSError as error:  # ssl.SSLError too: of a key that is damaged, or not the certificate's
+    except OSError as error:  # ssl.SSLError too: the key is damaged, or belongs to another certificate
         reason = error.strerror if error.filename else "key.pem is not the key of cert.pem"
         raise _unusable(certs, f"{error.filename or key}: {reason}") from error
     except (ValueError, TypeError, InvalidSignature) as error:
-        raise _unusable(certs, "they are damaged, or not of one set") from error
+        raise _unusable(certs, "they are damaged, or belong to different sets") from error
     now = datetime.now(UTC)
     for one in (root, issued):
         if not one.not_valid_before_utc <= now <= one.not_valid_after_utc:
             raise InvalidInput(
                 f"the certificates in {certs} are valid from {one.not_valid_before_utc:%Y-%m-%d} to "
-                f"{one.not_valid_after_utc:%Y-%m-%d}, and today is {now:%Y-%m-%d}: see that the clock is right, or "
-                "make them anew with `envmatte certs DIR` and copy them to every host of the cluster"
+                f"{one.not_valid_after_utc:%Y-%m-%d}, and today is {now:%Y-%m-%d}: check the clock, or make "
+                "new ones with `envmatte certs DIR` and copy them to every host of the cluster"
             )
     from distributed.security import Security  # with all of dask, which `envmatte certs` needs nothing of
 
@@ -136,8 +136,8 @@ def security_of(certs: Path) -> "Security":
 
 def _unusable(certs: Path, reason: str) -> InvalidInput:
     return InvalidInput(
-        f"the certificates in {certs} can't be used: {reason}. Make a folder of them with `envmatte certs DIR`, once "
-        "for a whole cluster, and copy it whole to every host"
+        f"the certificates in {certs} can't be used: {reason}. Make a folder with `envmatte certs DIR`, once for the "
+        "whole cluster, and copy the whole folder to every host"
     )
 
 
@@ -164,6 +164,6 @@ def _builder(
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Write a file that its owner alone may read, and never over another."""
+    """Write a new file that only its owner can read; an existing one is never overwritten."""
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
         file.write(data)

@@ -62,9 +62,9 @@ def test_it_leaves_its_matte_alone_and_needs_no_capture(engine: Engine, job: str
 def test_what_is_left_of_a_success_is_the_video(objects: Objects, engine: Engine, job: str) -> None:
     with writing(engine) as c:
         row = jobs.get(c, job)
-    JOB_KINDS["composite"].tidy(objects, row)
+    JOB_KINDS["composite"].remove_inputs(objects, row)
     assert objects.paths_below(composites.path(job)) == {composites.video_path(job)}
-    JOB_KINDS["composite"].discard(objects, row)
+    JOB_KINDS["composite"].remove_files(objects, row)
     assert objects.paths_below(composites.path(job)) == set()
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from sqlalchemy import Engine, select, update
 
-from services.coordinator.retention import count, forget_expired, forget_jobs
+from services.coordinator.retention import count_bytes, delete_expired, delete_old_jobs
 from storage.database import tables
 from storage.database.engine import open_engine, reading, writing
 from storage.database.owners import for_owner
@@ -62,14 +62,14 @@ def test_what_has_expired_goes_and_nothing_else(engine: Engine) -> None:
     add(engine, "bob", "long", seconds=3600.0)
     add(engine, "bob", "ever")
     with writing(engine) as c:
-        assert forget_expired(c) == []
+        assert delete_expired(c) == []
         for table in (tables.captures, tables.mattes):
             row = c.execute(select(table).where(table.c.id == "short")).one()
             assert row.expires_at == row.created_at + 60
             c.execute(update(table).where(table.c.id == "short").values(expires_at=time.time() - 1))
         uploads.add(c, "u", 5, "", -1, None)
     with writing(engine) as c:
-        assert forget_expired(c) == ["uploads/u", "captures/short", "uploads/short", "mattes/short"]
+        assert delete_expired(c) == ["uploads/u", "captures/short", "uploads/short", "mattes/short"]
     assert there(engine) == {"captures": {"long", "ever"}, "mattes": {"long", "ever"}}
     with reading(engine) as c:
         assert jobs.get(c, "short-r").state == "succeeded"  # what is known of it stays
@@ -84,12 +84,12 @@ def test_what_a_job_works_on_stays_until_it_has_ended(engine: Engine, kind: str,
         jobs.change(c, job, state=state)
     over(engine)
     with writing(engine) as c:
-        assert forget_expired(c) == []
+        assert delete_expired(c) == []
     assert there(engine) == {"captures": {"used"}, "mattes": {"used"}}
     with writing(engine) as c:
         jobs.end(c, job, "failed", {"detail": "", "status": 500})
     with writing(engine) as c:
-        assert forget_expired(c) == ["captures/used", "uploads/used", "mattes/used"]
+        assert delete_expired(c) == ["captures/used", "uploads/used", "mattes/used"]
 
 
 def test_what_is_being_made_or_unmade_stays(engine: Engine) -> None:
@@ -100,7 +100,7 @@ def test_what_is_being_made_or_unmade_stays(engine: Engine) -> None:
         mattes.add(c, "m", "c", jobs.add(c, "recover", "c", {}, "m"), {}, -1)
         for row in jobs.active(c):
             jobs.cancel(c, row.id)
-        assert forget_expired(c) == []
+        assert delete_expired(c) == []
 
 
 def ended_long_ago(engine: Engine) -> None:
@@ -130,12 +130,12 @@ def test_a_job_leaves_after_a_time_and_not_before_what_it_made(engine: Engine, o
     objects.put(composites.video_path(composite), b"video")
     everything = {"kept-i", "kept-r", "gone-i", "gone-r", composite, failed, queued}
     ended_long_ago(engine)
-    forget_jobs(engine, objects, None)
-    forget_jobs(engine, objects, 3600)
+    delete_old_jobs(engine, objects, None)
+    delete_old_jobs(engine, objects, 3600)
     assert listed(engine) == everything
     with writing(engine) as c:
         jobs.retry(c, failed)
-    forget_jobs(engine, objects, 60)
+    delete_old_jobs(engine, objects, 60)
     assert listed(engine) == {"kept-i", "kept-r", failed, queued}
     assert objects.paths_below("composites") == set()
     with reading(engine) as c:
@@ -148,7 +148,7 @@ def test_a_key_is_kept_as_long_as_what_it_made(engine: Engine, objects: Objects)
     with writing(for_owner(engine, "alice")) as c:
         for key, made in (("capture", "thing"), ("job", "thing-r"), ("gone", "another")):
             idempotency.add(c, key, "POST", made)
-    forget_jobs(engine, objects, None)
+    delete_old_jobs(engine, objects, None)
 
     def known() -> list[str | None]:
         with reading(for_owner(engine, "alice")) as c:
@@ -158,11 +158,11 @@ def test_a_key_is_kept_as_long_as_what_it_made(engine: Engine, objects: Objects)
     with writing(engine) as c:
         jobs.delete(c, "thing-r")
         captures.delete(c, "thing")
-    forget_jobs(engine, objects, None)
+    delete_old_jobs(engine, objects, None)
     assert known() == ["thing", None, None]  # the matte of this name is there
     with writing(engine) as c:
         mattes.delete(c, "thing")
-    forget_jobs(engine, objects, None)
+    delete_old_jobs(engine, objects, None)
     assert known() == [None, None, None]
 
 
@@ -181,7 +181,7 @@ def test_bytes_are_counted_once_a_thing_is_whole(engine: Engine, objects: Object
     objects.put(composites.clip_path(clip), bytes(300_000))
 
     def stored(owner: str) -> int:
-        count(engine, objects)
+        count_bytes(engine, objects)
         with reading(for_owner(engine, owner)) as c:
             return statistics.stored_bytes(c)
 
