@@ -47,7 +47,7 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
     )
     errors.register(app)
     app.add_middleware(tus.Protocol)
-    app.add_middleware(tracing.Requests)
+    app.add_middleware(tracing.TracingMiddleware)
 
     for router in (
         captures.router,

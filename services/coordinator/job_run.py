@@ -221,7 +221,7 @@ class JobRun:
     def _prepared(self, connection: Connection, plan: dict[str, Any]) -> Next:
         tile_records.add_plan(connection, self.job, plan)
         row = jobs.get(connection, self.job)
-        tracing.waited("queue", row.trace, row.created_at, row.started_at, job=self.job, kind=row.kind)
+        tracing.past_span("queue", row.trace, row.created_at, row.started_at, job=self.job, kind=row.kind)
         self.kind.prepared(connection, self.task, plan)
         for line in plan.get("notes", ()):
             job_log.add(connection, self.job, line)

@@ -1,9 +1,9 @@
-"""Traces by OpenTelemetry, from the request that asks for a job to each of its tiles.
+"""OpenTelemetry traces, from the request that asks for a job to each of its tiles.
 
-There are none, and nothing of OpenTelemetry is imported, unless OTEL_EXPORTER_OTLP_ENDPOINT is set in a process'
-environment; where to, by which sampler and how many at once is said by the variables of the OpenTelemetry specification
-too. Spans are sent by a thread in the background, and dropped if nobody takes them. Between processes a trace goes by
-its ``traceparent`` (https://www.w3.org/TR/trace-context), in the ledger and with every tile.
+A process traces, and imports OpenTelemetry, only if OTEL_EXPORTER_OTLP_ENDPOINT is set in its environment. The other
+variables of the OpenTelemetry specification set the sampler, batches and so on. Spans are sent by a background thread,
+and dropped if the collector does not accept them. A trace passes between processes as its ``traceparent``
+(https://www.w3.org/TR/trace-context), in the ledger and with every tile.
 """
 
 import atexit
@@ -33,17 +33,17 @@ TRACED = {
     path: compile_path(path)[0]
     for path in ("/v1/captures", "/v1/jobs", "/v1/jobs/{id}/retry", "/v1/mattes/{id}/composite")
 }
-"""Where a POST makes a job, or queues one again. A composite of a still makes none, and is work enough for a span."""
+"""Paths where a POST makes or retries a job. A composite of a still makes no job, but takes long enough for a span."""
 
 LAST = 2.0
-"""Seconds that a process takes at its end to send what it has not sent yet."""
+"""Seconds that a process spends at exit on sending the remaining spans."""
 
 _tracer: "Tracer | None" = None
-_asked_by: ContextVar[str | None] = ContextVar("asked_by", default=None)
+_current: ContextVar[str | None] = ContextVar("traceparent", default=None)
 
 
 def start(role: str) -> None:
-    """Trace what this process does, if that is asked for."""
+    """Start tracing in this process, if its environment asks for it."""
     global _tracer
     if not any(os.environ.get(name) for name in ENDPOINTS):
         return
@@ -54,7 +54,7 @@ def start(role: str) -> None:
         from opentelemetry.sdk.trace.export import BatchSpanProcessor
     except ImportError:
         logger.warning(
-            "%s asks for traces, which need another package: pip install 'envmatte[otel]'", ENDPOINTS[0]
+            "%s is set, but traces need another package: pip install 'envmatte[otel]'", ENDPOINTS[0]
         )
         return
     resource = Resource({"service.name": f"envmatte-{role}"}).merge(OTELResourceDetector().detect())
@@ -78,14 +78,14 @@ def start(role: str) -> None:
 
 @contextmanager
 def span(name: str, parent: str | None, **attributes: str | int) -> Iterator["Span | None"]:
-    """What is done inside is a span, of a trace that another process began.
+    """Trace what is done inside as a span.
 
     Parameters
     ----------
     parent : str, optional
-        A ``traceparent``; without one a trace begins here.
+        The ``traceparent`` that another process passed on; without one a new trace begins.
     **attributes
-        Called ``envmatte.…`` in the trace.
+        Attributes of the span, with the prefix ``envmatte.``.
     """
     if _tracer is None:
         yield None
@@ -94,20 +94,20 @@ def span(name: str, parent: str | None, **attributes: str | int) -> Iterator["Sp
         yield made
 
 
-def waited(name: str, parent: str | None, begin: float, end: float, **attributes: str | int) -> None:
-    """A span from one time to another, in seconds of the epoch."""
+def past_span(name: str, parent: str | None, begin: float, end: float, **attributes: str | int) -> None:
+    """Add a span from one time to another, both in seconds since the epoch."""
     if _tracer is not None:
         began, ended = int(begin * 1e9), int(end * 1e9)
         _tracer.start_span(name, _context(parent), attributes=_named(attributes), start_time=began).end(ended)
 
 
-def asked_by() -> str | None:
-    """The ``traceparent`` of what is made by the present request."""
-    return _asked_by.get()
+def current_traceparent() -> str | None:
+    """The ``traceparent`` for a job that the current request makes."""
+    return _current.get()
 
 
-class Requests:
-    """Middleware: a request that makes a job continues the trace of its caller, or begins one."""
+class TracingMiddleware:
+    """A request that makes a job continues the trace of its caller, or begins one."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
@@ -123,13 +123,13 @@ class Requests:
         parent = given if TRACEPARENT.fullmatch(given) else None
         with span(f"POST {route}", parent) as made:
 
-            async def send_and_note(message: Message) -> None:
+            async def send_and_record(message: Message) -> None:
                 if made is not None and message["type"] == "http.response.start":
                     made.set_attribute("http.response.status_code", message["status"])
                 await send(message)
 
-            _asked_by.set(parent if made is None else _traceparent())
-            await self.app(scope, receive, send_and_note)
+            _current.set(parent if made is None else _traceparent())
+            await self.app(scope, receive, send_and_record)
 
 
 def _named(attributes: dict[str, str | int]) -> dict[str, Any]:
@@ -144,7 +144,7 @@ def _context(parent: str | None) -> "Context":
 
 
 def _traceparent() -> str | None:
-    """Of the present span."""
+    """The ``traceparent`` of the current span."""
     from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
 
     carrier: dict[str, str] = {}

@@ -168,7 +168,7 @@ def _register(
             raise NotFound(f"upload {capture} does not exist any more")
         size = sum(part.size for part in parts)
         admit(c, context.settings, captures=1, jobs=1, size=size)
-        job = jobs.add(c, "ingest", capture, {}, trace=tracing.asked_by(), webhook=webhook)
+        job = jobs.add(c, "ingest", capture, {}, trace=tracing.current_traceparent(), webhook=webhook)
         captures.add(
             c,
             capture,

@@ -183,7 +183,9 @@ def post_job(
         admit(c, context.settings, jobs=1)
         matte = new_id()
         chosen = options.model_dump(mode="json")
-        job = jobs.add(c, "recover", capture.id, chosen, matte, tracing.asked_by(), webhook=request.webhook)
+        job = jobs.add(
+            c, "recover", capture.id, chosen, matte, tracing.current_traceparent(), webhook=request.webhook
+        )
         mattes.add(c, matte, capture.id, job, chosen, context.settings.matte_seconds)
         return job
 
@@ -237,7 +239,9 @@ def retry_job(context: OwnerContext, id: str) -> Job:
         memory = (row.plan or {}).get("memory", context.settings.ingest_memory)
         if row.state == "failed":
             admit(c, context.settings, jobs=1)
-        jobs.retry(c, id, replan=memory != context.settings.ingest_memory, trace=tracing.asked_by())
+        jobs.retry(
+            c, id, replan=memory != context.settings.ingest_memory, trace=tracing.current_traceparent()
+        )
         JOB_KINDS[row.kind].retried(c, row)
         return Job.read(c, id)
 

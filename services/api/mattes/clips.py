@@ -136,7 +136,7 @@ def _queue(
     def create(c: Connection) -> str:
         row = mattes.get_ready(c, matte)
         admit(c, context.settings, jobs=1, size=size)
-        capture, trace = row.capture or "", tracing.asked_by()
+        capture, trace = row.capture or "", tracing.current_traceparent()
         jobs.add(c, "composite", capture, options, matte, trace, job, size, webhook)
         tiles.add_steps(
             c, job

@@ -1,4 +1,4 @@
-"""Traces: none unless they are asked for; then from the request on, and never in the way of the work."""
+"""Traces: off by default; from request to tile when on; and never in the way of the work."""
 
 import os
 import subprocess
@@ -26,14 +26,14 @@ REQUEST = f"""
     asked = []
 
     async def app(scope, receive, send):
-        asked.append(tracing.asked_by())
+        asked.append(tracing.current_traceparent())
         await send({{"type": "http.response.start", "status": 201, "headers": []}})
 
     async def send(message): pass
 
     async def request(**scope):
         scope = {{"type": "http", "method": "POST", "path": "/v1/jobs", "headers": []}} | scope
-        await asyncio.create_task(tracing.Requests(app)(scope, None, send))
+        await asyncio.create_task(tracing.TracingMiddleware(app)(scope, None, send))
 
     async def main():
         await request(headers=[(b"traceparent", b"{CALLER}")])
@@ -51,7 +51,7 @@ REQUEST = f"""
 
 
 def run(script: str, **environment: str) -> str:
-    """What a script prints, in a process of its own: traces are set up once in each."""
+    """What a script prints, in a new process: tracing is set up once per process."""
     clean = {name: value for name, value in os.environ.items() if not name.startswith("OTEL_")}
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", textwrap.dedent(script)],
@@ -64,13 +64,13 @@ def run(script: str, **environment: str) -> str:
     return done.stdout
 
 
-def test_nothing_is_imported_unless_it_is_asked_for() -> None:
+def test_opentelemetry_is_not_imported_without_an_endpoint() -> None:
     script = REQUEST + "    print(asked, [name for name in sys.modules if 'opentelemetry' in name])"
-    # The trace of a caller goes on all the same: workers may be asked for theirs.
+    # The caller's trace is passed on all the same: workers may trace.
     assert run(script) == f"{[CALLER, *[None] * 6, CALLER, None]} []\n"
 
 
-def test_requests_that_make_jobs_are_spans_of_their_callers_traces() -> None:
+def test_requests_that_make_jobs_are_spans_in_the_callers_trace() -> None:
     with collecting() as collector:
         printed = run(REQUEST + "    print(*asked)", OTEL_EXPORTER_OTLP_ENDPOINT=collector.url).split()
     first, *others, last = collector.spans
@@ -79,8 +79,16 @@ def test_requests_that_make_jobs_are_spans_of_their_callers_traces() -> None:
     for span in (first, last):
         assert f"00-{span.trace.hex()}-{span.parent.hex()}-01" == CALLER
     assert {span.parent for span in others} == {b""}
-    said = [f"00-{span.trace.hex()}-{span.id.hex()}" for span in collector.spans]
-    assert [one[:52] for one in printed] == [*said[:2], "None", said[2], "None", "None", *said[3:], "None"]
+    expected = [f"00-{span.trace.hex()}-{span.id.hex()}" for span in collector.spans]
+    assert [one[:52] for one in printed] == [
+        *expected[:2],
+        "None",
+        expected[2],
+        "None",
+        "None",
+        *expected[3:],
+        "None",
+    ]
     assert {span.attributes["http.response.status_code"] for span in collector.spans} == {201}
 
 
@@ -93,7 +101,7 @@ def test_every_request_that_makes_a_job_is_traced(tmp_path: Path) -> None:
     assert TRACED.keys() == queued | {"/v1/captures"}
 
 
-def test_a_job_that_is_tried_again_goes_on_in_the_trace_of_who_asks_for_it(tmp_path: Path) -> None:
+def test_a_retried_job_continues_in_the_trace_of_the_retry(tmp_path: Path) -> None:
     engine = open_engine(f"sqlite:///{tmp_path / 'ledger.db'}")
     app = build_app(Settings(data=tmp_path), engine, Objects((tmp_path / "store").as_uri()))
     client = TestClient(app, "http://localhost")
@@ -101,7 +109,7 @@ def test_a_job_that_is_tried_again_goes_on_in_the_trace_of_who_asks_for_it(tmp_p
     with writing(engine) as c:
         mattes.add_imported(c, "m", {}, {})
         job = jobs.add(c, "composite", "", {}, "m", CALLER)
-    for asked in (again, None):  # who has no trace leaves the one that is known
+    for asked in (again, None):  # a retry without a trace keeps the one before
         with writing(engine) as c:
             jobs.end(c, job, "failed", {"detail": "", "status": 500})
         headers = {} if asked is None else {"traceparent": asked}
@@ -129,11 +137,11 @@ def spans(collector: Collector, parent: str | None = None, **environment: str) -
 def test_a_sampler_is_honoured() -> None:
     with collecting() as collector:
         assert spans(collector, OTEL_TRACES_SAMPLER="always_off") == []
-        assert spans(collector, CALLER[:-1] + "0") == []  # whoever began the trace does not keep it
+        assert spans(collector, CALLER[:-1] + "0") == []  # the caller does not sample this trace
         assert spans(collector, OTEL_SERVICE_NAME="ours") == ["ours"] * 20
 
 
-def test_a_collector_that_is_gone_holds_nothing_up() -> None:
+def test_an_unreachable_collector_does_not_slow_the_work() -> None:
     printed = run(
         f"""
         from services.runtime import tracing
@@ -151,19 +159,19 @@ def test_a_collector_that_is_gone_holds_nothing_up() -> None:
 @pytest.mark.parametrize(
     "wrong", ["", "00-0123", CALLER.upper(), CALLER + "0", CALLER.replace("0123456789abcdef", "0" * 16)]
 )
-def test_what_is_no_traceparent_is_passed_over(wrong: str) -> None:
+def test_malformed_traceparents_are_ignored(wrong: str) -> None:
     assert not TRACEPARENT.fullmatch(wrong)
     assert TRACEPARENT.fullmatch(CALLER)
 
 
-def test_time_waited_is_a_span() -> None:
+def test_past_span_has_the_given_times() -> None:
     begin = time.time() - 5
     with collecting() as collector:
         run(
             f"""
             from services.runtime import tracing
             tracing.start("service")
-            tracing.waited("queue", {CALLER!r}, {begin!r}, {begin + 2!r}, job="a-job")
+            tracing.past_span("queue", {CALLER!r}, {begin!r}, {begin + 2!r}, job="a-job")
             """,
             OTEL_EXPORTER_OTLP_ENDPOINT=collector.url,
         )
