@@ -52,21 +52,21 @@ def patterns(program: str, out: Path, monitor: tuple[int, int] | None, rate: flo
     Otherwise OUT is a new folder with a PNG of each pattern, and program.json for the capture.
     """
     from storage.errors import EnvmatteError
-    from workflows.programs import files
-    from workflows.programs import video as program_video
+    from workflows.programs.files import fit_to_screen, load_program, write_folder
+    from workflows.programs.video import FORMATS, write_video
 
-    video = out.suffix.lower() in program_video.FORMATS
+    video = out.suffix.lower() in FORMATS
     try:
-        shown = files.fitted(files.given(program), monitor, bordered=video)
+        shown = fit_to_screen(load_program(program), monitor, bordered=video)
         with Progress("patterns") as bar:
 
             def progress(done: int, of: int) -> None:
                 bar.show(done / of, f"{done} of {of}")
 
             if video:
-                program_video.write(shown, out, rate, progress)
+                write_video(shown, out, rate, progress)
             else:
-                files.write(shown, out, progress)
+                write_folder(shown, out, progress)
     except EnvmatteError as error:
         raise click.UsageError(error.detail) from error
     except OSError as error:

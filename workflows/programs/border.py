@@ -1,22 +1,21 @@
-"""The border around a program's patterns, and the lead-in before them: what makes a film of them certain to read.
+"""The numbered border around the patterns, and the lead-in before them, by which a film is read reliably.
 
-The patterns are shown in a rectangle, the monitor of their program, and the border lies around it: recovery needs to
-know nothing of it. Every bit in it is a pair of cells side by side, one lit and one dark; which of the two is lit is
-the bit.
+The patterns are shown in a rectangle, the monitor of their program, and the border lies around it, so recovery need not
+know of it. Each bit is a pair of neighbouring cells, one lit and one dark; which of them is lit is the bit.
 
 Notes
 -----
-Why pairs: a bit is the sign of a difference of neighbours. Exposure, and light that falls off towards the edges,
-scale both of them by the same factor; a camera's gamma is a rising curve, which keeps their order; a blur takes as much
-from one as it gives to the other, and keeps the sign as long as it is narrower than a cell. And whatever the bits are,
-half of the cells are lit: the mean light of the border is constant, and goes into the offset S of the glass.
+Why pairs: a bit is the sign of a difference between neighbours. Exposure and vignetting scale both by the same
+factor; a camera's curve is monotonic and keeps their order; blur keeps the sign as long as it is narrower than a cell.
+Whatever the bits are, half of the cells are lit: the mean light of the border is constant, and becomes part of the
+reflections S.
 
-Why a Gray code: from one number to the next a single bit changes, so a frame exposed across a change is undecided in
-that bit (and in the parity) alone, and reads as one of the two patterns it saw, and never as a third.
+Why a Gray code: from one number to the next a single bit changes. A frame exposed across a change is undecided in that
+bit and in the parity only, and reads as one of the two patterns that it saw, never as a third.
 
-The number is shown along the top and along the bottom, there in reversed order: a frame that a rolling shutter tore
-shows two numbers, and what stands in the way of a bit above leaves it free below. At the left and the right a tick, the
-number's parity, is repeated from top to bottom: it shows in which rows the frame is torn.
+The number is shown along the top, and in reverse order along the bottom: a frame torn by a rolling shutter shows two
+numbers, and an object that hides a bit above leaves it visible below. Along the left and the right a tick, the lowest
+bit of the number + 1, is repeated from top to bottom: it shows in which rows a frame is torn.
 
 References
 ----------
@@ -35,19 +34,19 @@ from workflows.programs.parts import Record
 
 BITS = 12
 MAX_PATTERNS = 2**BITS - 1
-"""Patterns that can be numbered: code 0 is the lead's."""
+"""Patterns that can be numbered: code 0 marks the lead-in and the lead-out."""
 TICKS = 8
-"""Times that the tick is repeated along each side."""
+"""How often the tick is repeated along each side."""
 LEAD = -1
-"""The number of what is shown before the first pattern and after the last."""
+"""The number of the lead-in and the lead-out."""
 LEAD_SECONDS = (1.0, 0.5, 0.5, 0.5, 0.5)
-"""Black, white, black, white, black."""
-LEAST_CELL = 4
-"""Pixels along the edge."""
+"""Of black, white, black, white, black."""
+MIN_CELL = 4
+"""The least length of a cell in pixels."""
 FAINT = 0.1
-"""The contrast that the median pair must have at least: less is noise, and no display in view."""
+"""A median contrast of the pairs below this is noise: no display is in view."""
 CERTAIN = 0.5
-"""The contrast of a cell pair, as a share of the pairs' median, under which its bit is not certain."""
+"""A bit is certain if its pair has at least this share of the median contrast."""
 
 Box = tuple[int, int, int, int]
 """x, y, width, height in pixels."""
@@ -66,7 +65,7 @@ class Border(Record):
 
     @model_validator(mode="after")
     def _room_for_cells(self) -> "Border":
-        if min(self.top[0][2], self.left[0][3]) < LEAST_CELL:
+        if min(self.top[0][2], self.left[0][3]) < MIN_CELL:
             raise ValueError(
                 f"a display of {self.width} x {self.height} pixels is too small for the cells of a border"
             )
@@ -74,7 +73,7 @@ class Border(Record):
 
     @classmethod
     def around(cls, width: int, height: int) -> "Border":
-        """On the display that a rectangle of ``width`` x ``height`` pixels just fits in.
+        """The border around a rectangle of ``width`` x ``height`` pixels.
 
         Raises
         ------
@@ -86,25 +85,25 @@ class Border(Record):
 
     @classmethod
     def on(cls, width: int, height: int) -> "Border":
-        """On a display of ``width`` x ``height`` pixels.
+        """The border on a display of ``width`` x ``height`` pixels.
 
         Raises
         ------
         OptionError
-            If it is too small for the cells, or too large.
+            If the display is too small for the cells, or too large.
         """
         try:
             return cls(width=width, height=height)
         except ValidationError as error:
             raise OptionError(
-                f"no border can be drawn on a display of {width} x {height} pixels: its cells need some 150 x 100, "
-                "and it may have 16384 x 16384",
+                f"no border can be drawn on a display of {width} x {height} pixels: its cells need about 150 x 100, "
+                "and 16384 x 16384 is the most",
                 field="monitor",
             ) from error
 
     @property
     def thickness(self) -> int:
-        """Of the border, in pixels."""
+        """Thickness of the border in pixels."""
         return self.height // 20
 
     @property
@@ -115,44 +114,44 @@ class Border(Record):
 
     @property
     def top(self) -> tuple[Box, ...]:
-        """The cells along the top, as `code` orders them."""
+        """The cells along the top, in the order of `number_cells`."""
         return tuple((x, 0, size, self.thickness) for x, size in self._cells(self.width, BITS + 1))
 
     @property
     def bottom(self) -> tuple[Box, ...]:
-        """The cells along the bottom, as `code` orders them: from right to left."""
+        """The cells along the bottom, in the order of `number_cells`: from right to left."""
         y = self.height - self.thickness
         return tuple((x, y, w, h) for x, _, w, h in reversed(self.top))
 
     @property
     def left(self) -> tuple[Box, ...]:
-        """The cells along the left, as `tick` orders them: from top to bottom."""
+        """The cells along the left, in the order of `tick_cells`: from top to bottom."""
         return tuple((0, y, self.thickness, size) for y, size in self._cells(self.height, TICKS))
 
     @property
     def right(self) -> tuple[Box, ...]:
-        """The cells along the right, as `tick` orders them: from top to bottom."""
+        """The cells along the right, in the order of `tick_cells`: from top to bottom."""
         x = self.width - self.thickness
         return tuple((x, y, w, h) for _, y, w, h in self.left)
 
     def _cells(self, length: int, pairs: int) -> list[tuple[int, int]]:
-        """Where each cell of some pairs begins along an edge, and its length."""
+        """Where the cells of ``pairs`` pairs begin along an edge, and their length."""
         size = (length - 2 * self.thickness) // (2 * pairs)
         start = (length - 2 * pairs * size) // 2
         return [(start + i * size, size) for i in range(2 * pairs)]
 
 
 class Step(NamedTuple):
-    """What is shown for a time.
+    """A picture that is shown for some time.
 
     Attributes
     ----------
     start, seconds : float
-        Since the beginning of the lead-in, and for how long.
+        When it is shown, from the beginning of the lead-in, and for how long.
     number : int
-        The pattern's, or `LEAD`.
+        Number of the pattern, or `LEAD`.
     white : bool
-        In the lead: whether the rectangle is white, or black.
+        Whether the rectangle is white; for the lead-in and the lead-out only.
     """
 
     start: float
@@ -162,7 +161,7 @@ class Step(NamedTuple):
 
 
 def schedule(count: int, rate: float) -> list[Step]:
-    """What is shown when: the lead-in, ``count`` patterns at ``rate`` a second, and the lead-out, which is the same.
+    """What is shown when: the lead-in, ``count`` patterns at ``rate`` a second, and a lead-out like the lead-in.
 
     Raises
     ------
@@ -171,7 +170,7 @@ def schedule(count: int, rate: float) -> list[Step]:
     """
     if count > MAX_PATTERNS:
         raise OptionError(
-            f"{count} patterns: a film may have {MAX_PATTERNS}, show some of them in another one",
+            f"{count} patterns: a film may have {MAX_PATTERNS}; show the rest in another one",
             limit=MAX_PATTERNS,
         )
     end = sum(LEAD_SECONDS)
@@ -190,8 +189,8 @@ def number_cells(number: int) -> NDArray[np.bool_]:
 
     Notes
     -----
-    The Gray code of number + 1, most significant bit first, and at the end the parity that makes the number of set
-    bits even. A set bit is lit, dark; one that is not, dark, lit.
+    They show the Gray code of number + 1, most significant bit first, and then the parity that makes the number of set
+    bits even. A set bit is lit, dark; a clear one is dark, lit.
     """
     value = number + 1
     gray = value ^ (value >> 1)
@@ -200,7 +199,7 @@ def number_cells(number: int) -> NDArray[np.bool_]:
 
 
 def tick_cells(number: int) -> NDArray[np.bool_]:
-    """Which cells along each side are lit for a pattern, (2 TICKS,) bool: is number + 1 odd?"""
+    """Which cells along each side are lit for a pattern, (2 TICKS,) bool: they show the lowest bit of number + 1."""
     return _pairs([(number + 1) & 1] * TICKS)
 
 
@@ -210,14 +209,14 @@ def _pairs(bits: list[int]) -> NDArray[np.bool_]:
 
 
 def draw_border(picture: NDArray[np.uint8], number: int, border: Border) -> NDArray[np.uint8]:
-    """A picture on the display with its border.
+    """Draw a picture and its border on the display.
 
     Parameters
     ----------
     picture : (rows, columns, 1 or 3) uint8
-        Stretched over the rectangle by repeating pixels; as it is if it has the rectangle's size.
+        Stretched over the rectangle by repeating pixels.
     number : int
-        The pattern's, or `LEAD`.
+        Number of the pattern, or `LEAD`.
     border : Border
 
     Returns
@@ -245,26 +244,26 @@ def draw_border(picture: NDArray[np.uint8], number: int, border: Border) -> NDAr
 
 
 def read_numbers(light: NDArray[np.floating]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """The patterns' numbers from the cells along an edge, as a camera saw them.
+    """Read the numbers of patterns from the cells along an edge, as a camera saw them.
 
     Parameters
     ----------
     light : (..., 2 (BITS + 1)) float
-        Mean camera values of the cells of `Border.top` or `Border.bottom`, in their order, in any unit and through
-        any rising curve. The inner half of each cell is best: it has least of its neighbours.
+        Mean camera values of the cells of `Border.top` or `Border.bottom`, in their order, in any unit and with any
+        monotonic curve. The inner half of each cell is best, because it has the least light of its neighbours.
 
     Returns
     -------
     number : (...) intp
-        The pattern's, or `LEAD`; where it is not certain, what comes closest.
+        Number of the pattern, or `LEAD`; the most likely one if it is not certain.
     certain : (...) bool
-        Whether every bit shows clearly and the parity is right. In a frame exposed across a change it is false unless
+        Whether every bit is clear and the parity is right. For a frame exposed across a change, this is false unless
         one of the two patterns was shown for most of the exposure.
 
     Notes
     -----
-    A pair of a and b has the contrast (a - b) / (a + b), which does not depend on how much light falls on it. A bit is
-    clear if its contrast has at least `CERTAIN` of the median's size, and that is not `FAINT`.
+    A pair a, b has the contrast (a - b) / (a + b), which does not depend on its illumination. A bit is clear if its
+    contrast is at least `CERTAIN` times the median, and the median is at least `FAINT`.
     """
     values = np.maximum(np.asarray(light, np.float64), 0)
     first, second = values[..., ::2], values[..., 1::2]
@@ -274,7 +273,7 @@ def read_numbers(light: NDArray[np.floating]) -> tuple[NDArray[np.intp], NDArray
     clear = np.all((size >= CERTAIN * usual) & (usual >= FAINT), axis=-1)
     bits = contrast > 0
     even = np.count_nonzero(bits, axis=-1) % 2 == 0
-    # A binary digit is the parity of the Gray digits down to it.
+    # A bit of the number is the parity of the Gray code's bits from the highest down to it.
     binary = np.cumsum(bits[..., :BITS], axis=-1) % 2
     number: NDArray[np.intp] = binary @ (1 << np.arange(BITS)[::-1]) - 1
     return number, clear & even

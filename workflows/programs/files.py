@@ -1,4 +1,4 @@
-"""A program as files: its record, a PNG of each pattern, and all of them in a folder or a ZIP."""
+"""A program as files: a JSON file, and a PNG of each pattern, in a folder or a ZIP."""
 
 import io
 import json
@@ -17,81 +17,81 @@ from pydantic import ValidationError
 from storage.errors import OptionError
 from workflows.images.integer_formats import to_integers
 from workflows.programs.border import Border
-from workflows.programs.presets import PRESETS, preset
+from workflows.programs.preset_names import PRESETS
+from workflows.programs.presets import preset
 from workflows.programs.program import Images, Program
 
 Size = tuple[int, int]
-USUAL = 1280, 960
-"""The screen that a preset is made for, if none is named."""
+DEFAULT_SCREEN = 1280, 960
+"""The screen that a preset is made for if none is given, in pixels."""
 PROGRAM_BYTES = 8 << 20
+"""The largest program file."""
 
 
-def given(name: str) -> str | Program:
-    """A preset's name, or the program in a JSON file: all there is in it, or the `program` of a `capture.json`.
+def load_program(name: str) -> str | Program:
+    """The name of a preset as it is, or the program in a JSON file: a program, or a capture.json.
 
     Raises
     ------
     OptionError
-        If it is neither.
+        If ``name`` is neither a preset nor a JSON file.
     pydantic.ValidationError
-        If it is no program.
+        If the JSON is not a program.
     """
     if name in PRESETS:
         return name
     file = Path(name)
     if not file.is_file():
         raise OptionError(
-            f"{name!r} is not one of {', '.join(map(repr, PRESETS))}, and no file", field="program"
+            f"{name!r} is not one of {', '.join(map(repr, PRESETS))}, nor a file", field="program"
         )
     if file.stat().st_size > PROGRAM_BYTES:
-        raise OptionError(f"{name} has more than {PROGRAM_BYTES} bytes: that is no program", field="program")
+        raise OptionError(f"{name} has more than {PROGRAM_BYTES} bytes: it is not a program", field="program")
     try:
         found = json.loads(file.read_bytes())
     except ValueError as error:
-        raise OptionError(f"{name} is no JSON: {error}", field="program") from error
+        raise OptionError(f"{name} is not JSON: {error}", field="program") from error
     return Program.model_validate(found.get("program", found) if isinstance(found, dict) else found)
 
 
-def fitted(given: str | Program, screen: Size | None, *, bordered: bool) -> Program:
-    """A program for a screen.
+def fit_to_screen(program: str | Program, screen: Size | None, *, bordered: bool) -> Program:
+    """Make a preset or a program for a screen.
 
     Parameters
     ----------
-    given : str or Program
+    program : str or Program
         The name of a preset, or a program.
     screen : (width, height), optional
-        In pixels; left out, 1280 x 960 for a preset, and the program's own monitor.
+        In pixels; by default 1280 x 960 for a preset, and a program's own monitor.
     bordered : bool
-        Whether the patterns are to be shown inside of a border (`workflows.programs.border`) on the screen.
+        Whether the patterns are shown inside a border (`workflows.programs.border`) on the screen.
 
     Returns
     -------
     Program
-        Its monitor is what the patterns cover of the screen.
+        Its monitor is the part of the screen that the patterns cover.
 
     Raises
     ------
     OptionError
-        If there is no such preset, it has no room on the screen, its grids do not nest, or it shows images, which are
+        If there is no such preset, it does not fit on the screen, its grids do not nest, or it shows images, which are
         files already.
     """
-    if isinstance(given, Program) and screen is None:
-        program = given
-    else:
-        size = screen or USUAL
+    if not isinstance(program, Program) or screen is not None:
+        size = screen or DEFAULT_SCREEN
         if bordered:
             size = Border.on(*size).inner[2:]
-        program = preset(given, *size) if isinstance(given, str) else _on(given, *size)
+        program = preset(program, *size) if isinstance(program, str) else _resize(program, *size)
     if any(isinstance(part, Images) for part in program.parts):
         raise OptionError(
-            "this program has a part of images, which are pictures already: leave it out", field="program"
+            "this program has a part of images, which are files already: leave it out", field="program"
         )
     program.bands()  # a capture of grids that do not nest would be refused
     return program
 
 
-def _on(program: Program, width: int, height: int) -> Program:
-    """A program on a monitor of another size."""
+def _resize(program: Program, width: int, height: int) -> Program:
+    """The same program for a monitor of another size."""
     monitor = program.monitor.model_dump() | {"width": width, "height": height}
     try:
         return Program.model_validate(program.model_dump() | {"monitor": monitor})
@@ -100,18 +100,18 @@ def _on(program: Program, width: int, height: int) -> Program:
         raise OptionError(f"on a monitor of {width} x {height} pixels: {why}", field="monitor") from error
 
 
-def record(program: Program) -> dict[str, Any]:
-    """A program as the capture format writes it."""
+def program_json(program: Program) -> dict[str, Any]:
+    """A program as capture.json writes it."""
     return program.model_dump(mode="json", exclude_defaults=True)
 
 
 def pictures(program: Program, first: int = 0, last: int | None = None) -> Iterator[NDArray[np.uint8]]:
-    """The pictures of the patterns from ``first`` up to ``last``, (height, width, 1 or 3) uint8, one after another."""
+    """Pictures of the patterns from ``first`` up to ``last``, (height, width, 1 or 3) uint8 each."""
     return program.mapped(_codes, first, program.count if last is None else last)
 
 
 def png(picture: NDArray[np.uint8]) -> bytes:
-    """A picture as PNG in the fewest bits that hold it: black and white, grey, or RGB."""
+    """Encode a picture as PNG in the fewest bits that hold it: black and white, grey, or RGB."""
     if np.any(picture != picture[:, :, :1]):
         image = Image.fromarray(picture)
     else:
@@ -122,27 +122,27 @@ def png(picture: NDArray[np.uint8]) -> bytes:
     return file.getvalue()
 
 
-def archive(program: Program) -> Iterator[bytes]:
-    """A ZIP of `program.json` and the numbered PNGs, part by part: no more than one picture is held."""
+def zip_program(program: Program) -> Iterator[bytes]:
+    """A ZIP of `program.json` and the numbered PNGs, in parts: no more than one picture is held in memory."""
     pipe = _Pipe()
     with zipfile.ZipFile(pipe, "w", zipfile.ZIP_STORED) as target:
         for name, data in _files(program):
-            target.writestr(zipfile.ZipInfo(name), data)  # of a fixed date: the same bytes at any time
-            yield pipe.taken()
-    yield pipe.taken()
+            target.writestr(zipfile.ZipInfo(name), data)  # its date is fixed
+            yield pipe.take()
+    yield pipe.take()
 
 
-def write(program: Program, folder: Path, progress: Callable[[int, int], None]) -> None:
-    """Write `program.json`, the capture format's `program`, and a numbered PNG of each pattern.
+def write_folder(program: Program, folder: Path, progress: Callable[[int, int], None]) -> None:
+    """Write `program.json`, the ``program`` of a capture.json, and a numbered PNG of each pattern.
 
     Parameters
     ----------
     program : Program
-        Without images; what it shows is rounded to 8 bits.
+        Without images. Patterns are rounded to 8 bits.
     folder : Path
-        Made whole or not at all; may be there if it is empty.
+        Created completely or not at all; it may exist if it is empty.
     progress : callable
-        Called with the number of patterns written, and of all.
+        Called with the number of patterns written, and of all patterns.
 
     Raises
     ------
@@ -164,8 +164,8 @@ def write(program: Program, folder: Path, progress: Callable[[int, int], None]) 
 
 
 def _files(program: Program) -> Iterator[tuple[str, bytes]]:
-    """The files of a program: its record, and then its patterns."""
-    yield "program.json", (json.dumps(record(program), indent=1) + "\n").encode()
+    """Names and contents of a program's files: the JSON first, then the patterns."""
+    yield "program.json", (json.dumps(program_json(program), indent=1) + "\n").encode()
     for n, picture in enumerate(pictures(program)):
         yield f"{n:05d}.png", png(picture)
 
@@ -175,19 +175,19 @@ def _codes(values: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 class _Pipe(io.RawIOBase):
-    """A file that zipfile writes to, and that gives away what was written."""
+    """A file for zipfile to write to, from which the bytes are taken as they come."""
 
     def __init__(self) -> None:
-        self._held = bytearray()
+        self._written = bytearray()
 
     def writable(self) -> bool:
         return True
 
     def write(self, data: bytes) -> int:  # type: ignore[override]
-        self._held += data
+        self._written += data
         return len(data)
 
-    def taken(self) -> bytes:
-        """What was written since the last call."""
-        data, self._held = bytes(self._held), bytearray()
+    def take(self) -> bytes:
+        """The bytes written since the last call."""
+        data, self._written = bytes(self._written), bytearray()
         return data

@@ -1,4 +1,4 @@
-"""Patterns on grids that nest: which grids those are, and the patterns' light on their cells."""
+"""Grids that nest, each a whole multiple of the one before, and the light of patterns on their cells."""
 
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
@@ -25,12 +25,12 @@ class Shape(NamedTuple):
 
 
 def nested(grids: set[Grid]) -> list[Grid]:
-    """Grids from coarse to fine, each a whole multiple of the one before.
+    """Sort grids from coarse to fine, each a whole multiple of the one before.
 
     Raises
     ------
     OptionError
-        If one is not.
+        If they do not nest.
     """
     ordered = _by_cells(grids)
     for coarse, fine in pairwise(ordered):
@@ -45,7 +45,7 @@ def nested(grids: set[Grid]) -> list[Grid]:
 
 
 def chain(grids: set[Grid]) -> list[Grid]:
-    """The most of some grids, from coarse to fine and up to the finest, that nest each in the next."""
+    """The longest chain of nested grids, from coarse to fine, that ends with the finest of all."""
     chains: dict[Grid, list[Grid]] = {}
     for grid in _by_cells(grids):
         below = (chains[coarse] for coarse in chains if _splits(coarse, grid))
@@ -54,7 +54,7 @@ def chain(grids: set[Grid]) -> list[Grid]:
 
 
 def fitting(grids: list[Grid], cell: int, limit: int) -> list[Grid]:
-    """Grids without the finest, as many of them as do not fit, at ``cell`` bytes a cell of each.
+    """Leave out the finest grids that do not fit into ``limit`` bytes, at ``cell`` bytes a cell.
 
     Raises
     ------
@@ -73,14 +73,14 @@ def fitting(grids: list[Grid], cell: int, limit: int) -> list[Grid]:
 
 
 def sense(light: Iterable[NDArray[np.float32]], shapes: Sequence[Shape], grids: Sequence[Grid]) -> Sensing:
-    """The light of patterns on the cells of grids.
+    """Build the sensing matrix of each grid: the light of patterns on its cells.
 
     Parameters
     ----------
     light : iterable of (rows, columns, 1 or 3) float32
         Linear light of each pattern, on its grid or, with an offset, on the finest of the grids.
     shapes : sequence of Shape
-        Of each pattern.
+        The shape of each pattern.
     grids : sequence of (int, int)
         From coarse to fine, each a whole multiple of the one before.
     """
@@ -98,7 +98,7 @@ def sense(light: Iterable[NDArray[np.float32]], shapes: Sequence[Shape], grids: 
             column = np.searchsorted(level.patterns, pattern)
             level.light[:, :, column] = cells.reshape(-1, cells.shape[2]).T
             if cells.size < shown.size:
-                shown = cells  # a coarser cell's mean is that of its equal parts, and quicker from them
+                shown = cells  # coarser cells are means of these: the same result, and faster
     return Sensing(tuple(levels))
 
 
@@ -111,7 +111,7 @@ def _splits(coarse: Grid, fine: Grid) -> bool:
 
 
 def _first_level(shape: Shape, grids: Sequence[Grid]) -> int:
-    """The coarsest grid on which a pattern is exact, or with an offset nearly so; the finest if there is none."""
+    """Index of the coarsest grid on which a pattern is exact, or nearly so with an offset; else of the finest grid."""
     for at, (columns, rows) in enumerate(grids):
         if shape.offset and columns >= shape.columns and rows >= shape.rows:
             return at

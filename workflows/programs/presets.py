@@ -1,4 +1,4 @@
-"""Programs by name: which patterns are worth showing, for a monitor of any size."""
+"""Programs by name, for a monitor of any size."""
 
 from typing import Literal, NamedTuple
 
@@ -7,7 +7,7 @@ from workflows.programs.parts import MAX_BLOCKS
 from workflows.programs.program import Bernoulli, Constant, Monitor, Program, Stripes
 
 SEED = 7
-"""Of the first random part; those after it count on from there."""
+"""Seed of the first random part; each further part adds 1."""
 
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 RED, GREEN, BLUE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
@@ -19,10 +19,10 @@ class Recipe(NamedTuple):
     Attributes
     ----------
     constant : Constant
-        Its levels or colours are multiples of 1/255, so that 8 bits hold them.
+        Its levels or colours are multiples of 1/255, so that 8 bits represent them exactly.
     grids : dict of int to int
-        Patterns by the number of blocks along the monitor's shorter side, from few to many, each a whole multiple
-        of the one before.
+        Number of patterns for each number of blocks along the monitor's shorter side: from few to many blocks, each
+        number a whole multiple of the one before.
     colour, offset
         As in `Bernoulli`.
     stripes : int
@@ -39,7 +39,7 @@ class Recipe(NamedTuple):
 EIGHT_LEVELS = Constant(kind="constant", levels=tuple(round(255 * i / 7) / 255 for i in range(8)))
 COLOURS = Constant(kind="constant", colours=(BLACK, BLACK, WHITE, WHITE, RED, GREEN, BLUE))
 
-PRESETS = {
+RECIPES = {
     "default": Recipe(
         Constant(kind="constant", levels=(0, 0, 1, 1)),
         {6: 10, 12: 20, 24: 26, 48: 22, 96: 14, 192: 12, 384: 8},
@@ -58,9 +58,9 @@ def preset(name: str, width: int = 1280, height: int = 960) -> Program:
     Parameters
     ----------
     name : str
-        One of `PRESETS`.
+        A key of `RECIPES`.
     width, height : int
-        The monitor's pixels.
+        Size of the monitor in pixels.
 
     Returns
     -------
@@ -74,12 +74,12 @@ def preset(name: str, width: int = 1280, height: int = 960) -> Program:
 
     Notes
     -----
-    The blocks of the coarsest grid are as square as whole numbers of them allow; finer grids split them. The
-    patterns of grids that are finer than the pixels go to the finest that is not, and so do those of stripes.
+    The blocks of the coarsest grid are as square as whole numbers of them allow; finer grids split them. Grids finer
+    than the pixels give their patterns to the finest grid that is not, and so do stripes finer than the pixels.
     """
-    if name not in PRESETS:
-        raise OptionError(f"there is no preset {name!r}: choose from {', '.join(PRESETS)}", field="preset")
-    recipe = PRESETS[name]
+    if name not in RECIPES:
+        raise OptionError(f"there is no preset {name!r}: choose from {', '.join(RECIPES)}", field="preset")
+    recipe = RECIPES[name]
     coarsest = min(recipe.grids)
     short, long = sorted((width, height))
     if short < coarsest:

@@ -1,4 +1,4 @@
-"""A pattern program: what the monitor shows, as bits, as pictures, and as rows of the sensing matrix."""
+"""A pattern program: the patterns that a monitor shows, as pictures and as rows of the sensing matrix."""
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
@@ -28,9 +28,9 @@ __all__ = ["Bernoulli", "Constant", "Images", "Monitor", "Program", "Stripes"]
 Value = TypeVar("Value", bound=np.generic)
 
 MAX_PARTS = 1000
-"""The chain of their grids is found in time in proportion to the square."""
+"""Finding the chain of their grids takes time in proportion to the square."""
 SENSING_BYTES = 512 << 20
-"""The largest sensing matrix that a worker is asked to hold."""
+"""The largest sensing matrix."""
 
 
 class Program(Record):
@@ -49,7 +49,7 @@ class Program(Record):
     ]
 
     @model_validator(mode="after")
-    def _usable(self) -> "Program":
+    def _check(self) -> "Program":
         if self.count > MAX_PATTERNS:
             raise ValueError(f"{self.count} patterns, more than the {MAX_PATTERNS} that a program may have")
         for part in self.parts:
@@ -68,11 +68,11 @@ class Program(Record):
         constants = [part.values for part in self.parts if isinstance(part, Constant)]
         if not constants or np.any(np.ptp(np.concatenate(constants), axis=0) == 0):
             raise ValueError(
-                "no two different constant levels: without them neither S nor rho can be told; "
+                "no two different constant levels: without them neither S nor rho can be measured; "
                 'add a part like {"kind": "constant", "levels": [0, 1]}'
             )
         if all(isinstance(part, Constant) for part in self.parts):
-            raise ValueError("only constant parts: without patterns no T can be told")
+            raise ValueError("only constant parts: without other patterns T can't be measured")
         size = 4 * sum(
             p.count * p.columns * p.rows * p.channels for p in self.parts if isinstance(p, Bernoulli)
         )
@@ -85,7 +85,7 @@ class Program(Record):
 
     @cached_property
     def starts(self) -> tuple[int, ...]:
-        """The first pattern of each part, and at the end the number of patterns."""
+        """The number of the first pattern of each part, and last the number of patterns."""
         return tuple(np.cumsum([0, *(part.count for part in self.parts)]).tolist())
 
     @property
@@ -95,7 +95,7 @@ class Program(Record):
 
     @cached_property
     def constants(self) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-        """The constant patterns: their numbers (k,) intp and the values sent to the monitor (k, 3) float32."""
+        """Numbers of the constant patterns, (k,) intp, and the values sent to the monitor, (k, 3) float32."""
         found = [
             (np.arange(start, start + part.count), part.values)
             for start, part in zip(self.starts, self.parts, strict=False)
@@ -104,33 +104,33 @@ class Program(Record):
         return np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
 
     def constants_among(self, patterns: Sequence[int]) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-        """`constants`, less those that are not among some patterns: a video may lack some."""
+        """Those of the `constants` that are among ``patterns``: a video may lack some."""
         numbers, sent = self.constants
-        there = np.isin(numbers, patterns)
-        return numbers[there], sent[there]
+        present = np.isin(numbers, patterns)
+        return numbers[present], sent[present]
 
     def values(
         self, first: int, last: int, images: Sequence[NDArray[np.float32]] = ()
     ) -> list[NDArray[np.float32]]:
-        """What is sent to the monitor for the patterns from ``first`` up to ``last``.
+        """The values of the patterns from ``first`` up to ``last``, as sent to the monitor.
 
         Returns
         -------
         list of (rows, columns, 1 or 3) float32
-            0 to 1, each on its own grid; patterns with an offset on the monitor's pixels.
+            0 to 1. Each pattern is on its own grid, or on the monitor's pixels if it has an offset.
         """
         return list(self._values(first, last, images))
 
     def pictures(
         self, first: int, last: int, images: Sequence[NDArray[np.float32]] = ()
     ) -> Iterator[NDArray[np.float32]]:
-        """The pictures sent to the monitor for the patterns from ``first`` up to ``last``, one after another.
+        """The pictures of the patterns from ``first`` up to ``last``, as sent to the monitor.
 
         Parameters
         ----------
         first, last : int
         images : sequence of (rows, columns, 1 or 3) float32
-            The images of the `Images` parts, in order, at any size.
+            The images of the `Images` parts, in order, of any size.
 
         Returns
         -------
@@ -146,9 +146,9 @@ class Program(Record):
         last: int,
         images: Sequence[NDArray[np.float32]] = (),
     ) -> Iterator[NDArray[Value]]:
-        """As `pictures`, put through a function of each value alone: a tone curve, say.
+        """As `pictures`, with a function such as a tone curve applied to each value.
 
-        A pattern has few blocks and the monitor many pixels, so the function is given whichever are fewer.
+        The function is applied to the blocks of a pattern or to the pixels of the monitor, whichever are fewer.
         """
         pixels = self.monitor.width * self.monitor.height
         for values, offset in self._drawn(first, last, images):
@@ -160,19 +160,19 @@ class Program(Record):
     def _values(
         self, first: int, last: int, images: Sequence[NDArray[np.float32]]
     ) -> Iterator[NDArray[np.float32]]:
-        """As `values`, one after another: at the monitor's resolution, all of them may be too much to hold."""
+        """As `values`, one at a time: at the monitor's resolution they may not fit into memory together."""
         for values, offset in self._drawn(first, last, images):
             yield values if offset is None else self._placed(values, offset)
 
     def _placed(self, values: NDArray[Value], offset: tuple[int, int] | None) -> NDArray[Value]:
-        """Values of a pattern's grid on the monitor's pixels."""
+        """Stretch the values of a pattern over the monitor's pixels, and apply its offset."""
         picture = stretch(values, self.monitor.width, self.monitor.height)
         return picture if offset is None else np.roll(picture, (-offset[1], -offset[0]), axis=(0, 1))
 
     def _drawn(
         self, first: int, last: int, images: Sequence[NDArray[np.float32]]
     ) -> Iterator[tuple[NDArray[np.float32], tuple[int, int] | None]]:
-        """The patterns on their own grids, and the offsets dx and dy of those that have one."""
+        """The patterns on their own grids, each with its offset dx, dy or None."""
         given = iter(images)
         for start, part in zip(self.starts, self.parts, strict=False):
             inside = range(max(first - start, 0), min(last - start, part.count))
@@ -190,10 +190,10 @@ class Program(Record):
                     yield part.pattern(i).astype(np.float32), (dx, dy) if part.offset else None
 
     def bands(self) -> list[tuple[int, int]]:
-        """The columns and rows of the Bernoulli parts' grids that nest, from coarse to fine.
+        """Columns and rows of the nested grids of the Bernoulli parts, from coarse to fine.
 
-        Those of the parts without an offset; if there are none, the longest chain of the others' that ends with
-        their finest.
+        These are the grids of the parts without an offset; if there are none, the longest chain among the others that
+        ends with their finest.
 
         Raises
         ------
@@ -209,12 +209,12 @@ class Program(Record):
         monitor_curve: Curve,
         images: Sequence[NDArray[np.float32]] = (),
     ) -> Sensing:
-        """The rows of the sensing matrix L_M (eq. 7) at every grid of the program, constants left out.
+        """The rows of the sensing matrix L_M (eq. 7) on every grid of the program, without the constant patterns.
 
         Parameters
         ----------
         monitor_curve : Curve
-            From the value sent to the light emitted.
+            From value sent to light emitted.
         images : sequence of (rows, columns, 1 or 3) float32
             The images of the `Images` parts, in order, each on the coarsest grid that holds it
             (`smallest_grid`).
@@ -222,16 +222,15 @@ class Program(Record):
         Raises
         ------
         OptionError
-            If the grids of two bands without an offset do not nest, or the matrices would be too large with the
-            coarsest level alone.
+            If grids without an offset do not nest, or the matrix of the coarsest level alone is too large.
 
         Notes
         -----
-        The levels are the `bands`; without any, grids of the images and stripes that nest. The finest levels are
-        left out if the matrices would be too large with them. A pattern is exact on its own grid and on every
-        finer one, and is listed from the first of them on. One with an offset is averaged over the cells, and
-        listed from the first level on whose cells are no larger than its blocks. What is left (a photograph,
-        say) is averaged over the cells of the finest.
+        The levels are the `bands`, or nested grids of the images and stripes if there are none. The finest levels
+        are left out if the matrices would be too large with them. A pattern is exact on its own grid and on every
+        finer one, and is included from the first of these on. A pattern with an offset is averaged over the cells, and
+        included from the first level whose cells are no larger than its blocks. Any other pattern, such as a
+        photograph, is averaged over the cells of the finest level.
         """
         shapes, channels = self._shapes(images), self.channels(images)
         grids = fitting(
@@ -254,7 +253,7 @@ class Program(Record):
                 yield from (to_light(v, curve) for v in self._values(start, start + part.count, images))
 
     def _grids_of_others(self, images: Sequence[NDArray[np.float32]]) -> list[tuple[int, int]]:
-        """A chain of the grids of the images, and of those that hold the stripes along both axes."""
+        """A chain of the grids of the images, and of grids on which the stripes along both axes are exact."""
         grids = {(image.shape[1], image.shape[0]) for image in images}
         stripes = [part for part in self.parts if isinstance(part, Stripes)]
         if stripes:
@@ -279,5 +278,5 @@ class Program(Record):
 
     @cached_property
     def measured(self) -> NDArray[np.intp]:
-        """The numbers of the patterns that are not constant, in order: axis 1 of the measurements."""
+        """Numbers of the patterns that are not constant, ascending: axis 1 of the measurements."""
         return np.setdiff1d(np.arange(self.count), self.constants[0])

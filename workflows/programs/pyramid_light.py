@@ -1,4 +1,4 @@
-"""The light of a program's patterns on a pyramid over the monitor."""
+"""The light of a program's patterns on a pyramid of grids over the monitor."""
 
 from collections.abc import Iterator, Sequence
 from itertools import compress, islice
@@ -15,15 +15,17 @@ from workflows.recovery.sensing import Patterns
 
 CODE = np.dtype(np.uint8)
 PATTERNS_BYTES = 256 << 20
-"""What a worker may hold of a program; with more patterns or pixels, the pyramid starts at cells of several pixels."""
+"""Bytes that a worker may hold of a program. Beyond that, the pyramid starts at cells of several pixels."""
 
-# Patterns written at a time: a node's are neighbours in memory.
+# Patterns written at a time, because the patterns of a node are neighbours in memory.
 _BATCH = 24
 
 
 def pyramid_of(program: Program, channels: int) -> Pyramid:
-    """The pyramid that the patterns of a program are laid out on: over the monitor's pixels, or over cells of
-    2 x 2, 4 x 4, … of them where all of it would take more than `PATTERNS_BYTES`."""
+    """The pyramid for the patterns of a program.
+
+    It starts at the monitor's pixels, or at cells of 2 x 2, 4 x 4, ... of them if it took more than `PATTERNS_BYTES`.
+    """
     columns, rows = program.monitor.width, program.monitor.height
     while (pyramid := Pyramid.over(columns, rows)).nodes * channels * program.measured.size > PATTERNS_BYTES:
         columns, rows = -(-columns // 2), -(-rows // 2)
@@ -31,13 +33,13 @@ def pyramid_of(program: Program, channels: int) -> Pyramid:
 
 
 def lay_out(program: Program, curve: Curve, images: Sequence[NDArray[np.float32]] = ()) -> Patterns:
-    """Lay the patterns of a program, constants left out, on its pyramid.
+    """Lay the patterns of a program, without the constant ones, out on its pyramid.
 
     Parameters
     ----------
     program : Program
     curve : Curve
-        From the value sent to the monitor to the light emitted.
+        From value sent to the monitor to light emitted.
     images : sequence of (rows, columns, 1 or 3) float32
         The images of the `Images` parts, in order.
 
@@ -76,6 +78,6 @@ def _codes(
         return program.mapped(
             lambda values: to_integers(to_light(values, curve), CODE), 0, program.count, images
         )
-    # A cell's light is the mean of its pixels': rounding comes after it, the curve before.
+    # The light of a cell is the mean of its pixels: the curve is applied before, rounding after.
     lights = program.mapped(lambda values: to_light(values, curve), 0, program.count, images)
     return (to_integers(area_mean(light, columns, rows), CODE) for light in lights)

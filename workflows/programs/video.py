@@ -1,4 +1,4 @@
-"""A program as a video: the lead-in, the patterns in their border, the lead-out."""
+"""A program as a video to film: the lead-in, the patterns in a numbered border, the lead-out."""
 
 import json
 import math
@@ -16,59 +16,59 @@ from numpy.typing import NDArray
 
 from storage.errors import OptionError
 from workflows.programs.border import LEAD, Border, draw_border, schedule
-from workflows.programs.files import pictures, record
+from workflows.programs.files import pictures, program_json
 from workflows.programs.program import Program
 
 FORMATS = {".mp4": "mp4", ".mkv": "matroska"}
-"""Containers, by the ends of their files' names."""
+"""Containers by file extension."""
 FRAMES_PER_SECOND = 6
-"""At least: a picture is repeated, so that a player which drops a frame drops no pattern."""
+"""The least frame rate: a picture is repeated, so that a player that drops a frame drops no pattern."""
 SLOWEST, FASTEST = 0.1, 30.0
 """Patterns a second."""
 
 
-def capture_record(program: Program, border: Border, rate: float) -> dict[str, Any]:
-    """The `capture.json` of whoever films it, and calls the film `film.mp4`."""
+def film_manifest(program: Program, border: Border, rate: float) -> dict[str, Any]:
+    """The capture.json for a film of the video, if the film is called `film.mp4`."""
     video = {"file": "film.mp4", "patterns_per_second": rate, "border": border.model_dump(mode="json")}
-    return {"format": "envmatte-capture/1", "program": record(program), "video": video}
+    return {"format": "envmatte-capture/1", "program": program_json(program), "video": video}
 
 
-def write(program: Program, path: Path, rate: float, progress: Callable[[int, int], None]) -> None:
-    """Write a video, and beside it, under the same name with the end `.json`, its `capture_record`.
+def write_video(program: Program, path: Path, rate: float, progress: Callable[[int, int], None]) -> None:
+    """Write a video, and its `film_manifest` beside it under the same name with the extension `.json`.
 
     Parameters
     ----------
     program : Program
-        As `workflows.programs.files.fitted` gives it.
+        As `workflows.programs.files.fit_to_screen` returns it.
     path : Path
-        One of `FORMATS` by its end; both files are made whole or not at all.
+        With an extension of `FORMATS`. Both files are written completely or not at all.
     rate : float
         Patterns a second.
     progress : callable
-        As for `encode`.
+        As for `encode_video`.
 
     Raises
     ------
     OptionError
-        If one of the files is there already.
+        If one of the files exists already.
     """
     path = path.resolve()
     beside = path.with_suffix(".json")
     for file in (path, beside):
         if file.exists():
-            raise OptionError(f"{file} is there already: name another file, or remove it", field="out")
+            raise OptionError(f"{file} exists already: name another file, or remove it", field="out")
     path.parent.mkdir(parents=True, exist_ok=True)
     border = Border.around(program.monitor.width, program.monitor.height)
     with tempfile.TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as folder:
         film, text = Path(folder, path.name), Path(folder, beside.name)
-        text.write_text(json.dumps(capture_record(program, border, rate), indent=1) + "\n")
+        text.write_text(json.dumps(film_manifest(program, border, rate), indent=1) + "\n")
         with film.open("wb") as target:
-            encode(program, target, rate, FORMATS[path.suffix.lower()], progress)
+            encode_video(program, target, rate, FORMATS[path.suffix.lower()], progress)
         os.replace(film, path)
         os.replace(text, beside)
 
 
-def encode(
+def encode_video(
     program: Program,
     target: IO[bytes],
     rate: float,
@@ -88,19 +88,19 @@ def encode(
     container : str
         A value of `FORMATS`.
     progress : callable
-        Called with the number of pictures done, those of the lead included, and of all.
+        Called with the number of pictures encoded, lead-in and lead-out included, and of all pictures.
 
     Raises
     ------
     OptionError
-        If there is no room for a border, the rate is none that can be shown, or the patterns are too many.
+        If there is no room for a border, the rate is out of range, or there are too many patterns.
 
     Notes
     -----
-    H.264 without loss (``qp`` 0), in YCbCr of the full range without subsampling of colours, 4:4:4: grey comes back
-    to the byte and colours to 1/255, and VLC, mpv, Chromium and all else with a decoder in software play it. What
-    decodes in hardware alone takes 4:2:0 at a loss, of 4/255 where it was measured; FFV1 keeps RGB to the byte, but
-    plays in fewer places. Every pattern has the same whole number of frames, so the rate is exact.
+    The video is lossless H.264 (``qp`` 0) in YCbCr 4:4:4 of full range: grey is exact and colours are exact to 1/255.
+    VLC, mpv, Chromium and other software decoders play it. Hardware decoders only take 4:2:0, which lost 4/255 when
+    measured; FFV1 keeps RGB exact, but fewer players have it. Every pattern has the same whole number of frames, so the
+    rate is exact.
     """
     if not SLOWEST <= rate <= FASTEST:
         raise OptionError(f"{rate} patterns a second: choose {SLOWEST} to {FASTEST}", field="rate")
@@ -113,7 +113,7 @@ def encode(
         stream = video.add_stream("libx264", rate=frame_rate, options={"qp": "0", "preset": "ultrafast"})
         stream.width, stream.height, stream.pix_fmt = border.width, border.height, "yuv444p"
         codec = stream.codec_context
-        codec.thread_count = 2  # fixed, as memory grows with it, and bytes may differ by it
+        codec.thread_count = 2  # fixed: memory grows with it, and the bytes may depend on it
         codec.color_range, codec.colorspace = ColorRange.JPEG, Colorspace.ITU709
         codec.color_primaries, codec.color_trc = ColorPrimaries.BT709, ColorTrc.IEC61966_2_1
         codec.time_base = 1 / frame_rate
@@ -130,7 +130,7 @@ def encode(
 
 
 def _frame(pixels: NDArray[np.uint8]) -> av.VideoFrame:
-    """Pixels, (height, width, 1 or 3), in the encoder's colours."""
+    """A frame of pixels, (height, width, 1 or 3), in the encoder's colour system."""
     wide = np.ascontiguousarray(np.broadcast_to(pixels, (*pixels.shape[:2], 3)))
     return av.VideoFrame.from_ndarray(wide, "rgb24").reformat(
         format="yuv444p",

@@ -17,7 +17,7 @@ from storage.database.engine import reading
 from storage.errors import NotFound
 from storage.records import programs
 from workflows.programs import video
-from workflows.programs.files import archive, pictures, png
+from workflows.programs.files import pictures, png, zip_program
 from workflows.programs.program import Program
 
 router = APIRouter(tags=["programs"])
@@ -47,7 +47,7 @@ async def get_pattern(context: OwnerContext, program: Stored, n: int) -> Respons
 @router.get("/programs/{id}/patterns.zip", response_class=StreamingResponse)
 async def get_patterns(context: OwnerContext, program: Stored) -> StreamingResponse:
     """`program.json` and a numbered PNG of each pattern, drawn while they are sent."""
-    parts = archive(program)
+    parts = zip_program(program)
 
     async def stream() -> AsyncIterator[bytes]:
         while part := await anyio.to_thread.run_sync(next, parts, b"", limiter=context.pictures):
@@ -69,7 +69,7 @@ async def get_film(
     def encode() -> tuple[IO[bytes], int]:
         with ExitStack() as stack:
             file = stack.enter_context(tempfile.TemporaryFile())
-            video.encode(program, file, rate)
+            video.encode_video(program, file, rate)
             size = file.seek(0, os.SEEK_END)
             file.seek(0)
             stack.pop_all()  # the answer closes it

@@ -18,7 +18,7 @@ from storage.database.tables import programs as table
 from storage.errors import OptionError
 from storage.records import programs
 from workflows.programs.border import MAX_PATTERNS, Border
-from workflows.programs.files import fitted, record
+from workflows.programs.files import fit_to_screen, program_json
 from workflows.programs.parts import Monitor
 from workflows.programs.preset_names import PRESETS
 from workflows.programs.program import Program as PatternProgram
@@ -162,9 +162,9 @@ def post_program(
     """Store a program. Its id is a hash of what it shows, so a repeated request creates nothing, with or without an
     Idempotency-Key."""
     screen = (request.monitor.width, request.monitor.height) if request.monitor else None
-    program = fitted(request.program or request.preset or "", screen, bordered=request.border)
+    program = fit_to_screen(request.program or request.preset or "", screen, bordered=request.border)
     _check_size(program)
-    kept = record(program)
+    kept = program_json(program)
     with writing(context.engine) as c:
         if size := programs.added_bytes(c, kept):
             admit(c, context.settings, size=size)

@@ -34,7 +34,7 @@ from services.client import Client
 from tests.benchmarks.recovery.kits import load, parser_of, show
 from workflows.images import integer_formats
 from workflows.images.tone_curves import from_light
-from workflows.programs.files import write
+from workflows.programs.files import write_folder
 from workflows.programs.presets import preset
 from workflows.simulation import glass_ball
 from workflows.simulation.scene import write_capture
@@ -140,7 +140,7 @@ def measure(
 def recover(kit: ModuleType, scenes: Path, ball: bool, client: Client, folder: Path) -> dict[str, str]:
     """The mattes, by their titles."""
     patterns = folder / "quick"
-    write(preset("quick"), patterns, lambda *_: None)
+    write_folder(preset("quick"), patterns, lambda *_: None)
     bundles = {}
     for scene in sorted(scenes.glob("*.npz")):
         bundles[scene.stem] = folder / f"{scene.stem}.zip"

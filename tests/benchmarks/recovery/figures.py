@@ -25,7 +25,7 @@ from scipy.stats import spearmanr
 
 from services.client import Client
 from workflows.images import integer_formats
-from workflows.programs.files import write
+from workflows.programs.files import write_folder
 from workflows.programs.presets import preset
 
 
@@ -57,7 +57,7 @@ def measure(
     else:
         patterns = folder / case.program
         if not patterns.exists():
-            write(preset(case.program), patterns, lambda *_: None)
+            write_folder(preset(case.program), patterns, lambda *_: None)
         program = ["--program", str(patterns)]
     with redirect_stdout(None):
         kit.main(["capture", str(scene), str(bundle), *program, "--mask", *film])

@@ -119,7 +119,7 @@ def test_the_patterns_of_a_preset_are_written_as_they_are(preset: str, tmp_path:
 
 
 def test_every_preset_is_described_in_the_help() -> None:
-    assert set(PRESETS) == set(presets.PRESETS)
+    assert set(PRESETS) == set(presets.RECIPES)
     said = patterns("--help").stdout
     for name, text in PRESETS.items():
         assert text.startswith(f"{presets.preset(name).count} frames")
@@ -172,7 +172,7 @@ def test_a_film_is_made_of_a_preset_and_of_its_record(tmp_path: Path) -> None:
     assert (tmp_path / "again.mp4").read_bytes() == film.read_bytes()
     refused = patterns("sketch", str(film))
     assert (refused.returncode, refused.stdout) == (2, "")
-    assert "is there already" in refused.stderr
+    assert "exists already" in refused.stderr
 
 
 @pytest.mark.parametrize(("out", "first"), [("patterns", "1 of 432"), ("patterns.mkv", "1 of 442")])

@@ -12,13 +12,13 @@ from PIL import Image
 
 from tests.end_to_end.captures.test_bad_input import check_problem
 from tests.end_to_end.conftest import Service
-from workflows.programs import video as program_video
 from workflows.programs.border import Border
-from workflows.programs.files import fitted, pictures, record
+from workflows.programs.files import fit_to_screen, pictures, program_json
 from workflows.programs.preset_names import PRESETS
 from workflows.programs.program import Program
+from workflows.programs.video import write_video
 
-SKETCH = fitted("sketch", (320, 240), bordered=True)
+SKETCH = fit_to_screen("sketch", (320, 240), bordered=True)
 CONSTANT = {"kind": "constant", "levels": [0, 1]}
 
 
@@ -42,7 +42,7 @@ def test_a_program_is_kept_once_whatever_it_came_from(service: Service, program:
     assert program["monitor"] == {"width": 296, "height": 216}
     assert program["display"] == {"width": 320, "height": 240}
     again = service.http.post(
-        "/v1/programs", json={"program": record(SKETCH)}, headers={"Idempotency-Key": "again"}
+        "/v1/programs", json={"program": program_json(SKETCH)}, headers={"Idempotency-Key": "again"}
     )
     assert (again.status_code, again.json()) == (201, program)
     assert service.http.get(f"/v1/programs/{program['id']}").json() == program
@@ -58,7 +58,7 @@ def test_presets_are_listed(service: Service) -> None:
 
 
 def test_a_program_is_made_for_another_monitor_on_request(service: Service) -> None:
-    asked = {"program": record(SKETCH), "monitor": {"width": 640, "height": 480}}
+    asked = {"program": program_json(SKETCH), "monitor": {"width": 640, "height": 480}}
     for border, size in ((False, (640, 480)), (True, (592, 432))):
         found = service.http.post("/v1/programs", json=asked | {"border": border}).json()
         assert (found["monitor"]["width"], found["monitor"]["height"]) == size
@@ -92,7 +92,7 @@ def test_the_video_is_the_one_of_the_command(service: Service, program: dict, tm
     answer = service.http.get(f"/v1/programs/{program['id']}/patterns.mp4?rate=10")
     assert answer.headers["content-type"] == "video/mp4"
     assert int(answer.headers["content-length"]) == len(answer.content)
-    program_video.write(SKETCH, tmp_path / "film.mp4", 10, lambda done, of: None)
+    write_video(SKETCH, tmp_path / "film.mp4", 10, lambda done, of: None)
     assert answer.content == (tmp_path / "film.mp4").read_bytes()
     with av.open(io.BytesIO(answer.content)) as video:
         stream = video.streams.video[0]
@@ -104,7 +104,11 @@ def test_the_video_is_the_one_of_the_command(service: Service, program: dict, tm
     ("body", "slug", "said"),
     [
         ({}, "bad-request", "either a preset or a program"),
-        ({"preset": "sketch", "program": record(SKETCH)}, "bad-request", "either a preset or a program"),
+        (
+            {"preset": "sketch", "program": program_json(SKETCH)},
+            "bad-request",
+            "either a preset or a program",
+        ),
         ({"preset": "best"}, "bad-option", "default, quick"),
         ({"preset": "quick", "monitor": {"width": 5, "height": 5}}, "bad-option", "too small"),
         (

@@ -11,7 +11,7 @@ from PIL import Image
 from pydantic import ValidationError
 
 from storage.errors import OptionError
-from workflows.programs.files import archive, fitted, given, pictures, png, record
+from workflows.programs.files import fit_to_screen, load_program, pictures, png, program_json, zip_program
 from workflows.programs.presets import preset
 from workflows.programs.program import Program
 
@@ -19,17 +19,17 @@ SKETCH = preset("sketch", 160, 120)
 
 
 def test_a_program_comes_from_a_preset_or_a_file(tmp_path: Path) -> None:
-    assert given("sketch") == "sketch"
+    assert load_program("sketch") == "sketch"
     file = tmp_path / "program.json"
-    for text in (record(SKETCH), {"format": "envmatte-capture/1", "program": record(SKETCH)}):
+    for text in (program_json(SKETCH), {"format": "envmatte-capture/1", "program": program_json(SKETCH)}):
         file.write_text(json.dumps(text))
-        assert given(str(file)) == SKETCH
+        assert load_program(str(file)) == SKETCH
 
 
 @pytest.mark.parametrize(
     ("text", "error", "said"),
     [
-        ("{", OptionError, "is no JSON"),
+        ("{", OptionError, "is not JSON"),
         ("[1]", ValidationError, "valid dictionary"),
         ("{}", ValidationError, "monitor"),
         ('"\\ud800"', ValidationError, "valid dictionary"),
@@ -41,14 +41,14 @@ def test_a_file_without_a_program_is_refused(
     file = tmp_path / "program.json"
     file.write_text(text)
     with pytest.raises(error, match=said):
-        given(str(file))
-    with pytest.raises(OptionError, match=r"is not one of 'default'.* and no file"):
-        given(str(tmp_path))
+        load_program(str(file))
+    with pytest.raises(OptionError, match=r"is not one of 'default'.* nor a file"):
+        load_program(str(tmp_path))
 
 
 def test_a_screen_is_the_monitor_or_has_it_inside_a_border() -> None:
     def size(of: str | Program, screen: tuple[int, int] | None, bordered: bool) -> tuple[int, int]:
-        monitor = fitted(of, screen, bordered=bordered).monitor
+        monitor = fit_to_screen(of, screen, bordered=bordered).monitor
         return monitor.width, monitor.height
 
     for of in ("sketch", SKETCH):
@@ -57,22 +57,22 @@ def test_a_screen_is_the_monitor_or_has_it_inside_a_border() -> None:
     assert size("sketch", None, False) == (1280, 960)
     assert size("sketch", None, True) == (1184, 864)
     for bordered in (False, True):
-        assert fitted(SKETCH, None, bordered=bordered) == SKETCH
+        assert fit_to_screen(SKETCH, None, bordered=bordered) == SKETCH
 
 
 def test_what_has_no_room_on_a_screen_or_is_files_already_is_refused() -> None:
     with pytest.raises(OptionError, match=r"on a monitor of 90 x 90 pixels: a grid of .* is finer"):
-        fitted(SKETCH, (90, 90), bordered=False)
-    images = record(SKETCH)
+        fit_to_screen(SKETCH, (90, 90), bordered=False)
+    images = program_json(SKETCH)
     images["parts"].append({"kind": "images", "files": ["a.png"]})
     with pytest.raises(OptionError, match="part of images"):
-        fitted(Program.model_validate(images), None, bordered=False)
+        fit_to_screen(Program.model_validate(images), None, bordered=False)
 
 
 def test_an_archive_has_the_record_and_every_picture() -> None:
-    parts = list(archive(SKETCH))
+    parts = list(zip_program(SKETCH))
     assert max(map(len, parts)) < 12_000  # of one picture each, and at the end the directory
-    assert b"".join(archive(SKETCH)) == b"".join(parts)
+    assert b"".join(zip_program(SKETCH)) == b"".join(parts)
     with zipfile.ZipFile(io.BytesIO(b"".join(parts))) as found:
         assert found.testzip() is None
         assert found.namelist() == ["program.json", *(f"{n:05d}.png" for n in range(32))]

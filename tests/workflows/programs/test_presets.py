@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from storage.errors import OptionError
-from workflows.programs.presets import PRESETS, preset
+from workflows.programs.presets import RECIPES, preset
 from workflows.programs.program import Bernoulli
 
 COUNTS = {"default": 132, "quick": 56, "sketch": 32, "paper-250": 282, "paper-400": 432}
@@ -27,7 +27,7 @@ def grids(name: str, width: int, height: int) -> list[Bernoulli]:
 
 
 def test_all_presets_are_listed() -> None:
-    assert set(PRESETS) == set(COUNTS)
+    assert set(RECIPES) == set(COUNTS)
 
 
 @pytest.mark.parametrize("name", COUNTS)

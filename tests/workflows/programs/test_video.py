@@ -1,6 +1,8 @@
-"""A program's video, decoded again: every picture as it was, as long as it should be."""
+"""A program's video: pictures and times are exact when it is decoded, and ingest finds every pattern in it."""
 
+import io
 import json
+import zipfile
 from fractions import Fraction
 from pathlib import Path
 
@@ -9,16 +11,23 @@ import numpy as np
 import pytest
 from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
-from storage.errors import OptionError
-from workflows.programs import video as program_video
+from storage.errors import CaptureError, OptionError
+from storage.layout import uploads
+from storage.layout.captures import Stack
+from storage.objects.store import Objects
+from workflows.ingest import steps
+from workflows.jobs import Task
 from workflows.programs.border import LEAD_SECONDS, Border, draw_border, schedule
-from workflows.programs.files import fitted, pictures
+from workflows.programs.files import fit_to_screen, pictures
 from workflows.programs.program import Bernoulli, Constant, Monitor, Program
+from workflows.programs.video import write_video
+from workflows.untrusted.limits import Limits
 
 LEVELS = Constant(kind="constant", levels=(0, 0.25, 0.5, 0.75, 1))
 RANDOM = Bernoulli(kind="bernoulli", columns=64, rows=48, count=6, seed=3, offset=True)
 GREY = Program(monitor=Monitor(width=271, height=199), parts=(LEVELS, RANDOM))  # odd sizes
-COLOURED = fitted("sketch", (320, 240), bordered=True)
+RATE = 2.0
+COLOURED = fit_to_screen("sketch", (320, 240), bordered=True)
 
 
 @pytest.mark.parametrize("end", [".mp4", ".mkv"])
@@ -28,7 +37,7 @@ def test_every_picture_comes_back_for_its_time(
     program: Program, off: int, end: str, rate: float, tmp_path: Path
 ) -> None:
     path = tmp_path / f"film{end}"
-    program_video.write(program, path, rate, lambda done, of: None)
+    write_video(program, path, rate, lambda done, of: None)
     border = Border.around(program.monitor.width, program.monitor.height)
     of_patterns = list(pictures(program))
     steps = schedule(program.count, rate)
@@ -62,7 +71,7 @@ def test_every_picture_comes_back_for_its_time(
 
 
 def test_beside_the_video_is_what_the_capture_needs(tmp_path: Path) -> None:
-    program_video.write(COLOURED, tmp_path / "sketch.mp4", 3.0, lambda done, of: None)
+    write_video(COLOURED, tmp_path / "sketch.mp4", 3.0, lambda done, of: None)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["sketch.json", "sketch.mp4"]
     record = json.loads((tmp_path / "sketch.json").read_text())
     assert record["format"] == "envmatte-capture/1"
@@ -73,15 +82,15 @@ def test_beside_the_video_is_what_the_capture_needs(tmp_path: Path) -> None:
 
 def test_the_same_program_gives_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a.mp4", "b.mp4"):
-        program_video.write(COLOURED, tmp_path / name, 2.0, lambda done, of: None)
+        write_video(COLOURED, tmp_path / name, 2.0, lambda done, of: None)
     assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
 
 
 @pytest.mark.parametrize("name", ["film.mp4", "film.json"])
 def test_a_file_that_is_there_is_kept(name: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text("mine")
-    with pytest.raises(OptionError, match=f"{name} is there already"):
-        program_video.write(COLOURED, tmp_path / "film.mp4", 2.0, lambda done, of: None)
+    with pytest.raises(OptionError, match=f"{name} exists already"):
+        write_video(COLOURED, tmp_path / "film.mp4", 2.0, lambda done, of: None)
     assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
 
 
@@ -90,7 +99,7 @@ def test_a_file_that_is_there_is_kept(name: str, tmp_path: Path) -> None:
     [
         (GREY, 0.0, "0.0 patterns a second"),
         (GREY, float("nan"), "nan patterns a second"),
-        (fitted("sketch", (40, 30), bordered=False), 2.0, "no border can be drawn"),
+        (fit_to_screen("sketch", (40, 30), bordered=False), 2.0, "no border can be drawn"),
         (
             Program(monitor=GREY.monitor, parts=(LEVELS, RANDOM.model_copy(update={"count": 4091}))),
             2.0,
@@ -103,5 +112,45 @@ def test_what_can_not_be_filmed_is_refused_and_leaves_nothing(
     program: Program, rate: float, said: str, tmp_path: Path
 ) -> None:
     with pytest.raises(OptionError, match=said):
-        program_video.write(program, tmp_path / "new" / "film.mkv", rate, lambda done, of: None)
+        write_video(program, tmp_path / "new" / "film.mkv", rate, lambda done, of: None)
     assert not list(tmp_path.rglob("*.*"))
+
+
+def prepare_film(folder: Path) -> Stack:
+    """Prepare a capture of `film.mp4` and `film.json`, as if a camera had seen exactly the display."""
+    target = io.BytesIO()
+    with zipfile.ZipFile(target, "w") as archive:
+        archive.write(folder / "film.json", "capture.json")
+        archive.write(folder / "film.mp4", "film.mp4")
+    objects = Objects((folder / "store").as_uri())
+    objects.put(uploads.part_path("c", "all"), target.getvalue())
+    uploads.seal(objects, "c", [uploads.Part("all", len(target.getvalue()))])
+    steps.prepare(objects, Task("j", "c", "", {}, Limits(unpacked=1 << 30, memory=1 << 28)))
+    return Stack(objects, "c")
+
+
+@pytest.mark.parametrize("name", [pytest.param("default", marks=pytest.mark.slow), "quick", "sketch"])
+@pytest.mark.parametrize("size", [(384, 288), pytest.param((640, 480), marks=pytest.mark.slow)], ids=str)
+def test_ingest_finds_every_pattern_of_a_film(name: str, size: tuple[int, int], tmp_path: Path) -> None:
+    program = fit_to_screen(name, size, bordered=True)
+    write_video(program, tmp_path / "film.mp4", RATE, lambda done, of: None)
+    stack = prepare_film(tmp_path)
+    assert stack.attributes["video"]["missing"] == {}
+    assert stack.attributes["patterns"] == list(range(program.count))
+    at, ticks, _ = stack.shares().T
+    shown = np.floor((ticks * stack.attributes["video"]["tick"] - sum(LEAD_SECONDS)) * RATE + 1e-3)
+    np.testing.assert_array_equal(shown, at)
+
+
+@pytest.mark.parametrize("name", ["default", "quick"])
+def test_ingest_refuses_the_film_of_another_program(name: str, tmp_path: Path) -> None:
+    write_video(
+        fit_to_screen(name, (384, 288), bordered=True), tmp_path / "film.mp4", RATE, lambda done, of: None
+    )
+    record = json.loads((tmp_path / "film.json").read_text())
+    for part in record["program"]["parts"]:
+        if "seed" in part:
+            part["seed"] += 100
+    (tmp_path / "film.json").write_text(json.dumps(record))
+    with pytest.raises(CaptureError, match="does not look like"):
+        prepare_film(tmp_path)

@@ -241,7 +241,7 @@ def test_a_clip_that_ends_early_is_composited_as_far_as_it_goes(
         assert 30 < len(made) < 60
         assert [round(time * 30, 1) for time in times] == [*range(len(made))]
     notes = plan_of(objects, short)["notes"]
-    assert "ends early: it is 2.666 s long" in notes[1]
+    assert "ends early: it should be 2.666 s long" in notes[1]
     assert len(plan_of(objects, data)["notes"]) == 1
 
 
