@@ -31,7 +31,7 @@ def on_postgresql(
 
 
 @pytest.mark.exhaustive
-def test_a_restarted_server(
+def test_restarted_database(
     on_postgresql: Known, postgresql_server: Server, table: list[Row], times: int
 ) -> None:
     row = on_postgresql.disturb("restart of PostgreSQL", postgresql_server.restart, times)
@@ -39,7 +39,7 @@ def test_a_restarted_server(
 
 
 @pytest.mark.exhaustive
-def test_a_server_that_stays_away(
+def test_database_that_stays_away(
     on_postgresql: Known, postgresql_server: Server, table: list[Row], times: int
 ) -> None:
     rig = on_postgresql.rig
@@ -59,7 +59,7 @@ def test_a_server_that_stays_away(
 
 
 @pytest.mark.exhaustive
-def test_a_late_writer(on_postgresql: Known, table: list[Row], seldom: int) -> None:
+def test_late_writer_is_shut_out(on_postgresql: Known, table: list[Row], seldom: int) -> None:
     rig = on_postgresql.rig
     told = "another coordinator drives the jobs now"
 

@@ -86,7 +86,7 @@ def full(disk: Path, left: int = 0) -> Iterator[None]:
 
 
 @pytest.mark.exhaustive
-def test_at_ingest(small: Small, bundle: Path, table: list[Row]) -> None:
+def test_full_disk_during_ingest(small: Small, bundle: Path, table: list[Row]) -> None:
     service, start = small.service, time.monotonic()
     with ExitStack() as filled:
         with paused(service):
@@ -99,7 +99,7 @@ def test_at_ingest(small: Small, bundle: Path, table: list[Row]) -> None:
 
 
 @pytest.mark.exhaustive
-def test_at_tiles(small: Small, table: list[Row]) -> None:
+def test_full_disk_during_tiles(small: Small, table: list[Row]) -> None:
     start = time.monotonic()
     with full(small.store, 256 << 10):
         job = small.service.client.recover(small.capture)
@@ -109,7 +109,7 @@ def test_at_tiles(small: Small, table: list[Row]) -> None:
 
 
 @pytest.mark.exhaustive
-def test_in_sqlite(small: Small, table: list[Row]) -> None:
+def test_full_disk_of_sqlite(small: Small, table: list[Row]) -> None:
     service, start = small.service, time.monotonic()
     job = service.client.recover(small.capture)
     wait(lambda: service.client.job(job["id"])["progress"] > 0.1)

@@ -27,12 +27,12 @@ def hosts(tmp_path_factory: pytest.TempPathFactory, bundle: Path) -> Iterator[Kn
 
 @pytest.mark.parametrize("name", ["service0", "scheduler"])
 @pytest.mark.exhaustive
-def test_the_link_of_another_that_is_cut(hosts: Known, table: list[Row], seldom: int, name: str) -> None:
+def test_cut_link_of_service_or_scheduler(hosts: Known, table: list[Row], seldom: int, name: str) -> None:
     cut_off(hosts, table, name, seldom)
 
 
 @pytest.mark.exhaustive
-def test_the_link_of_a_worker_that_is_cut(hosts: Known, table: list[Row], seldom: int) -> None:
+def test_cut_link_of_a_worker(hosts: Known, table: list[Row], seldom: int) -> None:
     cut_off(hosts, table, "worker0", seldom)
 
 

@@ -16,7 +16,7 @@ from tests.services.cluster.clusters import wait
 pytestmark = pytest.mark.timeout(7200)
 
 
-def test_a_killed_worker(known: Known, table: list[Row], times: int) -> None:
+def test_killed_worker(known: Known, table: list[Row], times: int) -> None:
     def kill() -> None:
         while not (there := known.rig.workers()):
             time.sleep(0.05)
@@ -35,21 +35,21 @@ def test_all_workers_killed(known: Known, table: list[Row], times: int) -> None:
 
 
 @pytest.mark.exhaustive
-def test_a_killed_scheduler(known: Known, table: list[Row], times: int) -> None:
+def test_killed_scheduler(known: Known, table: list[Row], times: int) -> None:
     rig = known.rig
     row = known.disturb("SIGKILL of the scheduler", lambda: rig.restart("scheduler"), times)
     check(table, row)
 
 
 @pytest.mark.slow
-def test_a_killed_service_that_drives(known: Known, table: list[Row], times: int) -> None:
+def test_killed_leading_service(known: Known, table: list[Row], times: int) -> None:
     rig = known.rig
     row = known.disturb("SIGKILL of API and coordinator", lambda: rig.restart(rig.driver()), times)
     check(table, row)
 
 
 @pytest.mark.exhaustive
-def test_a_frozen_worker(known: Known, table: list[Row]) -> None:
+def test_frozen_worker(known: Known, table: list[Row]) -> None:
     frozen: list[psutil.Process] = []
 
     def act() -> None:
@@ -68,7 +68,7 @@ def test_a_frozen_worker(known: Known, table: list[Row]) -> None:
 
 
 @pytest.mark.slow
-def test_a_cancelled_job_frees_its_workers_and_what_it_wrote(known: Known) -> None:
+def test_cancelled_job_frees_workers_and_disk(known: Known) -> None:
     rig = known.rig
     # One tile of nn-dgsr that takes minutes.
     options = {"method": "nn-dgsr", "tile": 1024}

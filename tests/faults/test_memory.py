@@ -38,7 +38,7 @@ def large(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.exhaustive
-def test_a_worker_out_of_memory(bundle: Path, large: Path, tmp_path: Path, table: list[Row]) -> None:
+def test_worker_out_of_memory(bundle: Path, large: Path, tmp_path: Path, table: list[Row]) -> None:
     memory = {"ENVMATTE_WORKER_MEMORY": str(LIMIT)}
     with serving(
         tmp_path / "data", "--workers", "2", **memory, ENVMATTE_INGEST_MEMORY=str(TOO_MUCH)

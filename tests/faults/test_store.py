@@ -106,7 +106,7 @@ def in_bucket(
             yield prepared(rig, bundle)
 
 
-def test_a_share_of_answers_503(in_bucket: Known, proxy: Proxy, table: list[Row], seldom: int) -> None:
+def test_store_answers_503_at_times(in_bucket: Known, proxy: Proxy, table: list[Row], seldom: int) -> None:
     proxy.refused, before = SHARE, proxy.lost
     row = in_bucket.disturb("503 from the store, of one in 5", lambda: None, seldom)
     proxy.refused = 0
@@ -114,7 +114,9 @@ def test_a_share_of_answers_503(in_bucket: Known, proxy: Proxy, table: list[Row]
     check(table, row)
 
 
-def test_a_share_without_an_answer(in_bucket: Known, proxy: Proxy, table: list[Row], seldom: int) -> None:
+def test_store_does_not_answer_at_times(
+    in_bucket: Known, proxy: Proxy, table: list[Row], seldom: int
+) -> None:
     def act() -> None:
         proxy.silent = SHARE
         time.sleep(5)
@@ -124,7 +126,7 @@ def test_a_share_without_an_answer(in_bucket: Known, proxy: Proxy, table: list[R
     check(table, row)
 
 
-def test_a_store_that_is_away(in_bucket: Known, proxy: Proxy, table: list[Row], seldom: int) -> None:
+def test_store_away_for_a_while(in_bucket: Known, proxy: Proxy, table: list[Row], seldom: int) -> None:
     def act() -> None:
         proxy.refused = 1
         time.sleep(AWAY)
@@ -133,7 +135,7 @@ def test_a_store_that_is_away(in_bucket: Known, proxy: Proxy, table: list[Row], 
     check(table, in_bucket.disturb("503 from the store, for 10 s", act, seldom))
 
 
-def test_a_store_that_stays_away(in_bucket: Known, proxy: Proxy, table: list[Row]) -> None:
+def test_store_that_stays_away(in_bucket: Known, proxy: Proxy, table: list[Row]) -> None:
     rig = in_bucket.rig
     job = rig.recover(in_bucket.capture)
     while rig.job(job["id"])["progress"] < 0.2:

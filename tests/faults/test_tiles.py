@@ -46,7 +46,9 @@ def deadly(rig: Rig, key: str) -> Iterator[None]:
 
 
 @pytest.mark.exhaustive
-def test_a_tile_that_kills_its_workers(known: Known, table: list[Row], bundle_bytes: bytes) -> None:
+def test_tile_that_kills_its_workers_fails_only_its_job(
+    known: Known, table: list[Row], bundle_bytes: bytes
+) -> None:
     rig = known.rig
     headers = {"Content-Type": "application/zip"}
     capture = rig.ask("POST", "/v1/captures", content=bundle_bytes, headers=headers).json()

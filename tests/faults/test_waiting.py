@@ -17,7 +17,7 @@ def says(rig: Rig, job: str, words: str) -> Callable[[], bool]:
     return lambda: words in (rig.job(job)["waits_for"] or "")
 
 
-def test_without_workers(known: Known) -> None:
+def test_waits_for_workers(known: Known) -> None:
     rig = known.rig
     for n in range(2):
         rig.kill(f"worker{n}")
@@ -31,7 +31,7 @@ def test_without_workers(known: Known) -> None:
     known.goes_on(job["id"], job["matte"])
 
 
-def test_without_a_scheduler(known: Known) -> None:
+def test_waits_for_the_scheduler(known: Known) -> None:
     rig = known.rig
     job = rig.recover(known.capture)
     rig.kill("scheduler")
@@ -40,7 +40,7 @@ def test_without_a_scheduler(known: Known) -> None:
     known.goes_on(job["id"], job["matte"])
 
 
-def test_without_a_coordinator(known: Known) -> None:
+def test_waits_for_a_coordinator(known: Known) -> None:
     rig = known.rig
     for n in range(2):
         rig.kill(f"service{n}")
@@ -53,7 +53,7 @@ def test_without_a_coordinator(known: Known) -> None:
     known.goes_on(job["id"], job["matte"])
 
 
-def test_for_its_capture_and_beside_others(known: Known, bundle_bytes: bytes) -> None:
+def test_waits_for_capture_and_for_other_jobs(known: Known, bundle_bytes: bytes) -> None:
     rig = known.rig
     uploaded = rig.ask(
         "POST", "/v1/captures", content=bundle_bytes, headers={"Content-Type": "application/zip"}
@@ -66,7 +66,7 @@ def test_for_its_capture_and_beside_others(known: Known, bundle_bytes: bytes) ->
         known.goes_on(one["id"], one["matte"])
 
 
-def test_a_client_that_waits_outlives_its_service(known: Known) -> None:
+def test_waiting_client_survives_a_restart_of_the_service(known: Known) -> None:
     rig = known.rig
     with Client(rig.urls[0]) as client, ThreadPoolExecutor(1) as pool:
         job = client.recover(known.capture)

@@ -21,19 +21,19 @@ def ask(folder: Path, line: str, *headers: str, body: bytes = b"") -> None:
     requests.read("\r\n".join(head).encode() + body, folder)
 
 
-def test_numbers_that_no_database_holds(folder: Path) -> None:
+def test_numbers_too_large_for_the_database(folder: Path) -> None:
     ask(folder, f"GET /v1/jobs/v/log?after={2**63 - 1}")
     with pytest.raises(Refused):
         ask(folder, f"GET /v1/jobs/v/log?after={2**63}")
 
 
-def test_ranges_of_more_digits_than_python_reads(folder: Path) -> None:
+def test_ranges_with_more_digits_than_python_parses(folder: Path) -> None:
     ask(folder, "GET /v1/jobs/v/video.mp4", f"Range: bytes={'9' * 5000}-")
     ask(folder, "GET /v1/jobs/v/video.mp4", f"Range: bytes=-{'9' * 5000}")
 
 
 @pytest.mark.parametrize("distance", ["inf", "nan", "1e300", "1e-300"])
-def test_distances_that_make_rays_no_numbers(folder: Path, distance: str) -> None:
+def test_distances_that_overflow(folder: Path, distance: str) -> None:
     call = "POST /v1/mattes/m/composite?depth=3&distance=2&other=m&other_distance"
     ask(folder, f"{call}=4", body=requests.PNG)
     with pytest.raises(Refused):

@@ -12,7 +12,7 @@ from tests.fuzzing.targets import ALL
 
 
 @pytest.mark.parametrize("target", ALL, ids=[target.name for target in ALL])
-def test_what_is_damaged_is_taken_or_refused(
+def test_damaged_input_is_accepted_or_refused(
     target: Target, tmp_path: Path, pytestconfig: pytest.Config
 ) -> None:
     times = int(pytestconfig.getoption("--times"))
@@ -23,7 +23,7 @@ def test_what_is_damaged_is_taken_or_refused(
     assert tally.taken > 0
 
 
-def test_input_follows_from_its_number() -> None:
+def test_input_is_reproducible_from_its_seed() -> None:
     for target in ALL:
         whole = target.whole()
         assert target.input(7) == target.input(7, whole), target.name

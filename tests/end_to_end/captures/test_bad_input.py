@@ -107,7 +107,7 @@ def a_video(manifest: dict, files: dict[str, bytes]) -> None:
         (a_video, "clip.mp4", "video.file"),
     ],
 )
-def test_a_bundle_that_is_refused_at_once(
+def test_archive_is_refused_at_once(
     service: Service, bundle: Path, change, entry: str, field: str | None
 ) -> None:
     before = service.stored()
@@ -119,7 +119,7 @@ def test_a_bundle_that_is_refused_at_once(
 
 
 @pytest.mark.parametrize("share", [0, 0.3, 0.99])
-def test_a_zip_that_is_cut_off(service: Service, bundle: Path, share: float) -> None:
+def test_truncated_zip_is_refused(service: Service, bundle: Path, share: float) -> None:
     before = service.stored()
     data = bundle.read_bytes()
     answer = service.http.post("/v1/captures", content=data[: int(len(data) * share)], headers=ZIP)
@@ -127,7 +127,7 @@ def test_a_zip_that_is_cut_off(service: Service, bundle: Path, share: float) -> 
     assert service.stored() == before
 
 
-def test_an_upload_that_breaks_off(service: Service, bundle: Path) -> None:
+def test_broken_upload_leaves_nothing(service: Service, bundle: Path) -> None:
     before, captures = service.stored(), service.http.get("/v1/captures").json()
     where = urlsplit(service.url)
     with socket.create_connection((where.hostname, where.port)) as raw:
@@ -175,7 +175,7 @@ def unknown_camera(manifest: dict, files: dict[str, bytes]) -> None:
 @pytest.mark.parametrize(
     "change", [of_another_size, of_another_kind, no_image, cut_off, bomb, unknown_camera]
 )
-def test_a_frame_that_is_refused_by_the_ingest(service: Service, bundle: Path, change) -> None:
+def test_frame_refused_by_the_ingest(service: Service, bundle: Path, change) -> None:
     before = service.stored()
     answer = service.http.post("/v1/captures", content=remade(bundle, change), headers=ZIP)
     assert answer.status_code == 201
@@ -197,14 +197,14 @@ def test_a_frame_that_is_refused_by_the_ingest(service: Service, bundle: Path, c
         time.sleep(0.05)
 
 
-def test_a_body_of_another_type(service: Service, bundle: Path) -> None:
+def test_wrong_media_type_is_refused(service: Service, bundle: Path) -> None:
     answer = service.http.post(
         "/v1/captures", content=bundle.read_bytes(), headers={"Content-Type": "text/plain"}
     )
     check_problem(answer, 415, "wrong-media-type")
 
 
-def test_an_unknown_option(service: Service, capture: str) -> None:
+def test_unknown_option_is_refused(service: Service, capture: str) -> None:
     before = service.http.get("/v1/mattes").json()
     for options, field in (({"speed": 11}, "speed"), ({"method": "magic"}, "method"), ({"tile": 1}, "tile")):
         answer = service.http.post("/v1/jobs", json={"capture": capture, "options": options})
@@ -213,12 +213,12 @@ def test_an_unknown_option(service: Service, capture: str) -> None:
 
 
 @pytest.mark.parametrize("body", [b"", b"{", b'{"capture": 3}', b'{"capture": "x", "more": 1}', b"[1]"])
-def test_a_job_that_is_no_job(service: Service, body: bytes) -> None:
+def test_invalid_job_is_refused(service: Service, body: bytes) -> None:
     answer = service.http.post("/v1/jobs", content=body, headers={"Content-Type": "application/json"})
     check_problem(answer, 422, "bad-request")
 
 
-def test_bodies_that_are_too_large(service: Service, matte: str) -> None:
+def test_too_large_bodies_are_refused(service: Service, matte: str) -> None:
     def endless(size: int):
         yield from (bytes(1 << 20) for _ in range(size >> 20))
 
@@ -228,7 +228,7 @@ def test_bodies_that_are_too_large(service: Service, matte: str) -> None:
     assert check_problem(answer, 413, "too-large")["limit"] == 128 << 20
 
 
-def test_a_program_whose_grids_do_not_nest(service: Service, bundle: Path) -> None:
+def test_recovery_needs_nested_grids(service: Service, bundle: Path) -> None:
     def not_nested(manifest: dict, files: dict[str, bytes]) -> None:
         manifest["program"]["parts"][2] |= {"columns": 20, "rows": 15}
 
@@ -239,16 +239,16 @@ def test_a_program_whose_grids_do_not_nest(service: Service, bundle: Path) -> No
 
 
 @pytest.mark.parametrize("body", [b"", b"no image at all", b"\x89PNG\r\n\x1a\n" + b"\0" * 50])
-def test_a_backdrop_that_is_no_image(service: Service, matte: str, body: bytes) -> None:
+def test_invalid_backdrop_is_refused(service: Service, matte: str, body: bytes) -> None:
     check_problem(service.http.post(f"/v1/mattes/{matte}/composite", content=body), 422, "bad-image")
 
 
-def test_an_answer_that_cannot_be_given(service: Service, matte: str) -> None:
+def test_unsupported_accept_is_refused(service: Service, matte: str) -> None:
     answer = service.http.post(f"/v1/mattes/{matte}/composite", headers={"Accept": "image/gif"})
     check_problem(answer, 406, "not-acceptable")
 
 
-def test_every_call_answers_an_unknown_id_with_a_problem(service: Service) -> None:
+def test_unknown_ids_are_not_found(service: Service) -> None:
     called = 0
     for path, calls in service.http.get("/openapi.json").json()["paths"].items():
         if "{id}" not in path or path.endswith("/play"):  # a page that is the same for all
@@ -269,13 +269,13 @@ def test_every_call_answers_an_unknown_id_with_a_problem(service: Service) -> No
     check_problem(service.http.get("/v1/jobs?limit=many"), 422, "bad-request")
 
 
-def test_calls_out_of_turn(service: Service, capture: str, matte: str) -> None:
+def test_calls_in_the_wrong_state_are_refused(service: Service, capture: str, matte: str) -> None:
     job = service.http.get(f"/v1/mattes/{matte}").json()["job"]
     check_problem(service.http.post(f"/v1/jobs/{job}/cancel"), 409, "conflict")
     check_problem(service.http.post(f"/v1/jobs/{job}/retry"), 409, "conflict")
     check_problem(service.http.get(f"/v1/captures/{capture}/frames/57.png"), 404, "not-found")
 
 
-def test_the_service_lives_on(service: Service, bundle: Path) -> None:
+def test_service_survives_bad_input(service: Service, bundle: Path) -> None:
     assert service.client.wait(service.client.upload(bundle)["job"])["state"] == "succeeded"
     assert service.process.poll() is None

@@ -44,7 +44,7 @@ def held(service: Service, matte: str) -> Iterator[tuple[psutil.Process, "Future
         yield one, left
 
 
-def test_a_decoder_that_is_killed_costs_one_request(service: Service, matte: str) -> None:
+def test_killed_decoder_costs_one_request(service: Service, matte: str) -> None:
     expected = asked(service, matte).content
     with held(service, matte) as (one, answer):
         one.kill()
@@ -54,9 +54,7 @@ def test_a_decoder_that_is_killed_costs_one_request(service: Service, matte: str
 
 
 @pytest.mark.slow
-def test_a_decoder_that_hangs_is_given_up_and_others_are_answered_meanwhile(
-    service: Service, matte: str
-) -> None:
+def test_hanging_decoder_is_killed_and_others_keep_serving(service: Service, matte: str) -> None:
     expected = asked(service, matte).content
     with held(service, matte) as (one, answer):
         meanwhile = 0
@@ -97,7 +95,7 @@ def taken_at_most(one: psutil.Process) -> int:
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="it is Linux that limits what a process takes")
-def test_a_film_that_takes_all_memory_to_decode_fails_alone(
+def test_film_that_needs_too_much_memory_fails_only_its_job(
     bundle: Path, program: Program, tmp_path: Path
 ) -> None:
     data = overstated(clip(pictures(9), even(9)), 40_000_000)  # FFmpeg makes an index of 2.8 GB of it

@@ -8,7 +8,7 @@ from PIL import Image
 from tests.end_to_end.conftest import Service
 
 
-def test_a_capture_links_to_its_report(service: Service, capture: str) -> None:
+def test_capture_links_to_its_report(service: Service, capture: str) -> None:
     link = service.http.get(f"/v1/captures/{capture}").json()["report"]
     report = service.http.get(link).json()
     assert report["level"] in ("good", "warning", "bad")
@@ -23,7 +23,7 @@ def test_a_capture_links_to_its_report(service: Service, capture: str) -> None:
     assert report["quality"]["low"] < report["quality"]["high"]
 
 
-def test_a_contact_sheet_is_a_small_picture(service: Service, capture: str) -> None:
+def test_contact_sheet_is_a_small_picture(service: Service, capture: str) -> None:
     answer = service.http.get(f"/v1/captures/{capture}/contact-sheet.png")
     assert answer.headers["content-type"] == "image/png"
     with Image.open(io.BytesIO(answer.content)) as sheet:
@@ -31,7 +31,7 @@ def test_a_contact_sheet_is_a_small_picture(service: Service, capture: str) -> N
         assert sheet.height > 72 * 2
 
 
-def test_there_is_no_report_before_the_frames_are_read(service: Service, bundle: Path) -> None:
+def test_no_report_before_the_ingest(service: Service, bundle: Path) -> None:
     cut = bundle.read_bytes().replace(b"\x89PNG", b"\x89GNP")
     made = service.http.post("/v1/captures", content=cut, headers={"Content-Type": "application/zip"}).json()
     assert made["report"] is None

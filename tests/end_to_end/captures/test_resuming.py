@@ -65,7 +65,7 @@ def sha256(file: Path) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", SIZES)
-def test_the_client_outlives_a_hundred_cuts(
+def test_client_survives_a_hundred_broken_connections(
     service: Service, bundle: Path, tmp_path: Path, size: int
 ) -> None:
     file = large(bundle, tmp_path / "large.zip", size)
@@ -83,7 +83,9 @@ def test_the_client_outlives_a_hundred_cuts(
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_what_a_hundred_cuts_let_through_is_kept(service: Service, tmp_path: Path, size: int) -> None:
+def test_bytes_sent_before_each_broken_connection_are_kept(
+    service: Service, tmp_path: Path, size: int
+) -> None:
     file = tmp_path / "noise"
     file.write_bytes(np.random.default_rng(size).bytes(size))
     where = create(service, size)
@@ -115,7 +117,7 @@ def test_what_a_hundred_cuts_let_through_is_kept(service: Service, tmp_path: Pat
 
 
 @pytest.mark.exhaustive
-def test_a_server_that_is_killed_costs_nothing(bundle: Path, tmp_path: Path) -> None:
+def test_upload_resumes_after_the_server_is_killed(bundle: Path, tmp_path: Path) -> None:
     data, file = tmp_path / "data", large(bundle, tmp_path / "large.zip", 50 * MB)
     made: list[dict] = []
     told: list[int] = []
@@ -155,7 +157,7 @@ def test_a_server_that_is_killed_costs_nothing(bundle: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_an_interrupted_command_goes_on_when_called_again(
+def test_interrupted_upload_command_resumes_when_run_again(
     service: Service, bundle: Path, tmp_path: Path
 ) -> None:
     file = large(bundle, tmp_path / "large.zip", 50 * MB)
@@ -174,7 +176,9 @@ def test_an_interrupted_command_goes_on_when_called_again(
     assert service.client.capture(done.stdout.strip())["bytes"] == file.stat().st_size
 
 
-def test_a_file_that_shrinks_meanwhile_is_told(service: Service, bundle: Path, tmp_path: Path) -> None:
+def test_file_that_shrinks_during_the_upload_is_reported(
+    service: Service, bundle: Path, tmp_path: Path
+) -> None:
     file = large(bundle, tmp_path / "large.zip", 20 * MB)
 
     def shrink(sent: int, whole: int) -> None:
@@ -202,7 +206,7 @@ print(first.url)
 
 
 @pytest.mark.parametrize("checksum", [False, True])
-def test_tuspy_works_against_it(service: Service, bundle: Path, checksum: bool) -> None:
+def test_tuspy_uploads(service: Service, bundle: Path, checksum: bool) -> None:
     arguments = {"file": str(bundle), "endpoint": f"{service.url}/v1/uploads", "checksum": checksum}
     command = [sys.executable, "-c", TUSPY, json.dumps(arguments)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
@@ -267,7 +271,7 @@ upload.start();
     [{}, {"chunk": 50_000}, {"chunk": 50_000, "during": True}, {"chunk": 50_000, "stop": True}],
     ids=["whole", "chunks", "with creation", "aborted and resumed"],
 )
-def test_tus_js_client_works_against_it(service: Service, bundle: Path, tus_js: Path, options: dict) -> None:
+def test_tus_js_client_uploads(service: Service, bundle: Path, tus_js: Path, options: dict) -> None:
     arguments = {"file": str(bundle), "endpoint": f"{service.url}/v1/uploads"} | options
     command = ["node", "-e", SCRIPT, "tus", json.dumps(arguments)]
     done = subprocess.run(command, cwd=tus_js, capture_output=True, text=True, timeout=60)

@@ -69,7 +69,7 @@ def gone(service: Service, upload: str) -> None:
         time.sleep(0.05)
 
 
-def test_options_say_what_is_spoken(service: Service) -> None:
+def test_options_list_versions_and_extensions(service: Service) -> None:
     answer = service.http.options("/v1/uploads")
     assert answer.status_code == 204
     assert answer.headers["tus-resumable"] == answer.headers["tus-version"] == "1.0.0"
@@ -79,7 +79,7 @@ def test_options_say_what_is_spoken(service: Service) -> None:
     assert answer.headers["tus-checksum-algorithm"] == "sha1,sha256"
 
 
-def test_a_capture_from_pieces(service: Service, bundle: Path) -> None:
+def test_capture_from_several_patches(service: Service, bundle: Path) -> None:
     data = bundle.read_bytes()
     metadata = f"filename {base64.b64encode(b'ball.zip').decode()},empty"
     answer = service.http.post(
@@ -121,7 +121,7 @@ def test_a_capture_from_pieces(service: Service, bundle: Path) -> None:
     check_problem(service.http.post("/v1/captures", json=body), 404, "not-found")
 
 
-def test_creation_may_bring_bytes(service: Service) -> None:
+def test_creation_with_upload(service: Service) -> None:
     headers = CHUNK | {"Upload-Length": "10"}
     answer = service.http.post("/v1/uploads", headers=headers, content=b"12345")
     assert (answer.status_code, answer.headers["upload-offset"]) == (201, "5")
@@ -136,7 +136,7 @@ def test_creation_may_bring_bytes(service: Service) -> None:
     check_problem(answer, 413, "too-large")
 
 
-def test_another_method_may_be_meant(service: Service) -> None:
+def test_method_override(service: Service) -> None:
     where = create(service, 3)
     headers = CHUNK | {"Upload-Offset": "0", "X-HTTP-Method-Override": "PATCH"}
     assert service.http.post(where, headers=headers, content=b"abc").status_code == 204
@@ -144,7 +144,7 @@ def test_another_method_may_be_meant(service: Service) -> None:
     assert service.http.post(where, headers=TUS | {"X-HTTP-Method-Override": "DELETE"}).status_code == 204
 
 
-def test_a_repeat_with_the_same_key_goes_on_with_the_same_upload(service: Service) -> None:
+def test_same_idempotency_key_continues_the_same_upload(service: Service) -> None:
     where = create(service, 10, **{"Idempotency-Key": "one file"})
     patch(service, where, 0, b"1234")
     again = service.http.post(
@@ -156,7 +156,7 @@ def test_a_repeat_with_the_same_key_goes_on_with_the_same_upload(service: Servic
 
 
 @pytest.mark.parametrize("algorithm", ["sha1", "sha256"])
-def test_a_checksum_lets_in_what_it_was_made_of_alone(service: Service, algorithm: str) -> None:
+def test_only_bytes_that_match_the_checksum_are_kept(service: Service, algorithm: str) -> None:
     before = uploads_of(service)
     where = create(service, 10)
     digest = base64.b64encode(hashlib.new(algorithm, b"12345").digest()).decode()
@@ -173,7 +173,7 @@ def test_a_checksum_lets_in_what_it_was_made_of_alone(service: Service, algorith
     service.http.delete(where, headers=TUS)
 
 
-def test_what_is_refused(service: Service) -> None:
+def test_invalid_requests_are_refused(service: Service) -> None:
     where = create(service, 10)
     patch(service, where, 0, b"12345")
     for version in ({}, {"Tus-Resumable": "0.2.2"}):
@@ -212,7 +212,7 @@ def test_what_is_refused(service: Service) -> None:
 
 
 @pytest.mark.slow
-def test_the_quota_is_told_before_the_first_byte(tmp_path: Path, bundle: Path) -> None:
+def test_upload_limit_is_checked_before_the_first_byte(tmp_path: Path, bundle: Path) -> None:
     limit = 1 << 58
     with serving(tmp_path / "data", "--workers", "1", ENVMATTE_UPLOAD_BYTES=str(limit)) as service:
         assert service.http.options("/v1/uploads").headers["tus-max-size"] == str(limit)
@@ -236,7 +236,7 @@ def test_the_quota_is_told_before_the_first_byte(tmp_path: Path, bundle: Path) -
 
 
 @pytest.mark.slow
-def test_a_disk_that_fills_up_is_told_and_loses_nothing(tmp_path: Path) -> None:
+def test_full_disk_is_reported_and_loses_nothing(tmp_path: Path) -> None:
     with (
         small_disk(tmp_path / "disk", 48 << 20) as disk,
         serving(disk / "data", "--workers", "1") as service,
@@ -256,7 +256,7 @@ def test_a_disk_that_fills_up_is_told_and_loses_nothing(tmp_path: Path) -> None:
         assert patch(service, where, 4 << 20, b"a" * (16 << 20)).headers["upload-offset"] == str(20 << 20)
 
 
-def test_what_came_before_a_line_broke_is_kept(service: Service) -> None:
+def test_bytes_before_a_broken_connection_are_kept(service: Service) -> None:
     before = uploads_of(service)
     where = create(service, 4 << 20)
     begin(service, where, 0, 4 << 20, b"a" * (3 << 20)).close()
@@ -275,7 +275,7 @@ def test_what_came_before_a_line_broke_is_kept(service: Service) -> None:
 
 
 @pytest.mark.exhaustive
-def test_who_falls_silent_counts_as_gone(service: Service) -> None:
+def test_silent_client_is_disconnected(service: Service) -> None:
     where = create(service, 1000)
     silent = begin(service, where, 0, 1000, b"a" * 300)
     deadline = time.monotonic() + 120
@@ -286,7 +286,7 @@ def test_who_falls_silent_counts_as_gone(service: Service) -> None:
     service.http.delete(where, headers=TUS)
 
 
-def test_an_upload_in_crumbs_is_refused(service: Service) -> None:
+def test_upload_in_too_many_pieces_is_refused(service: Service) -> None:
     where = create(service, 1000)
     assert patch(service, where, 0, b"a").status_code == 204
     engine = open_engine(f"sqlite:///{service.data / 'envmatte.db'}")
@@ -297,7 +297,7 @@ def test_an_upload_in_crumbs_is_refused(service: Service) -> None:
     service.http.delete(where, headers=TUS)
 
 
-def test_what_came_unverified_is_not_kept(service: Service) -> None:
+def test_unverified_bytes_are_not_kept(service: Service) -> None:
     before = uploads_of(service)
     where = create(service, 1000)
     host = urlsplit(service.url)
@@ -323,7 +323,7 @@ def test_what_came_unverified_is_not_kept(service: Service) -> None:
     service.http.delete(where, headers=TUS)
 
 
-def test_of_two_at_one_offset_one_wins(service: Service) -> None:
+def test_one_of_two_patches_at_the_same_offset_wins(service: Service) -> None:
     before = uploads_of(service)
     where = create(service, 1000)
     first = begin(service, where, 0, 1000, b"a" * 300)
@@ -340,7 +340,7 @@ def test_of_two_at_one_offset_one_wins(service: Service) -> None:
     service.http.delete(where, headers=TUS)
 
 
-def test_one_who_lags_behind_spoils_nothing(service: Service, bundle: Path) -> None:
+def test_late_patch_damages_nothing(service: Service, bundle: Path) -> None:
     data = bundle.read_bytes()
     where = create(service, len(data))
     late = begin(service, where, 0, len(data), bytes(1000))
@@ -353,7 +353,7 @@ def test_one_who_lags_behind_spoils_nothing(service: Service, bundle: Path) -> N
     assert service.client.wait(made["job"])["state"] == "succeeded"
 
 
-def test_two_clients_that_send_one_file_do_so_together(
+def test_two_clients_with_the_same_key_share_an_upload(
     service: Service, bundle: Path, tmp_path: Path
 ) -> None:
     file = tmp_path / "same.zip"
@@ -367,7 +367,7 @@ def test_two_clients_that_send_one_file_do_so_together(
     assert service.client.upload(file)["id"] not in {capture["id"] for capture in made}
 
 
-def test_a_capture_asked_for_many_times_at_once_is_one(service: Service, bundle: Path) -> None:
+def test_simultaneous_requests_make_one_capture(service: Service, bundle: Path) -> None:
     data = bundle.read_bytes()
     where = create(service, len(data))
     patch(service, where, 0, data)
@@ -379,7 +379,7 @@ def test_a_capture_asked_for_many_times_at_once_is_one(service: Service, bundle:
     assert service.client.wait(answers[0].json()["job"])["state"] == "succeeded"
 
 
-def test_one_that_is_deleted_is_gone(service: Service) -> None:
+def test_deleted_upload_is_gone(service: Service) -> None:
     before = uploads_of(service)
     where = create(service, 1000)
     patch(service, where, 0, b"a" * 100)
@@ -395,7 +395,7 @@ def test_one_that_is_deleted_is_gone(service: Service) -> None:
 
 
 @pytest.mark.slow
-def test_one_that_nobody_goes_on_with_expires(tmp_path: Path) -> None:
+def test_abandoned_upload_expires(tmp_path: Path) -> None:
     with serving(tmp_path / "data", "--workers", "1", ENVMATTE_UPLOAD_SECONDS="2") as service:
         unfinished, finished = create(service, 10), create(service, 3)
         patch(service, finished, 0, b"123")
@@ -410,7 +410,7 @@ def test_one_that_nobody_goes_on_with_expires(tmp_path: Path) -> None:
         check_problem(patch(service, unfinished, 6, b"x"), 404, "not-found")
 
 
-def test_one_that_is_no_capture_leaves_nothing(service: Service, tmp_path: Path) -> None:
+def test_upload_that_is_no_capture_leaves_nothing(service: Service, tmp_path: Path) -> None:
     before = service.stored()
     for data in (b"", b"this is no archive" * 1000):
         broken = tmp_path / "broken.zip"

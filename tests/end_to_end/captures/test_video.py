@@ -38,7 +38,7 @@ def uploaded(service: Service, scene: Scene, program: Program) -> dict:
     return service.client.capture(answer.json()["id"])
 
 
-def test_what_was_found_is_told(service: Service, uploaded: dict, program: Program) -> None:
+def test_ingest_reports_what_it_found(service: Service, uploaded: dict, program: Program) -> None:
     assert (uploaded["state"], uploaded["width"], uploaded["height"]) == ("ready", 96, 72)
     assert program.count - 6 <= uploaded["frames"] < program.count
     lines = [line["text"] for line in service.http.get(f"/v1/jobs/{uploaded['job']}/log").json()["lines"]]
@@ -58,7 +58,7 @@ def test_a_composite_is_close_to_the_truth(service: Service, uploaded: dict, sce
     assert -10 * np.log10(np.mean(error[scene.object_mask] ** 2)) > 32
 
 
-def test_a_recording_of_another_program_is_refused(service: Service, scene: Scene, program: Program) -> None:
+def test_recording_of_another_program_is_refused(service: Service, scene: Scene, program: Program) -> None:
     record, files = capture(program, film(lights(scene, program)[:12], CAMERA).data, 1 / CAMERA.hold)
     target = io.BytesIO()
     with zipfile.ZipFile(target, "w") as archive:

@@ -31,7 +31,7 @@ def followed(service: Service, job: str, last: str | None = None) -> list[tuple[
         return list(events(answer))
 
 
-def test_a_job_is_told_as_it_goes_on_and_to_its_end(service: Service, capture: str) -> None:
+def test_events_follow_a_job_to_its_end(service: Service, capture: str) -> None:
     job = service.client.recover(capture, tile=16)["id"]
     found = followed(service, job)
     states = [data["state"] for _, data in found]
@@ -46,7 +46,7 @@ def test_a_job_is_told_as_it_goes_on_and_to_its_end(service: Service, capture: s
     assert service.http.get(f"/v1/jobs/{job}/events", headers={"Last-Event-ID": ids[-1]}).status_code == 204
 
 
-def test_a_job_that_is_cancelled_or_deleted_ends_its_events(service: Service, capture: str) -> None:
+def test_events_end_when_the_job_is_cancelled_or_deleted(service: Service, capture: str) -> None:
     job = service.client.recover(capture)["id"]
     with service.http.stream("GET", f"/v1/jobs/{job}/events") as answer:
         told = events(answer)

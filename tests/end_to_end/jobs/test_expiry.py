@@ -22,7 +22,7 @@ def disk(service: Service) -> int:
 
 
 @pytest.mark.slow
-def test_what_has_expired_leaves_the_disk_and_what_a_job_needs_does_not(bundle: Path, tmp_path: Path) -> None:
+def test_expired_data_is_deleted_unless_a_job_needs_it(bundle: Path, tmp_path: Path) -> None:
     """Both expire while they are made, long before the recovery begins, and it succeeds all the same."""
     with serving(
         tmp_path / "data", "--workers", "1", ENVMATTE_CAPTURE_SECONDS="1", ENVMATTE_MATTE_SECONDS="1"
@@ -56,7 +56,7 @@ def test_what_has_expired_leaves_the_disk_and_what_a_job_needs_does_not(bundle: 
 
 
 @pytest.mark.exhaustive
-def test_what_is_deleted_leaves_the_disk(bundle: Path, tmp_path: Path) -> None:
+def test_deleted_data_leaves_the_disk(bundle: Path, tmp_path: Path) -> None:
     with serving(tmp_path / "data", "--workers", "1") as service:
         before = disk(service)
         capture = service.client.upload(bundle)

@@ -37,7 +37,7 @@ def recovered(service: Service, bundle: Path, **options: object) -> dict[str, st
     return files_of(service, job["matte"])
 
 
-def test_a_killed_server_goes_on_where_it_stood(
+def test_job_continues_after_the_server_is_killed(
     service: Service, matte: str, bundle: Path, tmp_path: Path
 ) -> None:
     data = tmp_path / "data"
@@ -60,7 +60,7 @@ def test_a_killed_server_goes_on_where_it_stood(
 
 
 @pytest.mark.exhaustive
-def test_a_server_killed_during_ingest_goes_on(
+def test_ingest_continues_after_the_server_is_killed(
     service: Service, matte: str, bundle: Path, tmp_path: Path
 ) -> None:
     data = tmp_path / "data"
@@ -77,7 +77,7 @@ def test_a_server_killed_during_ingest_goes_on(
 
 
 @pytest.mark.slow
-def test_the_bytes_do_not_depend_on_tiles_or_workers(
+def test_matte_bytes_do_not_depend_on_tiles_or_workers(
     service: Service, matte: str, bundle: Path, tmp_path: Path
 ) -> None:
     expected = files_of(service, matte)
@@ -88,7 +88,7 @@ def test_the_bytes_do_not_depend_on_tiles_or_workers(
         assert recovered(other, bundle, tile=32) == expected
 
 
-def test_a_cancelled_job_leaves_nothing(service: Service, capture: str) -> None:
+def test_cancelled_job_leaves_nothing(service: Service, capture: str) -> None:
     job = service.client.recover(capture)
     while service.client.job(job["id"])["tiles"]["done"] < 2:
         time.sleep(0.01)
@@ -99,7 +99,7 @@ def test_a_cancelled_job_leaves_nothing(service: Service, capture: str) -> None:
     assert service.client.cancel(job["id"])["state"] == "cancelled"
 
 
-def test_a_job_cancelled_while_it_waits_leaves_nothing(service: Service, bundle: Path) -> None:
+def test_job_cancelled_while_waiting_leaves_nothing(service: Service, bundle: Path) -> None:
     uploaded = service.client.upload(bundle)
     job = service.client.recover(uploaded["id"])
     assert service.client.cancel(job["id"])["state"] == "cancelled"
@@ -107,7 +107,7 @@ def test_a_job_cancelled_while_it_waits_leaves_nothing(service: Service, bundle:
     gone(service, job["matte"])
 
 
-def test_a_cancelled_ingest_leaves_nothing(service: Service, capture: str, bundle: Path) -> None:
+def test_cancelled_ingest_leaves_nothing(service: Service, capture: str, bundle: Path) -> None:
     service.client.recover(capture, tile=1024)  # keeps a worker busy
     before = service.stored()
     uploaded = service.client.upload(bundle)
@@ -123,9 +123,7 @@ def test_a_cancelled_ingest_leaves_nothing(service: Service, capture: str, bundl
 
 
 @pytest.mark.slow
-def test_an_ingest_that_failed_for_no_fault_of_the_capture_can_be_retried(
-    bundle: Path, tmp_path: Path
-) -> None:
+def test_ingest_that_failed_for_a_passing_reason_can_be_retried(bundle: Path, tmp_path: Path) -> None:
     with serving(tmp_path / "data", "--workers", "1") as service:
         first = service.client.upload(bundle)
         service.client.wait(first["job"])
@@ -147,7 +145,7 @@ def test_an_ingest_that_failed_for_no_fault_of_the_capture_can_be_retried(
 
 
 @pytest.mark.exhaustive
-def test_a_job_cancelled_before_a_kill_leaves_nothing(bundle: Path, tmp_path: Path) -> None:
+def test_job_cancelled_before_a_kill_leaves_nothing(bundle: Path, tmp_path: Path) -> None:
     data = tmp_path / "data"
     with serving(data, "--workers", "1") as first:
         job = first.client.recover(first.client.upload(bundle)["id"])
@@ -165,7 +163,7 @@ def test_a_job_cancelled_before_a_kill_leaves_nothing(bundle: Path, tmp_path: Pa
         assert second.client.wait(second.client.recover(job["capture"])["id"])["state"] == "succeeded"
 
 
-def test_a_worker_that_is_killed_costs_nothing(service: Service, matte: str, capture: str) -> None:
+def test_killed_worker_changes_no_byte(service: Service, matte: str, capture: str) -> None:
     job = service.client.recover(capture)
     while service.client.job(job["id"])["tiles"]["done"] < 3:
         time.sleep(0.01)
@@ -174,7 +172,7 @@ def test_a_worker_that_is_killed_costs_nothing(service: Service, matte: str, cap
     assert files_of(service, ended["matte"]) == files_of(service, matte)
 
 
-def test_a_damaged_matte_is_said_to_be_damaged(service: Service, capture: str) -> None:
+def test_damaged_matte_is_reported(service: Service, capture: str) -> None:
     job = service.client.wait(service.client.recover(capture, tile=48)["id"])
     folder = service.data / "store" / "mattes" / job["matte"]
     for at, name in ((0, "S/c/0/0/0"), (16, "count/c/1/1/0"), (32, "T/2.2/weight/c/0")):
@@ -188,9 +186,7 @@ def test_a_damaged_matte_is_said_to_be_damaged(service: Service, capture: str) -
 
 
 @pytest.mark.slow
-def test_a_tile_that_always_fails_fails_its_job_and_retry_goes_on(
-    service: Service, matte: str, bundle: Path
-) -> None:
+def test_failing_tile_fails_its_job_and_retry_continues(service: Service, matte: str, bundle: Path) -> None:
     uploaded = service.client.upload(bundle)
     service.client.wait(uploaded["job"])
     chunk = service.data / "store" / "captures" / uploaded["id"] / "frames" / "c" / "0" / "0" / "1" / "0"
@@ -210,9 +206,7 @@ def test_a_tile_that_always_fails_fails_its_job_and_retry_goes_on(
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
-def test_a_server_that_is_asked_to_stop_leaves_no_process(
-    bundle: Path, tmp_path: Path, number: int, code: int
-) -> None:
+def test_stopped_server_leaves_no_process(bundle: Path, tmp_path: Path, number: int, code: int) -> None:
     with serving(tmp_path / "data", "--workers", "2") as service:
         service.client.recover(service.client.upload(bundle)["id"])
         sending = begin(service, create(service, 1000), 0, 1000, b"the rest of which never comes")
@@ -225,7 +219,7 @@ def test_a_server_that_is_asked_to_stop_leaves_no_process(
         assert alive == []
 
 
-def test_a_second_service_on_one_folder_says_so_and_stops(service: Service) -> None:
+def test_second_service_on_the_same_folder_is_refused(service: Service) -> None:
     command = [sys.executable, "-m", "services", "serve", "--data", str(service.data), "--port", "0"]
     second = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert second.returncode == 1
@@ -234,7 +228,7 @@ def test_a_second_service_on_one_folder_says_so_and_stops(service: Service) -> N
     assert service.http.get("/healthz").status_code == 200
 
 
-def test_an_open_door_is_refused(tmp_path: Path) -> None:
+def test_public_address_without_keys_is_refused(tmp_path: Path) -> None:
     command = [
         sys.executable,
         "-m",

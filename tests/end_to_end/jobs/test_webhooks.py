@@ -39,7 +39,7 @@ def lines(service: Service, job: str) -> list[str]:
 
 
 @pytest.mark.slow
-def test_what_fails_first_comes_over_a_kill_and_signed(bundle: Path, tmp_path: Path) -> None:
+def test_failed_delivery_is_repeated_after_a_kill_and_signed(bundle: Path, tmp_path: Path) -> None:
     with receiver(lambda n: 500 if n == 0 else 200) as found:
         with serving(tmp_path / "data", "--workers", "1", **ALLOWED) as first:
             capture = first.client.upload(bundle, name="told", webhook=found.url)
@@ -71,7 +71,7 @@ def test_what_fails_first_comes_over_a_kill_and_signed(bundle: Path, tmp_path: P
 
 
 @pytest.mark.exhaustive
-def test_a_service_with_a_secret_refuses_addresses_that_are_not_public(bundle: Path, tmp_path: Path) -> None:
+def test_private_webhook_addresses_are_refused(bundle: Path, tmp_path: Path) -> None:
     with (
         receiver(lambda n: 200) as found,
         serving(tmp_path / "data", "--workers", "1", ENVMATTE_WEBHOOK_SECRET=SECRET) as service,
@@ -88,6 +88,6 @@ def test_a_service_with_a_secret_refuses_addresses_that_are_not_public(bundle: P
         assert found.received == []
 
 
-def test_a_service_without_a_secret_takes_no_webhook(service: Service, capture: str) -> None:
+def test_webhooks_need_a_secret(service: Service, capture: str) -> None:
     with pytest.raises(ServiceError, match="ENVMATTE_WEBHOOK_SECRET"):
         service.client.recover(capture, webhook="https://example.com/")

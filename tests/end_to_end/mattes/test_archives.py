@@ -39,7 +39,7 @@ def archive(service: Service, matte: str, tmp_path_factory: pytest.TempPathFacto
 
 
 @pytest.mark.slow
-def test_a_matte_comes_to_another_service_as_it_was(
+def test_archive_restores_the_matte_in_another_service(
     service: Service, elsewhere: Service, matte: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "matte.zip"
@@ -70,7 +70,7 @@ def test_a_matte_comes_to_another_service_as_it_was(
     assert elsewhere.stored() == set()
 
 
-def test_the_answer_is_a_file_with_a_name_and_a_size(service: Service, matte: str, archive: Path) -> None:
+def test_archive_has_a_name_and_a_size(service: Service, matte: str, archive: Path) -> None:
     answer = service.http.get(f"/v1/mattes/{matte}/archive")
     assert answer.content == archive.read_bytes()
     assert answer.headers["content-type"] == "application/zip"
@@ -80,7 +80,7 @@ def test_the_answer_is_a_file_with_a_name_and_a_size(service: Service, matte: st
 
 
 @pytest.mark.slow
-def test_a_repeat_with_the_same_key_makes_nothing_twice(elsewhere: Service, archive: Path) -> None:
+def test_same_idempotency_key_imports_once(elsewhere: Service, archive: Path) -> None:
     headers = ZIP | {"Idempotency-Key": "once"}
     first, again = (
         elsewhere.http.post("/v1/mattes", content=archive.read_bytes(), headers=headers) for _ in range(2)
@@ -97,7 +97,9 @@ def test_a_repeat_with_the_same_key_makes_nothing_twice(elsewhere: Service, arch
 
 
 @pytest.mark.slow
-def test_what_lies_is_refused_and_leaves_nothing(elsewhere: Service, archive: Path, tmp_path: Path) -> None:
+def test_false_archive_is_refused_and_leaves_nothing(
+    elsewhere: Service, archive: Path, tmp_path: Path
+) -> None:
     with zipfile.ZipFile(archive) as file:
         files = {name: file.read(name) for name in file.namelist()}
     lies = io.BytesIO()
@@ -123,7 +125,7 @@ def test_what_lies_is_refused_and_leaves_nothing(elsewhere: Service, archive: Pa
 
 
 @pytest.mark.exhaustive
-def test_one_that_is_too_large_is_refused_with_the_limit(archive: Path, tmp_path: Path) -> None:
+def test_archive_over_the_limit_is_refused(archive: Path, tmp_path: Path) -> None:
     size = archive.stat().st_size
     with serving(tmp_path / "data", "--workers", "1", ENVMATTE_UPLOAD_BYTES=str(size - 1)) as small:
 
@@ -161,9 +163,7 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_a_matte_deleted_while_it_is_sent_ends_the_connection(
-    elsewhere: Service, large: Path, tmp_path: Path
-) -> None:
+def test_deleting_a_matte_ends_its_download(elsewhere: Service, large: Path, tmp_path: Path) -> None:
     there = elsewhere.client.import_matte(large)["id"]
     sent: list[bytes] = []
     with elsewhere.http.stream("GET", f"/v1/mattes/{there}/archive") as answer:
@@ -178,9 +178,7 @@ def test_a_matte_deleted_while_it_is_sent_ends_the_connection(
 
 
 @pytest.mark.exhaustive
-def test_a_service_that_is_killed_keeps_the_mattes_that_came_and_nothing_else(
-    archive: Path, tmp_path: Path
-) -> None:
+def test_killed_service_keeps_only_complete_imports(archive: Path, tmp_path: Path) -> None:
     with serving(tmp_path / "data", "--workers", "1") as first:
         whole = first.client.import_matte(archive)["id"]
         kept = first.stored()

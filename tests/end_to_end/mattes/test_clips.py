@@ -41,7 +41,7 @@ def post(service: Service, matte: str, data: bytes, **headers: str) -> dict:
     return dict(answer.json())
 
 
-def test_a_clip_becomes_a_video_with_its_times(service: Service, matte: str) -> None:
+def test_clip_becomes_a_video_with_its_timestamps(service: Service, matte: str) -> None:
     before = stored(service)
     ticks = [3 * n * n for n in range(40)]
     shown = pictures(40)
@@ -76,7 +76,7 @@ def test_a_clip_becomes_a_video_with_its_times(service: Service, matte: str) -> 
     assert stored(service) == before
 
 
-def test_by_the_command_line(service: Service, matte: str, tmp_path: Path) -> None:
+def test_clip_by_the_command_line(service: Service, matte: str, tmp_path: Path) -> None:
     backdrop, output = tmp_path / "clip", tmp_path / "out.mp4"
     backdrop.write_bytes(clip(pictures(5), even(5)))
     done = envmatte(service, "composite", matte, str(backdrop), "-o", str(output), "--json")
@@ -87,7 +87,7 @@ def test_by_the_command_line(service: Service, matte: str, tmp_path: Path) -> No
     assert sorted(path.name for path in tmp_path.iterdir()) == ["clip", "out.mp4"]
 
 
-def test_what_is_no_clip_fails_and_leaves_nothing(service: Service, matte: str) -> None:
+def test_invalid_clip_fails_and_leaves_nothing(service: Service, matte: str) -> None:
     before = stored(service)
     job = post(service, matte, b"no clip" * 99)
     with pytest.raises(ServiceError, match="can't be read as a video") as caught:
@@ -103,7 +103,7 @@ def test_what_is_no_clip_fails_and_leaves_nothing(service: Service, matte: str) 
     assert service.client.matte(matte)["state"] == "ready"
 
 
-def test_a_cancelled_job_frees_what_it_had_and_holds_its_matte_no_more(service: Service, matte: str) -> None:
+def test_cancelled_clip_releases_its_matte(service: Service, matte: str) -> None:
     before = stored(service)
     job = post(service, matte, clip(pictures(300), even(300)))
     refused = service.http.delete(f"/v1/mattes/{matte}")
@@ -115,9 +115,7 @@ def test_a_cancelled_job_frees_what_it_had_and_holds_its_matte_no_more(service: 
 
 
 @pytest.mark.exhaustive
-def test_a_killed_worker_and_a_killed_service_change_no_byte(
-    service: Service, matte: str, tmp_path: Path
-) -> None:
+def test_kills_change_no_byte_of_a_clip(service: Service, matte: str, tmp_path: Path) -> None:
     data = clip(pictures(450), even(450))
     undisturbed = service.client.wait(post(service, matte, data)["id"])
     assert undisturbed["tiles"]["total"] >= 6
@@ -142,7 +140,7 @@ def test_a_killed_worker_and_a_killed_service_change_no_byte(
     assert again == service.http.get(undisturbed["video"]).content
 
 
-def test_what_can_not_be_taken_is_refused_before_it_comes(service: Service, matte: str) -> None:
+def test_invalid_clip_is_refused_before_its_body(service: Service, matte: str) -> None:
     before = stored(service)
     host = urlsplit(service.url)
     with closing(HTTPConnection(str(host.hostname), host.port, timeout=60)) as connection:

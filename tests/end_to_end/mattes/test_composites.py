@@ -35,7 +35,7 @@ def decoded(answer: httpx2.Response) -> np.ndarray:
     return integer_formats.decode(answer.content, memory=1 << 24)
 
 
-def test_the_three_kinds_of_answer_are_one_picture(service: Service, matte: str) -> None:
+def test_png_jpeg_and_exr_show_the_same_picture(service: Service, matte: str) -> None:
     exr = asked(service, matte, accept="image/x-exr")
     assert exr.headers["content-type"] == "image/x-exr"
     light = float_formats.decode(exr.content, memory=1 << 24)
@@ -49,7 +49,7 @@ def test_the_three_kinds_of_answer_are_one_picture(service: Service, matte: str)
     assert len(asked(service, matte, accept="image/jpeg", quality=20).content) < len(jpeg.content) / 3
 
 
-def test_light_goes_in_and_comes_out_as_exr(service: Service, matte: str) -> None:
+def test_exr_backdrop_gives_exr_composite(service: Service, matte: str) -> None:
     def seen(gain: float) -> np.ndarray:
         sent = float_formats.encode_exr({"RGB": BACKDROP * np.float32(gain)})
         return float_formats.decode(asked(service, matte, sent, "image/x-exr").content, memory=1 << 24)
@@ -61,7 +61,7 @@ def test_light_goes_in_and_comes_out_as_exr(service: Service, matte: str) -> Non
     assert deep.dtype == np.uint16
 
 
-def test_a_crop_is_a_piece_and_a_preview_is_small(service: Service, matte: str) -> None:
+def test_crop_and_preview(service: Service, matte: str) -> None:
     whole = decoded(asked(service, matte))
     crop = decoded(asked(service, matte, x=10, y=20, width=31, height=17))
     np.testing.assert_array_equal(crop, whole[20:37, 10:41])
@@ -74,20 +74,18 @@ def test_a_crop_is_a_piece_and_a_preview_is_small(service: Service, matte: str) 
     ("query", "field"),
     [({"x": 96}, "x"), ({"y": 60, "height": 13}, "y"), ({"width": 97}, "x"), ({"x": 90, "width": 10}, "x")],
 )
-def test_a_crop_outside_is_refused(service: Service, matte: str, query: dict[str, int], field: str) -> None:
+def test_crop_outside_is_refused(service: Service, matte: str, query: dict[str, int], field: str) -> None:
     problem = check_problem(asked(service, matte, **query), 422, "bad-option")
     assert problem["field"] == field
     assert "96 x 72" in problem["detail"]
 
 
 @pytest.mark.parametrize("query", [{"size": 0}, {"quality": 101}, {"scale": 0}, {"crop": 1}, {"x": -1}])
-def test_a_request_that_makes_no_sense_is_refused(
-    service: Service, matte: str, query: dict[str, int]
-) -> None:
+def test_invalid_query_is_refused(service: Service, matte: str, query: dict[str, int]) -> None:
     assert check_problem(asked(service, matte, **query), 422, "bad-request")["field"] in query
 
 
-def test_a_moved_backdrop_is_the_backdrop_moved(service: Service, matte: str) -> None:
+def test_moved_backdrop(service: Service, matte: str) -> None:
     half = np.zeros_like(BACKDROP)
     half[:, 80:] = BACKDROP[:, :80]
     moved = decoded(asked(service, matte, right=0.5)).astype(int)
@@ -96,7 +94,7 @@ def test_a_moved_backdrop_is_the_backdrop_moved(service: Service, matte: str) ->
     assert np.abs(moved - decoded(asked(service, matte))).mean() > 10
 
 
-def test_a_backdrop_at_another_depth(service: Service, matte: str) -> None:
+def test_backdrop_at_another_depth(service: Service, matte: str) -> None:
     still = decoded(asked(service, matte)).astype(int)
     told = {"distance": 3, "camera": 5}
     same = decoded(asked(service, matte, depth=3, **told)).astype(int)
@@ -110,7 +108,7 @@ def test_a_backdrop_at_another_depth(service: Service, matte: str) -> None:
     check_problem(asked(service, matte, **missing), 404, "not-found")
 
 
-def test_what_the_caller_has_is_not_made_again(service: Service, matte: str) -> None:
+def test_known_etag_is_not_computed_again(service: Service, matte: str) -> None:
     url = f"/v1/mattes/{matte}/composite"
     first = service.http.post(url, content=SENT)
     tag = first.headers["etag"]
@@ -127,9 +125,7 @@ def test_what_the_caller_has_is_not_made_again(service: Service, matte: str) -> 
     assert len({tag, *(other.headers["etag"] for other in others)}) == 4
 
 
-def test_a_picture_served_is_the_one_that_the_command_line_makes(
-    service: Service, matte: str, tmp_path
-) -> None:
+def test_command_line_gives_the_same_picture(service: Service, matte: str, tmp_path) -> None:
     (tmp_path / "backdrop.png").write_bytes(SENT)
     for name, kind in (("a.png", "image/png"), ("a.jpg", "image/jpeg"), ("a.exr", "image/x-exr")):
         out = tmp_path / name
@@ -138,14 +134,14 @@ def test_a_picture_served_is_the_one_that_the_command_line_makes(
         assert out.read_bytes() == asked(service, matte, accept=kind).content
 
 
-def test_many_ask_at_once_and_all_get_the_same(service: Service, matte: str) -> None:
+def test_simultaneous_requests_get_the_same_picture(service: Service, matte: str) -> None:
     expected = asked(service, matte, accept="image/jpeg").content
     with ThreadPoolExecutor(16) as threads:
         answers = list(threads.map(lambda _: asked(service, matte, accept="image/jpeg").content, range(64)))
     assert set(answers) == {expected}
 
 
-def test_a_matte_in_the_making_is_composited_as_far_as_it_is(service: Service, capture: str) -> None:
+def test_unfinished_matte_is_composited_as_far_as_recovered(service: Service, capture: str) -> None:
     job = service.client.recover(capture, tile=16)
     shares: list[float] = []
     pictures: list[np.ndarray] = []
@@ -175,7 +171,7 @@ def test_a_matte_in_the_making_is_composited_as_far_as_it_is(service: Service, c
     assert service.http.delete(f"/v1/mattes/{job['matte']}").status_code == 204
 
 
-def test_a_matte_that_is_deleted_while_it_is_served(service: Service, capture: str) -> None:
+def test_matte_deleted_while_it_is_composited(service: Service, capture: str) -> None:
     matte = service.client.wait(service.client.recover(capture)["id"])["matte"]
     expected = asked(service, matte).content
     answers: list[httpx2.Response] = []
@@ -223,15 +219,13 @@ def test_every_kind_of_picture_is_a_backdrop(service: Service, matte: str, body:
     assert decoded(asked(service, matte, body)).shape == (72, 96, 3)
 
 
-def test_a_backdrop_of_8_bits_that_lets_through_is_answered_with_as_many(
-    service: Service, matte: str
-) -> None:
+def test_8_bit_backdrop_with_alpha_gives_8_bits(service: Service, matte: str) -> None:
     codes = (255 * BACKDROP).astype(np.uint8)
     glassy = np.concatenate([codes, np.full((*codes.shape[:2], 1), 100, np.uint8)], axis=2)
     assert decoded(asked(service, matte, integer_formats.encode_png(glassy))).dtype == np.uint8
 
 
-def test_a_bomb_is_refused_before_it_goes_off(service: Service, matte: str) -> None:
+def test_decompression_bomb_is_refused(service: Service, matte: str) -> None:
     bomb = saved(Image.new("1", (20_000, 20_000)), "PNG")
     assert len(bomb) < 1 << 20
     problem = check_problem(asked(service, matte, bomb), 422, "bad-image")
@@ -244,7 +238,7 @@ def test_a_bomb_is_refused_before_it_goes_off(service: Service, matte: str) -> N
 @pytest.mark.parametrize(
     "requests", [600, pytest.param(10_000, marks=[pytest.mark.exhaustive, pytest.mark.timeout(3600)])]
 )
-def test_requests_leave_nothing_behind(service: Service, matte: str, requests: int) -> None:
+def test_requests_leak_nothing(service: Service, matte: str, requests: int) -> None:
     """Neither in the API's process nor in those that decode backdrops for it."""
     askers = 4
 

@@ -19,7 +19,7 @@ PROBLEM = "application/problem+json"
 
 
 @pytest.mark.parametrize("name", ["S", "rho", "alpha", "confidence"])
-def test_a_layer_is_a_png_and_an_exr(service: Service, matte: str, name: str) -> None:
+def test_layer_as_png_and_as_exr(service: Service, matte: str, name: str) -> None:
     answer = service.http.get(f"/v1/mattes/{matte}/layers/{name}.exr")
     assert (answer.status_code, answer.headers["content-type"]) == (200, "image/x-exr")
     exact = float_formats.decode(answer.content, memory=1 << 24)
@@ -31,7 +31,7 @@ def test_a_layer_is_a_png_and_an_exr(service: Service, matte: str, name: str) ->
     np.testing.assert_allclose(integer_formats.to_unit(pixels), np.clip(exact, 0, 1), atol=1e-5)
 
 
-def test_all_layers_are_one_exr_with_as_many_lobes_as_asked_for(service: Service, matte: str) -> None:
+def test_all_layers_in_one_exr_with_the_requested_lobes(service: Service, matte: str) -> None:
     for query, lobes in (("", 4), ("?lobes=2", 2)):
         answer = service.http.get(f"/v1/mattes/{matte}/layers/all.exr{query}")
         assert answer.status_code == 200
@@ -46,7 +46,7 @@ def test_all_layers_are_one_exr_with_as_many_lobes_as_asked_for(service: Service
             np.testing.assert_allclose(held[lit], channels["A"].pixels[lit], atol=2e-3)
 
 
-def test_an_stmap_says_where_the_monitor_is_seen(service: Service, matte: str, scene: Scene) -> None:
+def test_stmap_points_at_the_monitor(service: Service, matte: str, scene: Scene) -> None:
     pixels = float_formats.decode(service.client.layer(matte, "stmap.exr"), memory=1 << 24)
     # beside the ball the monitor is seen as it is: u to the right, v up
     beside = np.median(pixels[:, :3, 0]), np.median(pixels[:, -3:, 0])
@@ -59,7 +59,7 @@ def test_an_stmap_says_where_the_monitor_is_seen(service: Service, matte: str, s
 
 
 @pytest.mark.parametrize("file", ["T.png", "stmap.png", "all.png", "S.jpg", "S", ".exr"])
-def test_what_there_is_not_is_told_by_what_there_is(service: Service, matte: str, file: str) -> None:
+def test_unknown_layer_names_the_known_ones(service: Service, matte: str, file: str) -> None:
     answer = service.http.get(f"/v1/mattes/{matte}/layers/{file}")
     assert (answer.status_code, answer.headers["content-type"]) == (404, PROBLEM)
     for known in ("S.png", "confidence.exr", "stmap.exr", "all.exr"):
@@ -67,12 +67,12 @@ def test_what_there_is_not_is_told_by_what_there_is(service: Service, matte: str
 
 
 @pytest.mark.parametrize("lobes", ["0", "9", "many"])
-def test_no_lobes_or_too_many_are_refused(service: Service, matte: str, lobes: str) -> None:
+def test_lobe_count_outside_the_limits_is_refused(service: Service, matte: str, lobes: str) -> None:
     answer = service.http.get(f"/v1/mattes/{matte}/layers/all.exr", params={"lobes": lobes})
     assert (answer.status_code, answer.json()["field"]) == (422, "lobes")
 
 
-def test_a_pixel_tells_where_its_light_comes_from(service: Service, matte: str) -> None:
+def test_pixel_lists_where_its_light_comes_from(service: Service, matte: str) -> None:
     found = service.http.get(f"/v1/mattes/{matte}/transport", params={"x": 50, "y": 30}).json()
     assert (found["x"], found["y"], found["recovered"], found["monitor"]) == (50, 30, True, [1280, 960])
     cells = np.array([cell["weight"] for cell in found["cells"]])
@@ -88,7 +88,7 @@ def test_a_pixel_tells_where_its_light_comes_from(service: Service, matte: str) 
     np.testing.assert_allclose([found["lobes"][0]["u"], found["lobes"][0]["v"]], place[:2], rtol=1e-6)
 
 
-def test_a_pixel_is_drawn(service: Service, matte: str) -> None:
+def test_pixel_is_drawn(service: Service, matte: str) -> None:
     answer = service.http.get(f"/v1/mattes/{matte}/transport.png", params={"x": 50, "y": 30})
     assert (answer.status_code, answer.headers["content-type"]) == (200, "image/png")
     with Image.open(io.BytesIO(answer.content)) as drawn:
@@ -104,7 +104,7 @@ def test_a_pixel_is_drawn(service: Service, matte: str) -> None:
 @pytest.mark.parametrize(
     ("place", "field", "limit"), [((96, 0), "x", 95), ((0, 72), "y", 71), ((0, -1), "y", 71)]
 )
-def test_a_pixel_outside_is_refused_with_the_limit(
+def test_pixel_outside_is_refused(
     service: Service, matte: str, file: str, place: tuple[int, int], field: str, limit: int
 ) -> None:
     answer = service.http.get(f"/v1/mattes/{matte}/{file}", params=dict(zip("xy", place, strict=True)))

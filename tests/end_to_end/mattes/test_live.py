@@ -7,7 +7,7 @@ from tests.end_to_end.conftest import Service
 PROBLEM = "application/problem+json"
 
 
-def test_it_is_made_once_and_kept(service: Service, matte: str) -> None:
+def test_live_data_is_made_once(service: Service, matte: str) -> None:
     first = service.http.get(f"/v1/mattes/{matte}/live")
     assert (first.status_code, first.headers["content-encoding"]) == (200, "gzip")
     start = 4 + int.from_bytes(first.content[:4], "little")
@@ -21,12 +21,12 @@ def test_it_is_made_once_and_kept(service: Service, matte: str) -> None:
     assert service.http.get(f"/v1/mattes/{matte}/live", headers=known).status_code == 304
 
 
-def test_a_matte_that_is_not_there_has_none(service: Service) -> None:
+def test_unknown_matte_has_no_live_data(service: Service) -> None:
     answer = service.http.get("/v1/mattes/nothing/live")
     assert (answer.status_code, answer.headers["content-type"]) == (404, PROBLEM)
 
 
-def test_an_archive_is_the_same_with_it(service: Service, matte: str) -> None:
+def test_archive_does_not_depend_on_live_data(service: Service, matte: str) -> None:
     service.http.get(f"/v1/mattes/{matte}/live")
     archive = service.http.get(f"/v1/mattes/{matte}/archive").content
     made = service.http.post("/v1/mattes", content=archive, headers={"Content-Type": "application/zip"})

@@ -25,7 +25,7 @@ def tiles_done(service: Service, job: str) -> int:
 
 
 @pytest.mark.slow
-def test_a_job_that_ran_is_finished_where_the_backup_is_restored(
+def test_running_job_continues_in_the_restored_backup(
     bundle: Path, s3: str, postgresql_server: Server, tmp_path: Path
 ) -> None:
     backup, data = str(tmp_path / "backup"), tmp_path / "data"
@@ -80,7 +80,7 @@ def test_a_job_that_ran_is_finished_where_the_backup_is_restored(
         (("restore", "none", "--data", "new"), "there is no folder"),
     ],
 )
-def test_what_can_not_be_is_told(
+def test_invalid_arguments_are_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], said: str
 ) -> None:
     monkeypatch.chdir(tmp_path)

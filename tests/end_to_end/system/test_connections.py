@@ -36,7 +36,7 @@ def answer(connection: socket.socket) -> bytes:
 
 
 @pytest.mark.slow
-def test_thousands_that_say_nothing_keep_nobody_out_and_are_closed(service: Service) -> None:
+def test_thousands_of_idle_connections_are_served_around_and_closed(service: Service) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     count = min(10_000, hard - 1000)  # of this process, and as many of the service's own
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
@@ -67,7 +67,7 @@ def test_thousands_that_say_nothing_keep_nobody_out_and_are_closed(service: Serv
 
 
 @pytest.mark.slow
-def test_a_head_that_comes_byte_by_byte_is_not_waited_for(service: Service) -> None:
+def test_slow_request_head_is_disconnected(service: Service) -> None:
     begun = time.monotonic()
     with connected(service) as (slow,):
         slow.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
@@ -90,7 +90,7 @@ def test_a_head_that_comes_byte_by_byte_is_not_waited_for(service: Service) -> N
     ],
     ids=["a long header", "a long path", "noise", "two lengths", "an unknown encoding"],
 )
-def test_what_is_no_request_is_refused_and_the_connection_closed(service: Service, sent: bytes) -> None:
+def test_malformed_request_is_refused_and_disconnected(service: Service, sent: bytes) -> None:
     with connected(service) as (connection,):
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             connection.sendall(sent)
@@ -98,7 +98,7 @@ def test_what_is_no_request_is_refused_and_the_connection_closed(service: Servic
     assert service.http.get("/healthz").status_code == 200
 
 
-def test_a_half_closed_connection_counts_as_gone(service: Service) -> None:
+def test_half_closed_connection_is_closed(service: Service) -> None:
     """A client that closes looks the same until it is written to, and computing for nobody would cost more."""
     for sent in (b"GET /v1/jobs HTTP/1.1\r\nHost: localhost\r\n\r\n", b"GET /healthz HT"):
         with connected(service) as (half,):

@@ -191,7 +191,7 @@ def expected(route: str, kind: str) -> int | None:
 
 
 @pytest.mark.exhaustive
-def test_a_clip_takes_a_matte_of_ones_own(locked: Locked) -> None:
+def test_clip_needs_a_matte_of_the_same_owner(locked: Locked) -> None:
     url, video = f"/v1/mattes/{locked.ids['matte']}/composite", {"Content-Type": "video/mp4"}
     for kind, status in (("other", 404), ("read", 403)):
         answer = locked.service.http.post(url, content=b"clip", headers=video | bearer(locked.keys[kind]))
@@ -280,7 +280,7 @@ def test_a_program_needs_a_key_except_for_its_page(locked: Locked) -> None:
     assert http.get(str(httpx2.URL(page.url).join("../../../web/play/play.js"))).status_code == 200
 
 
-def test_the_same_idempotency_key_is_another_owners_own(locked: Locked, bundle: Path) -> None:
+def test_idempotency_keys_are_per_owner(locked: Locked, bundle: Path) -> None:
     for create in (
         {"url": "/v1/uploads", "headers": TUS | {"Upload-Length": "5"}},
         {"url": "/v1/captures", "headers": ZIP, "content": bundle.read_bytes()},
@@ -295,7 +295,7 @@ def test_the_same_idempotency_key_is_another_owners_own(locked: Locked, bundle: 
         assert made[0] == made[2] != made[1] == made[3]
 
 
-def test_the_same_program_is_kept_for_each_owner(locked: Locked) -> None:
+def test_programs_are_kept_per_owner(locked: Locked) -> None:
     asked = {"preset": "sketch", "monitor": {"width": 64, "height": 48}}
     http = locked.service.http
     urls = {
@@ -309,7 +309,7 @@ def test_the_same_program_is_kept_for_each_owner(locked: Locked) -> None:
 
 
 @pytest.mark.slow
-def test_a_revoked_key_ends_what_goes_on(locked: Locked, bundle: Path) -> None:
+def test_revoking_a_key_ends_its_running_requests(locked: Locked, bundle: Path) -> None:
     service, data = locked.service, locked.service.data
     made = command(data, "make", "passing", "--owner", "carol", "--json")
     key = json.loads(made.stdout)["key"]
@@ -343,7 +343,7 @@ def test_a_revoked_key_ends_what_goes_on(locked: Locked, bundle: Path) -> None:
     assert not any(key.encode() in file.read_bytes() for file in data.glob("envmatte.db*"))
 
 
-def test_the_command_says_what_is_wrong(tmp_path: Path) -> None:
+def test_keys_command_reports_errors(tmp_path: Path) -> None:
     assert command(tmp_path, "make", "lab").stdout.startswith("envmatte_")
     for words, said in (
         (("make", "lab"), "revoke it first"),

@@ -66,7 +66,7 @@ def test_an_upload_of_a_gigabyte_is_streamed(
 
 
 @pytest.mark.exhaustive
-def test_an_upload_over_the_limit_is_refused_without_being_read(bundle: Path, tmp_path: Path) -> None:
+def test_upload_over_the_limit_is_not_read(bundle: Path, tmp_path: Path) -> None:
     limit = bundle.stat().st_size - 1
     with serving(tmp_path / "data", "--workers", "1", ENVMATTE_UPLOAD_BYTES=str(limit)) as service:
         headers = {"Content-Type": "application/zip"}

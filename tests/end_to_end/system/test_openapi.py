@@ -167,7 +167,7 @@ def test_a_few_calls_of_each_route(bundle: Path, tmp_path: Path) -> None:
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("who", ["a key", "a key to look with", "no key", "a service without keys"])
-def test_the_service_is_as_its_document_says(
+def test_service_conforms_to_its_openapi_document(
     bundle: Path, tmp_path: Path, who: str, pytestconfig: pytest.Config
 ) -> None:
     examples = str(3 * int(pytestconfig.getoption("--times")))

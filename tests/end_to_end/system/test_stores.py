@@ -12,7 +12,7 @@ from tests.services.cluster.clusters import address, started
 
 
 @pytest.mark.slow
-def test_a_matte_is_the_same_in_a_bucket_and_in_a_folder(
+def test_matte_is_the_same_in_a_bucket_and_in_a_folder(
     service: Service, matte: str, bundle: Path, s3: str, tmp_path: Path
 ) -> None:
     folder = tmp_path / "certs"

@@ -91,7 +91,7 @@ def _figures(text: str) -> dict[tuple[str, ...], float]:
     }
 
 
-def test_figures_are_those_of_the_jobs(watched: Watched) -> None:
+def test_metrics_count_the_jobs(watched: Watched) -> None:
     answer = watched.service.http.get("/metrics")
     assert answer.headers["content-type"].startswith("text/plain; version=")
     found = _figures(answer.text)
@@ -113,14 +113,14 @@ def test_figures_are_those_of_the_jobs(watched: Watched) -> None:
     assert found[("envmatte_coordinator_last_sign_seconds",)] >= 0
 
 
-def test_figures_come_as_openmetrics_to_whoever_wants_them(watched: Watched) -> None:
+def test_openmetrics_on_request(watched: Watched) -> None:
     wanted = {"accept": "application/openmetrics-text; version=1.0.0"}
     answer = watched.service.http.get("/metrics", headers=wanted)
     assert answer.headers["content-type"].startswith("application/openmetrics-text")
     assert "envmatte_jobs" in {family.name for family in parse_openmetrics(answer.text)}
 
 
-def test_uploads_and_queued_tiles_are_counted(watched: Watched) -> None:
+def test_metrics_count_uploads_and_queued_tiles(watched: Watched) -> None:
     http = watched.service.http
     headers = {"Tus-Resumable": "1.0.0", "Upload-Length": "1000"}
     headers |= {"Content-Type": "application/offset+octet-stream"}
@@ -131,7 +131,7 @@ def test_uploads_and_queued_tiles_are_counted(watched: Watched) -> None:
     assert _figures(http.get("/metrics").text)[("envmatte_uploads",)] == 0
 
 
-def test_the_cluster_is_told(watched: Watched) -> None:
+def test_cluster_status(watched: Watched) -> None:
     http = watched.service.http
     wait(lambda: http.get("/v1/cluster").json()["queue"]["tiles_under_way"] == 0)
     found = http.get("/v1/cluster").json()
@@ -146,7 +146,7 @@ def test_the_cluster_is_told(watched: Watched) -> None:
     assert found["queue"] == queue | {"tiles_per_second": None}
 
 
-def test_every_line_of_the_log_is_an_object_with_a_time(watched: Watched) -> None:
+def test_every_log_line_is_a_json_object_with_a_time(watched: Watched) -> None:
     lines = watched.lines()
     assert {line["process"] for line in lines} == {"service", "worker"}
     for line in lines:
@@ -154,7 +154,7 @@ def test_every_line_of_the_log_is_an_object_with_a_time(watched: Watched) -> Non
         assert datetime.fromisoformat(line["time"]).utcoffset() is not None
 
 
-def test_lines_about_a_tile_name_it_and_its_job(watched: Watched) -> None:
+def test_log_lines_name_job_and_tile(watched: Watched) -> None:
     total = watched.service.client.job(watched.recover)["tiles"]["total"]
     lines = [line for line in watched.lines() if line.get("job") == watched.recover]
     done = [line for line in lines if line["process"] == "worker" and line["message"].startswith("done in")]
@@ -163,7 +163,7 @@ def test_lines_about_a_tile_name_it_and_its_job(watched: Watched) -> None:
     assert any(line["process"] == "service" and line["message"] == "succeeded" for line in lines)
 
 
-def test_a_failed_tile_is_logged_with_its_traceback(watched: Watched) -> None:
+def test_failed_tile_is_logged_with_its_traceback(watched: Watched) -> None:
     lines = [line for line in watched.lines() if line.get("job") == watched.failed]
     raised = [line for line in lines if "exception" in line]
     assert raised
@@ -177,7 +177,7 @@ def test_a_failed_tile_is_logged_with_its_traceback(watched: Watched) -> None:
 @pytest.mark.parametrize(
     ("kind", "asked_by"), [("recover", "POST /v1/jobs"), ("composite", "POST /v1/mattes/{id}/composite")]
 )
-def test_a_trace_leads_from_the_request_to_every_tile(watched: Watched, kind: str, asked_by: str) -> None:
+def test_trace_links_the_request_to_every_tile(watched: Watched, kind: str, asked_by: str) -> None:
     collector, job = watched.collector, getattr(watched, kind)
     wait(lambda: any(s.name == f"{kind} finish" for s in _of(collector, job)))
     total = watched.service.client.job(job)["tiles"]["total"]
@@ -195,7 +195,7 @@ def test_a_trace_leads_from_the_request_to_every_tile(watched: Watched, kind: st
     assert request.begin <= queue.begin <= queue.end <= prepare.begin
 
 
-def test_a_trace_begins_with_the_request_of_whoever_has_none(watched: Watched) -> None:
+def test_request_without_traceparent_starts_a_trace(watched: Watched) -> None:
     wait(lambda: any(s.name == "ingest finish" for s in _of(watched.collector, watched.ingest)))
     spans = _of(watched.collector, watched.ingest)
     (request,) = [s for s in watched.collector.spans if s.name == "POST /v1/captures"]
@@ -204,7 +204,7 @@ def test_a_trace_begins_with_the_request_of_whoever_has_none(watched: Watched) -
     assert {s.parent for s in spans} == {request.id}
 
 
-def test_a_failure_is_seen_in_the_trace(watched: Watched) -> None:
+def test_trace_shows_failures(watched: Watched) -> None:
     wait(lambda: any(span.failed for span in _of(watched.collector, watched.failed)))
     assert not any(span.failed for span in _of(watched.collector, watched.recover))
 

@@ -45,7 +45,7 @@ def test_from_a_capture_to_a_composite(service: Service, bundle: Path, tmp_path:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["backdrop.png", "composite.png"]
 
 
-def test_what_the_service_refuses_is_told_with_exit_code_1(service: Service, tmp_path: Path) -> None:
+def test_refusal_has_exit_code_1(service: Service, tmp_path: Path) -> None:
     broken = tmp_path / "broken.zip"
     broken.write_bytes(b"no zip")
     for arguments, said in (
@@ -59,7 +59,7 @@ def test_what_the_service_refuses_is_told_with_exit_code_1(service: Service, tmp
         assert "Traceback" not in refused.stderr
 
 
-def test_a_wrong_command_line_has_exit_code_2(service: Service) -> None:
+def test_wrong_command_line_has_exit_code_2(service: Service) -> None:
     for arguments in (
         ["recover"],
         ["upload", "no-such-file.zip"],
@@ -69,7 +69,7 @@ def test_a_wrong_command_line_has_exit_code_2(service: Service) -> None:
         assert envmatte(service, *arguments).returncode == 2
 
 
-def test_an_interrupt_stops_the_waiting_and_not_the_job(service: Service, capture: str) -> None:
+def test_interrupt_stops_waiting_but_not_the_job(service: Service, capture: str) -> None:
     command = [sys.executable, "-m", "services", "recover", capture, "--url", service.url]
     newest = service.http.get("/v1/jobs?limit=1").json()["jobs"][0]["id"]
     with paused(service), running(command) as waiting:
@@ -89,7 +89,7 @@ def patterns(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_the_patterns_of_a_preset_are_written_as_they_are(preset: str, tmp_path: Path) -> None:
+def test_patterns_of_a_preset_are_written(preset: str, tmp_path: Path) -> None:
     folder = tmp_path / "new" / "patterns"
     done = patterns(preset, str(folder), "--monitor", "160x120", "--json")
     assert done.returncode == 0, done.stderr
@@ -126,7 +126,7 @@ def test_every_preset_is_described_in_the_help() -> None:
         assert any(line.split(maxsplit=1) == [name, text] for line in said.splitlines())
 
 
-def test_patterns_go_into_a_new_or_empty_folder_alone(tmp_path: Path) -> None:
+def test_patterns_need_a_new_or_empty_folder(tmp_path: Path) -> None:
     done = patterns("sketch", str(tmp_path), "--monitor", "16x12")
     assert (done.returncode, done.stdout) == (0, f"{tmp_path}\n")
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
@@ -147,7 +147,7 @@ def test_patterns_go_into_a_new_or_empty_folder_alone(tmp_path: Path) -> None:
         (["quick", "x", "--monitor", "99999x960"], "less than or equal to 16384"),
     ],
 )
-def test_patterns_that_can_not_be_made_are_refused(arguments: list[str], said: str, tmp_path: Path) -> None:
+def test_invalid_patterns_are_refused(arguments: list[str], said: str, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "services", "patterns", *arguments]
     refused = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert (refused.returncode, refused.stdout) == (2, "")
@@ -155,7 +155,7 @@ def test_patterns_that_can_not_be_made_are_refused(arguments: list[str], said: s
     assert not list(tmp_path.iterdir())
 
 
-def test_a_film_is_made_of_a_preset_and_of_its_record(tmp_path: Path) -> None:
+def test_film_of_a_preset_and_of_its_record(tmp_path: Path) -> None:
     film = tmp_path / "new" / "sketch.mp4"
     done = patterns("sketch", str(film), "--monitor", "320x240", "--rate", "10", "--json")
     assert done.returncode == 0, done.stderr

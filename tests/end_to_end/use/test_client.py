@@ -35,7 +35,7 @@ def test_from_a_file_to_an_array(service: Service, bundle: Path) -> None:
                 gone()
 
 
-def test_an_array_is_the_light_of_an_image(service: Service, matte: str, tmp_path: Path) -> None:
+def test_array_is_linear_light(service: Service, matte: str, tmp_path: Path) -> None:
     client, light = service.client, np.linspace(0, 1, 48, dtype=np.float32).reshape(4, 4, 3)
     composite = client.composite(matte, light)
     sent = client.composite(matte, float_formats.encode_exr({"RGB": light}), kind="image/x-exr")

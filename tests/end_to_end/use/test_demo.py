@@ -26,7 +26,7 @@ def test_the_demo_leaves_its_picture(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends a process with its parent")
-def test_the_service_of_one_that_is_killed_ends(tmp_path: Path) -> None:
+def test_service_of_a_killed_demo_ends(tmp_path: Path) -> None:
     script = (
         "import sys, time; from pathlib import Path; from services.cli.demo_run import service\n"
         "with service(Path(sys.argv[1], 'data'), 1) as url: print(url, flush=True); time.sleep(300)"

@@ -31,7 +31,7 @@ def test_an_upload_is_ingested(service: Service, bundle: Path, scene: Scene) -> 
     gone(service, made["id"])
 
 
-def test_frames_are_kept_as_they_were_filmed(service: Service, capture: str, scene: Scene, program) -> None:
+def test_frames_are_stored_unchanged(service: Service, capture: str, scene: Scene, program) -> None:
     filmed = list(scene.film(program))
     for n in (0, 30, 56):
         answer = service.http.get(f"/v1/captures/{capture}/frames/{n}.png")
@@ -88,9 +88,7 @@ def test_a_composite_says_where_its_time_went(service: Service, matte: str) -> N
     assert names == ["open", "decode", "composite", "encode"]
 
 
-def test_what_the_mask_left_out_is_transparent(
-    service: Service, scene: Scene, program, tmp_path: Path
-) -> None:
+def test_masked_pixels_are_transparent(service: Service, scene: Scene, program, tmp_path: Path) -> None:
     masked = tmp_path / "masked.zip"
     write_capture(scene, program, masked, mask=True)
     uploaded = service.client.upload(masked)
@@ -108,7 +106,7 @@ def test_what_the_mask_left_out_is_transparent(
     assert np.unique(confidence).size > 100
 
 
-def test_lists_are_newest_first_and_go_on_after(service: Service, bundle: Path) -> None:
+def test_lists_are_newest_first_and_paged(service: Service, bundle: Path) -> None:
     made = [service.client.upload(bundle)["id"] for _ in range(3)]
     ids = [item["id"] for item in service.http.get("/v1/captures?limit=3").json()["captures"]]
     assert ids == made[::-1]
@@ -121,7 +119,7 @@ def test_lists_are_newest_first_and_go_on_after(service: Service, bundle: Path) 
     assert states == {"succeeded"}
 
 
-def test_a_repeated_post_makes_one_thing(service: Service, bundle: Path, capture: str) -> None:
+def test_repeated_post_makes_one_thing(service: Service, bundle: Path, capture: str) -> None:
     headers = {"Content-Type": "application/zip", "Idempotency-Key": "upload-1"}
     first, second = (
         service.http.post("/v1/captures", content=bundle.read_bytes(), headers=headers).json()["id"]
@@ -133,7 +131,7 @@ def test_a_repeated_post_makes_one_thing(service: Service, bundle: Path, capture
     assert len(jobs) == 1
 
 
-def test_deleting_takes_everything_with_it(service: Service, bundle: Path) -> None:
+def test_deleting_leaves_nothing(service: Service, bundle: Path) -> None:
     uploaded = service.client.upload(bundle)
     job = service.client.wait(service.client.recover(uploaded["id"])["id"])
     assert any(job["matte"] in name for name in service.stored())
@@ -145,7 +143,7 @@ def test_deleting_takes_everything_with_it(service: Service, bundle: Path) -> No
         assert service.http.get(f"/v1/{path}").status_code == 404
 
 
-def test_the_service_says_that_it_is_well(service: Service) -> None:
+def test_health(service: Service) -> None:
     assert service.http.get("/healthz").json() == {"status": "alive"}
     answer = service.http.get("/readyz")
     assert answer.status_code == 200, answer.text

@@ -36,7 +36,7 @@ def program(service: Service) -> dict:
     return found
 
 
-def test_a_program_is_kept_once_whatever_it_came_from(service: Service, program: dict) -> None:
+def test_equal_programs_are_stored_once(service: Service, program: dict) -> None:
     assert Program.model_validate(program["program"]) == SKETCH
     assert program["patterns"] == 32
     assert program["monitor"] == {"width": 296, "height": 216}
@@ -57,7 +57,7 @@ def test_presets_are_listed(service: Service) -> None:
     assert {one["name"]: one["description"] for one in listed} == PRESETS
 
 
-def test_a_program_is_made_for_another_monitor_on_request(service: Service) -> None:
+def test_program_is_fitted_to_another_monitor(service: Service) -> None:
     asked = {"program": program_json(SKETCH), "monitor": {"width": 640, "height": 480}}
     for border, size in ((False, (640, 480)), (True, (592, 432))):
         found = service.http.post("/v1/programs", json=asked | {"border": border}).json()
@@ -69,7 +69,7 @@ def test_a_program_is_made_for_another_monitor_on_request(service: Service) -> N
     check_problem(service.http.get(f"{small.headers['location']}/patterns.mp4"), 422, "bad-option")
 
 
-def test_patterns_are_drawn_one_by_one_and_all_in_a_zip(service: Service, program: dict) -> None:
+def test_patterns_as_png_and_as_zip(service: Service, program: dict) -> None:
     url = f"/v1/programs/{program['id']}"
     zipped = service.http.get(f"{url}/patterns.zip")
     assert zipped.headers["content-type"] == "application/zip"
@@ -88,7 +88,7 @@ def test_patterns_are_drawn_one_by_one_and_all_in_a_zip(service: Service, progra
         assert "0 to 31" in problem["detail"]
 
 
-def test_the_video_is_the_one_of_the_command(service: Service, program: dict, tmp_path: Path) -> None:
+def test_video_equals_that_of_the_command_line(service: Service, program: dict, tmp_path: Path) -> None:
     answer = service.http.get(f"/v1/programs/{program['id']}/patterns.mp4?rate=10")
     assert answer.headers["content-type"] == "video/mp4"
     assert int(answer.headers["content-length"]) == len(answer.content)
@@ -155,22 +155,20 @@ def test_the_video_is_the_one_of_the_command(service: Service, program: dict, tm
         ),
     ],
 )
-def test_a_program_that_can_not_be_shown_is_refused(
-    service: Service, body: dict, slug: str, said: str
-) -> None:
+def test_program_that_cannot_be_shown_is_refused(service: Service, body: dict, slug: str, said: str) -> None:
     before = service.http.get("/v1/programs").json()
     problem = check_problem(service.http.post("/v1/programs", json=body), 422, slug)
     assert said in problem["detail"]
     assert service.http.get("/v1/programs").json() == before
 
 
-def test_a_body_that_is_no_program_is_refused(service: Service) -> None:
+def test_invalid_program_body_is_refused(service: Service) -> None:
     many = json.dumps({"program": {"parts": [grid(2, 2, 2)] * 2000}}).encode()
     check_problem(service.http.post("/v1/programs", content=many), 413, "too-large")
     check_problem(service.http.post("/v1/programs", content=b"{"), 422, "bad-request")
 
 
-def test_a_deleted_program_is_gone_with_all_its_files(service: Service) -> None:
+def test_deleted_program_is_gone_with_its_files(service: Service) -> None:
     asked = {"preset": "sketch", "monitor": {"width": 200, "height": 150}}
     url = service.http.post("/v1/programs", json=asked).headers["location"]
     assert service.http.delete(url).status_code == 204

@@ -38,7 +38,7 @@ def test_the_five_lines_of_curl(service: Service, bundle: Path, tmp_path: Path) 
     assert (tmp_path / "composite.png").read_bytes() == expected
 
 
-def test_zarr_alone_reads_a_matte_and_composites_it(service: Service, matte: str, tmp_path: Path) -> None:
+def test_matte_is_read_and_composited_with_zarr_only(service: Service, matte: str, tmp_path: Path) -> None:
     look, lines = re.findall(r"```python\n(.*?)```", README.partition("## Taking a matte elsewhere")[2], re.S)
     service.client.export(matte, tmp_path / "matte.zip")
     stored = Matte(Objects((service.data / "store").as_uri()), matte)
@@ -56,7 +56,7 @@ def test_zarr_alone_reads_a_matte_and_composites_it(service: Service, matte: str
     np.testing.assert_allclose(sorted(weights), expected_weights, rtol=1e-5)
 
 
-def test_every_test_that_it_names_is_there() -> None:
+def test_every_test_it_names_exists() -> None:
     root = Path(__file__).parents[3]
     named = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", README)
     assert len(named) > 10
