@@ -9,7 +9,7 @@ from workflows.mattes.steps import STEPS as RECOVER
 
 
 @pytest.mark.parametrize("count", [1, 7, 30, 1000])
-def test_tiles_of_a_matte_are_taken_from_all_over_it(count: int) -> None:
+def test_tiles_of_a_matte_are_spread_over_it(count: int) -> None:
     tiles = order(RECOVER, range(count))
     assert sorted(tiles) == list(range(count))
     assert order(RECOVER, tiles[count // 2 :]) == tiles[count // 2 :]
@@ -18,5 +18,5 @@ def test_tiles_of_a_matte_are_taken_from_all_over_it(count: int) -> None:
         assert np.ptp(fifth) <= 2
 
 
-def test_tiles_of_a_capture_come_one_after_another() -> None:
+def test_slabs_of_a_capture_are_in_sequence() -> None:
     assert order(INGEST, [3, 0, 2]) == [0, 2, 3]

@@ -1,4 +1,4 @@
-"""Schedulers and workers in processes of their own."""
+"""Schedulers and workers in their own processes."""
 
 import os
 import subprocess
@@ -14,10 +14,10 @@ from services.decoding.process import NAME
 
 
 def wait(until: Callable[[], object], seconds: float = 120) -> None:
-    """Wait for something to become true; how long is no matter, but that it does."""
+    """Wait until something becomes true; it fails only if it never does."""
     end = time.monotonic() + seconds
     while not until():
-        assert time.monotonic() < end, "it never came"
+        assert time.monotonic() < end, "it never became true"
         time.sleep(0.1)
 
 
@@ -25,9 +25,9 @@ def wait(until: Callable[[], object], seconds: float = 120) -> None:
 def started(
     log: Path, *command: str, within: Sequence[str] = (), **environment: str
 ) -> Iterator[subprocess.Popen[str]]:
-    """A command of envmatte that runs, its stderr in a file; it and all that it started are gone in the end.
+    """A running command of envmatte, with its stderr in a file; on exit it and its children are killed.
 
-    ``within`` is put before it, to have it run on another host say.
+    ``within`` is put before the command, for example to run it on another host.
     """
     with log.open("ab") as stderr:
         process = subprocess.Popen(
@@ -50,7 +50,7 @@ def started(
 
 
 def address(process: subprocess.Popen[str]) -> str:
-    """Where a scheduler listens, as soon as it does."""
+    """The address of a scheduler, as soon as it listens."""
     assert process.stdout is not None
     line = process.stdout.readline()
     assert " at t" in line, line
@@ -58,35 +58,35 @@ def address(process: subprocess.Popen[str]) -> str:
 
 
 def children(process: subprocess.Popen[str]) -> list[psutil.Process]:
-    """What a process has started, and they in turn."""
+    """All descendants of a process."""
     return psutil.Process(process.pid).children(recursive=True)
 
 
 def workers(process: subprocess.Popen[str]) -> list[psutil.Process]:
-    """The worker processes of a process: those that its fork server has forked, and that decode nothing for its API."""
+    """The worker processes of a process: those forked by its fork server, without decoders."""
     return [one for one, name in _forked(process) if name != NAME]
 
 
 def decoders(process: subprocess.Popen[str]) -> list[psutil.Process]:
-    """The processes in which the API of a process has pictures decoded."""
+    """The processes that decode images for the API."""
     return [one for one, name in _forked(process) if name == NAME]
 
 
 def _forked(process: subprocess.Popen[str]) -> list[tuple[psutil.Process, str]]:
     found = []
     for one in children(process):
-        with suppress(psutil.NoSuchProcess):  # nor one that has just ended
+        with suppress(psutil.NoSuchProcess):  # it has just ended
             if any("forkserver" in argument for argument in psutil.Process(one.ppid()).cmdline()):
                 found.append((one, one.name()))
     return found
 
 
 def running(processes: list[psutil.Process]) -> list[psutil.Process]:
-    """Those that have not ended; one that nobody has waited for has."""
+    """Those that have not ended; zombies have."""
     return [one for one in processes if one.is_running() and one.status() != psutil.STATUS_ZOMBIE]
 
 
 def listening(process: psutil.Process) -> list[tuple[str, int]]:
-    """Where a process listens."""
+    """Addresses and ports on which a process listens."""
     found = process.net_connections()
     return [(one.laddr.ip, one.laddr.port) for one in found if one.status == psutil.CONN_LISTEN]

@@ -1,4 +1,4 @@
-"""A scheduler and workers in processes of their own: who gets in, and what is killed comes again."""
+"""A scheduler and workers in their own processes: who can connect, and that killed processes are replaced."""
 
 import asyncio
 import signal
@@ -20,9 +20,7 @@ from distributed.scheduler import KilledWorker
 from distributed.security import Security
 
 from services.cluster.connect import connect
-from services.cluster.embedded import embedded
 from services.runtime import certificates
-from services.settings import Settings
 from storage.errors import Unavailable
 from tests.services.cluster.clusters import address, children, listening, running, started, wait, workers
 
@@ -31,7 +29,7 @@ WORKERS = 2
 
 @dataclass
 class Cluster:
-    """A scheduler that can be killed and started again, and workers."""
+    """A scheduler that can be killed and restarted, and workers."""
 
     folder: Path
     security: Security
@@ -41,17 +39,17 @@ class Cluster:
     ending: ExitStack
 
     def kill_scheduler(self) -> None:
-        """End it as a crash would."""
+        """Kill the scheduler, as a crash would."""
         self.ending.close()
 
     def start_scheduler(self) -> None:
-        """Start it where it was."""
+        """Start the scheduler again at the same address."""
         self.scheduler = self.ending.enter_context(scheduling(self.folder, urlsplit(self.address).port or 0))
         address(self.scheduler)
 
     @property
     def log(self) -> str:
-        """What the workers have said so far."""
+        """What the workers have logged so far."""
         return (self.folder / "workers.log").read_text()
 
 
@@ -79,7 +77,7 @@ def working(folder: Path, at: str, *options: str, **environment: str) -> Iterato
 
 @pytest.fixture(scope="module")
 def cluster(folder: Path) -> Iterator[Cluster]:
-    """Workers first: they wait for the scheduler."""
+    """Workers that start before their scheduler, and wait for it."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -101,7 +99,7 @@ def client(cluster: Cluster) -> Iterator[Client]:
 
 
 async def gets_in(at: str, security: Security) -> bool:
-    """Whether a dask client is answered."""
+    """Whether a dask client gets an answer."""
     try:
         opening = open_comm(at, timeout=2, **security.get_connection_args("client"))
         comm = await asyncio.wait_for(opening, 5)
@@ -114,19 +112,19 @@ async def gets_in(at: str, security: Security) -> bool:
 
 
 async def answers_without_certificate(port: int) -> bool:
-    """Whether a word comes back over TLS from who does not ask for a certificate."""
+    """Whether a TLS server answers a client without a certificate."""
     context = ssl.create_default_context()
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     try:
         reader, writer = await asyncio.wait_for(asyncio.open_connection("127.0.0.1", port, ssl=context), 5)
-        word = await asyncio.wait_for(reader.read(1), 5)
+        answer = await asyncio.wait_for(reader.read(1), 5)
         writer.close()
     except (OSError, TimeoutError):
         return False
-    return bool(word)
+    return bool(answer)
 
 
-def test_no_socket_lets_in_who_has_no_certificate_of_the_cluster(cluster: Cluster, client: Client) -> None:
+def test_sockets_accept_only_certificates_of_the_cluster(cluster: Cluster, client: Client) -> None:
     own = {urlsplit(name).port for name in client.nthreads()}
     info = client.scheduler_info(n_workers=-1)["workers"].values()
     own |= {urlsplit(one["nanny"]).port for one in info} | {urlsplit(cluster.address).port}
@@ -138,7 +136,7 @@ def test_no_socket_lets_in_who_has_no_certificate_of_the_cluster(cluster: Cluste
     assert {ip for port, ip in found.items() if port not in own} <= {"127.0.0.1", "::1"}
     others = certificates.security_of(cluster.folder / "others")
 
-    async def who_gets_in(port: int) -> list[bool]:
+    async def attempts(port: int) -> list[bool]:
         return await asyncio.gather(
             gets_in(f"tls://127.0.0.1:{port}", cluster.security),
             gets_in(f"tls://127.0.0.1:{port}", others),
@@ -147,20 +145,20 @@ def test_no_socket_lets_in_who_has_no_certificate_of_the_cluster(cluster: Cluste
         )
 
     async def all_ports() -> list[list[bool]]:
-        return await asyncio.gather(*(who_gets_in(port) for port in found))
+        return await asyncio.gather(*(attempts(port) for port in found))
 
     for port, got_in in zip(found, asyncio.run(all_ports()), strict=True):
         assert got_in == [port in own, False, False, False], (port, own)
 
 
-def test_a_client_of_another_cluster_is_told(cluster: Cluster) -> None:
+def test_a_client_of_another_cluster_gets_an_error(cluster: Cluster) -> None:
     with pytest.raises(Unavailable, match="same certificates"):
         connect(cluster.address, certificates.security_of(cluster.folder / "others"))
     with pytest.raises(Unavailable, match="no scheduler answers at tcp"):
         connect("tcp://127.0.0.1:9", None)
 
 
-def test_who_takes_a_connection_and_is_silent_is_not_waited_for() -> None:
+def test_a_silent_server_is_not_waited_for() -> None:
     with socket.socket() as silent:
         silent.bind(("127.0.0.1", 0))
         silent.listen()
@@ -168,7 +166,7 @@ def test_who_takes_a_connection_and_is_silent_is_not_waited_for() -> None:
             connect(f"tcp://127.0.0.1:{silent.getsockname()[1]}", None)
 
 
-def test_a_worker_process_that_is_killed_comes_again(cluster: Cluster, client: Client) -> None:
+def test_a_killed_worker_process_is_replaced(cluster: Cluster, client: Client) -> None:
     before = client.nthreads().keys()
     workers(cluster.workers)[0].kill()
     wait(lambda: len(client.nthreads().keys() - before) == 1 and len(client.nthreads()) == WORKERS)
@@ -176,12 +174,12 @@ def test_a_worker_process_that_is_killed_comes_again(cluster: Cluster, client: C
 
 
 @pytest.mark.exhaustive
-def test_workers_join_a_scheduler_that_was_killed(cluster: Cluster, client: Client) -> None:
+def test_workers_join_a_restarted_scheduler(cluster: Cluster, client: Client) -> None:
     busy = client.submit(time.sleep, 3)
     for _ in range(2):
         cluster.kill_scheduler()
-        said = cluster.log.count("waiting for the scheduler")
-        wait(lambda said=said: cluster.log.count("waiting for the scheduler") > said)
+        before = cluster.log.count("waiting for the scheduler")
+        wait(lambda before=before: cluster.log.count("waiting for the scheduler") > before)
         cluster.start_scheduler()
         with connect(cluster.address, cluster.security) as again:
             wait(lambda again=again: len(again.nthreads()) == WORKERS)
@@ -189,8 +187,8 @@ def test_workers_join_a_scheduler_that_was_killed(cluster: Cluster, client: Clie
     assert busy.status != "finished"
 
 
-def test_of_tasks_that_are_over_next_to_nothing_is_kept(cluster: Cluster, client: Client) -> None:
-    """Each alone, as the tiles of a job are that is done last."""
+def test_finished_tasks_leave_almost_nothing_in_memory(cluster: Cluster, client: Client) -> None:
+    """Each is submitted alone, like the last tiles of a job."""
 
     def kept(dask_scheduler: Scheduler) -> int:
         import gc
@@ -215,7 +213,7 @@ def test_of_tasks_that_are_over_next_to_nothing_is_kept(cluster: Cluster, client
 
 
 @pytest.mark.slow
-def test_memory_has_an_end_and_a_task_that_takes_it_all_is_blamed_at_once(
+def test_a_task_that_exceeds_the_memory_is_blamed_at_once(
     cluster: Cluster, client: Client, tmp_path: Path
 ) -> None:
     limit = 700 << 20
@@ -237,7 +235,7 @@ def test_memory_has_an_end_and_a_task_that_takes_it_all_is_blamed_at_once(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_workers_that_are_asked_to_end_leave_nothing(
+def test_workers_that_are_stopped_leave_nothing(
     cluster: Cluster, client: Client, tmp_path: Path, number: signal.Signals
 ) -> None:
     before = client.nthreads().keys()
@@ -258,7 +256,7 @@ def test_workers_that_are_asked_to_end_leave_nothing(
 
 
 @pytest.mark.slow
-def test_workers_that_are_still_starting_end_when_they_are_asked(cluster: Cluster, tmp_path: Path) -> None:
+def test_starting_workers_stop_at_sigterm(cluster: Cluster, tmp_path: Path) -> None:
     with working(cluster.folder, cluster.address, "--workers", "2", TMPDIR=str(tmp_path)) as process:
         wait(lambda: len(workers(process)) == 2)
         tree = children(process)
@@ -281,7 +279,7 @@ def test_workers_die_with_their_nanny(cluster: Cluster, client: Client) -> None:
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_waiting_workers_end_when_they_are_asked(folder: Path, number: signal.Signals) -> None:
+def test_waiting_workers_stop_at_signals(folder: Path, number: signal.Signals) -> None:
     (folder / "workers.log").write_text("")
     with working(folder, "tls://127.0.0.1:9", "--workers", "2") as process:
         wait(lambda: "waiting for the scheduler at tls://127.0.0.1:9" in (folder / "workers.log").read_text())
@@ -291,7 +289,7 @@ def test_waiting_workers_end_when_they_are_asked(folder: Path, number: signal.Si
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_scheduler_ends_when_it_is_asked(folder: Path, number: signal.Signals) -> None:
+def test_a_scheduler_stops_at_signals(folder: Path, number: signal.Signals) -> None:
     with scheduling(folder, host="127.0.0.1") as process:
         assert address(process).startswith("tls://127.0.0.1:")
         process.send_signal(number)
@@ -299,7 +297,7 @@ def test_a_scheduler_ends_when_it_is_asked(folder: Path, number: signal.Signals)
 
 
 @pytest.mark.exhaustive
-def test_a_scheduler_without_certificates_is_for_this_machine_alone(tmp_path: Path) -> None:
+def test_a_scheduler_without_certificates_listens_on_loopback_only(tmp_path: Path) -> None:
     data = {"ENVMATTE_DATA": str(tmp_path)}
     with started(tmp_path / "log", "scheduler", "--host", "0.0.0.0", **data) as process:
         assert process.wait(60) == 1
@@ -319,17 +317,7 @@ def test_a_scheduler_without_certificates_is_for_this_machine_alone(tmp_path: Pa
                 assert {ip for ip, _ in listening(one)} <= {"127.0.0.1"}
 
 
-def test_the_embedded_cluster_listens_on_loopback_alone(tmp_path: Path) -> None:
-    this = psutil.Process()
-    others = set(this.children(recursive=True))
-    with embedded(Settings(data=tmp_path, workers=1)) as cluster:
-        found = {ip for one in {this, *this.children(recursive=True)} - others for ip, _ in listening(one)}
-        assert found == {"127.0.0.1"}
-        with connect(cluster.scheduler_address, None) as client:
-            assert list(client.nthreads().values()) == [1]
-
-
-def test_a_port_in_use_is_told(folder: Path) -> None:
+def test_a_port_in_use_is_reported(folder: Path) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

@@ -1,4 +1,4 @@
-"""What is handed to a real cluster, and what comes back of it."""
+"""Tiles submitted to a real cluster, and their outcomes."""
 
 import os
 import signal
@@ -19,7 +19,7 @@ from workflows.mattes.steps import STEPS
 from workflows.untrusted.limits import Limits
 
 
-def test_of_what_a_dead_worker_had_the_first_is_to_blame() -> None:
+def test_the_first_tile_of_a_dead_worker_is_blamed() -> None:
     dead = [
         (Flight("a", 1, 5), "one"),
         (Flight("b", 2, 3), "one"),
@@ -54,9 +54,7 @@ def outcomes(dispatcher: Dispatcher, count: int) -> list[Outcome]:
     return found
 
 
-def test_errors_come_back_and_what_dies_with_its_worker_is_told(
-    cluster: LocalCluster, tmp_path: Path
-) -> None:
+def test_errors_and_dead_workers_are_reported(cluster: LocalCluster, tmp_path: Path) -> None:
     with Dispatcher(lambda: Client(cluster, set_as_default=False), tmp_path.as_uri()) as dispatcher:
         while not dispatcher.free:
             time.sleep(0.02)
@@ -69,7 +67,7 @@ def test_errors_come_back_and_what_dies_with_its_worker_is_told(
         assert dispatcher.under_way("a") == 0
 
         (pid,) = (worker.pid for worker in cluster.workers.values())
-        os.kill(pid, signal.SIGSTOP)  # so that both are there when it dies
+        os.kill(pid, signal.SIGSTOP)  # so that it has both when it dies
         for tile in (1, 2):
             dispatcher.submit(STEPS, task("b"), tile)
         time.sleep(0.5)
@@ -79,7 +77,7 @@ def test_errors_come_back_and_what_dies_with_its_worker_is_told(
         assert found[1] == Outcome("b", 2)
 
 
-def test_a_scheduler_that_is_not_there_is_a_problem_in_words() -> None:
+def test_a_missing_scheduler_is_reported_as_a_problem() -> None:
     def connect() -> Client:
         raise Unavailable("no scheduler answers at tcp://127.0.0.1:1")
 
@@ -93,7 +91,7 @@ def test_a_scheduler_that_is_not_there_is_a_problem_in_words() -> None:
         dispatcher.drop("a")
 
 
-def test_a_task_is_known_by_its_name() -> None:
+def test_keys_are_read_back() -> None:
     assert read_key(key_of("recover", "0ab1", -2)) == ("0ab1", -2)
     assert read_key(key_of("ingest", "0ab1", 12)) == ("0ab1", 12)
     assert key_of("ingest", "0ab1", 12) != key_of("ingest", "0ab1", 12)

@@ -1,13 +1,18 @@
-"""The number of workers of the embedded cluster."""
+"""The embedded cluster: where it listens, and how many workers it has."""
 
 import time
+from pathlib import Path
 
+import psutil
 import pytest
 
-from services.cluster.embedded import Scale
+from services.cluster.connect import connect
+from services.cluster.embedded import Scale, embedded
+from services.settings import Settings
+from tests.services.cluster.clusters import listening
 
 
-def test_a_cluster_has_as_many_workers_as_are_of_use(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_scale_with_tiles_and_stop_when_idle(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 0.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
     asked: list[int] = []
@@ -27,3 +32,13 @@ def test_a_cluster_has_as_many_workers_as_are_of_use(monkeypatch: pytest.MonkeyP
     now = 701.0
     scale(0)
     assert asked == [1, 3, 4, 1]
+
+
+def test_the_embedded_cluster_listens_on_loopback_only(tmp_path: Path) -> None:
+    this = psutil.Process()
+    others = set(this.children(recursive=True))
+    with embedded(Settings(data=tmp_path, workers=1)) as cluster:
+        found = {ip for one in {this, *this.children(recursive=True)} - others for ip, _ in listening(one)}
+        assert found == {"127.0.0.1"}
+        with connect(cluster.scheduler_address, None) as client:
+            assert list(client.nthreads().values()) == [1]

@@ -1,4 +1,4 @@
-"""What progress costs: a job's tiles are written down many at once, however fast they are done."""
+"""The cost of progress: finished tiles are written many at once."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from services.coordinator.coordinator import WRITE
 from tests.benchmarks.cluster.overhead import measure
 
 OTHERS = 15
-"""Writes that come once a job, or every few seconds whatever goes on: its start, its stages, the lease."""
+"""Writes once per job, or every few seconds in any case: start, stages, lease."""
 
 
 @pytest.mark.exhaustive

@@ -1,4 +1,4 @@
-"""What ends of composite jobs mean to the ledger and to the store: against real ones."""
+"""What the end of a composite job changes in a real database and a real store."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -51,7 +51,7 @@ def fail(engine: Engine, job: str, error: EnvmatteError) -> None:
         write_failure(c, run.kind, run.task, error)
 
 
-def test_it_leaves_its_matte_alone_and_needs_no_capture(engine: Engine, job: str) -> None:
+def test_a_composite_changes_no_matte_and_needs_no_capture(engine: Engine, job: str) -> None:
     with writing(engine) as c:
         assert JOB_KINDS["composite"].is_due(c, jobs.get(c, job))
     fail(engine, job, GaveUp("again and again"))
@@ -59,7 +59,7 @@ def test_it_leaves_its_matte_alone_and_needs_no_capture(engine: Engine, job: str
         assert mattes.get(c, "m").state == "ready"
 
 
-def test_what_is_left_of_a_success_is_the_video(objects: Objects, engine: Engine, job: str) -> None:
+def test_after_success_only_the_video_is_left(objects: Objects, engine: Engine, job: str) -> None:
     with writing(engine) as c:
         row = jobs.get(c, job)
     JOB_KINDS["composite"].remove_inputs(objects, row)
@@ -69,7 +69,7 @@ def test_what_is_left_of_a_success_is_the_video(objects: Objects, engine: Engine
 
 
 @pytest.mark.parametrize(("error", "kept"), [(ClipError("no clip"), False), (GaveUp("again"), True)])
-def test_a_clip_is_kept_for_as_long_as_it_may_be_tried_again(
+def test_a_clip_is_kept_while_its_job_may_be_retried(
     engine: Engine, objects: Objects, job: str, error: EnvmatteError, kept: bool
 ) -> None:
     fail(engine, job, error)
@@ -84,9 +84,7 @@ def test_a_clip_is_kept_for_as_long_as_it_may_be_tried_again(
             JOB_KINDS["composite"].retried(c, row)
 
 
-def test_what_killed_uploads_left_is_swept_and_the_rest_is_not(
-    engine: Engine, objects: Objects, job: str
-) -> None:
+def test_a_sweep_removes_only_what_no_job_refers_to(engine: Engine, objects: Objects, job: str) -> None:
     objects.put(composites.clip_path("nobody"), b"any")
     sweep(engine, objects, seconds=0)
     assert objects.names("composites") == [job]

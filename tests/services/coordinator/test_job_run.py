@@ -1,4 +1,4 @@
-"""What a job does next, by what became of its tiles: against a real ledger."""
+"""How a job advances with the outcomes of its tiles, with a real database."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -35,7 +35,7 @@ def job(connection: Connection) -> str:
     return job
 
 
-def taken_up(connection: Connection, job: str) -> JobRun:
+def start(connection: Connection, job: str) -> JobRun:
     tile_records.add_steps(connection, job)
     run = JobRun.of(jobs.get(connection, job), tile_records.remaining(connection, job), LIMITS)
     jobs.enter_stage(connection, job, run.stage)
@@ -58,7 +58,7 @@ def done(run: JobRun, tile: int, result: object = 10) -> Outcome:
 
 
 def working(connection: Connection, job: str, tiles: int = 3) -> JobRun:
-    run = taken_up(connection, job)
+    run = start(connection, job)
     assert advance(connection, run, done(run, PREPARE, {"tiles": tiles}))
     return run
 
@@ -67,8 +67,8 @@ def lines(connection: Connection, job: str) -> list[str]:
     return [row.text for row in job_log.lines(connection, job, 0, 100)]
 
 
-def test_from_the_first_step_to_the_last(connection: Connection, job: str) -> None:
-    run = taken_up(connection, job)
+def test_steps_run_in_order(connection: Connection, job: str) -> None:
+    run = start(connection, job)
     assert list(run.to_do) == [PREPARE]
     assert advance(connection, run, done(run, PREPARE, {"tiles": 3}))
     assert (run.stage, sorted(run.to_do), run.task.plan) == ("recovering", [0, 1, 2], {"tiles": 3})
@@ -81,11 +81,11 @@ def test_from_the_first_step_to_the_last(connection: Connection, job: str) -> No
     assert (matte.state, matte.figures) == ("ready", {"width": 4})
     seconds = dict(connection.execute(select(tiles.c.tile, tiles.c.seconds).where(tiles.c.job == job)).all())
     assert seconds == dict.fromkeys((PREPARE, FINISH, 0, 1, 2), 0.1)
-    assert connection.scalar(select(totals.c.seconds)) == pytest.approx(0.3)  # the tiles'
+    assert connection.scalar(select(totals.c.seconds)) == pytest.approx(0.3)  # of tiles only
 
 
-def test_its_share_is_what_it_had_and_what_is_under_way(connection: Connection, job: str) -> None:
-    run = taken_up(connection, job)
+def test_used_seconds_include_tiles_under_way(connection: Connection, job: str) -> None:
+    run = start(connection, job)
     run.start = 5.0
     assert (run.used(), run.used(under_way=2)) == (5.0, 5.0)
     run.record_outcome(Outcome(job, 0, done=(0.5, 10)))
@@ -94,16 +94,16 @@ def test_its_share_is_what_it_had_and_what_is_under_way(connection: Connection, 
     assert (run.used(), run.used(under_way=2)) == (7.0, 9.0)
 
 
-def test_it_is_taken_up_where_it_stands(connection: Connection, job: str) -> None:
+def test_a_job_continues_where_the_ledger_says(connection: Connection, job: str) -> None:
     run = working(connection, job)
     advance(connection, run, done(run, 1), under_way=2)
-    again = taken_up(connection, job)
+    again = start(connection, job)
     assert (again.stage, sorted(again.to_do), again.task) == ("recovering", [0, 2], run.task)
     advance(connection, again, done(again, 0), done(again, 2))
-    assert list(taken_up(connection, job).to_do) == [FINISH]
+    assert list(start(connection, job).to_do) == [FINISH]
 
 
-def test_what_is_gone_is_done_again_and_blames_nobody(connection: Connection, job: str) -> None:
+def test_tiles_that_are_gone_are_repeated_without_blame(connection: Connection, job: str) -> None:
     run = working(connection, job)
     for _ in range(20):
         assert advance(connection, run, Outcome(job, 1))
@@ -112,8 +112,8 @@ def test_what_is_gone_is_done_again_and_blames_nobody(connection: Connection, jo
 
 
 @pytest.mark.parametrize("tile", [PREPARE, 1, FINISH])
-def test_what_fails_is_tried_three_times(connection: Connection, job: str, tile: int) -> None:
-    run = taken_up(connection, job) if tile == PREPARE else working(connection, job)
+def test_a_step_is_tried_three_times(connection: Connection, job: str, tile: int) -> None:
+    run = start(connection, job) if tile == PREPARE else working(connection, job)
     if tile == FINISH:
         advance(connection, run, *(done(run, n) for n in range(3)))
     error = Outcome(job, tile, error=ValueError("odd"))
@@ -124,16 +124,14 @@ def test_what_fails_is_tried_three_times(connection: Connection, job: str, tile:
     assert mattes.get(connection, "mat").state == "failed"
 
 
-def test_what_may_go_well_later_is_tried_again_and_what_can_not_is_not(
-    connection: Connection, job: str
-) -> None:
+def test_only_errors_that_may_pass_are_retried(connection: Connection, job: str) -> None:
     run = working(connection, job)
     assert advance(connection, run, Outcome(job, 0, error=Unavailable("the store is away")))
     assert not advance(connection, run, Outcome(job, 0, error=Corrupt("it is damaged")))
     assert jobs.get(connection, job).problem["detail"] == "it is damaged"
 
 
-def test_a_tile_of_which_workers_die(connection: Connection, job: str) -> None:
+def test_a_tile_that_kills_workers_fails_the_job(connection: Connection, job: str) -> None:
     run = working(connection, job)
     death = Outcome(job, 1, died="tls://host:1")
     assert [advance(connection, run, death) for _ in range(LOSSES)] == [True] * (LOSSES - 1) + [False]
@@ -141,7 +139,7 @@ def test_a_tile_of_which_workers_die(connection: Connection, job: str) -> None:
     assert jobs.get(connection, job).failed == 1
 
 
-def test_a_tile_that_wants_more_memory_than_there_is(connection: Connection, job: str) -> None:
+def test_a_tile_that_exceeds_the_memory_fails_the_job(connection: Connection, job: str) -> None:
     run = working(connection, job)
     death = Outcome(job, 1, died="tls://host:1", starved=True)
     assert [advance(connection, run, death) for _ in range(3)] == [True, True, False]
@@ -152,7 +150,7 @@ def test_a_tile_that_wants_more_memory_than_there_is(connection: Connection, job
     )
 
 
-def test_what_the_store_lacks_is_done_again(connection: Connection, job: str) -> None:
+def test_missing_tiles_are_repeated(connection: Connection, job: str) -> None:
     run = working(connection, job)
     advance(connection, run, *(done(run, n) for n in range(3)))
     assert advance(connection, run, done(run, FINISH, {"missing": [1]}))
@@ -164,7 +162,7 @@ def test_what_the_store_lacks_is_done_again(connection: Connection, job: str) ->
     assert (row.state, row.done, row.pixels) == ("succeeded", 3, 30)
 
 
-def test_a_job_that_was_cancelled_stays_so(connection: Connection, job: str) -> None:
+def test_a_cancelled_job_does_not_succeed(connection: Connection, job: str) -> None:
     run = working(connection, job)
     advance(connection, run, *(done(run, n) for n in range(3)))
     jobs.cancel(connection, job)

@@ -1,4 +1,4 @@
-"""What expires, and what is counted: against a real ledger and a real store."""
+"""What expires and what is counted, with a real database and a real store."""
 
 import time
 from collections.abc import Iterator
@@ -34,7 +34,7 @@ def objects(tmp_path: Path) -> Objects:
 
 
 def add(engine: Engine, owner: str, name: str, **times: float) -> None:
-    """A capture, a matte of it and an upload, all of one name, their jobs done."""
+    """Add a capture and a matte of it, both of one name, with their finished jobs."""
     with writing(for_owner(engine, owner)) as c:
         for kind, job in (("ingest", f"{name}-i"), ("recover", f"{name}-r")):
             jobs.add(c, kind, name, {}, name, job=job)
@@ -45,19 +45,19 @@ def add(engine: Engine, owner: str, name: str, **times: float) -> None:
         mattes.change(c, name, state="ready")
 
 
-def over(engine: Engine) -> None:
-    """Whatever expires at all has expired."""
+def expire(engine: Engine) -> None:
+    """Expire everything that has an expiry time."""
     with writing(engine) as c:
         for table in (tables.captures, tables.mattes):
             c.execute(update(table).where(table.c.expires_at.is_not(None)).values(expires_at=time.time() - 1))
 
 
-def there(engine: Engine) -> dict[str, set[str]]:
+def existing(engine: Engine) -> dict[str, set[str]]:
     with reading(engine) as c:
         return {t.name: set(c.scalars(select(t.c.id))) for t in (tables.captures, tables.mattes)}
 
 
-def test_what_has_expired_goes_and_nothing_else(engine: Engine) -> None:
+def test_only_expired_rows_are_deleted(engine: Engine) -> None:
     add(engine, "alice", "short", seconds=60.0)
     add(engine, "bob", "long", seconds=3600.0)
     add(engine, "bob", "ever")
@@ -70,30 +70,32 @@ def test_what_has_expired_goes_and_nothing_else(engine: Engine) -> None:
         uploads.add(c, "u", 5, "", -1, None)
     with writing(engine) as c:
         assert delete_expired(c) == ["uploads/u", "captures/short", "uploads/short", "mattes/short"]
-    assert there(engine) == {"captures": {"long", "ever"}, "mattes": {"long", "ever"}}
+    assert existing(engine) == {"captures": {"long", "ever"}, "mattes": {"long", "ever"}}
     with reading(engine) as c:
-        assert jobs.get(c, "short-r").state == "succeeded"  # what is known of it stays
+        assert jobs.get(c, "short-r").state == "succeeded"  # the record of its job stays
 
 
 @pytest.mark.parametrize("kind", ["recover", "composite"])
 @pytest.mark.parametrize("state", ["queued", "running"])
-def test_what_a_job_works_on_stays_until_it_has_ended(engine: Engine, kind: str, state: str) -> None:
+def test_what_an_active_job_uses_does_not_expire_before_it_ends(
+    engine: Engine, kind: str, state: str
+) -> None:
     add(engine, "alice", "used", seconds=60.0)
     with writing(engine) as c:
         job = jobs.add(c, kind, "used", {}, "used")
         jobs.change(c, job, state=state)
-    over(engine)
+    expire(engine)
     with writing(engine) as c:
         assert delete_expired(c) == []
-    assert there(engine) == {"captures": {"used"}, "mattes": {"used"}}
+    assert existing(engine) == {"captures": {"used"}, "mattes": {"used"}}
     with writing(engine) as c:
         jobs.end(c, job, "failed", {"detail": "", "status": 500})
     with writing(engine) as c:
         assert delete_expired(c) == ["captures/used", "uploads/used", "mattes/used"]
 
 
-def test_what_is_being_made_or_unmade_stays(engine: Engine) -> None:
-    """As long as a cancelled job is not wound up, its matte and its capture say so by their state."""
+def test_leftovers_of_cancelled_jobs_do_not_expire(engine: Engine) -> None:
+    """Until the coordinator has cleaned up, the states of a matte and its capture say that they are unfinished."""
     with writing(engine) as c:
         job = jobs.add(c, "ingest", "c", {})
         captures.add(c, "c", job, name="", bytes=1, frames=1, program={}, seconds=-1)
@@ -103,7 +105,7 @@ def test_what_is_being_made_or_unmade_stays(engine: Engine) -> None:
         assert delete_expired(c) == []
 
 
-def ended_long_ago(engine: Engine) -> None:
+def age_jobs(engine: Engine) -> None:
     with writing(engine) as c:
         for row in c.execute(select(tables.jobs)).all():
             if row.finished_at is not None:
@@ -115,7 +117,7 @@ def listed(engine: Engine) -> set[str]:
         return set(c.scalars(select(tables.jobs.c.id)))
 
 
-def test_a_job_leaves_after_a_time_and_not_before_what_it_made(engine: Engine, objects: Objects) -> None:
+def test_old_jobs_are_deleted_unless_what_they_made_exists(engine: Engine, objects: Objects) -> None:
     add(engine, "alice", "kept")
     add(engine, "bob", "gone")
     with writing(engine) as c:
@@ -129,7 +131,7 @@ def test_a_job_leaves_after_a_time_and_not_before_what_it_made(engine: Engine, o
         mattes.delete(c, "gone")
     objects.put(composites.video_path(composite), b"video")
     everything = {"kept-i", "kept-r", "gone-i", "gone-r", composite, failed, queued}
-    ended_long_ago(engine)
+    age_jobs(engine)
     delete_old_jobs(engine, objects, None)
     delete_old_jobs(engine, objects, 3600)
     assert listed(engine) == everything
@@ -143,7 +145,7 @@ def test_a_job_leaves_after_a_time_and_not_before_what_it_made(engine: Engine, o
             assert set(c.scalars(select(table.c.job))) <= listed(engine)
 
 
-def test_a_key_is_kept_as_long_as_what_it_made(engine: Engine, objects: Objects) -> None:
+def test_an_idempotency_key_is_kept_as_long_as_what_it_made(engine: Engine, objects: Objects) -> None:
     add(engine, "alice", "thing")
     with writing(for_owner(engine, "alice")) as c:
         for key, made in (("capture", "thing"), ("job", "thing-r"), ("gone", "another")):
@@ -166,7 +168,7 @@ def test_a_key_is_kept_as_long_as_what_it_made(engine: Engine, objects: Objects)
     assert known() == [None, None, None]
 
 
-def test_bytes_are_counted_once_a_thing_is_whole(engine: Engine, objects: Objects) -> None:
+def test_bytes_are_counted_once_complete(engine: Engine, objects: Objects) -> None:
     add(engine, "alice", "a")
     add(engine, "bob", "b")
     with writing(for_owner(engine, "alice")) as c:
@@ -185,9 +187,9 @@ def test_bytes_are_counted_once_a_thing_is_whole(engine: Engine, objects: Object
         with reading(for_owner(engine, owner)) as c:
             return statistics.stored_bytes(c)
 
-    each = len(objects.read_raw(f"{stored_mattes.path('a')}/z{SUFFIX}"))  # of the checksums, which count too
+    each = len(objects.read_raw(f"{stored_mattes.path('a')}/z{SUFFIX}"))  # checksums count too
     assert stored("alice") == 7 + 3 * each + 1000 + 20_000 + 300_000
-    assert stored("bob") == 0  # the bytes of its archive count until then
+    assert stored("bob") == 0  # the size of its capture archive counts until then
     with writing(engine) as c:
         jobs.end(c, clip, "succeeded")
         jobs.change(c, clip, stored=None)

@@ -1,4 +1,4 @@
-"""A collector of traces: OTLP over HTTP, and what has come."""
+"""A collector of traces by OTLP over HTTP, for tests."""
 
 import threading
 from collections.abc import Iterator
@@ -12,7 +12,7 @@ from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTrace
 
 @dataclass(frozen=True)
 class Span:
-    """A span: ids as bytes, times in seconds of the epoch."""
+    """A span: ids as bytes, times in seconds since the epoch."""
 
     service: str
     name: str
@@ -27,7 +27,7 @@ class Span:
 
 @dataclass
 class Collector:
-    """Where to send spans, and those that came."""
+    """The URL that takes spans, and the spans received."""
 
     url: str = ""
     spans: list[Span] = field(default_factory=list)

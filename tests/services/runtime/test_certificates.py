@@ -1,4 +1,4 @@
-"""Certificates of a cluster: made once, for its members alone, and told when they can't be used."""
+"""Certificates of a cluster: made once, for its members only, with an error when they can't be used."""
 
 import os
 import stat
@@ -20,12 +20,12 @@ def folder(tmp_path: Path) -> Path:
     return made
 
 
-def test_there_are_three_files_and_others_can_read_none(folder: Path) -> None:
+def test_only_the_owner_can_read_the_files(folder: Path) -> None:
     assert sorted(path.name for path in folder.iterdir()) == ["ca.pem", "cert.pem", "key.pem"]
     assert {stat.S_IMODE(path.stat().st_mode) for path in folder.iterdir()} == {0o600}
 
 
-def test_the_key_of_the_authority_is_gone(folder: Path) -> None:
+def test_the_key_of_the_authority_is_not_kept(folder: Path) -> None:
     authority = x509.load_pem_x509_certificate((folder / "ca.pem").read_bytes())
     member = x509.load_pem_x509_certificate((folder / "cert.pem").read_bytes())
     key = load_pem_private_key((folder / "key.pem").read_bytes(), None)
@@ -35,7 +35,7 @@ def test_the_key_of_the_authority_is_gone(folder: Path) -> None:
         assert path.read_text().count("PRIVATE KEY") == (2 if path.name == "key.pem" else 0)
 
 
-def test_dask_is_told_to_take_nothing_else(folder: Path) -> None:
+def test_dask_requires_these_certificates(folder: Path) -> None:
     security = certificates.security_of(folder)
     assert security.require_encryption
     for role in ("scheduler", "worker", "client"):
@@ -47,14 +47,14 @@ def test_dask_is_told_to_take_nothing_else(folder: Path) -> None:
         ]
 
 
-def test_a_whole_set_stays_as_it_is(folder: Path) -> None:
+def test_a_complete_set_is_not_replaced(folder: Path) -> None:
     before = {path: path.read_bytes() for path in folder.iterdir()}
     assert not certificates.make(folder)
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 
 @pytest.mark.parametrize("missing", ["ca.pem", "cert.pem", "key.pem"])
-def test_half_a_set_is_neither_used_nor_overwritten(folder: Path, missing: str) -> None:
+def test_an_incomplete_set_is_neither_used_nor_overwritten(folder: Path, missing: str) -> None:
     (folder / missing).unlink()
     before = {path: path.read_bytes() for path in folder.iterdir()}
     with pytest.raises(InvalidInput, match=f"{missing}.*envmatte certs"):
@@ -65,7 +65,7 @@ def test_half_a_set_is_neither_used_nor_overwritten(folder: Path, missing: str) 
 
 
 @pytest.mark.parametrize("mixed", ["ca.pem", "cert.pem", "key.pem"])
-def test_files_of_two_sets_do_not_go_together(folder: Path, tmp_path: Path, mixed: str) -> None:
+def test_files_of_two_sets_are_refused(folder: Path, tmp_path: Path, mixed: str) -> None:
     certificates.make(tmp_path / "other")
     os.replace(tmp_path / "other" / mixed, folder / mixed)
     with pytest.raises(InvalidInput, match="can't be used"):
@@ -73,13 +73,13 @@ def test_files_of_two_sets_do_not_go_together(folder: Path, tmp_path: Path, mixe
 
 
 @pytest.mark.parametrize("damaged", ["ca.pem", "cert.pem", "key.pem"])
-def test_damaged_files_are_told(folder: Path, damaged: str) -> None:
+def test_damaged_files_are_refused(folder: Path, damaged: str) -> None:
     (folder / damaged).write_bytes((folder / damaged).read_bytes()[:100])
     with pytest.raises(InvalidInput, match="can't be used"):
         certificates.security_of(folder)
 
 
-def test_expired_certificates_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_expired_certificates_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(certificates, "LIFETIME", timedelta(seconds=-1))
     certificates.make(tmp_path / "old")
     with pytest.raises(InvalidInput, match=r"valid from .* and today is .*envmatte certs"):
