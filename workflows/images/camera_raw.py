@@ -1,4 +1,4 @@
-"""Camera RAW to linear light, by LibRaw: what the sensor counted, and nothing made of it."""
+"""Decode camera RAW to linear light: the sensor's counts, without demosaicing, white balance or curve."""
 
 import io
 from itertools import islice
@@ -16,32 +16,35 @@ SUFFIXES = (
     *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef", ".mos"),
     *(".mrw", ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
 )
-"""Of RAW files' names: by their bytes, many are TIFFs that begin with a thumbnail."""
+"""Extensions of RAW files. By their bytes, many of them are TIFFs that begin with a thumbnail."""
 FULL = 0.99
-"""Share of the sensor's range from which it counts as clipped: its elements do not end at one value."""
-_BLOCKS = {2: 2, 6: 3}  # elements along a pixel, by the period of the colour filter: Bayer, X-Trans
-_ELEMENT, _LINEAR = 2 + 4, 8 + 12 + 4  # bytes of work for an element, and for a pixel of three colours
-_TURNS = {3: 3, 5: 8, 6: 6}  # orientations, by how LibRaw has them
-_IMAGES = 16  # of a DNG that are looked at
+"""Values from this share of the sensor's range on count as clipped, because photosites saturate at different values."""
+_BLOCKS = {2: 2, 6: 3}  # photosites along a pixel, by the period of the colour filter: Bayer, X-Trans
+_PHOTOSITE, _LINEAR = (
+    2 + 4,
+    8 + 12 + 4,
+)  # bytes that decoding takes for a photosite, and for a pixel of three colours
+_TURNS = {3: 3, 5: 8, 6: 6}  # EXIF orientations by LibRaw's flip
+_IMAGES = 16  # images of a DNG that are examined
 
 
 def is_raw(name: str) -> bool:
-    """Whether a file is camera RAW, by its name."""
+    """Whether a file is camera RAW, judging by its name."""
     return PurePosixPath(name).suffix.lower() in SUFFIXES
 
 
 def orientation(data: bytes) -> int:
-    """How a RAW is to be turned to be upright, as `images.upright` takes it; 1, not at all, if it can't be read."""
+    """The orientation of a RAW file for `integer_formats.upright`; 1, which is no turn, if it can't be read."""
     try:
         with rawpy.RawPy() as raw:
             raw.open_buffer(io.BytesIO(data))
             return _TURNS.get(raw.sizes.flip, 1)
-    except Exception:  # as below
+    except Exception:  # see `decode`
         return 1
 
 
 def decode(data: bytes, *, memory: int, turn: int | None = None) -> NDArray[np.float32]:
-    """Decode camera RAW of a Bayer or X-Trans sensor, or a DNG of pixels that are demosaiced already.
+    """Decode camera RAW of a Bayer or X-Trans sensor, or a DNG that is demosaiced already.
 
     Parameters
     ----------
@@ -49,38 +52,36 @@ def decode(data: bytes, *, memory: int, turn: int | None = None) -> NDArray[np.f
     memory : int
         Bytes that decoding may take; checked before anything is unpacked.
     turn : int, optional
-        How it is turned, see `images.upright`; default as it says itself.
+        Orientation, see `integer_formats.upright`; by default the file's own.
 
     Returns
     -------
     (h, w, 3) float32
-        Linear light, 0 at the black level and 1 at the white level. No white balance, no matrix, no curve. Noise
-        makes negative values; what is clipped is infinite.
+        Linear light, 0 at the black level and 1 at the white level, without white balance, colour matrix or curve.
+        Noise can be negative; clipped values are infinite.
 
     Raises
     ------
     ImageError
-        If LibRaw does not know the camera, the file is damaged, or its sensor has another colour filter.
+        If LibRaw does not know the camera, the file is damaged, or the sensor has another colour filter.
 
     Notes
     -----
-    Nothing is interpolated, for a pixel of a matte should hold what it saw and not what its neighbours did:
+    Nothing is interpolated: a pixel of a matte holds what it saw, not what its neighbours saw.
 
-    - *Bayer*: half the sensor's width and height. A square of four elements is a pixel, the mean of its two greens one
-      channel.
-    - *X-Trans* (Fuji): a third. The filter, 6 x 6, consists of blocks of 3 x 3 with a green in the middle and in the
-      corners, and two reds and two blues between them; each such block is a pixel. Its colours have one
-      centre, which those of a Bayer square have not, and it has more light; what is left at the edges, two rows
-      and columns at most, is cut off. The whole 6 x 6 would be no better, at a quarter of the pixels.
-    - *Linear DNG* (ProRAW of phones, what Adobe's converter calls linear): the file's own size: it does not say how
-      many elements went into a pixel, for many phones bin theirs.
+    - *Bayer*: half the sensor's width and height. Each square of four photosites is a pixel; its two greens are
+      averaged.
+    - *X-Trans* (Fuji): a third of the sensor's width and height. The 6 x 6 filter consists of 3 x 3 blocks with green
+      in the middle and in the corners, and two reds and two blues between them. Each block is a pixel; its colours
+      share a centre. Up to two rows and columns at the edges are cut off.
+    - *Linear DNG* (ProRAW of phones, "linear" in Adobe's converter): the size of the file.
     """
     try:
         linear = _is_linear(data)
         with rawpy.RawPy() as raw:
             raw.open_buffer(io.BytesIO(data))
             width, height = raw.sizes.raw_width, raw.sizes.raw_height
-            each, what = (_LINEAR, "linear pixels") if linear else (_ELEMENT, "elements")
+            each, what = (_LINEAR, "linear pixels") if linear else (_PHOTOSITE, "photosites")
             if width * height * each > memory:
                 raise ImageError(
                     f"decoding a RAW image of {width} x {height} {what} takes more than the {memory} bytes allowed "
@@ -94,34 +95,34 @@ def decode(data: bytes, *, memory: int, turn: int | None = None) -> NDArray[np.f
                 light = _light(raw.raw_image_visible[:, :, :3], raw, [0, 1, 2])
             else:
                 raise ImageError(
-                    "of RAW images without a colour filter, linear DNGs of three colours are read; develop these "
+                    "this RAW image has no colour filter, and is not a linear DNG of three colours: develop these "
                     "frames to TIFF of 16 bits with a linear curve"
                 )
             return upright(light, _TURNS.get(raw.sizes.flip, 1) if turn is None else turn)
     except rawpy.LibRawFileUnsupportedError as error:
         raise ImageError(
-            "this camera's RAW format is not known here: convert the frames to DNG, compressed without loss and not by "
-            "JPEG XL, or develop them to TIFF of 16 bits with a linear curve"
+            "this camera's RAW format is not supported: convert the frames to DNG, with lossless compression other "
+            "than JPEG XL, or develop them to TIFF of 16 bits with a linear curve"
         ) from error
     except ImageError:
         raise
-    except Exception as error:  # what LibRaw's wrapper raises on damaged bytes is not a closed set
+    except Exception as error:  # damaged bytes raise many kinds of errors
         raise ImageError(f"the RAW image is cut off or damaged: {error}") from error
 
 
 def _is_linear(data: bytes) -> bool:
-    """Whether bytes are a DNG whose main image has its colours in each pixel."""
+    """Whether bytes are a DNG whose main image has all colours in each pixel."""
     if not data.startswith((b"II*", b"MM\0*")):
         return False
     with tifffile.TiffFile(io.BytesIO(data)) as file:
         first = file.pages[0]
         for page in (first, *islice(first.pages or (), _IMAGES)):
-            if page.subfiletype != 0:  # a preview, or another part of the image
+            if page.subfiletype != 0:  # a preview or a mask
                 continue
             if page.sampleformat == tifffile.SAMPLEFORMAT.IEEEFP:
-                # LibRaw scales each to integers by its own largest value: frames would not be in one unit.
+                # LibRaw scales each file by its own largest value: frames would have different units.
                 raise ImageError(
-                    "DNGs of float values are not read: develop these frames to EXR or float TIFF"
+                    "DNGs of float values are not supported: develop these frames to EXR or float TIFF"
                 )
             if page.photometric == tifffile.PHOTOMETRIC.LINEAR_RAW:
                 return True
@@ -129,15 +130,15 @@ def _is_linear(data: bytes) -> bool:
 
 
 def _superpixels(raw: rawpy.RawPy) -> NDArray[np.float32]:
-    """The light of an unpacked RAW that has a colour filter: of each of its blocks, the mean of each colour."""
+    """The light of an unpacked RAW with a colour filter: the mean of each colour in each block."""
     period = len(raw.raw_pattern)
     if period not in _BLOCKS:
         raise ImageError(
-            "RAW images are read from sensors with a Bayer or an X-Trans filter; develop these frames to TIFF of 16 "
-            "bits with a linear curve"
+            "this RAW image comes from a sensor with neither a Bayer nor an X-Trans filter: develop these frames to "
+            "TIFF of 16 bits with a linear curve"
         )
     block = _BLOCKS[period]
-    # Not `raw_pattern` itself, which begins in the margin, where LibRaw does not know X-Trans.
+    # `raw_pattern` itself begins in the margin, where LibRaw does not know X-Trans.
     top, left = raw.sizes.top_margin, raw.sizes.left_margin
     at = range(period)
     numbers = np.array([[raw.raw_color(top + y, left + x) for x in at] for y in at])
@@ -149,7 +150,7 @@ def _superpixels(raw: rawpy.RawPy) -> NDArray[np.float32]:
         numbers, colours = (np.roll(p, (-y, -x), (0, 1)) for p in (numbers, colours))
     if sorted({*colours[:block, :block].ravel()}) != ["B", "G", "R"]:
         raise ImageError(
-            f"RAW images are read from sensors that see red, green and blue, not {raw.color_desc!r}"
+            f"this RAW image has the colours {raw.color_desc!r}: only red, green and blue are supported"
         )
     height, width = values.shape[0] // block, values.shape[1] // block
     values = values[: block * height, : block * width]
@@ -165,7 +166,7 @@ def _superpixels(raw: rawpy.RawPy) -> NDArray[np.float32]:
 
 
 def _first_block(colours: NDArray[np.str_]) -> tuple[int, int]:
-    """Where in an X-Trans filter a block begins that has green in its middle and its corners."""
+    """Where a block with green in its middle and corners begins in an X-Trans filter."""
     for y, x in np.ndindex(3, 3):
         block = np.roll(colours, (-y, -x), (0, 1))[:3, :3].ravel()
         if (block[::2] == "G").all():
@@ -174,7 +175,7 @@ def _first_block(colours: NDArray[np.str_]) -> tuple[int, int]:
 
 
 def _light(values: NDArray[np.uint16], raw: rawpy.RawPy, number: int | list[int]) -> NDArray[np.float32]:
-    """Linear light of counts of one of LibRaw's colours, or of several along the last axis."""
+    """Linear light of the counts of one of LibRaw's colours, or of several along the last axis."""
     black = np.array(raw.black_level_per_channel, np.float32)[number]
     span = np.float32(raw.white_level) - black
     if span.min() <= 0:

@@ -1,4 +1,4 @@
-"""Files of pictures to pixels, whatever kind they are: all that decoders of others do for a backdrop."""
+"""Decode a picture of any supported format, for a backdrop."""
 
 import io
 from typing import Literal
@@ -23,15 +23,14 @@ def decode(data: bytes, transfer: Transfer, *, memory: int) -> Codes | Floats:
     data : bytes
         PNG, JPEG, TIFF or EXR.
     transfer : str
-        How integers encode light. A profile (ICC) that goes with them is converted to sRGB's, unless they are
-        ``linear``.
+        How integers encode light. Colours with an ICC profile are converted to sRGB, unless this is ``linear``.
     memory : int
         Bytes that the decoded picture may take.
 
     Returns
     -------
     (height, width, 1 to 4) uint8 or uint16, or (height, width, 1 or 3) float32
-        Upright. Grey or RGB; integers with the alpha channel that is there. Float values are linear light.
+        Upright, grey or RGB. Integers keep an alpha channel; float values are linear light without one.
 
     Raises
     ------
@@ -40,14 +39,14 @@ def decode(data: bytes, transfer: Transfer, *, memory: int) -> Codes | Floats:
     if float_formats.is_float(data):
         return float_formats.decode(data, memory=memory)
     pixels = integer_formats.decode(data, memory=memory, alpha=True)
-    return _in_srgb(data, pixels) if transfer == "srgb" else pixels
+    return _to_srgb(data, pixels) if transfer == "srgb" else pixels
 
 
-def _in_srgb(data: bytes, pixels: Codes) -> Codes:
-    """RGB in sRGB's colours, by the profile of the file that it comes from."""
-    with Image.open(io.BytesIO(data), formats=integer_formats.READ) as picture:
+def _to_srgb(data: bytes, pixels: Codes) -> Codes:
+    """Convert RGB to sRGB by the ICC profile of the file, if it has one."""
+    with Image.open(io.BytesIO(data), formats=integer_formats.FORMATS) as picture:
         profile = picture.info.get("icc_profile")
-        # The profile of a palette or of inks is not that of what was made of them.
+        # Pixels made from a palette or from inks do not have the colours that the profile describes.
         if not profile or picture.mode not in ("RGB", "RGBA", "I;16B", "RGB;16"):
             return pixels
     if pixels.shape[2] < 3:
@@ -57,6 +56,6 @@ def _in_srgb(data: bytes, pixels: Codes) -> Codes:
         converted = imagecodecs.cms_transform(
             colours, profile, imagecodecs.cms_profile("srgb"), colorspace="rgb", outcolorspace="rgb"
         )
-    except Exception as error:  # what a library raises on damaged bytes is not a closed set
+    except Exception as error:  # damaged bytes raise many kinds of errors
         raise ImageError(f"the image's colour profile can't be used: {error}; save it without one") from error
     return np.concatenate([converted, pixels[..., 3:]], axis=2)

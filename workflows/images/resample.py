@@ -1,4 +1,4 @@
-"""Images on grids of cells laid over them."""
+"""Resample images: stretch them over a monitor, and average them over the cells of a grid."""
 
 from typing import TypeVar
 
@@ -9,7 +9,7 @@ Value = TypeVar("Value", bound=np.generic)
 
 
 def smallest_grid(image: NDArray[Value]) -> NDArray[Value]:
-    """An image on the coarsest even grid on which it loses nothing.
+    """Reduce an image to the coarsest regular grid on which it loses nothing.
 
     Parameters
     ----------
@@ -18,7 +18,7 @@ def smallest_grid(image: NDArray[Value]) -> NDArray[Value]:
     Returns
     -------
     (rows, columns, channels)
-        ``height`` is a whole multiple of ``rows``, ``width`` of ``columns``.
+        ``height`` is a whole multiple of ``rows``, and ``width`` of ``columns``.
     """
     for axis in (0, 1):
         other = tuple(a for a in range(3) if a != axis)
@@ -29,7 +29,7 @@ def smallest_grid(image: NDArray[Value]) -> NDArray[Value]:
 
 
 def stretch(values: NDArray[Value], width: int, height: int) -> NDArray[Value]:
-    """Values of a grid, stretched over a monitor as the capture format says.
+    """Stretch the values of a grid over a monitor, as the capture format defines it.
 
     Parameters
     ----------
@@ -49,14 +49,14 @@ def stretch(values: NDArray[Value], width: int, height: int) -> NDArray[Value]:
 
 
 def on_grid(light: NDArray[np.float32], columns: int, rows: int) -> NDArray[np.float32]:
-    """The mean light over each cell of a grid."""
+    """The mean light over each cell of a grid, repeated if the grid is a multiple of the light's own."""
     if columns % light.shape[1] == 0 and rows % light.shape[0] == 0:
         return light.repeat(rows // light.shape[0], axis=0).repeat(columns // light.shape[1], axis=1)
     return area_mean(light, columns, rows)
 
 
 def area_mean(image: NDArray[np.float32], columns: int, rows: int) -> NDArray[np.float32]:
-    """The mean of an image, stretched over a grid, in each of its cells.
+    """The mean of an image over each cell of a grid that it is stretched over.
 
     Parameters
     ----------
@@ -68,14 +68,14 @@ def area_mean(image: NDArray[np.float32], columns: int, rows: int) -> NDArray[np
 
     Notes
     -----
-    The integral of the image (constant over each of its pixels) is sampled at the cells' edges; differences
-    of it are exact means for any ratio of sizes, enlarging included.
+    The image is constant over each of its pixels. Its integral is sampled at the edges of the cells; differences of the
+    integral are exact means for any ratio of sizes, including enlargement.
     """
     for axis, cells in ((0, rows), (1, columns)):
         n = image.shape[axis]
         if n == cells:
             continue
-        if n % cells == 0:  # the sum of a cell's pixels is faster, and what most ask for
+        if n % cells == 0:  # the usual case, in which summing a cell's pixels is faster
             whole_pixels = (*image.shape[:axis], cells, n // cells, *image.shape[axis + 1 :])
             image = image.reshape(whole_pixels).mean(axis=axis + 1)
             continue

@@ -15,7 +15,7 @@ class Gamma(BaseModel):
     gamma: Annotated[float, Field(ge=0.2, le=5.0, description="The exponent.", examples=[2.2])]
 
 
-# Pixels, about, that curves are fitted to.
+# About how many pixels curves are fitted to.
 _SAMPLE = 4096
 
 Curve = Literal["linear", "srgb"] | Gamma
@@ -23,7 +23,7 @@ Response = Literal["linear", "srgb", "unknown"] | Gamma
 
 
 class Estimate(NamedTuple):
-    """Curves of monitor and camera, and which of them, ``monitor`` or ``camera``, are only assumed."""
+    """The curves of monitor and camera; ``assumed`` names those that could not be estimated."""
 
     monitor: Curve
     camera: Curve
@@ -31,7 +31,7 @@ class Estimate(NamedTuple):
 
 
 BLACK = 4096
-"""What no light is stored as where float values are stored as uint16: noise goes below it."""
+"""The code of no light where float values are stored as uint16, so that negative noise has codes below it."""
 
 
 def to_light(values: NDArray[np.float32], curve: Curve) -> NDArray[np.float32]:
@@ -68,9 +68,9 @@ def from_light(light: NDArray[np.float32], curve: Literal["linear", "srgb"]) -> 
 
 
 def table(curve: Curve, dtype: np.dtype[np.unsignedinteger], black: int = 0) -> NDArray[np.float32]:
-    """Light of every value of an unsigned integer type: turns a stack of frames to light by one look-up.
+    """A look-up table from every value of an unsigned integer type to linear light.
 
-    ``black`` is the value of no light; what is below it is negative.
+    ``black`` is the value of no light; values below it are negative light.
     """
     top = np.iinfo(dtype).max
     return to_light((np.arange(top + 1, dtype=np.float32) - black) / np.float32(top - black), curve)
@@ -84,33 +84,34 @@ def estimate(
     monitor: Response,
     camera: Response,
 ) -> Estimate:
-    """Curves in place of ``unknown`` ones, from what the camera saw of constant levels.
+    """Estimate ``unknown`` curves from what the camera saw of constant levels.
 
     Parameters
     ----------
     levels : (k,) float32
         Grey values sent to the monitor, 0 to 1.
     exposures : (k,) float32
-        For how long the camera saw each, in units of the shortest.
+        Exposure times, in units of the shortest.
     values : (k, n) float32
-        What n pixels stored for each, 0 to 1.
+        Values of n pixels for each level, 0 to 1.
     usable : (k, n) bool
         False where a value is clipped.
     monitor, camera : Response
-        As the capture says.
+        As the capture states them.
 
     Returns
     -------
     Estimate
-        Known curves as they are. The camera's is told by frames of one level with different exposures, else by three
-        levels of a known monitor; the monitor's by three levels before a camera whose curve is known or
-        told. What can't be told is taken for sRGB, which is what nearly every monitor and camera is built to.
+        Known curves are returned as they are. The camera's is estimated from frames of one level with different
+        exposures, or else from three levels of a known monitor; the monitor's from three levels seen by a camera with a
+        known or estimated curve. A curve that can't be estimated is assumed to be sRGB, which nearly all monitors and
+        cameras approximate.
 
     Notes
     -----
-    Of the gammas from 0.4 to 4, sRGB and no curve, that is taken under which the light at the camera is
-    closest to the model: ``t (S + rho b)`` in the light b of the monitor (eq. 6), or ``t x`` in the exposures t of a
-    level. A gamma must beat the named curves by 2 % of the squared error, for it has a value to choose.
+    Candidates are gammas from 0.4 to 4, sRGB and linear. The chosen one makes the light at the camera fit the model
+    best: ``t (S + rho b)`` for the light b of the monitor (eq. 6), or ``t x`` for the exposures t of a level. A gamma
+    must beat the named curves by 2 % of the squared error, because it has a free parameter.
     """
     some, step = usable.any(axis=1), max(1, values.shape[1] // _SAMPLE)
     levels, exposures = levels[some], exposures[some]
@@ -127,7 +128,7 @@ def estimate(
         missed = spread = 0.0
         for level in np.unique(levels):
             at = levels == level
-            # one exposure alone says nothing of the curve
+            # A single exposure says nothing about the curve.
             both = usable[at] & (usable[at].sum(axis=0) > 1)
             missed += _residual(exposures[at, np.newaxis], c[at], both)
             spread += _deviation(c[at], both)
@@ -156,13 +157,13 @@ def estimate(
 
 
 def _varies(values: NDArray[np.float32], usable: NDArray[np.bool_]) -> bool:
-    """Whether some pixel saw a difference."""
+    """Whether any pixel saw different values."""
     high, low = np.where(usable, values, -np.inf), np.where(usable, values, np.inf)
     return values.size > 0 and bool((high.max(axis=0) > low.min(axis=0)).any())
 
 
 def _closest(misfit: Callable[[Curve], float]) -> Curve:
-    from scipy.optimize import minimize_scalar  # half a second to import, and who composites never comes here
+    from scipy.optimize import minimize_scalar  # takes half a second to import, and only calibration needs it
 
     best = minimize_scalar(lambda gamma: misfit(Gamma(gamma=gamma)), bounds=(0.4, 4.0), method="bounded")
     named: tuple[Curve, ...] = ("linear", "srgb")
@@ -171,7 +172,7 @@ def _closest(misfit: Callable[[Curve], float]) -> Curve:
 
 
 def _residual(design: NDArray[np.float32], c: NDArray[np.float32], usable: NDArray[np.bool_]) -> float:
-    """Squared error of each pixel's light (k, n) where it is best fitted by the columns of the design (k, d)."""
+    """Squared error of the least squares fit of each pixel's light, (k, n), by a design matrix, (k, d)."""
     weight, light, X = usable.T.astype(np.float64), c.T.astype(np.float64), design.astype(np.float64)
     gram = np.einsum("nk,ki,kj->nij", weight, X, X)
     slope = np.linalg.pinv(gram, hermitian=True) @ ((weight * light) @ X)[..., np.newaxis]

@@ -1,4 +1,4 @@
-"""Limits of time and memory for decoders, which run in the process of a worker at files of strangers."""
+"""Limits of time and memory for decoders, which read untrusted files in the process of a worker."""
 
 import faulthandler
 import math
@@ -12,14 +12,14 @@ from pathlib import Path
 from storage.errors import CaptureError, ImageError
 
 SECONDS = 180
-"""More than the largest frame takes on a machine that is busy with much else, or a store that answers late."""
-COPIES, BESIDES = 8, 256 << 20
-"""Frames of the largest size that a decoder has room for, and bytes besides: twice what decoders of pictures and of
-films of 4K have been seen to take."""
+"""More than the largest frame takes on a busy machine, or with a slow store."""
+COPIES, EXTRA = 8, 256 << 20
+"""A decoder may take so many frames of the largest size, and so many bytes more: twice what decoders of pictures and of
+4K films took when measured."""
 
 
 class Guard:
-    """What watches over the decoder of one file, whenever that is at work.
+    """Limits the decoder of one file while it works.
 
     Parameters
     ----------
@@ -32,16 +32,16 @@ class Guard:
     def __init__(self, entry: str, image: int) -> None:
         self._entry = entry
         self._memory = room(image)
-        self._most: float = math.inf
-        self._then = 0
+        self._limit: float = math.inf
+        self._used_before = 0
 
     @contextmanager
     def on(self) -> Iterator[None]:
-        """Bound what is done inside. One thread at a time may be there, as in workers.
+        """Limit what runs inside the with statement. Only one thread at a time may be inside, as in workers.
 
-        If it takes longer than `SECONDS`, this process is ended, once its stacks are on stderr: a thread can't be
-        stopped, and a decoder may hold the interpreter, and let nothing else of the process run. A worker is started
-        again then, and its tile is one that was lost.
+        If it takes longer than `SECONDS`, the stacks are written to stderr and this process ends, because a thread
+        can't be stopped, and a decoder may hold the interpreter lock. The worker is then started again, and its tile
+        counts as lost.
 
         Raises
         ------
@@ -56,7 +56,7 @@ class Guard:
             if isinstance(error, MemoryError) or isinstance(error.__cause__, MemoryError):
                 raise CaptureError(
                     f"decoding {self._entry} takes more than the {self._memory >> 20} MB of memory allowed for it: it "
-                    "is damaged, or too large. Copy it anew from the camera, or make it smaller",
+                    "is damaged, or too large. Copy it again from the camera, or make it smaller",
                     entry=self._entry,
                     limit=self._memory,
                 ) from error
@@ -66,32 +66,32 @@ class Guard:
 
     @contextmanager
     def _limited(self) -> Iterator[None]:
-        """Have this process get no more memory than the decoder may take, all the times together that it is at work.
+        """Limit the memory of this process to what the decoder may take, over all its calls together.
 
-        Other threads of the worker are refused memory too, from when the decoder has taken all until it gives up. That
-        is a moment, and most decoders ask for more at once than the others need; at worst the worker is lost.
+        Other threads of the worker are refused memory as well between the decoder reaching its limit and giving up.
+        That time is short, and most decoders ask for larger pieces than the other threads; at worst the worker is lost.
         """
-        if sys.platform != "linux":  # others have the limit and do not keep to it
+        if sys.platform != "linux":  # other systems do not enforce the limit
             yield
             return
         now = in_use()
-        # What was taken since the last time is not the decoder's; what was given back may be.
-        self._most = min(self._most + max(now - self._then, 0), now + self._memory)
+        # Memory taken since the last call is not the decoder's; memory given back may be.
+        self._limit = min(self._limit + max(now - self._used_before, 0), now + self._memory)
         soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
-        most = int(self._most) if soft == resource.RLIM_INFINITY else min(soft, int(self._most))
-        resource.setrlimit(resource.RLIMIT_DATA, (most, hard))
+        limit = int(self._limit) if soft == resource.RLIM_INFINITY else min(soft, int(self._limit))
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
         try:
             yield
         finally:
             resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
-            self._then = in_use()
+            self._used_before = in_use()
 
 
 def room(image: int) -> int:
-    """Bytes that a decoder may take, one decoded frame of which may take `image`."""
-    return COPIES * image + BESIDES
+    """Bytes that a decoder may take if one decoded frame may take ``image`` bytes."""
+    return COPIES * image + EXTRA
 
 
 def in_use() -> int:
-    """Bytes of this process that count for RLIMIT_DATA, used or not; on Linux alone."""
+    """Bytes of this process that count towards RLIMIT_DATA, used or not; on Linux only."""
     return int(Path("/proc/self/statm").read_text().split()[5]) * os.sysconf("SC_PAGE_SIZE")

@@ -1,6 +1,6 @@
-"""Whether LZW of a TIFF can be unpacked.
+"""Check the LZW data of a TIFF before it is decoded.
 
-Where codes are wrong, imagecodecs 2026.3, the last for Python 3.11, follows pointers that were never written.
+On invalid codes, imagecodecs 2026.3, the last version for Python 3.11, follows pointers that were never written.
 """
 
 import numpy as np
@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from storage.errors import ImageError
 
-_CLEAR, _END, _MOST = 256, 257, 4096
+_CLEAR, _END, _MAX = 256, 257, 4096
 
 
-def see_that_it_is_sound(data: bytes, page: tifffile.TiffPage) -> None:
-    """See that every strip or tile of a page packed by LZW consists of codes that were defined before.
+def check_lzw(data: bytes, page: tifffile.TiffPage) -> None:
+    """Check that every strip or tile of an LZW page uses only codes that are defined.
 
     Raises
     ------
@@ -24,18 +24,18 @@ def see_that_it_is_sound(data: bytes, page: tifffile.TiffPage) -> None:
         return
     whole = np.frombuffer(data, np.uint8)
     for start, size in zip(page.dataoffsets, page.databytecounts, strict=False):
-        if not _is_sound(whole[start : start + size]):
-            raise ImageError("the TIFF image is cut off or damaged: its LZW has codes that stand for nothing")
+        if not _is_valid(whole[start : start + size]):
+            raise ImageError("the TIFF image is cut off or damaged: its LZW has undefined codes")
 
 
 @njit(nogil=True, cache=True)
-def _is_sound(packed: NDArray[np.uint8]) -> bool:
-    """Whether each code is of a byte, or of an entry of the table (TIFF 6.0, sect. 13).
+def _is_valid(packed: NDArray[np.uint8]) -> bool:
+    """Whether each code stands for a byte or for an entry of the table (TIFF 6.0, sect. 13).
 
     Notes
     -----
-    Codes have 9 bits, the highest first, and one more from the entry on that comes before the last of a width. Each but
-    the first after a clear makes an entry, and may be that entry itself.
+    Codes begin with 9 bits, most significant bit first, and get one more bit one entry before a width is exhausted.
+    Each code but the first after a clear adds an entry, and may stand for that entry itself.
     """
     entries, width, is_first = _END + 1, 9, True
     held, bits = 0, 0
@@ -52,7 +52,7 @@ def _is_sound(packed: NDArray[np.uint8]) -> bool:
             continue
         if code > (_CLEAR - 1 if is_first else entries):
             return False
-        if not is_first and entries < _MOST:
+        if not is_first and entries < _MAX:
             entries += 1
         if entries + 1 >= 1 << width and width < 12:
             width += 1

@@ -140,7 +140,7 @@ def test_idle_child_that_dies_is_replaced(decoders: Decoders) -> None:
 
 def test_child_has_a_memory_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(decoder_guard, "COPIES", 0)
-    monkeypatch.setattr(decoder_guard, "BESIDES", 32 << 20)
+    monkeypatch.setattr(decoder_guard, "EXTRA", 32 << 20)
     confined = Decoders(1 << 30)
     large = saved("PNG", np.zeros((6000, 6000, 3), np.uint8))
     with pytest.raises(ImageError, match="too much memory"):

@@ -76,7 +76,7 @@ def test_integers_and_others_are_no_floats() -> None:
 @pytest.mark.parametrize(
     ("data", "why"),
     [
-        (exr({"Z": VALUES[:, :, 3]}), "channels R, G and B, or Y; this one has Z"),
+        (exr({"Z": VALUES[:, :, 3]}), "has the channels Z: R, G and B, or Y are needed"),
         (
             tiff(
                 VALUES[:, :, :2],
@@ -94,7 +94,7 @@ def test_integers_and_others_are_no_floats() -> None:
         ),
         (
             tiff(np.ones((9, 9, 7), np.float32), photometric="minisblack", planarconfig="contig"),
-            "grey or RGB",
+            "grey (and|or) RGB",
         ),
     ],
 )
@@ -110,7 +110,7 @@ def test_several_parts_are_refused() -> None:
     part = {"Y": np.ones((4, 5), np.float32)}
     target = io.BytesIO()
     OpenEXR.File([OpenEXR.Part({}, part, "a"), OpenEXR.Part({}, part, "b")]).write(target)
-    with pytest.raises(ImageError, match="one part"):
+    with pytest.raises(ImageError, match="several parts"):
         decode(target.getvalue(), memory=MEMORY)
 
 

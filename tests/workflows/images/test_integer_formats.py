@@ -147,13 +147,13 @@ def test_a_tiff_that_holds_a_jpeg_is_read() -> None:
     ],
 )
 def test_what_is_no_image_is_refused(data: bytes) -> None:
-    with pytest.raises(ImageError, match="no PNG or TIFF or JPEG"):
+    with pytest.raises(ImageError, match="not a PNG or TIFF or JPEG"):
         decode(data, memory=MEMORY)
 
 
 def test_a_format_that_is_not_taken_is_refused() -> None:
     data = saved(Image.new("RGB", (4, 4)), "JPEG")
-    with pytest.raises(ImageError, match="no PNG or TIFF image"):
+    with pytest.raises(ImageError, match="not a PNG or TIFF image"):
         decode(data, memory=MEMORY, formats=("PNG", "TIFF"))
 
 

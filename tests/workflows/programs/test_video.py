@@ -142,7 +142,7 @@ def test_ingest_finds_every_pattern_of_a_film(name: str, size: tuple[int, int], 
     np.testing.assert_array_equal(shown, at)
 
 
-@pytest.mark.parametrize("name", ["default", "quick"])
+@pytest.mark.parametrize("name", [pytest.param("default", marks=pytest.mark.slow), "quick"])
 def test_ingest_refuses_the_film_of_another_program(name: str, tmp_path: Path) -> None:
     write_video(
         fit_to_screen(name, (384, 288), bordered=True), tmp_path / "film.mp4", RATE, lambda done, of: None

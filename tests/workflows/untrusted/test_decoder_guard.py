@@ -21,7 +21,7 @@ from workflows.untrusted.decoder_guard import Guard
 
 SCRIPT = """
 import time
-from workflows.ingest import guard
+from workflows.untrusted import decoder_guard
 from workflows.ingest.video.decoder import Clip
 
 class Film:
@@ -31,7 +31,7 @@ class Film:
     def seek(self, offset, whence=0):
         return 0
 
-guard.SECONDS = 1
+decoder_guard.SECONDS = 1
 Clip(Film(), "film.mp4", 1 << 20)
 """
 
@@ -70,7 +70,7 @@ def taken(size: int) -> mmap.mmap:
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> Iterator[Guard]:
     """A guard that lets a decoder have 64 MB."""
-    monkeypatch.setattr(decoder_guard, "BESIDES", 56 * MIB)
+    monkeypatch.setattr(decoder_guard, "EXTRA", 56 * MIB)
     before = resource.getrlimit(resource.RLIMIT_DATA)
     yield Guard("film.mp4", MIB)
     assert resource.getrlimit(resource.RLIMIT_DATA) == before
