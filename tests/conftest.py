@@ -1,4 +1,4 @@
-"""Parts that tests of every floor use."""
+"""Options, markers and fixtures of all tests."""
 
 import signal
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""A real service in a process of its own, and captures to send it."""
+"""A real service in its own process, and captures to send to it."""
 
 import hashlib
 import os
@@ -39,14 +39,14 @@ class Service:
     http: httpx2.Client
 
     def kill(self) -> None:
-        """End the server as a crash would; its workers have to notice by themselves."""
+        """End the server as a crash would; its workers must notice by themselves."""
         self.process.kill()
         self.process.wait(120)
 
     def stored(self) -> set[str]:
-        """Every file of the store that belongs to an upload, a capture or a matte; checksums go with their file."""
+        """Every file of the store that belongs to an upload, a capture or a matte; checksums count with their file."""
         store = self.data / "store"
-        # os.walk passes over a folder that is deleted meanwhile.
+        # os.walk skips folders that are deleted meanwhile.
         files = [
             Path(folder, name).relative_to(store) for folder, _, names in os.walk(store) for name in names
         ]
@@ -60,7 +60,7 @@ class Service:
 
 @contextmanager
 def serving(data: Path, *options: str, **environment: str) -> Iterator[Service]:
-    """Serve a folder on a free port, until the block ends."""
+    """Serve a folder on a free port until the block ends."""
     command = [sys.executable, "-m", "services", "serve", "--data", str(data), "--port", "0", *options]
     data.parent.mkdir(parents=True, exist_ok=True)
     with (data.parent / f"{data.name}.log").open("ab") as log:
@@ -88,9 +88,9 @@ def serving(data: Path, *options: str, **environment: str) -> Iterator[Service]:
 
 @contextmanager
 def paused(service: Service) -> Iterator[None]:
-    """Hold up the workers of a service: what was uploaded stays in the store.
+    """Suspend the workers of a service: uploads stay in the store.
 
-    One that says nothing for half a minute is ended by its scheduler, and another one started: it is held up too.
+    The scheduler replaces a worker that is silent for half a minute; the new one is suspended too.
     """
     over = threading.Event()
 
@@ -117,14 +117,14 @@ def paused(service: Service) -> Iterator[None]:
 
 
 def png(light: np.ndarray, transfer: str, dtype: type) -> bytes:
-    """A backdrop of linear light as it is sent."""
+    """A backdrop of linear light, encoded as PNG."""
     return integer_formats.encode_png(
         integer_formats.to_integers(from_light(light, transfer), np.dtype(dtype))
     )
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """A digest of every file below a folder, by its relative name; not of what is kept of a matte for browsers."""
+    """SHA-256 of every file below a folder by relative name, except the live data made for browsers."""
     names = {str(path.relative_to(folder)): path for path in sorted(folder.rglob("*")) if path.is_file()}
     return {
         name: hashlib.sha256(path.read_bytes()).hexdigest()

@@ -1,4 +1,4 @@
-"""A line to a service that breaks: a TCP proxy that cuts its connections at random, the same way for the same seed."""
+"""A TCP proxy that cuts its connections at random, reproducibly for a seed."""
 
 import contextlib
 import random
@@ -11,20 +11,20 @@ from urllib.parse import urlsplit
 
 
 class Line:
-    """A proxy on a port of its own.
+    """A proxy on its own port.
 
     Parameters
     ----------
     target : str
-        URL to forward to; may be changed meanwhile.
+        URL to forward to; may be changed while it runs.
     cuts : int
-        How often it cuts a connection before it holds.
+        Number of connections it cuts before it stops cutting.
     mean : int
-        Bytes from the client between two cuts, in the mean.
+        Mean number of bytes from the client between two cuts.
     back : bool
-        Whether half of the cuts come where all was sent, and the answer is on its way back.
+        Whether half of the cuts come after the request was sent, while the answer is on its way.
     pace : float
-        Seconds that 64 KiB from the client take at least.
+        Minimum number of seconds per 64 KiB from the client.
     """
 
     def __init__(
@@ -34,7 +34,7 @@ class Line:
         self.made = 0
         """Cuts so far."""
         self.carried = 0
-        """Bytes from the client that were passed on."""
+        """Bytes from the client that were forwarded."""
         self._cuts, self._mean, self._back, self._pace = cuts, mean, back, pace
         self._random = random.Random(seed)
         self._lock = threading.Lock()

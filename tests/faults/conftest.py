@@ -1,4 +1,4 @@
-"""A cluster that is disturbed, and the matte of one that is not."""
+"""A cluster for faults, and the matte it makes without them."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -25,13 +25,13 @@ def times(pytestconfig: pytest.Config) -> int:
 
 @pytest.fixture(scope="session")
 def seldom(times: int) -> int:
-    """How often what takes half a minute is injected."""
+    """How often faults that take half a minute are injected."""
     return max(1, times // 2)
 
 
 @pytest.fixture(scope="session")
 def table(pytestconfig: pytest.Config) -> Iterator[list[Row]]:
-    """The rows of the table of faults: printed at the end, and written if asked for."""
+    """The rows of the table of faults, printed at the end and written with ``--table``."""
     rows: list[Row] = []
     yield rows
     print(f"\n{'fault':<34}{'injected':>9}{'lost':>6}{'differing':>11}{'median s':>10}{'longest s':>11}")
@@ -59,25 +59,25 @@ def bundle_bytes(bundle: Path) -> bytes:
 
 @dataclass
 class Known:
-    """A rig, a capture in it, and the files of its matte when nothing is disturbed."""
+    """A rig, a capture in it, and the files of its matte without faults."""
 
     rig: Rig
     capture: str
     files: dict[str, str]
 
     def disturb(self, fault: str, act: Callable[[], object], times: int) -> Row:
-        """Do something bad at random moments of jobs, and see what comes of them."""
+        """Inject a fault at random moments of jobs; returns what became of them."""
         return self.rig.disturb(fault, act, self.capture, self.files, times)
 
     def goes_on(self, job: str, matte: str) -> None:
-        """See that a job ends well, and waits for nothing then."""
+        """Check that a job succeeds with the expected matte and waits for nothing."""
         assert self.rig.ended(job)["state"] == "succeeded"
         assert self.rig.job(job)["waits_for"] is None
         assert self.rig.files(matte) == self.files
 
 
 def check(table: list[Row], row: Row) -> None:
-    """Add a row to the table, and see that nothing was lost and all is the same to the byte."""
+    """Add a row to the table; check that no job was lost and every matte is the same to the byte."""
     table.append(row)
     assert (row.lost, row.differing) == (0, 0), row
 
@@ -89,7 +89,7 @@ def known(tmp_path_factory: pytest.TempPathFactory, bundle: Path) -> Iterator[Kn
 
 
 def prepared(rig: Rig, bundle: Path) -> Known:
-    """A rig with a capture that was recovered once."""
+    """Ingest a capture in a rig and recover it once."""
     uploaded = rig.ask(
         "POST", "/v1/captures", content=bundle.read_bytes(), headers={"Content-Type": "application/zip"}
     ).json()

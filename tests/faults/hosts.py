@@ -1,4 +1,4 @@
-"""Hosts on one machine: network namespaces, each with a link of its own to a switch, which can be cut."""
+"""Several hosts on one machine: network namespaces, whose links to a switch can be cut."""
 
 import ctypes
 import os
@@ -19,7 +19,7 @@ from services.runtime import certificates
 from tests.faults.rig import Rig, free_port, url_of
 
 HOSTS = ("scheduler", "service0", "worker0", "worker1")
-"""Each process is on a host of its own."""
+"""One host for each process."""
 NETWORK = "10.77.0"
 NAMESPACES = Path("/run/netns")
 CLONE_NEWNET = 0x40000000
@@ -27,7 +27,7 @@ CLONE_NEWNET = 0x40000000
 
 @dataclass(frozen=True)
 class Network:
-    """Hosts, and the switch between them."""
+    """Hosts and the switch between them."""
 
     mark: str
     names: Sequence[str]
@@ -39,7 +39,7 @@ class Network:
         return f"{NETWORK}.{self.names.index(name) + 1}"
 
     def cut(self, name: str) -> None:
-        """Take a host's link down, without a word to anyone."""
+        """Take a host's link down; no connection is closed."""
         self._set(name, "down")
 
     def mend(self, name: str) -> None:
@@ -51,7 +51,7 @@ class Network:
 
 @contextmanager
 def network(*names: str) -> Iterator[Network]:
-    """Hosts that reach each other, while this lasts; where there can be none, the test is skipped."""
+    """Make connected hosts until the block ends; skips the test where that is impossible."""
     if os.getuid() != 0:
         pytest.skip("network namespaces take root")
     if shutil.which("ip") is None:
@@ -84,7 +84,7 @@ class Hosts(Rig):
     def _start_all(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
         self.network = self._stack.enter_context(network(*HOSTS))
-        # Whoever asks the service is on its host.
+        # Requests to the service come from its own host.
         inside = self._stack.enter_context(
             ThreadPoolExecutor(1, initializer=_enter, initargs=(self.network.namespace("service0"),))
         )

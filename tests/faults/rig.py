@@ -1,4 +1,4 @@
-"""A cluster of real processes on loopback, and what can be done to it."""
+"""A cluster of real processes on loopback, and faults to inject."""
 
 import hashlib
 import random
@@ -26,7 +26,7 @@ STUCK = 240.0
 
 @dataclass
 class Row:
-    """A line of the table of faults; seconds are from the fault to the job's end."""
+    """A line of the table of faults; seconds count from the fault to the job's end."""
 
     fault: str
     injected: int = 0
@@ -82,23 +82,23 @@ class Rig:
         self._stack.close()
 
     def start(self, name: str, *command: str) -> None:
-        """Start a process, or the same once more."""
+        """Start a process, or start it again."""
         self._commands[name] = command or self._commands[name]
         log = self.folder / f"{name}.log"
         process = started(log, *self._commands[name], within=self._within(name), **self._environment)
         self._processes[name] = self._stack.enter_context(process)
 
     def _within(self, name: str) -> Sequence[str]:
-        """What a process is started by, to be on a host of its own."""
+        """Command prefix that runs a process on its own host."""
         return ()
 
     def kill(self, name: str) -> None:
-        """SIGKILL for a process, and for nothing that it started."""
+        """Send SIGKILL to a process but not to its children."""
         self._processes[name].kill()
         self._processes[name].wait()
 
     def restart(self, name: str) -> None:
-        """Kill a process, and start it again, as a supervisor would."""
+        """Kill a process and start it again, as a supervisor does."""
         self.kill(name)
         self.start(name)
 
@@ -115,7 +115,7 @@ class Rig:
         return [one for name in names for one in workers(self._processes[name])]
 
     def log(self, name: str) -> str:
-        """What a process has said so far."""
+        """The log of a process."""
         return (self.folder / f"{name}.log").read_text()
 
     def process(self, name: str) -> psutil.Process:
@@ -131,7 +131,7 @@ class Rig:
     def ask(
         self, method: str, path: str, *, at: str | None = None, repeat: bool = True, **content: Any
     ) -> httpx2.Response:
-        """A request to whichever service answers, or to one."""
+        """Send a request to the first service that answers, or to a given one."""
         end = time.monotonic() + 60
         while True:
             for url in [at] if at else self.urls:
@@ -156,7 +156,7 @@ class Rig:
         return made
 
     def ended(self, job: str, seconds: float = STUCK) -> dict[str, Any]:
-        """The job once it has ended, or as it is after a long time."""
+        """Wait for a job's end; returns the job, also if it has not ended after ``seconds``."""
         end = time.monotonic() + seconds
         while True:
             found = self.job(job)
@@ -165,7 +165,7 @@ class Rig:
             time.sleep(0.05)
 
     def files(self, matte: str) -> dict[str, str]:
-        """A digest of every file of a matte."""
+        """SHA-256 of every file of a matte."""
         return stored(Objects(self.store), mattes.path(matte))
 
     def names(self, matte: str) -> set[str]:
@@ -175,7 +175,7 @@ class Rig:
     def disturb(
         self, fault: str, act: Callable[[], object], capture: str, expected: dict[str, str], times: int
     ) -> Row:
-        """Do something bad at random moments of jobs, and see what comes of them."""
+        """Inject a fault at random moments of jobs; returns what became of them."""
         row = Row(fault)
         for _ in range(times):
             job = self.recover(capture)
@@ -193,7 +193,7 @@ class Rig:
 
 
 def stored(objects: Objects, folder: str) -> dict[str, str]:
-    """A digest of everything below a folder of a store, by its relative name."""
+    """SHA-256 of everything below a folder of a store, by relative name."""
     return {
         path.removeprefix(f"{folder}/"): hashlib.sha256(objects.read(path).read()).hexdigest()
         for path in sorted(objects.paths_below(folder))

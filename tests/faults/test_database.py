@@ -1,4 +1,4 @@
-"""PostgreSQL is restarted and stays away, and a coordinator sleeps over its lease: two services go on by themselves."""
+"""PostgreSQL restarts or stays away, or a coordinator misses its lease: two services recover by themselves."""
 
 import time
 from collections.abc import Iterator
@@ -75,7 +75,7 @@ def test_late_writer_is_shut_out(on_postgresql: Known, table: list[Row], seldom:
         finally:
             thaw(rig.process(name))
         wait(lambda: rig.log(name).count(told) > before)
-        time.sleep(1)  # in which it may do what it was frozen over
+        time.sleep(1)  # time to do what it was about to do when frozen
         assert rig.log(name).count(told) == before + 1
         assert rig.driver() != name
         assert record == [rig.ask("GET", f"/v1/jobs/{job}{more}").json() for more in ("", "/log")]

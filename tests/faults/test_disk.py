@@ -1,4 +1,4 @@
-"""Disks that are full: a job fails with words, or waits, and nothing half written stays; with room all goes on."""
+"""Full disks: jobs fail with a reason or wait, nothing half written stays, and work continues with room."""
 
 import os
 import shutil
@@ -25,7 +25,7 @@ STORE, LEDGER = 64 << 20, 8 << 20
 
 @dataclass
 class Small:
-    """A service whose store and database are on a small disk each, and the matte of a capture there."""
+    """A service whose store and database are on small disks, and the matte of a capture there."""
 
     service: Service
     store: Path
@@ -41,7 +41,7 @@ class Small:
         return Row(fault, 1, differing=int(differing), seconds=[round(time.monotonic() - start, 2)])
 
     def half_written(self) -> list[str]:
-        # os.walk passes over a folder that is deleted meanwhile.
+        # os.walk skips folders that are deleted meanwhile.
         return [name for _, _, names in os.walk(self.store) for name in names if "#" in name]
 
     def retried(self, job: str) -> str:
@@ -49,7 +49,7 @@ class Small:
         return str(self.service.client.wait(job)["state"])
 
     def failed_for_room(self, job: str) -> bool:
-        """Whether a job ends for want of room, and the service is none the worse for it."""
+        """Check that a job fails for lack of room and the service keeps working."""
         wait(lambda: self.service.client.job(job)["state"] not in ("queued", "running"))
         found = self.service.client.job(job)
         assert (found["state"], found["problem"]["type"]) == ("failed", "urn:envmatte:problem:no-room"), found
@@ -75,7 +75,7 @@ def small(tmp_path_factory: pytest.TempPathFactory, bundle: Path) -> Iterator[Sm
 
 @contextmanager
 def full(disk: Path, left: int = 0) -> Iterator[None]:
-    """Leave so many bytes of a disk, while this lasts."""
+    """Fill a disk up to some free bytes until the block ends."""
     ballast = disk / "ballast"
     with ballast.open("wb") as file:
         os.posix_fallocate(file.fileno(), 0, shutil.disk_usage(disk).free - left)
@@ -115,7 +115,7 @@ def test_full_disk_of_sqlite(small: Small, table: list[Row]) -> None:
     wait(lambda: service.client.job(job["id"])["progress"] > 0.1)
 
     def refused() -> bool:
-        """Whether an upload is, in the end: what the log of SQLite has taken before it may take again."""
+        """Whether an upload is accepted in the end: SQLite may reuse the room of its own log."""
         headers = {"Tus-Resumable": "1.0.0", "Upload-Length": "1", "Upload-Metadata": "name " + "QUFB" * 1000}
         answer = service.http.post("/v1/uploads", headers=headers)
         assert answer.status_code in (201, 507), answer.text

@@ -1,4 +1,4 @@
-"""The link between hosts is cut without a word, and mended: jobs end, and whoever was cut off is back."""
+"""Links between hosts are cut silently and restored: jobs end, and the hosts rejoin."""
 
 import time
 from collections.abc import Iterator
@@ -51,7 +51,7 @@ def cut_off(hosts: Known, table: list[Row], name: str, times: int) -> None:
 
 
 def workers_of(ledger: Path) -> int:
-    """How many workers the coordinator sees."""
+    """The number of workers that the coordinator sees."""
     engine = open_engine(f"sqlite:///{ledger}")
     with reading(engine) as c:
         sign = leases.last_heartbeat(c)

@@ -1,4 +1,4 @@
-"""Processes are killed and frozen at random moments, and jobs cancelled: no job is lost, and every matte is the same to
+"""Processes are killed or frozen at random moments and jobs cancelled: no job is lost, every matte is the same to
 the byte.
 """
 
@@ -59,9 +59,9 @@ def test_frozen_worker(known: Known, table: list[Row]) -> None:
     start = time.monotonic()
     row = known.disturb("SIGSTOP of a worker, for 60 s", act, 1)
     time.sleep(max(0.0, 60 - (time.monotonic() - start)))
-    with suppress(psutil.NoSuchProcess):  # its nanny may have ended it meanwhile
+    with suppress(psutil.NoSuchProcess):  # its nanny may have killed it meanwhile
         thaw(frozen[0])
-    time.sleep(3)  # in which it may do what it was frozen over
+    time.sleep(3)  # time to do what it was about to do when frozen
     (matte, *_) = known.rig.ask("GET", "/v1/mattes").json()["mattes"]
     assert known.rig.files(matte["id"]) == known.files
     check(table, row)

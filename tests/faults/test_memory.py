@@ -1,4 +1,4 @@
-"""An ingest that wants more memory than its worker may have: it fails with what to do, and no other job suffers."""
+"""An ingest that needs more memory than its worker has fails with a remedy and disturbs no other job."""
 
 import json
 import time
@@ -16,16 +16,16 @@ from tests.services.cluster.clusters import wait
 pytestmark = pytest.mark.timeout(1800)
 
 LARGER = 14
-"""How many times wider and higher the frames are."""
+"""Factor by which frames are enlarged."""
 LIMIT = 460 << 20
-"""Bytes that a worker may take: enough for small captures."""
+"""Memory limit of a worker in bytes: enough for small captures."""
 TOO_MUCH, ENOUGH = 4 << 30, 64 << 20
-"""Bytes of frames that an ingest may hold: more than its worker has, and few enough."""
+"""Memory setting of the ingest in bytes: larger and smaller than what its worker has."""
 
 
 @pytest.fixture(scope="module")
 def large(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The capture with frames of 3 Mpixel, all of which are one slab where memory allows."""
+    """A capture with frames of 3 megapixels, all in one slab if memory allows."""
     path = tmp_path_factory.mktemp("large") / "large.zip"
     with zipfile.ZipFile(bundle) as source, zipfile.ZipFile(path, "w") as target:
         manifest = json.loads(source.read("capture.json"))

@@ -1,4 +1,4 @@
-"""Two services behind one port serve one another's uploads, jobs and mattes."""
+"""Two services behind one port serve each other's uploads, jobs and mattes."""
 
 from itertools import cycle
 from pathlib import Path
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.timeout(900)
 
 
 class InTurn(Line):
-    """A line whose connections go to one service and to the other in turn, and which cuts some of them."""
+    """A proxy that alternates between two services and cuts some of its connections."""
 
     def __init__(self, targets: list[str], **cuts: int) -> None:
         self._targets = cycle(targets)

@@ -1,4 +1,4 @@
-"""The object store answers with 503, late or not at all: jobs go on, and one that can't end fails with words."""
+"""The object store answers with 503, late or not at all: jobs continue, or fail with a reason."""
 
 import http.client
 import random
@@ -20,11 +20,11 @@ pytestmark = [pytest.mark.timeout(3600), pytest.mark.exhaustive]
 AWAY = 10.0
 """Seconds for which the store is away."""
 SHARE = 0.2
-"""Of the requests, those that come to nothing."""
+"""Share of requests that fail."""
 
 
 class Proxy(ThreadingHTTPServer):
-    """Between a bucket and who uses it: hands on what it is asked, or what it is told to do instead."""
+    """A proxy in front of a bucket that forwards requests or fails them as configured."""
 
     daemon_threads = True
     request_queue_size = 64
@@ -33,9 +33,9 @@ class Proxy(ThreadingHTTPServer):
         super().__init__(("127.0.0.1", 0), _Handler)
         self.server = urlsplit(server).netloc
         self.refused = 0.0
-        """Share of the requests that are answered with 503."""
+        """Share of requests that are answered with 503."""
         self.silent = 0.0
-        """Share of those that are not answered, until the connection is closed after some seconds."""
+        """Share of requests whose connection is closed after some seconds without an answer."""
         self.lost = 0
 
     @property
@@ -43,7 +43,7 @@ class Proxy(ThreadingHTTPServer):
         return f"http://127.0.0.1:{self.server_port}"
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Of those who are gone before they are answered: nothing."""
+        """Ignore clients that left before their answer."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -81,7 +81,7 @@ class _Handler(BaseHTTPRequestHandler):
     do_GET = do_HEAD = do_PUT = do_POST = do_DELETE = _hand_on
 
     def log_message(self, format: str, *arguments: object) -> None:
-        """Nothing."""
+        """Log nothing."""
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +100,7 @@ def in_bucket(
 ) -> Iterator[Known]:
     with pytest.MonkeyPatch.context() as patch:
         for name, value in {"AWS_ENDPOINT_URL": s3_server, **KEYS}.items():
-            patch.setenv(name, value)  # for the test itself: past the proxy
+            patch.setenv(name, value)  # the test itself bypasses the proxy
         through = {"AWS_ENDPOINT_URL": proxy.url, "ENVMATTE_ATTEMPTS": "1"}
         with Rig(tmp_path_factory.mktemp("bucket"), store=f"s3://{BUCKET}/faults", **through) as rig:
             yield prepared(rig, bundle)

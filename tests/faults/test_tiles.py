@@ -1,4 +1,4 @@
-"""A tile that kills whoever works on it ends its own job, after so many, and no other."""
+"""A tile that kills its workers fails its own job after some attempts, and no other."""
 
 import os
 import threading
@@ -18,19 +18,19 @@ from tests.services.cluster.clusters import listening
 pytestmark = pytest.mark.timeout(900)
 
 TILE, LAST = 64, 5
-"""The edge of the tiles, and the number of the one in the corner."""
+"""The edge of the tiles, and the index of the one in the corner."""
 
 
 @contextmanager
 def deadly(rig: Rig, key: str) -> Iterator[None]:
-    """Kill every worker that works on a tile, while this lasts."""
+    """Kill every worker that works on a tile until the block ends."""
     done = threading.Event()
 
     def watch() -> None:
         with Client(rig.cluster, set_as_default=False) as client:
             while not done.wait(0.1):
                 keys = [one for held in client.processing().values() for one in held if one.startswith(key)]
-                # A worker has a stack to show of what it works on, and none of what waits there.
+                # A worker has a call stack for what it runs, and none for what is queued there.
                 for address in client.call_stack(keys=keys) if keys else ():
                     for process in rig.workers():
                         if urlsplit(address).port in {port for _, port in listening(process)}:
@@ -53,7 +53,7 @@ def test_tile_that_kills_its_workers_fails_only_its_job(
     headers = {"Content-Type": "application/zip"}
     capture = rig.ask("POST", "/v1/captures", content=bundle_bytes, headers=headers).json()
     assert rig.ended(capture["job"])["state"] == "succeeded"
-    # A chunk that whoever reads it waits for, for ever: of the corner, which no other tile needs.
+    # Readers of this chunk wait for ever. It belongs to the corner, which no other tile needs.
     folder = rig.folder / "store" / "captures" / capture["id"] / "frames" / "c" / "0"
     lowest = max(folder.iterdir(), key=lambda path: int(path.name))
     chunk = max(lowest.iterdir(), key=lambda path: int(path.name)) / "0"

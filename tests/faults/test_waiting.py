@@ -1,4 +1,4 @@
-"""A job that can't go on says in words what it waits for, and goes on as soon as it can."""
+"""A job that cannot continue says what it waits for, and continues as soon as it can."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

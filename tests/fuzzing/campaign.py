@@ -1,6 +1,6 @@
-"""Executions of a target in a process that is watched: what crashes, hangs or takes too much memory is counted too.
+"""Run a fuzzing target in a monitored process that also counts crashes, hangs and excessive memory.
 
-Input N of a target follows from its name and N alone, so whatever fails can be run again.
+Input N of a target depends only on its name and N, so every failure can be reproduced.
 """
 
 import multiprocessing
@@ -22,39 +22,39 @@ from typing import Any, NamedTuple
 
 ROOT = str(Path(__file__).parents[2])
 CPU_SECONDS, SECONDS = 10.0, 60.0
-"""That one execution may take, of processors and of the clock: this machine may be busy with much else."""
+"""Limits of one execution, in processor time and in wall time: the machine may be busy."""
 MEMORY = 128 << 20
-"""Bytes that one execution may take besides what the process had: limits of parsers are set to a few megabytes here."""
+"""Bytes by which one execution may grow its process: limits of parsers are a few megabytes here."""
 GUARDED = 384 << 20
-"""The same where a decoder is guarded, which has room for large films however small the limits are."""
+"""The same for guarded decoders, which have room for large films however small the limits are."""
 ADDRESSES = 6 << 30
-"""Bytes that the process may ask for besides what it had, so that no execution takes the machine's memory."""
+"""Bytes of address space the process may add, so that no execution takes all memory of the machine."""
 BATCH = 2000
-"""Executions of one process: what leaks does so in all of them."""
+"""Executions of one process, in all of which leaks add up."""
 
 
 class Refused(Exception):
-    """Of an execution, that its input was refused as it should be."""
+    """Raised by an execution whose input was refused as documented."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """A parser of foreign bytes.
+    """A parser of untrusted bytes.
 
     Attributes
     ----------
     name : str
     make : callable
-        Makes an input, out of whole files.
+        Makes an input out of valid files.
     run : callable
-        Reads an input, with an empty folder to work in that is the process'. It returns if the input was taken, and
-        raises `Refused` if it was refused as it is documented; any other error is a failure.
+        Reads an input, given an empty working folder. It returns if the input was accepted, and
+        raises `Refused` if it was refused as documented; any other error is a failure.
     whole : callable, optional
-        Makes those: once, and not in the processes that are watched.
+        Makes the valid files: once, and outside of the monitored processes.
     quick : int
-        Executions that take about a second.
+        Number of executions that take about a second.
     memory : int
-        Bytes that one may take.
+        Bytes that one execution may take.
     """
 
     name: str
@@ -65,12 +65,12 @@ class Target:
     memory: int = MEMORY
 
     def input(self, seed: int, whole: Any = None) -> bytes:
-        """An input; `whole` are the files it is made of, if they are there already."""
+        """The input of a seed; `whole` are the valid files, if they exist already."""
         return self.make(Random(f"{self.name} {seed}"), whole or self.whole())
 
 
 class Failure(NamedTuple):
-    """An execution that failed: ``kind`` is error, crash, hang or memory."""
+    """A failed execution; ``kind`` is error, crash, hang or memory."""
 
     kind: str
     target: str
@@ -85,7 +85,7 @@ class Failure(NamedTuple):
 
 @dataclass
 class Tally:
-    """What came of the executions of a target."""
+    """Results of the executions of a target."""
 
     executions: int = 0
     taken: int = 0
@@ -114,19 +114,19 @@ def run(
     Parameters
     ----------
     keep : Path
-        Folder for the inputs that fail.
+        Folder for inputs that fail.
     seconds : float
-        After which no more is run.
+        After which it stops.
     failures : int
-        After which no more is run.
+        After which it stops.
     cpu : float
-        Seconds of processors that one may take.
+        Processor seconds that one execution may take.
     """
     whole = target.whole()
     tally, start, seed = Tally(), time.monotonic(), first
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["tests.fuzzing.targets"])  # unless one runs already, of other tests
-    if ROOT not in sys.path:  # which those processes take over, and pytest goes without
+    context.set_forkserver_preload(["tests.fuzzing.targets"])  # unless other tests have started one
+    if ROOT not in sys.path:  # the processes inherit it; pytest itself does not add it
         sys.path.append(ROOT)
     while seed < first + count and len(tally.failures) < failures:
         left = seconds - (time.monotonic() - start)
@@ -146,7 +146,7 @@ def run(
 
 
 def _watch(process: Any, pipe: Connection, target: Target, seed: int, keep: Path, tally: Tally) -> int:
-    """Take what a process tells of its executions; returns the first seed that is still to be run."""
+    """Receive the results of a process; returns the first seed that still has to run."""
 
     def failed(kind: str, what: str) -> None:
         keep.mkdir(parents=True, exist_ok=True)
@@ -193,7 +193,7 @@ def _batch(
     folder: str,
     pipe: Connection,
 ) -> None:
-    """What a process does: run, and tell of each execution when it has ended."""
+    """Run inputs in a process, and send the result of each."""
     warnings.simplefilter("ignore")
     _be_quiet()
     _, most = resource.getrlimit(resource.RLIMIT_AS)
@@ -209,7 +209,7 @@ def _batch(
             signal.setitimer(signal.ITIMER_PROF, cpu)
             taken, failure = execute(target, data, Path(folder))
             signal.setitimer(signal.ITIMER_PROF, 0)
-            if once_more:  # what is loaded then, and kept, is no execution's
+            if once_more:  # what is loaded once does not count
                 before = _most_memory()
         took = time.perf_counter() - began
         grown = _most_memory() - before
@@ -217,12 +217,12 @@ def _batch(
             failure = "memory", f"it took {grown >> 20} MB"
         pipe.send((taken, took, failure))
         if grown > target.memory:
-            break  # what takes as much again would not show
+            break  # the peak hides later executions that take as much
     pipe.send(None)
 
 
 def execute(target: Target, data: bytes, folder: Path) -> tuple[bool, tuple[str, str] | None]:
-    """Run an input here: whether it was taken, and what failed."""
+    """Run an input in this process; returns whether it was accepted, and the failure if any."""
     try:
         target.run(data, folder)
     except Refused:
@@ -239,11 +239,11 @@ def execute(target: Target, data: bytes, folder: Path) -> tuple[bool, tuple[str,
 
 
 KEPT = "kept"
-"""What a target may leave in its folder from one execution to the next."""
+"""Name that a target may leave in its folder for the next execution."""
 
 
 def _be_quiet() -> None:
-    """Decoders write what they think of an input: nobody reads it."""
+    """Discard what decoders print."""
     nothing = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):
         os.dup2(nothing, stream)

@@ -1,4 +1,4 @@
-"""Changes of real files, as they are damaged and as liars make them: the same `Random`, the same bytes."""
+"""Random changes of real files, accidental and malicious; reproducible for a `Random`."""
 
 import json
 import re
@@ -12,7 +12,7 @@ from typing import Any
 from tests.parts.captures import zip_bytes
 
 EXTREMES = (0, 1, 2, 0x7F, 0x80, 0xFF, 0x7FFF, 0x8000, 0xFFFF, 0x10000, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)
-"""Where counts and lengths run over."""
+"""Values at which counts and lengths overflow."""
 VALUES: tuple[Any, ...] = (
     *(None, True, False, 0, 1, -1, 2, 17, 4096, 16384, 100_000, 2**31, 2**53, 2**63, 2**64, 10**30),
     *(0.5, 1e-9, -0.0, 1e308, 1e-320, float("nan"), float("inf")),
@@ -33,9 +33,9 @@ VALUES: tuple[Any, ...] = (
     ),
     *([], {}, [[]], [0, 1], ["a", "a"], {"gamma": 2.2}, {"": {}}),
 )
-"""What may stand in a JSON document in place of something else."""
+"""Replacements for values of a JSON document."""
 LARGEST = 1 << 18
-"""Bytes, about, of what is repeated."""
+"""Approximate size in bytes of repeated parts."""
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 TIFF_TYPES = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 16, 17, 18, 0, 255)
 TIFF_TAGS = (
@@ -84,19 +84,19 @@ TIFF_TAGS = (
         52525,
     ),
 )
-"""That decide how pixels are found and unpacked."""
+"""Tags that decide how pixels are found and unpacked."""
 
 
 def damaged(random: Random, data: bytes, marks: bytes | None = None, other: bytes = b"") -> bytes:
-    """A file with some bytes changed, more often at its beginning, and perhaps cut, doubled in parts or spliced.
+    """A file with some bytes changed, mostly near its start, perhaps truncated, partly repeated or spliced.
 
     Parameters
     ----------
     marks : bytes, optional
-        A regular expression of what stands before a file's counts and lengths, which are then changed as often as all
+        A regular expression of what precedes counts and lengths, which are then changed as often as all
         the rest.
     other : bytes, optional
-        Another file, whose parts may come in.
+        Another file, parts of which may be spliced in.
     """
     out = bytearray(data)
     places = [match.end() for match in re.finditer(marks, data, re.S)] if marks else []
@@ -146,7 +146,7 @@ FLOATS = (0.0, -0.0, -1.0, 2.0, 1e-45, 1e30, -1e30, float("inf"), float("-inf"),
 
 
 def other_float(random: Random, data: bytes) -> bytes:
-    """Values of 32 bits, one of which is another."""
+    """Values of 32 bits, one of them changed."""
     out = bytearray(data)
     if len(out) >= 4:
         struct.pack_into("<f", out, 4 * random.randrange(len(out) // 4), random.choice(FLOATS))
@@ -154,12 +154,12 @@ def other_float(random: Random, data: bytes) -> bytes:
 
 
 def other_json(random: Random, document: Any) -> bytes:
-    """A JSON text of a document with other values in some places, or with parts left out, moved, nested or repeated."""
+    """JSON of a document with some values replaced, or parts removed, moved, nested or repeated."""
     text = json.dumps(document).encode()
     for _ in range(random.choice((1, 1, 2, 3))):
         if len(text) > LARGEST:
             break
-        document = json.loads(text)  # nothing in it is there twice
+        document = json.loads(text)  # without shared objects
         ways = [*_ways(document)]
         way = random.choice(ways)
         text = json.dumps(_put(document, way, _other_value(random, document, way, ways))).encode()
@@ -169,7 +169,7 @@ def other_json(random: Random, document: Any) -> bytes:
 
 
 def _ways(value: Any, way: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """The ways to everything in a document."""
+    """The paths to everything in a document."""
     yield way
     inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for key, inner in inside:
@@ -221,7 +221,7 @@ ZIP_MARKS = rb"PK(?:\x01\x02|\x03\x04|\x05\x06|\x06\x06|\x06\x07)"
 def damaged_zip(
     random: Random, files: dict[str, bytes], change: Callable[[Random, str, bytes], bytes]
 ) -> bytes:
-    """A ZIP of which either the container is damaged, or an entry was changed before it was packed."""
+    """A ZIP whose container is damaged, or one of whose entries was changed before packing."""
     files = dict(files)
     if random.random() < 0.5:
         name = random.choice([*files])
@@ -232,7 +232,7 @@ def damaged_zip(
 
 
 def damaged_png(random: Random, data: bytes) -> bytes:
-    """A PNG with some chunks changed, left out, doubled or moved, whose checksums are right."""
+    """A PNG with some chunks changed, removed, repeated or moved, and correct checksums."""
     chunks, at = [], len(SIGNATURE)
     while at < len(data):
         (size,) = struct.unpack_from(">I", data, at)
@@ -262,7 +262,7 @@ def damaged_png(random: Random, data: bytes) -> bytes:
 
 
 def damaged_tiff(random: Random, data: bytes) -> bytes:
-    """A TIFF, or a camera's RAW made like one, of which some tags say something else."""
+    """A TIFF, or a camera RAW of that structure, with some tags changed."""
     out = bytearray(data)
     order = "<" if out.startswith(b"II") else ">"
     (first,) = struct.unpack_from(order + "I", out, 4)

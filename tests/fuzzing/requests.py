@@ -1,4 +1,4 @@
-"""Whole requests, as bytes of HTTP/1.1, to a service that has a matte, a video and an upload."""
+"""Whole HTTP/1.1 requests as bytes, to a service with a matte, a video and an upload."""
 
 import asyncio
 from functools import cache
@@ -132,7 +132,7 @@ HEADERS = (
 
 
 def other_text(random: Random, text: str) -> str:
-    """A line of text of which some words, numbers or characters are others."""
+    """A line of text with some words, numbers or characters replaced."""
     for _ in range(random.choice((0, 1, 1, 2, 4))):
         at = random.randrange(len(text) + 1)
         to = at
@@ -151,7 +151,7 @@ def other_text(random: Random, text: str) -> str:
 
 
 def make(random: Random, whole: object) -> bytes:
-    """A request whose framing is right, and of which something else is not."""
+    """A request with correct framing and something else wrong."""
     headers = random.sample(HEADERS, random.randrange(4))
     if random.random() < 0.4:
         line = random.choice(JSON)
@@ -176,7 +176,7 @@ def make(random: Random, whole: object) -> bytes:
 
 
 class Served:
-    """The service, in a folder, as it is for the port: without a cluster, which no request asks for anything."""
+    """The service's application on a folder, without a cluster."""
 
     def __init__(self, folder: Path) -> None:
         settings = Settings(data=folder, webhook_secret="0123456789abcdef", upload_bytes=1 << 20)
@@ -207,7 +207,7 @@ def served(folder: Path) -> Served:
 
 
 def read(data: bytes, folder: Path) -> None:
-    """Answer a request as the port does: whatever is sent, the fault is the sender's, and the answer says so."""
+    """Answer a request as the web server does; every error must be a 4xx problem."""
     service = served(folder / KEPT)
     connection = h11.Connection(h11.SERVER)
     connection.receive_data(data.replace(b"PROGRAM", service.program.encode()))
@@ -216,7 +216,7 @@ def read(data: bytes, folder: Path) -> None:
         request = connection.next_event()
         while not isinstance(event := connection.next_event(), h11.EndOfMessage):
             if event in (h11.NEED_DATA, h11.PAUSED):
-                raise Refused  # a body that never ends is the test's of connections
+                raise Refused  # bodies that never end are tested elsewhere
             body += bytes(event.data)
     except h11.RemoteProtocolError as error:
         raise Refused from error
@@ -250,7 +250,7 @@ def read(data: bytes, folder: Path) -> None:
 
     service.loop.run_until_complete(service.app(scope, receive, send))
     status, headers = sent[0]["status"], dict(sent[0]["headers"])
-    answer = h11.Response(status_code=status, headers=[*headers.items()])  # what can be sent
+    answer = h11.Response(status_code=status, headers=[*headers.items()])  # raises if it cannot be sent
     assert answer.status_code < 500 or answer.status_code == 507, sent
     if status >= 400:
         assert status == 416 or headers[b"content-type"] == b"application/problem+json", sent

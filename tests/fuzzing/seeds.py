@@ -1,4 +1,4 @@
-"""Real files for every parser, as small as they can be, by the libraries that make such."""
+"""Small valid files for every parser, made by common libraries."""
 
 import io
 import json
@@ -49,7 +49,7 @@ FILMED = RECORD | {
 
 
 def record_files(record: dict[str, Any] = RECORD) -> dict[str, bytes]:
-    """The entries of a bundle; its frames are no images, which no parser of bundles looks into."""
+    """The entries of a capture archive. Its frames are no images, which its parser does not look into."""
     names = ("a.png", *(f"{n}.png" for n in range(11)))
     return {"capture.json": json.dumps(record).encode(), **{name: name.encode() * 9 for name in names}}
 
@@ -198,7 +198,7 @@ MAGICS = (
         b"STARTOF",
     ),
 )
-"""What the formats begin with that LibRaw knows beside DNG: files of these can't be made here."""
+"""First bytes of formats other than DNG that LibRaw reads, files of which cannot be made here."""
 
 
 @cache
@@ -221,7 +221,7 @@ def backdrops() -> tuple[bytes, ...]:
 
 
 def profile() -> bytes:
-    """A colour profile of many kinds of tags."""
+    """A colour profile with many kinds of tags."""
     return _dated(imagecodecs.cms_profile("srgb"))
 
 
@@ -246,7 +246,7 @@ def _clip(container: str, codec: str, form: str, **options: str) -> bytes:
     return target.getvalue()
 
 
-# No AV1: its one encoder here, SVT-AV1, makes a process of root's a real-time one, which keeps all others waiting.
+# No AV1: as root its encoder SVT-AV1 gives its process real-time priority, which starves all others.
 CLIPS: tuple[tuple[Any, ...], ...] = (
     ("mp4", "libx264", "yuv420p", {"preset": "veryfast", "g": "4", "bf": "2"}),
     ("mp4", "libx264", "yuv422p10le", {"preset": "veryfast"}),
@@ -265,7 +265,7 @@ CLIPS: tuple[tuple[Any, ...], ...] = (
 
 @cache
 def clips() -> tuple[bytes, ...]:
-    """A clip of every container and codec that there is an encoder for."""
+    """A clip in every container and codec that has an encoder."""
     return tuple(
         _clip(container, codec, form, **options)
         for container, codec, form, options in CLIPS

@@ -1,4 +1,4 @@
-"""Every parser of what strangers send, as a table: what it is given, and what must hold of what it makes of it."""
+"""Every parser of untrusted input: how its input is made, and what must hold for its result."""
 
 import asyncio
 import io
@@ -56,11 +56,11 @@ from workflows.untrusted.limits import Limits
 
 LIMITS = Limits(unpacked=1 << 22, memory=1 << 22, frames=20_000, pixels=1 << 20)
 Files = tuple[bytes, ...]
-"""That are whole."""
+"""Valid files."""
 
 
 def refusing(read: Callable[[bytes, Path], object], data: bytes, folder: Path) -> None:
-    """Read, and take a refusal for one if it can be told as a problem."""
+    """Run a parser; an error that the API can report as a problem counts as a refusal."""
     try:
         read(data, folder)
     except InvalidInput as error:
@@ -71,7 +71,7 @@ def refusing(read: Callable[[bytes, Path], object], data: bytes, folder: Path) -
 def of_files(
     marks: bytes | None = None, *others: Callable[[Random, bytes], bytes]
 ) -> Callable[[Random, Files], bytes]:
-    """Makes damaged files of some that are whole; by `others` where there are such, half of the time."""
+    """Makes damaged files out of valid ones, half of the time by one of `others` if given."""
     return partial(_of_files, marks, others)
 
 
@@ -121,7 +121,7 @@ def read_bundle(data: bytes, folder: Path) -> None:
 
 
 def use_program(program: Program) -> None:
-    """What the service does with one before a job has it."""
+    """What the API does with an archive before a job reads it."""
     assert program.count > len(program.constants[0]) > 1
     program.bands()
     assert Program.model_validate(program.model_dump(mode="json")) == program
@@ -162,7 +162,7 @@ def make_archive(random: Random, whole: dict[str, bytes]) -> bytes:
     name = random.choice([*files])
     if name.endswith(".json"):
         files[name] = changes.other_json(random, json.loads(files[name]))
-        if random.random() < 0.8:  # with the checksum of what it now says, if it still has one
+        if random.random() < 0.8:  # with a correct checksum, if it still has one
             with suppress(ValueError, TypeError, AttributeError, RecursionError):
                 files[name] = seal(files[name])
     elif kind == 1:
@@ -261,7 +261,7 @@ MARKS = b"|".join((BOXES, CHUNKS, ELEMENTS))
 
 
 def damaged_film(random: Random, data: bytes) -> bytes:
-    """A film that is damaged, or an MP4 whose index says that it has many more samples."""
+    """A damaged film, or an MP4 whose index claims many more samples."""
     if b"stsz" in data and random.random() < 0.1:
         return overstated(data, int(2 ** random.uniform(4, 32)))
     return changes.damaged(random, data, MARKS)
@@ -306,7 +306,7 @@ PROGRAM = nested_program((64, 48), bands=((4, 3, 10),), levels=3)
 
 
 def capture_files() -> dict[str, Files]:
-    """Frames by the end of their names, and a film of `PROGRAM`."""
+    """Frames by file extension, and a film of `PROGRAM`."""
     camera = Camera(fps=20, hold=0.25, jitter=0.02, lead=0.5, tail=0.5)
     made = film(lights(glass_ball(32, 24, monitor=(64, 48), rays=4), PROGRAM), camera)
     stills = {
@@ -320,7 +320,7 @@ def capture_files() -> dict[str, Files]:
 
 
 def make_capture(random: Random, whole: dict[str, Files]) -> bytes:
-    """A capture of everything that may be in one, of which something is changed."""
+    """A capture archive with everything that one may contain, changed somewhere."""
     end = random.choice([*whole, *[".mp4"] * 4])
     one = random.choice(whole[end])
     if end == ".mp4":

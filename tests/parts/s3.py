@@ -1,6 +1,4 @@
-"""An S3 server in a process of its own, moto's, with a bucket: not a store that a service could rely on, but one that
-speaks the protocol.
-"""
+"""moto's S3 server in its own process, with a bucket. It speaks the protocol but is no store to rely on."""
 
 import subprocess
 import sys
@@ -33,14 +31,14 @@ def s3_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 @pytest.fixture
 def s3(s3_server: str, monkeypatch: pytest.MonkeyPatch) -> str:
-    """The URL of an empty store; processes that are started find it too."""
+    """The URL of an empty store, which started processes find too."""
     for name, value in {"AWS_ENDPOINT_URL": s3_server, **KEYS}.items():
         monkeypatch.setenv(name, value)
     return f"s3://{BUCKET}/{uuid.uuid4().hex}"
 
 
 def _with_bucket(server: "subprocess.Popen[bytes]", log: Path) -> str:
-    """Wait until the server says where it listens, and make the bucket."""
+    """Wait until the server prints its address, and make the bucket."""
     end = time.monotonic() + 120
     while True:
         said = [word for word in log.read_text().split() if word.startswith("http://127.0.0.1:")]

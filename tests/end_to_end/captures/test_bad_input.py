@@ -1,4 +1,4 @@
-"""Bad input over HTTP: a clear problem each, nothing left behind, and the service lives on."""
+"""Bad input over HTTP gets a clear problem, leaves nothing behind, and the service keeps running."""
 
 import io
 import json
@@ -21,7 +21,7 @@ ZIP = {"Content-Type": "application/zip"}
 
 
 def remade(bundle: Path | BinaryIO, change: Callable[[dict, dict[str, bytes]], None]) -> bytes:
-    """A bundle with its capture.json and its files changed."""
+    """A capture archive with its capture.json and its files changed."""
     with zipfile.ZipFile(bundle) as archive:
         files = {name: archive.read(name) for name in archive.namelist()}
     manifest = json.loads(files["capture.json"])
@@ -193,7 +193,7 @@ def test_frame_refused_by_the_ingest(service: Service, bundle: Path, change) -> 
     assert job["state"] == "failed"
     assert entry in job["problem"]["detail"]
     check_problem(service.http.post("/v1/jobs", json={"capture": made["id"]}), 409, "conflict")
-    while service.stored() != before:  # the failure is written down first, and what there was is deleted then
+    while service.stored() != before:  # the failure is recorded before the data is deleted
         time.sleep(0.05)
 
 
@@ -251,12 +251,12 @@ def test_unsupported_accept_is_refused(service: Service, matte: str) -> None:
 def test_unknown_ids_are_not_found(service: Service) -> None:
     called = 0
     for path, calls in service.http.get("/openapi.json").json()["paths"].items():
-        if "{id}" not in path or path.endswith("/play"):  # a page that is the same for all
+        if "{id}" not in path or path.endswith("/play"):  # the same page for every id
             continue
         for method in calls:
             url = path.replace("{id}", "no-such-id").replace("{n}", "0")
             answer = service.http.request(method, f"{url}?x=0&y=0", headers={"Tus-Resumable": "1.0.0"})
-            if method == "head":  # which has no body
+            if method == "head":  # answers to HEAD have no body
                 assert answer.status_code == 404
             else:
                 check_problem(answer, 404, "not-found")

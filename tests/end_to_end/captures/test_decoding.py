@@ -1,4 +1,4 @@
-"""Decoders are lost with what they decode, and with the service: nothing else suffers from it."""
+"""Decoders that hang, die or take too much memory affect only the request or job they work for."""
 
 import json
 import re
@@ -29,7 +29,7 @@ from workflows.programs.program import Program
 
 @contextmanager
 def held(service: Service, matte: str) -> Iterator[tuple[psutil.Process, "Future[httpx2.Response]"]]:
-    """A decoder that is stopped in the middle of a request, and that request; the next is decoded by another one."""
+    """Stop a decoder in the middle of a request; yields both. The next request gets another decoder."""
     for one in decoders(service.process):
         one.kill()
     wait(lambda: not decoders(service.process))
@@ -87,7 +87,7 @@ def test_decoders_end_with_the_service(tmp_path: Path, end: str, environment: di
 
 
 def taken_at_most(one: psutil.Process) -> int:
-    """Bytes that a process has had in memory at once."""
+    """Peak of a process's resident memory, in bytes."""
     found = re.search(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{one.pid}/status").read_text())
     assert found is not None
     return int(found[1]) << 10
@@ -98,7 +98,7 @@ def taken_at_most(one: psutil.Process) -> int:
 def test_film_that_needs_too_much_memory_fails_only_its_job(
     bundle: Path, program: Program, tmp_path: Path
 ) -> None:
-    data = overstated(clip(pictures(9), even(9)), 40_000_000)  # FFmpeg makes an index of 2.8 GB of it
+    data = overstated(clip(pictures(9), even(9)), 40_000_000)  # FFmpeg would build an index of 2.8 GB
     record, files = filmed(program, data, 2.0)
     bomb = tmp_path / "bomb.zip"
     bomb.write_bytes(zipped(json.dumps(record).encode(), files))
@@ -113,7 +113,7 @@ def test_film_that_needs_too_much_memory_fails_only_its_job(
         with pytest.raises(ServiceError, match="an index that takes too much memory") as caught:
             service.client.wait(uploaded["job"])
         assert caught.value.problem["entry"] == "clip.mp4"
-        # Another takes it bit by bit, and FFmpeg's own error of that is not one that every process can read.
+        # This one allocates in small steps, and not every process can unpickle FFmpeg's own error.
         slowly = zipped(json.dumps(record).encode(), {"clip.mp4": fragmented(4_000_000)})
         job = service.http.post("/v1/captures", content=slowly, headers=ZIP).json()["job"]
         with pytest.raises(ServiceError, match=r"^decoding clip\.mp4 takes more than the 384 MB"):

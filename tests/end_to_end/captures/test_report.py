@@ -1,4 +1,4 @@
-"""A capture's report and contact sheet, as the service gives them."""
+"""A capture's report and contact sheet over HTTP."""
 
 import io
 from pathlib import Path

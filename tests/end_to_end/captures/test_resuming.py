@@ -1,4 +1,4 @@
-"""Uploads that go on where they stood: over lines that break, over kills, and with other people's clients."""
+"""Uploads resume after broken connections and kills, also with other tus clients."""
 
 import base64
 import hashlib
@@ -31,7 +31,7 @@ SIZES = [50 * MB, pytest.param(1000 * MB, marks=[pytest.mark.exhaustive, pytest.
 
 
 def large(bundle: Path, path: Path, size: int) -> Path:
-    """A capture of a size: the scene's, and noise that no capture needs."""
+    """The scene's capture archive, enlarged to a size by an entry of noise."""
     shutil.copy(bundle, path)
     rng = np.random.default_rng(size)
     with zipfile.ZipFile(path, "a") as archive, archive.open("film.raw", "w", force_zip64=True) as entry:
@@ -41,14 +41,14 @@ def large(bundle: Path, path: Path, size: int) -> Path:
 
 
 def digest_of(service: Service, upload: str) -> str:
-    """The hash of what the store has of an upload."""
+    """SHA-256 of the bytes that the store has of an upload."""
     objects = Objects((service.data / "store").as_uri())
     engine = open_engine(f"sqlite:///{service.data / 'envmatte.db'}")
     with engine.connect() as c:
         parts = uploads.parts_of(c, upload)
     engine.dispose()
     digest = hashlib.sha256()
-    if parts:  # else it is a capture's, with an index
+    if parts:  # otherwise it belongs to a capture and has an index
         for part in parts:
             digest.update((service.data / "store" / stored_uploads.part_path(upload, part.name)).read_bytes())
     else:
@@ -103,12 +103,12 @@ def test_bytes_sent_before_each_broken_connection_are_kept(
                 source.seek(offset)
                 headers = CHUNK | {"Upload-Offset": str(offset), "Content-Length": str(size - offset)}
                 answer = http.patch(where, headers=headers, content=iter(lambda: source.read(MB), b""))
-                assert answer.status_code in (204, 409)  # what came before may be written down only now
+                assert answer.status_code in (204, 409)  # earlier bytes may be recorded only now
                 offset = int(answer.headers.get("upload-offset", offset))
             except httpx2.TransportError:
                 continue
         assert line.made == 100
-        # Each sent all that was left: had what came before a cut been dropped, the last would have begun at 0.
+        # Each PATCH sent all that was left: if bytes before a cut were dropped, the last would have begun at 0.
         assert begun > size // 4
     upload = where.rsplit("/", 1)[1]
     assert digest_of(service, upload) == sha256(file)
@@ -134,7 +134,7 @@ def test_upload_resumes_after_the_server_is_killed(bundle: Path, tmp_path: Path)
             sender = threading.Thread(target=lambda: made.append(client.upload(file, progress=progress)))
             sender.start()
             assert half.wait(60)
-            # One that no client goes on with, killed in the middle of its first part.
+            # An upload that no client continues, killed in the middle of its first part.
             other = create(first, 1000 * MB)
             busy = begin(first, other, 0, 1000 * MB, bytes(20 * MB))
             while not any("#" in name for name in uploads_of(first) if other.rsplit("/", 1)[1] in name):
@@ -188,7 +188,7 @@ def test_file_that_shrinks_during_the_upload_is_reported(
         service.client.upload(file, progress=shrink)
 
 
-# In a process of its own, for it leaves sockets and files to the garbage collector.
+# In its own process, because it leaves sockets and files to the garbage collector.
 TUSPY = """
 import json, sys
 from tusclient.client import TusClient
@@ -215,7 +215,7 @@ def test_tuspy_uploads(service: Service, bundle: Path, checksum: bool) -> None:
 
 
 def check_sent(service: Service, url: str, file: Path) -> None:
-    """See that an upload is a file, and becomes a capture."""
+    """Check that an upload equals a file and becomes a capture."""
     upload = url.rsplit("/", 1)[1]
     assert digest_of(service, upload) == sha256(file)
     metadata = service.http.head(f"/v1/uploads/{upload}", headers=TUS).headers["upload-metadata"]

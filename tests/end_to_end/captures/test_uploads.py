@@ -1,4 +1,4 @@
-"""Resumable uploads by the letter of tus 1.0: every header, and every refusal."""
+"""Resumable uploads follow tus 1.0: every header and every refusal."""
 
 import base64
 import hashlib
@@ -45,7 +45,7 @@ def offset_of(service: Service, where: str) -> int:
 
 
 def begin(service: Service, where: str, offset: int, length: int, data: bytes) -> HTTPConnection:
-    """Start a PATCH, and send only some of its body."""
+    """Start a PATCH and send only part of its body."""
     host = urlsplit(service.url)
     assert host.hostname is not None
     connection = HTTPConnection(host.hostname, host.port, timeout=120)
@@ -62,7 +62,7 @@ def uploads_of(service: Service) -> set[str]:
 
 
 def gone(service: Service, upload: str) -> None:
-    """Wait until an upload has left nothing: an archive goes once its capture is ready."""
+    """Wait until nothing of an upload is stored: an archive is deleted once its capture is ready."""
     deadline = time.monotonic() + 120
     while any(upload in name for name in uploads_of(service)):
         assert time.monotonic() < deadline
@@ -222,7 +222,7 @@ def test_upload_limit_is_checked_before_the_first_byte(tmp_path: Path, bundle: P
             raw.putrequest("POST", "/v1/uploads")
             for name, value in (CHUNK | {"Upload-Length": length, "Content-Length": length}).items():
                 raw.putheader(name, str(value))
-            raw.endheaders()  # and not a byte of the body
+            raw.endheaders()  # and no byte of the body
             answer = raw.getresponse()
             problem = httpx2.Response(answer.status, headers=dict(answer.headers), content=answer.read())
             assert check_problem(problem, status, slug).keys() & {"limit", "missing"}
@@ -243,7 +243,7 @@ def test_full_disk_is_reported_and_loses_nothing(tmp_path: Path) -> None:
     ):
         where = create(service, 20 << 20)
         assert patch(service, where, 0, bytes(4 << 20)).status_code == 204
-        # Another takes the room that was promised.
+        # Another process takes the promised room.
         filler = disk / "filler"
         filler.write_bytes(bytes(os.statvfs(disk).f_bavail * os.statvfs(disk).f_bsize - (6 << 20)))
         before = uploads_of(service)
@@ -264,7 +264,7 @@ def test_bytes_before_a_broken_connection_are_kept(service: Service) -> None:
     while not (offset := offset_of(service, where)):
         assert time.monotonic() < deadline
         time.sleep(0.01)
-    assert (3 << 20) - (1 << 18) <= offset <= 3 << 20  # the web server drops what it has not handed on
+    assert (3 << 20) - (1 << 18) <= offset <= 3 << 20  # the web server drops bytes it has not passed on
     begin(service, where, offset, 1 << 20, b"").close()
     rest = b"b" * ((4 << 20) - offset)
     assert patch(service, where, offset, rest).headers["upload-offset"] == str(4 << 20)
@@ -360,7 +360,7 @@ def test_two_clients_with_the_same_key_share_an_upload(
     file.write_bytes(bundle.read_bytes())
     with ThreadPoolExecutor() as pool:
         made = [*pool.map(lambda _: service.client.upload(file), range(2))]
-    # One or two captures: the slower may come when all is over. Afterwards the file makes a new one.
+    # One or two captures: the slower client may finish after the first capture exists.
     for capture in made:
         assert service.client.wait(capture["job"])["state"] == "succeeded"
         gone(service, capture["id"])
@@ -391,7 +391,7 @@ def test_deleted_upload_is_gone(service: Service) -> None:
     assert service.http.head(where, headers=TUS).status_code == 404
     check_problem(patch(service, where, 100, b"x"), 404, "not-found")
     check_problem(service.http.delete(where, headers=TUS), 404, "not-found")
-    assert uploads_of(service) <= before  # of which some may have been ingested meanwhile
+    assert uploads_of(service) <= before  # some may have been ingested meanwhile
 
 
 @pytest.mark.slow
@@ -399,7 +399,7 @@ def test_abandoned_upload_expires(tmp_path: Path) -> None:
     with serving(tmp_path / "data", "--workers", "1", ENVMATTE_UPLOAD_SECONDS="2") as service:
         unfinished, finished = create(service, 10), create(service, 3)
         patch(service, finished, 0, b"123")
-        for offset in range(6):  # each piece prolongs it
+        for offset in range(6):  # each piece extends its lifetime
             assert patch(service, unfinished, offset, b"x").status_code == 204
             time.sleep(0.5)
         assert service.http.head(finished, headers=TUS).status_code == 404

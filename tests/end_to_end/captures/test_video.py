@@ -1,4 +1,4 @@
-"""A video goes in over HTTP, a composite comes out."""
+"""From a video to a composite over HTTP."""
 
 import io
 import json
@@ -20,7 +20,7 @@ CAMERA = Camera(hold=0.25, hand=(6.0, 6.8), options={"crf": "12"})
 
 @pytest.fixture(scope="module")
 def uploaded(service: Service, scene: Scene, program: Program) -> dict:
-    """A recording of the scene, a hand in front of it for a while, as it was ingested."""
+    """An ingested recording of the scene, with a hand in front of it for a while."""
     made = film(lights(scene, program), CAMERA)
     record, files = capture(program, made.data, 1 / CAMERA.hold)
     target = io.BytesIO()
@@ -71,6 +71,6 @@ def test_recording_of_another_program_is_refused(service: Service, scene: Scene,
     while (job := service.http.get(f"/v1/jobs/{made['job']}").json())["state"] in ("queued", "running"):
         time.sleep(0.05)
     assert (job["state"], job["problem"]["entry"]) == ("failed", "clip.mp4")
-    # the failure is written down first, and what there was is deleted then
+    # the failure is recorded before the data is deleted
     while any(made["id"] in name for name in service.stored() - before):
         time.sleep(0.05)

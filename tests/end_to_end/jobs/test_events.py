@@ -10,7 +10,7 @@ from tests.end_to_end.conftest import Service
 
 
 def events(answer: httpx2.Response) -> Iterator[tuple[str, dict]]:
-    """Ids and data, as they come."""
+    """Ids and data of the events as they arrive."""
     id, data = "", ""
     for line in answer.iter_lines():
         name, _, value = line.partition(": ")
@@ -41,7 +41,7 @@ def test_events_follow_a_job_to_its_end(service: Service, capture: str) -> None:
     assert found[-1][1] | {"run_seconds": 0} == service.client.job(job).answer | {"run_seconds": 0}
     ids = [id for id, _ in found]
     assert len(set(ids)) == len(ids)
-    # Who comes back gets what is new: the end, or nothing, and then asks no more.
+    # A client that reconnects gets what is new: the end, or nothing and a signal to stop.
     assert followed(service, job, ids[0])[-1] == found[-1]
     assert service.http.get(f"/v1/jobs/{job}/events", headers={"Last-Event-ID": ids[-1]}).status_code == 204
 

@@ -1,4 +1,4 @@
-"""Captures and mattes that expire: in a real service, with what they take of the disk."""
+"""Expiry of captures and mattes in a real service, measured on disk."""
 
 import os
 import time
@@ -12,7 +12,7 @@ from tests.end_to_end.conftest import Service, paused, serving
 
 
 def disk(service: Service) -> int:
-    """Bytes in the store, which may be deleted from meanwhile: `os.walk` passes over a folder that is gone."""
+    """Bytes in the store. Files may be deleted meanwhile; `os.walk` skips folders that are gone."""
     used = 0
     for folder, _, names in os.walk(service.data / "store"):
         for name in names:
@@ -23,7 +23,7 @@ def disk(service: Service) -> int:
 
 @pytest.mark.slow
 def test_expired_data_is_deleted_unless_a_job_needs_it(bundle: Path, tmp_path: Path) -> None:
-    """Both expire while they are made, long before the recovery begins, and it succeeds all the same."""
+    """Both expire long before the recovery begins, and it still succeeds."""
     with serving(
         tmp_path / "data", "--workers", "1", ENVMATTE_CAPTURE_SECONDS="1", ENVMATTE_MATTE_SECONDS="1"
     ) as service:
@@ -31,7 +31,7 @@ def test_expired_data_is_deleted_unless_a_job_needs_it(bundle: Path, tmp_path: P
         with paused(service):
             capture = service.client.upload(bundle)
             job = service.client.recover(capture["id"])
-            time.sleep(4)  # more than a second, and the two between looks of the coordinator
+            time.sleep(4)  # the second of its lifetime, and the two between checks of the coordinator
             found = service.client.capture(capture["id"])
             assert found["expires_at"] > found["created_at"]
             assert disk(service) - before >= bundle.stat().st_size
@@ -52,7 +52,7 @@ def test_expired_data_is_deleted_unless_a_job_needs_it(bundle: Path, tmp_path: P
             "owner_bytes": 0,
             "store_bytes": 0,
         }
-        assert service.client.job(job["id"])["state"] == "succeeded"  # what is known of it stays
+        assert service.client.job(job["id"])["state"] == "succeeded"  # its record stays
 
 
 @pytest.mark.exhaustive
@@ -63,10 +63,10 @@ def test_deleted_data_leaves_the_disk(bundle: Path, tmp_path: Path) -> None:
         service.client.wait(capture["job"])
         matte = service.client.wait(service.client.recover(capture["id"])["id"])["matte"]
         deadline = time.monotonic() + 60
-        while True:  # until all of it is counted, which comes after the job's end
+        while True:  # until everything is counted, which happens after the job's end
             limits = service.http.get("/v1/limits").json()["limits"]
             used = {one["name"]: one["used"] for one in limits}
-            # Besides, there are the folders' own zarr.json.
+            # The rest are the zarr.json of folders.
             if used["owner_bytes"] and disk(service) - before - used["owner_bytes"] in range(2000):
                 break
             assert time.monotonic() < deadline, (used, disk(service) - before)

@@ -1,4 +1,4 @@
-"""What a service survives: kills, cancels, a second service; and that the bytes stay the same."""
+"""A service survives kills, cancelled jobs and a second service, and its mattes stay the same to the byte."""
 
 import os
 import signal
@@ -22,7 +22,7 @@ def files_of(service: Service, matte: str) -> dict[str, str]:
 
 
 def gone(service: Service, matte: str) -> None:
-    """Wait until a matte has left nothing."""
+    """Wait until nothing of a matte is left."""
     deadline = time.monotonic() + 120
     while service.http.get(f"/v1/mattes/{matte}").status_code != 404 or any(
         matte in n for n in service.stored()
@@ -179,7 +179,7 @@ def test_damaged_matte_is_reported(service: Service, capture: str) -> None:
         data = (folder / name).read_bytes()
         (folder / name).unlink()
         white = png(np.ones((2, 2, 3), np.float32), "srgb", np.uint8)
-        block = {"x": at, "y": at, "width": 16, "height": 16}  # others would be kept in memory
+        block = {"x": at, "y": at, "width": 16, "height": 16}  # other blocks are cached in memory
         answer = service.http.post(f"/v1/mattes/{job['matte']}/composite", params=block, content=white)
         assert (answer.status_code, answer.json()["type"]) == (500, "urn:envmatte:problem:corrupt")
         (folder / name).write_bytes(data)

@@ -58,7 +58,7 @@ def test_failed_delivery_is_repeated_after_a_kill_and_signed(bundle: Path, tmp_p
             while len(lines(second, capture.job)) < 2:
                 time.sleep(0.05)
             assert lines(second, capture.job)[1] == "webhook, attempt 2: answered with 200"
-            # A cancelled job is told too, and one whose row is gone before it is.
+            # Cancelled jobs are delivered too, even if their row is deleted before.
             job = second.client.recover(capture, webhook=found.url)
             second.client.cancel(job)
             second.client.delete(job)

@@ -1,4 +1,4 @@
-"""A matte that leaves one service and comes to another."""
+"""Mattes are exported from one service and imported by another."""
 
 import io
 import json
@@ -25,7 +25,7 @@ from workflows.simulation import glass_ball
 
 @pytest.fixture(scope="module")
 def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    """Another service, which knows nothing of the first."""
+    """Another service with its own data."""
     with serving(tmp_path_factory.mktemp("elsewhere") / "data", "--workers", "1") as running:
         yield running
 
@@ -132,7 +132,7 @@ def test_archive_over_the_limit_is_refused(archive: Path, tmp_path: Path) -> Non
         def pieces() -> Iterator[bytes]:
             yield archive.read_bytes()
 
-        for body in (archive.read_bytes(), pieces()):  # with its length, and without
+        for body in (archive.read_bytes(), pieces()):  # with and without Content-Length
             answer = small.http.post("/v1/mattes", content=body, headers=ZIP)
             assert check_problem(answer, 413, "too-large")["limit"] == size - 1
         with pytest.raises(ServiceError, match=str(size - 1)):
@@ -146,7 +146,7 @@ def test_archive_over_the_limit_is_refused(archive: Path, tmp_path: Path) -> Non
 
 @pytest.fixture(scope="module")
 def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An archive of 22 MB, more than a connection holds."""
+    """A matte whose archive has 22 MB, more than fits into the buffers of a connection."""
     folder = tmp_path_factory.mktemp("large")
     objects = Objects((folder / "store").as_uri())
     given = {"monitor": [8, 6], "crosstalk": np.eye(3).tolist(), "options": {}}
@@ -182,7 +182,7 @@ def test_killed_service_keeps_only_complete_imports(archive: Path, tmp_path: Pat
     with serving(tmp_path / "data", "--workers", "1") as first:
         whole = first.client.import_matte(archive)["id"]
         kept = first.stored()
-        half = first.data / "store/mattes/half/S/c/0/0/0"  # what an import that was killed has written
+        half = first.data / "store/mattes/half/S/c/0/0/0"  # written by an import that was killed
         half.parent.mkdir(parents=True)
         half.write_bytes(b"x")
         (first.data / "store/uploads/half").mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""A clip goes in over HTTP, a video of the glass before it comes out."""
+"""From a clip to a video of the glass in front of it, over HTTP."""
 
 import json
 import time
@@ -71,7 +71,7 @@ def test_clip_becomes_a_video_with_its_timestamps(service: Service, matte: str) 
     assert service.http.get(url, headers={"Range": "lines=1-2"}).content == whole
 
     only = f"composites/{job['id']}/video.mp4"
-    until(lambda: stored(service) - before == {only})  # what it was made of goes
+    until(lambda: stored(service) - before == {only})  # the job's inputs are deleted
     assert service.http.delete(f"/v1/jobs/{job['id']}").status_code == 204
     assert stored(service) == before
 
@@ -147,7 +147,7 @@ def test_invalid_clip_is_refused_before_its_body(service: Service, matte: str) -
         connection.putrequest("POST", f"/v1/mattes/{matte}/composite")
         for name, value in (VIDEO | {"Content-Length": str(9 << 30)}).items():
             connection.putheader(name, value)
-        connection.endheaders()  # and not a byte more
+        connection.endheaders()  # and no byte of the body
         refused = connection.getresponse()
         assert (refused.status, json.load(refused)["limit"]) == (413, 8 << 30)
     answer = service.http.post("/v1/mattes/none/composite", headers=VIDEO, content=b"any")

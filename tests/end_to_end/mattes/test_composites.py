@@ -1,4 +1,4 @@
-"""Composites over HTTP: what is asked for, and what is answered."""
+"""Composites over HTTP."""
 
 import io
 import threading
@@ -239,7 +239,7 @@ def test_decompression_bomb_is_refused(service: Service, matte: str) -> None:
     "requests", [600, pytest.param(10_000, marks=[pytest.mark.exhaustive, pytest.mark.timeout(3600)])]
 )
 def test_requests_leak_nothing(service: Service, matte: str, requests: int) -> None:
-    """Neither in the API's process nor in those that decode backdrops for it."""
+    """Neither in the API's process nor in its decoders."""
     askers = 4
 
     def ask(count: int) -> None:
@@ -247,19 +247,19 @@ def test_requests_leak_nothing(service: Service, matte: str, requests: int) -> N
             list(threads.map(lambda _: asked(service, matte, accept="image/jpeg", size=24), range(count)))
 
     def held() -> dict[int, np.ndarray]:
-        """Bytes, files and threads of each process."""
+        """Memory in bytes, open files and threads of each process."""
         every = [psutil.Process(service.process.pid), *decoders(service.process)]
         return {
             one.pid: np.array([one.memory_full_info().uss, one.num_fds(), one.num_threads()]) for one in every
         }
 
-    ask(requests // 3)  # until every thread has what it keeps
+    ask(requests // 3)  # until every thread has filled its caches
     before = held()
     ask(requests)
     after = held()
     assert set(before) <= set(after), "a decoder is gone"
     assert 1 < len(after) <= 1 + askers
-    same = {pid: after[pid] for pid in before}  # and one more may have been started
+    same = {pid: after[pid] for pid in before}  # another decoder may have been started
     for when, found in (("before", before), ("after", same)):
         memory, files, threads = sum(found.values())
         print(

@@ -1,4 +1,4 @@
-"""Layers and single pixels of a matte, as a compositor gets them."""
+"""Layers and single pixels of a matte over HTTP."""
 
 import io
 import json
@@ -41,7 +41,7 @@ def test_all_layers_in_one_exr_with_the_requested_lobes(service: Service, matte:
             weights = [name for name in channels if name.endswith(".weight.R")]
             assert weights == [f"lobe{k}.weight.R" for k in range(lobes)]
             held = sum(channels[name].pixels.astype(float) for name in weights)
-            lit = channels["rho.R"].pixels > 0.1  # of what is darker, at the ball's edge, nothing may be told
+            lit = channels["rho.R"].pixels > 0.1  # darker pixels, at the ball's edge, have no direction
             assert lit.mean() > 0.98
             np.testing.assert_allclose(held[lit], channels["A"].pixels[lit], atol=2e-3)
 

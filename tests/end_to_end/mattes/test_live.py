@@ -1,4 +1,4 @@
-"""A matte for graphics hardware, as a browser gets it."""
+"""The data from which a browser draws a matte live."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""A backup is taken of a service that runs, and another one goes on with its jobs, on other kinds of stores."""
+"""A backup of a running service is restored into other kinds of stores, and its jobs continue there."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Who connects and is slow, or means no good, keeps nobody else out."""
+"""Slow or malicious connections do not keep other clients out."""
 
 import contextlib
 import resource
@@ -27,7 +27,7 @@ def connected(service: Service, count: int = 1) -> Iterator[list[socket.socket]]
 
 
 def answer(connection: socket.socket) -> bytes:
-    """All that comes until the other side closes."""
+    """Everything received until the other side closes."""
     came = b""
     with contextlib.suppress(ConnectionResetError):
         while part := connection.recv(1 << 16):
@@ -38,12 +38,12 @@ def answer(connection: socket.socket) -> bytes:
 @pytest.mark.slow
 def test_thousands_of_idle_connections_are_served_around_and_closed(service: Service) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    count = min(10_000, hard - 1000)  # of this process, and as many of the service's own
+    count = min(10_000, hard - 1000)  # as many in this process as in the service's
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     process = psutil.Process(service.process.pid)
     before, most = process.num_fds(), 0
     try:
-        for _ in range(5):  # a busy machine may take longer to open them all than the first ones are kept
+        for _ in range(5):  # a busy machine may still be opening them when the first are closed
             with connected(service, count) as idle:
                 times = []
                 for _ in range(100):
@@ -99,7 +99,7 @@ def test_malformed_request_is_refused_and_disconnected(service: Service, sent: b
 
 
 def test_half_closed_connection_is_closed(service: Service) -> None:
-    """A client that closes looks the same until it is written to, and computing for nobody would cost more."""
+    """It looks like a closed one until it is written to, and computing for nobody would cost more."""
     for sent in (b"GET /v1/jobs HTTP/1.1\r\nHost: localhost\r\n\r\n", b"GET /healthz HT"):
         with connected(service) as (half,):
             half.sendall(sent)

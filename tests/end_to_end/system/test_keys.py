@@ -1,4 +1,4 @@
-"""Every route with every kind of key, and what keys can't do: a real service, and keys from the command line."""
+"""Every route of a real service with every kind of key."""
 
 import json
 import os
@@ -27,11 +27,11 @@ HEADERS = {
     "referrer-policy",
     "x-content-type-options",
 }
-"""That every answer has, whatever it answers."""
+"""Headers that every response has."""
 TUS = {"Tus-Resumable": "1.0.0"}
 ZIP = {"Content-Type": "application/zip"}
 SCOPES = {"read": "read", "write": "write", "admin": "admin", "other": "write", "other's admin": "admin"}
-"""Of the keys that are good; those of others are bob's, the rest alice's."""
+"""Scopes of the valid keys. The other's keys belong to bob, the rest to alice."""
 CONFIGURED = ("first-key", "second-key")
 """Keys from the service's settings."""
 KINDS = ("none", "wrong", "revoked", *SCOPES)
@@ -39,18 +39,18 @@ KINDS = ("none", "wrong", "revoked", *SCOPES)
 
 @dataclass(frozen=True)
 class Call:
-    """How a route is called: with what id of alice's, and what else."""
+    """How a route is called, and with which of alice's ids."""
 
     id: str | None = None
     headers: dict[str, str] | None = None
     json: dict[str, Any] | None = None
     content: bytes | None = None
     needs: str = "read"
-    """The scope it takes; nothing, if anyone may."""
+    """The scope it needs; empty if it needs no key."""
     named: bool = False
-    """Whether it names something of alice's elsewhere than in the path."""
+    """Whether it names something of alice's outside of the path."""
     last: int = 0
-    """It destroys something: allowed calls of it come after the others, in this order."""
+    """Not 0 if it deletes something: permitted calls come after all others, in this order."""
 
 
 CALLS = {
@@ -118,7 +118,7 @@ CALLS = {
 
 @dataclass
 class Locked:
-    """A service with keys, and what alice has there."""
+    """A service with keys, and alice's data there."""
 
     service: Service
     keys: dict[str, str]
@@ -139,7 +139,7 @@ class Locked:
             content=call.content,
             json=json.loads(body) if call.json else None,
         ) as answer:
-            if not (answer.is_success and path.endswith("/events")):  # some of which never end
+            if not (answer.is_success and path.endswith("/events")):  # streams that may never end
                 answer.read()
             return answer
 
@@ -179,7 +179,7 @@ def locked(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[L
 
 
 def expected(route: str, kind: str) -> int | None:
-    """The status of a refusal; None where there is none."""
+    """The status of a refusal, or None."""
     call = CALLS[route]
     if not call.needs:
         return None
@@ -215,7 +215,7 @@ def test_every_route_with_every_kind_of_key(locked: Locked) -> None:
     allowed = [(route, kind) for route in ordered for kind in KINDS if expected(route, kind) is None]
     for route, kind in refused + allowed:
         if CALLS[route].last and kind == "admin":
-            continue  # alice's other key has destroyed it
+            continue  # alice's other key has deleted it
         answer = locked.call(route, locked.keys.get(kind))
         status = expected(route, kind)
         good = answer.status_code == status if status else answer.status_code not in (401, 403, 404)

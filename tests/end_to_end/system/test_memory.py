@@ -1,4 +1,4 @@
-"""What an upload costs the server."""
+"""Memory of the server during an upload."""
 
 import threading
 import zipfile

@@ -1,6 +1,6 @@
-"""The service does what its OpenAPI document says, whatever is sent: no 5xx, no answer off its schema.
+"""The service conforms to its OpenAPI document whatever is sent: no 5xx, no response outside its schema.
 
-What is tried, and what came of it, is printed: ``pytest -n 0 -s --times 3 tests/end_to_end/system/test_openapi.py``.
+Prints what it tried and the results: ``pytest -n 0 -s --times 3 tests/end_to_end/system/test_openapi.py``.
 """
 
 import json
@@ -32,12 +32,12 @@ CHECKS = (
     "use_after_free",
     "ensure_resource_availability",
 )
-"""Not whether all that fits a schema is taken: what tus wants, and what a program may be, no schema can say."""
+"""Without positive_data_acceptance: no schema can express the rules of tus and of programs."""
 LOCKED = (*CHECKS, "ignored_auth")
-"""Where there are keys, also whether one is asked for: with none, and with a wrong one."""
+"""With keys also that requests without a key or with a wrong one are refused."""
 
-# What an archive or a picture is no schema says: of the calls that make something every second one has a good body.
-# Most ids that were only guessed become one that there is, and what it stands for stays, whoever finds it to delete.
+# No schema describes an archive or a picture, so every second call that creates something gets a valid body.
+# Most guessed ids become existing ones, and existing things are never deleted.
 HOOKS = """
 import json
 import re
@@ -98,11 +98,11 @@ MAKING = {
     "POST /v1/programs": 201,
     "POST /v1/uploads": 201,
 }
-"""Calls that make something, and the answer of it: of an empty service there is little to be found out."""
+"""Calls that create something, and their status. An empty service would reveal little."""
 
 
 def things_of(service: Service, bundle: Path, folder: Path) -> dict[str, str]:
-    """Ids of one of each, for calls that are about one, and bodies for those that make another."""
+    """Create one of each; returns their ids, and writes bodies for calls that create more."""
     made = service.client.upload(bundle)
     service.client.wait(made["job"])
     job = service.client.wait(service.client.recover(made["id"])["id"])
@@ -118,7 +118,7 @@ def things_of(service: Service, bundle: Path, folder: Path) -> dict[str, str]:
 def tried(
     service: Service, bundle: Path, folder: Path, key: str | None, checks: tuple[str, ...], *options: str
 ) -> Counter[str]:
-    """Have schemathesis call a service; returns how often which call had which answer."""
+    """Run schemathesis against a service; counts the responses by call and status."""
     program = shutil.which("schemathesis", path=str(Path(sys.executable).parent))
     assert program, "schemathesis is one of the tests' requirements"
     ids = things_of(service, bundle, folder)
@@ -128,7 +128,7 @@ def tried(
     header = ["-H", f"Authorization: Bearer {key}"] if key else []
     command = f"run {service.url}/openapi.json --seed 1 --generation-database none --no-color"
     command += " --request-timeout 120 --report json --report-json-path report.json"
-    command += " --exclude-path-regex /events$"  # some of which go on for ever
+    command += " --exclude-path-regex /events$"  # some never end
     done = subprocess.run(
         [program, *command.split(), *header, "--checks", ",".join(checks), *options],
         cwd=folder,
@@ -158,7 +158,7 @@ def made_in(answers: Counter[str]) -> set[str]:
 
 @pytest.mark.slow
 def test_a_few_calls_of_each_route(bundle: Path, tmp_path: Path) -> None:
-    """What fits into every run: the same few each time."""
+    """The same few calls in every run."""
     with serving(tmp_path / "data", "--workers", "1", ENVMATTE_KEYS=SECRET) as service:
         few = ("--phases", "fuzzing,stateful", "--max-examples", "3")
         answers = tried(service, bundle, tmp_path, SECRET, LOCKED, *few)

@@ -1,4 +1,4 @@
-"""A service whose work is done by a cluster on a bucket: the same bytes come out as on a laptop's folder."""
+"""A cluster on a bucket makes the same bytes as a single machine on a folder."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What whoever watches a service is told: figures, the cluster, logs and traces, of real jobs."""
+"""Metrics, cluster status, logs and traces of real jobs."""
 
 import json
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ CALLER = "00-0123456789abcdef0123456789abcdef-0123456789abcdef-01"
 
 @dataclass
 class Watched:
-    """A service that has done some jobs, and what was said of them."""
+    """A service that has run some jobs, with their ids and traces."""
 
     service: Service
     collector: Collector
@@ -72,7 +72,7 @@ def watched(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 
 
 def _without_frames(service: Service, capture: str) -> str:
-    """A job that fails: its capture is away while it runs."""
+    """Run a job that fails because its capture is moved away."""
     frames = service.data / "store" / "captures" / capture
     away = service.data / "away"
     frames.rename(away)

@@ -111,7 +111,7 @@ def test_patterns_of_a_preset_are_written(preset: str, tmp_path: Path) -> None:
         values = pixels.astype(np.float32) / np.float32(1 if pixels.dtype == bool else 255)
         if pixels.ndim == 2:
             values = np.broadcast_to(values[..., None], picture.shape)
-            # As small as can be: 1 bit where black and white is all there is.
+            # As small as possible: 1 bit for black and white.
             assert (pixels.dtype == bool) == set(np.unique(picture)).issubset({0.0, 1.0})
         else:
             assert np.any(picture != picture[..., :1])

@@ -1,4 +1,4 @@
-"""The client against a real service: records, arrays, and what a stranger does with them."""
+"""The Python client against a real service."""
 
 from pathlib import Path
 

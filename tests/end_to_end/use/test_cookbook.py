@@ -1,4 +1,4 @@
-"""The README's cookbook: its blocks, as they stand there, against real processes."""
+"""The commands of the cookbook, run as written against real processes."""
 
 import os
 import re
@@ -37,13 +37,13 @@ def blocks(task: str, language: str = "sh") -> list[str]:
 
 
 def environment(url: str) -> dict[str, str]:
-    """One where `envmatte` and `python3` are these, and the service is that one."""
+    """Environment in which `envmatte` and `python3` are those of the tests, and the service is the given one."""
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     return os.environ | {"PATH": path, "ENVMATTE_URL": url, "ENVMATTE_WORKERS": "1"}
 
 
 def film(show: Path, target: Path) -> None:
-    """What a camera of 160 x 120 pixels sees of a display that fills its picture, and no glass; nothing is clipped."""
+    """What a camera of 160 x 120 pixels sees of a display that fills its picture, without glass and unclipped."""
     with av.open(str(show)) as source, av.open(str(target), "w") as out:
         given = source.streams.video[0]
         stream = out.add_stream("libx264", rate=given.average_rate, options={"crf": "12"})
@@ -91,13 +91,13 @@ def test_from_a_film_to_a_folder_of_composites(service: Service, tmp_path: Path)
     with np.load(tmp_path / "composites.npz") as made:
         assert (made["film"].shape, made["film"].dtype) == ((4, 120, 160, 3), np.float32)
         assert made["alpha"].shape == (120, 160)
-        # The display fills the picture, and so do the stripes: they are seen, and move on.
+        # The moving stripes of the display fill the picture.
         assert np.std(made["film"], axis=0).mean() > 0.05
 
 
 @contextmanager
 def machine(script: str, folder: Path, **settings: str) -> Iterator[subprocess.Popen[str]]:
-    """What is run on a machine of its own: a process group, in a folder of its own."""
+    """Run a script as if on its own machine: a process group in its own folder."""
     folder.mkdir(exist_ok=True)
     with (folder / "log").open("w") as log:
         process = subprocess.Popen(

@@ -1,4 +1,4 @@
-"""A capture goes in over HTTP, a composite comes out."""
+"""From a capture to a composite over HTTP."""
 
 import io
 from datetime import datetime
@@ -69,7 +69,7 @@ def test_a_job_may_be_posted_while_its_capture_is_ingesting(service: Service, bu
 def test_a_composite_is_close_to_the_truth(
     service: Service, matte: str, scene: Scene, transfer: str, dtype: type
 ) -> None:
-    # Soft enough for the 32 x 24 cells of the program; what the grid can't show is measured elsewhere.
+    # Soft enough for the 32 x 24 cells of the program; finer detail is measured elsewhere.
     y, x = np.mgrid[:96, :128] / 128
     backdrop = np.stack([x, 1 - x, 0.5 + 0.4 * np.sin(9 * y)], axis=-1).astype(np.float32)
     answer = service.client.composite(matte, png(backdrop, transfer, dtype), transfer=transfer)

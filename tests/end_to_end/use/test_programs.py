@@ -1,4 +1,4 @@
-"""Programs over HTTP: kept by their content, and all their files made on request."""
+"""Programs over HTTP: stored by content, their files made on request."""
 
 import io
 import json

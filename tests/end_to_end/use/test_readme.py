@@ -1,4 +1,4 @@
-"""The README, as a new user would paste it."""
+"""The README's commands, as a new user pastes them."""
 
 import re
 import shutil
