@@ -71,6 +71,7 @@ CALLS = {
         content=b"12",
     ),
     "DELETE /v1/uploads/{id}": Call("upload", needs="write", headers=TUS, last=1),
+    "GET /v1/capture.schema.json": Call(),
     "GET /v1/captures": Call(),
     "POST /v1/captures": Call(needs="write", json={"upload": "{upload}"}, named=True),
     "GET /v1/captures/{id}": Call("capture"),
