@@ -61,11 +61,11 @@ def test_database_that_stays_away(
 @pytest.mark.exhaustive
 def test_late_writer_is_shut_out(on_postgresql: Known, table: list[Row], seldom: int) -> None:
     rig = on_postgresql.rig
-    told = "another coordinator drives the jobs now"
+    message = "another coordinator drives the jobs now"
 
     def sleep() -> None:
         name = rig.driver()
-        before, end = rig.log(name).count(told), time.monotonic() + ASLEEP
+        before, end = rig.log(name).count(message), time.monotonic() + ASLEEP
         other = rig.urls[1 - int(name[-1])]
         freeze(rig.process(name))
         try:
@@ -74,9 +74,9 @@ def test_late_writer_is_shut_out(on_postgresql: Known, table: list[Row], seldom:
             record = [rig.ask("GET", f"/v1/jobs/{job}{more}", at=other).json() for more in ("", "/log")]
         finally:
             thaw(rig.process(name))
-        wait(lambda: rig.log(name).count(told) > before)
+        wait(lambda: rig.log(name).count(message) > before)
         time.sleep(1)  # time to do what it was about to do when frozen
-        assert rig.log(name).count(told) == before + 1
+        assert rig.log(name).count(message) == before + 1
         assert rig.driver() != name
         assert record == [rig.ask("GET", f"/v1/jobs/{job}{more}").json() for more in ("", "/log")]
 

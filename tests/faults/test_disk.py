@@ -124,14 +124,14 @@ def test_full_disk_of_sqlite(small: Small, table: list[Row]) -> None:
         return answer.status_code == 507
 
     log = service.data.parent / f"{service.data.name}.log"
-    told = "trying again in a second: the disk is full"
+    message = "trying again in a second: the disk is full"
     with ExitStack() as filled:
         with paused(service):
             filled.enter_context(full(small.ledger))
             while not refused():
                 pass
-        said = log.read_text().count(told)
-        wait(lambda: log.read_text().count(told) > said + 2)
+        said = log.read_text().count(message)
+        wait(lambda: log.read_text().count(message) > said + 2)
         wait(lambda: service.http.get("/readyz").status_code == 503)
         assert service.client.job(job["id"])["state"] == "running"
     assert service.client.wait(job["id"])["state"] == "succeeded"

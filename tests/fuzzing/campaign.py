@@ -159,7 +159,7 @@ def _watch(process: Any, pipe: Connection, target: Target, seed: int, keep: Path
             if not pipe.poll(SECONDS):
                 process.kill()
                 raise EOFError
-            told = pipe.recv()
+            result = pipe.recv()
         except (EOFError, ConnectionError):
             process.join()
             code = process.exitcode
@@ -169,10 +169,10 @@ def _watch(process: Any, pipe: Connection, target: Target, seed: int, keep: Path
                 failed("crash", signal.Signals(-code).name if code < 0 else f"exit status {code}")
             tally.executions += 1
             return seed + 1
-        if told is None:
+        if result is None:
             process.join()
             return seed
-        taken, took, failure = told
+        taken, took, failure = result
         tally.executions += 1
         tally.taken += taken and failure is None
         tally.refused += not taken and failure is None

@@ -1,4 +1,4 @@
-"""Compares the ETA that jobs tell after a fifth of their tiles with the time that then really passes.
+"""Compares the ETA of jobs after a fifth of their tiles with the time they then take.
 
     python -m tests.benchmarks.cluster.eta [--size 160x120 --size 320x240] [--repeat 2] [--workers 2] [--json FILE]
 
@@ -31,14 +31,14 @@ CAMERA = Camera(hold=0.25, options={"crf": "12"})
 
 
 def stills(scene: Scene) -> bytes:
-    """A bundle of the scene."""
+    """A capture archive of the scene."""
     target = io.BytesIO()
     write_capture(scene, preset("default"), target)
     return target.getvalue()
 
 
 def video(scene: Scene) -> bytes:
-    """A bundle with a recording of the scene."""
+    """A capture archive with a recording of the scene."""
     program = preset("default")
     record, files = capture(program, film(lights(scene, program), CAMERA).data, 1 / CAMERA.hold)
     target = io.BytesIO()

@@ -1,6 +1,6 @@
-"""What a tile costs beside its work: the coordinator's and the scheduler's own time, and their memory.
+"""Measures the overhead of a tile: time and memory of the coordinator and the scheduler.
 
-A real scheduler and real workers in processes of their own, a real coordinator and database here; the work of a tile is
+A real scheduler and real workers in their own processes, a real coordinator and database in this one; a tile's work is
 to sleep. Prints a table, and JSON to a file if one is named.
 """
 
@@ -50,7 +50,7 @@ def main() -> None:
 
 
 def measure(tiles: int, seconds: float, workers: int, threads: int) -> dict[str, Any]:
-    """Drive one simulated job, on everything fresh."""
+    """Run one simulated job on a fresh database and cluster."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         with socket.create_server(("127.0.0.1", 0)) as free:

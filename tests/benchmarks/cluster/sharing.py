@@ -1,4 +1,4 @@
-"""What jobs get of a cluster: throughput with one and two workers, a small job beside a large one, a cancel.
+"""Measures how jobs share a cluster: throughput by workers, a small job beside a large one, a cancelled job.
 
 Through the HTTP service with its own cluster. Prints a table, and JSON to a file if one is named.
 """
@@ -45,15 +45,15 @@ def main() -> None:
 
 
 def throughput(folder: Path, rounds: int) -> list[dict[str, Any]]:
-    """The same capture with one worker and with two, in turn: tiles a second, and what of the workers' time is work."""
+    """The same capture with one and with two workers: tiles a second, and the workers' share of time on tiles."""
     bundle = folder / "ball.zip"
     write_capture(glass_ball.glass_ball(320, 240, rays=9), preset("default"), bundle)
     rows = []
     for n in range(rounds):
         for workers in (1, 2):
-            with served(workers) as (client, _):  # alone: an idle one takes 5 % of a core
+            with served(workers) as (client, _):  # one at a time: an idle one takes 5 % of a core
                 capture = _ingested(client, bundle)
-                client.wait(client.recover(capture)["id"])  # loads what the other finds loaded
+                client.wait(client.recover(capture)["id"])  # loads code that the next finds loaded
                 job = client.wait(client.recover(capture)["id"])
             row = {"workers": workers, "round": n, "tiles": job["tiles"]["total"]}
             rows.append(row | {"seconds": round(job["run_seconds"], 2)})
@@ -92,7 +92,7 @@ def sharing(folder: Path, megapixels: float) -> list[dict[str, Any]]:
 
 
 def enlarge(source: Path, target: Path, megapixels: float) -> None:
-    """The same capture with larger pixels, each of several of the camera's."""
+    """The same capture with pixels binned."""
     with zipfile.ZipFile(source) as archive, zipfile.ZipFile(target, "w") as out:
         for name in archive.namelist():
             data = archive.read(name)

@@ -1,4 +1,4 @@
-"""A kind of job that takes time and does nothing."""
+"""A kind of job that only takes time."""
 
 import time
 from typing import Any
@@ -30,5 +30,5 @@ class Simulated(JobKind):
 
 
 def register() -> None:
-    """Add the kind to those that a coordinator in this process runs."""
+    """Register the kind with the coordinator of this process."""
     JOB_KINDS["simulated"] = Simulated()

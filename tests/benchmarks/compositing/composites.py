@@ -1,9 +1,9 @@
-"""How fast composites are: the kernel beside a plain copy and scipy's product, requests, memory, and the cache.
+"""Measures composites: the kernel beside a plain copy and scipy's product, requests, memory and the cache.
 
     python -m tests.benchmarks.compositing.composites [--bundle NAME=CAPTURE.zip ...] [--large 1.0] [--json FILE]
 
-Recovers, through a real service, a traced glass ball of 640 x 480 pixels, one enlarged to so many megapixels, and
-each bundle that is named; then measures in this process and over HTTP. To be run from the root of the repository.
+Recovers through a real service a traced glass ball of 640 x 480 pixels, one enlarged to some megapixels, and
+each named capture archive; then measures in this process and over HTTP. To be run from the root of the repository.
 """
 
 import argparse
@@ -84,7 +84,7 @@ def main() -> None:
 
 
 def best(work: Callable[[], Any], rounds: int = 15) -> float:
-    """Milliseconds of the fastest of some runs."""
+    """Milliseconds of the fastest of several runs."""
     work()
     times = []
     for _ in range(rounds):
@@ -103,7 +103,7 @@ def kernel(objects: Objects, id: str) -> dict[str, Any]:
     codes = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
     backdrop = Backdrop(codes, table("srgb", np.dtype(np.uint8)))
     light = node_light(backdrop, matte.columns, matte.rows, CORES)
-    # What is the same in all channels is one row for scipy too.
+    # Rows that are equal in all channels are one row for scipy too.
     count = np.concatenate([strip.count.reshape(-1) for strip in strips]).astype(np.int64)
     cell = np.concatenate([strip.cell for strip in strips])
     weight = np.concatenate([strip.weight for strip in strips])
@@ -138,7 +138,7 @@ def backdrops(count: int) -> list[bytes]:
 
 
 def over_http(url: str, matte: str, seconds: float) -> list[dict[str, Any]]:
-    """Milliseconds a request, and requests a second, by the number of clients that ask without a pause."""
+    """Milliseconds per request and requests per second, by number of clients that ask without pause."""
     sent, rows = backdrops(16), []
     for clients in (1, 8, 32):
         times: list[float] = []
@@ -172,7 +172,7 @@ def over_http(url: str, matte: str, seconds: float) -> list[dict[str, Any]]:
 
 
 def twice(objects: Objects, id: str) -> dict[str, Any]:
-    """What a cache does that has room for half a matte: composites, and what it holds."""
+    """Composites with a cache for half a matte, and what it holds."""
     matte, whole = Matte(objects, id), Cache(objects, 1 << 34)
     backdrop = Backdrop(np.ones((8, 8, 3), np.float32))
     light = node_light(backdrop, matte.columns, matte.rows, CORES)
@@ -197,7 +197,7 @@ def twice(objects: Objects, id: str) -> dict[str, Any]:
 
 
 def first(client: Client, matte: str) -> float:
-    """Milliseconds of the first composite of a service that has just been started."""
+    """Milliseconds of the first composite of a freshly started service."""
     start = time.perf_counter()
     client.composite(matte, backdrops(1)[0], kind="image/jpeg")
     return round(1e3 * (time.perf_counter() - start), 1)

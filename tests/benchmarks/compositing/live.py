@@ -1,4 +1,4 @@
-"""The glass as the browser draws it: how far it agrees with the service's composites, and how long a picture takes.
+"""Measures live pictures in the browser: agreement with the service's composites, and time per picture.
 
     python -m tests.benchmarks.compositing.live KIT SCENES [--renderer default] [--frames 60] [--no-ball] [--json FILE]
 
@@ -46,7 +46,7 @@ PLACES = [
     {"right": -0.1, "down": 0, "scale": 0.5, "angle": -70},
 ]
 COARSEST = 2
-"""To which the app goes while a backdrop moves, see `services/web/app/composite/webgl.js`."""
+"""Resolution the app falls back to while a backdrop moves, see `services/web/app/composite/webgl.js`."""
 SOFTWARE = ("swiftshader", "llvmpipe", "software", "basic render")
 BROWSER = "--no-sandbox", "--enable-unsafe-swiftshader"
 OPEN = """async ([id, monitor]) => {
@@ -54,9 +54,9 @@ OPEN = """async ([id, monitor]) => {
     const { fetchLive } = await import("/web/app/composite/live.js");
     const found = await fetchLive(id);
     const gl = webglContext(document.createElement("canvas"));
-    const told = gl.getExtension("WEBGL_debug_renderer_info");
+    const info = gl.getExtension("WEBGL_debug_renderer_info");
     window.bench = { gl, painter: createPainter(gl, found, monitor) };
-    return gl.getParameter(told ? told.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
+    return gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
 }"""
 DRAW = """async ([picture, places]) => {
     const bytes = Uint8Array.from(atob(picture), (one) => one.charCodeAt(0));
@@ -86,7 +86,7 @@ def decoded(data: bytes) -> NDArray[np.float64]:
 
 
 def graphics_seconds() -> float:
-    """Of processor time that the browser's graphics process has taken."""
+    """Processor time of the browser's graphics process, in seconds."""
     return sum(
         one.cpu_times().user + one.cpu_times().system
         for one in psutil.Process().children(recursive=True)
@@ -170,7 +170,7 @@ def backdrops_of(kit: ModuleType) -> dict[str, bytes]:
 def compare(
     kit: ModuleType, url: str, mattes: dict[str, str], renderer: str, frames: int
 ) -> list[dict[str, Any]]:
-    """Draw all mattes and print what comes of it."""
+    """Draw all mattes and print the results."""
     backdrops = backdrops_of(kit)
     arguments = [*BROWSER, *([f"--use-angle={renderer}"] if renderer != "default" else [])]
     rows: list[dict[str, Any]] = []

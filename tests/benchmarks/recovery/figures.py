@@ -69,7 +69,7 @@ def measure(
     crosstalk = float(film[film.index("--crosstalk") + 1]) if "--crosstalk" in film else 0.0
     scores, squares = {}, []
     for name, backdrop in kit.backdrops().items():
-        # 16 bits, so that the matte is scored and not the answer's rounding.
+        # 16 bits, so that the matte is scored and not the rounding of the response.
         sent = integer_formats.to_integers(backdrop, np.dtype(np.uint16))
         answer = client.composite(job["matte"], integer_formats.encode_png(sent), transfer="linear")
         pixels = integer_formats.to_unit(integer_formats.decode(answer, memory=1 << 28))

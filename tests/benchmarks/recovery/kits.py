@@ -1,4 +1,4 @@
-"""What the benchmarks share: a kit of traced scenes, a service to measure, a table of what comes of it."""
+"""Shared parts of the benchmarks: a kit of traced scenes, a service to measure, tables."""
 
 import argparse
 import importlib.util
@@ -15,7 +15,7 @@ from services.client import Client
 
 
 def parser_of(documentation: str | None) -> argparse.ArgumentParser:
-    """A parser of KIT and SCENES, to be given more."""
+    """An argument parser for KIT and SCENES, to be extended."""
     parser = argparse.ArgumentParser(
         description=documentation, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -37,7 +37,7 @@ def load(kit: Path) -> ModuleType:
 
 @contextmanager
 def served(workers: int) -> Iterator[tuple[Client, Path]]:
-    """A running service's client, and a folder with its data, gone afterwards."""
+    """A client of a running service, and a temporary folder with its data."""
     with (
         tempfile.TemporaryDirectory() as folder,
         service(Path(folder, "data"), workers) as url,
@@ -47,5 +47,5 @@ def served(workers: int) -> Iterator[tuple[Client, Path]]:
 
 
 def show(row: dict[str, Any]) -> None:
-    """Print a row under the heads of its columns."""
+    """Print a row in the widths of its columns."""
     print("  ".join(f"{value!s:>{max(8, len(name))}}" for name, value in row.items()), flush=True)

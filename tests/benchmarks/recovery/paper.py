@@ -61,7 +61,7 @@ Solve = Callable[[NDArray[np.float64], NDArray[np.float64], float, int], NDArray
 
 @dataclass
 class Take:
-    """Some pixels of a scene, filmed: what a recovery gets, and the scene to score its composites by."""
+    """Filmed pixels of a scene, as a recovery gets them, and the scene to score composites by."""
 
     scene: Any
     measurements: NDArray[np.float32]
@@ -72,7 +72,7 @@ class Take:
 
 
 def sample(kit: ModuleType, path: Path, count: int) -> Any:
-    """A scene of nothing but `count` pixels of the object."""
+    """A scene of only `count` pixels of the object."""
     whole = kit.Scene.load(path)
     pixels = np.flatnonzero(whole.object_pixels)
     chosen = np.sort(np.random.default_rng(0).permutation(pixels)[:count])
@@ -113,7 +113,7 @@ def measure(kit: ModuleType, take: Take, recover: Recover) -> dict[str, float]:
 
 
 def grid_errors(kit: ModuleType, scene: Any) -> dict[str, float]:
-    """What the true T on the finest grid scores."""
+    """Score of the true T on the finest grid."""
     blocks = scene.blocks(*FINE)
     return _errors(
         kit,
@@ -147,7 +147,7 @@ def _backdrops(kit: ModuleType) -> list[NDArray[np.float32]]:
 
 
 def rival(solve: Solve, levels: str) -> Recover:
-    """A method that solves for the T of each pixel and channel by itself."""
+    """A method that solves for T pixel by pixel and channel by channel."""
 
     def recover(
         measurements: NDArray[np.float32], photometry: Photometry, sensing: Sensing, noise: Noise
@@ -183,7 +183,7 @@ def pursuit(
     m = len(target)
     matrix, target = _with_sum(matrix, target)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # it says when it ends for linear dependence
+        warnings.simplefilter("ignore", RuntimeWarning)  # it warns when it stops because of linear dependence
         path = orthogonal_mp(matrix, target, n_nonzero_coefs=min(most, matrix.shape[1]), return_path=True)
     path = path.reshape(matrix.shape[1], -1)
     left = ((target[:, None] - matrix @ path) ** 2).sum(axis=0)
@@ -228,7 +228,7 @@ def figures_4_and_5(kit: ModuleType, scenes: dict[str, Any]) -> list[dict[str, A
 
 
 def _compared(found: list[dict[str, dict[str, float]]]) -> dict[str, Any]:
-    """The means over scenes, and what the prior takes off the squared error: of all of it, and above the grid's."""
+    """Means over scenes, and by how much the prior reduces the squared error: in all, and above that of the grid."""
     grid, plain, filtered = (
         float(np.mean([f[kind]["mse"] for f in found])) for kind in ("grid", "none", "gaussian")
     )

@@ -1,4 +1,4 @@
-"""Plots how the time of a recovery grows, and what its confidence is worth, on traced scenes.
+"""Plots the time of a recovery and the calibration of its confidence on traced scenes.
 
     python tests/benchmarks/recovery/plots.py KIT SCENES FOLDER [--pixels 2000]
 
@@ -40,7 +40,7 @@ TIMES = (0.25, 0.5, 1, 2, 4)
 
 
 class Filmed:
-    """A scene before the monitor of a program, and its recovery."""
+    """A scene filmed with a program, and its recovery."""
 
     def __init__(self, kit: ModuleType, scene: Any, program: Program) -> None:
         self.kit, self.scene, self.program = kit, scene, program
@@ -60,7 +60,7 @@ class Filmed:
         self.patterns = lay_out(program, "linear")
 
     def recover(self, pixels: int) -> tuple[lobes.Recovery, float]:
-        """Recover the first pixels; the seconds it took, too."""
+        """Recover the first pixels; also returns the seconds it took."""
         constant, shown = self.numbers, self.program.measured
         light, usable = self.light[:pixels], self.usable[:pixels]
         photometry: Photometry = fit_photometry(

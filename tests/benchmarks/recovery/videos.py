@@ -1,4 +1,4 @@
-"""Ingests unsynchronised videos of traced scenes, and compares what comes of them with stills of the same program.
+"""Ingests unsynchronised videos of traced scenes, and compares the results with stills of the same program.
 
     python -m tests.benchmarks.recovery.videos KIT SCENES [--scene sphere] [--fps 30] [--workers 2] [--no-recovery]
         [--json FILE]
@@ -43,14 +43,14 @@ CASES = [Case(fps, 0.5, jitter) for fps in (25, 30, 60) for jitter in (0.03, 0.1
 
 
 def starts(case: Case, count: int) -> NDArray[np.float64]:
-    """When the kit shows each pattern, and when it ends: its own random numbers again."""
+    """When the kit shows each pattern and when it ends, from the same random numbers."""
     random = np.random.default_rng(SEED)
     holds = [case.hold * (1 + case.jitter * random.standard_normal()) for _ in range(count)]
     return LEAD + np.cumsum([0, *holds])
 
 
 def sorted_wrongly(stack: Stack, case: Case, count: int) -> tuple[int, int]:
-    """Frames that show mostly another pattern than they are taken for, and those that show a little of one."""
+    """Number of frames that mostly show another pattern than assigned, and of those that show a little of one."""
     edges, patterns = starts(case, count), stack.attributes["patterns"]
     wrong = torn = 0
     for at, tick, _ in stack.shares().tolist():
@@ -77,7 +77,7 @@ def psnr(kit: ModuleType, truth: Any, client: Client, capture: str) -> float:
 def measure(
     kit: ModuleType, scene: Path, case: Case, client: Client, folder: Path, stills: float | None
 ) -> dict[str, Any]:
-    """Film, upload, see what was found, recover, score."""
+    """Film, upload, compare what was found, recover, score."""
     clip, bundle, truth = folder / "clip.mp4", folder / "clip.zip", kit.Scene.load(scene)
     given = [
         "--bands",
@@ -121,7 +121,7 @@ def measure(
 
 
 def filmed_as_stills(kit: ModuleType, scene: Path, client: Client, folder: Path) -> float:
-    """The PSNR of a capture of stills of the same program, of the same camera."""
+    """PSNR of stills of the same program by the same camera."""
     bundle = folder / "stills.zip"
     with redirect_stdout(None):
         kit.main(["capture", str(scene), str(bundle), "--bands", NESTED, "--mask", "--response", "srgb"])

@@ -1,7 +1,7 @@
-"""What checksums cost, and how quick `envmatte verify`, `backup` and `restore` are.
+"""Measures the cost of checksums and the speed of `envmatte verify`, `backup` and `restore`.
 
 A capture of 132 frames of 640 x 480 pixels with a camera's noise, and a matte of that size with 24 cells a pixel;
-written and read with checksums and without, in turns, the best of some rounds. Seconds are of the processor, all
+written and read with and without checksums in turns, the best of several rounds. Seconds are of the processor, all
 threads together, and so are megabytes a second but for those that say wall: other work on the machine changes them
 little.
 """
@@ -39,14 +39,14 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         store = Objects((folder / "store").as_uri())
-        told = {what: [[], []] for what in ("write capture", "read capture", "write matte", "read matte")}
+        reported = {what: [[], []] for what in ("write capture", "read capture", "write matte", "read matte")}
         frames, block = _frames(), _block()
         for _, checked in product(range(rounds), (False, True)):
             _use(CODECS if checked else CODECS[:1])
             for what, act in _acts(store, frames, block):
-                told[what][checked].append(_seconds(act)[0])
+                reported[what][checked].append(_seconds(act)[0])
         print(f"{'CPU s':<16}{'without':>10}{'with':>10}")
-        for what, (without, with_them) in told.items():
+        for what, (without, with_them) in reported.items():
             print(f"{what:<16}{min(without):>10.3f}{min(with_them):>10.3f}")
         _whole(folder, store, rounds)
 
@@ -92,7 +92,7 @@ def _acts(store: Objects, frames: np.ndarray, block: Block) -> list[tuple[str, C
 
 
 def _whole(folder: Path, store: Objects, rounds: int) -> None:
-    """Verify, back up and restore what was written last."""
+    """Verify, back up and restore the data written last."""
     stack = Stack(store, "c")
     stack.save()
     engine = open_engine(f"sqlite:///{folder}/ledger.db")

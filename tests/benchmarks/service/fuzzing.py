@@ -1,10 +1,10 @@
-"""Fuzzing of every parser of foreign bytes: `python -m tests.benchmarks.service.fuzzing`.
+"""Fuzzes every parser of untrusted bytes: `python -m tests.benchmarks.service.fuzzing`.
 
     [--target NAME] … [--seconds N] [--first N] [--json FILE] [--keep FOLDER]
     --target NAME --seed N
 
-Runs damaged files and requests (`tests/fuzzing/`) through each parser for N seconds, in processes that are watched, and
-prints what came of them: executions, how many inputs were refused and how many taken, crashes, hangs, errors of another
+Runs damaged files and requests (`tests/fuzzing/`) through each parser for N seconds, in monitored processes, and
+prints the results: executions, how many inputs were refused and how many taken, crashes, hangs, errors of another
 kind than the documented, executions over the memory that they may take, and the longest. Inputs that fail are kept in
 the folder. Input N of a target is always the same: with `--seed` it is run alone, here, so that a debugger sees it; the
 next campaign goes on where `--first` says. Exit status 1 if anything failed. With `TMPDIR` in memory those that store
@@ -55,7 +55,7 @@ def main() -> int:
                 target.run(target.input(asked.seed), Path(folder))
         return 0
     print("  ".join(f"{name:>10}" for name in COLUMNS), flush=True)
-    told = {}
+    reported = {}
     for target in chosen:
         tally = campaign.run(target, asked.first, sys.maxsize, asked.keep, seconds=asked.seconds)
         kinds = [tally.count(kind) for kind in ("crash", "hang", "error", "memory")]
@@ -72,12 +72,12 @@ def main() -> int:
         print("  ".join(f"{value:>10}" for value in row), flush=True)
         for failure in tally.failures:
             print(failure, flush=True)
-        told[target.name] = asdict(tally)
+        reported[target.name] = asdict(tally)
     if asked.json:
-        asked.json.write_text(json.dumps(told, default=str, indent=1))
-    return int(any(tally["failures"] for tally in told.values()))
+        asked.json.write_text(json.dumps(reported, default=str, indent=1))
+    return int(any(tally["failures"] for tally in reported.values()))
 
 
 if __name__ == "__main__":
-    os.environ.setdefault("SVT_LOG", "1")  # the encoder of a clip tells what it does
+    os.environ.setdefault("SVT_LOG", "1")  # the encoder of a clip is verbose
     sys.exit(main())

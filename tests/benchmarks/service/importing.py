@@ -1,6 +1,6 @@
-"""How long importing the client takes: `python -m tests.benchmarks.service.importing`.
+"""Measures the import of the client: `python -m tests.benchmarks.service.importing`.
 
-Each in a new interpreter, from files that were read before, less what an interpreter takes that imports nothing.
+Each in a new interpreter with warm file caches, minus the time of an interpreter that imports nothing.
 """
 
 import subprocess
@@ -12,7 +12,7 @@ SCRIPT = "import time; start = time.process_time(); {}; print(time.process_time(
 
 
 def seconds(statement: str) -> list[float]:
-    """Seconds of CPU that a statement takes, in some interpreters."""
+    """CPU seconds of a statement, in several interpreters."""
     command = [sys.executable, "-c", SCRIPT.format(statement)]
     return [float(subprocess.check_output(command)) for _ in range(RUNS + 1)][1:]
 

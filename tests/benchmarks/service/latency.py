@@ -1,4 +1,4 @@
-"""How long `GET /v1/jobs/{id}` takes while the service works: with 50 pollers, a recovery, an ingest after another.
+"""Measures `GET /v1/jobs/{id}` under load: 50 pollers, a recovery, and one ingest after another.
 
     python -m tests.benchmarks.service.latency [--pollers 50] [--seconds 30] [--megapixels 2] [--json FILE]
 
@@ -112,7 +112,7 @@ def main() -> None:
         measure("nothing", f"/v1/jobs/{capture['job']}")
         job = client.recover(capture)
         path = f"/v1/jobs/{job['id']}"
-        while not client.job(job["id"])["tiles"]["done"]:  # whose workers load what the others find loaded
+        while not client.job(job["id"])["tiles"]["done"]:  # its workers load code that later jobs find loaded
             time.sleep(0.1)
         measure("a recovery", path)
         with repeated(client, large):

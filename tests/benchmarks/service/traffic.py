@@ -1,7 +1,7 @@
-"""Users of a service, each a thread that goes on until all is over, and what they send; `users` has what they do.
+"""Users of a service, each a thread that runs until the end, and their requests; `users` has their actions.
 
-All by HTTP on loopback. What an answer may be is said with each request, besides 404 and 409: things expire, are
-deleted and end under everyone's hands here.
+All requests are HTTP on loopback and name their expected statuses. 404 and 409 are always allowed: things expire, are
+deleted and end at any time.
 """
 
 import base64
@@ -33,7 +33,7 @@ TUS = {"Tus-Resumable": "1.0.0"}
 CHUNK = TUS | {"Content-Type": "application/offset+octet-stream"}
 VIDEO = {"Content-Type": "video/mp4"}
 PASSING = (404, 409)
-"""What may always be answered: it was there a moment ago."""
+"""Statuses that are always allowed: the thing may have gone a moment ago."""
 
 
 class Traffic:
@@ -44,13 +44,13 @@ class Traffic:
     url : str
         Of the service.
     webhook : str
-        A URL that jobs are to tell.
+        A URL for webhooks.
     folder : Path
-        For files that are sent.
+        For files to send.
     doings : sequence of callable
-        What each of them does, again and again; told the user.
+        Actions that each user repeats, called with the user.
     pause : float
-        Seconds between two things that a user does, on average.
+        Mean number of seconds between two actions of a user.
     seed : int
 
     Attributes
@@ -110,7 +110,7 @@ class Traffic:
 
 
 class User:
-    """Somebody with a connection to the service."""
+    """A user with a connection to the service."""
 
     def __init__(self, town: Traffic, seed: str) -> None:
         self.town = town
@@ -126,19 +126,19 @@ class User:
         self.client.__exit__(None, None, None)
 
     def ask(self, what: str, method: str, path: str, *fine: int, **request: Any) -> httpx2.Response:
-        """Ask for something, and note an answer that is not as it should be."""
+        """Send a request, and record an unexpected response."""
         answer = self.http.request(method, path, **request)
         self.note(what, answer, fine)
         return answer
 
     def note(self, what: str, answer: httpx2.Response, fine: Sequence[int] = ()) -> None:
-        """Note what was done, and an answer that should not have been."""
+        """Record an action, and an unexpected response."""
         self.town.done[what] += 1
         if answer.status_code not in (*(fine or (200, 201, 202, 204)), *PASSING):
             self.town.wrong.append(f"{what}: {answer.status_code} {answer.text[:300]}")
 
     def pick(self, found: Sequence[str]) -> str:
-        """One of those that were there lately."""
+        """One of those that existed recently."""
         return self.random.choice(list(found) or ["none-yet"])
 
     def ended(self, job: str) -> dict[str, Any]:
@@ -151,7 +151,7 @@ class User:
             time.sleep(0.2)
 
     def followed(self, job: str, most: int = 1000) -> None:
-        """Follow a job's events to the end, or leave after some of them."""
+        """Follow a job's events to the end, or disconnect after some."""
         with self.http.stream("GET", f"/v1/jobs/{job}/events") as answer:
             if answer.status_code != 200:
                 answer.read()
@@ -161,7 +161,7 @@ class User:
                     return
 
     def break_off(self, what: str, method: str, path: str, headers: dict[str, str], body: bytes) -> None:
-        """Begin a request, and hang up."""
+        """Begin a request, then disconnect."""
         where = urlsplit(self.town.url)
         head = [
             f"{method} {path} HTTP/1.1",
@@ -175,10 +175,10 @@ class User:
 
     def upload(self, data: bytes, **metadata: str) -> str:
         """Send bytes in pieces, with a pause between them; returns the upload's id."""
-        told = ",".join(
+        metadata = ",".join(
             f"{name} {base64.b64encode(text.encode()).decode()}" for name, text in metadata.items()
         )
-        create = TUS | {"Upload-Length": str(len(data)), "Upload-Metadata": told}
+        create = TUS | {"Upload-Length": str(len(data)), "Upload-Metadata": metadata}
         where = self.ask("create an upload", "POST", "/v1/uploads", headers=create).headers["location"]
         step = len(data) // self.random.randint(1, 4) + 1
         for at in range(0, len(data), step):

@@ -1,8 +1,8 @@
-"""A day of a service in minutes: at its end it holds what it held in the middle, and nothing once all has expired.
+"""A day of a service in minutes: nothing it holds grows, and nothing is left once everything has expired.
 
     python -m tests.benchmarks.soak.soak [--hours 24] [--minutes 8] [--json FILE]
 
-A scheduler, two workers and a service in processes of their own, and a town of users (`users`) that uploads, recovers,
+A scheduler, two workers and a service in their own processes, and many users (`users`) that uploads, recovers,
 composites, cancels, breaks off and errs. Captures, mattes, uploads and jobs are kept for two to three simulated hours,
 and workers are killed now and then. At the end of each hour memory, open files and threads of every process are looked
 at, the rows of every table, and what lies in the store. From the middle on none of it may grow; of workers, rows and
@@ -37,9 +37,9 @@ from tests.services.webhooks.receivers import receiver
 WORKERS = 2
 MB = 1e6
 KEPT = {"CAPTURE": 3.0, "MATTE": 3.0, "JOB": 3.0, "UPLOAD": 2.0}
-"""Simulated hours for which things are kept, by the names of the settings."""
+"""Simulated hours for which data are kept, by setting."""
 LASTING = {"coordinator", "totals"}
-"""Tables of which a row or three stay."""
+"""Tables that keep a few rows."""
 ALLOWED = {
     "MB": {"least": 4.0, "share": 0.03},
     "files": {"least": 3.0, "share": 0.0},
@@ -49,15 +49,15 @@ ALLOWED = {
     "objects": {"least": 300.0, "share": 0.5},
     "bytes": {"least": 300e3, "share": 0.5},
 }
-"""Growth that is none, by what is counted.
+"""Growth that is tolerated, by quantity.
 
 The store's threads, obstore's, are as many as its busiest moment took; rows and bytes follow the traffic, and are all
 gone in the end if none is left behind.
 """
 STORE = "tokio-rt-worker"
-"""What obstore calls its threads."""
+"""Name of obstore's threads."""
 PATIENCE = 300.0
-"""Seconds that the last of it may take to be gone, besides what it is kept."""
+"""Seconds that the last data may outlive their expiry."""
 Sample = dict[str, float]
 MISSING = float("nan")
 
@@ -72,11 +72,11 @@ class Running:
     workers: Any
 
     def named(self) -> Iterator[tuple[str, list[psutil.Process]]]:
-        """The processes by what they are."""
+        """The processes by role."""
         for name, process in self.processes.items():
             yield name, [process]
         yield "worker", workers(self.workers)
-        own = psutil.Process(self.workers.pid).children()  # which live as long as it does
+        own = psutil.Process(self.workers.pid).children()  # they live as long as it does
         yield "fork server", [one for one in own if any("forkserver" in word for word in one.cmdline())]
 
 
@@ -107,21 +107,21 @@ def running(folder: Path, hour: float) -> Iterator[Running]:
 
 
 def threads_of(process: psutil.Process) -> list[str]:
-    """The names of a process's threads."""
+    """Names of a process's threads."""
     names = []
     for task in Path(f"/proc/{process.pid}/task").glob("*/comm"):
-        with suppress(OSError):  # it has ended meanwhile
+        with suppress(OSError):  # the thread has ended
             names.append(task.read_text().strip())
     return names
 
 
 def memory_of(name: str, process: psutil.Process) -> int:
-    """Bytes that a process has for itself; of the fork server also those that it shares with workers, or did."""
+    """Private memory of a process in bytes; for the fork server also what it shares with workers, or did."""
     return int(process.memory_info().rss if name == "fork server" else process.memory_full_info().uss)
 
 
 def look(service: Running) -> Sample:
-    """All that may grow, now."""
+    """Everything that may grow, as it is now."""
     sample: Sample = {}
     for name, processes in service.named():
         held: list[tuple[float, int, int, int]] = []
@@ -144,7 +144,7 @@ def look(service: Running) -> Sample:
         with suppress(FileNotFoundError):
             sample[f"{file}: bytes"] = (service.data / file).stat().st_size
     sizes = [0]
-    for folder, _, names in os.walk(service.data / "store"):  # which passes over what goes meanwhile
+    for folder, _, names in os.walk(service.data / "store"):  # os.walk skips what is deleted meanwhile
         for name in names:
             with suppress(FileNotFoundError):
                 sizes.append(Path(folder, name).stat().st_size)
@@ -152,7 +152,7 @@ def look(service: Running) -> Sample:
 
 
 def live(service: Running, town: Traffic, hours: int, hour: float) -> list[Sample]:
-    """The day; a sample an hour."""
+    """Run the day; takes a sample every hour."""
     samples: list[Sample] = []
     begun = time.monotonic()
     for n in range(1, hours + 1):
@@ -169,7 +169,7 @@ def live(service: Running, town: Traffic, hours: int, hour: float) -> list[Sampl
 
 
 def left(service: Running, hour: float) -> Sample:
-    """What is still there of what expires, once all of it should have."""
+    """Data that should have expired but still exist."""
     end = time.monotonic() + max(KEPT.values()) * hour + PATIENCE
     while True:
         sample = look(service)
@@ -188,7 +188,7 @@ def left(service: Running, hour: float) -> Sample:
 
 
 def judged(samples: list[Sample]) -> dict[str, Trend]:
-    """The trend of everything that was looked at, over the hours that count.
+    """The trend of every quantity over the hours that count.
 
     While nobody cancels there is more of everything, and workers live: those hours alone count for both.
     """
@@ -229,7 +229,7 @@ def show(hour: int, sample: Sample, town: Traffic) -> None:
 
 
 def verdict(trends: dict[str, Trend], remains: Sample, wrong: list[str]) -> list[str]:
-    """What is not as it should be, in words."""
+    """The problems found, in words."""
     said = [
         f"{name} grows: from {one.first:.1f} to {one.last:.1f}, ± {one.error:.1f}; {one.allowed:.1f} is allowed"
         for name, one in trends.items()
@@ -240,10 +240,10 @@ def verdict(trends: dict[str, Trend], remains: Sample, wrong: list[str]) -> list
 
 
 def soak(hours: int, minutes: float, folder: Path, seed: int = 1) -> dict[str, Any]:
-    """The day, and what is to be said of it."""
+    """Run the day and report it."""
     hour = 60 * minutes / hours
-    with receiver(lambda n: 500 if n % 8 == 5 else 200) as told, running(folder, hour) as service:
-        town = Traffic(service.url, told.url, folder, users.ALL, pause=hour / 20, seed=seed)
+    with receiver(lambda n: 500 if n % 8 == 5 else 200) as webhooks, running(folder, hour) as service:
+        town = Traffic(service.url, webhooks.url, folder, users.ALL, pause=hour / 20, seed=seed)
         with town:
             samples = live(service, town, hours, hour)
         remains = left(service, hour)
@@ -253,7 +253,7 @@ def soak(hours: int, minutes: float, folder: Path, seed: int = 1) -> dict[str, A
         "hours": hours,
         "minutes": minutes,
         "done": dict(sorted(town.done.items())),
-        "webhooks": len(told.received),
+        "webhooks": len(webhooks.received),
         "samples": samples,
         "trends": {name: asdict(one) | {"grows": one.grows} for name, one in trends.items()},
         "said": verdict(trends, remains, town.wrong),
@@ -275,7 +275,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         found = soak(given.hours, given.minutes, given.logs or Path(folder), given.seed)
     print("\n" + ", ".join(f"{what}: {number}" for what, number in found["done"].items()))
-    print(f"webhooks told: {found['webhooks']}\n")
+    print(f"webhooks delivered: {found['webhooks']}\n")
     print(f"{'':34}{'middle':>12}{'end':>12}{'error':>10}{'allowed':>10}")
     for name, one in found["trends"].items():
         mark = "  grows" if one["grows"] else ""

@@ -1,4 +1,4 @@
-"""A short day of the soak: that it can be run, and that nothing is left of it."""
+"""A short day of the soak runs and leaves nothing."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from tests.benchmarks.soak.soak import soak
 @pytest.mark.timeout(900)
 def test_a_short_day_leaves_nothing(tmp_path: Path) -> None:
     found = soak(12, 1.2, tmp_path)
-    # A process that has just begun still takes what it will hold.
+    # A process that has just started still grows to its usual size.
     assert [one for one in found["said"] if ": MB grows" not in one] == []
     assert len(found["samples"]) == 13
     assert len(found["done"]) > 20

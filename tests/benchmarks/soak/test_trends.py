@@ -1,4 +1,4 @@
-"""What counts as growth."""
+"""Which series count as growth."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Whether a quantity that is looked at again and again grows: a line through its values, against their scatter."""
+"""Whether a repeatedly measured quantity grows: a line through its values, compared with their scatter."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 SURE = 4.0
-"""Standard errors of the growth by which it has to differ from none."""
+"""Standard errors by which growth must exceed zero."""
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Trend:
     error : float
         Standard error of the growth from one to the other.
     allowed : float
-        Growth that is none: a page more, a thread of a pool.
+        Growth that is tolerated: another page, a thread of a pool.
     """
 
     first: float
@@ -35,7 +35,7 @@ class Trend:
 
     @property
     def grows(self) -> bool:
-        """Whether it is more than is allowed, and than scatter makes."""
+        """Whether it exceeds what is tolerated and what scatter explains."""
         return self.growth > self.allowed and self.growth > SURE * self.error
 
 
@@ -47,7 +47,7 @@ def trend(values: Sequence[float], *, least: float, share: float) -> Trend:
     values : sequence of float
         Three or more.
     least, share : float
-        Growth that is allowed: so much, or that share of the mean if that is more.
+        Tolerated growth: an absolute value, or a share of the mean if that is more.
     """
     y = np.asarray(values, float)
     x = np.arange(len(y)) - (len(y) - 1) / 2

@@ -1,4 +1,4 @@
-"""What people and machines do to a service all day, the careless among them: each function is one thing."""
+"""Actions of people and machines on a service, also careless ones; each function is one action."""
 
 import io
 import time
@@ -30,7 +30,7 @@ FAILING = (bad.no_image, bad.bomb)
 
 
 def film(user: User) -> None:
-    """Somebody uploads a capture one way or another, recovers its matte, and may tidy up afterwards."""
+    """Upload a capture in one of several ways, recover its matte, and perhaps delete them."""
     random, town = user.random, user.town
     way = random.choice(("one body", "pieces", "client"))
     if way == "one body":
@@ -50,8 +50,8 @@ def film(user: User) -> None:
         town.done["upload by the client"] += 1
     if random.random() < 0.5:
         user.ended(made["job"])
-    told = {"webhook": town.webhook} if random.random() < 0.5 else {}
-    asked = {"capture": made["id"], "options": random.choice(OPTIONS)} | told
+    extra = {"webhook": town.webhook} if random.random() < 0.5 else {}
+    asked = {"capture": made["id"], "options": random.choice(OPTIONS)} | extra
     answer = user.ask(
         "recover", "POST", "/v1/jobs", json=asked, headers={"Idempotency-Key": f"{random.random()}"}
     )
@@ -73,7 +73,7 @@ def film(user: User) -> None:
 
 
 def composite(user: User) -> None:
-    """Somebody looks at a matte, and puts it before something."""
+    """Look at a matte and composite it."""
     random, town = user.random, user.town
     matte = f"/v1/mattes/{user.pick(town.mattes)}"
     backdrop = random.choice(town.backdrops)
@@ -110,7 +110,7 @@ def composite(user: User) -> None:
     def carry() -> None:
         try:
             archive = user.ask("fetch an archive", "GET", f"{matte}/archive")
-        except httpx2.RemoteProtocolError:  # it was deleted meanwhile
+        except httpx2.RemoteProtocolError:  # the thing was deleted meanwhile
             return
         if archive.status_code == 200:
             key = ZIP | {"Idempotency-Key": f"{random.random()}"}
@@ -141,7 +141,7 @@ def composite(user: User) -> None:
 
 
 def change_mind(user: User) -> None:
-    """Somebody cancels: in the queue, while it runs, and what is over already."""
+    """Cancel jobs: queued, running and ended ones."""
     random, town = user.random, user.town
 
     def ingest() -> None:
@@ -165,14 +165,14 @@ def change_mind(user: User) -> None:
         asked = {"capture": user.pick(town.captures), "options": options or {}, "webhook": town.webhook}
         return str(user.ask("recover", "POST", "/v1/jobs", json=asked).json().get("id", "none"))
 
-    if town.gentle:  # a task that runs on after it was cancelled takes its worker with it
+    if town.gentle:  # a task that continues after it was cancelled takes its worker with it
         user.ended(recover())
     else:
         random.choice((ingest, queued, running))()
 
 
 def break_off(user: User) -> None:
-    """Somebody's line breaks, or nobody goes on with what was begun."""
+    """Break connections, or abandon what was begun."""
     random, town = user.random, user.town
     half = town.bundle[: len(town.bundle) // 2]
     size = {"Content-Length": str(len(town.bundle))}
@@ -205,7 +205,7 @@ def break_off(user: User) -> None:
 
 
 def mistake(user: User) -> None:
-    """Somebody sends what can't be used."""
+    """Send invalid data."""
     random, town = user.random, user.town
 
     def bundle() -> None:
@@ -258,7 +258,7 @@ def mistake(user: User) -> None:
 
 
 def watch(user: User) -> None:
-    """A dashboard, a browser, Prometheus."""
+    """Requests of a dashboard, a browser and Prometheus."""
     random, town = user.random, user.town
 
     def pages() -> None:
@@ -283,8 +283,8 @@ def watch(user: User) -> None:
         asked = {"preset": "sketch", "monitor": monitor}
         made = user.ask("make a program", "POST", "/v1/programs", json=asked).json()["id"]
         at = f"/v1/programs/{made}"
-        told = {"phase": "shown", "patterns_per_second": 2}
-        user.ask("show a program", "PUT", f"{at}/showing", json=told)
+        shown = {"phase": "shown", "patterns_per_second": 2}
+        user.ask("show a program", "PUT", f"{at}/showing", json=shown)
         user.ask("fetch a pattern", "GET", f"{at}/patterns/{random.randrange(32)}.png")
         with user.http.stream("GET", f"{at}/events") as answer:
             user.note("follow a program", answer)
@@ -295,4 +295,4 @@ def watch(user: User) -> None:
 
 
 ALL = (film, film, composite, composite, change_mind, break_off, mistake, watch)
-"""Of a town: who does what."""
+"""All actions."""

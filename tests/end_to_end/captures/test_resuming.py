@@ -69,15 +69,15 @@ def test_client_survives_a_hundred_broken_connections(
     service: Service, bundle: Path, tmp_path: Path, size: int
 ) -> None:
     file = large(bundle, tmp_path / "large.zip", size)
-    told: list[int] = []
+    sent_so_far: list[int] = []
     with Line(service.url, cuts=100, mean=size // 200, back=True, seed=1) as line, Client(line.url) as client:
         with paused(service):
-            made = client.upload(file, progress=lambda sent, whole: told.append(sent))
+            made = client.upload(file, progress=lambda sent, whole: sent_so_far.append(sent))
             assert line.made == 100
             assert made["bytes"] == file.stat().st_size
             assert digest_of(service, made["id"]) == sha256(file)
-        assert told == sorted(set(told))
-        assert told[-1] == file.stat().st_size
+        assert sent_so_far == sorted(set(sent_so_far))
+        assert sent_so_far[-1] == file.stat().st_size
     assert service.client.wait(made["job"])["state"] == "succeeded"
     gone(service, made["id"])
 
@@ -120,11 +120,11 @@ def test_bytes_sent_before_each_broken_connection_are_kept(
 def test_upload_resumes_after_the_server_is_killed(bundle: Path, tmp_path: Path) -> None:
     data, file = tmp_path / "data", large(bundle, tmp_path / "large.zip", 50 * MB)
     made: list[dict] = []
-    told: list[int] = []
+    sent_so_far: list[int] = []
     half = threading.Event()
 
     def progress(sent: int, whole: int) -> None:
-        told.append(sent)
+        sent_so_far.append(sent)
         if sent > whole // 3:
             half.set()
 
@@ -141,14 +141,14 @@ def test_upload_resumes_after_the_server_is_killed(bundle: Path, tmp_path: Path)
                 time.sleep(0.01)
             first.kill()
             busy.close()
-            reached = told[-1]
+            reached = sent_so_far[-1]
         with serving(data, "--workers", "1") as second:
             assert offset_of(second, other) == 0
             assert not [name for name in uploads_of(second) if other.rsplit("/", 1)[1] in name]
             line.target, carried = second.url, line.carried
             sender.join(120)
             assert made
-            assert told == sorted(set(told))
+            assert sent_so_far == sorted(set(sent_so_far))
             assert line.carried - carried < file.stat().st_size - reached + MB
             assert second.client.wait(made[0]["job"])["state"] == "succeeded"
             assert second.http.delete(other, headers=TUS).status_code == 204

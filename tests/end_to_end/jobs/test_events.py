@@ -49,9 +49,9 @@ def test_events_follow_a_job_to_its_end(service: Service, capture: str) -> None:
 def test_events_end_when_the_job_is_cancelled_or_deleted(service: Service, capture: str) -> None:
     job = service.client.recover(capture)["id"]
     with service.http.stream("GET", f"/v1/jobs/{job}/events") as answer:
-        told = events(answer)
-        next(told)
+        received = events(answer)
+        next(received)
         service.client.cancel(job)
-        assert [data["state"] for _, data in told][-1] == "cancelled"
+        assert [data["state"] for _, data in received][-1] == "cancelled"
     assert service.http.delete(f"/v1/jobs/{job}").status_code == 204
     check_problem(service.http.get(f"/v1/jobs/{job}/events"), 404, "not-found")

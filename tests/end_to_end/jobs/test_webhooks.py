@@ -42,10 +42,10 @@ def lines(service: Service, job: str) -> list[str]:
 def test_failed_delivery_is_repeated_after_a_kill_and_signed(bundle: Path, tmp_path: Path) -> None:
     with receiver(lambda n: 500 if n == 0 else 200) as found:
         with serving(tmp_path / "data", "--workers", "1", **ALLOWED) as first:
-            capture = first.client.upload(bundle, name="told", webhook=found.url)
+            capture = first.client.upload(bundle, name="ball", webhook=found.url)
             wait_for(found, 1)
-            told = verified(found.received[0])
-            assert (told["event"], told["job"]["id"]) == ("job.succeeded", capture.job)
+            event = verified(found.received[0])
+            assert (event["event"], event["job"]["id"]) == ("job.succeeded", capture.job)
             while not lines(first, capture.job):
                 time.sleep(0.05)
             assert lines(first, capture.job) == ["webhook, attempt 1: answered with 500; again in 5 s"]
@@ -63,8 +63,8 @@ def test_failed_delivery_is_repeated_after_a_kill_and_signed(bundle: Path, tmp_p
             second.client.cancel(job)
             second.client.delete(job)
             wait_for(found, 3)
-            told = verified(found.received[2])
-            assert (told["event"], told["job"]["id"]) == ("job.cancelled", job.id)
+            event = verified(found.received[2])
+            assert (event["event"], event["job"]["id"]) == ("job.cancelled", job.id)
             with pytest.raises(NotFound):
                 second.client.job(job)
     assert len(found.received) == 3

@@ -96,10 +96,10 @@ def test_moved_backdrop(service: Service, matte: str) -> None:
 
 def test_backdrop_at_another_depth(service: Service, matte: str) -> None:
     still = decoded(asked(service, matte)).astype(int)
-    told = {"distance": 3, "camera": 5}
-    same = decoded(asked(service, matte, depth=3, **told)).astype(int)
+    depths = {"distance": 3, "camera": 5}
+    same = decoded(asked(service, matte, depth=3, **depths)).astype(int)
     assert np.abs(same - still).mean() < 0.5
-    farther = decoded(asked(service, matte, depth=4, **told)).astype(int)
+    farther = decoded(asked(service, matte, depth=4, **depths)).astype(int)
     assert np.abs(farther - still).mean() > 5
     for query in ({"depth": 3}, {"distance": 3}, {"depth": 3, "distance": 3, "other": matte}):
         found = check_problem(asked(service, matte, **query), 422, "bad-request")

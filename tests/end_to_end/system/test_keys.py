@@ -204,12 +204,12 @@ def test_every_route_with_every_kind_of_key(locked: Locked) -> None:
     document = locked.service.http.get("/openapi.json").json()
     routes = {f"{method.upper()} {path}" for path, calls in document["paths"].items() for method in calls}
     assert routes == set(CALLS), "this test has to know how each route is called, and with what key"
-    told = {
+    secured = {
         f"{method.upper()} {path}": "security" in call
         for path, calls in document["paths"].items()
         for method, call in calls.items()
     }
-    assert told == {route: bool(call.needs) for route, call in CALLS.items()}
+    assert secured == {route: bool(call.needs) for route, call in CALLS.items()}
     wrong = []
     ordered = sorted(CALLS, key=lambda route: CALLS[route].last)
     refused = [(route, kind) for route in ordered for kind in KINDS if expected(route, kind) is not None]
@@ -226,8 +226,8 @@ def test_every_route_with_every_kind_of_key(locked: Locked) -> None:
             slug = {401: "unauthorized", 403: "forbidden", 404: "not-found"}[status]
             assert check_problem(answer, status, slug)["type"].endswith(slug)
         if kind.startswith("other") and status is None and CALLS[route].needs != "admin":
-            told = [id for id in locked.ids.values() if id in answer.text]
-            assert not told, (route, kind, "tells of alice's")
+            leaked = [id for id in locked.ids.values() if id in answer.text]
+            assert not leaked, (route, kind, "names alice's")
     assert wrong == []
     assert len(refused) > 4 * len(CALLS)
 

@@ -50,9 +50,9 @@ def test_matte_is_read_and_composited_with_zarr_only(service: Service, matte: st
     done = subprocess.run(
         [sys.executable, "-c", look], cwd=tmp_path, check=True, timeout=120, capture_output=True, text=True
     )
-    told = service.http.get(f"/v1/mattes/{matte}/transport?x=40&y=30").json()
+    pixel = service.http.get(f"/v1/mattes/{matte}/transport?x=40&y=30").json()
     weights = [float(weight) for weight in re.findall(r"float32\(([\d.e-]+)\)\)", done.stdout)]
-    expected_weights = sorted(cell["weight"][0] for cell in told["cells"] if cell["weight"][0])
+    expected_weights = sorted(cell["weight"][0] for cell in pixel["cells"] if cell["weight"][0])
     np.testing.assert_allclose(sorted(weights), expected_weights, rtol=1e-5)
 
 
