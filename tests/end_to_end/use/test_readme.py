@@ -1,69 +1,193 @@
-"""The README's commands, as a new user pastes them."""
+"""The commands of the README, as a new user pastes them, against real processes."""
 
-import re
+import os
 import shutil
+import signal
+import socket
 import subprocess
 import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
+import av
+import httpx2
 import numpy as np
 import pytest
 
-from services.settings import Settings
-from storage.layout.mattes import Matte
-from storage.objects.store import Objects
-from tests.end_to_end.conftest import Service
-from workflows.composite import composite
-from workflows.images import integer_formats
-from workflows.images.resample import area_mean
+from services.client import Client
+from tests.docs.readmes import block
+from tests.end_to_end.conftest import png
 from workflows.simulation import glass_ball
 
-README = (Path(__file__).parents[3] / "README.md").read_text()
+URL = "http://127.0.0.1:8000"
 
 
-@pytest.mark.skipif(
-    shutil.which("curl") is None, reason="the README's lines need curl, which is not installed"
-)
-def test_the_five_lines_of_curl(service: Service, bundle: Path, tmp_path: Path) -> None:
-    (lines,) = (block for block in re.findall(r"```sh\n(.*?)```", README, re.S) if "curl" in block)
-    assert len(lines.splitlines()) == 5
-    (tmp_path / "demo").mkdir()
-    (tmp_path / "demo" / "glass-ball.zip").write_bytes(bundle.read_bytes())
-    backdrop = integer_formats.to_integers(glass_ball.backdrop(160, 120), np.dtype(np.uint8))
-    (tmp_path / "demo" / "backdrop.png").write_bytes(integer_formats.encode_png(backdrop))
-    script = lines.replace("http://127.0.0.1:8000", service.url)
-    subprocess.run(["bash", "-euc", script], cwd=tmp_path, check=True, timeout=120)
-    (newest,) = service.http.get("/v1/mattes?limit=1").json()["mattes"]
-    expected = service.client.composite(newest["id"], (tmp_path / "demo" / "backdrop.png").read_bytes())
-    assert (tmp_path / "composite.png").read_bytes() == expected
+@dataclass
+class Home:
+    """The folder in which a user has followed the README as far as `envmatte serve`."""
+
+    folder: Path
+    url: str
+    client: Client
+
+    def run(self, script: str, *arguments: str, **settings: str) -> str:
+        """Run lines of shell there, and return what they print."""
+        return subprocess.run(
+            ["bash", "-euc", script.replace(URL, self.url), "bash", *arguments],
+            cwd=self.folder,
+            env=environment(ENVMATTE_URL=self.url, **settings),
+            stdout=subprocess.PIPE,
+            text=True,
+            check=True,
+            timeout=240,
+        ).stdout
 
 
-def test_matte_is_read_and_composited_with_zarr_only(service: Service, matte: str, tmp_path: Path) -> None:
-    look, lines = re.findall(r"```python\n(.*?)```", README.partition("## Taking a matte elsewhere")[2], re.S)
-    service.client.export(matte, tmp_path / "matte.zip")
-    stored = Matte(Objects((service.data / "store").as_uri()), matte)
-    backdrop = glass_ball.backdrop(160, 120)
-    np.save(tmp_path / "light.npy", area_mean(backdrop, stored.columns, stored.rows))
-    subprocess.run([sys.executable, "-c", lines], cwd=tmp_path, check=True, timeout=120)
-    expected = composite(stored, backdrop)[..., :3]
-    np.testing.assert_allclose(np.load(tmp_path / "composite.npy"), expected, atol=1e-5)
-    done = subprocess.run(
-        [sys.executable, "-c", look], cwd=tmp_path, check=True, timeout=120, capture_output=True, text=True
+def environment(**settings: str) -> dict[str, str]:
+    """One in which `envmatte` and `python3` are those of this interpreter, and services have one worker."""
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    return os.environ | {"PATH": path, "ENVMATTE_WORKERS": "1"} | settings
+
+
+@contextmanager
+def machine(script: str, folder: Path, **settings: str) -> Iterator[subprocess.Popen[str]]:
+    """Lines of shell as on a machine of their own: a process group, in a folder of its own."""
+    folder.mkdir(exist_ok=True)
+    with (folder / "log").open("w") as log:
+        process = subprocess.Popen(
+            ["bash", "-euc", script],
+            cwd=folder,
+            env=environment(**settings),
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+            start_new_session=True,
+        )
+    try:
+        yield process
+    finally:
+        os.killpg(process.pid, signal.SIGTERM)
+        process.wait(30)
+        assert process.stdout is not None
+        process.stdout.close()
+
+
+def url_of(serving: subprocess.Popen[str], folder: Path) -> str:
+    """The address at which `envmatte serve` says that it serves."""
+    assert serving.stdout is not None
+    while " at http" not in (line := serving.stdout.readline()):
+        assert line, (folder / "log").read_text()
+    return line.rsplit(" at ", 1)[1].strip()
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        return int(taken.getsockname()[1])
+
+
+def film(show: Path, target: Path) -> None:
+    """What a camera of 160 x 120 pixels sees of a display that fills its picture, without glass and unclipped."""
+    with av.open(str(show)) as source, av.open(str(target), "w") as out:
+        given = source.streams.video[0]
+        stream = out.add_stream("libx264", rate=given.average_rate, options={"crf": "12"})
+        stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
+        for n, frame in enumerate(source.decode(given)):
+            pixels = frame.to_ndarray(format="rgb24").reshape(120, 2, 160, 2, 3).mean(axis=(1, 3))
+            seen = av.VideoFrame.from_ndarray((16 + 0.8 * pixels).astype(np.uint8), "rgb24")
+            seen.pts, seen.time_base = n, 1 / given.average_rate
+            out.mux(stream.encode(seen))
+        out.mux(stream.encode(None))
+
+
+@pytest.fixture(scope="module")
+def home(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Home]:
+    """What the install command has left, with a smaller capture; and the service, started as the README says."""
+    folder = tmp_path_factory.mktemp("home")
+    (folder / ".venv/bin").mkdir(parents=True)
+    (folder / ".venv/bin/activate").write_text("")
+    (folder / "demo").mkdir()
+    shutil.copy(bundle, folder / "demo/glass-ball.zip")
+    (folder / "demo/backdrop.png").write_bytes(png(glass_ball.backdrop(160, 120), "srgb", np.uint8))
+    with ExitStack() as stack:
+        script = block("README.md", "Your first composite")
+        serving = stack.enter_context(machine(script, folder, ENVMATTE_PORT="0"))
+        url = url_of(serving, folder)
+        yield Home(folder, url, stack.enter_context(Client(url)))
+
+
+def test_first_composite(home: Home) -> None:
+    home.run(block("README.md", "Your first composite", number=1))
+    by_command = (home.folder / "composite.png").read_bytes()
+    (home.folder / "composite.png").unlink()
+    curl = block("README.md", "Your first composite", number=2)
+    assert len(curl.splitlines()) == 5
+    if shutil.which("curl") is None:
+        pytest.skip("five lines of the README need curl, which is not installed")
+    home.run(curl)
+    assert (home.folder / "composite.png").read_bytes() == by_command
+    newest = httpx2.get(f"{home.url}/v1/mattes?limit=1").json()["mattes"][0]
+    assert home.client.composite(newest["id"], home.folder / "demo/backdrop.png") == by_command
+
+
+@pytest.mark.slow
+def test_from_a_film_to_composites(home: Home) -> None:
+    show, pack = (
+        block("README.md", "Film your own glass", number=n).replace("1920x1080", "320x240") for n in (0, 1)
     )
-    pixel = service.http.get(f"/v1/mattes/{matte}/transport?x=40&y=30").json()
-    weights = [float(weight) for weight in re.findall(r"float32\(([\d.e-]+)\)\)", done.stdout)]
-    expected_weights = sorted(cell["weight"][0] for cell in pixel["cells"] if cell["weight"][0])
-    np.testing.assert_allclose(sorted(weights), expected_weights, rtol=1e-5)
+    home.run(show)
+    film(home.folder / "show.mp4", home.folder / "film.mp4")
+    (home.folder / "backdrops").mkdir()
+    light = {name: glass_ball.backdrop(64, 48) * gain for name, gain in (("day", 1.0), ("night", 0.25))}
+    for name, values in light.items():
+        (home.folder / f"backdrops/{name}.png").write_bytes(png(values, "srgb", np.uint8))
+
+    printed = home.run(f'{pack}{block("README.md", "Command line and Python")}echo "$capture $matte"\n')
+    capture, matte = printed.split()[-2:]
+    assert home.client.capture(capture)["name"] == "my glass"
+    assert sorted(path.name for path in (home.folder / "layers").iterdir()) == sorted(
+        ["all.exr", "stmap.exr", "S.png", "rho.png", "alpha.png", "confidence.png"]
+    )
+    assert sorted(path.stem for path in (home.folder / "composites").iterdir()) == ["day", "night"]
+    for name in light:
+        expected = home.client.composite(matte, home.folder / f"backdrops/{name}.png")
+        assert (home.folder / f"composites/{name}.png").read_bytes() == expected
+
+    (home.folder / "stripes.py").write_text(
+        block("README.md", "Command line and Python", "python").replace(URL, home.url)
+    )
+    home.run(f"python3 stripes.py {matte}", PYTHONPATH=os.getcwd())
+    with np.load(home.folder / "composites.npz") as made:
+        assert (made["film"].shape, made["film"].dtype) == ((4, 120, 160, 3), np.float32)
+        assert made["alpha"].shape == (120, 160)
+        # The moving stripes of the display fill the picture.
+        assert np.std(made["film"], axis=0).mean() > 0.05
 
 
-def test_every_test_it_names_exists() -> None:
-    root = Path(__file__).parents[3]
-    named = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", README)
-    assert len(named) > 10
-    for file, test in named:
-        assert f"\ndef {test}(" in (root / file).read_text(), (file, test)
-
-
-def test_every_setting_is_documented() -> None:
-    documented = set(re.findall(r"`ENVMATTE_(\w+)`", README))
-    assert documented == {name.upper() for name in Settings.model_fields}
+@pytest.mark.slow
+def test_three_machines(bundle: Path, tmp_path: Path) -> None:
+    port = free_port()
+    first, others = (
+        block("README.md", "Scale out", number=n)
+        .replace("FIRST:8786", f"127.0.0.1:{port}")
+        .replace("/mnt/envmatte", str(tmp_path / "shared"))
+        .replace("envmatte scheduler", f"envmatte scheduler --port {port}")
+        for n in (0, 1)
+    )
+    with ExitStack() as stack:
+        serving = stack.enter_context(machine(first, tmp_path / "first", ENVMATTE_PORT="0"))
+        url = url_of(serving, tmp_path / "first")
+        for name in ("second", "third"):
+            shutil.copytree(tmp_path / "first" / "certs", tmp_path / name / "certs")
+            stack.enter_context(machine(others, tmp_path / name))
+        deadline = time.monotonic() + 120
+        while len(httpx2.get(f"{url}/v1/cluster").json()["workers"]) < 2:
+            assert time.monotonic() < deadline
+            time.sleep(0.2)
+        with Client(url) as client:
+            job = client.wait(client.recover(client.upload(bundle), tile=16))
+            assert (job.state, job["tiles"]["done"]) == ("succeeded", 30)
+            assert client.composite(client.matte(job), np.ones((4, 4, 3), np.float32)).shape == (72, 96, 3)
+    assert (tmp_path / "shared" / "mattes").is_dir()

@@ -29,7 +29,7 @@ from tests.parts.processes import interrupt, running
 from tests.services.client.test_client import JOB, answering, ok, refused, saying
 
 ROOT = Path(__file__).parents[3]
-README = (ROOT / "README.md").read_text()
+README = (ROOT / "services/cli/README.md").read_text()
 COMMAND = [sys.executable, "-m", "services"]
 PROCESSES = {"serve", "coordinator", "scheduler", "worker", "completion"}
 """Commands that have no answer to print as JSON."""

@@ -1,0 +1,129 @@
+"""The commands of the READMEs beside the code, as they stand there, against a real service."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from services.runtime.webhook_signature import headers_of, signing_key
+from services.settings import Settings
+from storage.layout.mattes import Matte
+from storage.objects.store import Objects
+from tests.docs.readmes import block, codes, table
+from tests.end_to_end.conftest import Service
+from tests.end_to_end.use.test_readme import URL, environment
+from workflows.composite import composite
+from workflows.images.resample import area_mean
+from workflows.simulation import glass_ball
+
+
+def run(script: str, folder: Path, **settings: str) -> str:
+    """Run lines of shell in a folder, and return what they print."""
+    command = ["bash", "-euc", script]
+    done = subprocess.run(
+        command,
+        cwd=folder,
+        env=environment(**settings),
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    return done.stdout
+
+
+def test_patterns(tmp_path: Path) -> None:
+    for section in ("As a video", "As pictures"):
+        run(block("workflows/programs/README.md", section).replace("1920x1080", "320x240"), tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"patterns", "patterns.mp4", "patterns.json"}
+    assert {"00000.png", "program.json"} < {path.name for path in (tmp_path / "patterns").iterdir()}
+
+
+@pytest.mark.skipif(
+    shutil.which("curl") is None, reason="the README's line needs curl, which is not installed"
+)
+def test_a_program_over_http(service: Service, tmp_path: Path) -> None:
+    line = block("workflows/programs/README.md", "In the browser").replace(URL, service.url)
+    (program,) = re.findall(r'"id":"([^"]+)"', run(line, tmp_path))
+    assert service.http.get(f"/v1/programs/{program}/play").headers["content-type"].startswith("text/html")
+
+
+def test_a_matte_elsewhere(service: Service, matte: str, tmp_path: Path) -> None:
+    readme = "workflows/mattes/README.md"
+    export = block(readme, "Moving a matte elsewhere").replace(URL, service.url)
+    lines = (block(readme, "Layers for other tools") + export).replace("MATTE", matte)
+    imported = run(lines, tmp_path, ENVMATTE_URL=service.url).split()[-1]
+    assert service.client.matte(imported)["state"] == "ready"
+    assert (tmp_path / "layers/all.exr").exists()
+
+    reading, compositing = (block(readme, "Reading a matte without envmatte", "python", n) for n in (0, 1))
+    printed = python(reading, tmp_path)
+    answer = service.http.get(f"/v1/mattes/{matte}/transport?x=40&y=30").json()
+    weights = [float(weight) for weight in re.findall(r"float32\(([\d.e-]+)\)\)", printed)]
+    expected = sorted(cell["weight"][0] for cell in answer["cells"] if cell["weight"][0])
+    np.testing.assert_allclose(sorted(weights), expected, rtol=1e-5)
+
+    stored = Matte(Objects((service.data / "store").as_uri()), matte)
+    backdrop = glass_ball.backdrop(160, 120)
+    np.save(tmp_path / "light.npy", area_mean(backdrop, stored.columns, stored.rows))
+    python(compositing, tmp_path)
+    np.testing.assert_allclose(
+        np.load(tmp_path / "composite.npy"), composite(stored, backdrop)[..., :3], atol=1e-5
+    )
+
+
+def test_keys_and_backups(tmp_path: Path) -> None:
+    """On an installation that no service runs on."""
+    for readme, section in (("README.md", "Run the service"), ("services/README.md", "Keys, owners, limits")):
+        folder = tmp_path / section
+        folder.mkdir()
+        printed = run(block(readme, section), folder)
+        assert re.search(r"lab\s+alice\s+write", printed), printed
+    backups = {block("README.md", "Security and backups"), block("storage/README.md", "Backups")}
+    (lines,) = backups
+    run(lines.replace("/mnt/backups", str(tmp_path)), folder)
+    assert {path.name for path in folder.iterdir()} == {"envmatte-data", "elsewhere"}
+    assert (tmp_path / "monday/manifest.jsonl").exists()
+
+
+def test_completion(tmp_path: Path) -> None:
+    lines = block("services/cli/README.md", "Shell completion")
+    assert "envmatte" in run(f"{lines}complete -p envmatte", tmp_path)
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="the README's line needs openssl")
+def test_webhooks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    readme = "services/webhooks/README.md"
+    run(block(readme, "The secret"), tmp_path)
+    monkeypatch.chdir(tmp_path)
+    secret = Settings().webhook_secret or ""
+    body, names = json.dumps({"job": {"id": "j"}}).encode(), {}
+    exec(block(readme, "Verifying", "python"), names)
+    headers = headers_of(signing_key(secret), "id", int(time.time()), body)
+    assert names["receive"](secret, body, headers) == {"id": "j"}
+    assert headers.keys() == {codes(name)[0] for name, _ in table(readme, "header", "holds")}
+
+
+def test_metrics(service: Service) -> None:
+    documented = {
+        name
+        for names, _, _ in table("services/README.md", "metric", "labels", "counts")
+        for name in codes(names)
+    }
+    families = text_string_to_metric_families(service.http.get("/metrics").text)
+    assert documented == {family.name for family in families}
+
+
+def python(script: str, folder: Path) -> str:
+    """Run a block of Python in a folder, and return what it prints."""
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=folder, check=True, timeout=120, stdout=subprocess.PIPE, text=True
+    )
+    return done.stdout
