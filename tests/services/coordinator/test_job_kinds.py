@@ -85,7 +85,7 @@ def test_a_clip_is_kept_while_its_job_may_be_retried(
 
 
 def test_a_sweep_removes_only_what_no_job_refers_to(engine: Engine, objects: Objects, job: str) -> None:
-    objects.put(composites.clip_path("nobody"), b"any")
+    objects.put(composites.clip_path("unknown"), b"any")
     sweep(engine, objects, seconds=0)
     assert objects.names("composites") == [job]
     with writing(engine) as c:
