@@ -1,30 +1,30 @@
-"""What can go wrong, as one tree.
+"""The errors that callers can act on, as one tree.
 
 ::
 
     EnvmatteError
-    ├── InvalidInput            what was sent can't be used
-    │   ├── CaptureError        a capture's archive or capture.json
-    │   │   └── OverLimit       one that is larger than the service takes
-    │   ├── ArchiveError        a matte's archive
-    │   ├── ImageError          bytes that should be an image
-    │   ├── ClipError           a clip to be a backdrop
-    │   └── OptionError         an option of recovery
+    ├── InvalidInput            something sent to us cannot be used
+    │   ├── CaptureError        a capture archive or its capture.json
+    │   │   └── OverLimit       a capture above one of the service's limits
+    │   ├── ArchiveError        a matte archive
+    │   ├── ImageError          an image that cannot be read
+    │   ├── ClipError           a backdrop clip that cannot be read
+    │   └── OptionError         a recovery option
     ├── NotFound                no such capture, job, matte or frame
-    ├── Conflict                it exists, but not in a state that allows this
-    ├── NoRoom                  the store has no space for it, or its owner no more of it
-    ├── TooMany                 as much is under way as may be at once
-    ├── Unavailable             something the service needs can't be reached for now
-    ├── Corrupt                 something stored is missing or damaged
-    └── GaveUp                  work that failed as often as it may
+    ├── Conflict                it exists, but its state does not allow this
+    ├── NoRoom                  the store is full, or the owner has used up their share
+    ├── TooMany                 too many uploads, jobs or requests at the same time
+    ├── Unavailable             something that the service needs cannot be reached now
+    ├── Corrupt                 stored data is missing or damaged
+    └── GaveUp                  work that failed in all of its attempts
 
-Every error says in ``detail`` what is wrong and what to do; ``fields`` locate the fault (``entry``, ``field``,
-``limit``). They cross process borders, so they are made of plain values only.
+The ``detail`` of an error says what is wrong and what to do; its ``fields`` locate the fault (``entry``, ``field``,
+``limit``). Errors are sent between processes, so they hold plain values only.
 """
 
 DISK_FULL = (
-    "the disk is full: delete captures, mattes or uploads, or free room on it, and try again; what was stored before "
-    "is kept"
+    "the disk is full: delete captures, mattes or uploads, or free space on the disk, and try again; everything stored "
+    "before is kept"
 )
 
 
@@ -34,9 +34,9 @@ class EnvmatteError(Exception):
     Parameters
     ----------
     detail : str
-        What is wrong and what to do about it, for people.
+        What is wrong and what to do about it, in words.
     **fields : str or int or float
-        What locates the fault.
+        Where the fault is.
     """
 
     def __init__(self, detail: str, **fields: str | int | float) -> None:
@@ -53,56 +53,56 @@ def _rebuild(kind: type[EnvmatteError], detail: str, fields: dict[str, str | int
 
 
 class InvalidInput(EnvmatteError):
-    """What was sent can't be used."""
+    """Something sent to us cannot be used."""
 
 
 class CaptureError(InvalidInput):
-    """A capture's archive, its capture.json or one of its frames."""
+    """A capture archive, its capture.json or one of its frames cannot be used."""
 
 
 class OverLimit(CaptureError):
-    """A capture that is larger than the service takes."""
+    """A capture exceeds one of the service's limits."""
 
 
 class ArchiveError(InvalidInput):
-    """A matte's archive, or one of its entries."""
+    """A matte archive or one of its entries cannot be used."""
 
 
 class ImageError(InvalidInput):
-    """Bytes that should be an image."""
+    """An image cannot be read."""
 
 
 class ClipError(InvalidInput):
-    """A clip to be a backdrop."""
+    """A backdrop clip cannot be read."""
 
 
 class OptionError(InvalidInput):
-    """An option of recovery that does not exist, is out of range, or does not go with the capture."""
+    """A recovery option does not exist, is out of range, or does not suit the capture."""
 
 
 class NotFound(EnvmatteError):
-    """No such capture, job, matte or frame."""
+    """There is no such capture, job, matte or frame."""
 
 
 class Conflict(EnvmatteError):
-    """It exists, but is not in a state that allows this."""
+    """The state of something does not allow this."""
 
 
 class NoRoom(EnvmatteError):
-    """The store has no space for it, or its owner no more of it."""
+    """The store is full, or the owner has used up their share of it."""
 
 
 class TooMany(EnvmatteError):
-    """As much is under way as may be at once."""
+    """There are too many uploads, jobs or requests at the same time."""
 
 
 class Unavailable(EnvmatteError):
-    """Something that the service needs can't be reached for now; the same may go well later."""
+    """Something that the service needs cannot be reached now; a later attempt may succeed."""
 
 
 class Corrupt(EnvmatteError):
-    """Something that the store should hold is missing or damaged."""
+    """Stored data is missing or damaged."""
 
 
 class GaveUp(EnvmatteError):
-    """Work that failed as often as it may, for a reason nobody foresaw."""
+    """Work failed in all of its attempts, for an unexpected reason."""

@@ -1,1 +1,1 @@
-"""Rows of the database, one file for each kind of record."""
+"""Rows of the database: one module for each kind of record."""

@@ -11,18 +11,24 @@ from storage.database.tables import captures
 def add(
     connection: Connection, capture: str, job: str, *, seconds: float | None = None, **record: Any
 ) -> None:
-    """Write down a new capture, whose ingest job is queued, and that is kept for some time, or until it is deleted."""
+    """Add a capture that is being ingested by a job; it expires after `seconds`, or never if that is None."""
     row = {"id": capture, "state": "ingesting", "job": job, **lifetime(seconds), **record}
     connection.execute(insert(captures).values(row))
 
 
 def get(connection: Connection, capture: str) -> Row[Any]:
-    """A capture's row; `NotFound` if there is none."""
+    """A capture's row.
+
+    Raises
+    ------
+    NotFound
+        If there is none.
+    """
     return find(connection, captures, capture)
 
 
 def exists(connection: Connection, capture: str) -> bool:
-    """Whether there is a capture."""
+    """Whether a capture exists."""
     return connection.scalar(select(captures.c.id).where(captures.c.id == capture)) is not None
 
 

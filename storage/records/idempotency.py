@@ -1,4 +1,4 @@
-"""What a POST with an Idempotency-Key created."""
+"""What each Idempotency-Key has created, so that a repeated request gets the same response."""
 
 from sqlalchemy import Connection, insert, select
 
@@ -6,10 +6,10 @@ from storage.database.tables import made
 
 
 def find(connection: Connection, key: str, call: str) -> str | None:
-    """The id of what a call with this Idempotency-Key made, if it made something."""
+    """The id of what a call with this Idempotency-Key created, if it has created something."""
     return connection.scalar(select(made.c.id).where(made.c.key == key, made.c.call == call))
 
 
-def add(connection: Connection, key: str, call: str, made_id: str) -> None:
-    """Write down what a call with an Idempotency-Key made."""
-    connection.execute(insert(made).values(key=key, call=call, id=made_id))
+def add(connection: Connection, key: str, call: str, created: str) -> None:
+    """Record what a call with an Idempotency-Key created."""
+    connection.execute(insert(made).values(key=key, call=call, id=created))

@@ -1,4 +1,4 @@
-"""The log of a job, line by line."""
+"""The log of a job."""
 
 import time
 from collections.abc import Sequence
@@ -15,6 +15,6 @@ def add(connection: Connection, job: str, text: str) -> None:
 
 
 def lines(connection: Connection, job: str, after: int, limit: int) -> Sequence[Row[Any]]:
-    """Lines of a job's log after a line, oldest first."""
+    """Up to `limit` lines of a job's log that follow line number `after`, oldest first."""
     query = select(log).where(log.c.job == job, log.c.line > after).order_by(log.c.line).limit(limit)
     return connection.execute(query).all()

@@ -1,9 +1,8 @@
-"""The ledger: jobs, their tiles and their log. The one truth about progress.
+"""Rows of jobs: their states from queued to ended.
 
-A job is ``queued``, ``running``, and then one of ``succeeded``, ``failed`` and ``cancelled``. Its work is cut into
-tiles (frames of a capture by slabs, pixels of a matte by rectangles), each ``queued``, ``done`` or ``failed``; a tile
-is done when what it writes is stored and its row here says so. One that is done here, and then not to be found in the
-store, is ``missing`` until it is done again.
+A job is ``queued``, then ``running``, and finally ``succeeded``, ``failed`` or ``cancelled``. The rows of jobs and of
+their tiles (`storage.records.tiles`) are the only source of truth about progress: workers and schedulers may restart at
+any time.
 """
 
 import time
@@ -36,13 +35,13 @@ def add(
     Parameters
     ----------
     job : str, optional
-        The id, if it has one already: something was stored under it.
+        The id, if something is already stored under it; otherwise a new one.
     stored : int, optional
-        How many bytes that is.
+        The bytes stored under the id.
     trace : str, optional
-        The ``traceparent`` (W3C Trace Context) of the request that asks for it.
+        The ``traceparent`` (W3C Trace Context) of the request.
     webhook : str, optional
-        URL that is told whenever it has ended.
+        URL to notify when the job has ended.
     """
     job = job or new_id()
     row = {
@@ -64,7 +63,13 @@ def add(
 
 
 def get(connection: Connection, job: str) -> Row[Any]:
-    """A job's row; `NotFound` if there is none."""
+    """A job's row.
+
+    Raises
+    ------
+    NotFound
+        If there is none.
+    """
     return find(connection, jobs, job)
 
 
@@ -84,7 +89,7 @@ def is_retryable(problem: dict[str, Any]) -> bool:
 
 def cancelled_with_leftovers(connection: Connection) -> Sequence[Row[Any]]:
     """Cancelled jobs that have left something in the store: an unfinished matte, capture or composite."""
-    # A composite has no other record: what it left is there for as long as its tiles are, see `clear`.
+    # A composite has no record besides its job: it has leftovers while it has tiles, see `tiles.delete_all`.
     left = (jobs.c.kind == "composite") & exists().where(tiles.c.job == jobs.c.id)
     query = (
         select(jobs)
@@ -104,7 +109,7 @@ def change(connection: Connection, job: str, **values: Any) -> None:
 
 
 def enter_stage(connection: Connection, job: str, stage: str) -> None:
-    """Put an active job into a stage; the first one starts it."""
+    """Move an active job to a stage; its first stage starts it."""
     row = get(connection, job)
     if row.state not in ACTIVE:
         return
@@ -116,7 +121,7 @@ def enter_stage(connection: Connection, job: str, stage: str) -> None:
 
 
 def end(connection: Connection, job: str, state: str, problem: dict[str, Any] | None = None) -> bool:
-    """End an active job; false, and nothing changed, if it had ended before."""
+    """End an active job and queue its webhook; returns false and changes nothing if it has already ended."""
     result = connection.execute(
         update(jobs)
         .where(jobs.c.id == job, jobs.c.state.in_(ACTIVE))
@@ -131,40 +136,40 @@ def end(connection: Connection, job: str, state: str, problem: dict[str, Any] | 
 
 
 def cancel(connection: Connection, job: str) -> None:
-    """Cancel an active job; a cancelled one stays so.
+    """Cancel an active job; cancelling it again changes nothing.
 
     Raises
     ------
     NotFound
         If there is none.
     Conflict
-        If it has ended otherwise.
+        If it has succeeded or failed.
     """
     row = get(connection, job)
     if not end(connection, job, "cancelled") and row.state != "cancelled":
-        raise Conflict(f"job {job} has {row.state} already and can't be cancelled")
+        raise Conflict(f"job {job} has already {row.state} and cannot be cancelled")
 
 
 def retry(connection: Connection, job: str, *, replan: bool = False, trace: str | None = None) -> None:
-    """Queue a failed job again; the tiles that are done stay done.
+    """Queue a failed job again; its done tiles stay done.
 
     Parameters
     ----------
     replan : bool
-        Forget its plan and its tiles, because the plan would be another one today.
+        Delete its plan and its tiles, because the settings that the plan depends on have changed.
     trace : str, optional
-        The ``traceparent`` of the request that asks for it; default that of the one before.
+        The ``traceparent`` of the request; by default the job keeps its previous one.
 
     Raises
     ------
     NotFound
-        If there is none.
+        If there is no such job.
     Conflict
         If it has not failed.
     """
     row = get(connection, job)
     if row.state != "failed":
-        raise Conflict(f"job {job} is {row.state}; only a failed job can be tried again")
+        raise Conflict(f"job {job} is {row.state}; only a failed job can be retried")
     if replan:
         connection.execute(tiles.delete().where(tiles.c.job == job))
         nothing = {"plan": None, "total": 0, "pixels": 0}
@@ -183,7 +188,7 @@ def retry(connection: Connection, job: str, *, replan: bool = False, trace: str 
 
 
 def delete(connection: Connection, job: str) -> None:
-    """Delete a job that has ended, its tiles and its log.
+    """Delete a job that has ended, with its tiles and its log.
 
     Raises
     ------

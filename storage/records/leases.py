@@ -1,9 +1,9 @@
-"""The lease of the coordinator: of all that run, the one that holds it drives the jobs.
+"""The coordinator's lease: of several running coordinators, the one that holds it runs the jobs.
 
-It is a row of the database with a token that grows by one whenever the lease changes hands. A coordinator extends it by
-its heartbeat, and checks the token first in every transaction by which it writes: one that was frozen or cut off while
-another took over finds another token, and nothing of what it wanted to write is committed. Times are the database's,
-so that clocks of hosts that differ change nothing.
+The lease is a row of the database with a token that grows by one whenever it changes hands. A coordinator renews the
+lease with each heartbeat and checks the token first in every transaction that writes. A coordinator that was frozen or
+cut off while another took over finds a different token, and nothing that it writes is committed. Times are by the
+database's clock, so the clocks of hosts may differ.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from storage.database.dialects import clock
 from storage.database.tables import coordinator
 
 SECONDS = 10.0
-"""How long a lease holds without a heartbeat."""
+"""How long a lease lasts without a heartbeat."""
 
 
 class Superseded(Exception):
@@ -24,16 +24,16 @@ class Superseded(Exception):
 
 @dataclass(frozen=True)
 class Heartbeat:
-    """The last sign of life of a coordinator.
+    """The last heartbeat of a coordinator.
 
     Attributes
     ----------
     holder : str or None
-        Whose it was; None if it has given the lease back.
+        The process that sent it; None if it has released the lease.
     seconds : float
-        How long ago that was.
+        Its age.
     cluster : dict
-        The cluster as it saw it: ``workers``, and ``problem``, what is wrong in words or None.
+        The cluster as the coordinator saw it: ``workers``, and ``problem``, a text or None.
     """
 
     holder: str | None
@@ -45,14 +45,14 @@ EMPTY_CLUSTER: dict[str, Any] = {"workers": [], "problem": None}
 
 
 def acquire(connection: Connection, holder: str, *, seize: bool = False) -> int | None:
-    """Take the lease if it is free or has run out; returns the token, or None while another holds it.
+    """Acquire the lease if it is free or has expired; returns its token, or None while another process holds it.
 
     Parameters
     ----------
     holder : str
-        Names the process to people.
+        Name of the process, for people.
     seize : bool
-        Take it from whoever holds it: the caller knows that there is nobody else.
+        Acquire it even if another process holds it; the caller knows that none is running.
     """
     row = connection.execute(select(coordinator, clock().label("now"))).one_or_none()
     if row is None:
@@ -68,20 +68,20 @@ def acquire(connection: Connection, holder: str, *, seize: bool = False) -> int 
 
 
 def require_held(connection: Connection, token: int) -> None:
-    """See that the lease is still held by a token.
+    """Check that a token still holds the lease.
 
     Raises
     ------
     Superseded
-        If it is not: the transaction must not be committed.
+        If it does not; the transaction must not be committed.
     """
     held = coordinator.c.holder.is_not(None)
     if connection.scalar(select(coordinator.c.token).where(held)) != token:
-        raise Superseded("another coordinator drives the jobs now")
+        raise Superseded("another coordinator runs the jobs now")
 
 
 def renew(connection: Connection, token: int, cluster: dict[str, Any]) -> None:
-    """Extend the lease, and write down the cluster.
+    """Renew the lease and store the state of the cluster.
 
     Raises
     ------
@@ -93,16 +93,16 @@ def renew(connection: Connection, token: int, cluster: dict[str, Any]) -> None:
 
 
 def release(connection: Connection, token: int) -> None:
-    """Free the lease for the next, if it is still held."""
+    """Release the lease if the token still holds it."""
     connection.execute(update(coordinator).where(coordinator.c.token == token).values(holder=None))
 
 
 def check_writable(connection: Connection) -> None:
-    """Write what is there already, to see that the database can be written to."""
+    """Check that the database accepts writes, without changing anything."""
     connection.execute(update(coordinator).values(token=coordinator.c.token))
 
 
 def last_heartbeat(connection: Connection) -> Heartbeat | None:
-    """The last sign of life of a coordinator, if there ever was one."""
+    """The last heartbeat of a coordinator; None if there never was one."""
     row = connection.execute(select(coordinator, clock().label("now"))).one_or_none()
     return None if row is None else Heartbeat(row.holder, row.now - row.beat_at, row.cluster)

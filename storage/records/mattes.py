@@ -17,7 +17,7 @@ def add(
     options: dict[str, Any],
     seconds: float | None = None,
 ) -> None:
-    """Write down a matte that a job is to recover, and that is kept for some time, or until it is deleted."""
+    """Add a matte that a job will recover; it expires after `seconds`, or never if that is None."""
     row = {"id": matte, "capture": capture, "job": job, "state": "recovering", "options": options}
     connection.execute(insert(mattes).values(row | lifetime(seconds)))
 
@@ -30,18 +30,24 @@ def add_imported(
     stored: int | None = None,
     seconds: float | None = None,
 ) -> None:
-    """Write down a matte that came in an archive, and is whole: it has no capture and no job here."""
+    """Add an imported matte, which is ready and has no capture and no job here."""
     row = {"id": matte, "state": "ready", "options": options, "figures": figures, "stored": stored}
     connection.execute(insert(mattes).values(row | lifetime(seconds)))
 
 
 def get(connection: Connection, matte: str) -> Row[Any]:
-    """A matte's row; `NotFound` if there is none."""
+    """A matte's row.
+
+    Raises
+    ------
+    NotFound
+        If there is none.
+    """
     return find(connection, mattes, matte)
 
 
 def get_ready(connection: Connection, matte: str) -> Row[Any]:
-    """The row of a matte that is recovered.
+    """The row of a matte that is ready.
 
     Raises
     ------
@@ -52,7 +58,7 @@ def get_ready(connection: Connection, matte: str) -> Row[Any]:
     """
     row = get(connection, matte)
     if row.state != "ready":
-        raise Conflict(f"matte {matte} is {row.state}; job {row.job} says more")
+        raise Conflict(f"matte {matte} is {row.state}; see job {row.job}")
     return row
 
 

@@ -1,4 +1,4 @@
-"""Programs: their records in the database. All else of a program, its pictures too, follows from its record."""
+"""Rows of programs. Everything else about a program, its pictures too, is computed from the row."""
 
 import hashlib
 import json
@@ -12,7 +12,7 @@ from storage.database.tables import programs as table
 
 
 def add(connection: Connection, program: dict[str, Any]) -> str:
-    """Write down a program and return its id; the same program has the same id, and is written down once."""
+    """Add a program and return its id; an identical program has the same id and is stored once."""
     id = _id(program)
     if added_bytes(connection, program):
         connection.execute(insert(table).values(id=id, program=program, created_at=time.time()))
@@ -20,7 +20,7 @@ def add(connection: Connection, program: dict[str, Any]) -> str:
 
 
 def added_bytes(connection: Connection, program: dict[str, Any]) -> int:
-    """Bytes that writing down a program takes, as `counts.of_bytes` counts them: none if it is there already."""
+    """Bytes that adding a program would take, as `statistics.stored_bytes` counts them; 0 if it is already stored."""
     known = connection.scalar(select(table.c.id).where(table.c.id == _id(program))) is not None
     return 0 if known else len(json.dumps(program))
 
@@ -42,12 +42,12 @@ def get(connection: Connection, program: str) -> Row[Any]:
 
 
 def delete(connection: Connection, program: str) -> None:
-    """Remove a program's row."""
+    """Delete a program's row."""
     connection.execute(table.delete().where(table.c.id == program))
 
 
 def set_showing(connection: Connection, program: str, showing: dict[str, Any]) -> None:
-    """Write down how far the showing of a program is, and when that was.
+    """Store the playback progress of a program, with the current time.
 
     Raises
     ------
@@ -55,5 +55,5 @@ def set_showing(connection: Connection, program: str, showing: dict[str, Any]) -
         If there is no such program.
     """
     find(connection, table, program)
-    told = showing | {"at": time.time()}
-    connection.execute(update(table).where(table.c.id == program).values(showing=told))
+    record = showing | {"at": time.time()}
+    connection.execute(update(table).where(table.c.id == program).values(showing=record))

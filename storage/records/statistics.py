@@ -1,4 +1,4 @@
-"""How much there is of everything, for those who watch: a few sums, none of them over all tiles."""
+"""Counts and sums for metrics, limits and estimates; none of them reads all tiles."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,14 +12,14 @@ from storage.steps import FINISH
 
 
 def job_counts(connection: Connection) -> Sequence[Row[Any]]:
-    """Jobs by ``kind`` and ``state``: how many as ``number``, and their tiles as ``total``, ``done`` and ``failed``."""
+    """Jobs by ``kind`` and ``state``: their ``number``, and the ``total``, ``done`` and ``failed`` tiles."""
     sums = [func.sum(jobs.c[name]).label(name) for name in ("total", "done", "failed")]
     query = select(jobs.c.kind, jobs.c.state, func.count().label("number"), *sums)
     return connection.execute(query.group_by(jobs.c.kind, jobs.c.state)).all()
 
 
 def missing_tiles(connection: Connection) -> dict[str, int]:
-    """Tiles of active jobs that were done and are not in the store, by kind: they are done again."""
+    """Tiles of active jobs whose output has gone missing in the store and is being made again, by kind of job."""
     query = (
         select(jobs.c.kind, func.count())
         .join(tiles, tiles.c.job == jobs.c.id)
@@ -30,12 +30,12 @@ def missing_tiles(connection: Connection) -> dict[str, int]:
 
 
 def work_totals(connection: Connection) -> Sequence[Row[Any]]:
-    """What has ever been done by each kind of job, see `storage.database.tables.totals`."""
+    """Work done so far by each kind of job, see `storage.database.tables.totals`."""
     return connection.execute(select(totals)).all()
 
 
 def capture_counts(connection: Connection) -> Sequence[Row[Any]]:
-    """Captures by ``state``: how many as ``number``, and the ``bytes`` of their archives."""
+    """Captures by ``state``: their ``number``, and the ``bytes`` of their archives."""
     sums = (func.count().label("number"), func.sum(captures.c.bytes).label("bytes"))
     return connection.execute(select(captures.c.state, *sums).group_by(captures.c.state)).all()
 
@@ -47,14 +47,14 @@ def matte_counts(connection: Connection) -> dict[str, int]:
 
 
 def upload_counts(connection: Connection) -> Row[Any]:
-    """Uploads under way: how many as ``number``, bytes of theirs that have ``come``, and that there are, ``length``."""
+    """Uploads: their ``number``, the bytes that have ``come``, and their ``length`` in bytes."""
     come, length = (func.coalesce(func.sum(column), 0) for column in (uploads.c.offset, uploads.c.length))
     query = select(func.count().label("number"), come.label("come"), length.label("length"))
     return connection.execute(query.select_from(uploads)).one()
 
 
 def tiles_per_second(connection: Connection) -> float | None:
-    """The pace of all running jobs together, each measured over its present stage; None before there is one."""
+    """Tiles per second of all running jobs, each measured over its current stage; None if nothing is measured yet."""
     query = select(jobs.c.done - jobs.c.paced_done, jobs.c.moved_at - jobs.c.paced_at).where(
         jobs.c.state == "running", jobs.c.paced_at < jobs.c.moved_at, jobs.c.done < jobs.c.total
     )
@@ -63,20 +63,20 @@ def tiles_per_second(connection: Connection) -> float | None:
 
 
 def captures_and_uploads(connection: Connection) -> int:
-    """Captures, and the uploads under way that may become some."""
+    """The number of captures, and of uploads that may become captures."""
     return sum(connection.scalar(select(func.count()).select_from(one)) or 0 for one in (captures, uploads))
 
 
 def active_jobs(connection: Connection) -> int:
-    """Jobs that are queued or running."""
+    """The number of queued and running jobs."""
     return connection.scalar(select(func.count()).where(jobs.c.state.in_(ACTIVE))) or 0
 
 
 def stored_bytes(connection: Connection, *, all_owners: bool = False) -> int:
-    """Bytes in the store: of what is there as they were counted, of what is under way as they were announced.
+    """Bytes stored: as counted for finished data, as announced for uploads.
 
-    Programs count too, though they are rows and nothing more: they are as large as who makes them likes, and stay.
-    A capture that is being ingested counts with its archive, a matte that is being recovered not yet.
+    Programs count too, although they are only rows: users choose their size, and they do not expire. A capture that is
+    being ingested counts with the size of its archive; a matte that is being recovered does not count yet.
     """
     sums = [
         func.sum(func.coalesce(captures.c.stored, captures.c.bytes)),
@@ -92,7 +92,7 @@ def stored_bytes(connection: Connection, *, all_owners: bool = False) -> int:
 
 
 def recent_ingests(connection: Connection, limit: int) -> list[tuple[dict[str, Any], float]]:
-    """Of the last ingests that succeeded: their plans, and the seconds that the step after their tiles took."""
+    """The last ingests that succeeded: the plan of each, and the seconds that its final step took."""
     step = (tiles.c.job == jobs.c.id) & (tiles.c.tile == FINISH)
     query = select(jobs.c.plan, tiles.c.seconds).join(tiles, step)
     query = query.where(jobs.c.kind == "ingest", jobs.c.state == "succeeded", tiles.c.seconds.is_not(None))

@@ -1,4 +1,10 @@
-"""Rows of a job's tiles: queued, done, failed, tried again."""
+"""Rows of a job's tiles: which are to do, done, failed or missing, and how often each was tried.
+
+A tile is a slab of a capture's frames, a rectangle of a matte's pixels, or a segment of a clip; the two steps around
+the tiles (`storage.steps`) have rows too. A tile is ``queued``, and ``done`` once its output is stored and its row says
+so; it is ``failed`` after too many attempts. A done tile whose output is not in the store any more is ``missing`` until
+it is done again.
+"""
 
 import time
 from collections.abc import Sequence
@@ -15,12 +21,12 @@ REMAINING = ("queued", "missing")
 
 
 def delete_all(connection: Connection, job: str) -> None:
-    """Delete the tiles of a job that was cancelled; what is known of it as a whole stays."""
+    """Delete the tiles of a cancelled job; the job itself keeps its totals."""
     connection.execute(delete(tiles).where(tiles.c.job == job))
 
 
 def add_steps(connection: Connection, job: str) -> None:
-    """Write down the two steps around a job's tiles, once: a repeat changes nothing."""
+    """Add the two steps around a job's tiles; a repeated call changes nothing."""
     known = set(connection.scalars(select(tiles.c.tile).where(tiles.c.job == job, tiles.c.tile < 0)))
     rows = [_tile(job, step) for step in (PREPARE, FINISH) if step not in known]
     if rows:
@@ -28,7 +34,7 @@ def add_steps(connection: Connection, job: str) -> None:
 
 
 def add_plan(connection: Connection, job: str, plan: dict[str, Any]) -> None:
-    """Write down a job's plan and its tiles, once: a repeat changes nothing."""
+    """Store a job's plan and add its tiles; a repeated call changes nothing."""
     if get(connection, job).plan is not None:
         return
     connection.execute(insert(tiles), [_tile(job, tile) for tile in range(plan["tiles"])])
@@ -40,19 +46,19 @@ def _tile(job: str, tile: int) -> dict[str, Any]:
 
 
 def remaining(connection: Connection, job: str) -> list[int]:
-    """The tiles of a job that are still to do, ascending."""
+    """The tiles of a job that are still to be done, ascending."""
     query = select(tiles.c.tile).where(tiles.c.job == job, tiles.c.tile >= 0, tiles.c.state.in_(REMAINING))
     return list(connection.scalars(query.order_by(tiles.c.tile)))
 
 
 def done(connection: Connection, job: str) -> list[int]:
-    """The tiles of a job that are done."""
+    """The tiles of a job that are done, ascending."""
     query = select(tiles.c.tile).where(tiles.c.job == job, tiles.c.tile >= 0, tiles.c.state == "done")
     return list(connection.scalars(query.order_by(tiles.c.tile)))
 
 
 def mark_done(connection: Connection, job: str, finished: Sequence[tuple[int, float, int]]) -> None:
-    """Write down finished tiles, each (tile, seconds, pixels); one that was done before counts once."""
+    """Mark tiles as done, each given as (tile, seconds, pixels); a tile that was already done counts once."""
     query = select(tiles.c.tile, tiles.c.state).where(
         tiles.c.job == job, tiles.c.tile.in_([tile for tile, _, _ in finished]), tiles.c.state.in_(REMAINING)
     )
@@ -78,23 +84,23 @@ def mark_done(connection: Connection, job: str, finished: Sequence[tuple[int, fl
 
 
 def start_pace(connection: Connection, job: str, after: int) -> bool:
-    """Measure the pace of a job's tiles from here on; false, and nothing changed, until some are done."""
+    """Measure the pace of a job's tiles from now on; false, without a change, if fewer than `after` are done."""
     values = {"paced_at": time.time(), "paced_done": jobs.c.done}
     result = connection.execute(update(jobs).where(jobs.c.id == job, jobs.c.done >= after).values(values))
     return bool(result.rowcount)
 
 
 def record_failure(connection: Connection, job: str, tile: int, reason: str, allowed: int) -> bool:
-    """Write down a failed attempt at a tile; true if it may be tried again, which one that is done need not be."""
-    return _again(connection, job, tile, tiles.c.attempts, "attempt", reason, allowed)
+    """Record a failed attempt at a tile; returns whether to try it again, which is false for a done tile."""
+    return _record(connection, job, tile, tiles.c.attempts, "attempt", reason, allowed)
 
 
 def record_loss(connection: Connection, job: str, tile: int, reason: str, allowed: int) -> bool:
-    """Write down that a tile was lost, with its worker say; true if it may be tried again, as `miss` says."""
-    return _again(connection, job, tile, tiles.c.losses, "loss", reason, allowed)
+    """Record that a tile was lost, for example with its worker; returns whether to try it again."""
+    return _record(connection, job, tile, tiles.c.losses, "loss", reason, allowed)
 
 
-def _again(
+def _record(
     connection: Connection, job: str, tile: int, counter: Column[int], what: str, reason: str, allowed: int
 ) -> bool:
     here = (tiles.c.job == job, tiles.c.tile == tile, tiles.c.state.in_(REMAINING))
@@ -112,19 +118,21 @@ def _again(
 
 
 def requeue_missing(connection: Connection, job: str, missing: Sequence[int], allowed: int) -> list[int]:
-    """Queue tiles again that are done by the ledger, and are not in the store; returns those that may be."""
+    """Queue done tiles again whose output is not in the store; returns those that may be tried again."""
     connection.execute(
         update(tiles)
         .where(tiles.c.job == job, tiles.c.tile.in_(missing), tiles.c.state == "done")
         .values(state="missing")
     )
     return [
-        tile for tile in missing if record_loss(connection, job, tile, "it is missing in the store", allowed)
+        tile
+        for tile in missing
+        if record_loss(connection, job, tile, "its output is missing in the store", allowed)
     ]
 
 
 def _count(connection: Connection, job: str, **more: float) -> None:
-    """Add to what was ever done by jobs of a kind."""
+    """Add to the totals of the job's kind."""
     kind = get(connection, job).kind
     values = {totals.c[name]: totals.c[name] + value for name, value in more.items()}
     if not connection.execute(update(totals).where(totals.c.kind == kind).values(values)).rowcount:

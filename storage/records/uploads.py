@@ -1,4 +1,4 @@
-"""Rows of uploads under way: their offsets, parts and expiry."""
+"""Rows of resumable uploads: their offsets, parts and expiry."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ if TYPE_CHECKING:
     from storage.objects.store import Objects
 
 MAX_PARTS = 10_000
-"""Parts of one upload: what whoever reads it has to know of it stays below a megabyte."""
+"""Most parts of an upload: keeps its index below a megabyte."""
 
 
 def add(
     connection: Connection, upload: str, length: int, metadata: str, seconds: float, key: str | None
 ) -> None:
-    """Write down a new upload, of which nothing has come yet.
+    """Add an upload of which no bytes have arrived yet.
 
     Parameters
     ----------
     length : int
-        Bytes that it will have.
+        Its bytes in total.
     metadata : str
-        What the client says about it, as it is sent.
+        The client's ``Upload-Metadata``, as sent.
     seconds : float
-        How long it is kept, from now and again from every part on.
+        How long it is kept after it was created, or after its last part arrived.
     key : str, optional
-        Idempotency-Key of who made it: there is one upload for a key.
+        The client's Idempotency-Key; a key has at most one upload.
     """
     now = time.time()
     row = {"id": upload, "key": key, "offset": 0, "parts": 0, "length": length, "metadata": metadata}
@@ -49,32 +49,32 @@ def get(connection: Connection, upload: str) -> Row[Any]:
     Raises
     ------
     NotFound
-        If there is none, or not any more. tus would like to know which, but that would take a record of every upload
-        that ever expired.
+        If there is none, or it has expired. tus would allow to tell the two apart, but that would need a record of
+        every expired upload.
     """
     query = select(uploads).where(uploads.c.id == upload, uploads.c.expires_at > time.time())
     row = connection.execute(query).one_or_none()
     if row is None:
         raise NotFound(
-            f"there is no upload {upload!r}: it has expired, was deleted or became a capture; start a new one"
+            f"there is no upload {upload!r}: it has expired, was deleted or became a capture; start a new upload"
         )
     return row
 
 
 def by_key(connection: Connection, key: str) -> Row[Any] | None:
-    """The upload that was made with an Idempotency-Key, if it is still there."""
+    """The upload that was created with an Idempotency-Key, if it still exists."""
     return connection.execute(select(uploads).where(uploads.c.key == key)).one_or_none()
 
 
 def advance(connection: Connection, upload: str, offset: int, parts: Sequence[Part], seconds: float) -> int:
-    """Write down parts that are stored; returns the offset after them.
+    """Record stored parts; returns the offset after them.
 
     Raises
     ------
     Conflict
-        If the upload does not stand at ``offset``: another writer was quicker.
+        If the upload is not at ``offset``, because another writer was faster.
     NotFound
-        If it is gone.
+        If it does not exist any more.
     """
     starts = list(accumulate((part.size for part in parts), initial=offset))
     result = connection.execute(
@@ -91,7 +91,7 @@ def advance(connection: Connection, upload: str, offset: int, parts: Sequence[Pa
 
 
 def check_offset(row: Row[Any], offset: int) -> None:
-    """See that an upload stands at an offset.
+    """Check that an upload is at an offset.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def check_offset(row: Row[Any], offset: int) -> None:
     """
     if row.offset != offset:
         raise Conflict(
-            f"upload {row.id} stands at byte {row.offset}, not {offset}; ask for its offset and go on from there",
+            f"upload {row.id} is at byte {row.offset}, not {offset}; request its offset and continue from there",
             offset=row.offset,
         )
 
@@ -111,18 +111,18 @@ def parts_of(connection: Connection, upload: str) -> list[Part]:
 
 
 def delete(connection: Connection, upload: str) -> bool:
-    """Delete an upload's row; false if there was none."""
+    """Delete an upload's row; returns false if there was none."""
     return bool(connection.execute(uploads.delete().where(uploads.c.id == upload)).rowcount)
 
 
 def delete_expired(connection: Connection) -> list[str]:
-    """Delete the rows of uploads whose time is over; returns their ids."""
+    """Delete the rows of expired uploads; returns their ids."""
     query = uploads.delete().where(uploads.c.expires_at <= time.time()).returning(uploads.c.id)
     return list(connection.scalars(query))
 
 
 def check_room(connection: Connection, objects: Objects, length: int) -> None:
-    """See that the store has room for more bytes, besides those that unfinished uploads are still to bring.
+    """Check that the store has room for more bytes, in addition to those that unfinished uploads still need.
 
     Raises
     ------
@@ -135,7 +135,7 @@ def check_room(connection: Connection, objects: Objects, length: int) -> None:
     missing = length + int(promised) - free
     if missing > 0:
         raise NoRoom(
-            f"the store has no room for {length} bytes: {free} are free, {promised} of them promised to unfinished "
-            f"uploads. Delete captures, mattes or uploads, or free {missing} bytes on the disk",
+            f"the store has no room for {length} bytes: {free} bytes are free, of which unfinished uploads need "
+            f"{promised}. Delete captures, mattes or uploads, or free {missing} bytes on the disk",
             missing=missing,
         )

@@ -1,7 +1,7 @@
-"""What is to be told to webhooks: a row for each ending of a job that has one, until it is delivered or given up.
+"""Webhook deliveries: a row for each job that has ended and has a webhook, until it is delivered or given up.
 
-A row is made in the transaction that ends its job, and holds all that is sent, so that neither a restart nor the job's
-deletion loses it. What is sent to one that answers late may be sent again: receivers tell by the id.
+The row is added in the transaction that ends the job and holds the whole body, so neither a restart nor the deletion of
+the job loses it. A receiver that responds late may get the same delivery twice; its id tells.
 """
 
 import json
@@ -16,21 +16,21 @@ from storage.database.rows import new_id
 from storage.database.tables import deliveries
 
 DELAYS = (5.0, 30.0, 120.0, 600.0, 3600.0, 3 * 3600.0, 6 * 3600.0, 12 * 3600.0)
-"""Seconds from each failed attempt to the next: nine attempts within a day."""
+"""Seconds between a failed attempt and the next: nine attempts within a day."""
 ATTEMPT_SECONDS = 60.0
-"""Seconds after which an attempt of which nothing was written down counts as lost with its process."""
+"""Seconds after which an attempt without a recorded result is repeated: its process has died."""
 
 
 def add(connection: Connection, job: Row[Any]) -> None:
-    """Queue what is told about a job that has just ended."""
+    """Queue the delivery for a job that has just ended."""
     delivery = new_id()
-    told = {
+    ended = {
         name: getattr(job, name) or None for name in ("id", "kind", "state", "capture", "matte", "problem")
     }
-    told |= {name: _time(getattr(job, name)) for name in ("created_at", "finished_at")}
+    ended |= {name: _time(getattr(job, name)) for name in ("created_at", "finished_at")}
     now = time.time()
     body = json.dumps(
-        {"id": delivery, "event": f"job.{job.state}", "created_at": _time(now), "job": told},
+        {"id": delivery, "event": f"job.{job.state}", "created_at": _time(now), "job": ended},
         separators=(",", ":"),
     )
     row = {"id": delivery, "job": job.id, "url": job.webhook, "body": body, "attempts": 0}
@@ -38,12 +38,12 @@ def add(connection: Connection, job: Row[Any]) -> None:
 
 
 def any_due(connection: Connection) -> bool:
-    """Whether something is to be sent now."""
+    """Whether a delivery is due."""
     return connection.scalar(select(deliveries.c.id).where(_is_due()).limit(1)) is not None
 
 
 def claim(connection: Connection, most: int) -> Sequence[Row[Any]]:
-    """Count an attempt at what is to be sent now; what was tried least comes first."""
+    """Count an attempt at up to `most` due deliveries and return them, those with the fewest attempts first."""
     query = select(deliveries.c.id).where(_is_due())
     query = query.order_by(deliveries.c.attempts, deliveries.c.due_at).limit(most)
     claimed = deliveries.c.id.in_(connection.scalars(query).all())
@@ -53,12 +53,12 @@ def claim(connection: Connection, most: int) -> Sequence[Row[Any]]:
 
 
 def delete(connection: Connection, delivery: str) -> None:
-    """Forget what was taken."""
+    """Delete a delivery that the receiver has accepted."""
     connection.execute(deliveries.delete().where(deliveries.c.id == delivery))
 
 
 def schedule_retry(connection: Connection, delivery: str, attempts: int) -> float | None:
-    """Have it tried again; returns the seconds until then, or None if it was given up."""
+    """Schedule the next attempt; returns the seconds until then, or None if the delivery was given up."""
     if attempts > len(DELAYS):
         delete(connection, delivery)
         return None

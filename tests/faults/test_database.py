@@ -61,7 +61,7 @@ def test_database_that_stays_away(
 @pytest.mark.exhaustive
 def test_late_writer_is_shut_out(on_postgresql: Known, table: list[Row], seldom: int) -> None:
     rig = on_postgresql.rig
-    message = "another coordinator drives the jobs now"
+    message = "another coordinator runs the jobs now"
 
     def sleep() -> None:
         name = rig.driver()

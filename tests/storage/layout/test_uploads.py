@@ -93,7 +93,7 @@ def test_one_that_is_gone_is_not_found(engine: Engine) -> None:
             lambda: uploads.get(c, "u"),
             lambda: uploads.advance(c, "u", 7, [Part("b", 1)], DAY),
         ):
-            with pytest.raises(NotFound, match="start a new one"):
+            with pytest.raises(NotFound, match="start a new upload"):
                 call()
 
 
