@@ -1,1 +1,1 @@
-"""How captures, mattes and composites are laid out as arrays and bytes."""
+"""Layout of captures, mattes, uploads and composites in the store, as arrays and bytes."""

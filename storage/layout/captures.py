@@ -1,9 +1,9 @@
-"""A capture: the frame stack, and its record.
+"""A capture in the store: the stack of its frames, and what was measured from them.
 
-In the store, under ``captures/ID``, a zarr group: ``frames`` (frame, y, x, channel), the optional ``mask`` (y, x) and
-``images/N`` (row, column, channel), the patterns that came as images; of a video also ``shares`` (share, column),
-which of its frames make up each frame of the stack. Its attributes hold the manifest, those of the group ``measured``
-in it what was measured from the frames. The archive that was uploaded lies where `storage.layout.uploads` puts it until
+``captures/ID`` is a zarr group with the arrays ``frames`` (frame, y, x, channel), optionally ``mask`` (y, x), and
+``images/N`` (row, column, channel) for the patterns that are images. A capture from a video also has ``shares`` (share,
+column): which frames of the video make up each frame of the stack. The attributes of the group hold the manifest, those
+of its subgroup ``measured`` the measurements. The uploaded archive stays where `storage.layout.uploads` has it until
 its frames are in the stack.
 """
 
@@ -24,11 +24,11 @@ from storage.objects.zarr_store import EVERY_CHUNK
 
 MEASURED = "measured"
 CHUNK = 1 << 20
-"""Bytes of a chunk of the stack, about: small enough that a tile reads little more than its own."""
+"""Approximate bytes of a chunk of the stack: small enough that a tile reads little more than its own pixels."""
 
 
 def path(capture: str) -> str:
-    """Where a capture lies in the store."""
+    """Path of a capture in the store."""
     return f"captures/{capture}"
 
 
@@ -44,32 +44,31 @@ def create_stack(
     images: Sequence[NDArray[np.float32]],
     shares: NDArray[np.int64] | None = None,
 ) -> int:
-    """Make the empty stack of a capture; a repeat writes the same, and touches nothing that was written since.
+    """Create the empty stack of a capture; a repeated call writes the same and leaves frames written since as they are.
 
     Parameters
     ----------
     shape : (frames, height, width, channels)
     memory : int
-        Bytes that whoever writes it may hold at once: a slab of whole frames, and the chunk of it that is
-        being compressed.
+        Bytes that a writer may hold at once: a slab of whole frames, and the chunk of it that is being compressed.
     attributes : dict
         The manifest, as JSON.
     mask : (height, width) bool, optional
     images : sequence of (rows, columns, 1 or 3) float32
     shares : (k, 3) int64, optional
-        What a video's frames go into: a frame of the stack, a time in ticks, and a weight, in this order.
+        For each frame of a video that is used: a frame of the stack, its time in ticks, and its weight.
 
     Returns
     -------
     int
-        Frames of a slab: what is written at once, and the length of a chunk. A slab is all that one writer
-        touches, so that slabs can be written in any order, by anyone, and again.
+        Frames of a slab, which is written at once and is as long as a chunk. Slabs share no chunk, so they can be
+        written in any order, by any worker, and repeatedly.
 
     Notes
     -----
-    A slab holds as many frames as the memory allows. A chunk is a slab's frames over a square of pixels; the
-    square doubles from the block's edge (`block_edge`) until the chunk has about `CHUNK` bytes, so that a
-    tile reads few chunks and few bytes that it does not need.
+    A slab holds as many frames as the memory allows. A chunk is the frames of a slab over a square of pixels. The edge
+    of the square doubles, beginning with that of a block (`block_edge`), until a chunk has about `CHUNK` bytes: a tile
+    reads few chunks, and few bytes that it does not need.
     """
     frames, height, width, channels = shape
     pixel = channels * dtype.itemsize
@@ -99,7 +98,7 @@ def create_stack(
 
 
 def write_slab(objects: Objects, capture: str, first: int, frames: NDArray[np.generic]) -> None:
-    """Write a slab of whole frames, from frame ``first`` on."""
+    """Write a slab of whole frames that begins with frame ``first``."""
     (stack,) = gather(objects.array(f"{path(capture)}/frames"))
     stack[first : first + len(frames)] = frames
 
@@ -110,16 +109,16 @@ class Stack:
     Attributes
     ----------
     attributes : dict
-        The manifest and what was measured, as JSON.
+        The manifest and the measurements, as JSON.
     frames, height, width : int
     dtype : numpy.dtype
-        Of the values: uint8 or uint16.
+        uint8 or uint16.
     """
 
     def __init__(self, objects: Objects, capture: str) -> None:
         at = path(capture)
 
-        async def if_there(found: Coroutine[Any, Any, Any]) -> Any:
+        async def optional(found: Coroutine[Any, Any, Any]) -> Any:
             try:
                 return await found
             except FileNotFoundError:
@@ -131,8 +130,8 @@ class Stack:
             group, self._frames, self._mask, measured = gather(
                 objects.group(at),
                 objects.array(f"{at}/frames"),
-                if_there(objects.array(f"{at}/mask")),
-                if_there(objects.group(f"{at}/{MEASURED}")),
+                optional(objects.array(f"{at}/mask")),
+                optional(objects.group(f"{at}/{MEASURED}")),
             )
         except FileNotFoundError as error:
             raise Corrupt(f"capture {capture} is not in the store; upload it again") from error
@@ -145,23 +144,23 @@ class Stack:
     def read(
         self, rows: slice = slice(None), columns: slice = slice(None), frames: slice = slice(None)
     ) -> NDArray[Any]:
-        """(frame, y, x, channel) values of a rectangle of pixels.
+        """Values of a rectangle of pixels, (frame, y, x, channel).
 
         Raises
         ------
         Corrupt
-            If a chunk of it is missing.
+            If one of its chunks is missing or damaged.
         """
         return np.asarray(self._frames[frames, rows, columns])
 
     def read_frames(self, frames: list[int], rows: slice, columns: slice) -> NDArray[Any]:
-        """As `read`, of any frames in any order."""
+        """Like `read`, for any frames in any order."""
         return np.asarray(self._frames.oindex[np.array(frames), rows, columns])
 
     def read_masked(
         self, rows: slice = slice(None), columns: slice = slice(None)
     ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-        """As `read`, and (y, x) bool: the pixels to recover."""
+        """The results of `read` and `mask`, read at the same time."""
         if self._mask is None:
             return self.read(rows, columns), self.mask(rows, columns)
         values, mask = gather(
@@ -171,13 +170,13 @@ class Stack:
         return values, mask
 
     def mask(self, rows: slice = slice(None), columns: slice = slice(None)) -> NDArray[np.bool_]:
-        """(y, x) bool: the pixels of a rectangle that are to be recovered."""
+        """Which pixels of a rectangle are to be recovered, (y, x) bool."""
         if self._mask is None:
             return np.ones((self.height, self.width), bool)[rows, columns]
         return np.asarray(self._mask[rows, columns])
 
     def images(self) -> list[NDArray[np.float32]]:
-        """The patterns that came as images, each (rows, columns, 1 or 3) float32."""
+        """The patterns that are images, each (rows, columns, 1 or 3) float32."""
         names = self._objects.names(f"{self._path}/images")
         return [
             np.asarray(self._array(f"images/{n}")[:], np.float32)
@@ -185,11 +184,11 @@ class Stack:
         ]
 
     def shares(self) -> NDArray[np.int64]:
-        """What the frames of a video go into, as given to `create_stack`."""
+        """The frames of a video and what they are used for, as given to `create_stack`."""
         return np.asarray(self._array("shares")[:], np.int64)
 
     def missing(self) -> list[int]:
-        """The slabs of which a chunk is not there, ascending; nothing is read."""
+        """The slabs that lack a chunk, ascending; lists the store and reads nothing."""
         stored = self._objects.paths_below(f"{self._path}/frames")
         grid = [
             range(-(-size // chunk))
@@ -201,12 +200,12 @@ class Stack:
         )
 
     def annotate(self, **attributes: Any) -> None:
-        """Add to the attributes what was measured from the frames; `save` stores it."""
+        """Add measurements to the attributes; `save` stores them."""
         self._measured |= attributes
         self.attributes |= attributes
 
     def save(self) -> None:
-        """Store what was measured, all at once: nobody ever reads half of it."""
+        """Store the measurements with one write, so that no reader sees only some of them."""
         gather(self._objects.put_group(f"{self._path}/{MEASURED}", self._measured))
 
     def _array(self, name: str) -> zarr.Array[Any]:

@@ -1,7 +1,7 @@
-"""What graphics hardware draws a matte from, kept in the store beside the matte: bytes that can be made again.
+"""Textures from which graphics hardware draws a matte, cached in the store.
 
-In the matte's group, so that it goes with the matte, as an array of one dimension, so that it is no foreign object to
-who reads the group with zarr.
+They lie in the matte's group, so that they are deleted with it, each as a one-dimensional array, so that any zarr
+reader can read the group.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from storage.objects.store import Objects, gather
 
 
 def read(objects: Objects, matte: str, format: str) -> bytes | None:
-    """What is kept of a matte in a format; None if nothing is, or not all of it yet."""
+    """The cached textures of a matte in a format; None if they are missing or incomplete."""
     try:
         (array,) = gather(objects.array(_path(matte, format)))
         return np.asarray(array[:], np.uint8).tobytes()
@@ -21,7 +21,7 @@ def read(objects: Objects, matte: str, format: str) -> bytes | None:
 
 
 def write(objects: Objects, matte: str, format: str, data: bytes) -> None:
-    """Keep it, in place of an earlier one."""
+    """Cache the textures of a matte in a format, replacing earlier ones."""
     gather(objects.put_array(_path(matte, format), np.frombuffer(data, np.uint8)))
 
 

@@ -1,10 +1,10 @@
-"""An archive of a matte: one ZIP, to take it elsewhere.
+"""Export of a matte as one ZIP archive.
 
-Its root is the matte's zarr group, laid out as in the store (see `storage.layout.mattes`), so any zarr reader opens
-it: ``zarr.open_group(zarr.storage.ZipStore("matte.zip"))``. Entries are stored, for the chunks are compressed
-already; their dates are fixed, and they come block by block: the same matte makes the same bytes. The last one,
-``envmatte.json``, is the manifest: ``format``; ``matte``, the figures and options to list it by; ``members``, the
-size and SHA-256 of every other entry.
+The root of the archive is the matte's zarr group, laid out as in the store (see `storage.layout.mattes`), so any zarr
+reader opens it: ``zarr.open_group(zarr.storage.ZipStore("matte.zip"))``. Entries are stored without compression,
+because their chunks are already compressed. Their dates are fixed and their order is block by block, so the same matte
+gives the same bytes. The last entry, ``envmatte.json``, is the manifest: ``format``; ``matte``, the figures and options
+to list it with; ``members``, the size and SHA-256 of every other entry.
 """
 
 import hashlib
@@ -24,47 +24,47 @@ from storage.objects.store import Objects, gather
 FORMAT = "envmatte-archive/1"
 MANIFEST = "envmatte.json"
 GROUPS = ("zarr.json", "T/zarr.json", *(f"{name}/zarr.json" for name in FRAMES))
-"""The entries that belong to no block."""
+"""The entries that do not belong to a block."""
 DATE = (1980, 1, 1, 0, 0, 0)
 ZIP64 = (1 << 31) - 1
-"""Offsets above this are written in more bytes, by zipfile."""
+"""zipfile writes offsets above this in the ZIP64 format."""
 
 
 def summary(attributes: dict[str, Any]) -> dict[str, Any]:
-    """What a manifest says of a matte with these attributes."""
+    """The part ``matte`` of the manifest of a matte with these attributes."""
     return {name: attributes[name] for name in (*mattes.FIGURES, "options")}
 
 
 def chunk_entry(name: str, row: int, column: int) -> str:
-    """The entry of a block of a frame-shaped array."""
+    """The entry of a block in a frame-shaped array."""
     return f"{name}/c/{row}/{column}" + ("/0" if name in CHANNELS else "")
 
 
 def rows_folder(row: int, column: int) -> str:
-    """The folder of a block's rows T."""
+    """The folder of the rows T of a block."""
     return f"T/{row}.{column}"
 
 
 def block_entries(row: int, column: int) -> list[str]:
-    """The entries of a block; the chunks of rows are not there if all of its rows are empty."""
+    """The entries of a block; the chunks of its rows T are missing if all of them are empty."""
     T = rows_folder(row, column)
     arrays = (f"{T}/{name}/{part}" for name in ("cell", "weight") for part in ("zarr.json", "c/0"))
     return [*(chunk_entry(name, row, column) for name in FRAMES), f"{T}/zarr.json", *arrays]
 
 
 class Archive:
-    """The archive of a matte in the store; iterating over it gives its bytes, a block's at a time.
+    """The archive of a matte in the store; iterating over it yields its bytes, one block at a time.
 
     Attributes
     ----------
     size : int
-        Its bytes.
+        Bytes of the archive.
 
     Raises
     ------
     Corrupt
-        If something of the matte is missing; while iterating, also if it is damaged, or deleted meanwhile. What has
-        come by then is no archive: it lacks its directory.
+        If an object of the matte is missing; while iterating, also if one is damaged or has been deleted. The bytes
+        up to then are not a valid archive, because its directory is missing.
     """
 
     def __init__(self, objects: Objects, matte: str) -> None:
@@ -93,7 +93,7 @@ class Archive:
         for batch in self._batches:
             for name, data in zip(batch, self._read(batch), strict=True):
                 folder, _, inner = name.rpartition("zarr.json" if name.endswith("zarr.json") else "c/")
-                if not inner:  # it comes before the chunks that it describes
+                if not inner:  # comes before the chunks that it describes
                     checked[folder] = is_checked(unseal(f"{self._path}/{name}", data)[0])
                 if len(data) != self._sizes[name] or (inner and checked[folder] and not is_intact(data)):
                     raise self._corrupt(name)
@@ -117,21 +117,22 @@ class Archive:
         return json.dumps({"format": FORMAT, "matte": self._record, "members": members}).encode()
 
     def _corrupt(self, name: str) -> Corrupt:
-        return Corrupt(f"{name} of the matte is missing or damaged; recover it again")
+        return Corrupt(f"{name} of the matte is missing or damaged; recover the matte again")
 
 
 def zip_size(sizes: dict[str, int]) -> int:
-    """Bytes of a ZIP of stored entries, as zipfile writes it.
+    """Bytes of a ZIP archive of stored entries, as zipfile writes it.
 
     Parameters
     ----------
     sizes : dict of str to int
-        The bytes of its entries, by names in ASCII, in order.
+        The bytes of each entry by its ASCII name, in order.
 
     Notes
     -----
-    APPNOTE sect. 4.3: an entry has a local header of 30 bytes and one in the directory of 46, each with its name, and
-    12 more there where it lies beyond 2 GiB. The directory ends with 22 bytes, and 76 more if it is large.
+    APPNOTE sect. 4.3: an entry has a local header of 30 bytes and a directory header of 46 bytes, each followed by its
+    name, and 12 more bytes in the directory if it lies beyond 2 GiB. The directory ends with 22 bytes, and 76 more in
+    the ZIP64 format.
     """
     starts = list(accumulate((30 + len(name) + size for name, size in sizes.items()), initial=0))
     directory = sum(46 + len(name) for name in sizes) + 12 * sum(start > ZIP64 for start in starts[:-1])
@@ -141,12 +142,12 @@ def zip_size(sizes: dict[str, int]) -> int:
 
 def _entry(name: str) -> zipfile.ZipInfo:
     info = zipfile.ZipInfo(name, DATE)
-    info.create_system, info.external_attr = 3, 0o644 << 16  # a plain file of Unix, on whatever machine
+    info.create_system, info.external_attr = 3, 0o644 << 16  # a Unix file, whatever the machine
     return info
 
 
 class _Tail:
-    """A file of which only the end is held: zipfile goes back no further than to the entry that it is writing."""
+    """A file that holds only its end: zipfile seeks back no further than to the entry that it is writing."""
 
     def __init__(self) -> None:
         self._taken = 0
@@ -165,7 +166,7 @@ class _Tail:
         pass
 
     def take(self) -> bytes:
-        """What was written since."""
+        """Return and forget the bytes written since the last call."""
         data = self._held.getvalue()
         self._taken += len(data)
         self._held = io.BytesIO()

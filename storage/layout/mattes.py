@@ -1,25 +1,25 @@
-"""A matte: S, rho and T, laid out in zarr so that any zarr reader can read it.
+"""A matte in the store: S, rho and T in zarr arrays that any zarr reader can read.
 
-In the store, under ``mattes/ID``, a zarr group with the attributes ``width``, ``height``, ``columns``, ``rows`` (the
-first grid of T's cells), ``block``, ``crosstalk`` (X of ``C = S + X (rho T L)``: row the camera's channel, column the
-monitor's) and what the matte was made from; and in it
+``mattes/ID`` is a zarr group with the attributes ``width``, ``height``, ``columns`` and ``rows`` (the first grid of T's
+cells), ``block``, ``crosstalk`` (X of ``C = S + X (rho T L)``: a row for each channel of the camera, a column for each
+of the monitor), and the options that it was recovered with. In it are
 
 - ``S``, ``rho`` (y, x, channel) float32;
-- ``count`` (y, x, channel) uint32: how many cells the row T of a pixel and channel has;
-- ``shared`` (y, x) bool: whether a pixel's first row is the T of all its channels; the others are empty then;
-- ``error`` (y, x) float32: root of the mean squared error to expect of a composite there, in camera units; infinite
+- ``count`` (y, x, channel) uint32: the number of cells in the row T of a pixel and channel;
+- ``shared`` (y, x) bool: whether a pixel's first row T holds for all of its channels, and the others are empty;
+- ``error`` (y, x) float32: expected root mean squared error of a composite at the pixel, in camera units; infinite
   where nothing could be recovered;
-- ``recovered`` (y, x) bool: false where the capture's mask left a pixel out;
-- ``T/R.C/cell`` and ``T/R.C/weight``, one-dimensional, for the block in block row R and block column C: the
-  cells and weights of its rows T one after another, in the order (y, x, channel).
+- ``recovered`` (y, x) bool: false where the capture's mask excludes the pixel;
+- ``T/R.C/cell`` and ``T/R.C/weight``, one-dimensional, for the block in block row R and block column C: the cells and
+  weights of its rows T, concatenated in the order (y, x, channel).
 
-Cells are numbered ``row * columns + column``, row 0 at the top, through a first grid laid over the monitor, then
-through one of half as many columns and rows (rounded up), and so on. A cell of the first grid sees the mean light over
-it; one of a further grid sees sixteen of the grid before, 2 column - 1 to 2 column + 2 and the same in rows, with the
-weights [1, 3, 3, 1] / 8 along each axis, beyond the edge the cells at the edge.
+Cells are numbered ``row * columns + column``, row 0 at the top, first in a grid over the monitor, then in a grid of
+half as many columns and rows (rounded up), and so on. A cell of the first grid sees the mean light over it. A cell of
+a further grid sees sixteen cells of the previous grid, columns 2 column - 1 to 2 column + 2 and rows likewise, with the
+weights [1, 3, 3, 1] / 8 along each axis; beyond the edge, the cells at the edge count instead.
 
-A block is a square of ``block`` pixels, and a chunk of the frame-shaped arrays. Whoever recovers a block writes all of
-it and nothing else, so blocks can be written in any order, by anyone, and again.
+A block is a square of ``block`` pixels and one chunk of each frame-shaped array. A task that recovers a block writes
+all of it and nothing else, so blocks can be written in any order, by any worker, and repeatedly.
 """
 
 from dataclasses import dataclass
@@ -40,9 +40,9 @@ FORMAT = "envmatte-matte/1"
 FRAMES = ("S", "rho", "error", "recovered", "shared", "count")
 """The frame-shaped arrays."""
 CHANNELS = ("S", "rho", "count")
-"""Those of them that have channels."""
+"""The frame-shaped arrays that have channels."""
 FIGURES = ("width", "height", "monitor", "columns", "rows", "block")
-"""The attributes that a matte is listed with."""
+"""The attributes that describe a matte in lists."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Block:
 
 
 def path(matte: str) -> str:
-    """Where a matte lies in the store."""
+    """Path of a matte in the store."""
     return f"mattes/{matte}"
 
 
@@ -104,26 +104,26 @@ class Matte:
 
     @property
     def figures(self) -> dict[str, Any]:
-        """What a matte is listed with."""
+        """The attributes that describe a matte in lists."""
         return {name: self.attributes[name] for name in FIGURES}
 
     @property
     def block_rows(self) -> int:
-        """Blocks from top to bottom."""
+        """Number of blocks from top to bottom."""
         return -(-self.height // self.block)
 
     @property
     def block_columns(self) -> int:
-        """Blocks from left to right."""
+        """Number of blocks from left to right."""
         return -(-self.width // self.block)
 
     def span(self, row: int, column: int) -> tuple[slice, slice]:
-        """The pixels of a block: rows and columns of the frame."""
+        """The rows and columns of the frame that a block covers."""
         y, x = row * self.block, column * self.block
         return slice(y, min(y + self.block, self.height)), slice(x, min(x + self.block, self.width))
 
     def write(self, row: int, column: int, block: Block) -> None:
-        """Write a block, in place of an earlier one."""
+        """Write a block, replacing an earlier one."""
         span, rows = self.span(row, column), f"{self._path}/T/{row}.{column}"
 
         async def write(name: str) -> None:
@@ -135,7 +135,7 @@ class Matte:
             self._objects.put_array(f"{rows}/weight", block.weight),
             *(write(name) for name in FRAMES if name != "count"),
         )
-        # ``count`` comes last: a block is written once its counts are there.
+        # ``count`` is written last: a block with counts is complete.
         gather(write("count"))
 
     def read(self, row: int, column: int) -> Block:
@@ -144,7 +144,7 @@ class Matte:
         Raises
         ------
         Corrupt
-            If some of it is missing.
+            If some of it is missing or damaged.
         """
         span = self.span(row, column)
 
@@ -166,26 +166,26 @@ class Matte:
         return Block(**frames, cell=cell, weight=weight)
 
     def layer(self, name: str) -> NDArray[Any]:
-        """A frame-shaped array, whole.
+        """All of a frame-shaped array.
 
         Raises
         ------
         Corrupt
-            If some of it is missing.
+            If some of it is missing or damaged.
         """
         return np.asarray(self._frames[name][:])
 
     def missing(self) -> set[tuple[int, int]]:
-        """Rows and columns of the blocks of which something is not there; nothing is read."""
+        """Rows and columns of incomplete blocks; lists the store and reads nothing."""
         stored = self._objects.paths_below(self._path)
 
-        def is_there(row: int, column: int) -> bool:
+        def is_complete(row: int, column: int) -> bool:
             chunks = (
                 f"{self._path}/{name}/c/{row}/{column}" + "/0" * (array.ndim - 2)
                 for name, array in self._frames.items()
             )
             rows = [f"{self._path}/T/{row}.{column}/{name}" for name in ("cell", "weight")]
-            # A block whose rows are all empty has no chunk in either.
+            # A block whose rows T are all empty has neither chunk.
             return (
                 all(chunk in stored for chunk in chunks)
                 and all(f"{array}/zarr.json" in stored for array in rows)
@@ -193,16 +193,16 @@ class Matte:
             )
 
         blocks = product(range(self.block_rows), range(self.block_columns))
-        return {block for block in blocks if not is_there(*block)}
+        return {block for block in blocks if not is_complete(*block)}
 
     def _corrupt(self, row: int, column: int) -> Corrupt:
-        return Corrupt(f"block {row}.{column} of the matte is missing or damaged; recover it again")
+        return Corrupt(f"block {row}.{column} of the matte is missing or damaged; recover the matte again")
 
 
 def create(
     objects: Objects, matte: str, *, height: int, width: int, columns: int, rows: int, **attributes: Any
 ) -> Matte:
-    """Make an empty matte; a repeat writes the same, and touches nothing that was written since.
+    """Create an empty matte; a repeated call writes the same and leaves blocks written since as they are.
 
     Parameters
     ----------
@@ -211,7 +211,7 @@ def create(
     columns, rows : int
         The first grid of T's cells.
     **attributes
-        What it is made from, as JSON. No times and no ids: the same input makes the same bytes.
+        What it is recovered from and with, as JSON; without times and ids, so that the same input gives the same bytes.
     """
     edge = block_edge(height, width)
     layout = {

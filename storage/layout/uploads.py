@@ -1,10 +1,10 @@
-"""Uploads under way: a record each, and the bytes that have come, in parts.
+"""Bytes of uploads in the store, in parts.
 
-In the store, ``uploads/ID/NAME.part``, an object for each stretch of bytes: a bucket can append to none. Which of
-them count, and in which order, the database says: a part is stored first and then written down, so that a killed
-writer leaves one that nothing refers to, and of two writers at one offset the first to write it down wins. An
-archive that is complete gets an index, ``uploads/ID/parts.json``, for workers, who have no database; it keeps its
-id and its place as a capture.
+Each part is an object ``uploads/ID/NAME.part``, because objects in a bucket cannot be appended to. The database says
+which parts belong to an upload, and in which order. A part is stored first and recorded then: a writer that is killed
+in between leaves an object that nothing refers to, and of two writers at the same offset the first to record its part
+wins. A complete upload gets an index, ``uploads/ID/parts.json``, for workers, which do not use the database. An upload
+that becomes a capture keeps its id and its place.
 """
 
 from __future__ import annotations
@@ -29,41 +29,41 @@ INDEX = "parts.json"
 
 @dataclass(frozen=True)
 class Part:
-    """A stretch of an upload: the name of its object, and its bytes."""
+    """A part of an upload: the name of its object and its size in bytes."""
 
     name: str
     size: int
 
 
 def path(upload: str) -> str:
-    """Where an upload lies in the store, and the archive of a capture until it is ingested."""
+    """Path of an upload in the store, and of the archive of a capture until it is ingested."""
     return f"uploads/{upload}"
 
 
 def part_path(upload: str, name: str) -> str:
-    """Where a part of it lies."""
+    """Path of a part of an upload."""
     return f"{path(upload)}/{name}.part"
 
 
 def remove(objects: Objects, upload: str) -> None:
-    """Remove the bytes of an upload whose row is deleted, and of an archive that is ingested."""
-    # Whoever writes to it still, and makes a file here meanwhile, finds the row gone and removes what he wrote.
+    """Remove the bytes of an upload whose row is deleted, or of an archive that is ingested."""
+    # A request that is still writing here may create a file meanwhile; it finds the row deleted and cleans up itself.
     with suppress(OSError):
         objects.delete(path(upload))
 
 
 def seal(objects: Objects, upload: str, parts: Sequence[Part]) -> None:
-    """Write the index of an upload that is complete, so that `read` can read it."""
+    """Write the index of a complete upload, which `read` needs."""
     objects.put(f"{path(upload)}/{INDEX}", json.dumps([[part.name, part.size] for part in parts]).encode())
 
 
 def read(objects: Objects, upload: str) -> BinaryIO:
-    """A seekable file over the parts of a sealed upload; reading it is `Corrupt` where a part is cut short.
+    """A seekable file over the parts of a sealed upload; reading raises `Corrupt` where a part is damaged.
 
     Raises
     ------
     FileNotFoundError
-        If there is none, or one of its parts is missing.
+        If there is no index, or a part is missing.
     """
     with objects.read(f"{path(upload)}/{INDEX}") as file:
         parts = [Part(name, size) for name, size in json.load(file)]
@@ -74,7 +74,7 @@ def read(objects: Objects, upload: str) -> BinaryIO:
 
 
 def sweep(objects: Objects, upload: str, parts: Sequence[str]) -> None:
-    """Remove what killed writers have left of an upload that nobody writes to: all but its parts, by their names."""
+    """Remove what killed writers have left of an upload that no request writes to: everything but the named parts."""
     known = {f"{part}.part" for part in parts}
     for name in objects.names(path(upload)):
         if name not in known:
@@ -82,7 +82,7 @@ def sweep(objects: Objects, upload: str, parts: Sequence[str]) -> None:
 
 
 class _Joined(io.RawIOBase):
-    """Parts as one raw file, of which one is open at a time: an archive of gigabytes is read without a copy."""
+    """Parts as one raw file; only one part is open at a time, so an archive of gigabytes is read without a copy."""
 
     def __init__(self, objects: Objects, upload: str, parts: Sequence[Part]) -> None:
         self._paths = [part_path(upload, part.name) for part in parts]
@@ -100,7 +100,7 @@ class _Joined(io.RawIOBase):
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
         base = (0, self._at, self._starts[-1])[whence]
         if base + offset < 0:
-            raise ValueError(f"a seek to {base + offset}, before the start")
+            raise ValueError(f"seek to {base + offset}, before the start")
         self._at = base + offset
         return self._at
 
@@ -115,7 +115,7 @@ class _Joined(io.RawIOBase):
         file.seek(self._at - self._starts[n])
         count = file.readinto(memoryview(buffer)[: self._starts[n + 1] - self._at])  # type: ignore[attr-defined]
         if not count:
-            raise Corrupt(f"{self._paths[n]} is shorter than it was; upload the capture again")
+            raise Corrupt(f"{self._paths[n]} is shorter than when it was stored; upload the capture again")
         self._at += count
         return int(count)
 

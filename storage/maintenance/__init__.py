@@ -1,1 +1,1 @@
-"""Verify, back up and restore an installation."""
+"""Verifying, backing up and restoring an installation."""

@@ -1,14 +1,14 @@
-"""A backup of a whole installation: every row and every object, in a folder or a bucket of its own.
+"""Backup of an installation: all rows and objects, in a folder or bucket of its own.
 
-- ``ledger.jsonl``: the rows, see `storage.maintenance.row_dump`; all as one transaction saw them, at the start.
-- ``objects/…``: what those rows stand for in the store, under the same names and as the same bytes.
-- ``manifest.jsonl``, written last, for without it there is no backup: a line with the ``format``, ``version``,
-  ``revision`` of the schema, ``made_at`` and the ``size`` and ``sha256`` of the ``ledger``; a line for each object with
-  its ``name``, ``size`` and ``sha256``; and a line with the number of ``objects``, their ``bytes``, and the ``sha256``
-  of all lines before.
+- ``ledger.jsonl``: the rows, see `storage.maintenance.row_dump`, as one transaction saw them at the beginning.
+- ``objects/…``: the objects of those rows, with the same names and bytes as in the store.
+- ``manifest.jsonl``, which is written last and makes the backup valid: a line with the ``format``, ``version``,
+  ``revision`` of the schema, ``made_at``, and the ``size`` and ``sha256`` of the ``ledger``; a line for each object
+  with its ``name``, ``size`` and ``sha256``; and a line with the number of ``objects``, their ``bytes``, and the
+  ``sha256`` of all previous lines.
 
-It is taken while services run. What is deleted meanwhile is left out with its rows; of what is turned into something
-else, an archive into a capture say, the rows are taken anew.
+Services may run meanwhile. Data that is deleted during the backup is left out, with its rows. If an item changes into
+another, such as an archive into a capture, its rows are read again.
 """
 
 import hashlib
@@ -36,14 +36,14 @@ OBJECTS = "objects"
 
 
 class Tally:
-    """The ``size`` in bytes, and the SHA-256, of pieces that have passed through it."""
+    """Size in bytes and SHA-256 of the pieces that have passed through it."""
 
     def __init__(self) -> None:
         self._digest = hashlib.sha256()
         self.size = 0
 
     def passing(self, pieces: Iterable[bytes]) -> Iterator[bytes]:
-        """The pieces, each counted before it is given."""
+        """Yield the pieces, and count each."""
         for piece in pieces:
             self._digest.update(piece)
             self.size += len(piece)
@@ -51,7 +51,7 @@ class Tally:
 
     @property
     def sha256(self) -> str:
-        """In hexadecimal digits."""
+        """The SHA-256 so far, in hexadecimal digits."""
         return self._digest.hexdigest()
 
 
@@ -62,30 +62,30 @@ def back_up(
     version: str,
     progress: Callable[[float, int], None] = lambda share, size: None,
 ) -> dict[str, int]:
-    """Make a backup; memory is that of some chunks and the ids of what there is, whatever its size.
+    """Make a backup; takes the memory of a few chunks and of the ids of all items.
 
     Parameters
     ----------
     engine : sqlalchemy.Engine
-        Of the database, which may be of an earlier revision.
+        Of the database, which may have an earlier revision.
     version : str
-        Of envmatte.
+        Version of envmatte.
     progress : callable
-        Gets the share of the things that were copied, and their bytes.
+        Called with the share of the items that were copied, and their bytes.
 
     Returns
     -------
     dict of str to int
-        ``objects``, ``bytes`` and ``rows`` that it has.
+        Counts of ``objects``, ``bytes`` and ``rows`` in the backup.
 
     Raises
     ------
     Conflict
-        If there is something at the target.
+        If the target is not empty.
     Corrupt
-        If something that is to be copied is missing or damaged. Nothing is left at the target then.
+        If an object is missing or damaged; the target is empty then.
     """
-    _see_that_it_is_empty(target)
+    _require_empty(target)
     try:
         with tempfile.TemporaryFile() as rows, tempfile.TemporaryFile() as entries:
             copying = _Copying(engine, objects, target, rows, entries)
@@ -107,16 +107,16 @@ def back_up(
         raise
 
 
-def _see_that_it_is_empty(target: Objects) -> None:
+def _require_empty(target: Objects) -> None:
     there = target.names("")
     if MANIFEST in there:
         raise Conflict(
-            f"{target.url} has a backup already: name an empty folder, or another prefix of the bucket"
+            f"{target.url} already has a backup; name an empty folder, or another prefix of the bucket"
         )
     if there:
         raise Conflict(
-            f"{target.url} is not empty, {there[0]!r} is there: name an empty folder, or another prefix of the bucket; "
-            "what an interrupted backup has left there has no use, and can be removed"
+            f"{target.url} is not empty: it has {there[0]!r}. Name an empty folder, or another prefix of "
+            "the bucket; leftovers of an interrupted backup are useless and can be removed"
         )
 
 
@@ -138,16 +138,16 @@ def _manifest(header: dict[str, Any], entries: IO[bytes]) -> Iterator[bytes]:
 
 
 class _Copying:
-    """A backup that is being made.
+    """The state of a backup while it is made.
 
     Attributes
     ----------
     revision : str
-        Of the schema.
+        Revision of the schema.
     count : int
-        Families at the start.
+        Number of families at the beginning.
     objects, bytes, rows : int
-        That were copied.
+        Copied so far.
     """
 
     def __init__(
@@ -156,84 +156,84 @@ class _Copying:
         self._engine, self._target = engine, target
         self._rows, self._entries = rows, entries
         self._of_family: list[dict[str, Any]] = []
-        self._anew: dict[str, list[Line]] = {}
+        self._reread: dict[str, list[Line]] = {}
         self.revision = ""
         self.count = self.objects = self.bytes = self.rows = 0
 
     def snapshot(self) -> dict[str, list[Item]]:
-        """Write down all rows, as they are at one time; returns what they stand for, by family."""
+        """Store all rows as one transaction sees them; returns their items, by family."""
         families: dict[str, list[Item]] = {}
         with reading(self._engine) as c:
             self.revision = revision(c) or ""
             tables = row_dump.tables_of(c)
             for name, row in row_dump.lines(c, tables):
                 self._rows.write(row_dump.to_line(name, row))
-                for thing in inventory.items_of_row(c, tables, name, row):
-                    families.setdefault(thing.family, []).append(thing)
+                for item in inventory.items_of_row(c, tables, name, row):
+                    families.setdefault(item.family, []).append(item)
         self.count = len(families)
         return families
 
     def take(self, path: str, pieces: Iterator[bytes]) -> None:
-        """Copy an object; called by several threads."""
+        """Copy an object; several threads call this."""
         tally = Tally()
         self._target.write_raw(f"{OBJECTS}/{path}", tally.passing(pieces))
         self._of_family.append({"name": path, "size": tally.size, "sha256": tally.sha256})
 
-    def copy(self, examiner: Examiner, family: str, things: list[Item]) -> None:
-        """Copy what belongs together, as often as it changes meanwhile.
+    def copy(self, examiner: Examiner, family: str, items: list[Item]) -> None:
+        """Copy the items of a family, and again if they changed meanwhile.
 
         Raises
         ------
         Corrupt
-            If something is missing or damaged, though its rows have not changed.
+            If an object is missing or damaged although the rows have not changed.
         """
         faults: set[Finding] = set()
         while True:
-            found = [one for thing in things for one in examiner.examine(thing) if one.what != "unexpected"]
-            if not found and all(thing.state == "whole" for thing in things):
+            found = [one for item in items for one in examiner.examine(item) if one.what != "unexpected"]
+            if not found and all(item.state == "whole" for item in items):
                 break
-            lines, now = self._look_again(family)
-            # What is being written, and still has its row, was not deleted before it was copied.
-            if not found and {(one.kind, one.id) for one in things} <= {(one.kind, one.id) for one in now}:
+            lines, now = self._read_again(family)
+            # Items that are still being written and still have their row were not deleted before they were copied.
+            if not found and {(one.kind, one.id) for one in items} <= {(one.kind, one.id) for one in now}:
                 break
-            if set(now) == set(things) and faults & set(found):
+            if set(now) == set(items) and faults & set(found):
                 first = next(one for one in found if one in faults)
                 raise Corrupt(
-                    f"{first.object} is {first.what} in the store, and a backup would be without it: {first.remedy}. "
-                    "`envmatte verify` finds all there is of the kind",
+                    f"{first.object} is {first.what} in the store, so it cannot be backed up: {first.remedy}. "
+                    "`envmatte verify` lists all such objects",
                     entry=first.object,
                 )
-            for thing in things:
-                self._target.delete(f"{OBJECTS}/{thing.folder}")
+            for item in items:
+                self._target.delete(f"{OBJECTS}/{item.folder}")
             self._of_family.clear()
-            self._anew[family], things, faults = lines, now, set(found)
+            self._reread[family], items, faults = lines, now, set(found)
         for entry in sorted(self._of_family, key=lambda entry: str(entry["name"])):
             self._entries.write(json.dumps(entry).encode() + b"\n")
             self.objects += 1
             self.bytes += entry["size"]
         self._of_family.clear()
 
-    def _look_again(self, family: str) -> tuple[list[Line], list[Item]]:
-        """The rows of a family as they are now, and what they stand for."""
+    def _read_again(self, family: str) -> tuple[list[Line], list[Item]]:
+        """The rows of a family as they are now, and their items."""
         with reading(self._engine) as c:
             tables = row_dump.tables_of(c)
             lines = list(row_dump.lines_of_family(c, tables, family))
-            return lines, [thing for line in lines for thing in inventory.items_of_row(c, tables, *line)]
+            return lines, [item for line in lines for item in inventory.items_of_row(c, tables, *line)]
 
     def put_ledger(self) -> dict[str, Any]:
-        """Write the rows of what was copied; returns what the manifest says of them."""
+        """Write the ledger; returns its entry in the manifest."""
         tally = Tally()
         self._target.write_raw(LEDGER, tally.passing(self._lines()))
         return {"rows": self.rows, "size": tally.size, "sha256": tally.sha256}
 
     def _lines(self) -> Iterator[bytes]:
-        """All rows, counted: those of families that changed as they were when those were copied."""
+        """All rows, counted; those of families that changed are as they were when the family was copied."""
         replaced: set[str] = set()
         self._rows.seek(0)
         for line in self._rows:
-            if self._anew:
+            if self._reread:
                 name, row = json.loads(line)
-                if inventory.family_of(name, row) in self._anew:
+                if inventory.family_of(name, row) in self._reread:
                     if name == "jobs":
                         replaced.add(row["id"])
                     continue
@@ -241,7 +241,7 @@ class _Copying:
                     continue
             self.rows += 1
             yield line
-        for lines in self._anew.values():
+        for lines in self._reread.values():
             for name, row in lines:
                 self.rows += 1
                 yield row_dump.to_line(name, row)

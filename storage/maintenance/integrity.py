@@ -1,6 +1,6 @@
-"""Whether what is stored is what was written: every object of a thing is read, and held against its checksum.
+"""Integrity check of items in the store: every object of an item is read and compared with its checksum.
 
-What a thing must have is told by its kind, and by the ``zarr.json`` of its arrays: every chunk of every array.
+The kind of an item and the ``zarr.json`` of its arrays say which objects it must have: every chunk of every array.
 """
 
 import json
@@ -21,14 +21,14 @@ from storage.objects.checksums import BLOCK, SUFFIX, damaged, is_checked, is_int
 from storage.objects.store import Objects
 
 THREADS = 8
-"""Objects that are read at once: a bucket takes tens of milliseconds to answer."""
+"""Objects that are read at the same time: a bucket takes tens of milliseconds to respond."""
 Take = Callable[[str, Iterator[bytes]], None]
-"""What is done with an object's bytes, in pieces, as they are read; it must read them all."""
+"""Takes the path of an object and its bytes in pieces; it must read all of them."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that is not as it should be.
+    """Something wrong with an object in the store.
 
     Attributes
     ----------
@@ -36,6 +36,7 @@ class Finding:
     object : str
         Its path in the store.
     remedy : str
+        What to do about it.
     """
 
     what: Literal["missing", "damaged", "unexpected"]
@@ -44,25 +45,25 @@ class Finding:
 
 
 def discard(path: str, pieces: Iterable[bytes]) -> None:
-    """Read an object, and that is all."""
+    """Read the bytes of an object and do nothing with them."""
     for _ in pieces:
         pass
 
 
 class Examiner:
-    """Reads things, object by object, several at once.
+    """Checks items object by object, several objects at a time.
 
     Parameters
     ----------
     objects : Objects
     take : callable
-        Gets the bytes of every object that a thing has to have, by its path, in one of several threads.
+        Called with the path and the bytes of every object that an item must have, in one of several threads.
 
     Attributes
     ----------
     read : collections.Counter
-        ``objects`` and ``bytes`` that were read; ``unchecked`` and ``unchecked_bytes``, of those the ones that have no
-        checksum, for they were stored before there were checksums.
+        ``objects`` and ``bytes`` that were read; of these, ``unchecked`` and ``unchecked_bytes`` have no checksum,
+        because they were stored before there were checksums.
     """
 
     def __init__(self, objects: Objects, take: Take = discard) -> None:
@@ -78,33 +79,33 @@ class Examiner:
     def __exit__(self, *exception: object) -> None:
         self._pool.shutdown(cancel_futures=True)
 
-    def examine(self, thing: Item) -> list[Finding]:
-        """Read a thing, and return what is not as it should be: memory is that of a few chunks, whatever its size."""
-        sizes = self._objects.sizes(thing.folder)
-        look = self._look_at_arrays if thing.kind in ("capture", "matte") else self._look_at_files
-        found = list(look(thing, sizes))
-        # What is being written may still lack anything, or have more than its rows tell.
-        return [one for one in found if thing.state == "whole" or one.what == "damaged"]
+    def examine(self, item: Item) -> list[Finding]:
+        """Check an item and return what is wrong with it; takes the memory of a few chunks, whatever its size."""
+        sizes = self._objects.sizes(item.folder)
+        check = self._check_arrays if item.kind in ("capture", "matte") else self._check_files
+        found = list(check(item, sizes))
+        # An item that is being written may lack objects, or have more than its rows say.
+        return [one for one in found if item.state == "whole" or one.what == "damaged"]
 
-    def _look_at_files(self, thing: Item, sizes: dict[str, int]) -> Iterator[Finding]:
+    def _check_files(self, item: Item, sizes: dict[str, int]) -> Iterator[Finding]:
         expected = []
-        if thing.kind == "upload":
-            expected = [uploads.part_path(thing.id, name) for name in thing.parts]
-        elif thing.kind == "archive":
-            index = f"{thing.folder}/{uploads.INDEX}"
+        if item.kind == "upload":
+            expected = [uploads.part_path(item.id, name) for name in item.parts]
+        elif item.kind == "archive":
+            index = f"{item.folder}/{uploads.INDEX}"
             try:
-                expected = [index, *_parts_of(self._objects, thing.id)]
+                expected = [index, *_parts_of(self._objects, item.id)]
             except FileNotFoundError:
                 yield missing(index)
             except Corrupt as error:
                 yield _damaged(str(error.fields.get("entry", index)))
-        elif thing.state == "whole":
-            expected = [composites.video_path(thing.id)]
+        elif item.state == "whole":
+            expected = [composites.video_path(item.id)]
         else:
             expected = sorted(path for path in sizes if not path.endswith(SUFFIX))
-        yield from self._all(self._look_at_file, [(path,) for path in expected])
+        yield from self._all(self._check_file, [(path,) for path in expected])
 
-    def _look_at_file(self, path: str) -> Finding | None:
+    def _check_file(self, path: str) -> Finding | None:
         with self._objects.reader(path) as file:
             self._take(path, iter(lambda: file.read(BLOCK), b""))
             self._count(file.size, file.is_checked)
@@ -114,12 +115,12 @@ class Examiner:
                 self._count(len(table), True)
         return None
 
-    def _look_at_arrays(self, thing: Item, sizes: dict[str, int]) -> Iterator[Finding]:
+    def _check_arrays(self, item: Item, sizes: dict[str, int]) -> Iterator[Finding]:
         documents: dict[str, dict[str, Any]] = {}
         paths = sorted(path for path in sizes if path.endswith("/zarr.json"))
-        yield from self._all(self._look_at_document, [(path, documents) for path in paths])
+        yield from self._all(self._check_document, [(path, documents) for path in paths])
         there = {path.removesuffix("/zarr.json") for path in paths}
-        for folder in sorted(_expected(thing, documents, sizes) - there):
+        for folder in sorted(_expected(item, documents, sizes) - there):
             yield missing(f"{folder}/zarr.json")
         chunks = []
         for folder, document in documents.items():
@@ -128,14 +129,14 @@ class Examiner:
                     chunks.append((path, is_checked(document)))
                 else:
                     yield missing(path)
-        yield from self._all(self._look_at_chunk, chunks)
+        yield from self._all(self._check_chunk, chunks)
         known = {path for path, _ in chunks} | set(paths)
         for path in sorted(sizes.keys() - known):
-            # Of an array that is not known no chunk is: that was said of its zarr.json.
-            if path.rpartition("/c/")[0] in documents or "/c/" not in path.removeprefix(thing.folder):
-                yield Finding("unexpected", path, "nothing reads it: remove it from the store")
+            # Chunks of an array without zarr.json are not reported again: its zarr.json is.
+            if path.rpartition("/c/")[0] in documents or "/c/" not in path.removeprefix(item.folder):
+                yield Finding("unexpected", path, "it is never read; remove it from the store")
 
-    def _look_at_document(self, path: str, documents: dict[str, dict[str, Any]]) -> Finding | None:
+    def _check_document(self, path: str, documents: dict[str, dict[str, Any]]) -> Finding | None:
         data = self._objects.read_raw(path)
         document, checked = unseal(path, data)
         self._take(path, iter([data]))
@@ -147,7 +148,7 @@ class Examiner:
         documents[path.removesuffix("/zarr.json")] = document
         return None
 
-    def _look_at_chunk(self, path: str, checked: bool) -> Finding | None:
+    def _check_chunk(self, path: str, checked: bool) -> Finding | None:
         data = self._objects.read_raw(path)
         if checked and not is_intact(data):
             raise damaged(path)
@@ -156,20 +157,20 @@ class Examiner:
         return None
 
     def _all(
-        self, look: Callable[..., Finding | None], these: Sequence[tuple[Any, ...]]
+        self, check: Callable[..., Finding | None], these: Sequence[tuple[Any, ...]]
     ) -> Iterator[Finding]:
-        """Look at objects, several at once, and a bounded number under way."""
+        """Check objects concurrently, a bounded number at a time."""
 
-        def told(arguments: tuple[Any, ...]) -> Finding | None:
+        def check_one(arguments: tuple[Any, ...]) -> Finding | None:
             try:
-                return look(*arguments)
+                return check(*arguments)
             except FileNotFoundError:
                 return missing(arguments[0])
             except Corrupt as error:
                 return _damaged(str(error.fields.get("entry", arguments[0])))
 
         for first in range(0, len(these), 4 * THREADS):
-            yield from filter(None, self._pool.map(told, these[first : first + 4 * THREADS]))
+            yield from filter(None, self._pool.map(check_one, these[first : first + 4 * THREADS]))
 
     def _count(self, size: int, checked: bool) -> None:
         more = {"objects": 1, "bytes": size}
@@ -178,7 +179,7 @@ class Examiner:
 
 
 def missing(path: str) -> Finding:
-    """What is found of an object that is not there."""
+    """The finding for an object that is not there."""
     return Finding("missing", path, remedy(path))
 
 
@@ -195,28 +196,28 @@ def _parts_of(objects: Objects, archive: str) -> list[str]:
             raise damaged(index) from error
 
 
-def _expected(thing: Item, documents: dict[str, dict[str, Any]], sizes: Iterable[str]) -> set[str]:
-    """The folders that must have a zarr.json: those of the thing's kind, and those in which something lies."""
+def _expected(item: Item, documents: dict[str, dict[str, Any]], sizes: Iterable[str]) -> set[str]:
+    """The folders that must have a zarr.json: by the kind of the item, and because they contain objects."""
     names: list[str] = ["", "frames", MEASURED]
-    if thing.kind == "matte":
+    if item.kind == "matte":
         names = [name.removesuffix("zarr.json").rstrip("/") for name in GROUPS]
-        figures = documents.get(thing.folder, {}).get("attributes", {})
+        figures = documents.get(item.folder, {}).get("attributes", {})
         height, width, edge = (figures.get(name) for name in ("height", "width", "block"))
         if all(isinstance(one, int) and one > 0 for one in (height, width, edge)):
             for row, column in product(range(-(-height // edge)), range(-(-width // edge))):
                 T = rows_folder(row, column)
                 names += [T, f"{T}/cell", f"{T}/weight"]
-    expected = {f"{thing.folder}/{name}".rstrip("/") for name in names}
+    expected = {f"{item.folder}/{name}".rstrip("/") for name in names}
     for path in sizes:
-        at = path.rpartition("/c/" if "/c/" in path.removeprefix(thing.folder) else "/")[0]
-        while len(at) >= len(thing.folder):
+        at = path.rpartition("/c/" if "/c/" in path.removeprefix(item.folder) else "/")[0]
+        while len(at) >= len(item.folder):
             expected.add(at)
             at = at.rpartition("/")[0]
     return expected
 
 
 def _chunks(folder: str, document: dict[str, Any]) -> Iterator[str]:
-    """The paths of an array's chunks; of a group there are none."""
+    """The paths of an array's chunks; a group has none."""
     if document["node_type"] == "group":
         return iter(())
     edges = document["chunk_grid"]["configuration"]["chunk_shape"]

@@ -1,4 +1,4 @@
-"""What the store has to hold, by what the database says: for whoever tidies up, checks it, or takes it elsewhere."""
+"""What the store should hold according to the database: for clean-up, verification and backups."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -11,33 +11,33 @@ from storage.layout import captures, composites, mattes, uploads
 from storage.records.jobs import is_retryable
 
 FOLDERS = ("captures", "mattes", "uploads", "composites")
-"""All that there is at the top of the store."""
+"""The top folders of the store."""
 GRACE_SECONDS = 3600.0
-"""Seconds for which what nothing refers to is left alone: someone may be about to write down that it is there."""
+"""Seconds for which objects without a row are left alone: their row may be about to be added."""
 COLUMNS = {
     "captures": ("id", "state", "problem"),
     "mattes": ("id", "state", "capture"),
     "uploads": ("id",),
     "jobs": ("id", "state", "problem", "kind", "capture", "matte"),
 }
-"""Of the tables whose rows stand for something in the store: what tells it."""
+"""Tables whose rows have items in the store, and the columns that describe them."""
 
 
 @dataclass(frozen=True)
 class Item:
-    """What a row stands for in the store.
+    """The objects of one row in the store.
 
     Attributes
     ----------
     kind : str
-        An ``archive`` is what a capture was uploaded as, until it is ingested.
+        An ``archive`` is the uploaded archive of a capture until it is ingested.
     id : str
     state : str
-        ``whole``; ``busy``, being written; or ``left``, by a job that failed and may be tried again.
+        ``whole``; ``busy``, being written; or ``left`` by a failed job that may be retried.
     folder : str
-        Where it lies.
+        Path of its folder in the store.
     family : str
-        The same of all that is deleted with, or made of, one another: the id of a capture, or of a matte without one.
+        Id of the capture it was made from, or of an imported matte: items that depend on each other have the same.
     parts : tuple of str
         Names of the parts of an upload under way.
     """
@@ -51,7 +51,7 @@ class Item:
 
 
 def items(connection: Connection, tables: Mapping[str, Table] = metadata.tables) -> Iterator[Item]:
-    """All that there is by the database."""
+    """All items according to the database."""
     for name, columns in COLUMNS.items():
         query = select(*(tables[name].c[column] for column in columns))
         if name == "jobs":
@@ -61,7 +61,7 @@ def items(connection: Connection, tables: Mapping[str, Table] = metadata.tables)
 
 
 def family_of(table: str, row: Mapping[str, Any]) -> str | None:
-    """The family that a row belongs to, see `Thing`; of tiles and log it is their job's."""
+    """The family of a row, see `Item`; None for tables without one, such as tiles and log."""
     match table:
         case "captures" | "uploads":
             return str(row["id"])
@@ -77,14 +77,14 @@ def family_of(table: str, row: Mapping[str, Any]) -> str | None:
 def items_of_row(
     connection: Connection, tables: Mapping[str, Table], table: str, row: Mapping[str, Any]
 ) -> Iterator[Item]:
-    """What a row stands for in the store; nothing, of most tables.
+    """The items of a row; most tables have none.
 
     Parameters
     ----------
     tables : mapping of str to Table
-        As the database has them, which may be of an earlier revision.
+        The tables of the database, which may have an earlier revision.
     row : mapping
-        With `COLUMNS`.
+        A row with at least the `COLUMNS` of its table.
     """
     family = family_of(table, row) or ""
     if table == "captures" and (row["state"] != "failed" or is_retryable(row["problem"])):

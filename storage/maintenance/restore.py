@@ -1,7 +1,8 @@
-"""A backup comes back, into an installation that holds nothing: all of it, or nothing.
+"""Restoring a backup into an empty installation: all of it, or nothing.
 
-Every byte is held against the manifest on its way in. Objects come first, and the rows last, in one transaction; until
-then a marker in the store says that what is there belongs to nothing, and whoever restores again clears it away.
+Every byte is compared with the manifest while it is copied. Objects come first; the rows follow in one transaction.
+Until then, a marker in the store says that its objects belong to an unfinished restore, and the next restore removes
+them.
 """
 
 import hashlib
@@ -28,11 +29,11 @@ from storage.objects.byte_objects import PART
 from storage.objects.store import Objects
 
 MARKER = "restoring"
-"""In the store while a backup is being restored: names the database that its rows are to come to."""
+"""Object in the store during a restore: names the database that the rows will go to."""
 LINE = 1 << 16
-"""Bytes of a line of the manifest, at most."""
+"""Most bytes of a line of the manifest."""
 NAME = re.compile(rf"({'|'.join(FOLDERS)})(/[A-Za-z0-9_-][A-Za-z0-9._-]*)+")
-"""Of an object: none leaves its folder."""
+"""Valid names of objects: none leaves its folder."""
 SHA256 = re.compile("[0-9a-f]{64}")
 
 
@@ -47,35 +48,35 @@ def restore(
     Parameters
     ----------
     engine : sqlalchemy.Engine
-        Of a database that has no rows, and may have no tables.
+        Of a database without rows; it may have no tables.
     objects : Objects
-        A store that has none.
+        An empty store.
     progress : callable
-        Gets the share of the bytes that were restored, and their number.
+        Called with the share of the bytes that were restored, and their number.
 
     Returns
     -------
     dict of str to int
-        ``objects``, ``bytes`` and ``rows`` that came.
+        Counts of ``objects``, ``bytes`` and ``rows`` restored.
 
     Raises
     ------
     Conflict
-        If there is no backup, or one of a newer envmatte; if the installation holds something, or a service runs on it.
+        If there is no backup, a newer envmatte made it, the installation is not empty, or a service runs on it.
     InvalidInput
-        If something of the backup is not what its manifest says.
+        If the backup does not match its manifest.
     NoRoom
-        If the store has too little.
+        If the store has too little space.
     """
     manifest = Manifest(source)
     with reading(engine) as c:
-        _see_that_it_is_empty(c)
+        _require_empty_database(c)
     database = dialects.display_url(engine.url).encode()
-    _see_that_nothing_is_stored(objects, database)
+    _require_empty_store(objects, database)
     free = objects.free_bytes()
     if free is not None and free < manifest.bytes:
         raise NoRoom(
-            f"the backup has {manifest.bytes} bytes, and the disk of the store {free} free: free some"
+            f"the backup has {manifest.bytes} bytes, but the disk of the store only {free} free; free space on it"
         )
     objects.put(MARKER, database)
     try:
@@ -84,12 +85,12 @@ def restore(
             rows.writelines(_read(source, LEDGER, manifest.ledger))
             rows.seek(0)
             with writing(engine) as c:
-                _see_that_it_is_empty(c)
-                count = _read_in(c, manifest.revision, rows)
+                _require_empty_database(c)
+                count = _insert_rows(c, manifest.revision, rows)
     except BaseException:
         with reading(engine) as c:
-            came = row_dump.counts(c, row_dump.tables_of(c))
-        if not came:  # else it is whole, and only that was not heard of
+            counts = row_dump.counts(c, row_dump.tables_of(c))
+        if not counts:  # otherwise the transaction was committed, and only its confirmation was lost
             _clear(objects)
         raise
     objects.delete(MARKER)
@@ -97,21 +98,21 @@ def restore(
 
 
 class Manifest:
-    """The manifest of a backup; iterating over it gives what it says of each object.
+    """The manifest of a backup; iterating over it yields the entry of each object.
 
     Attributes
     ----------
     revision : str
     ledger : dict
-        ``size`` and ``sha256`` of the rows.
+        ``size`` and ``sha256`` of the ledger.
     objects, bytes : int
 
     Raises
     ------
     Conflict
-        If there is none, or a newer envmatte has written it.
+        If there is none, or a newer envmatte wrote it.
     InvalidInput
-        If it is not whole, or says what none says.
+        If it is incomplete or invalid.
     """
 
     def __init__(self, source: Objects) -> None:
@@ -121,7 +122,7 @@ class Manifest:
             header = _object(next(lines, b""))
             if header.get("format") != FORMAT:
                 raise Conflict(
-                    f"the backup has the format {header.get('format')!r}, and this envmatte knows {FORMAT!r}: "
+                    f"the backup has the format {header.get('format')!r}, but this envmatte reads {FORMAT!r}; "
                     "install the envmatte that made it"
                 )
             self.revision, self.ledger = (
@@ -129,10 +130,10 @@ class Manifest:
                 _entry(header.get("ledger"), named=False),
             )
             migrations.require_known(self.revision, "the backup")
-            self._see_that_it_is_whole()
+            self._check_complete()
         except FileNotFoundError as error:
             raise Conflict(
-                f"{source.url} has no {MANIFEST}: there is no backup, or one that was never finished"
+                f"{source.url} has no {MANIFEST}: there is no backup, or it was never finished"
             ) from error
 
     def _lines(self) -> Iterator[bytes]:
@@ -140,7 +141,7 @@ class Manifest:
             while line := file.readline(LINE):
                 yield line
 
-    def _see_that_it_is_whole(self) -> None:
+    def _check_complete(self) -> None:
         digest, before = hashlib.sha256(), b""
         self.objects, self.bytes = -1, 0
         for line in self._lines():
@@ -152,7 +153,7 @@ class Manifest:
             before = line
         last = {"objects": self.objects, "bytes": self.bytes, "sha256": digest.hexdigest()}
         if _object(before) != last:
-            raise _not_whole()
+            raise _incomplete()
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         for line in islice(self._lines(), 1, self.objects + 1):
@@ -165,23 +166,23 @@ def _object(line: bytes) -> dict[str, Any]:
     except ValueError:
         found = None
     if not isinstance(found, dict):
-        raise _not_whole()
+        raise _incomplete()
     return found
 
 
-def _not_whole() -> InvalidInput:
-    return InvalidInput(f"{MANIFEST} of the backup is cut short, or was changed: use another backup")
+def _incomplete() -> InvalidInput:
+    return InvalidInput(f"{MANIFEST} of the backup is incomplete or was changed; use another backup")
 
 
 def _entry(given: Any, *, named: bool = True) -> dict[str, Any]:
-    """What a manifest says of an object, or of the rows, if it says that."""
+    """A valid entry of an object, or of the ledger, in the manifest."""
     name, size, digest = (
         (given.get(key) for key in ("name", "size", "sha256")) if isinstance(given, dict) else (None,) * 3
     )
     if named and not (isinstance(name, str) and NAME.fullmatch(name)):
-        raise InvalidInput(f"{MANIFEST} of the backup names {name!r}, which is no object of a store")
+        raise InvalidInput(f"{MANIFEST} of the backup has the invalid object name {name!r}")
     if not (isinstance(size, int) and size >= 0 and isinstance(digest, str) and SHA256.fullmatch(digest)):
-        raise InvalidInput(f"{MANIFEST} of the backup has no size and checksum of {name or LEDGER}")
+        raise InvalidInput(f"{MANIFEST} of the backup has no valid size and checksum for {name or LEDGER}")
     return {"name": name or LEDGER, "size": size, "sha256": digest}
 
 
@@ -201,59 +202,60 @@ def _copy(
 
 
 def _read(source: Objects, path: str, entry: dict[str, Any]) -> Iterator[bytes]:
-    """The pieces of something in the backup, see `_checked`."""
+    """The pieces of an object of the backup, see `_checked`."""
     try:
-        if entry["size"] <= PART:  # most objects are, and one request then
+        if entry["size"] <= PART:  # true of most objects, which take one request then
             yield from _checked(entry, iter([source.read_raw(path, entry["size"])]))
         else:
             with source.reader(path) as reader:
                 yield from _checked(entry, iter(lambda: reader.read(PART), b""))
     except FileNotFoundError as error:
         raise InvalidInput(
-            f"{entry['name']} is missing in the backup: use another", entry=entry["name"]
+            f"{entry['name']} is missing in the backup; use another backup", entry=entry["name"]
         ) from error
     except Corrupt as error:
-        raise _unlike(entry["name"]) from error
+        raise _mismatch(entry["name"]) from error
 
 
 def _checked(entry: dict[str, Any], pieces: Iterator[bytes]) -> Iterator[bytes]:
-    """The pieces of an object, after the last of which it is told if they are not what the manifest says."""
+    """The pieces of an object; raises after the last if they do not match the manifest."""
     tally = Tally()
     for piece in tally.passing(pieces):
         if tally.size > entry["size"]:
-            raise _unlike(entry["name"])
+            raise _mismatch(entry["name"])
         yield piece
     if (tally.size, tally.sha256) != (entry["size"], entry["sha256"]):
-        raise _unlike(entry["name"])
+        raise _mismatch(entry["name"])
 
 
-def _unlike(name: str) -> InvalidInput:
+def _mismatch(name: str) -> InvalidInput:
     return InvalidInput(
-        f"{name} in the backup is not what {MANIFEST} says: it is damaged; use another backup", entry=name
+        f"{name} in the backup does not match {MANIFEST}: it is damaged; use another backup", entry=name
     )
 
 
-def _see_that_it_is_empty(connection: Connection) -> None:
+def _require_empty_database(connection: Connection) -> None:
     tables = row_dump.tables_of(connection)
     found = row_dump.counts(connection, tables)
     if found:
         rows = ", ".join(f"{count} of {name}" for name, count in found.items())
         raise Conflict(
-            f"the installation is not empty, its database has rows: {rows}. A backup is restored into an empty one: "
-            "name another folder, database and store"
+            f"the installation is not empty: its database has rows ({rows}). Restore into an empty installation: name "
+            "another folder, or another database and store"
         )
     if "coordinator" in tables and "holder" in tables["coordinator"].c:
         lease = tables["coordinator"].c
         if connection.scalar(
             select(lease.holder).where(lease.holder.is_not(None), lease.expires_at > clock())
         ):
-            raise Conflict("a service runs on the installation: stop it until the backup is restored")
+            raise Conflict("a service runs on the installation; stop it until the backup is restored")
 
 
-def _see_that_nothing_is_stored(objects: Objects, database: bytes) -> None:
-    """See to it that the store is empty; what a restore that was interrupted has left there goes.
+def _require_empty_store(objects: Objects, database: bytes) -> None:
+    """Check that the store is empty, after removing the leftovers of an interrupted restore.
 
-    If it was one into the same database, which is empty: what is there with another one may be that one's.
+    Leftovers are removed only if that restore was into the same database, which is empty; with another database, the
+    objects may be in use.
     """
     if MARKER in objects.names("") and objects.read_raw(MARKER) == database:
         _clear(objects)
@@ -261,8 +263,8 @@ def _see_that_nothing_is_stored(objects: Objects, database: bytes) -> None:
         there = [name for name in objects.names(folder) if name != "zarr.json"]
         if there:
             raise Conflict(
-                f"the installation is not empty, its store {objects.url} has {folder}/{there[0]}. A backup is restored "
-                "into an empty one: name another folder, or another prefix of the bucket"
+                f"the installation is not empty: its store {objects.url} has {folder}/{there[0]}. Restore into "
+                "an empty installation: name another folder, or another prefix of the bucket"
             )
 
 
@@ -271,8 +273,8 @@ def _clear(objects: Objects) -> None:
         objects.delete(what)
 
 
-def _read_in(connection: Connection, revision: str, rows: IO[bytes]) -> int:
-    """Make the tables as they were when the backup was made, fill them, and bring them up to date."""
+def _insert_rows(connection: Connection, revision: str, rows: IO[bytes]) -> int:
+    """Create the tables at the revision of the backup, insert the rows, and upgrade the schema."""
     there = MetaData()
     there.reflect(connection, only=lambda name, _: name in metadata.tables or name == "alembic_version")
     there.drop_all(connection)

@@ -1,7 +1,7 @@
-"""The rows of a database of any revision: opened without an upgrade, and as lines of JSON.
+"""The rows of a database of any revision as lines of JSON, for backups.
 
-A line is a list of two, the name of a table and a row of it. Not among them are who drives the jobs, for nobody does
-yet where they are restored, and what is to be told to webhooks, for the service that has it here tells it.
+A line is a list of two: the name of a table, and a row as an object. The coordinator's lease is left out, because it
+means nothing to the restored installation, and so are webhook deliveries, because the original service makes them.
 """
 
 import json
@@ -20,34 +20,32 @@ from storage.errors import Conflict, InvalidInput
 
 SKIPPED = ("coordinator", "deliveries")
 BATCH = 500
-"""Rows that are held."""
+"""Rows in memory at a time."""
 Line = tuple[str, Mapping[str, Any]]
 
 
 def open_without_upgrade(url: str) -> Engine:
-    """Open a database that a service uses, or used, and leave its schema alone.
+    """Open the database of a service without upgrading its schema.
 
     Raises
     ------
     Conflict
         If there is none, or a newer envmatte has used it.
     InvalidInput, Unavailable
-        As of `storage.database.engine.open_engine`.
+        As for `storage.database.engine.open_engine`.
     """
     engine = dialects.make_engine(url)
     where = dialects.display_url(engine.url)
     file = engine.url.database
-    if engine.dialect.name == "sqlite" and not (file and Path(file).is_file()):  # which opening would make
-        raise Conflict(
-            f"there is no database {where}: name the one of the service, with --data or --database"
-        )
+    if engine.dialect.name == "sqlite" and not (file and Path(file).is_file()):  # opening would create it
+        raise Conflict(f"there is no database {where}; name the service's database with --data or --database")
     try:
         with reading(engine) as c:
             found = revision(c)
         if found is None:
             raise Conflict(
-                f"the database {where} has no tables of envmatte, or those of a very old one: name the one of the "
-                "service, or start `envmatte serve` on it once"
+                f"the database {where} has no tables of envmatte, or those of a very old version; name the service's "
+                "database, or start `envmatte serve` with it once"
             )
         migrations.require_known(found, "the database")
     except BaseException:
@@ -57,19 +55,19 @@ def open_without_upgrade(url: str) -> Engine:
 
 
 def tables_of(connection: Connection) -> Mapping[str, Table]:
-    """The tables as the database has them, by name, those first to which others refer."""
+    """The tables that the database has, by name; a table comes after those that it refers to."""
     found = MetaData()
     there = metadata.tables.keys() & set(inspect(connection).get_table_names())
     found.reflect(connection, only=sorted(there))
     for table in found.tables.values():
         for column in table.columns:
             if isinstance(column.type, JSON):
-                column.type.none_as_null = True  # as all of ours
+                column.type.none_as_null = True  # as in `storage.database.tables`
     return {table.name: table for table in found.sorted_tables}
 
 
 def lines(connection: Connection, tables: Mapping[str, Table]) -> Iterator[Line]:
-    """All rows, as the transaction sees them; few of them are held."""
+    """All rows, read in batches within the transaction."""
     for name, table in tables.items():
         if name not in SKIPPED:
             streamed = connection.execution_options(yield_per=BATCH)
@@ -78,7 +76,7 @@ def lines(connection: Connection, tables: Mapping[str, Table]) -> Iterator[Line]
 
 
 def lines_of_family(connection: Connection, tables: Mapping[str, Table], family: str) -> Iterator[Line]:
-    """The rows of what is deleted with, or made of, one another, see `storage.maintenance.inventory.Item`."""
+    """The rows of a family, see `storage.maintenance.inventory.Item`."""
     captures, mattes, jobs = (tables[name] for name in ("captures", "mattes", "jobs"))
     uploads, parts = tables["uploads"], tables["upload_parts"]
     of_jobs = or_(jobs.c.capture == family, (jobs.c.capture == "") & (jobs.c.matte == family))
@@ -98,12 +96,12 @@ def lines_of_family(connection: Connection, tables: Mapping[str, Table], family:
 
 
 def to_line(name: str, row: Mapping[str, Any]) -> bytes:
-    """A line."""
+    """A row as a line."""
     return json.dumps([name, dict(row)], separators=(",", ":")).encode() + b"\n"
 
 
 def counts(connection: Connection, tables: Mapping[str, Table]) -> dict[str, int]:
-    """Rows by table, where there are any; without the coordinator's, which every service has."""
+    """The number of rows of each table that has any; without the coordinator's lease, which every service has."""
     found = {
         name: connection.scalar(select(func.count()).select_from(table)) or 0
         for name, table in tables.items()
@@ -113,28 +111,26 @@ def counts(connection: Connection, tables: Mapping[str, Table]) -> dict[str, int
 
 
 def insert_lines(connection: Connection, source: Iterable[bytes]) -> int:
-    """Insert rows into empty tables of the revision that they are of; returns how many.
+    """Insert rows into empty tables of the same revision; returns how many.
 
-    Jobs that ran are queued: their tiles say how far they were.
+    Running jobs are queued; their tiles keep their progress.
 
     Raises
     ------
     InvalidInput
-        If a line is none, or of another schema.
+        If a line is not a row, or does not match the schema.
     """
     tables = tables_of(connection)
     read = 0
     for name, group in groupby(map(_loaded, source), key=lambda line: line[0]):
         if name not in tables or name in SKIPPED:
-            raise InvalidInput(f"the backup's ledger has rows of a table {name!r}, and there is none")
+            raise InvalidInput(f"the backup's ledger has rows of a table {name!r}, which does not exist")
         table = tables[name]
         rows = (row for _, row in group)
         while some := list(islice(rows, BATCH)):
             for row in some:
                 if row.keys() != set(table.columns.keys()):
-                    raise InvalidInput(
-                        f"the backup's ledger has a row of {name} with other columns than that has"
-                    )
+                    raise InvalidInput(f"the backup's ledger has a row of {name} with unexpected columns")
                 if name == "jobs" and row["state"] == "running":
                     row |= {"state": "queued", "stage": "waiting"}
             connection.execute(insert(table), some)
@@ -146,14 +142,14 @@ def _loaded(line: bytes) -> tuple[str, dict[str, Any]]:
     try:
         name, row = json.loads(line)
     except ValueError as error:
-        raise InvalidInput("the backup's ledger has a line that is no row") from error
+        raise InvalidInput("the backup's ledger has a line that is not a row") from error
     if not (isinstance(name, str) and isinstance(row, dict)):
-        raise InvalidInput("the backup's ledger has a line that is no row")
+        raise InvalidInput("the backup's ledger has a line that is not a row")
     return name, row
 
 
 def continue_numbering(connection: Connection) -> None:
-    """Have rows that are new numbered after those that were read in; SQLite does so by itself."""
+    """Make new rows continue the numbering of the inserted ones; SQLite does that by itself."""
     if connection.dialect.name != "postgresql":
         return
     for table in metadata.sorted_tables:

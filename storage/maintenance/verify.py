@@ -1,7 +1,7 @@
-"""A look at everything that is stored: what is missing, damaged, or there without anyone knowing of it.
+"""Verification of everything in the store: finds objects that are missing, damaged, or known to no row.
 
-It may run beside a service. What is deleted meanwhile is no finding, for whatever is found is looked at twice, and what
-is being written is left out.
+It may run while the service does. Items that are being written are skipped, and every finding is checked twice, so that
+data deleted meanwhile is not reported.
 """
 
 import time
@@ -16,23 +16,23 @@ from storage.maintenance.integrity import Examiner, Finding
 from storage.maintenance.inventory import FOLDERS, GRACE_SECONDS, Item
 from storage.objects.store import Objects
 
-AGAIN = 1.0
-"""Seconds between the first and the second look at what was found: of two objects that belong together, one may have
-been written when the other was not yet."""
+RECHECK_AFTER = 1.0
+"""Seconds until a finding is checked again: of two objects that belong together, one may have been written a moment
+before the other."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """What was found.
+    """Result of a verification.
 
     Attributes
     ----------
     things : int
-        Captures, mattes, uploads and composites that were read.
+        Captures, mattes, uploads and composites that were checked.
     busy : int
-        Those that were not, because they are being written.
+        Those that were skipped because they are being written.
     read : dict of str to int
-        As of `Examiner`.
+        Counts of `Examiner`.
     findings : list of Finding
     """
 
@@ -45,43 +45,43 @@ class Report:
 def verify(
     engine: Engine, objects: Objects, progress: Callable[[float, int], None] = lambda share, size: None
 ) -> Report:
-    """Read all that is stored.
+    """Check everything in the store.
 
     Parameters
     ----------
     progress : callable
-        Gets the share of the things that were read, and their bytes.
+        Called with the share of the items that were checked, and the bytes that were read.
     """
-    things = _things(engine)
+    items = _items(engine)
     found: dict[Item, list[Finding]] = {}
-    whole = [thing for thing in things if thing.state != "busy"]
+    whole = [item for item in items if item.state != "busy"]
     with Examiner(objects) as examiner:
-        for n, thing in enumerate(whole):
-            if findings := examiner.examine(thing):
-                found[thing] = findings
+        for n, item in enumerate(whole):
+            if findings := examiner.examine(item):
+                found[item] = findings
             progress((n + 1) / len(whole), examiner.read["bytes"])
         read = dict(examiner.read)
-        findings = _unexpected(objects, things)
+        findings = _unexpected(objects, items)
         if found:
-            time.sleep(AGAIN)
-            now = set(_things(engine))
-            for thing, before in found.items():
-                if thing in now:
-                    again = examiner.examine(thing)
+            time.sleep(RECHECK_AFTER)
+            now = set(_items(engine))
+            for item, before in found.items():
+                if item in now:
+                    again = examiner.examine(item)
                     findings += [one for one in before if one in again]
     counts = {name: read.get(name, 0) for name in ("objects", "bytes", "unchecked", "unchecked_bytes")}
-    return Report(len(whole), len(things) - len(whole), counts, findings)
+    return Report(len(whole), len(items) - len(whole), counts, findings)
 
 
-def _things(engine: Engine) -> list[Item]:
+def _items(engine: Engine) -> list[Item]:
     with reading(engine) as c:
         return list(inventory.items(c, row_dump.tables_of(c)))
 
 
-def _unexpected(objects: Objects, things: list[Item]) -> list[Finding]:
-    """What no row stands for, and nobody wrote to for a while: a row may be about to come."""
-    known = {thing.folder for thing in things}
-    remedy = "no row stands for it: a service that runs removes it within an hour"
+def _unexpected(objects: Objects, items: list[Item]) -> list[Finding]:
+    """Objects without a row that have not changed for a while; newer ones may be about to get a row."""
+    known = {item.folder for item in items}
+    remedy = "no row refers to it; a running service removes it within an hour"
     return [
         Finding("unexpected", f"{folder}/{name}", remedy)
         for folder in FOLDERS

@@ -1,4 +1,4 @@
-"""Objects of plain bytes: written with the table of their checksums beside them, and checked block by block as read."""
+"""Plain byte objects: written with a table of checksums beside them, and checked block by block when read."""
 
 import io
 from collections.abc import Iterable
@@ -14,31 +14,31 @@ if TYPE_CHECKING:
     from obstore import AsyncWritableFile
 
 PART = 8 << 20
-"""Bytes of one part of a large object: S3 takes parts of 5 MiB and more."""
+"""Bytes of a part of a multipart upload: S3 requires at least 5 MiB."""
 
 
 class Writer:
-    """What streams into an object."""
+    """Streams bytes into an object and computes their checksums."""
 
     def __init__(self, file: "AsyncWritableFile") -> None:
         self._file = file
         self.table = Table()
 
     async def write(self, data: Buffer) -> None:
-        """Take in the bytes that come next."""
+        """Append bytes."""
         self.table.update(data)
         await self._file.write(data)
 
 
 class Reader(io.RawIOBase):
-    """An object as a raw file of the io module, which zipfile can read; it is read in blocks, and each is checked.
+    """An object as a raw file of the io module, for zipfile for example; each block is checked when it is read.
 
     Raises
     ------
     FileNotFoundError
-        If there is none.
+        If there is no such object.
     Corrupt
-        If a block is not what was written; when it is read.
+        If a block is damaged; raised when it is read.
     """
 
     def __init__(self, store: ObjectStore, path: str) -> None:
@@ -47,14 +47,14 @@ class Reader(io.RawIOBase):
             self.size: int = obstore.head(store, path)["size"]
         try:
             self._sums: list[int] | None = read_table(path, read_raw(store, path + SUFFIX), self.size)
-        except FileNotFoundError:  # it was stored before there were checksums
+        except FileNotFoundError:  # stored before there were checksums
             self._sums = None
         self._at = 0
         self._block = (-1, memoryview(b""))
 
     @property
     def is_checked(self) -> bool:
-        """Whether it has checksums."""
+        """Whether the object has checksums."""
         return self._sums is not None
 
     def readable(self) -> bool:
@@ -66,7 +66,7 @@ class Reader(io.RawIOBase):
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
         at = (0, self._at, self.size)[whence] + offset
         if at < 0:
-            raise ValueError(f"a seek to {at}, before the start")
+            raise ValueError(f"seek to {at}, before the start")
         self._at = at
         return at
 
@@ -103,12 +103,12 @@ def read_raw(store: ObjectStore, path: str, most: int | None = None) -> bytes:
 
 
 def write_raw(store: ObjectStore, path: str, pieces: Iterable[bytes]) -> None:
-    """Write the pieces of an object one after another, as they are; left by an error it leaves no object."""
+    """See `storage.objects.store.Objects.write_raw`."""
     taken = iter(pieces)
     first = next(taken, b"")
     second = next(taken, None)
     with translate_errors():
-        if second is None:  # most objects are one piece, and one request
+        if second is None:  # most objects are one piece, which takes one request
             obstore.put(store, path, first)
             return
         with obstore.open_writer(store, path, buffer_size=PART, max_concurrency=2) as file:

@@ -1,12 +1,12 @@
-"""Checksums of what is stored, all CRC-32C, made as it is written: what has rotted is told wherever it is read.
+"""CRC-32C checksums of everything stored: computed on writing, checked on reading.
 
-- A chunk of an array ends with its own, by zarr's codec ``crc32c``, which any zarr reader checks.
-- A ``zarr.json`` has its own among the attributes, as ``crc32c``: of the document without it (`seal`). It is one line,
-  by which it is told from those of before, which may have none.
-- Other objects have one for each `BLOCK` of theirs, in an object beside them (`Table`), so that a stretch in the
-  middle of gigabytes is checked as it is read.
+- A chunk of an array ends with its checksum, by zarr's codec ``crc32c``, which any zarr reader checks.
+- A ``zarr.json`` has its checksum as the attribute ``crc32c``: that of the document without it (`seal`). Such a
+  document is one line, which tells it from older ones, which may lack a checksum.
+- Other objects have one checksum for each `BLOCK` bytes, in an object beside them (`Table`), so that a range in the
+  middle of gigabytes can be checked.
 
-What was stored before there were checksums has none, and is read as it is.
+Objects stored before there were checksums have none and are read unchecked.
 """
 
 import json
@@ -23,15 +23,15 @@ from zarr.registry import register_pipeline
 from storage.errors import Corrupt
 
 CODECS = (ZstdCodec(level=0, checksum=False), Crc32cCodec())
-"""What a chunk goes through: zarr's default, and the checksum."""
+"""Codecs of a chunk: zarr's default compression, and the checksum."""
 ATTRIBUTE = "crc32c"
-"""Of a zarr.json: its own checksum."""
+"""The attribute of a zarr.json with its checksum."""
 SUFFIX = ".crc32c"
-"""Of the object beside a plain one that holds the table of its checksums."""
+"""Suffix of the object that holds the checksums of a plain object."""
 BLOCK = 1 << 20
-"""Bytes of a plain object that have one checksum."""
-SET_BEFORE = b"{\n"
-"""How a zarr.json without a checksum begins, as zarr sets it."""
+"""Bytes of a plain object for each checksum."""
+UNSEALED_START = b"{\n"
+"""How a zarr.json without a checksum begins, as zarr writes it."""
 SUM = 4
 """Bytes of a checksum."""
 Buffer = bytes | memoryview
@@ -41,48 +41,48 @@ REMEDIES = {
     "uploads": "delete the capture, or the upload, and upload it again",
     "composites": "delete the job and composite the clip again",
 }
-"""By the folder that an object lies in."""
+"""What to do about a damaged object, by its top folder."""
 DERIVED = "/live-"
-"""In the path of what is made again of a matte when it is needed, see `storage.layout.live`."""
+"""Part of the path of cached textures, which are made again when needed, see `storage.layout.live`."""
 
 
 def crc32c(data: Buffer, before: int = 0) -> int:
-    """The CRC-32C (RFC 3720) of bytes that come after others."""
-    # It takes bytes and arrays, no memoryviews.
+    """The CRC-32C (RFC 3720) of bytes that follow other bytes with the checksum `before`."""
+    # google_crc32c takes bytes and arrays, but no memoryviews.
     return int(google_crc32c.extend(before, np.frombuffer(data, np.uint8) if len(data) else b""))
 
 
 def remedy(path: str) -> str:
     """What to do about an object that is missing or damaged."""
     if DERIVED in path:
-        return "look at the matte live: it is made again"
-    return REMEDIES.get(path.partition("/")[0], "make it again") + ", or restore a backup"
+        return "view the matte live, which makes it again"
+    return REMEDIES.get(path.partition("/")[0], "create it again") + ", or restore a backup"
 
 
-def damaged(path: str, how: str = "it is not what was written") -> Corrupt:
-    """What to raise of an object that can't be used any more."""
-    return Corrupt(f"{path} is damaged in the store, {how}: {remedy(path)}", entry=path)
+def damaged(path: str, how: str = "checksum mismatch") -> Corrupt:
+    """The error to raise for a damaged object."""
+    return Corrupt(f"{path} is damaged in the store ({how}): {remedy(path)}", entry=path)
 
 
 def seal(document: bytes) -> bytes:
-    """A zarr.json with its checksum, in place of an earlier one."""
+    """Add its checksum to a zarr.json, replacing an earlier one."""
     found = _without_sum(json.loads(document))[0]
     return _dumped(found | {"attributes": {**found.get("attributes", {}), ATTRIBUTE: _sum_of(found)}})
 
 
 def unseal(path: str, data: bytes) -> tuple[dict[str, Any], bool]:
-    """What a zarr.json says without its checksum, and whether it has one.
+    """A zarr.json without its checksum, and whether it has one.
 
     Raises
     ------
     Corrupt
-        If it is no JSON object, or not the one that was written.
+        If it is not a JSON object, or does not match its checksum.
     """
     try:
         document, found = _without_sum(json.loads(data))
     except (ValueError, TypeError, AttributeError) as error:
-        raise damaged(path, "it is no JSON object any more") from error
-    if found != _sum_of(document) and not (found is None and data.startswith(SET_BEFORE)):
+        raise damaged(path, "not a JSON object") from error
+    if found != _sum_of(document) and not (found is None and data.startswith(UNSEALED_START)):
         raise damaged(path)
     return document, found is not None
 
@@ -102,21 +102,21 @@ def _dumped(document: dict[str, Any]) -> bytes:
 
 
 def is_checked(document: dict[str, Any]) -> bool:
-    """Whether the chunks of an array with this zarr.json have a checksum."""
+    """Whether chunks of the array with this zarr.json have checksums."""
     codecs = document.get("codecs") or [{}]
     return bool(codecs[-1].get("name") == "crc32c")
 
 
 def is_intact(data: bytes) -> bool:
-    """Whether bytes that end with their checksum are what was written."""
+    """Whether bytes match the checksum that they end with."""
     view = memoryview(data)
     return len(data) >= SUM and crc32c(view[:-SUM]) == int.from_bytes(view[-SUM:], "little")
 
 
 class Table:
-    """The checksums of an object's blocks, made as its bytes go by.
+    """Computes the checksums of an object's blocks while its bytes are written.
 
-    Written down they are 4 bytes each, little-endian, one after another; then, in the same way, their own.
+    They are stored as 4 bytes each, little-endian, followed by the checksum of them all in the same form.
     """
 
     def __init__(self) -> None:
@@ -124,7 +124,7 @@ class Table:
         self._size = 0
 
     def update(self, data: Buffer) -> None:
-        """Take in the bytes that come next."""
+        """Append bytes."""
         view = memoryview(data).cast("B")
         while view:
             at = self._size % BLOCK
@@ -136,43 +136,46 @@ class Table:
             view = view[len(part) :]
 
     def to_bytes(self) -> bytes:
-        """As it is written down."""
+        """The checksums as they are stored."""
         sums = np.array(self._sums, "<u4").tobytes()
         return sums + crc32c(sums).to_bytes(SUM, "little")
 
 
 def read_table(path: str, data: bytes, size: int) -> list[int]:
-    """The checksums of the blocks of an object of so many bytes.
+    """Read the checksums of the blocks of an object of `size` bytes.
 
     Parameters
     ----------
     path : str
-        The object's, for the error.
+        Path of the object, for the error.
 
     Raises
     ------
     Corrupt
-        If that is no table of theirs.
+        If the table is damaged, or belongs to an object of another size.
     """
     if not is_intact(data):
         raise damaged(path + SUFFIX)
     if len(data) != SUM * (-(-size // BLOCK) + 1):
-        raise damaged(path, f"it has {size} bytes and another number was written")
+        raise damaged(path, f"it has {size} bytes, not as many as were written")
     return [int(one) for one in np.frombuffer(data[:-SUM], "<u4")]
 
 
-class _Named(BatchedCodecPipeline):
-    """How zarr reads chunks, one at a time: one that can't be decoded, or fails its checksum, is `Corrupt` by name."""
+class _NamingPipeline(BatchedCodecPipeline):
+    """How zarr reads chunks, one at a time: a chunk that is damaged raises `Corrupt` with its path."""
 
     async def read_batch(self, batch_info: Iterable[Any], *given: Any, **more: Any) -> Any:
         batch = list(batch_info)
         try:
             return await super().read_batch(batch, *given, **more)
-        except (ValueError, RuntimeError) as error:  # of Crc32cCodec, of numpy; of zstd
+        except (
+            ValueError,
+            RuntimeError,
+        ) as error:  # ValueError from Crc32cCodec and numpy, RuntimeError from zstd
             raise damaged(batch[0][0].path) from error
 
 
 def configure_zarr() -> None:
     """Have zarr report chunks that can't be read by name, in this process: opening a store does it."""
-    register_pipeline(_Named)
-    zarr.config.set({"codec_pipeline.path": f"{_Named.__module__}.{_Named.__qualname__}"})
+    register_pipeline(_NamingPipeline)
+    zarr.config.set({"codec_pipeline.path": f"{_NamingPipeline.__module__}.{_NamingPipeline.__qualname__}"})

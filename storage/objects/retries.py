@@ -1,4 +1,4 @@
-"""A bucket or a folder that is away or full: how long is waited for it, and how that is told."""
+"""Time limits and retries for requests to the store, and translation of its errors."""
 
 import errno
 import re
@@ -16,31 +16,31 @@ if TYPE_CHECKING:
 
 REQUESTS: "ClientConfig" = {
     "connect_timeout": timedelta(seconds=5),
-    "timeout": timedelta(seconds=20),  # of a part of 8 MiB, too
-    "allow_http": True,  # where AWS_ENDPOINT_URL names it, and nowhere else
+    "timeout": timedelta(seconds=20),  # also for a part of 8 MiB
+    "allow_http": True,  # only if AWS_ENDPOINT_URL names such a URL
 }
 RETRIES: "RetryConfig" = {
-    "max_retries": 1000,  # it is the time that ends them
+    "max_retries": 1000,  # the time limit ends them
     "retry_timeout": timedelta(seconds=40),
-    # Each pause is drawn between the first and the last one times the base: with less than e they don't get longer.
+    # Each pause is drawn between the first pause and the base times the last one: below e they would not grow.
     "backoff": {"init_backoff": timedelta(seconds=0.1), "max_backoff": timedelta(seconds=5), "base": 4},
 }
-"""Of what a bucket does not answer, or with an error of its own: a minute in all, with the last request."""
+"""For requests that a bucket does not answer, or answers with a server error: a minute in all."""
 UNREACHABLE = re.compile(r"HTTP error|status code: (429|5\d\d)|error sending request|response body")
-"""What obstore says when a bucket does not answer, or with an error of its own; it has no kind of error for that."""
+"""Messages of obstore for a bucket that does not answer, or answers with a server error; they have no own class."""
 
 
 @contextmanager
 def translate_errors() -> Iterator[None]:
-    """Turns what obstore raises, of several kinds and without a number, to `NoRoom` and `Unavailable`."""
+    """Translate errors of obstore, which have neither number nor specific class, to `NoRoom` and `Unavailable`."""
     try:
         yield
     except (BaseError, OSError) as error:
-        said = str(error).partition("\n")[0]
+        message = str(error).partition("\n")[0]
         if any(f"(os error {number})" in str(error) for number in (errno.ENOSPC, errno.EDQUOT)):
             raise NoRoom(DISK_FULL) from error
-        if said.startswith("Generic S3 error") and UNREACHABLE.search(said):
+        if message.startswith("Generic S3 error") and UNREACHABLE.search(message):
             raise Unavailable(
-                f"the store can't be reached for now; try again ({said.rpartition(' - ')[2].strip(': ')})"
+                f"the store cannot be reached; try again later ({message.rpartition(' - ')[2].strip(': ')})"
             ) from error
         raise

@@ -1,4 +1,4 @@
-"""The object store behind a URL, a folder or a bucket: for zarr and for plain bytes."""
+"""The object store, a folder or a bucket: zarr arrays and plain bytes."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ if TYPE_CHECKING:
 
 
 def gather(*work: Coroutine[Any, Any, Any]) -> list[Any]:
-    """Do what does not wait for one another at once, and return what came of each.
+    """Run coroutines concurrently from synchronous code, and return their results.
 
-    A bucket takes tens of milliseconds to answer, and zarr about one to go over to its thread and back. All of
-    it has ended when this returns, or raises the first error.
+    A bucket takes tens of milliseconds to respond, and zarr about one to switch to its thread and back. All coroutines
+    have ended when this returns, or raises the first error.
     """
     return asyncio.run_coroutine_threadsafe(_gather(*work), _loop()).result()
 
@@ -51,9 +51,9 @@ async def _gather(*work: Coroutine[Any, Any, Any]) -> list[Any]:
 
 @cache
 def _loop() -> asyncio.AbstractEventLoop:
-    """The loop that `gather` runs on, in a thread of its own: a caller may have a loop that must not wait.
+    """The event loop of `gather`, in its own thread, because a caller's loop must not be blocked.
 
-    It is kept because the threads in which zarr compresses are the loop's.
+    It is kept because zarr's compression threads belong to the loop.
     """
     loop = asyncio.new_event_loop()
     threading.Thread(target=loop.run_forever, name="objects", daemon=True).start()
@@ -61,17 +61,17 @@ def _loop() -> asyncio.AbstractEventLoop:
 
 
 class Objects:
-    """Objects under a URL.
+    """Objects under a URL, in a folder or a bucket.
 
     Parameters
     ----------
     url : str
-        ``file:///folder`` (made if it does not exist) or ``s3://bucket/prefix``; where the bucket is and who asks say
-        the environment variables ``AWS_ENDPOINT_URL``, ``AWS_REGION``, ``AWS_ACCESS_KEY_ID`` and so on.
+        ``file:///folder`` (created if it does not exist) or ``s3://bucket/prefix``. The environment variables
+        ``AWS_ENDPOINT_URL``, ``AWS_REGION``, ``AWS_ACCESS_KEY_ID`` and so on configure access to a bucket.
 
     Notes
     -----
-    Whatever reads or writes a bucket raises `Unavailable` if it can't be reached.
+    All methods that access a bucket raise `Unavailable` if it cannot be reached.
     """
 
     def __init__(self, url: str) -> None:
@@ -81,12 +81,12 @@ class Objects:
         self._folder: Path | None = None
         if url.startswith("file:"):
             self._folder = Path(url2pathname(urlsplit(url).path))
-            # Whoever deletes the last object of a folder, zarr too, takes the folder with it.
+            # Deleting the last object of a folder, also by zarr, deletes the folder.
             self._store = LocalStore.from_url(url, mkdir=True, automatic_cleanup=True)
         else:
             self._store = from_url(url, client_options=REQUESTS, retry_config=RETRIES)
         self.zarr = zarr_store.StrictStore(ZarrStore(self._store))
-        # Every tile opens the same ten arrays anew, to see that they are there; to parse them takes longer.
+        # Each tile reads the metadata of the same ten arrays again, to check that they exist; parsing it takes longer.
         self._array = lru_cache(maxsize=64)(partial(zarr_store.open_array, self.zarr))
 
     async def group(self, path: str) -> zarr.Group:
@@ -94,20 +94,24 @@ class Objects:
 
         Raises
         ------
-        FileNotFoundError, Corrupt
-            If there is none, or it is damaged.
+        FileNotFoundError
+            If there is none.
+        Corrupt
+            If it is damaged.
         """
         document = checksums.unseal(f"{path}/zarr.json", await self._document(path))[0]
-        with zarr_store.translate_errors_of(path):
+        with zarr_store.translate_metadata_errors(path):
             return zarr.Group(zarr.AsyncGroup.from_dict(StorePath(self.zarr, path), document))
 
     async def array(self, path: str) -> zarr.Array[Any]:
-        """The zarr array at a path, to read and to write, for `gather`.
+        """The zarr array at a path, for reading and writing, for `gather`.
 
         Raises
         ------
-        FileNotFoundError, Corrupt
-            If there is none, or it is damaged.
+        FileNotFoundError
+            If there is none.
+        Corrupt
+            If it is damaged.
         """
         return self._array(path, await self._document(path))
 
@@ -118,16 +122,16 @@ class Objects:
         return document.to_bytes()
 
     async def put_group(self, path: str, attributes: dict[str, Any] | None = None) -> None:
-        """Make a zarr group at a path, for `gather`; what is in it already stays."""
+        """Create a zarr group at a path, for `gather`; its members stay."""
         document = {"zarr_format": 3, "node_type": "group", "attributes": attributes or {}}
         group = zarr.AsyncGroup.from_dict(StorePath(self.zarr, path), document)
         await self._put_metadata(path, group)
 
     async def put_array(self, path: str, values: NDArray[Any]) -> None:
-        """Make a zarr array of one dimension and one chunk at a path, in place of an earlier one, for `gather`.
+        """Write a one-dimensional zarr array of one chunk at a path, replacing an earlier one, for `gather`.
 
-        It is what ``zarr.create_array(…, overwrite=True)`` makes there, except for the groups above it, which zarr
-        would look at and make: three objects to write, and no moment in which an earlier array is gone.
+        The result equals that of ``zarr.create_array(…, overwrite=True)``, but zarr would also look up and create the
+        groups above, and would first delete the earlier array.
         """
         n = len(values)
         shape = {
@@ -138,7 +142,7 @@ class Objects:
             StorePath(self.zarr, path), zarr_store.array_metadata(values.dtype) | shape
         )
         array = array.with_config(zarr_store.EVERY_CHUNK)
-        # Without values there is no chunk.
+        # An empty array has no chunk.
         chunk = array.setitem(slice(None), values) if n else self.zarr.delete(f"{path}/c/0")
         await _gather(self._put_metadata(path, array), chunk)
 
@@ -147,7 +151,7 @@ class Objects:
             await self.zarr.set(f"{path}/{name}", zarr_store.sealed(name, document))
 
     def put_tree(self, path: str, tree: MemoryStore) -> None:
-        """Write what zarr has laid out in memory below a path; what is there besides stays."""
+        """Copy a zarr hierarchy from memory to a path; other objects below the path stay."""
 
         async def copy() -> None:
             prototype = default_buffer_prototype()
@@ -160,24 +164,24 @@ class Objects:
 
     @asynccontextmanager
     async def write(self, path: str) -> AsyncIterator[Writer]:
-        """A writer that streams into an object, and leaves its checksums; left by an exception it leaves no object.
+        """A writer that streams into an object and stores its checksums; after an exception there is no object.
 
         Raises
         ------
         NoRoom
             If the disk is full.
         """
-        # Two parts under way bound the memory of an upload to a few parts, whatever its size.
+        # Two concurrent requests bound the memory of an upload to a few parts, whatever its size.
         writer = obstore.open_writer_async(self._store, path, buffer_size=PART, max_concurrency=2)
         with translate_errors():
             async with writer as file:
                 written = Writer(file)
                 yield written
-            with self._gone_without(path):
+            with self._delete_without_checksums(path):
                 await obstore.put_async(self._store, path + SUFFIX, written.table.to_bytes())
 
     def read(self, path: str) -> BinaryIO:
-        """A seekable file over an object; reading it is `Corrupt` where it is not what was written.
+        """A seekable file over an object; reading raises `Corrupt` where the object is damaged.
 
         Raises
         ------
@@ -187,32 +191,32 @@ class Objects:
         return io.BufferedReader(self.reader(path), 1 << 16)
 
     def reader(self, path: str) -> byte_objects.Reader:
-        """The same without a buffer, for who reads from the start to the end."""
+        """Like `read`, without a buffer: for reading from the beginning to the end."""
         return byte_objects.Reader(self._store, path)
 
     def read_raw(self, path: str, most: int | None = None) -> bytes:
-        """The bytes of a small object, as they are.
+        """The bytes of a small object, without checking them.
 
         Parameters
         ----------
         most : int, optional
-            Bytes that it may have.
+            Most bytes that it may have.
 
         Raises
         ------
         FileNotFoundError
             If there is none.
         Corrupt
-            If it has more.
+            If it has more bytes.
         """
         return byte_objects.read_raw(self._store, path, most)
 
     def write_raw(self, path: str, pieces: Iterable[bytes]) -> None:
-        """Write the pieces of an object one after another, as they are: without checksums of its own."""
+        """Write an object piece by piece, without storing checksums; after an exception there is no object."""
         byte_objects.write_raw(self._store, path, pieces)
 
     def put(self, path: str, data: bytes) -> None:
-        """Write a small object, whole, and its checksums.
+        """Write a small object and its checksums.
 
         Raises
         ------
@@ -223,12 +227,12 @@ class Objects:
         table.update(data)
         with translate_errors():
             obstore.put(self._store, path, data)
-            with self._gone_without(path):
+            with self._delete_without_checksums(path):
                 obstore.put(self._store, path + SUFFIX, table.to_bytes())
 
     @contextmanager
-    def _gone_without(self, path: str) -> Iterator[None]:
-        """Remove an object whose checksums can't be written: it would count as one from before there were any."""
+    def _delete_without_checksums(self, path: str) -> Iterator[None]:
+        """Remove an object whose checksums cannot be written: it would count as one without checksums."""
         try:
             yield
         except BaseException:
@@ -236,12 +240,14 @@ class Objects:
             raise
 
     async def get(self, path: str) -> bytes:
-        """The bytes of a small object, for `gather`.
+        """The bytes of a small object, without checking them, for `gather`.
 
         Raises
         ------
-        FileNotFoundError, Corrupt
-            If there is none; the latter where it is a chunk.
+        FileNotFoundError
+            If there is none.
+        Corrupt
+            If there is none and it should be a chunk of an array.
         """
         value = await self.zarr.get(path, default_buffer_prototype())
         if value is None:
@@ -249,33 +255,33 @@ class Objects:
         return value.to_bytes()
 
     def names(self, folder: str) -> list[str]:
-        """What lies directly in a folder, folders and objects, by name; without what holds checksums."""
+        """Names of the folders and objects directly in a folder, sorted; without tables of checksums."""
         with translate_errors():
             found = obstore.list_with_delimiter(self._store, folder)
         paths = [*found["common_prefixes"], *(meta["path"] for meta in found["objects"])]
         return sorted(path.rsplit("/", 1)[-1] for path in paths if not path.endswith(SUFFIX))
 
     def paths_below(self, folder: str) -> set[str]:
-        """The paths of all objects below a folder, however deep; without what holds checksums."""
+        """Paths of all objects below a folder, at any depth; without tables of checksums."""
         return {path for path in self.sizes(folder) if not path.endswith(SUFFIX)}
 
     def sizes(self, folder: str) -> dict[str, int]:
-        """The bytes of all objects below a folder, however deep, by their paths; with what holds checksums."""
+        """Sizes in bytes of all objects below a folder, at any depth, by path; with tables of checksums."""
         with translate_errors():
             return {
                 meta["path"]: meta["size"] for batch in obstore.list(self._store, folder) for meta in batch
             }
 
     def stale_names(self, folder: str, seconds: float, but: Collection[str] = ()) -> list[str]:
-        """What lies directly in a folder and was not written to for some time, by name: for whoever tidies up.
+        """Names of what lies directly in a folder and has not changed for some time, for clean-up.
 
         Parameters
         ----------
         seconds : float
-            How long ago the newest object of it was written, or removed from a folder of this machine. The store's
-            clock says when it was, and this machine's what time it is.
+            How long no object of it was written, or removed from a local folder: from the time by the store's clock
+            to now by this machine's clock.
         but : collection of str
-            Names that are left out, and not looked at.
+            Names to skip.
         """
         end = time.time() - seconds
         return [
@@ -285,8 +291,8 @@ class Objects:
         ]
 
     def _written_at(self, path: str) -> float:
-        """When the newest object at a path or below it was written; infinity if there is none any more."""
-        if self._folder is not None:  # with what is under way, see `sweep`, and folders
+        """When the newest object at or below a path was written; infinity if there is none any more."""
+        if self._folder is not None:  # unfinished files (see `sweep`) and folders count too
             newest = -np.inf
             for one in (self._folder / path, *(self._folder / path).rglob("*")):
                 with suppress(FileNotFoundError):
@@ -294,14 +300,14 @@ class Objects:
         else:
             with translate_errors():
                 found = [meta for batch in obstore.list(self._store, path) for meta in batch]
-                with suppress(FileNotFoundError):  # which a bucket does not list below itself
+                with suppress(FileNotFoundError):  # a bucket does not list an object below its own path
                     found.append(obstore.head(self._store, path))
             newest = max((meta["last_modified"].timestamp() for meta in found), default=-np.inf)
         return newest if newest > -np.inf else np.inf
 
     def delete(self, path: str) -> None:
-        """Remove an object, or everything below a folder; nothing there is no error."""
-        if self._folder is not None:  # with its folders, and with what was never finished, see `sweep`
+        """Remove an object, or everything below a folder; it is not an error if there is nothing."""
+        if self._folder is not None:  # with its folders and unfinished files, see `sweep`
             target = self._folder / path
             if target.is_dir():
                 shutil.rmtree(target)
@@ -310,26 +316,27 @@ class Objects:
                 target.with_name(target.name + SUFFIX).unlink(missing_ok=True)
             return
         with translate_errors():
-            obstore.delete(self._store, [path, path + SUFFIX])  # which a bucket does not list below itself
+            obstore.delete(
+                self._store, [path, path + SUFFIX]
+            )  # a bucket does not list an object below its own path
             for batch in obstore.list(self._store, path, chunk_size=500):
                 obstore.delete(self._store, [meta["path"] for meta in batch])
 
     def sweep(self, path: str) -> None:
-        """Remove what writers that were killed have left below a folder that nobody writes to.
+        """Remove what killed writers have left below a folder that no process writes to.
 
-        In a folder of this machine an object is written beside its place, under a name with a ``#``, and
-        then moved. A bucket shows nothing of the kind: what it keeps of uploads that were cut off, a rule of its own
-        for incomplete multipart uploads removes.
+        In a local folder, an object is first written to a file with ``#`` in its name and then renamed. A bucket has no
+        such objects; incomplete multipart uploads are removed by a lifecycle rule of the bucket.
         """
         if self._folder is not None:
             for part in (self._folder / path).rglob("*#*"):
                 part.unlink()
 
     def free_bytes(self) -> int | None:
-        """Bytes that the disk of a folder has left; None for a bucket, which has no end."""
+        """Free bytes on the disk of a folder; None for a bucket, which has no limit."""
         return shutil.disk_usage(self._folder).free if self._folder is not None else None
 
     def check_reachable(self) -> None:
-        """Reach the store once; raises whatever it raises when it can't be reached."""
+        """Send the store one request, which raises an error if the store cannot be reached."""
         with translate_errors():
             obstore.list_with_delimiter(self._store, None)

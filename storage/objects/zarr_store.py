@@ -1,4 +1,4 @@
-"""What zarr is told, and tells, about arrays in the store."""
+"""zarr arrays in the store: strict reading, checksums of metadata, and array metadata made once."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ if TYPE_CHECKING:
     from zarr.core.buffer import Buffer, BufferPrototype
 
 EVERY_CHUNK: ArrayConfigParams = {"write_empty_chunks": True}
-"""For whoever makes an array: a chunk of zeros is stored like any other, so that one that is missing is damage."""
+"""Configuration of every array: chunks of zeros are stored too, so that a missing chunk means damage."""
 METADATA = ("zarr.json", ".zarray", ".zgroup", ".zattrs", ".zmetadata")
-"""Objects that zarr looks for to see whether there is an array or a group: they may be missing."""
+"""Objects by which zarr finds out whether there is an array or a group: they may be missing."""
 
 
 def open_array(store: StrictStore, path: str, data: bytes) -> zarr.Array[Any]:
     """The array that a ``zarr.json`` describes."""
     document, _ = checksums.unseal(f"{path}/zarr.json", data)
-    with translate_errors_of(path):
+    with translate_metadata_errors(path):
         array = zarr.AsyncArray.from_dict(StorePath(store, path), document)
     return zarr.Array(array).with_config(EVERY_CHUNK)
 
 
 @contextmanager
-def translate_errors_of(path: str) -> Iterator[None]:
-    """What describes no array, or group, that zarr knows is `Corrupt`."""
+def translate_metadata_errors(path: str) -> Iterator[None]:
+    """Raise `Corrupt` where zarr does not accept the metadata at a path."""
     try:
         yield
     except (ValueError, TypeError, KeyError) as error:
@@ -49,7 +49,7 @@ def translate_errors_of(path: str) -> Iterator[None]:
 
 
 def sealed(name: str, value: Buffer) -> Buffer:
-    """What is stored under a name: a zarr.json gets its checksum."""
+    """What to store under a name: a zarr.json gets its checksum."""
     if not name.endswith("zarr.json"):
         return value
     return default_buffer_prototype().buffer.from_bytes(checksums.seal(value.to_bytes()))
@@ -57,15 +57,15 @@ def sealed(name: str, value: Buffer) -> Buffer:
 
 @cache
 def array_metadata(dtype: np.dtype[Any]) -> dict[str, Any]:
-    """What zarr writes down about an array of a type, for arrays of any length."""
+    """zarr's metadata of a one-dimensional array of a type, for any length."""
     array = zarr.create_array(MemoryStore(), shape=(1,), chunks=(1,), dtype=dtype, compressors=CODECS)
     return array.metadata.to_dict()
 
 
 class StrictStore(WrapperStore[ZarrStore[ObjectStore]]):
-    """A store for zarr in which a missing chunk is an error: zarr reads it as its fill value, without a word.
+    """A store for zarr in which a missing chunk is an error; zarr alone would silently read its fill value.
 
-    What can't be written or reached is told as everywhere here; these are the calls that zarr makes.
+    It also translates the errors of the calls that zarr makes, as `storage.objects.retries` does.
     """
 
     async def get(
@@ -74,7 +74,7 @@ class StrictStore(WrapperStore[ZarrStore[ObjectStore]]):
         with translate_errors():
             value = await self._store.get(key, prototype, byte_range)
         if value is None and not key.endswith(METADATA):
-            raise Corrupt(f"{key} is missing in the store: what it belongs to is damaged, make it again")
+            raise Corrupt(f"{key} is missing in the store: {checksums.remedy(key)}")
         return value
 
     async def set(self, key: str, value: Buffer) -> None:

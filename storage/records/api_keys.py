@@ -37,7 +37,7 @@ def create(connection: Connection, name: str, owner: str, scope: str) -> str:
     for what, text in (("name", name), ("owner", owner)):
         if not (text.strip() == text and 0 < len(text) <= MAX_LENGTH and text.isprintable()):
             raise InvalidInput(
-                f"{what} {text!r} must have 1 to {MAX_LENGTH} printable characters, with no blank at either end"
+                f"{what} {text!r} must have 1 to {MAX_LENGTH} characters, all printable and none blank at either end"
             )
     if _active(connection, name) is not None:
         raise Conflict(f"there is already a key {name!r}; revoke it first, or use another name")

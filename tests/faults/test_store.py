@@ -145,7 +145,7 @@ def test_store_that_stays_away(in_bucket: Known, proxy: Proxy, table: list[Row])
     failed = rig.ended(job["id"])
     proxy.refused = 0
     assert failed["state"] == "failed"
-    assert "the store can't be reached" in failed["problem"]["detail"]
+    assert "the store cannot be reached" in failed["problem"]["detail"]
     assert rig.ask("POST", f"/v1/jobs/{job['id']}/retry").status_code == 202
     row = Row("a store that stays away, and retry", 1)
     row.lost += rig.ended(job["id"])["state"] != "succeeded"

@@ -194,26 +194,26 @@ def test_only_into_what_is_empty(
     engine: Engine, furnished: Objects, target: Objects, elsewhere: tuple[Engine, Objects]
 ) -> None:
     with pytest.raises(
-        Conflict, match=r"has no manifest\.jsonl: there is no backup, or one that was never finished"
+        Conflict, match=r"has no manifest\.jsonl: there is no backup, or it was never finished"
     ):
         restore(target, *elsewhere)
     back_up(engine, furnished, target, "1")
-    with pytest.raises(Conflict, match="has a backup already: name an empty folder"):
+    with pytest.raises(Conflict, match="already has a backup; name an empty folder"):
         back_up(engine, furnished, target, "1")
     target.delete(MANIFEST)
-    with pytest.raises(Conflict, match=r"is not empty, 'ledger\.jsonl' is there"):
+    with pytest.raises(Conflict, match=r"is not empty: it has 'ledger\.jsonl'"):
         back_up(engine, furnished, target, "1")
     for what in (LEDGER, "objects"):
         target.delete(what)
     back_up(engine, furnished, target, "1")
-    with pytest.raises(Conflict, match=r"not empty, its database has rows: .*2 of captures.*name another"):
+    with pytest.raises(Conflict, match=r"not empty: its database has rows \(.*2 of captures.*name another"):
         restore(target, engine, elsewhere[1])
-    with pytest.raises(Conflict, match=r"not empty, its store .* has captures/c\."):
+    with pytest.raises(Conflict, match=r"not empty: its store .* has captures/c\."):
         restore(target, elsewhere[0], furnished)
     used = open_engine(elsewhere[0].url.render_as_string(hide_password=False))
     with writing(used) as c:
         leases.acquire(c, "somebody")
-    with pytest.raises(Conflict, match="a service runs on the installation: stop it"):
+    with pytest.raises(Conflict, match="a service runs on the installation; stop it"):
         restore(target, *elsewhere)
     with writing(used) as c:
         leases.release(c, 1)
@@ -229,26 +229,29 @@ def change(index: int, **values: Any) -> Callable[[list[bytes]], None]:
 
 
 LIES: dict[str, tuple[str, Callable[[list[bytes]], None]]] = {
-    "cut": ("cut short, or was changed", lambda lines: lines.__delitem__(slice(5, None))),
-    "half a line": ("cut short, or was changed", lambda lines: lines.__setitem__(-1, lines[-1][:30])),
-    "one less": ("cut short, or was changed", lambda lines: lines.__delitem__(4)),
-    "empty": ("cut short, or was changed", lambda lines: lines.clear()),
-    "format": ("the format 'x', and this envmatte knows", change(0, format="x")),
+    "cut": ("is incomplete or was changed", lambda lines: lines.__delitem__(slice(5, None))),
+    "half a line": ("is incomplete or was changed", lambda lines: lines.__setitem__(-1, lines[-1][:30])),
+    "one less": ("is incomplete or was changed", lambda lines: lines.__delitem__(4)),
+    "empty": ("is incomplete or was changed", lambda lines: lines.clear()),
+    "format": ("the format 'x', but this envmatte reads", change(0, format="x")),
     "revision": (
         "the backup was written by a newer envmatte: it has revision 9999",
         change(0, revision="9999"),
     ),
 }
 SEALED: dict[str, tuple[str, Callable[[list[bytes]], None]]] = {
-    "above": ("names 'captures/../../x', which is no object", change(3, name="captures/../../x")),
-    "root": ("names '/etc/x'", change(3, name="/etc/x")),
-    "elsewhere": ("names 'certs/ca.pem'", change(3, name="certs/ca.pem")),
-    "hidden": ("names 'captures/c/.x'", change(3, name="captures/c/.x")),
-    "number": ("names 3", change(3, name=3)),
+    "above": ("has the invalid object name 'captures/../../x'", change(3, name="captures/../../x")),
+    "root": ("has the invalid object name '/etc/x'", change(3, name="/etc/x")),
+    "elsewhere": ("has the invalid object name 'certs/ca.pem'", change(3, name="certs/ca.pem")),
+    "hidden": ("has the invalid object name 'captures/c/.x'", change(3, name="captures/c/.x")),
+    "number": ("has the invalid object name 3", change(3, name=3)),
     "not there": ("captures/c/none is missing in the backup", change(3, name="captures/c/none")),
-    "checksum": ("is not what manifest.jsonl says: it is damaged", change(3, sha256="0" * 64)),
-    "no checksum": ("no size and checksum of", change(3, sha256="x")),
-    "ledger": ("ledger.jsonl in the backup is not what", change(0, ledger={"size": 1, "sha256": "0" * 64})),
+    "checksum": ("does not match manifest.jsonl: it is damaged", change(3, sha256="0" * 64)),
+    "no checksum": ("no valid size and checksum for", change(3, sha256="x")),
+    "ledger": (
+        "ledger.jsonl in the backup does not match",
+        change(0, ledger={"size": 1, "sha256": "0" * 64}),
+    ),
 }
 
 
@@ -269,7 +272,7 @@ def test_what_lies_is_refused_and_leaves_nothing(
     target.write_raw(MANIFEST, iter(whole))
     for path in ("objects/mattes/m/rho/c/0/0/0", LEDGER):
         flip(target, path)
-        with pytest.raises(InvalidInput, match=r"is not what manifest\.jsonl says: it is damaged"):
+        with pytest.raises(InvalidInput, match=r"does not match manifest\.jsonl: it is damaged"):
             restore(target, *elsewhere)
         nothing(*elsewhere)
         flip(target, path)
@@ -277,8 +280,8 @@ def test_what_lies_is_refused_and_leaves_nothing(
     for row, match in (
         (b'["alembic_version",{"version_num":"x"}]\n', "table 'alembic_version'"),
         (b'["coordinator",{"id":1}]\n', "table 'coordinator'"),
-        (b'["jobs",{"id":1}]\n', "a row of jobs with other columns"),
-        (b"[1]\n", "a line that is no row"),
+        (b'["jobs",{"id":1}]\n', "a row of jobs with unexpected columns"),
+        (b"[1]\n", "a line that is not a row"),
     ):
         data = b"".join(rows) + row
         target.write_raw(LEDGER, iter([data]))

@@ -25,7 +25,7 @@ NOT_READ = re.compile(r"mattes/r/|captures/i/|composites/w/")
 
 @pytest.fixture(autouse=True)
 def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(verifying, "AGAIN", 0.0)
+    monkeypatch.setattr(verifying, "RECHECK_AFTER", 0.0)
 
 
 @pytest.fixture
@@ -140,7 +140,7 @@ def test_what_belongs_to_nothing_is_found_once_it_is_old(
     report = verify(engine, furnished)
     assert {("unexpected", "mattes/nobody")} == {one for one in found(report) if one[0] == "unexpected"}
     assert Finding(
-        "unexpected", "mattes/nobody", "no row stands for it: a service that runs removes it within an hour"
+        "unexpected", "mattes/nobody", "no row refers to it; a running service removes it within an hour"
     ) in (report.findings)
     assert {path for what, path in found(report) if what == "missing"} == {
         "mattes/m/T/7.7/zarr.json",
@@ -163,7 +163,7 @@ def test_what_has_no_checksum_is_counted(engine: Engine, furnished: Objects) -> 
 
 
 def test_a_database_that_is_none_is_refused_and_not_made(tmp_path: Path) -> None:
-    with pytest.raises(Conflict, match=r"no database sqlite:.*none\.db: name the one of the service"):
+    with pytest.raises(Conflict, match=r"no database sqlite:.*none\.db; name the service's database"):
         open_without_upgrade(f"sqlite:///{tmp_path}/none.db")
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "empty.db").touch()
