@@ -16,6 +16,7 @@ from tests.services.cluster.clusters import wait
 pytestmark = pytest.mark.timeout(7200)
 
 
+@pytest.mark.slow
 def test_killed_worker(known: Known, table: list[Row], times: int) -> None:
     def kill() -> None:
         while not (there := known.rig.workers()):

@@ -228,6 +228,7 @@ def test_too_large_bodies_are_refused(service: Service, matte: str) -> None:
     assert check_problem(answer, 413, "too-large")["limit"] == 128 << 20
 
 
+@pytest.mark.slow
 def test_recovery_needs_nested_grids(service: Service, bundle: Path) -> None:
     def not_nested(manifest: dict, files: dict[str, bytes]) -> None:
         manifest["program"]["parts"][2] |= {"columns": 20, "rows": 15}

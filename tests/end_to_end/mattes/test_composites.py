@@ -172,6 +172,7 @@ def test_unfinished_matte_is_composited_as_far_as_recovered(service: Service, ca
     assert service.http.delete(f"/v1/mattes/{job['matte']}").status_code == 204
 
 
+@pytest.mark.slow
 def test_matte_deleted_while_it_is_composited(service: Service, capture: str) -> None:
     matte = service.client.wait(service.client.recover(capture)["id"])["matte"]
     expected = asked(service, matte).content

@@ -166,7 +166,6 @@ def test_from_a_film_to_composites(home: Home) -> None:
         assert np.std(made["film"], axis=0).mean() > 0.05
 
 
-@pytest.mark.slow
 def test_three_machines(bundle: Path, tmp_path: Path) -> None:
     port = free_port()
     first, others = (

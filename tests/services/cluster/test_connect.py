@@ -158,6 +158,7 @@ def test_a_client_of_another_cluster_gets_an_error(cluster: Cluster) -> None:
         connect("tcp://127.0.0.1:9", None)
 
 
+@pytest.mark.slow
 def test_a_silent_server_is_not_waited_for() -> None:
     with socket.socket() as silent:
         silent.bind(("127.0.0.1", 0))

@@ -123,6 +123,7 @@ def test_killed_child_fails_only_its_own_picture(decoders: Decoders) -> None:
     assert "(SIGKILL)" in refusal_by_stopped_child(decoders, lambda child: child.kill())
 
 
+@pytest.mark.slow
 def test_child_that_hangs_is_ended_after_the_time_limit() -> None:
     impatient = Decoders(MEMORY, seconds=8)
     assert "takes more than 8 s" in refusal_by_stopped_child(impatient, lambda child: None)

@@ -36,6 +36,7 @@ def within(kernel: Dispatcher) -> set[Dispatcher]:
     return found
 
 
+@pytest.mark.slow
 def test_kernels_that_several_others_share_are_compiled_when_they_are_loaded() -> None:
     modules = [
         importlib.import_module(found.name)

@@ -114,7 +114,7 @@ def steady(ball: Ball) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return np.zeros((ball[1].count, 2)), np.ones(ball[1].count)
 
 
-@pytest.mark.parametrize("ball", ["default", "quick"], indirect=True)
+@pytest.mark.parametrize("ball", [pytest.param("default", marks=pytest.mark.slow), "quick"], indirect=True)
 def test_what_is_steady_is_left_alone(ingest: Ingest, objects: Objects, digests: Digests, ball: Ball) -> None:
     stack = ingest("c", filmed(ball, *steady(ball)))
     made = report(stack.attributes, stack.frames)

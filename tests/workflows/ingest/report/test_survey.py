@@ -68,7 +68,8 @@ def test_a_white_that_is_clipped_asks_for_less_exposure(ingest: Ingest, bundle: 
 
 
 @pytest.mark.parametrize(
-    ("gain", "level", "more"), [(0.4, "warning", "a stop more"), (0.1, "bad", "3 stops more")]
+    ("gain", "level", "more"),
+    [(0.4, "warning", "a stop more"), pytest.param(0.1, "bad", "3 stops more", marks=pytest.mark.slow)],
 )
 def test_a_dark_white_asks_for_more_exposure(
     ingest: Ingest, bundle: bytes, gain: float, level: str, more: str

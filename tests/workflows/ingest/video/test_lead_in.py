@@ -67,6 +67,7 @@ def test_the_lead_in_is_told_from_the_patterns(
         assert made.starts[k] - 0.05 < time < made.starts[k + 1] + 0.01
 
 
+@pytest.mark.slow
 def test_a_film_without_the_lead_out_is_read_too(take: Callable[..., tuple[Stack, Film, int]]) -> None:
     stack, _, _ = take("sketch", Camera(hold=HOLD, jitter=0.0, tail=-4.2))
     missing = stack.attributes["video"]["missing"]

@@ -79,18 +79,18 @@ def error_of(stack: Stack, film: Film) -> float:
         Camera(),
         pytest.param(Camera(fps=24, exposure=1.0, seed=1), marks=pytest.mark.exhaustive),
         pytest.param(Camera(fps=25, exposure=1.0, hold=0.4, seed=2), marks=pytest.mark.exhaustive),
-        Camera(fps=60, hold=0.1, seed=3),
+        pytest.param(Camera(fps=60, hold=0.1, seed=3), marks=pytest.mark.slow),
         pytest.param(Camera(fps=60, hold=0.15, exposure=1.0, seed=4), marks=pytest.mark.exhaustive),
-        Camera(fps=120, hold=0.2, readout=0.008, seed=5),
+        pytest.param(Camera(fps=120, hold=0.2, readout=0.008, seed=5), marks=pytest.mark.slow),
         Camera(fps=30000 / 1001, uneven=0.6, seed=6),
-        Camera(fps=30, jitter=0.03, readout=0.033, seed=7),
-        Camera(codec="libx265", seed=8),
+        pytest.param(Camera(fps=30, jitter=0.03, readout=0.033, seed=7), marks=pytest.mark.slow),
+        pytest.param(Camera(codec="libx265", seed=8), marks=pytest.mark.slow),
         pytest.param(Camera(codec="mjpeg", container="mov", seed=9), marks=pytest.mark.exhaustive),
         Camera(codec="mjpeg", container="avi", seed=10),
-        Camera(container="matroska", seed=11),
+        pytest.param(Camera(container="matroska", seed=11), marks=pytest.mark.slow),
         pytest.param(Camera(idle=0.0, lead=1.3, seed=12), marks=pytest.mark.exhaustive),
-        Camera(lead=0.1, tail=0.1, seed=13),
-        Camera(options={"g": "7", "bf": "2"}, seed=14),
+        pytest.param(Camera(lead=0.1, tail=0.1, seed=13), marks=pytest.mark.slow),
+        pytest.param(Camera(options={"g": "7", "bf": "2"}, seed=14), marks=pytest.mark.slow),
         pytest.param(Camera(options={"crf": "30"}, seed=15), marks=pytest.mark.exhaustive),
     ],
     ids=str,
@@ -109,6 +109,7 @@ def test_every_pattern_is_found(take: Callable[..., Stack], light: list[np.ndarr
         assert found["first_pattern_seconds"] == pytest.approx(made.starts[0], abs=0.5 * camera.hold)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pack", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
 def test_the_bytes_are_the_same_whatever_the_slabs(
     take: Callable[..., Stack], digests: Digests, light: list[np.ndarray], pack: int
@@ -160,6 +161,7 @@ def test_patterns_alike_are_told_by_their_time(take: Callable[..., Stack], light
     assert [pattern for pattern, _ in wrong(stack, made) if pattern not in (1, 2, 3, 4)] == []
 
 
+@pytest.mark.slow
 def test_a_hand_in_front_costs_the_patterns_behind_it(
     take: Callable[..., Stack], light: list[np.ndarray]
 ) -> None:
@@ -249,6 +251,7 @@ def test_frames_larger_than_the_limit_are_refused(take: Callable[..., Stack], fi
     assert caught.value.fields == {"entry": "clip.mp4", "limit": 96 * 72 * 6 - 1}
 
 
+@pytest.mark.slow
 def test_frames_larger_than_the_container_says_are_never_decoded(
     take: Callable[..., Stack], light: list[np.ndarray]
 ) -> None:

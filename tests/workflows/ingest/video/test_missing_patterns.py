@@ -24,7 +24,10 @@ def light() -> list[np.ndarray]:
 
 @pytest.mark.parametrize(
     ("camera", "what"),
-    [(Camera(hand=(5.0, 6.0)), "keep hands"), (Camera(tail=-1.5), "go on until after")],
+    [
+        (Camera(hand=(5.0, 6.0)), "keep hands"),
+        pytest.param(Camera(tail=-1.5), "go on until after", marks=pytest.mark.slow),
+    ],
     ids=["a hand in front", "ended too early"],
 )
 def test_patterns_without_a_frame_are_named_with_a_remedy(
