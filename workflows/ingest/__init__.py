@@ -1,1 +1,1 @@
-"""From a bundle, the archive that a user uploads, to a frame stack."""
+"""From a capture archive to a stack of frames, and a report on them."""

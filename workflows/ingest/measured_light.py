@@ -1,4 +1,4 @@
-"""The light of each pattern at some pixels, from all of its frames: moved to one place, brought to one monitor."""
+"""The light of each pattern at some pixels, from all of its frames, corrected for drift, flicker and crosstalk."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -14,14 +14,14 @@ from workflows.images.tone_curves import Curve, table
 from workflows.programs.program import Program
 
 LOBES = 3
-"""Of Lanczos' kernel on either side, which frames are moved by."""
+"""Lobes on either side of the Lanczos kernel that frames are shifted with."""
 TOUCHED = 0.05
-"""A value that was moved is clipped where the clipped ones among those that it comes from weigh more than this."""
+"""A shifted value counts as clipped if clipped values have more than this share of its weights."""
 
 Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 FrameOf = Callable[[int], tuple[Floats, Bools]]
-"""Of a frame, by its number: (n, channels) light and whether it is not clipped."""
+"""Returns the light of a frame, (n, channels), and whether it is not clipped, by the frame's index."""
 
 
 class Light(NamedTuple):
@@ -30,11 +30,11 @@ class Light(NamedTuple):
     Attributes
     ----------
     values : (n, count, 3) float32
-        In units of what fills the camera's range in the shortest exposure.
+        1 is full scale of the camera in the shortest exposure.
     usable : (n, count, 3) bool
-        False where in every exposure some frame is clipped, at black or at white, and where there is no frame.
+        False where some frame of every exposure is clipped, at black or at white, and where there is no frame.
     worth : (n, count, 3) float32
-        Frames of the shortest exposure that say as much.
+        The number of frames of the shortest exposure that carry as much information.
     """
 
     values: Floats
@@ -43,22 +43,22 @@ class Light(NamedTuple):
 
 
 def look_up_of(stack: Stack) -> Floats:
-    """(k,) float32: the light of each value that a stack stores."""
+    """A look-up table from the values of a stack to light, (k,) float32."""
     camera = TypeAdapter[Curve](Curve).validate_python(stack.attributes["camera_curve"])
     return table(camera, stack.dtype, stack.attributes["storage"]["black"])
 
 
 def exposures_of(attributes: dict[str, Any]) -> Floats:
-    """(frames,) float32: how long a stack's frames were exposed, in units of the shortest."""
+    """Exposure times of a stack's frames in units of the shortest, (frames,) float32."""
     exposures = np.array(attributes["exposures"], np.float32)
     exposures /= exposures.min()
     return exposures
 
 
 def read_light(stack: Stack, span: tuple[slice, slice], program: Program) -> tuple[Light, Bools]:
-    """The light of each pattern at the pixels of a rectangle that are to be recovered, and (y, x) bool: which they are.
+    """The light of each pattern at the pixels of a rectangle that are to be recovered, and their (y, x) bool mask.
 
-    Drift and flicker are taken out if `workflows.ingest.report.steadiness` was sure of them, crosstalk always.
+    Drift and flicker are corrected if `workflows.ingest.report.steadiness` was certain of them, crosstalk always.
 
     Raises
     ------
@@ -90,13 +90,13 @@ def read_light(stack: Stack, span: tuple[slice, slice], program: Program) -> tup
 
 
 def light_of(frame_of: FrameOf, attributes: dict[str, Any], program: Program, pixels: int) -> Light:
-    """The light of each pattern at some pixels, from their frames: merged, without flicker and crosstalk.
+    """Merge the frames of each pattern at some pixels, and correct flicker and crosstalk.
 
     Notes
     -----
-    Of light S that is not the monitor's, gains g of the monitor leave ``C = S + g rho T L``. The light of a pattern,
-    over all of its frames, is brought to ``S + (C - S) / g``, g being the mean of its frames' by what they count, and
-    S what is seen before a black monitor.
+    A gain g of the monitor changes only its own light: ``C = S + g rho T L``. The light of a pattern is corrected to
+    ``S + (C - S) / g``, where g is the weighted mean over the pattern's frames, and S is what is seen before a black
+    monitor.
     """
     light, gain = merge(frame_of, attributes, program.count, pixels)
     values, usable, worth = light
@@ -114,14 +114,14 @@ def light_of(frame_of: FrameOf, attributes: dict[str, Any], program: Program, pi
 def merge(
     frame_of: FrameOf, attributes: dict[str, Any], count: int, pixels: int
 ) -> tuple[Light, Floats | None]:
-    """The light of each of ``count`` patterns from all of its frames, and the monitor's gain in it, if it has one.
+    """Merge all frames of each of ``count`` patterns; returns their light and, if there are gains, the mean gain.
 
     Notes
     -----
-    A frame that was exposed t times as long as the shortest has the value v = t x of the light x, with the variance
-    ``read + shot v``. Where the photons' noise counts most, the likelihood's maximum is ``sum v / sum t``, over the
-    exposures that are not clipped, with the variance ``shot x / sum t``: `worth` is ``sum t``. Read noise, which long
-    exposures have less of, is then rather overstated. The gain, as the light, is ``sum g t / sum t``.
+    A frame exposed t times as long as the shortest has the value v = t x for light x, with the variance ``read + shot
+    v``. Where shot noise dominates, the maximum likelihood estimate is ``sum v / sum t`` over the exposures that are
+    not clipped, with the variance ``shot x / sum t``; `worth` is ``sum t``. Read noise, of which long exposures have
+    relatively less, is then somewhat overestimated. The mean gain is ``sum g t / sum t``.
     """
     exposures = exposures_of(attributes)
     gains = attributes.get("gains")
@@ -159,30 +159,30 @@ def merge(
 
 
 def black_patterns(program: Program) -> NDArray[np.intp]:
-    """The numbers of the patterns that are black all over."""
+    """The numbers of the constant patterns that are black."""
     numbers, sent = program.constants
     return numbers[~sent.any(axis=1)]
 
 
 def margin_of(shifts: Sequence[Sequence[float]]) -> int:
-    """Pixels around others that these are made of when frames are moved."""
+    """How many pixels around a rectangle are needed to shift frames."""
     return LOBES + math.ceil(max((abs(s) for shift in shifts for s in shift), default=0))
 
 
 def unclipped_light(
     codes: Codes, shift: Sequence[float], margin: int, look_up: Floats
 ) -> tuple[Floats, Bools]:
-    """The light of a frame, moved back by the shift of its picture, and whether it is not clipped.
+    """The light of a frame, shifted back to where its picture should be, and whether it is not clipped.
 
     Parameters
     ----------
     codes : (..., h, w, channels) uint8 or uint16
     shift : (float, float)
-        x and y of what lay at the origin, in pixels: of the picture at (y, x) they tell what is at
-        (y + shift[1], x + shift[0]) of the frame.
+        x and y in pixels: what belongs at (y, x) is at (y + shift[1], x + shift[0]) of the frame.
     margin : int
-        What `codes` has on each side beyond what is wanted, `margin_of` the shift at least.
+        Extra pixels of `codes` on each side, at least `margin_of` the shift.
     look_up : (k,) float32
+        See `look_up_of`.
 
     Returns
     -------
@@ -191,7 +191,8 @@ def unclipped_light(
 
     Notes
     -----
-    The kernel is Lanczos', of three lobes, one axis after the other. A value is the same in whatever rectangle.
+    The kernel is Lanczos of three lobes, applied along one axis after the other. A value does not depend on the
+    rectangle that it is in.
     """
     values = look_up[codes]
     clipped = (codes == 0) | (codes == len(look_up) - 1)
@@ -206,7 +207,7 @@ def unclipped_light(
 
 
 def _lanczos(fraction: float) -> Floats:
-    """Weights of the neighbours from ``1 - LOBES`` to ``LOBES`` of what lies a fraction of a pixel on."""
+    """Weights of the neighbours ``1 - LOBES`` to ``LOBES`` for a position a fraction of a pixel away."""
     distance = np.arange(1 - LOBES, LOBES + 1) - fraction
     taps = np.sinc(distance) * np.sinc(distance / LOBES)
     weights: Floats = (taps / taps.sum()).astype(np.float32)
@@ -214,7 +215,7 @@ def _lanczos(fraction: float) -> Floats:
 
 
 def _weighed(values: Floats, taps: Floats, axis: int, first: int, length: int) -> Floats:
-    """The weighted sums of neighbours, along an axis, of ``length`` values from ``first`` on."""
+    """Weighted sums of neighbours along an axis, for ``length`` values from ``first`` on."""
 
     def neighbours(place: int) -> Floats:
         inside = [slice(None)] * values.ndim
@@ -228,7 +229,7 @@ def _weighed(values: Floats, taps: Floats, axis: int, first: int, length: int) -
 
 
 def _around(stack: Stack, span: tuple[slice, slice], margin: int) -> Codes:
-    """The values of a rectangle and of a margin around it; beyond the frame, those of its edge."""
+    """The values of a rectangle with a margin around it; beyond the frame, the edge is repeated."""
     inside, beyond = [], [(0, 0)]
     for given, size in zip(span, (stack.height, stack.width), strict=True):
         start, stop, _ = given.indices(size)

@@ -1,4 +1,4 @@
-"""The ingest of a capture: frames are read one at a time and written, a slab of them at once, into the stack."""
+"""The steps of an ingest job: each tile decodes a slab of frames and writes it into the capture's stack."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -33,13 +33,14 @@ from workflows.untrusted.limits import Limits
 
 
 def prepare(objects: Objects, task: Task) -> dict[str, Any]:
-    """Look into the archive of a capture and make its empty stack.
+    """Check the archive of a capture, match a video to its patterns, and create the empty stack.
 
     Returns
     -------
     dict
-        ``tiles``: the number of slabs; ``slab``: frames of one; ``memory``: the limit that it comes of; ``width``,
-        ``height``, ``frames``; ``notes``: lines for people about what was found in a video.
+        ``tiles``: the number of slabs; ``slab``: frames in a slab; ``memory``: the limit that it follows from;
+        ``width``, ``height`` and ``frames`` of the stack; ``video``: whether it is one; ``notes``: lines for the job's
+        log about what was found in a video.
 
     Raises
     ------
@@ -55,16 +56,16 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
             patterns.append(integer_formats.to_unit(smallest_grid(_decode(archive, name, limits))))
             if sum(pattern.nbytes for pattern in patterns) > limits.memory // 2:
                 raise CaptureError(
-                    f"the patterns that come as images take more than {limits.memory // 2} bytes together, from "
-                    f"{name} on: use fewer, smaller or coarser ones",
+                    f"the image files of patterns, up to {name}, take more than {limits.memory // 2} bytes together: "
+                    "use fewer, smaller or coarser ones",
                     entry=name,
                     limit=limits.memory // 2,
                 )
-        # Of all frames, for the camera stood still: one that looks down takes itself for turned now this way, now that.
+        # One orientation for all frames: a camera that looks down detects its orientation at random.
         turn = (
             1 if manifest.video is not None else stills.orientation(archive, manifest.frames[0].file, limits)
         )
-        shape, storage, filmed = _look(archive, patterns, limits)
+        shape, storage, filmed = _examine(archive, patterns, limits)
         mask = None
         if manifest.mask is not None:
             mask = np.any(_decode(archive, manifest.mask, limits), axis=2)
@@ -94,7 +95,7 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
         memory=limits.memory,
         attributes={
             "program": manifest.program.model_dump(mode="json"),
-            # Float values are linear light, whatever is left unsaid.
+            # Float values are linear light, also if the response is unknown.
             "response": "linear"
             if storage.black
             else TypeAdapter(Response).dump_python(manifest.response, mode="json"),
@@ -114,10 +115,10 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
     return {"tiles": -(-frames // slab), "slab": slab, "memory": limits.memory, **size, "notes": notes}
 
 
-def _look(
+def _examine(
     archive: CaptureArchive, patterns: Sequence[NDArray[np.float32]], limits: Limits
 ) -> tuple[tuple[int, int, int, int], stills.Storage, MatchedFrames | None]:
-    """The shape of the stack and how it is stored, and of a video which of its frames show what."""
+    """The shape of the stack and how it is stored; for a video, also its frames matched to the patterns."""
     manifest = archive.manifest
     if manifest.video is None:
         first = stills.read(archive, manifest.frames[0].file, limits)
@@ -127,8 +128,8 @@ def _look(
     program, entry = manifest.program, manifest.video.file
     if program.count > MAX_PATTERNS:
         raise CaptureError(
-            f"{entry} shows {program.count} patterns, more than the {MAX_PATTERNS} that are told apart in a video: "
-            "send frames, or show fewer",
+            f"{entry} shows {program.count} patterns, more than the {MAX_PATTERNS} that are found in a video: "
+            "upload frames, or show fewer patterns",
             entry=entry,
             limit=MAX_PATTERNS,
         )
@@ -155,12 +156,12 @@ def _look(
 
 
 def work(objects: Objects, task: Task, tile: int) -> int:
-    """Decode the frames of a slab into the stack; returns the number of their pixels.
+    """Decode the frames of a slab into the stack, and return the number of their pixels.
 
     Raises
     ------
     CaptureError
-        Naming the frame that can't be decoded, or is of another size or kind than the first.
+        Naming the frame that can't be decoded, or has another size or kind than the first.
     """
     stack, slab = Stack(objects, task.capture), task.plan["slab"]
     first, last = tile * slab, min((tile + 1) * slab, stack.frames)
@@ -194,7 +195,7 @@ STEPS = Steps("ingest", "reading", prepare, work, missing, finish, scattered=Fal
 def _pixels(
     archive: CaptureArchive, stack: Stack, first: int, last: int, limits: Limits
 ) -> Iterator[integer_formats.Codes]:
-    """The frames of a stack from ``first`` up to ``last``, one after another."""
+    """The frames of a stack from ``first`` up to ``last``."""
     video = archive.manifest.video
     if video is not None:
         shares = stack.shares()
@@ -205,7 +206,7 @@ def _pixels(
     shape = (stack.height, stack.width, stack.channels)
     storage = stills.Storage(stack.dtype, **stack.attributes["storage"])
     kind = np.dtype(np.float32) if storage.black else stack.dtype
-    turn = stack.attributes.get("orientation", 1)  # which captures did not have before it was looked at
+    turn = stack.attributes.get("orientation", 1)  # missing from stacks of earlier versions
     for frame in archive.manifest.frames[first:last]:
         pixels = stills.read(archive, frame.file, limits, turn)
         if pixels.shape != shape or pixels.dtype != kind:

@@ -1,4 +1,4 @@
-"""One frame from its file, and how frames of float values are stored as integers."""
+"""Read one frame from its image file, and store frames of float values as integers."""
 
 from typing import NamedTuple
 
@@ -16,9 +16,9 @@ from workflows.untrusted.decoder_guard import Guard
 from workflows.untrusted.limits import Limits
 
 HEADROOM = 1.05
-"""Full scale over the largest value of the white frame, for noise."""
+"""Full scale relative to the largest value of the white frame: leaves room for noise."""
 HIGHLIGHT = 4.0
-"""Full scale over the 99th percentile of the white frame, at most: a glint must not cost the rest its precision."""
+"""The most that full scale may be, relative to the white frame's 99th percentile: a glint must not cost precision."""
 
 
 class Storage(NamedTuple):
@@ -27,13 +27,13 @@ class Storage(NamedTuple):
     Attributes
     ----------
     dtype : numpy.dtype
-        Of the stack: uint8 or uint16.
+        Type of the stack: uint8 or uint16.
     black : int
-        The stored value of no light. Float values may lie below it, by noise.
+        The stored value of no light. Noise of float values may lie below it.
     full : float
-        The light, in the frames' own units, of the largest stored value.
+        The light of the largest stored value, in the frames' own units.
     bounded : bool
-        Whether the camera ends there, or only what is stored.
+        Whether the camera itself saturates there.
     """
 
     dtype: np.dtype[np.unsignedinteger]
@@ -42,35 +42,37 @@ class Storage(NamedTuple):
     bounded: bool
 
     def encode(self, pixels: Codes | Floats) -> Codes:
-        """Values of a frame as they are stored.
+        """Convert the values of a frame to those that are stored.
 
-        Float values become ``black + value / full * (65535 - black)``, rounded; 0 and 65535 are left to
-        what lies outside or is no number, as they are in files of integers.
+        Float values become ``black + value / full * (65535 - black)``, rounded. As with integer files, 0 and 65535
+        stand for clipped values; NaN becomes 0.
         """
         if pixels.dtype != np.float32:
             return pixels  # type: ignore[return-value]
         span = np.iinfo(self.dtype).max - self.black
         codes = np.empty(pixels.shape, self.dtype)
-        for row, stored in zip(pixels, codes, strict=True):  # a row at a time: no second frame in memory
+        for row, stored in zip(
+            pixels, codes, strict=True
+        ):  # row by row, so that no second frame is in memory
             scaled = np.nan_to_num(row * np.float32(span / self.full), nan=-np.inf)
             stored[:] = np.rint(np.clip(scaled + np.float32(self.black), 0, np.iinfo(self.dtype).max))
         return codes
 
 
 def orientation(archive: CaptureArchive, entry: str, limits: Limits) -> int:
-    """How a frame says that it is to be turned to be upright, as `images.upright` takes it."""
+    """The orientation that a frame states, for `integer_formats.upright`."""
     data = archive.read(entry)
     with Guard(entry, limits.image).on():
         return camera_raw.orientation(data) if camera_raw.is_raw(entry) else integer_formats.orientation(data)
 
 
 def read(archive: CaptureArchive, entry: str, limits: Limits, turn: int | None = None) -> Codes | Floats:
-    """Decode a frame: PNG, TIFF, JPEG, EXR, camera RAW.
+    """Decode a frame: PNG, TIFF, JPEG, EXR or camera RAW.
 
     Parameters
     ----------
     turn : int, optional
-        How it is turned, whatever it says itself; default as it says.
+        Orientation; by default the one that the file states.
 
     Returns
     -------
@@ -95,24 +97,24 @@ def read(archive: CaptureArchive, entry: str, limits: Limits, turn: int | None =
 
 
 def storage_of(archive: CaptureArchive, first: NDArray[np.generic], limits: Limits) -> Storage:
-    """How the frames of a archive are to be stored, by its first.
+    """How to store the frames of an archive, given the first of them.
 
     Raises
     ------
     CaptureError
-        If float frames are said to have a curve, or the white one has no light.
+        If float frames are said to have a tone curve, or the white frame has no light.
 
     Notes
     -----
-    Integers are stored as they are. RAW ends at its white level. Other float values have no upper end: full scale is
-    that of the brightest constant frame, whose every pixel is at least as bright as before any pattern.
+    Integers are stored as they are. Full scale is the white level of RAW. Other float values have no upper limit: full
+    scale is then given by the brightest constant frame, in which every pixel is at least as bright as in any pattern.
     """
     if first.dtype != np.float32:
         return Storage(first.dtype, 0, 1.0, True)  # type: ignore[arg-type]
     manifest = archive.manifest
     if manifest.response not in ("linear", "unknown"):
         raise CaptureError(
-            'RAW, EXR and float TIFF frames hold linear light: say so, "response": "linear"',
+            'RAW, EXR and float TIFF frames hold linear light: set "response": "linear"',
             entry=MANIFEST,
             field="response",
         )

@@ -103,7 +103,7 @@ def test_patterns_that_are_large_images_are_refused(make_zip: Zip, ingest: Inges
     given["program"]["parts"][1] = {"kind": "images", "files": names}
     pictures = {f"{n}.png": encode_png(frame) for n, frame in enumerate(shots(12, 1, "uint8"))}
     data = make_zip(given, pictures | dict.fromkeys(names, encode_png(photograph)))
-    with pytest.raises(CaptureError, match="patterns that come as images") as caught:
+    with pytest.raises(CaptureError, match="image files of patterns") as caught:
         ingest("c", data, memory=400_000)
     assert caught.value.fields == {"entry": names[4], "limit": 200_000}
 

@@ -131,6 +131,6 @@ def test_integers_among_floats_are_refused(make_zip: Zip, ingest: Ingest) -> Non
 
 def test_raw_of_a_camera_that_is_not_known_is_refused(make_zip: Zip, ingest: Ingest) -> None:
     files = {f"{n}.nef": bytes(9000) for n in range(6)}
-    with pytest.raises(CaptureError, match=r"^0\.nef: this camera's RAW format is not known") as caught:
+    with pytest.raises(CaptureError, match=r"^0\.nef: this camera's RAW format is not supported") as caught:
         ingest("c", make_zip(record("nef"), files))
     assert caught.value.fields == {"entry": "0.nef"}

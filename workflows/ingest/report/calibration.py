@@ -1,4 +1,4 @@
-"""What the frames of constant monitors say of the camera: its noise, its crosstalk, and curves that are unknown."""
+"""Measure the camera from constant frames: its noise, its crosstalk, and unknown tone curves."""
 
 from collections.abc import Sequence
 from itertools import product
@@ -17,23 +17,22 @@ from workflows.recovery.noise import Noise
 from workflows.recovery.photometry import estimate_crosstalk, estimate_noise
 
 SAMPLES = 20_000
-"""Pixels, about, from which the noise and unknown curves are measured."""
+"""About how many pixels the noise and unknown curves are measured from."""
 FRAMES = 64
-"""Frames of constant levels, at most, from which they are."""
-
+"""At most how many constant frames they are measured from."""
 COMPRESSED_SAMPLES = 4096
-"""Pixels, at most, from which the noise of a video is measured, in all of its frames."""
+"""At most how many pixels of all frames the noise of a video is measured from."""
 
 
 def measure(stack: Stack, gains: Sequence[float] | None = None) -> None:
-    """Measure the noise, the crosstalk, and the curves that the capture calls unknown, from frames of constant levels.
+    """Measure noise, crosstalk and unknown curves from the constant frames of a stack.
 
     Parameters
     ----------
     stack : Stack
-        It is annotated with what was found, and not saved.
+        Annotated with the results, but not saved.
     gains : sequence of float, optional
-        Of the monitor's light in each frame; 1 if left out.
+        Gain of the monitor's light in each frame; 1 by default.
     """
     program = Program.model_validate(stack.attributes["program"])
     frames, sent, exposures = constant_frames(stack, program)
@@ -49,21 +48,21 @@ def measure(stack: Stack, gains: Sequence[float] | None = None) -> None:
         program.monitor.response,
         TypeAdapter(Response).validate_python(stack.attributes["response"]),
     )
-    # Of one exposure, so that they have one noise.
+    # Only one exposure, so that all frames have the same noise.
     shortest = np.flatnonzero(exposures == exposures.min())
     codes, usable, sent, grey = codes[:, shortest], usable[:, shortest], sent[shortest], grey[shortest]
     look_up = table(found.camera, stack.dtype, black)
     light, shown = look_up[codes], to_light(sent, found.monitor)
     if gains is not None:
         shown *= np.array([gains[frames[at]] for at in shortest], np.float32)[:, np.newaxis]
-    # what the channels see of each other's colours is no noise
+    # Crosstalk between channels must not count as noise, so grey levels are used if there are enough.
     some = grey if np.count_nonzero(grey) >= 4 else np.ones_like(grey)
     noise = estimate_noise(light[:, some], shown[some], usable[:, some], 1 / (top - black))
     if "video" in stack.attributes:
         noise = _compressed(stack, look_up, frames, shown, noise)
     stack.annotate(
-        monitor_curve=_plain(found.monitor),
-        camera_curve=_plain(found.camera),
+        monitor_curve=_as_json(found.monitor),
+        camera_curve=_as_json(found.camera),
         assumed_curves=found.assumed,
         noise={"read": noise.read, "shot": noise.shot},
         crosstalk=estimate_crosstalk(light, shown, usable).tolist(),
@@ -77,9 +76,9 @@ def _compressed(
     shown: NDArray[np.float32],
     noise: Noise,
 ) -> Noise:
-    """The noise of a video's frames, which compression makes larger before patterns than before constants.
+    """The noise of a video's frames, which compression makes larger for patterns than for constant frames.
 
-    Every frame counts as one, whatever went into its mean: what compression does is not averaged away.
+    Each mean frame counts as one frame, because averaging does not remove compression noise.
     """
     squares = product(_spread(stack.height), _spread(stack.width))
     read = [stack.read_masked(y, x) for y, x in squares]
@@ -97,14 +96,14 @@ def _compressed(
 def constant_frames(
     stack: Stack, program: Program
 ) -> tuple[list[int], NDArray[np.float32], NDArray[np.float32]]:
-    """Frames of constant levels to measure by: one a pattern and exposure, from dark to bright.
+    """Constant frames to measure from: one for each pattern and exposure, from dark to bright.
 
     Returns
     -------
     frames : list of int
-        `FRAMES` of them at most.
+        At most `FRAMES`.
     sent : (k, 3) float32
-        What the monitor showed in each.
+        Values sent to the monitor in each.
     exposures : (k,) float32
         In units of the stack's shortest.
     """
@@ -128,12 +127,12 @@ def constant_frames(
 
 
 def _by_value(values: NDArray[Any]) -> NDArray[Any]:
-    """(k, 3 n) of (n, k, 3)."""
+    """Reorder (n, k, 3) to (k, 3 n)."""
     return values.transpose(1, 0, 2).reshape(values.shape[1], -1)
 
 
 def _sample(stack: Stack, frame: int) -> NDArray[Any]:
-    """(n, 3) values of a frame at pixels spread over it: whole chunks, so that few are read."""
+    """Values of a frame at pixels spread over it, (n, 3), in short runs so that few chunks are read."""
     rows, columns = (_spread(n) for n in (stack.height, stack.width))
     parts = [
         stack.read(y, x, slice(frame, frame + 1)).reshape(-1, stack.channels) for y in rows for x in columns
@@ -143,10 +142,10 @@ def _sample(stack: Stack, frame: int) -> NDArray[Any]:
 
 
 def _spread(n: int) -> list[slice]:
-    """At most four short runs of pixels, spread over n."""
+    """Up to four short runs spread over n pixels."""
     length = max(1, min(n // 4, int(SAMPLES**0.5) // 4))
     return [slice(start, start + length) for start in sorted({n * k // 4 for k in range(4)})]
 
 
-def _plain(curve: Curve) -> Any:
+def _as_json(curve: Curve) -> Any:
     return TypeAdapter(Curve).dump_python(curve, mode="json")

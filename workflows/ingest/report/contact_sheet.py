@@ -1,4 +1,4 @@
-"""A picture of a capture at a glance: some of its frames, with what is clipped marked."""
+"""A contact sheet of a capture: some of its frames, with clipped pixels marked."""
 
 import io
 from itertools import pairwise
@@ -13,12 +13,15 @@ from workflows.ingest.measured_light import look_up_of
 from workflows.programs.program import Program
 
 WIDTH, HEIGHT = 240, 240
-"""Pixels of a thumbnail, at most."""
+"""Largest size of a thumbnail in pixels."""
 ACROSS = 4
+"""Thumbnails in a row."""
 EACH = 2
-"""Patterns of each part, and at most `PARTS` parts."""
+"""Patterns shown of each part."""
 PARTS = 9
+"""Parts shown, at most."""
 CAPTION = 18
+"""Height of a caption in pixels."""
 AT_WHITE, AT_BLACK = (255, 0, 0), (0, 90, 255)
 
 
@@ -28,7 +31,7 @@ def contact_sheet(stack: Stack) -> bytes:
     Returns
     -------
     bytes
-        A PNG. Red is what is clipped at white, blue at black, in some channel of some pixel under a thumbnail's.
+        A PNG. A thumbnail's pixel is red where any value in it is clipped at white, and blue where at black.
     """
     program = Program.model_validate(stack.attributes["program"])
     picked = _pick(stack, program)
@@ -51,7 +54,7 @@ def contact_sheet(stack: Stack) -> bytes:
 
 
 def _pick(stack: Stack, program: Program) -> list[tuple[int, str]]:
-    """Frames, in the order of their patterns, and their captions."""
+    """The frames to show, and their captions."""
     numbers, sent = program.constants
     chosen = {
         int(numbers[np.argmin(sent.sum(axis=1))]): "darkest",
@@ -83,10 +86,10 @@ def _pick(stack: Stack, program: Program) -> list[tuple[int, str]]:
 def _shrink(
     stack: Stack, frames: list[int]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
-    """The light of frames at a thumbnail's size, and what is clipped in it; a band of rows is read at a time."""
+    """The light of frames at the size of thumbnails, and where it is clipped high and low; read in bands of rows."""
     factor = max(1, -(-stack.width // WIDTH), -(-stack.height // HEIGHT))
     height, width = stack.height // factor, stack.width // factor
-    # The light is shown as if full scale were white, whatever the camera's curve.
+    # Full scale is shown as white, whatever the camera's curve.
     top = np.iinfo(stack.dtype).max
     look_up = look_up_of(stack)
     light = np.zeros((len(frames), height, width, stack.channels), np.float32)

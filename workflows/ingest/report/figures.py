@@ -1,4 +1,4 @@
-"""The figures of a report: what was measured of a capture."""
+"""The figures in the report on a capture."""
 
 from typing import Any, Literal
 
@@ -8,7 +8,7 @@ from workflows.images.tone_curves import Curve
 
 
 class Frames(BaseModel):
-    """How many frames were kept, of how many patterns, in how many exposures, and the patterns without a frame."""
+    """The numbers of frames kept, of patterns and of exposures, and the patterns without a frame."""
 
     kept: int
     patterns: int
@@ -17,7 +17,7 @@ class Frames(BaseModel):
 
 
 class Clipping(BaseModel):
-    """Shares of the pixels, 0 to 1: at white in the white frame, at black in the black one, and of both in patterns."""
+    """Shares of clipped pixels, 0 to 1: at white in the white frame, at black in the black one, and in the patterns."""
 
     white: float
     black: float
@@ -26,9 +26,10 @@ class Clipping(BaseModel):
 
 
 class Drift(BaseModel):
-    """The largest distance between two frames' places in pixels, and the standard error of a frame's place.
+    """The largest distance between the positions of two frames, and the standard error of a position, in pixels.
 
-    ``quarters`` are the mean places in the quarters of the capture, x and y. ``corrected``: recovery moves frames back.
+    ``quarters`` are the mean positions, x and y, in each quarter of the capture. ``corrected`` says whether recovery
+    shifts the frames back.
     """
 
     pixels: float
@@ -38,9 +39,9 @@ class Drift(BaseModel):
 
 
 class Flicker(BaseModel):
-    """How much the monitor's light varied between frames, in per cent: its deviation, and the frame furthest off.
+    """How much the monitor's light varied between frames, in per cent: standard deviation and worst frame.
 
-    ``error`` is the standard error of a frame's. ``corrected``: recovery takes it out.
+    ``error`` is the standard error of a frame. ``corrected`` says whether recovery corrects it.
     """
 
     percent: float
@@ -52,9 +53,9 @@ class Flicker(BaseModel):
 
 
 class Noise(BaseModel):
-    """Standard deviations in grey levels of 8 bits, in linear light: before a black monitor, and at full scale.
+    """Standard deviations of the noise at black and at full scale, in grey levels of 8 bits in linear light.
 
-    ``read`` and ``shot`` are the variance ``read + shot v`` of a value v, full scale being 1.
+    A value v has the variance ``read + shot v``; full scale is 1.
     """
 
     black: float
@@ -64,17 +65,18 @@ class Noise(BaseModel):
 
 
 class ToneCurve(BaseModel):
-    """A tone curve, and whether the capture names it, constant levels tell it, or it is only assumed."""
+    """A tone curve, and whether the capture states it, or it was estimated from constant levels, or is assumed."""
 
     curve: Curve
     source: Literal["given", "estimated", "assumed"]
 
 
 class Quality(BaseModel):
-    """PSNR in dB to expect of composites, of worse and of better glass.
+    """The PSNR to expect of composites in dB: ``low`` for difficult, ``high`` for easy glass.
 
-    ``blocks`` is how many the finest random grid has along the monitor's shorter side if no grid has offsets: then
-    clear glass is worst and frosted glass best. Else it is None, and clear glass best.
+    If no random grid has offsets, ``blocks`` is the number of blocks of the finest one along the monitor's shorter
+    side; then clear glass is the most difficult, and frosted glass the easiest. Otherwise it is None, and clear glass
+    the easiest.
     """
 
     low: float
@@ -83,7 +85,7 @@ class Quality(BaseModel):
 
 
 class Figures(BaseModel):
-    """What was measured of a capture."""
+    """Everything that was measured of a capture."""
 
     frames: Frames
     clipping: Clipping

@@ -1,4 +1,4 @@
-"""What figures of a capture mean, and what to do about them, in words."""
+"""What the figures of a capture mean, and what to do about them, in words."""
 
 from math import floor, log2
 from typing import Any, Literal
@@ -14,13 +14,14 @@ Level = Literal["good", "warning", "bad"]
 LEVELS: tuple[Level, ...] = ("good", "warning", "bad")
 
 SURE = 4.0
-"""Standard errors of a frame's, from which a drift or a flicker is one."""
+"""A drift or flicker is real from so many standard errors on."""
 
 
 class Finding(BaseModel):
-    """One thing that was looked at.
+    """One aspect of a capture.
 
-    ``name`` is stable and for machines, ``message`` says what is, ``remedy`` what to do about it: empty if it is good.
+    ``name`` is stable, for programs. ``message`` says what was found, and ``remedy`` what to do about it; it is empty
+    if the level is good.
     """
 
     name: str
@@ -29,20 +30,20 @@ class Finding(BaseModel):
     remedy: str = ""
 
 
-def findings(made: Figures, program: Program, attributes: dict[str, Any]) -> list[Finding]:
-    """All findings about a capture, from its figures, its program and its stack's attributes."""
+def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> list[Finding]:
+    """All findings about a capture, from its figures, its program and the attributes of its stack."""
     found = [
-        _frames(made),
-        *_exposure(made, attributes["storage"]),
+        _frames(figures),
+        *_exposure(figures, attributes["storage"]),
         *_steadiness(attributes.get("steadiness")),
-        *_drift(made.drift),
-        *_flicker(made.flicker),
-        _noise(made, attributes["survey"]),
-        _crosstalk(made, program),
-        *_curves(made, program),
+        *_drift(figures.drift),
+        *_flicker(figures.flicker),
+        _noise(figures, attributes["survey"]),
+        _crosstalk(figures, program),
+        *_curves(figures, program),
     ]
-    if made.quality is not None:
-        found.append(_quality(made.quality))
+    if figures.quality is not None:
+        found.append(_quality(figures.quality))
     return found
 
 
@@ -56,41 +57,41 @@ def _quality(quality: Quality) -> Finding:
     else:
         worst, best = "clear glass, many edges", "frosted glass"
         why = (
-            f": the random grids lie still, and where in a block of the finest, {quality.blocks} along the shorter "
-            "side, light comes from is not told. Patterns with offsets, as of the preset `default`, do better"
+            f": the random grids have no offsets, so light is located no finer than a block of the finest grid, with "
+            f"{quality.blocks} along the shorter side. Patterns with offsets, as in the preset `default`, do better"
         )
     return Finding(
         name="quality",
         level="good",
-        message=f"composites of about {quality.low:.0f} dB ({worst}) to {quality.high:.0f} dB ({best}) are to be "
-        f"expected, if nothing else is wrong{why}",
+        message=f"expect composites of about {quality.low:.0f} dB ({worst}) to {quality.high:.0f} dB ({best}), if "
+        f"nothing else is wrong{why}",
     )
 
 
-def _frames(made: Figures) -> Finding:
-    # Only those of a recording may be without one.
-    missing = {int(number): why for number, why in made.video["missing"].items()} if made.video else {}
+def _frames(figures: Figures) -> Finding:
+    # Only patterns of a video can be missing.
+    missing = {int(number): why for number, why in figures.video["missing"].items()} if figures.video else {}
     if missing:
         which = "; ".join(f"{ranges(numbers)} ({why})" for numbers, why in by_reason(missing))
         return Finding(
             name="frames",
-            level=_graded(len(missing) / made.frames.patterns, 0, 0.1),
-            message=f"{len(missing)} of {made.frames.patterns} patterns have no frame that can be used: {which}",
+            level=_graded(len(missing) / figures.frames.patterns, 0, 0.1),
+            message=f"{len(missing)} of {figures.frames.patterns} patterns have no frame that can be used: {which}",
             remedy=remedy(missing.values()),
         )
-    several = f", in {made.frames.exposures} exposures" if made.frames.exposures > 1 else ""
+    several = f", in {figures.frames.exposures} exposures" if figures.frames.exposures > 1 else ""
     return Finding(
         name="frames",
         level="good",
-        message=f"{made.frames.kept} frames of all {made.frames.patterns} patterns{several}",
+        message=f"{figures.frames.kept} frames of all {figures.frames.patterns} patterns{several}",
     )
 
 
-def _exposure(made: Figures, storage: dict[str, Any]) -> list[Finding]:
+def _exposure(figures: Figures, storage: dict[str, Any]) -> list[Finding]:
     found = []
     if storage["bounded"]:
-        found.append(_white(made))
-    black = made.clipping.black
+        found.append(_white(figures))
+    black = figures.clipping.black
     level = _graded(black, 0.05, 0.3) if storage["black"] == 0 else "good"
     found.append(
         Finding(
@@ -99,15 +100,15 @@ def _exposure(made: Figures, storage: dict[str, Any]) -> list[Finding]:
             message=f"the black frame is clipped in {100 * black:.1f} % of the pixels",
             remedy=""
             if level == "good"
-            else "raise the camera's black level, let a little light into the room, or film RAW: what lies below black "
-            "is lost, and dark glass comes out too bright",
+            else "raise the camera's black level, let a little light into the room, or shoot RAW: values below black "
+            "are lost, and dark glass becomes too bright",
         )
     )
     return found
 
 
-def _white(made: Figures) -> Finding:
-    clipped, reach = made.clipping.white, made.white_reaches
+def _white(figures: Figures) -> Finding:
+    clipped, reach = figures.clipping.white, figures.white_reaches
     level = _graded(clipped, 0.002, 0.05)
     if level != "good":
         less = "a third of a stop" if clipped < 0.01 else "half a stop" if clipped < 0.05 else "a stop"
@@ -138,10 +139,10 @@ def _steadiness(found: dict[str, Any] | None) -> list[Finding]:
         Finding(
             name="steadiness",
             level="warning",
-            message="the patterns of the program don't explain what the frames show: how still the camera was and how "
-            "even the light can't be told",
-            remedy="name the camera's curve (`response`), see that the frames show the patterns that capture.json "
-            "says, and that neither camera nor glass was moved by more than three pixels",
+            message="the patterns of the program don't explain what the frames show: the stillness of the camera and "
+            "the evenness of the light can't be measured",
+            remedy="state the camera's curve (`response`), and check that the frames show the patterns that "
+            "capture.json names, and that neither camera nor glass moved by more than three pixels",
         )
     ]
 
@@ -149,20 +150,20 @@ def _steadiness(found: dict[str, Any] | None) -> list[Finding]:
 def _drift(drift: Drift | None) -> list[Finding]:
     if drift is None:
         return []
-    # Of what is taken out, a little is left; what is within its own error is none.
+    # A corrected drift leaves a small rest; a drift within its own error is none.
     limits = (0.5, 2.0) if drift.corrected else (0.1, 0.5)
     level = _graded(drift.pixels if drift.corrected or drift.pixels > SURE * drift.error else 0.0, *limits)
-    found = f"the camera moved by {drift.pixels:.2f} pixels (a frame's place is told to {drift.error:.3f})"
+    found = f"the camera moved by {drift.pixels:.2f} pixels (a frame is located to {drift.error:.3f})"
     return [
         Finding(
             name="drift",
             level=level,
-            message=found + (": recovery moves the frames back" if drift.corrected else ""),
+            message=found + (": recovery shifts the frames back" if drift.corrected else ""),
             remedy=""
             if level == "good"
-            else "fix camera, glass and monitor better, release from afar, and film again: "
+            else "fix camera, glass and monitor better, use a remote release, and film again: "
             + (
-                "what moved so far is taken out only in part"
+                "so large a drift is corrected only in part"
                 if drift.corrected
                 else "no common shift of the frames explains it, so it is not corrected"
             ),
@@ -180,61 +181,61 @@ def _flicker(flicker: Flicker | None) -> list[Finding]:
             name="flicker",
             level=level,
             message=f"the light varies by {flicker.percent:.2f} % between frames, by {flicker.worst_percent:+.1f} % in "
-            f"frame {flicker.worst_frame}" + (": recovery takes it out" if flicker.corrected else ""),
+            f"frame {flicker.worst_frame}" + (": recovery corrects it" if flicker.corrected else ""),
             remedy=""
             if level == "good"
             else "switch automatic exposure and the monitor's dimming off, let the monitor warm up, and expose "
             "for whole periods of its refresh"
             + (
-                ": so much is taken out only in part"
+                ": so much is corrected only in part"
                 if flicker.corrected
-                else ": it is not corrected, for it is not told surely, or no frame is black"
+                else ": it is not corrected, because it is not certain, or no frame is black"
             ),
         )
     ]
 
 
-def _noise(made: Figures, survey: dict[str, Any]) -> Finding:
+def _noise(figures: Figures, survey: dict[str, Any]) -> Finding:
     ratio = survey["contrast"] / survey["deviation"] if survey["deviation"] else 0.0
     level = _graded(-ratio, -25, -8)
     return Finding(
         name="noise",
         level=level,
-        message=f"noise of {made.noise.black:.1f} grey levels of 8 bits at black, {made.noise.full:.1f} at full scale; "
-        f"white less black is {ratio:.0f} times that of a pixel between them",
+        message=f"noise of {figures.noise.black:.1f} grey levels of 8 bits at black, {figures.noise.full:.1f} at full "
+        f"scale; white minus black is {ratio:.0f} times that of a pixel between them",
         remedy=""
         if level == "good"
         else "expose longer at a lower ISO, take several frames of each pattern, make the monitor brighter or the room "
-        "darker; or the mask takes in pixels that see no monitor",
+        "darker; or leave pixels that see no monitor out of the mask",
     )
 
 
-def _crosstalk(made: Figures, program: Program) -> Finding:
-    between = float(np.abs(np.array(made.crosstalk) - np.eye(3)).max())
+def _crosstalk(figures: Figures, program: Program) -> Finding:
+    between = float(np.abs(np.array(figures.crosstalk) - np.eye(3)).max())
     _, sent = program.constants
-    told = np.linalg.matrix_rank(np.concatenate([np.ones((len(sent), 1)), sent], axis=1)) == 4
-    if told:
-        text = f"the camera's channels see up to {100 * between:.1f} % of the monitor's other colours: it is taken out"
+    measured = np.linalg.matrix_rank(np.concatenate([np.ones((len(sent), 1)), sent], axis=1)) == 4
+    if measured:
+        text = f"the camera's channels see up to {100 * between:.1f} % of the monitor's other colours: it is corrected"
         return Finding(name="crosstalk", level=_graded(between, 0.3, 0.7), message=text)
     coloured = any(getattr(part, "colour", "grey") == "rgb" for part in program.parts)
     return Finding(
         name="crosstalk",
         level="warning" if coloured else "good",
-        message="no crosstalk between colours is assumed: the program shows none alone",
+        message="no crosstalk between colours is assumed: the program does not show them one at a time",
         remedy="add constant frames of red, green and blue, as the coloured presets do" if coloured else "",
     )
 
 
-def _curves(made: Figures, program: Program) -> list[Finding]:
+def _curves(figures: Figures, program: Program) -> list[Finding]:
     _, sent = program.constants
     greys = not np.isin(sent, (0, 1)).all() or any(isinstance(part, Images) for part in program.parts)
     words = {
-        "given": "named by the capture",
+        "given": "stated by the capture",
         "estimated": "estimated from constant levels",
         "assumed": "only assumed",
     }
     found = []
-    for name, curve, matters in (("camera", made.camera, True), ("monitor", made.monitor, greys)):
+    for name, curve, matters in (("camera", figures.camera, True), ("monitor", figures.monitor, greys)):
         assumed = curve.source == "assumed" and matters
         shape = curve.curve if isinstance(curve.curve, str) else f"a gamma of {curve.curve.gamma:g}"
         harmless = "" if matters else "; it makes no difference to black and white"
@@ -245,7 +246,7 @@ def _curves(made: Figures, program: Program) -> list[Finding]:
                 message=f"the {name}'s curve is {shape}, {words[curve.source]}{harmless}",
                 remedy=""
                 if not assumed
-                else "name it in capture.json (`response`), show three or more grey levels, or film the constant ones "
+                else "state it in capture.json (`response`), show three or more grey levels, or take the constant ones "
                 "in two exposures; RAW needs no curve",
             )
         )

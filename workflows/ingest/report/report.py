@@ -1,4 +1,4 @@
-"""A report on a capture that a person can act on: what was measured, what it means, and what to do about it."""
+"""The report on a capture: what was measured, what it means, and what to do about it."""
 
 from typing import Any
 
@@ -11,25 +11,25 @@ from workflows.programs.program import Program
 
 
 class Report(Figures):
-    """A report on a capture; ``level`` is that of the worst finding."""
+    """The report on a capture; ``level`` is that of the worst finding."""
 
     level: Level
     findings: list[Finding]
 
 
 def report(attributes: dict[str, Any], frames: int) -> Report:
-    """The report on a capture.
+    """Write the report on a capture.
 
     Parameters
     ----------
     attributes : dict
-        Of its stack, as `measure` and `survey` left them.
+        Attributes of its stack after `measure` and `survey`.
     frames : int
-        Of the stack.
+        Number of frames in the stack.
     """
     program = Program.model_validate(attributes["program"])
     survey, noise, steadiness = attributes["survey"], attributes["noise"], attributes.get("steadiness") or {}
-    said = {"monitor": program.monitor.response, "camera": attributes["response"]}
+    stated = {"monitor": program.monitor.response, "camera": attributes["response"]}
     curves = {
         name: ToneCurve(
             curve=attributes[f"{name}_curve"],
@@ -39,9 +39,9 @@ def report(attributes: dict[str, Any], frames: int) -> Report:
             if response == "unknown"
             else "given",
         )
-        for name, response in said.items()
+        for name, response in stated.items()
     }
-    made = Figures(
+    figures = Figures(
         frames=Frames(
             kept=frames,
             patterns=program.count,
@@ -68,5 +68,5 @@ def report(attributes: dict[str, Any], frames: int) -> Report:
         quality=expected(program, survey),
         video=attributes.get("video"),
     )
-    found = findings(made, program, attributes)
-    return Report(**dict(made), level=max((f.level for f in found), key=LEVELS.index), findings=found)
+    found = findings(figures, program, attributes)
+    return Report(**dict(figures), level=max((f.level for f in found), key=LEVELS.index), findings=found)

@@ -1,4 +1,4 @@
-"""How still the camera was and how even the light: of every frame, from a trial recovery of some pixels."""
+"""Measure the drift of the camera and the flicker of the light in every frame, by trial recoveries of some pixels."""
 
 from collections.abc import Callable
 from functools import partial
@@ -11,53 +11,55 @@ from pydantic import TypeAdapter
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import Curve
 from workflows.ingest.measured_light import black_patterns
-from workflows.ingest.report.trial_recovery import FURTHEST, Doubles, Trial, look, sampled
+from workflows.ingest.report.trial_recovery import FURTHEST, Doubles, Trial, take_sample, try_recovery
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out
 
 ROUNDS = 10
-"""Of measuring and taking out, at most."""
+"""Rounds of measuring and correcting, at most."""
 SETTLED = (0.003, 0.0005)
-"""Pixels of shift, and gain: rounds end when the last one changed less, root mean square."""
-LEAST_DRIFT, LEAST_FLICKER = 0.01, 0.003
-"""Root mean square in pixels, and deviation of the gain, from which they are corrected."""
+"""Rounds end when shifts, in pixels, and gains change less than this, root mean square."""
+MIN_DRIFT, MIN_FLICKER = 0.01, 0.003
+"""Drift (root mean square, pixels) and flicker (standard deviation of the gain) below these are not corrected."""
 TRIFLE = 0.5
-"""Of these, from which a first look, which sees but part of them, is followed by others."""
+"""The first trial sees only part of a disturbance: more rounds follow if it finds this share of `MIN_DRIFT` or
+`MIN_FLICKER`,"""
 LOOK_AGAIN, SURE = 2.0, 4.0
-"""Standard errors from which it is, and from which in the end there is anything."""
-MOST = np.array([FURTHEST, FURTHEST, 0.4])
-"""Pixels of shift, and of gain its logarithm, that are looked for."""
+"""and at least `LOOK_AGAIN` standard errors. In the end, what is below `SURE` standard errors is not corrected."""
+LIMITS = np.array([FURTHEST, FURTHEST, 0.4])
+"""Largest shifts, in pixels, and largest logarithm of the gain that are searched for."""
 REST = 0.25
-"""What the last round leaves, at most, of what was found."""
+"""The last round may leave at most this share of what was found."""
 EXPLAINED = np.array([2.4, 1.5])
-"""Residuals, in the noise's deviations and of 3 at most, up to which shifts and gains are believed."""
+"""Largest residuals with which shifts and gains are believed, in standard deviations of the noise."""
 MEMORY = 4
-"""Rounds before the last that the next one is told from."""
-LEAST_FRAMES = 8
-"""Of patterns, for anything to be told."""
+"""Rounds before the last one from which the next is extrapolated."""
+MIN_FRAMES = 8
+"""Frames of patterns that are needed to measure anything."""
 QUARTERS = 4
-"""Of the capture: their mean places are told."""
+"""Parts of the capture whose mean positions are reported."""
 
 
 def find_steadiness(stack: Stack) -> None:
-    """Find each frame's shift and gain, and annotate the stack with them.
+    """Find the shift and the gain of each frame, and annotate the stack with them.
 
-    ``steadiness`` says what was found; it is None if too few pixels tell anything, and empty if the patterns don't
-    explain what the frames show. Its ``drift`` and ``flicker`` are None where they are too large to be either.
-    ``shifts`` (frames, 2), x and y in pixels, and ``gains`` (frames) are None unless they are to be taken out, which
-    `workflows.ingest.measured_light` does. Shifts are about the patterns' mean place, gains about their median.
+    ``steadiness`` says what was found. It is None if there are too few pixels to measure, and empty if the patterns
+    don't explain what the frames show. Its ``drift`` and ``flicker`` are None if they are too large to be either.
+    ``shifts`` (frames, 2), x and y in pixels, and ``gains`` (frames) are None unless they are to be corrected, which
+    `workflows.ingest.measured_light` does. Shifts are relative to the mean position of the patterns, gains to their
+    median.
 
     Notes
     -----
-    T is recovered for some pixels as if all was still. What frame n then shows otherwise than predicted is fitted by
-    ``d_n . grad C + a_n rho T L`` over all of them (Huber's weights), its picture's shift -d_n and gain 1 + a_n.
-    T has taken part of that for its own, above all of a slow drift, since coarse and fine patterns are shown one after
-    another; so frames are corrected, T is recovered again, and so on, each round from what the last few say
-    together (Anderson's acceleration). Constants have no structure of their own to be placed by: they get the
-    shift of the frames before and after.
+    T is recovered for some pixels as if nothing had moved. The difference between frame n and its prediction is then
+    fitted by ``d_n . grad C + a_n rho T L`` over these pixels, with Huber weights; -d_n is the shift and 1 + a_n the
+    gain of the frame. T has absorbed part of a disturbance, most of all of a slow drift, since coarse and fine patterns
+    are shown one after another. So the frames are corrected, T is recovered again, and so on; each round extrapolates
+    from the last few (Anderson acceleration). Constant frames have no structure to locate them by, and get the shift of
+    the frames before and after.
 
-    What it is worth: PSNR in dB of composites, uncorrected and corrected, of a ball of 4,300 pixels with a blur of half
-    a pixel and the noise of `Scene.film`.
+    PSNR of composites in dB, uncorrected and corrected, for a ball of 4,300 pixels with a blur of half a pixel and the
+    noise of `Scene.film`:
 
     ==================  ============  ============
     frames              default       quick
@@ -71,29 +73,31 @@ def find_steadiness(stack: Stack) -> None:
     flicker of 3 %      48.9 -> 54.5
     ==================  ============  ============
 
-    The true shifts do better by 1 dB at most. Flicker of 0.3 % costs nothing. Undisturbed captures are found still to
-    0.002 pixels and even to 0.04 %. Pictures that no lens has blurred alias: there a drift of 0.3 pixels is not
-    sure, and stays.
+    The true shifts are better by 1 dB at most. Flicker of 0.3 % costs nothing. Undisturbed captures are found to be
+    still to 0.002 pixels and even to 0.04 %. Pictures without any optical blur alias: a drift of 0.3 pixels is then not
+    certain, and is not corrected.
 
     References
     ----------
     H. F. Walker and P. Ni, Anderson acceleration for fixed-point iterations, SIAM J. Numer. Anal. 49, 2011.
     """
-    stack.annotate(steadiness=None, shifts=None, gains=None)  # an ingest may be tried again
+    stack.annotate(steadiness=None, shifts=None, gains=None)  # a retried ingest must not find old ones
     program = Program.model_validate(stack.attributes["program"])
-    sample = sampled(stack)
+    sample = take_sample(stack)
     if sample is None:
         return
     monitor: Curve = TypeAdapter[Curve](Curve).validate_python(stack.attributes["monitor_curve"])
-    try_out = partial(look, stack, program, monitor, lay_out(program, monitor, stack.images()), sample)
+    try_out = partial(
+        try_recovery, stack, program, monitor, lay_out(program, monitor, stack.images()), sample
+    )
     patterns = np.array(stack.attributes["patterns"])
     shown = np.isin(patterns, program.measured)
     first = try_out(np.zeros((stack.frames, 3)))
-    if first is None or np.count_nonzero(np.isfinite(first.off[shown]).all(axis=1)) < LEAST_FRAMES:
+    if first is None or np.count_nonzero(np.isfinite(first.off[shown]).all(axis=1)) < MIN_FRAMES:
         return
-    found, last = _filled(first.off, shown), first
+    found, last = _fill_gaps(first.off, shown), first
     moves = flickers = False
-    least = np.array([LEAST_DRIFT, LEAST_FLICKER])
+    least = np.array([MIN_DRIFT, MIN_FLICKER])
     size, error = _sizes(found, first, shown)
     if ((size > TRIFLE * least) & (size > LOOK_AGAIN * error)).any():
         has_black = bool(np.isin(black_patterns(program), patterns).any())
@@ -103,21 +107,21 @@ def find_steadiness(stack: Stack) -> None:
         sure = there & (_sizes(left, last, shown)[0] <= REST * size) & _within(found, shown)
         believed = last.residual < np.minimum(EXPLAINED, first.residual)
         moves = bool(sure[0] and believed[0])
-        # What moved otherwise than that looks like flicker.
+        # Movement that is not a common shift looks like flicker.
         flickers = bool(sure[1] and believed[1] and has_black and (moves or not there[0]))
     if not moves and not flickers and last.residual > EXPLAINED[0]:
         stack.annotate(steadiness={})
         return
     if not moves and not flickers:
-        # A first look sees part of what there is, but further ones may lead astray.
-        found, last = _filled(first.off, shown), first
+        # The first trial underestimates, but later rounds may have diverged.
+        found, last = _fill_gaps(first.off, shown), first
     gain = np.exp(found[:, 2] - np.median(found[shown, 2]))
     drift = _drift(found[shown, :2], last.error[shown, :2]) | {"corrected": moves}
     flicker = _flicker(gain, last.error[:, 2], np.flatnonzero(shown)) | {"corrected": flickers}
-    # What is beyond all that is looked for is something else.
-    told = _within(found, shown)
+    # A drift or flicker beyond the limits of the search is something else.
+    within = _within(found, shown)
     stack.annotate(
-        steadiness={"drift": drift if told[0] else None, "flicker": flicker if told[1] else None},
+        steadiness={"drift": drift if within[0] else None, "flicker": flicker if within[1] else None},
         **({"shifts": found[:, :2].round(4).tolist()} if moves else {}),
         **({"gains": gain.round(5).tolist()} if flickers else {}),
     )
@@ -126,13 +130,13 @@ def find_steadiness(stack: Stack) -> None:
 def _settle(
     try_out: Callable[[Doubles], Trial | None], trial: Trial, shown: NDArray[np.bool_], has_black: bool
 ) -> tuple[Doubles, Trial, Doubles]:
-    """Take out what is found and look again, until little is left: what was found, the last trial, and what it left."""
+    """Correct and measure again until little is left; returns what was found, the last trial, and what it left."""
     scale = np.array([1, 1, SETTLED[0] / SETTLED[1]])
     state = np.zeros_like(trial.off)
     states: list[Doubles] = []
     steps: list[Doubles] = []
     for _ in range(ROUNDS):
-        step = _filled(trial.off, shown) * ([1, 1, 1] if has_black else [1, 1, 0])
+        step = _fill_gaps(trial.off, shown) * ([1, 1, 1] if has_black else [1, 1, 0])
         states.append(state * scale)
         steps.append(step * scale)
         ahead = states[-1] + steps[-1]
@@ -145,45 +149,45 @@ def _settle(
             ahead -= ((from_steps + from_states) @ share).reshape(state.shape)
         ahead /= scale
         ahead[:, :2] -= ahead[shown, :2].mean(axis=0)
-        ahead = np.clip(ahead, -MOST, MOST)
+        ahead = np.clip(ahead, -LIMITS, LIMITS)
         again = try_out(ahead)
         if again is None:
             break
         state, trial = ahead, again
-        left = _filled(trial.off, shown)
+        left = _fill_gaps(trial.off, shown)
         if _size(left[shown, :2]) < SETTLED[0] and _size(left[shown, 2:]) < SETTLED[1]:
             break
-    return state, trial, _filled(trial.off, shown)
+    return state, trial, _fill_gaps(trial.off, shown)
 
 
-def _filled(off: Doubles, shown: NDArray[np.bool_]) -> Doubles:
-    """What each frame is off by: shifts that aren't told from the frames before and after, gains are then 1.
+def _fill_gaps(off: Doubles, shown: NDArray[np.bool_]) -> Doubles:
+    """The shift and gain of each frame; missing shifts are interpolated from other frames, missing gains are 1.
 
-    About the mean place of the patterns; gains are against the constants'.
+    Shifts are relative to the mean position of the patterns, gains to those of the constant frames.
     """
     filled = off.copy()
-    told = np.flatnonzero(shown & np.isfinite(off).all(axis=1))
+    known = np.flatnonzero(shown & np.isfinite(off).all(axis=1))
     for axis in range(2):
-        filled[:, axis] = np.interp(np.arange(len(off)), told, off[told, axis])
+        filled[:, axis] = np.interp(np.arange(len(off)), known, off[known, axis])
     filled[:, :2] -= filled[shown, :2].mean(axis=0)
     return np.nan_to_num(filled)
 
 
 def _size(values: Doubles) -> float:
-    """Root mean square length of rows."""
+    """Root mean square of the lengths of rows."""
     return float(np.sqrt((values**2).sum(axis=1).mean()))
 
 
 def _sizes(found: Doubles, trial: Trial, shown: NDArray[np.bool_]) -> tuple[Doubles, Doubles]:
-    """How far the frames lie apart in place and gain, root mean square, and the standard errors of that."""
+    """Size of the drift and of the flicker, root mean square, and their standard errors."""
     error = trial.error[shown & np.isfinite(trial.error).all(axis=1)]
     size = np.array([_size(found[shown, :2]), found[shown, 2].std()])
     return size, np.array([_size(error[:, :2]), _size(error[:, 2:])])
 
 
 def _within(found: Doubles, shown: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Whether places and gains are within what is looked for."""
-    most = np.abs(found[shown]).max(axis=0) < MOST
+    """Whether shifts and gains are within `LIMITS`."""
+    most = np.abs(found[shown]).max(axis=0) < LIMITS
     return np.array([most[:2].all(), most[2]])
 
 

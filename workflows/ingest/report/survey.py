@@ -1,4 +1,4 @@
-"""How a capture turned out: clipping, exposure and contrast, from windows of frames, and how steady it was."""
+"""Measure how a capture turned out: clipping, exposure, contrast and steadiness, in windows of its frames."""
 
 from collections.abc import Iterator
 from itertools import product
@@ -15,17 +15,17 @@ from workflows.programs.program import Program
 from workflows.recovery.noise import Noise
 
 EDGE = 96
-"""Pixels of a window, at most; there are four by four, spread over the frame."""
+"""Largest side of a window in pixels. Four by four windows are spread over the frame."""
 FRAMES = 2000
-"""Frames that are looked at, at most, spread over the capture."""
+"""Frames that are examined, at most, spread over the capture."""
 BATCH = 32 << 20
-"""Bytes of a window's frames that are read at once, about."""
+"""About how many bytes of a window's frames are read at a time."""
 
 
 def survey(stack: Stack) -> None:
-    """Measure what a report on a capture needs, and annotate the stack with it as ``survey``, which is not saved.
+    """Measure what the report on a capture needs, and annotate the stack with it as ``survey``; it is not saved.
 
-    How steady it was is found first, and the noise measured anew where frames flicker: that is none.
+    Steadiness is measured first. If frames flicker, the noise is then measured again, because flicker is not noise.
     """
     find_steadiness(stack)
     if stack.attributes["gains"] is not None:
@@ -101,9 +101,9 @@ def _windows(stack: Stack) -> Iterator[tuple[slice, slice]]:
 def _batches(
     stack: Stack, rows: slice, columns: slice, chosen: NDArray[np.intp]
 ) -> Iterator[tuple[NDArray[np.intp], NDArray[Any]]]:
-    """The chosen frames of a window, some at a time: their places among the chosen, and their values."""
+    """The chosen frames of a window in batches: their indices among the chosen, and their values."""
     size = (rows.stop - rows.start) * (columns.stop - columns.start) * stack.channels * stack.dtype.itemsize
-    # Values become floats, by then of several kinds.
+    # Values become floats, in several arrays.
     step = max(1, BATCH // (16 * size))
     for first in range(0, len(chosen), step):
         at = np.arange(first, min(first + step, len(chosen)))

@@ -1,4 +1,4 @@
-"""A trial recovery of some pixels of a capture: what each of its frames shows otherwise than the others say."""
+"""Recover some pixels of a capture, and measure how each frame differs from what the recovery predicts."""
 
 from typing import NamedTuple
 
@@ -11,37 +11,37 @@ from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import Curve, to_light
 from workflows.ingest.measured_light import LOBES, exposures_of, light_of, look_up_of, unclipped_light
 from workflows.programs.program import Program
-from workflows.recovery.lobes import recover as lobes
+from workflows.recovery.lobes.recover import recover
 from workflows.recovery.noise import Noise
 from workflows.recovery.photometry import fit_photometry
 from workflows.recovery.sensing import Patterns
 from workflows.recovery.transport import Transport
 
 EDGE = 8
-"""Pixels of the squares that are looked at."""
+"""Side in pixels of the squares that are examined."""
 SQUARES = 40
-"""Of these, at most, spread over what is recovered."""
+"""Squares, at most, spread over what is recovered."""
 BYTES = 96 << 20
-"""Of their frames, at most."""
-FEWEST_SQUARES = 8
-"""For anything to be told: how far their answers lie apart is how sure it is."""
+"""Bytes of their frames, at most."""
+MIN_SQUARES = 8
+"""Squares that are needed: the spread of their results gives the standard error."""
 PIXELS = 640
-"""Of the squares, at most, that are recovered."""
+"""Pixels of the squares that are recovered, at most."""
 VALUES = 1 << 20
 """Pixels times frames that are recovered, at most."""
-FEWEST = 100
-"""Pixels with contrast, at least, for anything to be told."""
+MIN_PIXELS = 100
+"""Pixels with contrast that are needed."""
 CONTRAST = 10.0
-"""Standard deviations of a mid-grey value between black and white, from which a pixel is asked."""
+"""Difference between black and white from which a pixel is used, in standard deviations of a mid-grey value."""
 FURTHEST = 3
-"""Pixels that a frame is moved by, at most."""
+"""Pixels that a frame may be shifted by."""
 HUBER, REWEIGHTED = 1.5, 6
-"""Deviations from which a value counts less, and how often that is found anew."""
+"""Standard deviations beyond which a value gets less weight, and how often weights are updated."""
 OUTLIER = 9.0
-"""The most that one value counts for a residual."""
+"""The most that one value adds to a residual."""
 
 _SLOPE = 2
-# Between the pixels that are looked at and the edge of what is read of a frame.
+# Pixels that are read around those that are examined.
 _MARGIN = _SLOPE + LOBES + FURTHEST
 
 Floats = NDArray[np.float32]
@@ -49,14 +49,14 @@ Doubles = NDArray[np.float64]
 
 
 class Sample(NamedTuple):
-    """Pixels of some squares, in all frames.
+    """Pixels of some squares in all frames.
 
     Attributes
     ----------
     codes : (frames, squares, h, w, channels) uint8 or uint16
         With `_MARGIN` on each side.
     chosen : three (n,) intp
-        Square, row and column of the pixels, margins left out.
+        Square, row and column of each pixel, counted without the margins.
     """
 
     codes: Codes
@@ -64,7 +64,7 @@ class Sample(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """The pixels as the frames show them where these have been moved back: all (frames, n, channels) float32."""
+    """The sample in frames that were shifted back; all arrays are (frames, n, channels)."""
 
     values: Floats
     whole: NDArray[np.bool_]
@@ -72,16 +72,16 @@ class _Seen(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """What one trial recovery says of the frames.
+    """How the frames differ from the prediction of a trial recovery.
 
     Attributes
     ----------
     off : (frames, 3) float64
-        Shift x and y in pixels and relative gain that are left; NaN where they are not told.
+        Remaining shift x and y in pixels, and logarithm of the gain; NaN where they can't be measured.
     error : (frames, 3) float64
         Standard errors.
     residual : float
-        Of the values, what T does not explain, in standard deviations of the noise: root mean square without outliers.
+        Root mean square of what T does not explain, without outliers, in standard deviations of the noise.
     """
 
     off: Doubles
@@ -89,8 +89,8 @@ class Trial(NamedTuple):
     residual: float
 
 
-def sampled(stack: Stack) -> Sample | None:
-    """Squares spread over what is recovered, and pixels of them; None where there are too few."""
+def take_sample(stack: Stack) -> Sample | None:
+    """Choose squares spread over the pixels to recover, and pixels in them; None if there are too few."""
     wanted = stack.mask()
     down, across = (np.arange(_MARGIN, size - _MARGIN - EDGE + 1, EDGE) for size in wanted.shape)
     corners = [(y, x) for y in down.tolist() for x in across.tolist()]
@@ -98,20 +98,20 @@ def sampled(stack: Stack) -> Sample | None:
     useful = np.flatnonzero(counts >= EDGE**2 // 4)
     size = stack.frames * (EDGE + 2 * _MARGIN) ** 2 * stack.channels * stack.dtype.itemsize
     most = min(len(useful), SQUARES, BYTES // size)
-    if most < FEWEST_SQUARES:
+    if most < MIN_SQUARES:
         return None
     corners = [corners[useful[at]] for at in np.linspace(0, len(useful) - 1, most).astype(int)]
     wide = EDGE + _MARGIN
     squares = [stack.read(slice(y - _MARGIN, y + wide), slice(x - _MARGIN, x + wide)) for y, x in corners]
     inside = np.stack([wanted[y : y + EDGE, x : x + EDGE] for y, x in corners])
     chosen = np.stack(np.nonzero(inside))
-    limit = max(min(PIXELS, VALUES // stack.frames), FEWEST)
+    limit = max(min(PIXELS, VALUES // stack.frames), MIN_PIXELS)
     chosen = chosen[:, :: -(-chosen.shape[1] // limit)]
     return Sample(np.stack(squares, axis=1), tuple(chosen))
 
 
 def _see(stack: Stack, sample: Sample, shifts: Doubles) -> _Seen:
-    """The sample's pixels in frames that are moved back."""
+    """The sample in frames that are shifted back."""
     look_up = look_up_of(stack)
     square, y, x = sample.chosen
     y, x = y + _SLOPE, x + _SLOPE
@@ -121,7 +121,7 @@ def _see(stack: Stack, sample: Sample, shifts: Doubles) -> _Seen:
     for n, (codes, shift) in enumerate(zip(sample.codes, shifts.tolist(), strict=True)):
         picture, unclipped = unclipped_light(codes, shift, _MARGIN - _SLOPE, look_up)
         values[n], whole[n] = picture[square, y, x], unclipped[square, y, x]
-        # the slope of the polynomial through five values
+        # The slope of the polynomial through five values.
         for slope, (dy, dx) in ((across, (0, 1)), (down, (1, 0))):
             near = picture[square, y + dy, x + dx] - picture[square, y - dy, x - dx]
             far = picture[square, y + 2 * dy, x + 2 * dx] - picture[square, y - 2 * dy, x - 2 * dx]
@@ -129,10 +129,10 @@ def _see(stack: Stack, sample: Sample, shifts: Doubles) -> _Seen:
     return _Seen(values, whole, (across, down))
 
 
-def look(
+def try_recovery(
     stack: Stack, program: Program, monitor: Curve, patterns: Patterns, sample: Sample, state: Doubles
 ) -> Trial | None:
-    """Recover the sample's pixels with frames moved and dimmed back, and say what these have left."""
+    """Recover the sample from frames corrected by ``state``, (frames, 3), and measure what remains."""
     seen, gains = _see(stack, sample, state[:, :2]), np.exp(state[:, 2])
     attributes = stack.attributes | {"gains": gains.tolist() if state[:, 2].any() else None}
     noise = Noise(**attributes["noise"])
@@ -143,10 +143,10 @@ def look(
     levels = to_light(sent, monitor)
     photometry = fit_photometry(light[:, numbers], levels, usable[:, numbers], noise, worth[:, numbers])
     alive = photometry.rho**2 > CONTRAST**2 * noise.variance(photometry.S + photometry.rho / 2)
-    if np.count_nonzero(alive.any(axis=1)) < FEWEST:
+    if np.count_nonzero(alive.any(axis=1)) < MIN_PIXELS:
         return None
     shown = program.measured
-    transport, photometry, _ = lobes.recover(
+    transport, photometry, _ = recover(
         np.ascontiguousarray(light[:, shown]), photometry, patterns, noise, usable[:, shown], worth[:, shown]
     )
     predicted = np.zeros((program.count, *alive.shape), np.float32)
@@ -181,7 +181,7 @@ def look(
 
 
 def _arrived(transport: Transport, patterns: Patterns) -> Floats:
-    """T L of each pattern, (m, n, 3)."""
+    """The light T L of each pattern, (m, n, 3)."""
     cells, place = np.unique(transport.cell, return_inverse=True)
     ends = np.concatenate([[0], np.cumsum(transport.count, dtype=np.int64)])
     size = len(transport.shared)
@@ -197,7 +197,7 @@ def _arrived(transport: Transport, patterns: Patterns) -> Floats:
 def _fit(
     design: Floats, rest: Floats, weight: Floats, square: NDArray[np.intp]
 ) -> tuple[Doubles, Doubles] | None:
-    """Robust least squares, and standard errors by what squares say otherwise; None where it is not told."""
+    """Robust least squares, and standard errors from the spread between squares; None if it is underdetermined."""
     scale = np.sqrt(weight.astype(np.float64))
     A, r = design * scale[:, np.newaxis], rest * scale
     trust = np.ones(len(r))

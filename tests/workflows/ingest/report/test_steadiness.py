@@ -154,7 +154,7 @@ def test_drift_is_found_and_taken_out(
     first, last = drift["quarters"][0], drift["quarters"][-1]
     assert last[0] - first[0] > 0.5 * pixels
     assert last[1] - first[1] < -0.35 * pixels
-    assert "moves the frames back" in found["drift"].message
+    assert "shifts the frames back" in found["drift"].message
     assert found["drift"].level == ("good" if pixels < 0.45 else "warning")
     assert with_it > without + gain
 
@@ -175,7 +175,7 @@ def test_flicker_is_found_and_taken_out(
     flicker = stack.attributes["steadiness"]["flicker"]
     assert flicker["corrected"]
     assert flicker["percent"] == pytest.approx(100 * gains[ball[1].measured].std(), rel=0.1)
-    assert "recovery takes it out" in found["flicker"].message
+    assert "recovery corrects it" in found["flicker"].message
     assert found["flicker"].level == "warning"
     assert not stack.attributes["steadiness"]["drift"]["corrected"]
     assert with_it > without + gain
