@@ -38,6 +38,33 @@ class System(NamedTuple):
     variance: NDArray[np.float64]
 
 
+class Problem(NamedTuple):
+    """The measurements that one row of T is solved from: a row of a `System`.
+
+    Attributes
+    ----------
+    light : (c, cells, m) float32
+        Light of the row's channels.
+    columns : int
+    scale, target : (c * m,) float32
+    variance : float
+    """
+
+    light: NDArray[np.float32]
+    columns: int
+    scale: NDArray[np.float32]
+    target: NDArray[np.float32]
+    variance: float
+
+
+@njit(nogil=True, cache=True, inline="always")
+def problem_of(system: System, p: int) -> Problem:
+    """Row p of a system."""
+    channels = system.scale.shape[1] // system.light.shape[2]
+    light = system.light[system.source[p] : system.source[p] + channels]
+    return Problem(light, system.columns, system.scale[p], system.target[p], system.variance[p])
+
+
 @njit(nogil=True, cache=True)
 def grow_rows(system: System, found: Rows, finest: bool, constants: Constants) -> None:
     """Fit the weights of sparse rows to measurements by NN-DGSR, from zero.
@@ -51,58 +78,104 @@ def grow_rows(system: System, found: Rows, finest: bool, constants: Constants) -
         Whether to stop growing, and to drop cells, where more cells explain nothing.
     constants : Constants
     """
-    light, columns, rows, source, scale, target, _ = system
     begin, cell, weight = found
-    sweeps, tolerance = constants.sweeps, constants.tolerance
-    field = np.zeros((rows + 2, columns + 2), np.float32)
-    channels = scale.shape[1] // light.shape[2]
-    for p in range(source.size):
-        own, best = cell[begin[p] : begin[p + 1]], weight[begin[p] : begin[p + 1]]
-        s = own.size
+    field = np.zeros((system.rows + 2, system.columns + 2), np.float32)
+    for p in range(system.source.size):
+        candidates, best = cell[begin[p] : begin[p + 1]], weight[begin[p] : begin[p + 1]]
         best[:] = 0
-        m = inner(scale[p], scale[p])
-        if s == 0 or m <= 0:
-            continue
-        seen = light[source[p] : source[p] + channels]
-        most = min(max(int(constants.sparsity * m), 1) if finest else max(int(m), 1), s)
-        residual = target[p].copy()
-        left = inner(residual, residual)
-        price = 2 * np.log(max(s, 2))
-        proxy, x = np.empty(s, np.float32), np.empty(s, np.float32)
-        chosen = np.empty(s, np.bool_)
-        k = 1
-        while True:
-            before, cells = left, np.count_nonzero(best)
-            for _ in range(constants.rounds):
-                correlate(seen, own, scale[p], residual, proxy)
+        problem = problem_of(system, p)
+        m = inner(problem.scale, problem.scale)
+        if candidates.size > 0 and m > 0:
+            grow_row(problem, candidates, best, m, finest, constants, field)
+
+
+@njit(nogil=True, cache=True, inline="always")
+def grow_row(
+    problem: Problem,
+    cell: NDArray[np.int32],
+    best: NDArray[np.float32],
+    m: np.float32,
+    finest: bool,
+    constants: Constants,
+    field: NDArray[np.float32],
+) -> None:
+    """Fit the weights of one row: more and more cells, until more explain nothing.
+
+    Parameters
+    ----------
+    problem : Problem
+    cell : (s,) int32
+        Candidates, s at least 1.
+    best : (s,) float32
+        Their weights, 0 at first; changed.
+    m : float32
+        Measurements that say something, above 0.
+    finest, constants
+        As in :func:`grow_rows`.
+    field : (rows + 2, columns + 2) float32
+        Working space, all zero before and after.
+    """
+    s = cell.size
+    most = min(max(int(constants.sparsity * m), 1) if finest else max(int(m), 1), s)
+    residual = problem.target.copy()
+    left = inner(residual, residual)
+    price = 2 * np.log(max(s, 2))
+    proxy, x, chosen = np.empty(s, np.float32), np.empty(s, np.float32), np.empty(s, np.bool_)
+    k = min(1, most)
+    while True:
+        before, cells = left, np.count_nonzero(best)
+        for _ in range(constants.rounds):
+            pruned = light_and_prune(problem, cell, best, k, m, residual, constants, field, proxy, x, chosen)
+            now = inner(pruned, pruned)
+            stalled = now >= (1 - constants.stall) * left
+            if now < left:
+                residual, left = pruned, now
                 for j in range(s):
-                    proxy[j] = max(best[j] + proxy[j] / m, 0)
-                choose_groups(own, proxy, k, columns, field, chosen)
-                for j in range(s):
-                    chosen[j] = chosen[j] or best[j] > 0
-                    x[j] = best[j]
-                solve_chosen(seen, own, scale[p], target[p], chosen, x, sweeps, tolerance)
-                choose_groups(own, x, k, columns, field, chosen)
-                pruned = solve_chosen(seen, own, scale[p], target[p], chosen, x, sweeps, tolerance)
-                now = inner(pruned, pruned)
-                stalled = now >= (1 - constants.stall) * left
-                if now < left:
-                    residual, left = pruned, now
-                    for j in range(s):
-                        best[j] = x[j]
-                if stalled:
-                    break
-            gain = m * np.log(before / max(left, 1e-30))
-            enough = gain <= price * (np.count_nonzero(best) - cells)
-            settled = finest and enough and abs(best.sum() - 1) <= constants.sum_tolerance
-            if settled or k == most:
+                    best[j] = x[j]
+            if stalled:
                 break
-            k = min(max(k + 1, int(k * constants.growth)), most)
-        if finest:
-            group_sums(own, best, columns, field, proxy)
-            for j in range(s):
-                chosen[j] = best[j] > 0 and proxy[j] > np.sqrt(price * left) / m
-            solve_chosen(seen, own, scale[p], target[p], chosen, best, sweeps, tolerance)
+        gain = m * np.log(before / max(left, 1e-30))
+        enough = gain <= price * (np.count_nonzero(best) - cells)
+        settled = finest and enough and abs(best.sum() - 1) <= constants.sum_tolerance
+        if settled or k == most:
+            break
+        k = min(max(k + 1, int(k * constants.growth)), most)
+    if finest:
+        group_sums(cell, best, problem.columns, field, proxy)
+        for j in range(s):
+            chosen[j] = best[j] > 0 and proxy[j] > np.sqrt(price * left) / m
+        solve_chosen(problem, cell, chosen, best, constants)
+
+
+@njit(nogil=True, cache=True, inline="always")
+def light_and_prune(
+    problem: Problem,
+    cell: NDArray[np.int32],
+    best: NDArray[np.float32],
+    k: int,
+    m: np.float32,
+    residual: NDArray[np.float32],
+    constants: Constants,
+    field: NDArray[np.float32],
+    proxy: NDArray[np.float32],
+    x: NDArray[np.float32],
+    chosen: NDArray[np.bool_],
+) -> NDArray[np.float32]:
+    """One round: add the k groups of cells with the largest proxies, solve, keep the k best groups, solve again.
+
+    `x` is written; what it leaves of the measurements is returned. `proxy` and `chosen` are working space.
+    """
+    correlate(problem.light, cell, problem.scale, residual, proxy)
+    for j in range(cell.size):
+        proxy[j] = max(best[j] + proxy[j] / m, 0)
+    choose_groups(cell, proxy, k, problem.columns, field, chosen)
+    for j in range(cell.size):
+        chosen[j] = chosen[j] or best[j] > 0
+        x[j] = best[j]
+    solve_chosen(problem, cell, chosen, x, constants)
+    choose_groups(cell, x, k, problem.columns, field, chosen)
+    pruned: NDArray[np.float32] = solve_chosen(problem, cell, chosen, x, constants)
+    return pruned
 
 
 @njit(nogil=True, cache=True)
@@ -181,41 +254,35 @@ def choose_groups(
 
 @njit(nogil=True, cache=True)
 def solve_chosen(
-    light: NDArray[np.float32],
+    problem: Problem,
     cell: NDArray[np.int32],
-    scale: NDArray[np.float32],
-    target: NDArray[np.float32],
     chosen: NDArray[np.bool_],
     x: NDArray[np.float32],
-    sweeps: int,
-    tolerance: float,
+    constants: Constants,
 ) -> NDArray[np.float32]:
-    """Non-negative least squares on some of the cells, from x.
+    """Non-negative least squares on some of the candidates, starting from x.
 
     Parameters
     ----------
-    light : (channels, cells, m) float32
-        Light of the channels, 0 to 1.
+    problem : Problem
     cell : (s,) int32
         Candidates.
-    scale, target : (channels * m,) float32
-        Factor of each measurement, and what the scaled rows of the candidates are to add up to.
     chosen : (s,) bool
         Candidates that may be above zero.
     x : (s,) float32
         The start; overwritten with the result.
-    sweeps, tolerance
-        As in :func:`~workflows.recovery.solvers.descend`.
+    constants : Constants
+        `sweeps` and `tolerance` are used.
 
     Returns
     -------
-    (channels * m,) float32
+    (c * m,) float32
         What is left of the target.
     """
     index = np.flatnonzero(chosen)
-    matrix, y = np.empty((index.size, target.size), np.float32), x[index]
-    stack_rows(light, cell[index], scale, matrix)
-    residual: NDArray[np.float32] = descend(matrix, target, y, sweeps, tolerance)
+    matrix, y = np.empty((index.size, problem.target.size), np.float32), x[index]
+    stack_rows(problem.light, cell[index], problem.scale, matrix)
+    residual: NDArray[np.float32] = descend(matrix, problem.target, y, constants.sweeps, constants.tolerance)
     x[:] = 0
     for i in range(index.size):
         x[index[i]] = y[i]

@@ -81,13 +81,14 @@ def predict(
         Written: the prediction.
     """
     node, terms, light, sums = room
+    first = np.int64(0)  # a literal would have `load` compiled once more
     groups, m = shown.groups, shown.m
     for g in range(groups):
         for j in range(g * (m + 2), (g + 1) * (m + 2)):
             f[j] = mixture.offset[g]
     for i in range(k):
         n = sample(mixture.lobes[i], mixture.level[i], shown.grids, node, terms)
-        load(shown.code, shown.first, light.shape[1], node, n, light, 0)
+        load(shown.code, shown.first, light.shape[1], node, n, light, first)
         combine(terms, light, n, sums)
         for t in range(terms.shape[0]):
             of_lobe = response[i, t]
@@ -170,6 +171,113 @@ def misfit(
     return float(inner(residual, residual))
 
 
+class Equations(NamedTuple):
+    """Working space of Levenberg-Marquardt steps for n parameters: one offset per group, then those of each lobe.
+
+    Attributes
+    ----------
+    residual : (groups (m + 2),) float32
+        Measurements less prediction, times the root of the precision.
+    slopes : (n, groups (m + 2)) float32
+        Derivatives of the prediction, times the root of the precision.
+    A : (n, n) float64
+        Lower triangle of ``slopes slopes'``.
+    b, change : (n,) float64
+        ``slopes residual``, and the solution.
+    damped : (n, n) float64
+    """
+
+    residual: NDArray[np.float32]
+    slopes: NDArray[np.float32]
+    A: NDArray[np.float64]
+    b: NDArray[np.float64]
+    change: NDArray[np.float64]
+    damped: NDArray[np.float64]
+
+
+@njit(nogil=True, cache=True, inline="always")
+def linearise(
+    mixture: Mixture,
+    k: int,
+    groups: int,
+    response: NDArray[np.float32],
+    precision: NDArray[np.float32],
+    equations: Equations,
+) -> None:
+    """Write the slopes about k lobes, and the normal equations ``A change = b``."""
+    slopes, residual, A, b = equations.slopes, equations.residual, equations.A, equations.b
+    size = precision.size // groups
+    for g in range(groups):
+        for j in range(precision.size):
+            inside = g * size <= j < (g + 1) * size
+            slopes[g, j] = math.sqrt(precision[j]) if inside else 0.0
+    for i in range(k):
+        for t in range(PARAMETERS):
+            weight = np.float32(1.0 if t == 0 else mixture.lobes[i, 0])
+            slope, of_lobe = slopes[groups + PARAMETERS * i + t], response[i, t]
+            for j in range(precision.size):
+                slope[j] = weight * of_lobe[j] * math.sqrt(precision[j])
+    for i in range(b.size):
+        b[i] = inner(slopes[i], residual)
+        for j in range(i + 1):
+            A[i, j] = inner(slopes[i], slopes[j])
+
+
+@njit(nogil=True, cache=True, inline="always")
+def solve_damped(equations: Equations, damping: float) -> bool:
+    """Write the change that solves the damped equations; false if there is none."""
+    A, damped, change = equations.A, equations.damped, equations.change
+    for i in range(change.size):
+        change[i] = equations.b[i]
+        for j in range(i + 1):
+            damped[i, j] = A[i, j]
+        damped[i, i] += damping * A[i, i] + 1e-6
+    solved: bool = solve(damped, change)
+    return solved
+
+
+@njit(nogil=True, cache=True, inline="always")
+def refine_round(
+    shown: Shown,
+    y: NDArray[np.float32],
+    mixture: Mixture,
+    k: int,
+    options: LobesOptions,
+    room: Room,
+    response: NDArray[np.float32],
+    f: NDArray[np.float32],
+    precision: NDArray[np.float32],
+    equations: Equations,
+    new: Mixture,
+) -> None:
+    """Take Levenberg-Marquardt steps at fixed precisions; `mixture`, `response` and `f` are changed together."""
+    damping = _DAMPING
+    chi = misfit(y, f, precision, equations.residual)
+    for _ in range(options.steps):
+        linearise(mixture, k, shown.groups, response, precision, equations)
+        better, now = False, chi
+        for _ in range(_TRIES):
+            if solve_damped(equations, damping):
+                copy_mixture(k, shown.groups, mixture, new)
+                for g in range(shown.groups):
+                    new.offset[g] += equations.change[g]
+                step(new, equations.change[shown.groups :], shown.grids, options.fit_resolution)
+                predict(shown, new, k, room, response, f)
+                now = misfit(y, f, precision, equations.residual)
+                better = now < chi
+                if better:
+                    break
+            damping *= _HARDER
+        if not better:
+            predict(shown, mixture, k, room, response, f)
+            break
+        damping = max(damping * _EASIER, 1e-5)
+        copy_mixture(k, shown.groups, new, mixture)
+        if chi - now < options.tolerance:
+            break
+        chi = now
+
+
 @njit(nogil=True, cache=True)
 def refine(
     shown: Shown,
@@ -180,7 +288,7 @@ def refine(
     options: LobesOptions,
     bound: float,
 ) -> tuple[float, float, NDArray[np.float32], NDArray[np.float32]]:
-    """Fit all parameters of k lobes by Levenberg and Marquardt's method, from what they are.
+    """Fit all parameters of k lobes by the Levenberg-Marquardt method, starting from their present values.
 
     Parameters
     ----------
@@ -191,9 +299,9 @@ def refine(
         Changed.
     k : int
     options : LobesOptions
-        Of which this takes `fit_resolution`, `rounds`, `steps` and `tolerance`.
+        `fit_resolution`, `rounds`, `steps` and `tolerance` are used.
     bound : float
-        Rounds end when the objective and the price are above it.
+        Rounds end once the objective plus the price is above it.
 
     Returns
     -------
@@ -201,68 +309,31 @@ def refine(
         As from :func:`~workflows.recovery.lobes.likelihood.weigh`.
     f, precision : like y
     """
-    groups, m, grids = shown.groups, shown.m, shown.grids
+    groups, size = shown.groups, shown.groups * shown.m
     M, n = y.size, groups + PARAMETERS * k
     room = Room(
         np.empty(NODES, np.int64),
         np.empty((PARAMETERS, NODES), np.float32),
-        np.empty((NODES, groups * m), np.float32),
-        np.empty((PARAMETERS, groups * m), np.float32),
+        np.empty((NODES, size), np.float32),
+        np.empty((PARAMETERS, size), np.float32),
     )
     response = np.empty((k, PARAMETERS, M), np.float32)
-    f, precision, residual = np.empty_like(y), np.empty_like(y), np.empty_like(y)
-    slopes, A, damped = np.empty((n, M), np.float32), np.empty((n, n)), np.empty((n, n))
-    b, change = np.empty(n), np.empty(n)
+    f, precision = np.empty_like(y), np.empty_like(y)
+    equations = Equations(
+        np.empty_like(y),
+        np.empty((n, M), np.float32),
+        np.empty((n, n)),
+        np.empty(n),
+        np.empty(n),
+        np.empty((n, n)),
+    )
     new = Mixture(mixture.lobes.copy(), mixture.level.copy(), mixture.offset.copy())
     predict(shown, mixture, k, room, response, f)
     kappa, objective = weigh(y, f, variance, groups, n, precision)
     for _ in range(options.rounds):
         before = objective
-        damping = _DAMPING
-        chi = misfit(y, f, precision, residual)
-        for _ in range(options.steps):
-            for g in range(groups):
-                for j in range(M):
-                    inside = g * (m + 2) <= j < (g + 1) * (m + 2)
-                    slopes[g, j] = math.sqrt(precision[j]) if inside else 0.0
-            for i in range(k):
-                for t in range(PARAMETERS):
-                    weight = np.float32(1.0 if t == 0 else mixture.lobes[i, 0])
-                    slope, of_lobe = slopes[groups + PARAMETERS * i + t], response[i, t]
-                    for j in range(M):
-                        slope[j] = weight * of_lobe[j] * math.sqrt(precision[j])
-            for i in range(n):
-                b[i] = inner(slopes[i], residual)
-                for j in range(i + 1):
-                    A[i, j] = inner(slopes[i], slopes[j])
-            better = False
-            now = chi
-            for _ in range(_TRIES):
-                for i in range(n):
-                    change[i] = b[i]
-                    for j in range(i + 1):
-                        damped[i, j] = A[i, j]
-                    damped[i, i] += damping * A[i, i] + 1e-6
-                if solve(damped, change):
-                    copy_mixture(k, groups, mixture, new)
-                    for g in range(groups):
-                        new.offset[g] += change[g]
-                    step(new, change[groups:], grids, options.fit_resolution)
-                    predict(shown, new, k, room, response, f)
-                    now = misfit(y, f, precision, residual)
-                    better = now < chi
-                    if better:
-                        break
-                damping *= _HARDER
-            if not better:
-                predict(shown, mixture, k, room, response, f)
-                break
-            damping = max(damping * _EASIER, 1e-5)
-            copy_mixture(k, groups, new, mixture)
-            if chi - now < options.tolerance:
-                break
-            chi = now
+        refine_round(shown, y, mixture, k, options, room, response, f, precision, equations, new)
         kappa, objective = weigh(y, f, variance, groups, n, precision)
-        if abs(before - objective) < 1 or objective + price(grids, mixture.level, k) > bound:
+        if abs(before - objective) < 1 or objective + price(shown.grids, mixture.level, k) > bound:
             break
     return kappa, objective, f, precision

@@ -96,12 +96,89 @@ def unresolved(
         As from :func:`~workflows.recovery.lobes.likelihood.scatter`.
     """
     m = y.size // groups - 2
-    kappa, misfit = scatter(y, f, mean, variance, groups, 0, _LEAST_KAPPA)
+    # a literal would have `scatter` compiled once more
+    parameters = np.int64(0)
+    kappa, misfit = scatter(y, f, mean, variance, groups, parameters, _LEAST_KAPPA)
     for g in range(groups):
         for j in range(g * (m + 2), (g + 1) * (m + 2)):
             within = kappa * max(1 - square[j], 0.0) if j < g * (m + 2) + m else 0.0
             total[j] = variance[j] + within
     return kappa, misfit
+
+
+@njit(nogil=True, cache=True, inline="always")
+def apply_covariance(
+    A: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    kappa: float,
+    total: NDArray[np.float32],
+    groups: int,
+    measured: NDArray[np.bool_],
+    p: NDArray[np.float32],
+    out: NDArray[np.float32],
+) -> None:
+    """Write K p, K the covariance of the measurements: of T, of the offsets and, `total`, of each alone."""
+    size = p.size // groups
+    for j in range(p.size):
+        out[j] = total[j] * p[j]
+    for g in range(groups):
+        offset = np.float32(0)
+        for j in range(g * size, (g + 1) * size):
+            offset += p[j]
+        for j in range(g * size, (g + 1) * size):
+            out[j] += np.float32(_OFFSET**2) * offset
+    add_products(A, np.float32(kappa), weight, p, out)
+    for j in range(p.size):
+        out[j] = out[j] if measured[j] else 0.0
+
+
+@njit(nogil=True, cache=True, inline="always")
+def solve_covariance(
+    A: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    kappa: float,
+    total: NDArray[np.float32],
+    diagonal: NDArray[np.float32],
+    groups: int,
+    measured: NDArray[np.bool_],
+    r: NDArray[np.float32],
+    steps: int,
+    x: NDArray[np.float32],
+) -> None:
+    """Solve ``K x = r`` by conjugate gradients preconditioned by the diagonal of K; r is overwritten."""
+    z, p, Kp = np.empty_like(r), np.empty_like(r), np.empty_like(r)
+    for j in range(r.size):
+        x[j], z[j] = 0.0, r[j] / diagonal[j]
+        p[j] = z[j]
+    left = inner(r, z)
+    enough = left * np.float32(_ENOUGH)
+    for _ in range(steps):
+        if left <= enough:
+            break
+        apply_covariance(A, weight, kappa, total, groups, measured, p, Kp)
+        length = left / inner(p, Kp)
+        subtract(x, -length, p)
+        subtract(r, length, Kp)
+        for j in range(r.size):
+            z[j] = r[j] / diagonal[j]
+        now = inner(r, z)
+        for j in range(r.size):
+            p[j] = z[j] + now / left * p[j]
+        left = now
+
+
+@njit(nogil=True, cache=True, inline="always")
+def reweight(
+    A: NDArray[np.float32], kappa: float, x: NDArray[np.float32], weight: NDArray[np.float32]
+) -> None:
+    """Multiply the weights by ``1 + kappa A x``, cut off at 0, and scale them to a sum of 1."""
+    whole = 0.0
+    for i in range(weight.size):
+        weight[i] *= max(1 + np.float32(kappa) * inner(A[i], x), np.float32(0))
+        whole += weight[i]
+    if whole > 0:
+        for i in range(weight.size):
+            weight[i] /= np.float32(whole)
 
 
 @njit(nogil=True, cache=True)
@@ -115,7 +192,7 @@ def update(
     passes: int,
     steps: int,
 ) -> tuple[float, float]:
-    """Replace the weights of a T by their posterior mean given the measurements, again and again.
+    """Replace the weights of a T by their posterior mean given the measurements, several times.
 
     Parameters
     ----------
@@ -130,75 +207,39 @@ def update(
     passes : int
         Each starts from the weights that the one before left.
     steps : int
-        Most conjugate gradients in a pass.
+        Most conjugate gradient steps in a pass.
 
     Returns
     -------
     kappa, misfit : float
-        As from :func:`unresolved`, before the last pass. The misfit is an estimate of the squared error of T times a
-        pattern that it was not fitted to.
+        As from :func:`unresolved`, before the last pass. The misfit estimates the squared error of T times a pattern
+        that it was not fitted to.
 
     Notes
     -----
-    A priori T ~ N(t, kappa diag t): what a sample of 1 / kappa rays of t would be. With K = kappa A' diag(t) A + V, the
+    A priori T ~ N(t, kappa diag t), as a sample of 1 / kappa rays of t would be. With K = kappa A' diag(t) A + V, the
     posterior mean is ``t + kappa t * A K^-1 (y - A' t)``; negative weights are cut off. K is never built:
-    ``K x = r`` is solved by conjugate gradients, of which the diagonal is the preconditioner.
+    ``K x = r`` is solved by conjugate gradients.
     """
-    n, M = A.shape
-    m = M // groups - 2
-    f, total, diagonal = np.empty_like(y), np.empty_like(y), np.empty_like(y)
-    r, x, p, z, Kp = np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y)
-    mean, square = np.empty_like(y), np.empty_like(y)
+    size = y.size // groups
+    f, total, diagonal, r, x = (
+        np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y)
+    )  # fmt: skip
+    mean, square, measured = np.empty_like(y), np.empty_like(y), variance < np.inf
     kappa, misfit = 0.0, 0.0
     for _ in range(passes):
-        for j in range(M):
-            mean[j] = square[j] = 0
+        mean[:], square[:] = 0, 0
         add_moments(A, weight, mean, square)
-        for g in range(groups):
-            for j in range(g * (m + 2), (g + 1) * (m + 2)):
-                f[j] = offset[g] + mean[j]
+        for j in range(y.size):
+            f[j] = offset[j // size] + mean[j]
         kappa, misfit = unresolved(y, f, mean, square, variance, groups, total)
-        for j in range(M):
+        for j in range(y.size):
             diagonal[j] = total[j] + np.float32(_OFFSET**2) + np.float32(kappa) * square[j]
-        for j in range(M):
             # what was not measured stays as predicted
-            r[j] = y[j] - f[j] if variance[j] < np.inf else 0.0
-            total[j] = total[j] if variance[j] < np.inf else 0.0
-            x[j], z[j] = 0.0, r[j] / diagonal[j]
-            p[j] = z[j]
-        left = inner(r, z)
-        enough = left * np.float32(_ENOUGH)
-        for _ in range(steps):
-            if left <= enough:
-                break
-            for j in range(M):
-                Kp[j] = total[j] * p[j]
-            for g in range(groups):
-                lean = np.float32(0)
-                for j in range(g * (m + 2), (g + 1) * (m + 2)):
-                    lean += p[j]
-                for j in range(g * (m + 2), (g + 1) * (m + 2)):
-                    Kp[j] += np.float32(_OFFSET**2) * lean
-            add_products(A, np.float32(kappa), weight, p, Kp)
-            for j in range(M):
-                Kp[j] = Kp[j] if variance[j] < np.inf else 0.0
-            length = left / inner(p, Kp)
-            subtract(x, -length, p)
-            subtract(r, length, Kp)
-            for j in range(M):
-                z[j] = r[j] / diagonal[j]
-            now = inner(r, z)
-            for j in range(M):
-                p[j] = z[j] + now / left * p[j]
-            left = now
-        for g in range(groups):
-            for j in range(g * (m + 2), (g + 1) * (m + 2)):
-                offset[g] += _OFFSET**2 * x[j]
-        whole = 0.0
-        for i in range(n):
-            weight[i] *= max(1 + np.float32(kappa) * inner(A[i], x), np.float32(0))
-            whole += weight[i]
-        if whole > 0:
-            for i in range(n):
-                weight[i] /= np.float32(whole)
+            r[j] = y[j] - f[j] if measured[j] else 0.0
+            total[j] = total[j] if measured[j] else 0.0
+        solve_covariance(A, weight, kappa, total, diagonal, groups, measured, r, steps, x)
+        for j in range(y.size):
+            offset[j // size] += _OFFSET**2 * x[j]
+        reweight(A, kappa, x, weight)
     return kappa, misfit

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workflows.recovery.lobes.options import FINE, LobesOptions
-from workflows.recovery.lobes.pixels import recover_pixels
+from workflows.recovery.lobes.pixels import Explained, Pixels, recover_pixels
 from workflows.recovery.noise import Noise
 from workflows.recovery.normalise import Measured, expected_error, normalise, refit
 from workflows.recovery.photometry import Photometry
@@ -118,9 +118,8 @@ def _recover_block(
         apart = np.zeros(n, bool)
     counts = np.zeros((len(apart), 3), np.int64)
     seen, left_out, missed = np.zeros_like(own.value), np.zeros(counts.shape), np.zeros(counts.shape)
-    node, weight = recover_pixels(
-        patterns.pyramid.arrays, patterns.code, joint, own, apart, options, seen, left_out, missed, counts
-    )
+    pixels = Pixels(patterns.pyramid.arrays, patterns.code, joint, own)
+    node, weight = recover_pixels(pixels, apart, options, Explained(seen, left_out, missed, counts))
     response[alive], kappa[alive], misfit[alive] = seen, left_out, missed
     count, shared = np.zeros((alive.size, 3), np.int64), np.zeros(alive.size, bool)
     count[alive], shared[alive] = counts, ~apart
