@@ -52,7 +52,7 @@ def test_kernels_that_several_others_share_are_compiled_when_they_are_loaded() -
     shared = [
         kernel
         for kernel, times in Counter(k for entry in entries for k in within(entry)).items()
-        if times > 1
+        if times > 1 and kernel.targetoptions.get("inline") != "always"  # a part of each of its callers
     ]
     assert {"inner", "subtract"} <= {kernel.py_func.__name__ for kernel in shared}
     for kernel in shared:
