@@ -81,15 +81,12 @@ def test_a_matte_elsewhere(service: Service, matte: str, tmp_path: Path) -> None
 
 def test_keys_and_backups(tmp_path: Path) -> None:
     """On an installation that no service runs on."""
-    for readme, section in (("README.md", "Run the service"), ("services/README.md", "Keys, owners, limits")):
-        folder = tmp_path / section
-        folder.mkdir()
-        printed = run(block(readme, section), folder)
-        assert re.search(r"lab\s+alice\s+write", printed), printed
-    backups = {block("README.md", "Security and backups"), block("storage/README.md", "Backups")}
-    (lines,) = backups
-    run(lines.replace("/mnt/backups", str(tmp_path)), folder)
-    assert {path.name for path in folder.iterdir()} == {"envmatte-data", "elsewhere"}
+    (keys,) = {block("README.md", "Run the service"), block("services/README.md", "Keys, owners, limits")}
+    (backups,) = {block("README.md", "Security and backups"), block("storage/README.md", "Backups")}
+    (tmp_path / "home").mkdir()
+    printed = run(keys + backups.replace("/mnt/backups", str(tmp_path)), tmp_path / "home")
+    assert re.search(r"^lab\s+alice\s+write", printed, re.M), printed
+    assert {path.name for path in (tmp_path / "home").iterdir()} == {"envmatte-data", "elsewhere"}
     assert (tmp_path / "monday/manifest.jsonl").exists()
 
 
