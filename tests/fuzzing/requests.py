@@ -104,6 +104,7 @@ LINES = (
     "GET /v1/programs/PROGRAM/patterns/2.png",
     "GET /v1/presets",
     "GET /v1/limits",
+    "GET /v1/capture.schema.json",
     "GET /v1/network",
     "GET /web/app.js",
     "GET /openapi.json?x",
