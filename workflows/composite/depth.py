@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from storage.errors import Conflict
 from storage.layout.mattes import Matte
 from workflows.composite.threads import in_parts
-from workflows.mattes.lobes import lobes_of
+from workflows.mattes.lobes import block_lobes
 from workflows.recovery.pyramid import Grids
 
 LOBES = 3
@@ -62,7 +62,7 @@ def places_of(matte: Matte, threads: int) -> Places:
     blocks = list(product(range(matte.block_rows), range(matte.block_columns)))
 
     def one(number: int) -> None:
-        lobe = lobes_of(matte, matte.read(*blocks[number]), LOBES)[:, :, 0]
+        lobe = block_lobes(matte, matte.read(*blocks[number]), LOBES)[:, :, 0]
         at = places[matte.span(*blocks[number])]
         at[..., 3] = lobe[..., 2:5].mean(axis=2)
         at[..., 0], at[..., 1] = lobe[..., 0], np.where(at[..., 3] > 0, 1 - lobe[..., 1], 0)

@@ -47,7 +47,7 @@ from numpy.typing import NDArray
 
 from storage.layout.mattes import Matte
 from workflows.images import float_formats, integer_formats
-from workflows.mattes.lobes import lobes_of
+from workflows.mattes.lobes import block_lobes
 from workflows.recovery.lobe_table import FIELDS
 
 NAMES = ("S", "rho", "alpha", "confidence")
@@ -60,6 +60,19 @@ _COMMENTS = (
     "backdrop L, from its bottom left. sigma: in widths of the monitor. "
     "theta: radians counter-clockwise from u. Linear light."
 )
+
+
+def confidence(matte: Matte) -> NDArray[np.float32]:
+    """How far each pixel of a matte can be trusted.
+
+    Returns
+    -------
+    (height, width) float32
+        ``1 / (1 + e / 0.01)``, e the expected error of a composite in camera units: 1/2 at 40 dB. 0 where nothing was
+        recovered.
+    """
+    trusted = 1 / (1 + matte.layer("error") / np.float32(0.01))
+    return np.where(matte.layer("recovered"), trusted, 0).astype(np.float32)
 
 
 def layer(matte: Matte, name: str) -> NDArray[np.float32]:
@@ -102,7 +115,7 @@ def stmap(matte: Matte) -> bytes:
     """Where the heaviest lobe of each pixel lies, as an EXR of 32 bits: u, v, and whether there is one."""
     planes = {channel: np.zeros((matte.height, matte.width), np.float32) for channel in "RGB"}
     for row, column in np.ndindex(matte.block_rows, matte.block_columns):
-        lobes = lobes_of(matte, matte.read(row, column), LOBES)[..., 0, :]
+        lobes = block_lobes(matte, matte.read(row, column), LOBES)[..., 0, :]
         at = matte.span(row, column)
         planes["R"][at], planes["G"][at] = lobes[..., 0], lobes[..., 1]
         planes["B"][at] = lobes[..., 2:5].any(axis=-1)
@@ -133,7 +146,7 @@ def everything(matte: Matte, lobes: int = LOBES) -> bytes:
     planes["confidence.Y"][:] = confidence(matte)
     for row, column in np.ndindex(matte.block_rows, matte.block_columns):
         block, at = matte.read(row, column), matte.span(row, column)
-        ranked = lobes_of(matte, block, lobes)
+        ranked = block_lobes(matte, block, lobes)
         white = block.S + (block.rho * ranked[..., 2:5].sum(axis=-2)) @ crosstalk.T
         for c, channel in enumerate("RGB"):
             planes[channel][at] = white[..., c]
@@ -157,16 +170,3 @@ def _encode(matte: Matte, planes: Planes) -> bytes:
         "comments": _COMMENTS,
     }
     return float_formats.encode_exr(planes, header)
-
-
-def confidence(matte: Matte) -> NDArray[np.float32]:
-    """How far a matte can be trusted.
-
-    Returns
-    -------
-    (height, width) float32
-        ``1 / (1 + e / 0.01)``, e the error to expect of a composite in camera units: 1/2 at 40 dB. 0 where nothing was
-        recovered.
-    """
-    trusted = 1 / (1 + matte.layer("error") / np.float32(0.01))
-    return np.where(matte.layer("recovered"), trusted, 0).astype(np.float32)

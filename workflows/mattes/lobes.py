@@ -8,8 +8,14 @@ from workflows.recovery.lobe_table import FIELDS, ranked_lobes
 from workflows.recovery.transport import Transport
 
 
-def lobes_of(matte: Matte, block: Block, most: int) -> NDArray[np.float32]:
-    """(h, w, most, 8) float32: the lobes of a block's pixels, see `ranked_lobes`."""
+def block_lobes(matte: Matte, block: Block, most: int) -> NDArray[np.float32]:
+    """The lobes of a block's pixels, heaviest first.
+
+    Returns
+    -------
+    (h, w, most, 8) float32
+        See :func:`~workflows.recovery.lobe_table.ranked_lobes`.
+    """
     width, height = matte.attributes["monitor"]
     rows = Transport(
         matte.columns,

@@ -1,4 +1,4 @@
-"""One pixel of a matte looked into: from which cells of the monitor its light comes, and in which lobes."""
+"""One pixel of a matte: the cells of the monitor that its light comes from, and its lobes."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from storage.errors import InvalidInput
 from storage.layout.mattes import Matte
-from workflows.mattes.lobes import lobes_of
+from workflows.mattes.lobes import block_lobes
 from workflows.recovery.pyramid import Pyramid
 
 
@@ -24,7 +24,7 @@ class Pixel:
     columns, rows : int
         The first grid of the cells.
     recovered : bool
-        False where the mask left it out: then all that follows is zero or empty.
+        False where the mask excluded it; the fields that follow are then zero or empty.
     S, rho : (3,) float32
     node : (n,) int64
         Nodes of :class:`~workflows.recovery.pyramid.Pyramid`, heaviest first.
@@ -66,7 +66,7 @@ class Pixel:
 
 
 def look_into(matte: Matte, x: int, y: int, lobes: int) -> Pixel:
-    """Look into a pixel; one block is read.
+    """Read a pixel of a matte. One block is read.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def look_into(matte: Matte, x: int, y: int, lobes: int) -> Pixel:
     else:
         weight[place, np.repeat(np.arange(3), size)] = block.weight[entries]
     order = np.argsort(-weight.sum(axis=1), kind="stable")
-    ranked = lobes_of(matte, block, lobes)[i, j]
+    ranked = block_lobes(matte, block, lobes)[i, j]
     width, height = matte.attributes["monitor"]
     return Pixel(
         x,

@@ -34,7 +34,7 @@ def picture(pixel: Pixel) -> bytes:
     bytes
         A PNG: the whole monitor, a close-up of where most light comes from, and the close-up channel by channel.
         Brightness is the logarithm of the contribution over three powers of ten; ellipses are the lobes, at two
-        standard deviations; the lines below tell their numbers.
+        standard deviations; the lines below list their numbers.
     """
     aspect = pixel.monitor[1] / pixel.monitor[0]
     wide, narrow = (_fitting(width, aspect) for width in (WIDE, NARROW))

@@ -11,11 +11,11 @@ from workflows.recovery.pyramid import Pyramid
 from workflows.recovery.transport import Transport
 
 FIELDS = ("u", "v", "weight.R", "weight.G", "weight.B", "sigma_u", "sigma_v", "theta")
-"""What is told of a lobe, in this order."""
+"""The columns of a lobe table."""
 
 _APART = 3.0
 """Clusters are lobes of their own where their centres are further apart than this many standard deviations of the
-wider one: the two halves of a Gaussian are 2.6 of their own apart, and are none."""
+wider one. The two halves of a Gaussian are 2.6 of their own apart, and so stay together."""
 _SPACING = 0.5
 """Standard deviation of a node in spacings of its grid, at least: neighbours, and on the diagonal, are not apart."""
 _CLUSTERS, _WIDEST = 32, 4.0**6

@@ -159,7 +159,7 @@ def estimate_crosstalk(
     -------
     (3, 3) float64
         X of ``C = S + X (rho T L)``: row the camera's channel, column the monitor's, 1 on the diagonal. The identity if
-        the monitors do not tell the colours apart, or the camera does not.
+        the monitors do not show the colours apart, or the camera does not separate them.
 
     Raises
     ------

@@ -50,13 +50,13 @@ def test_contributions_are_those_of_the_bumps(matte: Matte) -> None:
 
 
 @pytest.mark.parametrize(("x", "recovered"), [(2, True), (3, False)])
-def test_a_pixel_of_which_nothing_is_known_is_drawn_empty(matte: Matte, x: int, recovered: bool) -> None:
+def test_pixel_without_transport_is_drawn_empty(matte: Matte, x: int, recovered: bool) -> None:
     pixel = look_into(matte, x, 0, 4)
     assert (pixel.recovered, len(pixel.node), len(pixel.cells), len(pixel.lobes)) == (recovered, 0, 0, 0)
     assert picture(pixel).startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize(("x", "y"), [(4, 0), (-1, 0), (0, 1)])
-def test_there_is_no_pixel_outside(matte: Matte, x: int, y: int) -> None:
+def test_pixel_outside_the_frame_is_refused(matte: Matte, x: int, y: int) -> None:
     with pytest.raises(InvalidInput, match="from 0 to"):
         look_into(matte, x, y, 4)

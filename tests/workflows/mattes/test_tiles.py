@@ -266,7 +266,7 @@ def bracketed(data: bytes, exposures: tuple[float, ...]) -> bytes:
     return target.getvalue()
 
 
-def test_exposures_are_merged_by_what_they_say(objects: Objects, ingest: Ingest) -> None:
+def test_exposures_are_merged_by_their_weight(objects: Objects, ingest: Ingest) -> None:
     scene = glass_ball(44, 36, monitor=(64, 48), rays=4)
     program = nested_program((64, 48), bands=((4, 3, 14), (8, 6, 10)), levels=5)
     target = io.BytesIO()

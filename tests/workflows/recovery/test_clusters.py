@@ -69,7 +69,7 @@ def test_a_gaussian_past_the_edge_has_all_its_mass_on_the_monitor():
     assert mass.sum() == pytest.approx(1, abs=1e-5)
 
 
-def test_one_cell_is_no_narrower_than_a_cell():
+def test_cluster_of_one_cell_is_as_wide_as_a_cell():
     field = np.zeros((1, ROWS, COLUMNS), np.float32)
     cell, mass = spread(raw([(7, 5, 1.0)]), COLUMNS, 3.0, field)
     expected = exact(7.5, 5.5, CELL_VARIANCE**0.5, CELL_VARIANCE**0.5, 0.0, fine=64)

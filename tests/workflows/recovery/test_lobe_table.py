@@ -77,7 +77,7 @@ def test_a_gaussian_is_one_lobe_that_lies_as_it_does(turn: float) -> None:
     np.testing.assert_allclose([u * COLUMNS, v * ROWS], [30.3, 18.2], atol=0.02)
     np.testing.assert_allclose(weight, 1, atol=1e-6)
     assert abs(theta) <= np.pi / 4 + 1e-6
-    # the covariance, from what is told of the ellipse
+    # the covariance, from the described ellipse
     axes = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
     got = axes @ np.diag([sigma_u**2, sigma_v**2]) @ axes.T * COLUMNS**2
     axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
@@ -124,7 +124,7 @@ def test_channels_that_come_from_one_place_have_three_weights() -> None:
 
 def test_the_fringes_of_a_prism_are_lobes_apart() -> None:
     found = lobes([gaussian(x, 20, 2.5, 1.5, 0, 1.0) for x in (27, 30, 33)])[0]
-    # each colour keeps its place, as far as four lobes can tell
+    # each colour keeps its place, as far as four lobes allow
     centres = found[:, 2:5].T @ found[:, 0] * COLUMNS
     np.testing.assert_allclose(centres, [27, 30, 33], atol=0.4)
 

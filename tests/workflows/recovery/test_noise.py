@@ -1,13 +1,13 @@
-"""The line of a camera's noise, from samples of squared errors."""
+"""The line of a camera's noise, and the noise of pattern frames."""
 
 import numpy as np
 import pytest
 
-from workflows.recovery.noise import Noise, noise_line
+from workflows.recovery.noise import Noise, estimate_excess, noise_line
 
 
 @pytest.mark.parametrize("trim", [0.9, 1.0])
-def test_the_line_is_that_of_the_samples(trim):
+def test_line_fits_the_samples(trim):
     rng = np.random.default_rng(0)
     level = rng.uniform(0, 1, 100_000)
     noise = Noise(4e-6, 5e-5)
@@ -16,12 +16,35 @@ def test_the_line_is_that_of_the_samples(trim):
     assert found.shot == pytest.approx(noise.shot, rel=0.05)
 
 
-def test_no_variance_is_below_the_floor():
+def test_variance_is_at_least_the_floor():
     found = noise_line(np.linspace(0, 1, 1000), np.zeros(1000), 1e-6)
     assert found.read == pytest.approx(1e-6)
     assert found.shot == pytest.approx(0, abs=1e-12)
 
 
-def test_few_samples_are_no_line():
+def test_too_few_samples_give_none():
     assert noise_line(np.linspace(0, 1, 119), np.ones(119), 1e-12) is None
     assert noise_line(np.linspace(0, 1, 120), np.ones(120), 1e-12) is not None
+
+
+@pytest.mark.parametrize("blocks", [1, 2, 6])
+def test_excess_is_found_in_values_beyond_black_and_white(blocks: int) -> None:
+    # A pixel sees the mean of some blocks, black or white; what is assumed of the values near both is the worst case.
+    random = np.random.default_rng(blocks)
+    black = np.full((400, 3), 0.05, np.float32)
+    white = np.linspace(0.3, 0.9, 1200, dtype=np.float32).reshape(400, 3)
+    lit = random.integers(0, 2, (400, 100, 3, blocks)).mean(axis=3)
+    true = black[:, None] + lit * (white - black)[:, None]
+    variance = 1e-6 + 2e-4 * true
+    values = (true + np.sqrt(variance) * random.standard_normal(true.shape)).astype(np.float32)
+    found = estimate_excess(values, black, white, np.ones(values.shape, bool))
+    assert found is not None
+    for level in (0.05, 0.3, 0.8):
+        ratio = float(found.variance(np.array([level], np.float32))[0]) / (1e-6 + 2e-4 * level)
+        assert 0.9 < ratio < 1.7
+
+
+def test_values_between_black_and_white_give_no_excess() -> None:
+    values = np.full((50, 20, 3), 0.5, np.float32)
+    black, white = np.zeros((50, 3), np.float32), np.ones((50, 3), np.float32)
+    assert estimate_excess(values, black, white, np.ones(values.shape, bool)) is None

@@ -32,7 +32,7 @@ def test_normalise_gives_the_signed_form_and_its_variance(photometry):
     assert (value.dtype, variance.dtype) == (np.float32, np.float32)
 
 
-def test_what_says_nothing_has_an_infinite_variance(photometry):
+def test_unusable_measurements_have_infinite_variance(photometry):
     measurements = np.full((2, 4, 3), 0.3, np.float32)
     measurements[1, :2, 0] = np.nan, np.inf
     usable = np.ones(measurements.shape, bool)
@@ -78,7 +78,7 @@ def test_refit_is_weighted_least_squares_in_camera_values(photometry):
     assert (fit.S[0, 2], fit.rho[0, 2]) == (photometry.S[0, 2], photometry.rho[0, 2])
 
 
-def test_a_t_that_says_nothing_leaves_the_photometry(photometry):
+def test_refit_without_information_keeps_the_photometry(photometry):
     unknown = Measured(np.zeros((2, 3, 5), np.float32), np.full((2, 3, 5), np.inf, np.float32))
     flat = Measured(np.full((2, 3, 5), 0.3, np.float32), np.ones((2, 3, 5), np.float32))
     for measured in (unknown, flat):
@@ -87,7 +87,7 @@ def test_a_t_that_says_nothing_leaves_the_photometry(photometry):
         np.testing.assert_array_equal(fit.rho, photometry.rho)
 
 
-def test_a_t_that_is_sure_of_itself_and_wrong_leaves_the_photometry(photometry):
+def test_refit_ignores_overconfident_transport(photometry):
     # one cell is predicted, but the light comes from two: half of the patterns are grey
     response = np.where(np.arange(24) % 2, 1, -1) * np.ones((2, 3, 1))
     value = np.where(np.arange(24) % 4 < 2, response, 0)

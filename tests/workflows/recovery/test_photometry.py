@@ -130,7 +130,7 @@ def test_crosstalk_is_recovered():
 
 
 @pytest.mark.parametrize("why", ["grey", "clipped", "dark", "no colours"])
-def test_crosstalk_that_nothing_tells_of_is_none(why):
+def test_crosstalk_without_evidence_is_the_identity(why):
     rho = np.random.default_rng(0).uniform(0.1, 0.9, (40, 1, 3))
     levels = np.repeat(np.linspace(0, 1, 5)[:, None], 3, axis=1) if why == "grey" else COLOURS
     crosstalk = np.ones((3, 3)) / 3 if why == "no colours" else np.eye(3)

@@ -76,7 +76,7 @@ def test_posterior_mean_is_the_closed_form():
     assert (posterior_mean(matrix, residual, mean, variance, 0.0, 200, 1e-6) == mean).all()
 
 
-def test_posterior_mean_of_patterns_that_see_nothing():
+def test_posterior_mean_without_light_is_the_prior():
     mean = np.full(3, 1 / 3, np.float32)
     found = posterior_mean(np.zeros((3, 4), np.float32), np.ones(4, np.float32), mean, 0.0, 1.0, 10, 0.0)
     np.testing.assert_array_equal(found, mean)

@@ -93,5 +93,5 @@ def test_an_entry_is_dropped_by_its_share_of_the_row():
     np.testing.assert_array_equal(dropped.weight, [0.5, 0.5])
 
 
-def test_ragged_entries_of_nothing():
+def test_ragged_entries_of_no_runs():
     assert ragged_entries(np.array([], int), np.array([], int)).size == 0

@@ -12,8 +12,7 @@ from storage.layout.captures import Stack
 from workflows.images.tone_curves import Curve, Response, estimate, table, to_light
 from workflows.ingest.measured_light import exposures_of
 from workflows.programs.program import Program
-from workflows.recovery.compression_noise import estimate_excess
-from workflows.recovery.noise import Noise
+from workflows.recovery.noise import Noise, estimate_excess
 from workflows.recovery.photometry import estimate_crosstalk, estimate_noise
 
 SAMPLES = 20_000

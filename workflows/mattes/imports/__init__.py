@@ -1,1 +1,1 @@
-"""A matte that comes in an archive: checked as hostile, and written anew."""
+"""A matte that comes in an archive: checked as untrusted, and written to the store."""

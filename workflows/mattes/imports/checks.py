@@ -1,4 +1,4 @@
-"""The values of a block that came in an archive."""
+"""Checks of the values of an imported block."""
 
 from collections.abc import Iterator
 
@@ -7,18 +7,18 @@ import numpy as np
 from storage.layout.mattes import Block
 
 BRIGHTEST = 1e20
-"""More than any S and rho, and little enough for whatever is added up of them in 32 bits."""
+"""Larger than any real S or rho, and small enough that sums of them fit 32-bit floats."""
 TOLERANCE = 1e-4
-"""By which the sum of a row of T may miss 1: it is stored in 32 bits."""
+"""Most difference between the sum of a row of T and 1; weights are 32-bit floats."""
 
 
 def faults(block: Block, nodes: int) -> Iterator[tuple[str, str]]:
-    """What is wrong with a block: the array, and why."""
+    """Yield each fault of a block: the name of the array, and what is wrong."""
     for name in ("S", "rho"):
         if not (np.abs(getattr(block, name)) < BRIGHTEST).all():
-            yield name, "a value is infinite, no number, or larger than any light"
+            yield name, "a value is infinite, not a number, or larger than any light"
     if not (block.error >= 0).all():  # infinite where nothing was recovered
-        yield "error", "a value is negative, or no number"
+        yield "error", "a value is negative, or not a number"
     if block.count[~block.recovered].any():
         yield "count", "a pixel that was left out has cells"
     if block.count[block.shared, 1:].any():

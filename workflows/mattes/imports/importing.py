@@ -1,11 +1,10 @@
-"""A matte that comes in an archive: checked as hostile, and written anew.
+"""Import a matte from an archive, which is untrusted.
 
-Nothing foreign reaches the store but values that were checked: of the archive's attributes a matte is made here, and
-each block is unpacked within bounds, looked through, and written as one that was recovered here. A matte that was
-exported comes back as the same bytes.
+Only checked values reach the store. A new matte is created from the archive's attributes; each block is unpacked within
+bounds, checked, and written like a block that was recovered here. An exported matte comes back as the same bytes.
 
-Of native code only zlib and zstd see foreign bytes here, each into a buffer whose size was checked, and in a time that
-grows with it alone: unlike decoders of pictures (`services.decoding.pool`), they need no process of their own.
+The only native code that reads untrusted bytes is zlib and zstd. Both write to a buffer of checked size, in time that
+grows only with that size, so unlike image decoders (`services.decoding.pool`) they need no process of their own.
 """
 
 from itertools import product
@@ -21,7 +20,7 @@ from workflows.untrusted.limits import Limits
 
 
 def take_in(file: BinaryIO, objects: Objects, matte: str, limits: Limits) -> Matte:
-    """Make a matte of an archive; memory is that of a block, whatever the size.
+    """Create a matte from an archive. Memory use is that of one block, whatever the size.
 
     Parameters
     ----------
@@ -30,12 +29,12 @@ def take_in(file: BinaryIO, objects: Objects, matte: str, limits: Limits) -> Mat
     matte : str
         Id of the matte to make.
     limits : Limits
-        What it may cost: bytes that all of it unpacks to, and that may be held.
+        Most bytes that the archive may unpack to, and that may be held in memory.
 
     Raises
     ------
     ArchiveError
-        Naming the entry that is wrong and why. Nothing of the matte is left then.
+        Names the entry that is wrong, and why. The matte is deleted.
     """
     archive = Reader(file, limits)
     given = archive.attributes

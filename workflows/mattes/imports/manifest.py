@@ -1,4 +1,4 @@
-"""What the JSON of a matte's archive may say."""
+"""Models of the JSON in a matte archive."""
 
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -18,7 +18,7 @@ class _Strict(BaseModel):
 
 
 class Attributes(_Strict):
-    """Those of a matte's group."""
+    """The attributes of a matte's zarr group."""
 
     format: Literal["envmatte-matte/1"]
     height: Annotated[int, Field(ge=1, le=65535)]
@@ -34,7 +34,7 @@ class Attributes(_Strict):
 
 
 class Member(_Strict):
-    """What the manifest says of an entry."""
+    """An entry in the manifest."""
 
     size: Annotated[int, Field(ge=0)]
     sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
@@ -46,11 +46,11 @@ class Manifest(_Strict):
     format: Literal["envmatte-archive/1"]
     matte: dict[str, Any]
     members: dict[str, Any]
-    """A `Member` each."""
+    """Each value is a `Member`."""
 
 
 def valid(model: type[Model], given: Any, entry: str, within: str = "") -> Model:
-    """What an entry, or a part of it, says, as a model; `ArchiveError` if it is none."""
+    """Validate an entry, or a part of it, against a model; raise `ArchiveError` if it does not fit."""
     try:
         return model.model_validate(given)
     except ValidationError as error:

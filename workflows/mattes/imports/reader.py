@@ -1,4 +1,4 @@
-"""A matte in an archive: what is read of it has been checked."""
+"""Read a matte from an untrusted archive, and check it."""
 
 import hashlib
 from functools import cache
@@ -43,7 +43,7 @@ AGAIN = "export the matte again"
 
 
 class Reader:
-    """A matte in an archive: entries that are those of its format, none of which has been believed yet.
+    """A matte in an archive. Opening it checks that the entries are those of the format; reading checks their values.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class Reader:
         return block
 
     def compare(self, name: str, ours: dict[str, Any]) -> None:
-        """See that a zarr.json says what one that is written here does; its chunks may have no checksums."""
+        """Check that a zarr.json equals the one written here, except that its chunks may have no checksums."""
         found = self._document(name, DOCUMENT_BYTES)
         before_checksums = ours | ({"codecs": ours["codecs"][:-1]} if "codecs" in ours else {})
         if found not in (ours, before_checksums):

@@ -39,7 +39,7 @@ def test_a_damaged_archive_is_refused_or_the_same(
 @pytest.mark.slow
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_damage_that_is_signed_is_refused_or_harmless(
+def test_damage_with_a_valid_checksum_is_refused_or_harmless(
     objects: Objects, archive: bytes, data: st.DataObject
 ) -> None:
     files = unpacked(archive)

@@ -316,7 +316,9 @@ MANIFESTS: dict[str, tuple[str, Change]] = {
 
 
 @pytest.mark.parametrize("case", MANIFESTS)
-def test_what_the_manifest_does_not_say_is_refused(objects: Objects, archive: bytes, case: str) -> None:
+def test_manifest_that_differs_from_the_archive_is_refused(
+    objects: Objects, archive: bytes, case: str
+) -> None:
     match, change = MANIFESTS[case]
     files = unpacked(archive)
     change(files)

@@ -1,4 +1,4 @@
-"""The posterior mean of T against the dense closed form, and what it owes whatever was measured."""
+"""The posterior mean of T against the dense closed form, and what holds for any measurements."""
 
 import numpy as np
 import pytest
@@ -78,7 +78,7 @@ def test_weights_stay_shares(seed):
     assert (weight[empty] == 0).all()
 
 
-def test_nothing_measured_changes_nothing():
+def test_weights_stay_without_measurements():
     A, weight, y, variance, _ = problem(1)
     variance[:] = np.inf
     start, offset = weight.copy(), np.full(1, 0.02)
@@ -87,7 +87,7 @@ def test_nothing_measured_changes_nothing():
     assert offset[0] == 0.02
 
 
-def test_a_t_that_explains_everything_stays():
+def test_weights_that_explain_the_measurements_stay():
     A, weight, _, variance, _ = problem(1)
     start, exact = weight.copy(), weight @ A
     update(A, weight, exact, variance, 1, np.zeros(1), 3, 10)

@@ -106,7 +106,7 @@ def test_two_lobes(request, colours, truth, observe):
         np.testing.assert_allclose(moments(part)[..., :2], moments(lobe)[..., :2], atol=0.2)
 
 
-def test_what_lobes_do_not_say_the_posterior_mean_does(patterns, observe):
+def test_posterior_mean_finds_what_lobes_miss(patterns, observe):
     # half a disc is no Gaussian
     y, x = np.mgrid[:ROWS, :COLUMNS].reshape(2, -1) + 0.5
     rng, pixels = np.random.default_rng(0), []
@@ -168,7 +168,7 @@ def test_channels_that_agree_share_a_t(request, colours, shape, truth, observe):
     np.testing.assert_array_equal((found.count > 0).sum(axis=1), np.where(found.shared, 1, 3))
 
 
-def test_disagreement_says_when(patterns, varied, observe):
+def test_disagreement_decides_whether_channels_share_t(patterns, varied, observe):
     scene = observe(patterns, varied)
     assert not recovered(patterns, scene, LobesOptions(disagreement=0.0)).transport.shared.any()
     assert recovered(patterns, scene, LobesOptions(disagreement=1e6)).transport.shared.all()
@@ -237,7 +237,7 @@ def test_rows_are_clean(patterns, varied, observe):
 
 
 @pytest.mark.parametrize("least", [0.0, 1e-3])
-def test_least_weight_says_what_is_kept(patterns, truth, observe, least):
+def test_least_weight_bounds_the_kept_weights(patterns, truth, observe, least):
     scene = observe(patterns, truth((33.1, 24.8, 12.0, 8.0)))
     found = recovered(
         patterns, scene, LobesOptions(least_weight=least, fit_resolution=4.0, resolution=4.0)
