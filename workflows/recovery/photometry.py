@@ -70,6 +70,14 @@ def fit_photometry(
     Notes
     -----
     Least squares of eq. 6, ``C = S + rho b``, weighted by the inverse variance of the values, with rho >= 0.
+
+    Examples
+    --------
+    >>> values = np.full((1, 2, 3), [[0.1], [0.7]], np.float32)
+    >>> levels = np.full((2, 3), [[0], [1]], np.float32)
+    >>> found = fit_photometry(values, levels, values > 0, Noise(1e-6, 0), np.ones(2))
+    >>> print(found.S.round(3), found.rho.round(3))
+    [[0.1 0.1 0.1]] [[0.6 0.6 0.6]]
     """
     _check(values, levels, usable)
     if (np.ptp(levels, axis=0) == 0).any():

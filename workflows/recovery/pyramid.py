@@ -44,6 +44,12 @@ class Pyramid:
     Notes
     -----
     Burt and Adelson, "The Laplacian pyramid as a compact image code", IEEE Trans. Communications 1983.
+
+    Examples
+    --------
+    >>> pyramid = Pyramid.over(64, 48)
+    >>> pyramid.grids, pyramid.nodes
+    (((64, 48), (32, 24)), 3840)
     """
 
     grids: tuple[tuple[int, int], ...]

@@ -1,5 +1,6 @@
-"""The compiled kernels as a whole: what one method computes does not depend on which was compiled before."""
+"""The package as a whole: examples run, and what one method computes does not depend on what was compiled before."""
 
+import doctest
 import importlib
 import pkgutil
 from collections import Counter
@@ -59,3 +60,12 @@ def test_kernels_that_several_others_share_are_compiled_when_they_are_loaded() -
         # what has types of its own takes no others
         with pytest.raises(TypeError, match="No matching definition"):
             kernel(*[0j] * kernel.py_func.__code__.co_argcount)
+
+
+def test_examples_run() -> None:
+    found = [
+        doctest.testmod(importlib.import_module(module.name))
+        for module in pkgutil.walk_packages(recovery.__path__, f"{recovery.__name__}.")
+    ]
+    assert sum(result.attempted for result in found) > 0
+    assert not sum(result.failed for result in found)
