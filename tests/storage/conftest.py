@@ -1,7 +1,7 @@
-"""A store and a database, both real, for the tests of storage.
+"""Real stores and databases for the tests of storage.
 
-A test of `objects` runs twice, with a folder and with a bucket, one that looks into the folder once; a test of `engine`
-runs with SQLite and with PostgreSQL.
+A test with `objects` runs with a folder and with a bucket, or only with a folder if it also uses `folder`; a test with
+`engine` runs with SQLite and with PostgreSQL.
 """
 
 import hashlib
@@ -10,10 +10,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from sqlalchemy import Engine
+from sqlalchemy import Connection, Engine
 
-from storage.database.engine import open_engine
+from storage.database.engine import open_engine, writing
 from storage.objects.store import Objects
+from tests.storage.installation import fill
 
 
 @pytest.fixture
@@ -43,7 +44,7 @@ def objects(store: str) -> Objects:
 
 @pytest.fixture(scope="session")
 def sqlite_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A SQLite database that has the tables, for fresh ones to be copied from."""
+    """A SQLite database with the tables, from which new ones are copied."""
     path = tmp_path_factory.mktemp("sqlite") / "with_tables.db"
     open_engine(f"sqlite:///{path}").dispose()
     return path
@@ -51,7 +52,7 @@ def sqlite_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def sqlite(tmp_path: Path, sqlite_template: Path) -> str:
-    """The URL of a fresh SQLite database that has the tables."""
+    """The URL of a new SQLite database with the tables."""
     path = tmp_path / "ledger.db"
     shutil.copyfile(sqlite_template, path)
     return f"sqlite:///{path}"
@@ -59,7 +60,7 @@ def sqlite(tmp_path: Path, sqlite_template: Path) -> str:
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def url(request: pytest.FixtureRequest) -> str:
-    """The URL of a fresh database, of each engine in turn."""
+    """The URL of a new database with the tables, of either kind."""
     url: str = request.getfixturevalue(request.param)
     return url
 
@@ -73,7 +74,7 @@ def engine(url: str) -> Iterator[Engine]:
 
 @pytest.fixture
 def digests(objects: Objects) -> Callable[[str], dict[str, str]]:
-    """The objects below a folder of the store, each with the hash of its bytes."""
+    """Returns the SHA-256 of every object below a folder of the store."""
 
     def of(below: str) -> dict[str, str]:
         paths = sorted(objects.paths_below(below))
@@ -84,3 +85,17 @@ def digests(objects: Objects) -> Callable[[str], dict[str, str]]:
         }
 
     return of
+
+
+@pytest.fixture
+def connection(engine: Engine) -> Iterator[Connection]:
+    """A connection in a transaction that may write."""
+    with writing(engine) as connection:
+        yield connection
+
+
+@pytest.fixture
+def filled(engine: Engine, objects: Objects) -> Objects:
+    """The store of an installation with one item of every kind; its database is `engine`."""
+    fill(engine, objects)
+    return objects

@@ -1,4 +1,4 @@
-"""The error tree: what locates a fault survives the way between processes."""
+"""The error tree: errors are pickled between processes with their fields."""
 
 import pickle
 
@@ -19,7 +19,7 @@ from storage import errors
         errors.Corrupt,
     ],
 )
-def test_an_error_survives_pickling(kind: type[errors.EnvmatteError]) -> None:
+def test_error_survives_pickling(kind: type[errors.EnvmatteError]) -> None:
     error = kind("a frame is cut off; send it again", entry="frames/1.png", limit=7)
     back = pickle.loads(pickle.dumps(error))
     assert type(back) is kind
@@ -27,7 +27,7 @@ def test_an_error_survives_pickling(kind: type[errors.EnvmatteError]) -> None:
     assert back.fields == {"entry": "frames/1.png", "limit": 7}
 
 
-def test_what_was_sent_is_told_from_what_was_stored() -> None:
+def test_invalid_input_is_separate_from_other_errors() -> None:
     for kind in (errors.CaptureError, errors.ImageError, errors.OptionError):
         assert issubclass(kind, errors.InvalidInput)
     for other in (errors.NotFound, errors.Conflict, errors.Corrupt):

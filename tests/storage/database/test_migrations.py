@@ -1,4 +1,4 @@
-"""The schema's revisions: databases of every age end with the same tables, and what they hold."""
+"""Schema migrations: databases of every age end with the same tables and keep their rows."""
 
 import sqlite3
 import subprocess
@@ -49,7 +49,7 @@ for _ in range(2):
 
 @pytest.fixture
 def old(tmp_path: Path) -> str:
-    """The URL of a SQLite database with the tables that the code made before there were revisions, and rows."""
+    """The URL of a SQLite database with the tables and some rows from before there were revisions."""
     path = tmp_path / "old.db"
     with closing(sqlite3.connect(path)) as connection:
         connection.executescript(BEFORE_REVISIONS.read_text())
@@ -85,7 +85,7 @@ def differences(connection: Connection) -> list[Any]:
 
 
 def schema(engine: Engine) -> dict[str, Any]:
-    """Everything about the tables, as the database tells it."""
+    """All about the tables, as read from the database."""
     found = inspect(engine)
     return {
         name: (
@@ -100,20 +100,20 @@ def schema(engine: Engine) -> dict[str, Any]:
     }
 
 
-def test_the_newest_revision_has_the_tables_of_the_code(engine: Engine) -> None:
+def test_newest_revision_equals_tables(engine: Engine) -> None:
     with reading(engine) as connection:
         assert revision(connection) == NEWEST == max(migrations.known())
         assert differences(connection) == []
     assert set(schema(engine)) == set(metadata.tables)
 
 
-def test_a_difference_would_be_seen(engine: Engine) -> None:
+def test_schema_comparison_finds_differences(engine: Engine) -> None:
     with writing(engine) as connection:
         connection.execute(text("ALTER TABLE jobs ADD COLUMN more INTEGER"))
         assert [found[0] for found in differences(connection)] == ["remove_column"]
 
 
-def test_the_first_revision_is_what_there_was_before(old: str, tmp_path: Path) -> None:
+def test_first_revision_equals_schema_before_revisions(old: str, tmp_path: Path) -> None:
     before, first = dialects.make_engine(old), dialects.make_engine(f"sqlite:///{tmp_path}/first.db")
     with writing(first) as connection:
         migrations.upgrade(connection, "0001")
@@ -122,7 +122,7 @@ def test_the_first_revision_is_what_there_was_before(old: str, tmp_path: Path) -
     first.dispose()
 
 
-def test_a_database_older_than_revisions_keeps_its_rows(old: str) -> None:
+def test_database_without_revision_keeps_its_rows(old: str) -> None:
     engine = open_engine(old)
     with reading(engine) as connection:
         assert differences(connection) == []
@@ -148,7 +148,7 @@ def test_a_database_older_than_revisions_keeps_its_rows(old: str) -> None:
     engine.dispose()
 
 
-def test_a_database_of_code_that_knew_fewer_tables_gets_the_rest(old: str) -> None:
+def test_older_database_gets_missing_tables(old: str) -> None:
     with closing(sqlite3.connect(old.removeprefix("sqlite:///"))) as connection:
         for table in ("upload_parts", "uploads", "made", "programs"):
             connection.execute(f"DROP TABLE {table}")
@@ -159,7 +159,7 @@ def test_a_database_of_code_that_knew_fewer_tables_gets_the_rest(old: str) -> No
     engine.dispose()
 
 
-def test_an_upgrade_that_fails_leaves_the_old_schema(bare: Engine) -> None:
+def test_failed_upgrade_leaves_old_schema(bare: Engine) -> None:
     with writing(bare) as connection:
         migrations.upgrade(connection, "0001")
         connection.execute(text("CREATE TABLE totals (in_the_way INTEGER)"))
@@ -184,7 +184,7 @@ def test_an_upgrade_that_fails_leaves_the_old_schema(bare: Engine) -> None:
     engine.dispose()
 
 
-def test_a_newer_database_is_refused_and_left_alone(engine: Engine, url: str) -> None:
+def test_newer_database_is_refused_and_unchanged(engine: Engine, url: str) -> None:
     with writing(engine) as connection:
         connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))
     with pytest.raises(Conflict, match=r"revision 9999, .* up to \d{4}; install the newer envmatte"):
@@ -194,7 +194,7 @@ def test_a_newer_database_is_refused_and_left_alone(engine: Engine, url: str) ->
         assert differences(connection) == []
 
 
-def test_processes_that_open_it_at_once_upgrade_it_once(bare: Engine) -> None:
+def test_concurrent_processes_upgrade_once(bare: Engine) -> None:
     command = [sys.executable, "-c", OPEN, bare.url.render_as_string(hide_password=False)]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     processes = [subprocess.Popen(command, text=True, **pipes) for _ in range(2)]
@@ -205,19 +205,19 @@ def test_processes_that_open_it_at_once_upgrade_it_once(bare: Engine) -> None:
         assert process.stdin is not None
         process.stdin.write("\n")
         process.stdin.flush()
-    told = [process.communicate(timeout=60) for process in processes]
-    assert told == [(f"{NEWEST}\n", "")] * 2
+    outputs = [process.communicate(timeout=60) for process in processes]
+    assert outputs == [(f"{NEWEST}\n", "")] * 2
     with reading(bare) as connection:
         assert differences(connection) == []
 
 
-def test_an_upgrade_is_logged_in_a_line_of_ours(old: str) -> None:
+def test_upgrade_is_logged_in_one_line(old: str) -> None:
     done = subprocess.run([sys.executable, "-c", LOGGED, old], capture_output=True, text=True, check=True)
     upgraded = f"upgraded the database schema from revision none to {NEWEST}"
     assert (done.stdout, done.stderr) == ("", f"INFO:storage.database.migrations:{upgraded}\n")
 
 
-def test_mattes_stay_when_others_without_a_capture_are_let_in(bare: Engine) -> None:
+def test_upgrade_to_imported_mattes_keeps_rows(bare: Engine) -> None:
     with writing(bare) as connection:
         migrations.upgrade(connection, "0003")
         connection.execute(
@@ -234,7 +234,7 @@ def test_mattes_stay_when_others_without_a_capture_are_let_in(bare: Engine) -> N
     assert (old.capture, old.job, old.created_at) == ("c", "j", 1000.5)
     assert (new.capture, new.job, new.state, new.figures) == (None, None, "ready", {"width": 7})
     assert new.number > old.number
-    with pytest.raises(IntegrityError), writing(engine) as connection:  # an id is there once, as before
+    with pytest.raises(IntegrityError), writing(engine) as connection:  # ids are still unique
         mattes.add_imported(connection, "m", {}, {})
     engine.dispose()
 
@@ -255,7 +255,7 @@ INSERT INTO made (key, call, id) VALUES ('again', 'POST', 'c')
 """
 
 
-def test_what_was_there_before_owners_is_the_default_owners(bare: Engine) -> None:
+def test_rows_before_owners_belong_to_default_owner(bare: Engine) -> None:
     with writing(bare) as connection:
         migrations.upgrade(connection, "0004")
         for statement in OF_0004.split(";"):

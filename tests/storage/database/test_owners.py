@@ -1,4 +1,4 @@
-"""The one rule of who sees what: statements over an engine that is bound to an owner."""
+"""Statements over an engine that is bound to an owner."""
 
 import pytest
 from sqlalchemy import Engine, Executable, delete, exists, func, insert, select, text, union, update
@@ -16,7 +16,7 @@ OWNERS = ("alice", "bob")
 
 @pytest.fixture
 def filled(engine: Engine) -> Engine:
-    """A database in which alice and bob have an active job, a capture and an upload each."""
+    """A database in which alice and bob each have an active job, a capture and an upload."""
     for owner in OWNERS:
         with writing(for_owner(engine, owner)) as c:
             jobs.add(c, "ingest", f"{owner}-capture", {}, job=f"{owner}-job")
@@ -27,7 +27,7 @@ def filled(engine: Engine) -> Engine:
     return engine
 
 
-def test_lists_and_lookups_are_the_owners(filled: Engine) -> None:
+def test_lists_and_lookups_show_only_the_owners_rows(filled: Engine) -> None:
     for owner, other in (OWNERS, OWNERS[::-1]):
         with reading(for_owner(filled, owner)) as c:
             for table, what in ((tables.captures, "capture"), (tables.jobs, "job")):
@@ -48,7 +48,7 @@ def test_lists_and_lookups_are_the_owners(filled: Engine) -> None:
         assert jobs.active(c) == []
 
 
-def test_what_belongs_to_a_row_is_its_owners(filled: Engine) -> None:
+def test_dependent_rows_belong_to_the_owner(filled: Engine) -> None:
     with reading(for_owner(filled, "alice")) as c:
         assert [line.text for line in job_log.lines(c, "alice-job", 0, 10)] == ["queued"]
         assert job_log.lines(c, "bob-job", 0, 10) == []
@@ -63,7 +63,7 @@ def test_what_belongs_to_a_row_is_its_owners(filled: Engine) -> None:
             assert set(c.scalars(joined)) <= {"alice-job"}
 
 
-def test_changes_and_deletions_touch_the_owners_rows_alone(filled: Engine) -> None:
+def test_changes_and_deletions_affect_only_the_owners_rows(filled: Engine) -> None:
     with writing(for_owner(filled, "alice")) as c:
         assert c.execute(update(tables.jobs).values(stage="mine")).rowcount == 1
         assert c.execute(update(tables.tiles).values(attempts=7)).rowcount == 2
@@ -77,7 +77,7 @@ def test_changes_and_deletions_touch_the_owners_rows_alone(filled: Engine) -> No
         assert captures.exists(c, "bob-capture")
 
 
-def test_sums_over_all_owners_say_so(filled: Engine) -> None:
+def test_sum_over_all_owners_needs_across_owners(filled: Engine) -> None:
     query = select(func.count()).select_from(tables.jobs)
     with reading(for_owner(filled, "alice")) as c:
         assert c.scalar(query) == 1
@@ -106,12 +106,12 @@ def test_sums_over_all_owners_say_so(filled: Engine) -> None:
     ],
     ids=lambda statement: " ".join(str(statement).split())[:60],
 )
-def test_what_cannot_be_narrowed_is_refused(engine: Engine, statement: Executable) -> None:
+def test_statement_that_cannot_be_restricted_is_refused(engine: Engine, statement: Executable) -> None:
     with writing(for_owner(engine, "alice")) as c, pytest.raises(TypeError, match="owner"):
         c.execute(statement)
 
 
-def test_every_table_is_someones_or_known_to_be_nobodys(engine: Engine) -> None:
+def test_every_table_is_restricted_or_known_to_be_shared(engine: Engine) -> None:
     refused = set()
     for name, table in tables.metadata.tables.items():
         with reading(for_owner(engine, "alice")) as c:
@@ -122,7 +122,7 @@ def test_every_table_is_someones_or_known_to_be_nobodys(engine: Engine) -> None:
     assert refused == {"totals", "keys", "deliveries"}
 
 
-def test_the_coordinator_is_seen_by_all(engine: Engine) -> None:
+def test_every_owner_can_read_the_coordinator(engine: Engine) -> None:
     with writing(engine) as c:
         leases.acquire(c, "me")
     with writing(for_owner(engine, NOBODY)) as c:

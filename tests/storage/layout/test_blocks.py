@@ -1,4 +1,4 @@
-"""Edges of blocks: powers of two that keep the number of objects bounded."""
+"""Edges of blocks bound the number of objects."""
 
 import pytest
 
@@ -18,11 +18,11 @@ from storage.layout.blocks import EDGES, LARGEST, block_edge
         (16384, 16384, 64),
     ],
 )
-def test_edges_of_known_frames(height: int, width: int, edge: int) -> None:
+def test_edge_of_known_frames(height: int, width: int, edge: int) -> None:
     assert block_edge(height, width) == block_edge(width, height) == edge
 
 
-def test_an_edge_is_the_smallest_that_bounds_the_blocks() -> None:
+def test_edge_is_smallest_that_bounds_number_of_blocks() -> None:
     for height in range(1, 5000, 331):
         for width in range(1, 5000, 297):
             edge = block_edge(height, width)

@@ -1,4 +1,4 @@
-"""A capture in the store: its stack whatever the order of writing, its damage, and its record."""
+"""Captures in the store: slabs in any order, masks, images, measurements, and missing chunks."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -7,15 +7,12 @@ import numpy as np
 import pytest
 import zarr
 from numpy.typing import NDArray
-from sqlalchemy import Engine
 
-from storage.database.engine import writing
-from storage.errors import Corrupt, NotFound
-from storage.layout import captures as stored_captures
+from storage.errors import Corrupt
+from storage.layout import captures
 from storage.layout.blocks import block_edge
 from storage.layout.captures import Stack, create_stack, write_slab
 from storage.objects.store import Objects
-from storage.records import captures
 
 SHAPE = (11, 37, 50, 3)
 
@@ -35,7 +32,7 @@ def create(
 @pytest.fixture
 def values() -> NDArray[np.uint16]:
     made = np.random.default_rng(1).integers(0, 65536, SHAPE, np.uint16)
-    made[4:8] = 0  # a slab of nothing but zeros is stored like any other
+    made[4:8] = 0  # a slab of zeros is stored too
     return made
 
 
@@ -46,7 +43,7 @@ def fill(objects: Objects, values: NDArray[np.uint16], order: tuple[int, ...] = 
     return Stack(objects, "c")
 
 
-def test_what_is_written_is_read(objects: Objects, values: NDArray[np.uint16]) -> None:
+def test_written_frames_are_read_back(objects: Objects, values: NDArray[np.uint16]) -> None:
     stack = fill(objects, values)
     assert stack.missing() == []
     assert (stack.frames, stack.height, stack.width, stack.channels) == SHAPE
@@ -66,7 +63,7 @@ def test_what_is_written_is_read(objects: Objects, values: NDArray[np.uint16]) -
 
 
 @pytest.mark.parametrize("order", [(2, 0, 1), (1, 2, 0, 1, 1)])
-def test_slabs_in_any_order_and_again_are_the_same_bytes(
+def test_order_of_slabs_does_not_change_bytes(
     objects: Objects,
     values: NDArray[np.uint16],
     digests: Callable[[str], dict[str, str]],
@@ -82,7 +79,7 @@ def test_slabs_in_any_order_and_again_are_the_same_bytes(
     )
 
 
-def test_masks_and_images_come_back(objects: Objects) -> None:
+def test_masks_and_images_are_read_back(objects: Objects) -> None:
     rng = np.random.default_rng(2)
     mask = rng.random((37, 50)) < 0.5
     images = [rng.random((n, 3, 1 + 2 * (n % 2)), np.float32) for n in range(1, 12)]
@@ -103,9 +100,7 @@ def test_masks_and_images_come_back(objects: Objects) -> None:
 
 @pytest.mark.parametrize("memory", [1, 10**5, 10**7, 10**9])
 @pytest.mark.parametrize("shape", [(7, 5, 3, 1), (200, 100, 130, 3), (30, 600, 1000, 3)])
-def test_a_slab_and_its_chunks_are_bounded(
-    objects: Objects, memory: int, shape: tuple[int, int, int, int]
-) -> None:
+def test_slab_and_chunks_are_bounded(objects: Objects, memory: int, shape: tuple[int, int, int, int]) -> None:
     slab = create_stack(
         objects, "c", shape, np.dtype("uint8"), memory=memory, attributes={}, mask=None, images=()
     )
@@ -116,12 +111,14 @@ def test_a_slab_and_its_chunks_are_bounded(
     chunks = zarr.open_array(objects.zarr, path="captures/c/frames").chunks
     edge = block_edge(shape[1], shape[2])
     least = slab * min(edge, shape[1]) * min(edge, shape[2]) * shape[3]
-    assert int(np.prod(chunks)) <= max(2 * stored_captures.CHUNK, least)
+    assert int(np.prod(chunks)) <= max(2 * captures.CHUNK, least)
     for size, n in zip(chunks[1:3], shape[1:3], strict=True):
         assert size == n or size % edge == 0
 
 
-def test_a_stack_made_again_keeps_what_was_written(objects: Objects, values: NDArray[np.uint16]) -> None:
+def test_creating_stack_again_keeps_frames_and_measurements(
+    objects: Objects, values: NDArray[np.uint16]
+) -> None:
     stack = fill(objects, values)
     stack.annotate(noise=1)
     stack.save()
@@ -131,7 +128,7 @@ def test_a_stack_made_again_keeps_what_was_written(objects: Objects, values: NDA
     assert again.attributes == {"patterns": [1, 0], "noise": 1}
 
 
-def test_what_was_measured_is_kept(objects: Objects) -> None:
+def test_measurements_are_saved(objects: Objects) -> None:
     create(objects)
     stack = Stack(objects, "c")
     stack.annotate(noise={"read": 1e-6})
@@ -141,7 +138,7 @@ def test_what_was_measured_is_kept(objects: Objects) -> None:
     assert Stack(objects, "c").attributes == {"patterns": [1, 0], "noise": {"read": 1e-6}}
 
 
-def test_a_removed_chunk_is_corrupt(objects: Objects, folder: Path, values: NDArray[np.uint16]) -> None:
+def test_missing_chunk_is_corrupt(objects: Objects, folder: Path, values: NDArray[np.uint16]) -> None:
     stack = fill(objects, values)
     (folder / "captures/c/frames/c/1/0/0/0").unlink()
     assert stack.missing() == [1]
@@ -151,7 +148,7 @@ def test_a_removed_chunk_is_corrupt(objects: Objects, folder: Path, values: NDAr
 
 
 @pytest.mark.parametrize("name", ["mask", "images/0"])
-def test_a_removed_chunk_of_a_mask_or_an_image_is_corrupt(objects: Objects, folder: Path, name: str) -> None:
+def test_missing_chunk_of_mask_or_image_is_corrupt(objects: Objects, folder: Path, name: str) -> None:
     create(objects, mask=np.zeros(SHAPE[1:3], bool), images=[np.zeros((4, 4, 1), np.float32)])
     for slab in (0, 4, 8):
         write_slab(objects, "c", slab, np.zeros((min(4, 11 - slab), *SHAPE[1:]), np.uint16))
@@ -164,38 +161,20 @@ def test_a_removed_chunk_of_a_mask_or_an_image_is_corrupt(objects: Objects, fold
         stack.read_masked() if name == "mask" else stack.images()
 
 
-def test_slabs_that_were_never_written_are_corrupt(objects: Objects, values: NDArray[np.uint16]) -> None:
+def test_slab_that_was_never_written_is_corrupt(objects: Objects, values: NDArray[np.uint16]) -> None:
     stack = fill(objects, values, order=(0, 2))
     assert stack.missing() == [1]
     with pytest.raises(Corrupt):
         stack.read()
 
 
-def test_a_capture_that_is_not_there(objects: Objects) -> None:
+def test_missing_capture_is_corrupt(objects: Objects) -> None:
     with pytest.raises(Corrupt, match="capture none"):
         Stack(objects, "none")
 
 
-def test_a_capture_without_its_frames_is_corrupt(objects: Objects, folder: Path) -> None:
+def test_capture_without_frames_is_corrupt(objects: Objects, folder: Path) -> None:
     create(objects)
     (folder / "captures/c/frames/zarr.json").unlink()
     with pytest.raises(Corrupt, match="capture c"):
         Stack(objects, "c")
-
-
-def test_the_record(engine: Engine) -> None:
-    with writing(engine) as connection:
-        captures.add(connection, "c1", "j1", name="ball", bytes=7, frames=3, program={"parts": []})
-        captures.add(connection, "c2", "j2", name="", bytes=8, frames=4, program={})
-        row = captures.get(connection, "c1")
-        assert (row.state, row.job, row.name, row.bytes, row.frames) == ("ingesting", "j1", "ball", 7, 3)
-        assert (row.program, row.width, row.problem) == ({"parts": []}, None, None)
-        captures.change(connection, "c1", state="ready", width=20, height=10)
-    with writing(engine) as connection:
-        row = captures.get(connection, "c1")
-        assert (row.state, row.width, row.height) == ("ready", 20, 10)
-        assert captures.get(connection, "c2").state == "ingesting"
-        captures.delete(connection, "c1")
-        with pytest.raises(NotFound, match="'c1'"):
-            captures.get(connection, "c1")
-        assert captures.get(connection, "c2").job == "j2"

@@ -1,4 +1,4 @@
-"""What is kept of a matte for graphics hardware."""
+"""The cache of textures for graphics hardware."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ def objects(tmp_path: Path) -> Objects:
     return made
 
 
-def test_what_is_kept_is_read_again_until_the_matte_goes(objects: Objects) -> None:
+def test_cached_bytes_are_read_until_matte_is_deleted(objects: Objects) -> None:
     assert live.read(objects, "m", FORMAT) is None
     live.write(objects, "m", FORMAT, bytes(range(256)))
     live.write(objects, "m", FORMAT, b"another")
@@ -28,13 +28,13 @@ def test_what_is_kept_is_read_again_until_the_matte_goes(objects: Objects) -> No
     assert live.read(objects, "m", FORMAT) is None
 
 
-def test_what_is_half_written_is_made_again(objects: Objects, tmp_path: Path) -> None:
+def test_incomplete_cache_reads_as_none(objects: Objects, tmp_path: Path) -> None:
     live.write(objects, "m", FORMAT, b"whole")
     (tmp_path / "mattes/m" / FORMAT / "c/0").unlink()
     assert live.read(objects, "m", FORMAT) is None
 
 
-def test_it_is_an_array_of_the_mattes_group(objects: Objects, tmp_path: Path) -> None:
+def test_cache_is_an_array_of_the_mattes_group(objects: Objects, tmp_path: Path) -> None:
     live.write(objects, "m", FORMAT, b"bytes")
     group = zarr.open_group(tmp_path / "mattes/m", mode="r")
     assert FORMAT in dict(group.members())

@@ -1,4 +1,4 @@
-"""The archive of a matte: its bytes, its size, and who can open it."""
+"""Matte archives: their bytes and size, and missing objects."""
 
 import hashlib
 import io
@@ -18,12 +18,12 @@ from storage.layout import mattes
 from storage.layout.matte_archive import MANIFEST, Archive, _entry, _Tail, zip_size
 from storage.layout.mattes import Matte
 from storage.objects.store import Objects
-from tests.storage.layout.test_mattes import block, extent, places, zeros
+from tests.storage.layout.matte_blocks import block, extent, places, zeros
 
 
 @pytest.fixture
 def matte(objects: Objects) -> Matte:
-    """A matte, one of whose blocks has no rows."""
+    """A matte with one block without rows T."""
     made = mattes.create(
         objects, "m", height=21, width=40, columns=4, rows=3, monitor=[8, 6], options={"method": "lobes"}
     )
@@ -34,7 +34,7 @@ def matte(objects: Objects) -> Matte:
     return made
 
 
-def test_any_zarr_reader_opens_it(objects: Objects, matte: Matte, tmp_path: Path) -> None:
+def test_zarr_opens_archive(objects: Objects, matte: Matte, tmp_path: Path) -> None:
     (tmp_path / "matte.zip").write_bytes(b"".join(Archive(objects, "m")))
     with ZipStore(tmp_path / "matte.zip", mode="r") as store:
         group = zarr.open_group(store, mode="r")
@@ -48,9 +48,7 @@ def test_any_zarr_reader_opens_it(objects: Objects, matte: Matte, tmp_path: Path
         assert group["T/0.1/cell"].shape == (0,)
 
 
-def test_the_manifest_lists_every_entry_and_nothing_of_where_it_came_from(
-    objects: Objects, matte: Matte
-) -> None:
+def test_manifest_lists_every_entry_and_no_origin(objects: Objects, matte: Matte) -> None:
     with zipfile.ZipFile(io.BytesIO(b"".join(Archive(objects, "m")))) as archive:
         assert archive.testzip() is None
         names = archive.namelist()
@@ -80,7 +78,7 @@ def test_the_manifest_lists_every_entry_and_nothing_of_where_it_came_from(
         assert all(archive.read(name) == objects.read(f"mattes/m/{name}").read() for name in stored)
 
 
-def test_the_same_matte_makes_the_same_bytes_as_long_as_it_says(objects: Objects, matte: Matte) -> None:
+def test_same_matte_gives_same_bytes_of_announced_size(objects: Objects, matte: Matte) -> None:
     first = Archive(objects, "m")
     pieces = list(first)
     assert sum(map(len, pieces)) == first.size
@@ -94,7 +92,7 @@ def test_the_same_matte_makes_the_same_bytes_as_long_as_it_says(objects: Objects
         time.tzset()
 
 
-def test_a_matte_that_lacks_something_has_no_archive(objects: Objects, matte: Matte) -> None:
+def test_incomplete_matte_is_corrupt(objects: Objects, matte: Matte) -> None:
     for name in ("S/c/1/2/0", "T/1.2/weight/c/0", "T/0.1/zarr.json", "rho/zarr.json"):
         data = objects.read(f"mattes/m/{name}").read()
         objects.delete(f"mattes/m/{name}")
@@ -105,9 +103,7 @@ def test_a_matte_that_lacks_something_has_no_archive(objects: Objects, matte: Ma
 
 
 @pytest.mark.parametrize("change", ["deleted", "cut"])
-def test_one_that_changes_meanwhile_ends_without_a_directory(
-    objects: Objects, matte: Matte, change: str
-) -> None:
+def test_archive_of_changing_matte_is_invalid(objects: Objects, matte: Matte, change: str) -> None:
     archive = iter(Archive(objects, "m"))
     sent = next(archive) + next(archive)
     if change == "deleted":
@@ -129,12 +125,12 @@ def test_one_that_changes_meanwhile_ends_without_a_directory(
     ],
     ids=["empty", "one", "many", "large"],
 )
-def test_the_size_is_known_before(sizes: dict[str, int]) -> None:
-    noughts = bytes(1 << 20)
+def test_size_is_known_in_advance(sizes: dict[str, int]) -> None:
+    zeroes = bytes(1 << 20)
     written, size = _Tail(), 0
     archive = zipfile.ZipFile(written, "w")  # type: ignore[call-overload]
     for name, of in sizes.items():
-        archive.writestr(_entry(name), noughts[:of])
+        archive.writestr(_entry(name), zeroes[:of])
         size += len(written.take())
     archive.close()
     assert size + len(written.take()) == zip_size(sizes)

@@ -1,146 +1,24 @@
-"""A backup of a whole installation, and its way back: into other kinds of databases and stores, whole or not at all."""
-
-import hashlib
-import json
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
+"""Backing up an installation that changes meanwhile, or is damaged."""
 
 import pytest
-from sqlalchemy import Engine, delete, func, select, text
+from sqlalchemy import Engine, delete, select
 
-from storage.database import dialects, migrations
 from storage.database import tables as database_tables
-from storage.database.engine import open_engine, reading, writing
-from storage.database.revision import NEWEST, revision
-from storage.errors import Conflict, Corrupt, InvalidInput
+from storage.database.engine import reading, writing
+from storage.errors import Corrupt
 from storage.layout import composites
-from storage.maintenance import row_dump
-from storage.maintenance.backup import LEDGER, MANIFEST, back_up
-from storage.maintenance.restore import MARKER, restore
-from storage.maintenance.row_dump import open_without_upgrade
+from storage.maintenance.backup import back_up
+from storage.maintenance.restore import restore
 from storage.maintenance.verify import verify
 from storage.objects.store import Objects
-from storage.records import captures, jobs, leases, mattes, tiles
-from tests.storage.furnished import contents, flip, furnish
-
-Bytes = dict[str, bytes]
-HALF = """
-import os, sys
-from storage.database import dialects
-from storage.objects.store import Objects
-from storage.maintenance.restore import restore
-source, database, store = sys.argv[1:]
-restore(Objects(source), dialects.make_engine(database), Objects(store), lambda share, size: os._exit(9))
-"""
+from storage.records import captures, jobs, mattes
+from tests.storage.installation import flip
 
 
-@pytest.fixture
-def furnished(engine: Engine, objects: Objects) -> Objects:
-    furnish(engine, objects)
-    return objects
-
-
-@pytest.fixture
-def target(tmp_path: Path) -> Objects:
-    return Objects((tmp_path / "backup").as_uri())
-
-
-@pytest.fixture
-def elsewhere(tmp_path: Path) -> Iterator[tuple[Engine, Objects]]:
-    """An installation that holds nothing yet."""
-    engine = dialects.make_engine(f"sqlite:///{tmp_path}/elsewhere.db")
-    yield engine, Objects((tmp_path / "elsewhere").as_uri())
-    engine.dispose()
-
-
-def rows_of(engine: Engine) -> list[str]:
-    """All rows that a backup has, as it has them; a job that runs is queued where it is restored."""
-    with reading(engine) as c:
-        lines = [list(line) for line in row_dump.lines(c, row_dump.tables_of(c))]
-    for name, row in lines:
-        if name == "jobs" and row["state"] == "running":
-            row |= {"state": "queued", "stage": "waiting"}
-    return sorted(json.dumps(line, sort_keys=True) for line in lines)
-
-
-def needed(objects: Objects) -> Bytes:
-    return {
-        path: data for path, data in contents(objects).items() if not path.startswith("composites/v/clip")
-    }
-
-
-def nothing(engine: Engine, objects: Objects) -> None:
-    """See that an installation holds nothing."""
-    with reading(engine) as c:
-        assert row_dump.counts(c, row_dump.tables_of(c)) == {}
-    assert contents(objects) == {}
-
-
-def lines_of(target: Objects, name: str = MANIFEST) -> list[bytes]:
-    return target.read_raw(name).splitlines(keepends=True)
-
-
-def sealed(target: Objects, lines: list[bytes]) -> None:
-    """Write a manifest whose last line fits the others."""
-    entries = [json.loads(line) for line in lines[1:-1]]
-    digest = hashlib.sha256(b"".join(lines[:-1])).hexdigest()
-    last = {"objects": len(entries), "bytes": sum(one["size"] for one in entries), "sha256": digest}
-    target.write_raw(MANIFEST, iter([*lines[:-1], json.dumps(last).encode()]))
-
-
-@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
-def test_from_sqlite_and_a_folder_to_postgresql_and_a_bucket_and_back(
-    engine: Engine,
-    objects: Objects,
-    folder: Path,
-    s3: str,
-    postgresql: str,
-    elsewhere: tuple[Engine, Objects],
+def test_backup_while_items_are_deleted_and_finished(
+    engine: Engine, filled: Objects, target: Objects, elsewhere: tuple[Engine, Objects]
 ) -> None:
-    furnish(engine, objects)
-    there, bucket = Objects(f"{s3}/backup"), Objects(f"{s3}/store")
-    told: list[tuple[float, int]] = []
-    made = back_up(engine, objects, there, "1.2.3", lambda *how: told.append(how))
-    assert told[-1] == (1.0, made["bytes"])
-    assert made["bytes"] == sum(map(len, contents(objects).values()))
-    header = json.loads(lines_of(there)[0])
-    assert (header["version"], header["revision"]) == ("1.2.3", NEWEST)
-    second = dialects.make_engine(postgresql)
-    assert restore(there, second, bucket) == made
-    assert rows_of(second) == rows_of(engine)
-    assert contents(bucket) == contents(objects)
-    assert bucket.names("") == ["captures", "composites", "mattes", "uploads"]
-    assert verify(second, bucket).findings == []
-    with writing(second) as c:  # it goes on with its numbers
-        number = c.scalar(select(func.max(database_tables.jobs.c.number)))
-        assert jobs.get(c, jobs.add(c, "ingest", "n", {})).number == number + 1
-        jobs.cancel(
-            c, c.scalar(select(database_tables.jobs.c.id).where(database_tables.jobs.c.capture == "n"))
-        )
-    back = Objects((folder.parent / "back").as_uri())
-    again = back_up(second, bucket, back, "1.2.3")
-    assert again["objects"] == made["objects"]
-    restore(back, *elsewhere)
-    assert rows_of(elsewhere[0]) == rows_of(second)
-    assert contents(elsewhere[1]) == contents(objects)
-    second.dispose()
-    with reading(elsewhere[0]) as c:
-        row = jobs.get(c, "rr")
-        assert (row.state, row.done, tiles.remaining(c, "rr")) == ("queued", 2, [2, 3, 4, 5])
-        tables = row_dump.tables_of(c)
-        for name in row_dump.SKIPPED:  # who drives, and what the first service still has to tell
-            assert c.scalar(select(func.count()).select_from(tables[name])) == 0
-    with reading(engine) as c:
-        assert c.scalar(select(func.count()).select_from(database_tables.deliveries)) == 1
-
-
-def test_what_is_deleted_or_ends_meanwhile(
-    engine: Engine, furnished: Objects, target: Objects, elsewhere: tuple[Engine, Objects]
-) -> None:
-    """Each family but the first that is copied has changed when its turn comes."""
+    """Every family except the first has changed before it is copied."""
     first: list[str] = []
 
     def meanwhile(share: float, size: int) -> None:
@@ -156,18 +34,18 @@ def test_what_is_deleted_or_ends_meanwhile(
             for job in ("v", "w"):
                 c.execute(delete(database_tables.jobs).where(database_tables.jobs.c.id == job))
         for path in ("mattes/m", "mattes/r", "uploads/i", "composites/v", "composites/w"):
-            furnished.delete(path)
-        for path in [path for path in furnished.sizes("captures/c")]:
-            furnished.write_raw(path.replace("/c/", "/i/", 1), iter([furnished.read_raw(path)]))
+            filled.delete(path)
+        for path in [path for path in filled.sizes("captures/c")]:
+            filled.write_raw(path.replace("/c/", "/i/", 1), iter([filled.read_raw(path)]))
 
-    back_up(engine, furnished, target, "1", meanwhile)
+    back_up(engine, filled, target, "1", meanwhile)
     restore(target, *elsewhere)
     assert verify(*elsewhere).findings == []
     with reading(elsewhere[0]) as c:
         found = dict(c.execute(select(database_tables.captures.c.id, database_tables.captures.c.state)).all())
         assert found["c"] == "ready"
         assert set(c.scalars(select(database_tables.mattes.c.id))) in ({"l"}, {"l", "m", "r"})
-        for row in jobs.active(c):  # whatever goes on has what it needs
+        for row in jobs.active(c):  # jobs that continue have what they need
             if row.kind == "recover":
                 assert mattes.get(c, row.matte).state == "recovering"
                 assert f"mattes/{row.matte}/zarr.json" in elsewhere[1].sizes(f"mattes/{row.matte}")
@@ -179,179 +57,11 @@ def test_what_is_deleted_or_ends_meanwhile(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["flipped", "gone"])
-def test_what_is_damaged_is_no_backup(engine: Engine, furnished: Objects, target: Objects, how: str) -> None:
+def test_damaged_object_fails_backup(engine: Engine, filled: Objects, target: Objects, how: str) -> None:
     path = "mattes/m/S/c/1/2/0"
-    flip(furnished, path) if how == "flipped" else furnished.delete(path)
+    flip(filled, path) if how == "flipped" else filled.delete(path)
     with pytest.raises(
         Corrupt, match=rf"{path} is (damaged|missing) .*recover, or import, it again.*envmatte verify"
     ):
-        back_up(engine, furnished, target, "1")
+        back_up(engine, filled, target, "1")
     assert target.names("") == []
-
-
-@pytest.mark.slow
-def test_only_into_what_is_empty(
-    engine: Engine, furnished: Objects, target: Objects, elsewhere: tuple[Engine, Objects]
-) -> None:
-    with pytest.raises(
-        Conflict, match=r"has no manifest\.jsonl: there is no backup, or it was never finished"
-    ):
-        restore(target, *elsewhere)
-    back_up(engine, furnished, target, "1")
-    with pytest.raises(Conflict, match="already has a backup; name an empty folder"):
-        back_up(engine, furnished, target, "1")
-    target.delete(MANIFEST)
-    with pytest.raises(Conflict, match=r"is not empty: it has 'ledger\.jsonl'"):
-        back_up(engine, furnished, target, "1")
-    for what in (LEDGER, "objects"):
-        target.delete(what)
-    back_up(engine, furnished, target, "1")
-    with pytest.raises(Conflict, match=r"not empty: its database has rows \(.*2 of captures.*name another"):
-        restore(target, engine, elsewhere[1])
-    with pytest.raises(Conflict, match=r"not empty: its store .* has captures/c\."):
-        restore(target, elsewhere[0], furnished)
-    used = open_engine(elsewhere[0].url.render_as_string(hide_password=False))
-    with writing(used) as c:
-        leases.acquire(c, "somebody")
-    with pytest.raises(Conflict, match="a service runs on the installation; stop it"):
-        restore(target, *elsewhere)
-    with writing(used) as c:
-        leases.release(c, 1)
-    restore(target, *elsewhere)
-    used.dispose()
-
-
-def change(index: int, **values: Any) -> Callable[[list[bytes]], None]:
-    def apply(lines: list[bytes]) -> None:
-        lines[index] = json.dumps(json.loads(lines[index]) | values).encode() + b"\n"
-
-    return apply
-
-
-LIES: dict[str, tuple[str, Callable[[list[bytes]], None]]] = {
-    "cut": ("is incomplete or was changed", lambda lines: lines.__delitem__(slice(5, None))),
-    "half a line": ("is incomplete or was changed", lambda lines: lines.__setitem__(-1, lines[-1][:30])),
-    "one less": ("is incomplete or was changed", lambda lines: lines.__delitem__(4)),
-    "empty": ("is incomplete or was changed", lambda lines: lines.clear()),
-    "format": ("the format 'x', but this envmatte reads", change(0, format="x")),
-    "revision": (
-        "the backup was written by a newer envmatte: it has revision 9999",
-        change(0, revision="9999"),
-    ),
-}
-SEALED: dict[str, tuple[str, Callable[[list[bytes]], None]]] = {
-    "above": ("has the invalid object name 'captures/../../x'", change(3, name="captures/../../x")),
-    "root": ("has the invalid object name '/etc/x'", change(3, name="/etc/x")),
-    "elsewhere": ("has the invalid object name 'certs/ca.pem'", change(3, name="certs/ca.pem")),
-    "hidden": ("has the invalid object name 'captures/c/.x'", change(3, name="captures/c/.x")),
-    "number": ("has the invalid object name 3", change(3, name=3)),
-    "not there": ("captures/c/none is missing in the backup", change(3, name="captures/c/none")),
-    "checksum": ("does not match manifest.jsonl: it is damaged", change(3, sha256="0" * 64)),
-    "no checksum": ("no valid size and checksum for", change(3, sha256="x")),
-    "ledger": (
-        "ledger.jsonl in the backup does not match",
-        change(0, ledger={"size": 1, "sha256": "0" * 64}),
-    ),
-}
-
-
-@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
-def test_what_lies_is_refused_and_leaves_nothing(
-    engine: Engine, furnished: Objects, folder: Path, target: Objects, elsewhere: tuple[Engine, Objects]
-) -> None:
-    back_up(engine, furnished, target, "1")
-    whole = lines_of(target)
-    for lies, seal in ((LIES, False), (SEALED, True)):
-        for match, apply in lies.values():
-            lines = list(whole)
-            apply(lines)
-            sealed(target, lines) if seal else target.write_raw(MANIFEST, iter(lines))
-            with pytest.raises((InvalidInput, Conflict), match=match):
-                restore(target, *elsewhere)
-            nothing(*elsewhere)
-    target.write_raw(MANIFEST, iter(whole))
-    for path in ("objects/mattes/m/rho/c/0/0/0", LEDGER):
-        flip(target, path)
-        with pytest.raises(InvalidInput, match=r"does not match manifest\.jsonl: it is damaged"):
-            restore(target, *elsewhere)
-        nothing(*elsewhere)
-        flip(target, path)
-    rows = lines_of(target, LEDGER)
-    for row, match in (
-        (b'["alembic_version",{"version_num":"x"}]\n', "table 'alembic_version'"),
-        (b'["coordinator",{"id":1}]\n', "table 'coordinator'"),
-        (b'["jobs",{"id":1}]\n', "a row of jobs with unexpected columns"),
-        (b"[1]\n", "a line that is not a row"),
-    ):
-        data = b"".join(rows) + row
-        target.write_raw(LEDGER, iter([data]))
-        lines = list(whole)
-        change(0, ledger={"size": len(data), "sha256": hashlib.sha256(data).hexdigest()})(lines)
-        sealed(target, lines)
-        with pytest.raises(InvalidInput, match=match):
-            restore(target, *elsewhere)
-        nothing(*elsewhere)
-    target.write_raw(LEDGER, iter(rows))
-    target.write_raw(MANIFEST, iter(whole))
-    restore(target, *elsewhere)
-    assert rows_of(elsewhere[0]) == rows_of(engine)
-    assert contents(elsewhere[1]) == contents(furnished)
-
-
-@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
-def test_one_that_was_killed_holds_nothing_and_is_done_again(
-    engine: Engine, furnished: Objects, target: Objects, elsewhere: tuple[Engine, Objects]
-) -> None:
-    back_up(engine, furnished, target, "1")
-    second, store = elsewhere
-    where = [target.url, second.url.render_as_string(), store.url]
-    killed = subprocess.run([sys.executable, "-c", HALF, *where], timeout=120)
-    assert killed.returncode == 9
-    assert contents(store)
-    assert MARKER in store.names("")
-    store.put("mattes/x/left", b"of the first")
-    other = dialects.make_engine(f"{second.url.render_as_string()}.other")
-    with pytest.raises(Conflict, match=r"its store .* has \w+/"):  # it may be in use with the first database
-        restore(target, other, store)
-    other.dispose()
-    restore(target, second, store)
-    assert contents(store) == contents(furnished)
-    assert MARKER not in store.names("")
-
-
-def test_one_of_an_earlier_revision_is_brought_up_to_date(
-    tmp_path: Path, objects: Objects, target: Objects, elsewhere: tuple[Engine, Objects]
-) -> None:
-    url = f"sqlite:///{tmp_path}/old.db"
-    old = dialects.make_engine(url)
-    with writing(old) as c:
-        migrations.upgrade(c, "0004")
-        c.execute(
-            text(
-                "INSERT INTO jobs VALUES (7, 'j', 'recover', 'running', 'recovering', 'c', 'm', '{}', "
-                "'{\"tiles\": 2}', 2, 1, 0, 10, NULL, 1000.5, 1001.5, NULL, NULL, NULL, NULL, 0, NULL)"
-            )
-        )
-        c.execute(
-            text("INSERT INTO tiles VALUES ('j', 0, 'done', 1, 0.5, 0), ('j', 1, 'queued', 2, NULL, 0)")
-        )
-        c.execute(text("INSERT INTO uploads VALUES ('u', NULL, 1, 2, 1, '', 1000.5, 9e9)"))
-        c.execute(text("INSERT INTO upload_parts VALUES ('u', 0, 'p', 1)"))
-    old.dispose()
-    objects.write_raw("uploads/u/p.part", iter([b"x"]))
-    opened = open_without_upgrade(url)
-    back_up(opened, objects, target, "1")
-    with reading(opened) as c:
-        assert revision(c) == "0004"  # which making a copy before an upgrade is for
-    opened.dispose()
-    restore(target, *elsewhere)
-    with reading(elsewhere[0]) as c:
-        assert revision(c) == NEWEST
-        row = jobs.get(c, "j")
-        assert (row.state, row.stage, row.problem, row.owner) == ("queued", "waiting", None, "default")
-        assert tiles.remaining(c, "j") == [1]
-        assert (
-            c.scalar(select(database_tables.jobs.c.id).where(database_tables.jobs.c.problem.is_(None))) == "j"
-        )
-        assert c.execute(select(database_tables.upload_parts)).all() == [("u", 0, "p", 1)]
-    assert verify(*elsewhere).read["unchecked"] == 1

@@ -1,4 +1,4 @@
-"""Checksums: what has rotted is told wherever it is read; what has none is read as before."""
+"""Checksums: damage is reported wherever it is read; objects without checksums are read."""
 
 import json
 from collections.abc import Callable
@@ -8,7 +8,6 @@ import google_crc32c
 import numpy as np
 import pytest
 import zarr
-from sqlalchemy import Engine
 
 from storage.errors import Corrupt
 from storage.layout import captures, composites, live, uploads
@@ -17,7 +16,7 @@ from storage.layout.matte_archive import Archive
 from storage.layout.mattes import Matte
 from storage.objects.checksums import BLOCK, CODECS, Table, crc32c, is_intact, seal, unseal
 from storage.objects.store import Objects, gather
-from tests.storage.furnished import ARCHIVE, flip, furnish, stream
+from tests.storage.installation import ARCHIVE, flip, stream
 
 READS: dict[str, tuple[str, Callable[[Objects], Any]]] = {
     "frames": ("captures/c/frames/c/0/0/0/0", lambda o: Stack(o, "c").read()),
@@ -42,34 +41,28 @@ READS: dict[str, tuple[str, Callable[[Objects], Any]]] = {
 }
 
 
-@pytest.fixture
-def furnished(engine: Engine, objects: Objects) -> Objects:
-    furnish(engine, objects)
-    return objects
-
-
 @pytest.mark.parametrize("url", ["sqlite"], indirect=True)
-def test_a_flipped_bit_is_told_by_name_wherever_it_is_read(furnished: Objects) -> None:
+def test_flipped_bit_is_reported_by_path_wherever_read(filled: Objects) -> None:
     for path, read in READS.values():
-        read(furnished)
+        read(filled)
         for at in (0.0, 0.5, 1.0):
-            flip(furnished, path, at)
+            flip(filled, path, at)
             with pytest.raises(Corrupt) as caught:
-                read(furnished)
+                read(filled)
             assert path in caught.value.detail or path.partition("/m/")[2] in caught.value.detail
             assert "again" in caught.value.detail
-            flip(furnished, path, at)
-        read(furnished)
+            flip(filled, path, at)
+        read(filled)
 
 
 @pytest.mark.parametrize("url", ["sqlite"], indirect=True)
-def test_a_browser_s_bytes_that_rot_are_made_again(furnished: Objects) -> None:
-    assert live.read(furnished, "m", "live-1") is not None
-    flip(furnished, "mattes/m/live-1/c/0")
-    assert live.read(furnished, "m", "live-1") is None
+def test_damaged_cache_for_browsers_reads_as_none(filled: Objects) -> None:
+    assert live.read(filled, "m", "live-1") is not None
+    flip(filled, "mattes/m/live-1/c/0")
+    assert live.read(filled, "m", "live-1") is None
 
 
-def test_a_stretch_is_read_though_another_block_is_damaged(objects: Objects) -> None:
+def test_range_is_read_although_another_block_is_damaged(objects: Objects) -> None:
     stream(objects, "uploads/u/p.part", ARCHIVE)
     flip(objects, "uploads/u/p.part")
     with objects.read("uploads/u/p.part") as file:
@@ -82,14 +75,14 @@ def test_a_stretch_is_read_though_another_block_is_damaged(objects: Objects) -> 
 
 
 @pytest.mark.parametrize("cut", [-1, 1])
-def test_another_length_is_damage(objects: Objects, cut: int) -> None:
+def test_wrong_length_is_corrupt(objects: Objects, cut: int) -> None:
     stream(objects, "a/b", ARCHIVE[:BLOCK])
     objects.write_raw("a/b", iter([ARCHIVE[: BLOCK + cut]]))
     with pytest.raises(Corrupt, match="a/b is damaged"), objects.read("a/b") as file:
         file.read()
 
 
-def test_what_was_stored_before_there_were_checksums_is_read(objects: Objects) -> None:
+def test_objects_without_checksums_are_read(objects: Objects) -> None:
     values = np.arange(24, dtype=np.uint16).reshape(1, 2, 4, 3)
     captures.create_stack(
         objects, "c", values.shape, values.dtype, memory=1000, attributes={"a": 1}, mask=None, images=()
@@ -106,7 +99,7 @@ def test_what_was_stored_before_there_were_checksums_is_read(objects: Objects) -
     assert objects.read("uploads/u/p.part").read() == b"any"
 
 
-def test_any_zarr_reader_checks_chunks(objects: Objects) -> None:
+def test_chunk_checksums_are_those_of_zarr(objects: Objects) -> None:
     gather(objects.put_array("a", np.arange(1000)))
     document = json.loads(objects.read_raw("a/zarr.json"))
     assert [codec["name"] for codec in document["codecs"]] == ["bytes", "zstd", "crc32c"]
@@ -115,7 +108,7 @@ def test_any_zarr_reader_checks_chunks(objects: Objects) -> None:
     assert crc32c(b"123456789") == 0xE3069283  # RFC 3720's check value
 
 
-def test_a_table_is_the_same_however_the_bytes_come() -> None:
+def test_table_does_not_depend_on_pieces() -> None:
     whole, pieces = Table(), Table()
     whole.update(ARCHIVE)
     for at in range(0, len(ARCHIVE), 77_777):
@@ -128,7 +121,7 @@ def test_a_table_is_the_same_however_the_bytes_come() -> None:
     assert len(Table().to_bytes()) == 4
 
 
-def test_a_sealed_document_is_checked_but_for_how_it_is_set() -> None:
+def test_sealed_document_is_checked_but_not_its_formatting() -> None:
     document = {"attributes": {"x": [0.1, None, "é"]}, "zarr_format": 3}
     sealed = seal(json.dumps(document).encode())
     assert seal(sealed) == sealed

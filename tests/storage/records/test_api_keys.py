@@ -1,4 +1,4 @@
-"""Keys: made once, kept as a hash, revoked for good."""
+"""API keys: created, found by hash, revoked."""
 
 import pytest
 from sqlalchemy import Engine, select
@@ -9,7 +9,7 @@ from storage.errors import Conflict, InvalidInput, NotFound
 from storage.records import api_keys
 
 
-def test_a_key_is_known_until_it_is_revoked(engine: Engine) -> None:
+def test_key_works_until_revoked(engine: Engine) -> None:
     with reading(engine) as c:
         assert not api_keys.any_created(c)
     with writing(engine) as c:
@@ -29,7 +29,7 @@ def test_a_key_is_known_until_it_is_revoked(engine: Engine) -> None:
         with pytest.raises(NotFound, match="lab"):
             api_keys.revoke(c, "lab")
         api_keys.revoke(c, "shop")
-        assert api_keys.any_created(c)  # or the service would be open again
+        assert api_keys.any_created(c)  # otherwise the service would be open again
         assert api_keys.create(c, "lab", "alice", "read") != first
         assert [(row.name, row.revoked_at is None) for row in api_keys.list_all(c)] == [
             ("lab", False),
@@ -38,7 +38,7 @@ def test_a_key_is_known_until_it_is_revoked(engine: Engine) -> None:
         ]
 
 
-def test_nothing_that_is_kept_tells_the_key(engine: Engine) -> None:
+def test_stored_row_does_not_reveal_key(engine: Engine) -> None:
     with writing(engine) as c:
         key = api_keys.create(c, "lab", "alice", "write")
         (row,) = c.execute(select(table)).all()
@@ -46,7 +46,7 @@ def test_nothing_that_is_kept_tells_the_key(engine: Engine) -> None:
     assert key.removeprefix(api_keys.PREFIX) not in str(row)
 
 
-def test_a_name_is_used_once_at_a_time(engine: Engine) -> None:
+def test_active_key_names_are_unique(engine: Engine) -> None:
     with writing(engine) as c:
         api_keys.create(c, "lab", "alice", "write")
         with pytest.raises(Conflict, match="revoke it first"):
@@ -56,6 +56,6 @@ def test_a_name_is_used_once_at_a_time(engine: Engine) -> None:
 @pytest.mark.parametrize(
     ("name", "owner"), [("", "alice"), ("lab", ""), ("lab", "x" * 65), (" lab", "a"), ("lab", "a\nb")]
 )
-def test_names_that_cannot_be_shown_are_refused(engine: Engine, name: str, owner: str) -> None:
+def test_invalid_names_are_refused(engine: Engine, name: str, owner: str) -> None:
     with writing(engine) as c, pytest.raises(InvalidInput, match="1 to 64 characters"):
         api_keys.create(c, name, owner, "read")

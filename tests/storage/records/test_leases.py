@@ -1,4 +1,4 @@
-"""The lease of the coordinator: who has it, when it runs out, and that a late writer's commit is refused."""
+"""The coordinator's lease: acquired, renewed, expired, released, and required for commits."""
 
 import threading
 
@@ -16,41 +16,41 @@ def expire(engine: Engine) -> None:
         c.execute(update(tables.coordinator).values(expires_at=dialects.clock() - 1))
 
 
-def take(engine: Engine, holder: str, *, seize: bool = False) -> int | None:
+def acquire(engine: Engine, holder: str, *, seize: bool = False) -> int | None:
     with writing(engine) as c:
         return leases.acquire(c, holder, seize=seize)
 
 
-def test_one_has_it(engine: Engine) -> None:
-    assert take(engine, "first") == 1
-    assert take(engine, "second") is None
-    assert take(engine, "first") is None
+def test_one_process_holds_the_lease(engine: Engine) -> None:
+    assert acquire(engine, "first") == 1
+    assert acquire(engine, "second") is None
+    assert acquire(engine, "first") is None
     expire(engine)
-    assert take(engine, "second") == 2
-    assert take(engine, "first", seize=True) == 3
+    assert acquire(engine, "second") == 2
+    assert acquire(engine, "first", seize=True) == 3
 
 
-def test_a_lease_that_is_given_back_is_free(engine: Engine) -> None:
-    token = take(engine, "first")
+def test_released_lease_is_free(engine: Engine) -> None:
+    token = acquire(engine, "first")
     assert token is not None
     with writing(engine) as c:
         leases.release(c, token)
     with writing(engine) as c, pytest.raises(Superseded):
         leases.require_held(c, token)
-    assert take(engine, "second") == token + 1
+    assert acquire(engine, "second") == token + 1
     with writing(engine) as c:
         leases.release(c, token)  # late
     with writing(engine) as c:
         leases.require_held(c, token + 1)
 
 
-def test_a_beat_extends_it(engine: Engine) -> None:
-    token = take(engine, "first")
+def test_heartbeat_renews_lease(engine: Engine) -> None:
+    token = acquire(engine, "first")
     assert token is not None
     expire(engine)
     with writing(engine) as c:
         leases.renew(c, token, {"workers": [{"name": "a"}], "problem": "none"})
-    assert take(engine, "second") is None
+    assert acquire(engine, "second") is None
     with reading(engine) as c:
         sign = leases.last_heartbeat(c)
     assert sign is not None
@@ -59,19 +59,19 @@ def test_a_beat_extends_it(engine: Engine) -> None:
     assert 0 <= sign.seconds < 5
 
 
-def test_nobody_ever_had_it(engine: Engine) -> None:
+def test_no_heartbeat_without_coordinator(engine: Engine) -> None:
     with reading(engine) as c:
         assert leases.last_heartbeat(c) is None
 
 
-def test_a_late_writers_commit_is_refused(engine: Engine) -> None:
-    late = take(engine, "first")
+def test_commit_of_superseded_coordinator_is_refused(engine: Engine) -> None:
+    late = acquire(engine, "first")
     assert late is not None
     with writing(engine) as c:
         job = jobs.add(c, "recover", "cap", {}, "mat")
         tiles.add_plan(c, job, {"tiles": 2})
     expire(engine)
-    token = take(engine, "second")
+    token = acquire(engine, "second")
     with pytest.raises(Superseded), writing(engine) as c:  # noqa: PT012
         tiles.mark_done(c, job, [(0, 0.1, 10)])
         leases.require_held(c, late)
@@ -84,12 +84,14 @@ def test_a_late_writers_commit_is_refused(engine: Engine) -> None:
     assert (sign.holder, token) == ("second", late + 1)
 
 
-def test_of_many_who_want_it_one_gets_it(engine: Engine) -> None:
+def test_one_of_many_acquires_the_lease(engine: Engine) -> None:
     got: list[int | None] = []
-    wanting = [threading.Thread(target=lambda n=n: got.append(take(engine, f"holder {n}"))) for n in range(8)]
-    for thread in wanting:
+    threads = [
+        threading.Thread(target=lambda n=n: got.append(acquire(engine, f"holder {n}"))) for n in range(8)
+    ]
+    for thread in threads:
         thread.start()
-    for thread in wanting:
+    for thread in threads:
         thread.join()
     assert sorted(token for token in got if token) == [1]
     with reading(engine) as c:

@@ -1,20 +1,12 @@
-"""What is to be told to webhooks: made with a job's end, and there until it is delivered or given up."""
+"""Webhook deliveries: added when a job ends, kept until they are delivered or given up."""
 
 import json
 import time
 
-import pytest
-from sqlalchemy import Connection, Engine, select, update
+from sqlalchemy import Connection, select, update
 
-from storage.database.engine import writing
 from storage.database.tables import deliveries as table
 from storage.records import jobs, webhook_deliveries
-
-
-@pytest.fixture
-def connection(engine: Engine):  # type: ignore[no-untyped-def]
-    with writing(engine) as connection:
-        yield connection
 
 
 def ended(connection: Connection, state: str = "succeeded", **problem: str) -> str:
@@ -29,16 +21,18 @@ def bring_forward(connection: Connection) -> None:
     connection.execute(update(table).values(due_at=time.time() - 1))
 
 
-def test_a_jobs_end_is_to_be_told_once(connection: Connection) -> None:
+def test_end_of_job_is_delivered_once(connection: Connection) -> None:
     job = ended(connection, "failed", detail="no light")
     assert not jobs.end(connection, job, "cancelled")
     (row,) = webhook_deliveries.claim(connection, 9)
     body = json.loads(row.body)
     created_at = body.pop("created_at")
     assert (body["id"], body["event"]) == (row.id, "job.failed")
-    told = body["job"]
-    assert created_at >= told.pop("finished_at") >= told.pop("created_at") > "2020-01-01T00:00:00Z"
-    assert told == {
+    job_fields = body["job"]
+    assert (
+        created_at >= job_fields.pop("finished_at") >= job_fields.pop("created_at") > "2020-01-01T00:00:00Z"
+    )
+    assert job_fields == {
         "id": job,
         "kind": "recover",
         "state": "failed",
@@ -49,7 +43,7 @@ def test_a_jobs_end_is_to_be_told_once(connection: Connection) -> None:
     assert (row.url, row.attempts) == ("https://example.com/x", 1)
 
 
-def test_a_job_that_is_tried_again_is_told_again(connection: Connection) -> None:
+def test_retried_job_is_delivered_again(connection: Connection) -> None:
     job = ended(connection, "failed", detail="no light")
     jobs.retry(connection, job)
     jobs.end(connection, job, "succeeded")
@@ -57,12 +51,12 @@ def test_a_job_that_is_tried_again_is_told_again(connection: Connection) -> None
     assert sorted(events) == ["job.failed", "job.succeeded"]
 
 
-def test_a_job_without_a_webhook_is_not_told(connection: Connection) -> None:
+def test_job_without_webhook_has_no_delivery(connection: Connection) -> None:
     jobs.end(connection, jobs.add(connection, "recover", "cap", {}, "mat"), "succeeded")
     assert not webhook_deliveries.any_due(connection)
 
 
-def test_what_is_claimed_is_due_again_when_its_process_was_lost(connection: Connection) -> None:
+def test_claimed_delivery_is_due_again_after_process_died(connection: Connection) -> None:
     ended(connection)
     assert webhook_deliveries.any_due(connection)
     webhook_deliveries.claim(connection, 9)
@@ -72,7 +66,7 @@ def test_what_is_claimed_is_due_again_when_its_process_was_lost(connection: Conn
     assert row.attempts == 2
 
 
-def test_the_least_tried_come_first(connection: Connection) -> None:
+def test_deliveries_with_fewest_attempts_come_first(connection: Connection) -> None:
     first = ended(connection)
     webhook_deliveries.claim(connection, 9)
     second = ended(connection)
@@ -94,7 +88,7 @@ def test_attempts_are_spread_over_a_day_and_end(connection: Connection) -> None:
     assert connection.execute(select(table)).all() == []
 
 
-def test_a_job_that_is_deleted_is_told_nevertheless(connection: Connection) -> None:
+def test_deleted_job_is_still_delivered(connection: Connection) -> None:
     jobs.delete(connection, ended(connection))
     (row,) = webhook_deliveries.claim(connection, 1)
     webhook_deliveries.delete(connection, row.id)

@@ -1,4 +1,4 @@
-"""An installation with one of everything that is stored: rows, and objects as those who store them write them."""
+"""An installation with one item of every kind: rows, and objects as the service writes them."""
 
 import asyncio
 
@@ -13,20 +13,20 @@ from storage.layout.captures import Stack, create_stack, write_slab
 from storage.layout.uploads import Part
 from storage.objects.store import Objects
 from storage.records import api_keys, captures, idempotency, jobs, mattes, programs, tiles, uploads
-from tests.storage.layout.test_mattes import block, extent, places
+from tests.storage.layout.matte_blocks import block, extent, places
 
 SHAPE = (6, 21, 40, 3)
 ARCHIVE = np.random.default_rng(4).bytes((2 << 20) + 777)
-"""Of three blocks of checksums."""
-AGAIN = {"status": 500, "detail": "gave up"}
+"""Has three blocks with checksums."""
+RETRYABLE = {"status": 500, "detail": "gave up"}
 
 
-def furnish(engine: Engine, objects: Objects) -> None:
+def fill(engine: Engine, objects: Objects) -> None:
     """Fill an installation.
 
-    The capture ``c`` and its matte ``m``; ``i``, the archive of a capture that is ingested; ``u``, an upload under way;
-    composites, of which ``v`` is done, ``w`` waits, and ``x`` has failed and may be tried again; ``l``, a matte that
-    came in an archive; ``r``, one that is recovered.
+    It has the capture ``c`` and its matte ``m``; ``i``, a capture that is being ingested from its archive; ``u``, an
+    unfinished upload; the composites ``v``, which is done, ``w``, which is queued, and ``x``, which has failed and may
+    be retried; ``l``, an imported matte; and ``r``, a matte that is being recovered.
     """
     rng = np.random.default_rng(3)
     create_stack(
@@ -61,12 +61,12 @@ def furnish(engine: Engine, objects: Objects) -> None:
         objects.put(composites.ticks_path(job), ARCHIVE[:80])
         objects.put(composites.segment_path(job, 0), ARCHIVE[:70])
     with writing(engine) as c:
-        write_down(c)
+        add_rows(c)
         api_keys.create(c, "lab", "alice", "write")
 
 
-def write_down(c: Connection) -> None:
-    """The rows."""
+def add_rows(c: Connection) -> None:
+    """Add the rows."""
     for job, kind, capture, matte in (
         ("ci", "ingest", "c", None),
         ("mr", "recover", "c", "m"),
@@ -101,30 +101,30 @@ def write_down(c: Connection) -> None:
     uploads.advance(c, "u", 0, [Part("p", 999), Part("q", 999)], 1e6)
     for job in ("ci", "mr", "v"):
         jobs.end(c, job, "succeeded")
-    jobs.end(c, "x", "failed", AGAIN)
+    jobs.end(c, "x", "failed", RETRYABLE)
     idempotency.add(c, "key", "POST /v1/captures", "c")
     programs.add(c, {"any": 1})
 
 
-def stream(objects: Objects, path: str, data: bytes) -> None:
-    """Write an object as an upload is."""
+def stream(objects: Objects, path: str, data: bytes, piece: int = 70_000) -> None:
+    """Write an object in pieces, as an upload is written."""
 
     async def write() -> None:
         async with objects.write(path) as file:
-            for at in range(0, len(data), 70_000):
-                await file.write(data[at : at + 70_000])
+            for at in range(0, len(data), piece):
+                await file.write(data[at : at + piece])
 
     asyncio.run(write())
 
 
 def flip(objects: Objects, path: str, at: float = 0.5) -> None:
-    """Flip a bit of an object, as a disk might."""
+    """Flip a bit of an object at a share of its length."""
     data = bytearray(objects.read_raw(path))
     data[min(int(len(data) * at), len(data) - 1)] ^= 0x10
     objects.write_raw(path, iter([bytes(data)]))
 
 
 def contents(objects: Objects) -> dict[str, bytes]:
-    """Every object, by its path."""
+    """The bytes of every object, by path."""
     folders = ("captures", "mattes", "uploads", "composites")
     return {path: objects.read_raw(path) for folder in folders for path in objects.sizes(folder)}

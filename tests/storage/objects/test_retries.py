@@ -1,0 +1,184 @@
+"""A store that fails: full disks, and buckets that do not answer."""
+
+import os
+import shutil
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from datetime import timedelta
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+
+from storage.errors import NoRoom, Unavailable
+from storage.objects import store as module
+from storage.objects.byte_objects import PART
+from storage.objects.store import Objects, gather
+from tests.parts.disks import small_disk
+from tests.services.cluster.clusters import wait
+from tests.storage.installation import stream
+
+SIZE = 12 << 20
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gives up on a bucket immediately instead of after a minute."""
+    backoff = {
+        "init_backoff": timedelta(milliseconds=1),
+        "max_backoff": timedelta(milliseconds=10),
+        "base": 2,
+    }
+    monkeypatch.setattr(module, "RETRIES", module.RETRIES | {"max_retries": 1, "backoff": backoff})
+    monkeypatch.setattr(module, "REQUESTS", module.REQUESTS | {"timeout": timedelta(seconds=1)})
+
+
+@pytest.fixture(params=["refused", "silent", "503", "429"])
+def unreachable(
+    impatient: None, request: pytest.FixtureRequest, s3: str, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[str]:
+    """The URL of a store whose bucket does not answer, or answers with an error."""
+
+    class Busy(BaseHTTPRequestHandler):
+        def _refuse(self) -> None:
+            self.send_response(int(request.param))
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+
+        do_GET = do_PUT = do_POST = do_HEAD = do_DELETE = _refuse
+
+        def log_message(self, format: str, *args: object) -> None:
+            pass
+
+    if request.param in ("503", "429"):
+        with ThreadingHTTPServer(("127.0.0.1", 0), Busy) as server:
+            threading.Thread(target=server.serve_forever).start()
+            monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{server.server_port}")
+            yield s3
+            server.shutdown()
+        return
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        if request.param == "silent":
+            taken.listen(100)
+            short = module.REQUESTS | {"timeout": timedelta(seconds=0.2)}
+            monkeypatch.setattr(module, "REQUESTS", short)
+        monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{taken.getsockname()[1]}")
+        yield s3
+
+
+def test_every_call_reports_unreachable_bucket(unreachable: str) -> None:
+    objects = Objects(unreachable)
+    array = np.zeros(3)
+    asked: list[Callable[[], object]] = [
+        objects.check_reachable,
+        lambda: objects.read("a"),
+        lambda: objects.put("a", b"1"),
+        lambda: stream(objects, "a", b"1"),
+        lambda: stream(objects, "a", bytes(PART + 1)),
+        lambda: objects.names("a"),
+        lambda: objects.paths_below("a"),
+        lambda: objects.stale_names("a", 1),
+        lambda: objects.delete("a"),
+        lambda: gather(objects.group("a")),
+        lambda: gather(objects.array("a")),
+        lambda: gather(objects.put_array("a", array)),
+        lambda: zarr.create_array(objects.zarr, name="a", data=array),
+        lambda: zarr.open_group(objects.zarr, path="a"),
+    ]
+    for ask in asked:
+        with pytest.raises(Unavailable, match="try again"):
+            ask()
+
+
+def test_bucket_that_disconnects_during_read(impatient: None, s3: str) -> None:
+    there = os.environ["AWS_ENDPOINT_URL"].removeprefix("http://").split(":")
+    with socket.create_server(("127.0.0.1", 0)) as between:
+        os.environ["AWS_ENDPOINT_URL"] = f"http://127.0.0.1:{between.getsockname()[1]}"
+        sockets: list[socket.socket] = []
+
+        def relay() -> None:
+            while True:
+                try:
+                    near, _ = between.accept()
+                except OSError:
+                    return
+                far = socket.create_connection((there[0], int(there[1])))
+                sockets.extend((near, far))
+                for one, other in ((near, far), (far, near)):
+                    threading.Thread(target=carry, args=(one, other)).start()
+
+        def carry(one: socket.socket, other: socket.socket) -> None:
+            try:
+                while data := one.recv(1 << 16):
+                    other.sendall(data)
+            except OSError:
+                pass
+
+        thread = threading.Thread(target=relay)
+        thread.start()
+        objects = Objects(s3)
+        data = np.random.default_rng(0).bytes(3 << 20)
+        stream(objects, "a", data)
+        with objects.read("a") as file:
+            assert file.read(1000) == data[:1000]
+            between.shutdown(socket.SHUT_RDWR)
+            thread.join()
+            for one in sockets:
+                one.close()
+            with pytest.raises(Unavailable):
+                file.read()
+
+
+def test_missing_bucket_is_not_reported_as_unavailable(s3: str) -> None:
+    objects = Objects(s3.replace("envmatte", "another"))
+    with pytest.raises(Exception, match="NoSuchBucket") as caught:
+        objects.check_reachable()
+    assert not isinstance(caught.value, Unavailable)
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    with small_disk(tmp_path / "disk", SIZE) as folder:
+        yield folder
+
+
+@pytest.mark.parametrize("piece", [1 << 18, 9 << 20, 2 * SIZE], ids=["crumbs", "parts", "at once"])
+def test_writer_leaves_nothing_on_full_disk(disk: Path, piece: int) -> None:
+    objects = Objects((disk / "store").as_uri())
+    stream(objects, "a", 1000, 1000)
+    with pytest.raises(NoRoom, match="free space"):
+        stream(objects, "b", 2 * SIZE, piece)
+    assert {path.name for path in disk.rglob("*") if path.is_file()} == {"a", "a.crc32c"}
+    wait(
+        lambda: shutil.disk_usage(disk).free > SIZE // 2 + (1 << 20)
+    )  # a part under way holds what was removed
+    stream(objects, "b", SIZE // 2, piece)
+    assert objects.names("") == ["a", "b"]
+
+
+def test_small_object_on_full_disk(disk: Path) -> None:
+    objects = Objects((disk / "store").as_uri())
+    with pytest.raises(NoRoom, match="free space"):
+        objects.put("a", bytes(SIZE + 1))
+    objects.put("a", b"1")
+    assert objects.read("a").read() == b"1"
+
+
+def test_chunk_on_full_disk(disk: Path) -> None:
+    objects = Objects((disk / "store").as_uri())
+    array = zarr.create_array(
+        objects.zarr,
+        name="a",
+        shape=(2, SIZE * 2 // 3),
+        chunks=(1, SIZE * 2 // 3),
+        dtype="u1",
+        compressors=None,
+    )
+    array[0, :] = 1
+    with pytest.raises(NoRoom, match="free space"):
+        array[1, :] = 1
+    assert np.asarray(array[0, :10]).all()
