@@ -14,7 +14,11 @@ from sqlalchemy import Connection, Engine
 
 from storage.database.engine import open_engine, writing
 from storage.objects.store import Objects
+from tests.parts.disks import small_disk
 from tests.storage.installation import fill
+
+DISK = 12 << 20
+"""Bytes of the small disk."""
 
 
 @pytest.fixture
@@ -99,3 +103,10 @@ def filled(engine: Engine, objects: Objects) -> Objects:
     """The store of an installation with one item of every kind; its database is `engine`."""
     fill(engine, objects)
     return objects
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """A folder on a disk of `DISK` bytes."""
+    with small_disk(tmp_path / "disk", DISK) as folder:
+        yield folder

@@ -15,8 +15,7 @@ from storage.errors import InvalidInput, NoRoom
 from storage.records import jobs, uploads
 from tests.parts.disks import small_disk
 from tests.parts.postgres import TEMPLATE, Server
-
-SIZE = 12 << 20
+from tests.storage.conftest import DISK
 
 
 def test_sqlite_settings(sqlite: str) -> None:
@@ -104,14 +103,14 @@ def test_sqlite_on_full_disk_keeps_rows(disk: Path) -> None:
 
 def test_postgresql_on_full_disk_keeps_rows(postgresql_server: Server) -> None:
     server = postgresql_server
-    with small_disk(server.folder / "disk", 2 * SIZE) as disk:
+    with small_disk(server.folder / "disk", 2 * DISK) as disk:
         shutil.chown(disk, server.folder.owner())
         server.execute(f"CREATE TABLESPACE small LOCATION '{disk}'")
         with server.database(like=f"{TEMPLATE} TABLESPACE small") as url:
             engine = open_engine(url)
             with writing(engine) as c:
                 uploads.add(c, "before", 10, "", 1000.0, None)
-            big = secrets.token_hex(SIZE)  # random, so that it cannot be compressed to fit
+            big = secrets.token_hex(DISK)  # random, so that it cannot be compressed to fit
             with pytest.raises(NoRoom, match="free space"), writing(engine) as c:
                 uploads.add(c, "big", 10, big, 1000.0, None)
             with writing(engine) as c:

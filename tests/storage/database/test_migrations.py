@@ -39,9 +39,9 @@ with reading(engine) as connection:
 
 LOGGED = """
 import logging, sys
-import storage.database.tables
 from storage.database.engine import open_engine
 logging.basicConfig(level=logging.INFO)
+logging.getLogger("alembic").setLevel(logging.WARNING)  # as services.runtime.logs does
 for _ in range(2):
     open_engine(sys.argv[1]).dispose()
 """

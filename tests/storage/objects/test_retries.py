@@ -17,11 +17,9 @@ from storage.errors import NoRoom, Unavailable
 from storage.objects import store as module
 from storage.objects.byte_objects import PART
 from storage.objects.store import Objects, gather
-from tests.parts.disks import small_disk
 from tests.services.cluster.clusters import wait
+from tests.storage.conftest import DISK
 from tests.storage.installation import stream
-
-SIZE = 12 << 20
 
 
 @pytest.fixture
@@ -140,30 +138,24 @@ def test_missing_bucket_is_not_reported_as_unavailable(s3: str) -> None:
     assert not isinstance(caught.value, Unavailable)
 
 
-@pytest.fixture
-def disk(tmp_path: Path) -> Iterator[Path]:
-    with small_disk(tmp_path / "disk", SIZE) as folder:
-        yield folder
-
-
-@pytest.mark.parametrize("piece", [1 << 18, 9 << 20, 2 * SIZE], ids=["crumbs", "parts", "at once"])
+@pytest.mark.parametrize("piece", [1 << 18, 9 << 20, 2 * DISK], ids=["crumbs", "parts", "at once"])
 def test_writer_leaves_nothing_on_full_disk(disk: Path, piece: int) -> None:
     objects = Objects((disk / "store").as_uri())
-    stream(objects, "a", 1000, 1000)
+    stream(objects, "a", os.urandom(1000))
     with pytest.raises(NoRoom, match="free space"):
-        stream(objects, "b", 2 * SIZE, piece)
+        stream(objects, "b", os.urandom(2 * DISK), piece)
     assert {path.name for path in disk.rglob("*") if path.is_file()} == {"a", "a.crc32c"}
     wait(
-        lambda: shutil.disk_usage(disk).free > SIZE // 2 + (1 << 20)
+        lambda: shutil.disk_usage(disk).free > DISK // 2 + (1 << 20)
     )  # a part under way holds what was removed
-    stream(objects, "b", SIZE // 2, piece)
+    stream(objects, "b", os.urandom(DISK // 2), piece)
     assert objects.names("") == ["a", "b"]
 
 
 def test_small_object_on_full_disk(disk: Path) -> None:
     objects = Objects((disk / "store").as_uri())
     with pytest.raises(NoRoom, match="free space"):
-        objects.put("a", bytes(SIZE + 1))
+        objects.put("a", bytes(DISK + 1))
     objects.put("a", b"1")
     assert objects.read("a").read() == b"1"
 
@@ -173,8 +165,8 @@ def test_chunk_on_full_disk(disk: Path) -> None:
     array = zarr.create_array(
         objects.zarr,
         name="a",
-        shape=(2, SIZE * 2 // 3),
-        chunks=(1, SIZE * 2 // 3),
+        shape=(2, DISK * 2 // 3),
+        chunks=(1, DISK * 2 // 3),
         dtype="u1",
         compressors=None,
     )
