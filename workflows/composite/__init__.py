@@ -1,4 +1,4 @@
-"""Composites: a matte before any backdrop."""
+"""Composite a matte over any backdrop."""
 
 from collections.abc import Callable
 from functools import partial
@@ -25,28 +25,28 @@ def composite(
     read: Callable[[int, int], Strip] | None = None,
     threads: int = CORES,
 ) -> NDArray[np.float32]:
-    """Put a matte before a backdrop.
+    """Composite a matte over a backdrop.
 
     Parameters
     ----------
     matte : Matte
     backdrop : Backdrop, or (h, w, 1 or 3) float32
-        The latter linear light.
+        An array is linear light.
     placement : Placement, optional
-        Where the backdrop stands before the monitor's place.
+        Where the backdrop stands, in the plane of the monitor.
     rays : Rays, optional
-        How far behind it, or before it.
+        For a backdrop at another depth than the monitor.
     window : Window, optional
-        Of the matte; default all of it.
+        Part of the matte; by default all of it.
     read : callable, optional
-        Where strips come from, as `compose` says; default the store.
+        Returns strips, see `compose`; by default they are read from the store.
     threads : int
-        To share the work; the picture is the same.
+        Threads to use; the result does not depend on it.
 
     Returns
     -------
     (height, width, 4) float32
-        Linear light, and in the last channel 1 where the pixel was recovered, 0 where the mask left it out.
+        Linear light and alpha: 1 where the pixel was recovered, 0 where the mask left it out.
 
     Raises
     ------

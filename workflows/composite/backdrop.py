@@ -1,4 +1,4 @@
-"""The light of a backdrop at the nodes of T: resampled to the monitor's cells, then from grid to coarser grid."""
+"""The light of a backdrop at the nodes of T: resampled to the monitor's cells, then to coarser and coarser grids."""
 
 import math
 from dataclasses import dataclass
@@ -17,19 +17,19 @@ from workflows.images.tone_curves import table
 from workflows.recovery.pyramid import Pyramid
 
 ROWS = 64
-"""Rows of cells that a thread makes at a time."""
+"""Rows of cells that a thread computes at a time."""
 
 
 @dataclass(frozen=True)
 class Backdrop:
-    """A picture to put a matte before.
+    """A picture behind a matte.
 
     Attributes
     ----------
     pixels : (h, w, 1 to 4) uint8 or uint16, or (h, w, 1 or 3) float32
-        With an alpha channel if it has two or four: what is transparent is black, in part in proportion.
+        Two or four channels include alpha: transparent pixels are black, in proportion.
     table : (256 or 65536,) float32, optional
-        Linear light of every value of an integer type; float values are linear light.
+        Linear light of every integer value; float values are linear light.
     """
 
     pixels: NDArray[np.integer] | NDArray[np.float32]
@@ -37,20 +37,20 @@ class Backdrop:
 
 
 def backdrop_of(pixels: Codes | Floats, transfer: Transfer) -> Backdrop:
-    """A backdrop of a picture that `images.decode.decode` has decoded.
+    """Make a backdrop of a picture from `workflows.images.decode.decode`.
 
     Parameters
     ----------
     pixels : (h, w, 1 to 4) uint8 or uint16, or (h, w, 1 or 3) float32
-        With an alpha channel if it has two or four. Float values are changed in place.
+        Two or four channels include alpha. Float values are changed in place.
     transfer : str
         How integers encode light; float values are linear light.
 
     Returns
     -------
     Backdrop
-        Where it is transparent it is black, in part in proportion: there is no light behind it. What is infinite or
-        no number in a float image is black.
+        Transparent pixels are black, in proportion, because there is no light behind them. Infinite values and NaN are
+        black.
     """
     if pixels.dtype == np.float32:
         light = cast("Floats", pixels)
@@ -68,7 +68,7 @@ def node_light(
     placement: Placement | None = None,
     monitor: tuple[int, int] = (1, 1),
 ) -> NDArray[np.float32]:
-    """The light that the nodes of a pyramid see of a backdrop.
+    """The light of a backdrop at the nodes of a pyramid.
 
     Parameters
     ----------
@@ -76,22 +76,22 @@ def node_light(
     columns, rows : int
         The pyramid's first grid.
     threads : int
-        To share the work.
+        Threads to use.
     placement : Placement, optional
-        Where it stands; default stretched over the monitor.
+        Where the backdrop stands; by default it is stretched over the monitor.
     monitor : (int, int)
-        The monitor's width and height, for a placement.
+        Width and height of the monitor; needed with a placement.
 
     Returns
     -------
     (nodes + 1, 3) float32
-        Row by row; the last one is 0, and nobody's: `gather` reads past a node's three values.
+        Row by row. The last one is padding and 0, because `gather` reads four values at each node.
 
     Notes
     -----
-    A cell sees the mean of the backdrop over it, as the patterns' blocks were to it: nothing aliases, whatever the
-    backdrop's size. A backdrop that is placed elsewhere is first made as coarse as the cells, by means too, and then
-    sampled between its pixels. Further grids see what `Pyramid` says.
+    A cell gets the mean of the backdrop over it, as it did of the patterns, so nothing aliases, whatever the size of
+    the backdrop. A backdrop with a placement is first averaged to about the size of the cells, and then sampled with
+    bilinear interpolation. Coarser grids are computed as in `Pyramid`.
     """
     pyramid = Pyramid.over(columns, rows)
     light = np.empty((pyramid.nodes + 1, 3), np.float32)
@@ -120,9 +120,9 @@ def _resample(
     grid: tuple[int, int],
     corner: tuple[int, int] = (0, 0),
 ) -> None:
-    """Stretch a backdrop over a grid of rows and columns: each cell gets the mean over it.
+    """Average a backdrop, stretched over a grid of rows and columns, over each cell.
 
-    Made are the cells (rows, columns, 3) from the grid's row and column `corner` on.
+    Only ``cells`` (rows, columns, 3) are computed, which begin at row and column ``corner`` of the grid.
     """
     in_parts(
         lambda start: _area_mean(
@@ -140,13 +140,13 @@ def _place(
     cells: NDArray[np.float32],
     threads: int,
 ) -> None:
-    """Place a backdrop before cells (rows, columns, 3)."""
+    """Compute cells (rows, columns, 3) of a backdrop with a placement."""
     rows, columns, _ = cells.shape
     height, width, _ = backdrop.pixels.shape
     steps = np.hypot(*placement.matrix((columns, rows), monitor, (width, height))[:, :2].T)
     wide, high = (math.ceil(size / max(step, 1.0)) for size, step in zip((width, height), steps, strict=True))
     matrix = placement.matrix((columns, rows), monitor, (wide, high))
-    # No more of it than the cells see: of a backdrop that is much enlarged all pixels would be too many.
+    # Only the part that the cells see: an enlarged backdrop would have too many pixels.
     across, down = _seen(matrix[0], columns, rows, wide), _seen(matrix[1], columns, rows, high)
     corner = (down.start, across.start)
     picture = np.empty((len(down), len(across), 3), np.float32)
@@ -159,16 +159,16 @@ def _place(
 
 
 def _seen(line: NDArray[np.float64], columns: int, rows: int, size: int) -> range:
-    """The pixels along an axis of a picture between which cells sample it, and one more at each end, for rounding.
+    """The range of pixels along an axis of a picture that cells sample, with one more at each end for rounding.
 
     Parameters
     ----------
     line : (3,) float64
-        The axis' line of a placement's matrix.
+        The row of a placement's matrix for this axis.
     columns, rows : int
-        Of the grid of cells.
+        Size of the grid of cells.
     size : int
-        Of the picture.
+        Size of the picture along this axis.
     """
     places = [line @ (x, y, 1) for x in (0, columns) for y in (0, rows)]
     first, end = (min(max(at, 0), size) for at in (math.floor(min(places)) - 2, math.floor(max(places)) + 3))
@@ -183,13 +183,13 @@ def _light_at(
     x: int,
     channel: int,
 ) -> np.float32:
-    """The linear light of a colour of a pixel, looked up only here: no backdrop of codes is held as float."""
+    """The linear light of a channel of a pixel; looked up here, so that integer pictures need no float copy."""
     if table is None:
         value: np.float32 = image[y, x, channel]
         return value
     light: np.float32 = table[image[y, x, channel]]
     last = image.shape[2] - 1
-    if last & 1:  # which is alpha then
+    if last & 1:  # the last channel is alpha
         light *= np.float32(image[y, x, last]) / np.float32(table.size - 1)
     return light
 
@@ -204,25 +204,25 @@ def _area_mean(
     stop: int,
     cells: NDArray[np.float32],
 ) -> None:
-    """The mean over each cell of a part of a grid, of an image that is constant over each of its pixels.
+    """The mean of an image over each cell in part of a grid; the image is constant over each of its pixels.
 
     Parameters
     ----------
     image, table
-        A backdrop's.
+        Those of a backdrop.
     grid : (int, int)
         Rows and columns of the grid that the image is stretched over.
     corner : (int, int)
-        Row and column that the part begins with.
+        First row and column of the part.
     start, stop : int
-        Rows of the part.
+        Rows of the part to compute.
     cells : (rows, columns, 3) float32
-        The part; written between `start` and `stop`.
+        The part; rows from ``start`` up to ``stop`` are written.
     """
     height, width, channels = image.shape
     rows, columns = grid
     colours = 3 if channels >= 3 else 1
-    line = np.empty((width // columns + 2, colours), np.float32)  # of the pixels of a cell
+    line = np.empty((width // columns + 2, colours), np.float32)  # sums over the rows of a cell's pixels
     for r in range(start, stop):
         top, bottom = (corner[0] + r) * height / rows, (corner[0] + r + 1) * height / rows
         for k in range(cells.shape[1]):
@@ -245,7 +245,7 @@ def _area_mean(
 
 @njit(nogil=True, cache=True)
 def _halve(fine: NDArray[np.float32], start: int, stop: int, coarse: NDArray[np.float32]) -> None:
-    """Some rows of the next grid: every second node seen with the weights [1, 3, 3, 1] / 8 along each axis."""
+    """Some rows of the next coarser grid, with the weights [1, 3, 3, 1] / 8 along each axis."""
     rows, columns, _ = fine.shape
     line = np.empty((columns, 3), np.float32)
     three, eighth = np.float32(3), np.float32(1 / 8)

@@ -1,4 +1,4 @@
-"""What was read of mattes, kept in memory within bounds: a matte is composited thousands of times."""
+"""A cache in memory of what was read of mattes, because a matte is composited thousands of times."""
 
 import threading
 from collections import OrderedDict
@@ -11,18 +11,18 @@ from workflows.composite.strips import Blocks, Strip, columns_of, read_strip
 
 Key = tuple[str, int, int, tuple[int, ...]]
 OPEN = 256
-"""Mattes whose attributes are kept, some kilobytes each."""
+"""Mattes whose attributes are kept, at some kilobytes each."""
 
 
 class Cache:
-    """Strips of mattes, those that were asked for last; for any number of threads.
+    """Keeps the most recently used strips of mattes. It is thread-safe.
 
     Parameters
     ----------
     objects : Objects
-        Where mattes are.
+        Where mattes are stored.
     memory : int
-        Bytes of strips that are kept, and an eighth of it for `places`. What is in use besides is a strip a thread.
+        Bytes of strips to keep; `places` may take an eighth of it in addition. Each thread uses one strip more.
     """
 
     def __init__(self, objects: Objects, memory: int) -> None:
@@ -34,12 +34,10 @@ class Cache:
         self._places: OrderedDict[str, Places] = OrderedDict()
         self._reading: dict[Key, Future[Strip]] = {}
         self.bytes = 0
-        """Of the strips that are kept."""
-        self.hits = self.misses = 0
-        """Strips that were asked for and there; and those that were read."""
+        """Size of the strips that are kept."""
 
     def matte(self, id: str) -> Matte:
-        """A matte, opened once.
+        """Open a matte, or return it if it is open already.
 
         Raises
         ------
@@ -59,7 +57,7 @@ class Cache:
         return found
 
     def strip(self, id: str, row: int, number: int, there: Blocks | None = None) -> Strip:
-        """A strip of a matte, as `read_strip` reads it, once however many ask for it at a time.
+        """A strip of a matte, see `read_strip`. Threads that ask for it at the same time share one read.
 
         Raises
         ------
@@ -73,19 +71,17 @@ class Cache:
             strip = self._strips.get(key)
             if strip is not None:
                 self._strips.move_to_end(key)
-                self.hits += 1
                 return strip
             read = self._reading.get(key)
             if read is None:
                 mine = self._reading[key] = Future()
-                self.misses += 1
         if read is not None:
             return read.result()
         try:
             strip = read_strip(matte, row, number, there)
         except BaseException as error:
             with self._lock:
-                if self._reading.get(key) is mine:  # else the matte was deleted meanwhile, which is often why
+                if self._reading.get(key) is mine:  # else the matte was deleted meanwhile, the usual reason
                     del self._reading[key]
             mine.set_exception(error)
             raise
@@ -101,7 +97,7 @@ class Cache:
         return strip
 
     def places(self, id: str, threads: int) -> Places:
-        """Where the pixels of a matte look, as `places_of` tells; of a few mattes it is kept."""
+        """Where the pixels of a matte look, see `places_of`; kept for a few mattes."""
         with self._lock:
             found = self._places.get(id)
         if found is None:
@@ -113,7 +109,7 @@ class Cache:
         return found
 
     def forget(self, id: str) -> None:
-        """Keep nothing of a matte that is no more."""
+        """Drop everything of a matte that was deleted."""
         with self._lock:
             self._mattes.pop(id, None)
             self._places.pop(id, None)

@@ -1,9 +1,9 @@
-"""A backdrop that stands at another depth than the monitor did: the rays that the matte's pixels see.
+"""The rays that a matte's pixels see, for a backdrop at another depth than the monitor.
 
-T says where a pixel's light left the monitor, and not under which angle. With a second matte of the same object and
-camera, before a monitor at another distance, the ray through both places is known. With one, it is taken to start where
-the camera's line of sight meets the plane through the object, square to the camera's axis: which is right for what is
-thin, and off by what light moves sideways in the object for what is thick.
+T says where a pixel's light left the monitor, but not at which angle. A second matte of the same object and camera,
+with the monitor at another distance, gives the ray through both positions. With one matte, the ray is assumed to start
+where the camera's line of sight meets the plane through the object, perpendicular to the camera's axis. That is right
+for thin objects; for thick ones it is off by how far light moves sideways inside them.
 """
 
 from dataclasses import dataclass
@@ -20,24 +20,25 @@ from workflows.mattes.lobes import block_lobes
 from workflows.recovery.pyramid import Grids
 
 LOBES = 3
-"""Of a pixel, of which the heaviest counts."""
+"""Lobes of a pixel that are fitted; the heaviest is used."""
 DIRECT = 0.9
-"""Share of a pixel's light in its heaviest lobe, from which on it may see the monitor directly."""
+"""A pixel may see the monitor directly if its heaviest lobe has at least this share of its light."""
 NEAR = 0.004
-"""How far, in widths of the monitor, such a pixel may see beside the common perspective: four pixels of a thousand."""
+"""How far such a pixel may deviate from the common perspective, in widths of the monitor."""
 STRAY = 0.1
-"""How far beside the pixels about it, in widths of the monitor, a ray meets the object's plane at most."""
-LEAST = 0.02
-"""Share of the recovered pixels that must see the monitor directly, to tell the camera's perspective."""
+"""How far a ray may deviate from those around it in the object's plane, in widths of the monitor."""
+MIN_DIRECT = 0.02
+"""Share of the recovered pixels that must see the monitor directly to find the camera's perspective."""
 Places = NDArray[np.float32]
+"""(height, width, 4) float32: the heaviest lobe of every pixel, see `places_of`."""
 
 
 @dataclass(frozen=True)
 class Rays:
     """Where pixels see a backdrop at another depth.
 
-    What a pixel saw of the monitor at p, it sees of the backdrop at ``shift + scale p``, both in widths and heights of
-    the monitor from its top left; the backdrop is as large as the monitor, and its middle on the same axis.
+    A pixel that saw the monitor at p sees the backdrop at ``shift + scale p``, both in widths and heights of the
+    monitor from its top left. The backdrop has the size of the monitor, and is centred on the same axis.
 
     Attributes
     ----------
@@ -55,8 +56,8 @@ def places_of(matte: Matte, threads: int) -> Places:
     Returns
     -------
     (height, width, 4) float32
-        Its centre, in widths and heights of the monitor from the top left; its mean standard deviation, in widths; its
-        share of the light. The last is 0 where nothing was recovered.
+        Its centre, in widths and heights of the monitor from the top left; its mean standard deviation, in widths; and
+        its share of the light, which is 0 where nothing was recovered.
     """
     places = np.zeros((matte.height, matte.width, 4), np.float32)
     blocks = list(product(range(matte.block_rows), range(matte.block_columns)))
@@ -73,16 +74,16 @@ def places_of(matte: Matte, threads: int) -> Places:
 
 
 def from_two(first: Places, second: Places, distances: tuple[float, float], depth: float) -> Rays:
-    """Rays through what two mattes saw.
+    """Rays through the positions that two mattes saw.
 
     Parameters
     ----------
     first, second : (height, width, 4) float32
-        As `places_of` gives them; the first is that of the matte to be composited.
+        See `places_of`; the first is the matte to composite.
     distances : (float, float)
-        Of the monitor from the object, in each; in any unit.
+        From the object to the monitor in each of them, in any unit.
     depth : float
-        Of the backdrop, in the same unit.
+        From the object to the backdrop, in the same unit.
 
     Raises
     ------
@@ -91,9 +92,9 @@ def from_two(first: Places, second: Places, distances: tuple[float, float], dept
 
     Notes
     -----
-    Both places lie on a ray that meets the plane of the object, at distance 0, in ``(d2 p1 - d1 p2) / (d2 - d1)``.
-    Where that is far from where the pixels about look through, the two saw different light (a reflection, say, that
-    misses the farther monitor), and what those pixels share stands in: an affine map of the frame.
+    The ray through both positions meets the plane of the object, at distance 0, in ``(d2 p1 - d1 p2) / (d2 - d1)``.
+    Where that is far from the rays of other pixels, the two mattes saw different light, such as a reflection that
+    misses the farther monitor. An affine map of the frame, fitted to the other pixels, is then used instead.
     """
     near, far = distances
     through = (far * first[..., :2] - near * second[..., :2]) / np.float32(far - near)
@@ -101,7 +102,7 @@ def from_two(first: Places, second: Places, distances: tuple[float, float], dept
     frame = np.stack([x, y, np.ones_like(x)], axis=2)
     fits = (first[..., 3] > 0) & (second[..., 3] > 0)
     if np.count_nonzero(fits) < 16:
-        raise Conflict("too few pixels were recovered in both mattes to tell their rays")
+        raise Conflict("too few pixels were recovered in both mattes to find their rays")
     for _ in range(10):
         common = frame @ np.linalg.lstsq(frame[fits], through[fits], rcond=None)[0]
         off = np.hypot(*np.moveaxis(through - common, 2, 0))
@@ -111,26 +112,26 @@ def from_two(first: Places, second: Places, distances: tuple[float, float], dept
 
 
 def from_one(places: Places, aspect: float, distance: float, camera: float, depth: float) -> Rays:
-    """Rays that leave the plane of the object where the camera's lines of sight meet it.
+    """Rays through the points where the camera's lines of sight meet the plane of the object.
 
     Parameters
     ----------
     places : (height, width, 4) float32
-        As `places_of` gives them.
+        See `places_of`.
     aspect : float
         Height of the monitor as a share of its width.
     distance, camera, depth : float
-        From the object to the monitor, to the camera and to the backdrop; in one unit.
+        From the object to the monitor, to the camera and to the backdrop, in one unit.
 
     Raises
     ------
     Conflict
-        If too few pixels see the monitor directly to tell where the camera looks.
+        If too few pixels see the monitor directly to find the camera's perspective.
 
     Notes
     -----
-    The camera's perspective is the homography between its pixels and the places of the monitor that they see beside the
-    object; the foot of the camera on the monitor is taken to be in the middle of the frame.
+    The camera's perspective is the homography between its pixels and the positions on the monitor that they see beside
+    the object. The camera's axis is assumed to pass through the middle of the frame.
     """
     sight = _perspective(places, aspect)
     height, width = sight.shape[:2]
@@ -140,7 +141,7 @@ def from_one(places: Places, aspect: float, distance: float, camera: float, dept
 
 
 def _through(place: NDArray[np.floating], away: float) -> Rays:
-    """Rays through places (height, width, 2) of the object's plane, to so many times the monitor's distance."""
+    """Rays through positions ``place`` of the object's plane, to ``away`` times the monitor's distance."""
     return Rays((place * (1 - away)).astype(np.float32), away)
 
 
@@ -152,14 +153,14 @@ def _perspective(places: Places, aspect: float) -> NDArray[np.float32]:
     seen = places[..., :2].astype(np.float64)
     sharp = places[..., 3] > DIRECT
     candidates = sharp & (places[..., 2] < 2 * np.median(places[..., 2][sharp])) if sharp.any() else sharp
-    # Beside the object is where the frame ends, to begin with; then wherever the same perspective is seen.
+    # Start with the pixels at the edge of the frame, then add all that fit the same perspective.
     fits = candidates & (np.maximum(np.abs(across), np.abs(down)) > 0.9)
-    least = max(LEAST * np.count_nonzero(places[..., 3]), 16)
+    least = max(MIN_DIRECT * np.count_nonzero(places[..., 3]), 16)
     for _ in range(10):
         if np.count_nonzero(fits) < least:
             raise Conflict(
-                "too little of the monitor is seen directly beside the object to tell where the camera looks: film it "
-                "with some of the bare monitor in the frame and no mask, or give a second matte at another distance"
+                "too little of the monitor is seen directly beside the object to find the camera's perspective: film "
+                "it with some of the bare monitor in the frame and no mask, or give a second matte at another distance"
             )
         h = _homography(across[fits], down[fits], seen[fits])
         scale = h[2, 0] * across + h[2, 1] * down + h[2, 2]
@@ -176,7 +177,7 @@ def _perspective(places: Places, aspect: float) -> NDArray[np.float32]:
 def _homography(
     x: NDArray[np.float64], y: NDArray[np.float64], seen: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The (3, 3) homography that takes (x, y, 1) to ``seen`` (n, 2), its last entry 1, by linear least squares."""
+    """The (3, 3) homography from (x, y, 1) to ``seen`` (n, 2), by linear least squares; its last entry is 1."""
     u, v = seen.T
     one, zero = np.ones_like(x), np.zeros_like(x)
     rows = np.concatenate(
@@ -201,26 +202,27 @@ def arrived_along(
     scale: float,
     arrived: NDArray[np.float32],
 ) -> None:
-    """T L of a strip, of a backdrop at another depth.
+    """Compute T L of a strip for a backdrop at another depth.
 
     Parameters
     ----------
     count, shared, cell, weight
-        Of the strip.
+        Arrays of the strip.
     light : (nodes + 1, 3) float32
-        Of the backdrop, as if it stood where the monitor did.
+        Light of the backdrop as if it stood where the monitor did.
     grids : Grids
-        Of the pyramid.
+        Grids of the pyramid.
     shift : (h, w, 2) float32
-        Of `Rays`, for the strip's pixels.
+        `Rays.shift` of the strip's pixels.
     scale : float
+        `Rays.scale`.
     arrived : (h, w, 3) float32
-        Written.
+        Output.
 
     Notes
     -----
-    A node that is seen larger by ``scale`` is looked up as much coarser: between two grids, and between the nodes of
-    each.
+    A node that appears larger by ``scale`` is looked up on a coarser level, interpolating between two grids and between
+    the nodes of each.
     """
     columns, rows, starts = grids
     entry, levels = 0, len(columns)
@@ -263,7 +265,7 @@ def _look_up(
     share: float,
     seen: NDArray[np.float32],
 ) -> None:
-    """Add a share of the light between the nodes of a grid."""
+    """Add a share of the light at a point of a grid, interpolated between its nodes."""
     columns, rows, starts = grids
     wide, high, first = columns[level], rows[level], starts[level]
     x = min(max(u * columns[0] / 2.0**level - 0.5, 0.0), wide - 1.0)

@@ -1,4 +1,4 @@
-"""C = S + X (rho T L) (eq. 5, and the crosstalk X between the monitor's and the camera's channels), strip by strip."""
+"""Composite C = S + X (rho T L), strip by strip: eq. 5 with X, the crosstalk from monitor to camera channels."""
 
 from collections.abc import Callable
 from itertools import product
@@ -35,20 +35,20 @@ class Window(NamedTuple):
         width: int | None = None,
         height: int | None = None,
     ) -> "Window":
-        """One that lies in a matte; what is left out of its size reaches to the edge.
+        """A window of a matte; by default its size reaches to the edge.
 
         Raises
         ------
         OptionError
-            If it does not lie in it.
+            If it does not lie inside the matte.
         """
         width = matte.width - x if width is None else width
         height = matte.height - y if height is None else height
         for name, at, size, most in (("x", x, width, matte.width), ("y", y, height, matte.height)):
             if at < 0 or size < 1 or at + size > most:
                 raise OptionError(
-                    f"a crop from {name} = {at} on, {size} pixels long, does not lie in the matte, which has "
-                    f"{matte.width} x {matte.height}",
+                    f"a crop from {name} = {at}, {size} pixels long, does not lie inside the matte of "
+                    f"{matte.width} x {matte.height} pixels",
                     field=name,
                     limit=most,
                 )
@@ -63,33 +63,33 @@ def compose(
     threads: int,
     rays: Rays | None = None,
 ) -> NDArray[np.float32]:
-    """Put a window of a matte before a backdrop.
+    """Composite a window of a matte over a backdrop.
 
     Parameters
     ----------
     matte : Matte
     light : (nodes + 1, 3) float32
-        As `node_light` makes it.
+        See `node_light`.
     window : Window
     read : callable
-        Returns a strip by its block row and its number in it, as `read_strip` does.
+        Returns a strip by its block row and its number in the row, as `read_strip` does.
     threads : int
-        To share the work.
+        Threads to use.
     rays : Rays, optional
-        Of a backdrop at another depth than the monitor's.
+        For a backdrop at another depth than the monitor.
 
     Returns
     -------
-    (window's height, width, 4) float32
-        Linear light, and in the last channel 1 where the pixel was recovered; 0 in all of them where it was not.
+    (height, width, 4) float32
+        Linear light and alpha, of the window's size. Alpha is 1 where the pixel was recovered; elsewhere all is 0.
 
     Raises
     ------
     Corrupt
-        If `read` does.
+        If ``read`` raises it.
     """
     pyramid = Pyramid.over(matte.columns, matte.rows)
-    assert light.shape == (pyramid.nodes + 1, 3)  # which compiled code reads without looking
+    assert light.shape == (pyramid.nodes + 1, 3)  # compiled code does not check bounds
     picture = np.zeros((window.height, window.width, 4), np.float32)
     crosstalk = np.array(matte.attributes["crosstalk"], np.float32)
     grids = pyramid.arrays
@@ -138,7 +138,7 @@ def _seen_along(
     shift: NDArray[np.float32],
     scale: float,
 ) -> NDArray[np.float32]:
-    """A strip before a backdrop at another depth."""
+    """Composite a strip over a backdrop at another depth."""
     arrived = np.empty_like(strip.S)
     arrived_along(strip.count, strip.shared, strip.cell, strip.weight, light, grids, shift, scale, arrived)
     alpha = strip.recovered[..., np.newaxis]
@@ -160,7 +160,7 @@ def _compose(
     left: int,
     picture: NDArray[np.float32],
 ) -> None:
-    """Composite a strip, whose first pixel is at (top, left) of the picture, as far as it lies in it."""
+    """Composite the part of a strip that lies in the picture; its first pixel is at (top, left)."""
     height, width, _ = picture.shape
     entry = np.intp(0)
     for y in range(recovered.shape[0]):
@@ -187,12 +187,12 @@ def _compose(
 
 
 def shrink(picture: NDArray[np.float32], size: int) -> NDArray[np.float32]:
-    """A picture whose longer side has no more than some pixels, of which each is the mean over it.
+    """Shrink a picture by averaging, so that its longer side has at most ``size`` pixels.
 
     Parameters
     ----------
     picture : (h, w, 4) float32
-        Linear light, and alpha: what has none counts for nothing.
+        Linear light and alpha. Transparent pixels have no weight.
     size : int
     """
     height, width, _ = picture.shape

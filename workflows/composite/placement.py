@@ -1,4 +1,4 @@
-"""A backdrop that is moved, scaled and turned before the monitor's place."""
+"""A backdrop that is moved, scaled and turned in the plane of the monitor."""
 
 import math
 from dataclasses import dataclass
@@ -15,11 +15,11 @@ class Placement:
     Attributes
     ----------
     right, down : float
-        By how much its centre is moved, in widths and heights of the monitor.
+        Displacement of its centre, in widths and heights of the monitor.
     scale : float
-        By how much it is larger.
+        Factor by which it is enlarged.
     angle : float
-        By how much it is turned about its centre, in degrees, clockwise.
+        Rotation about its centre, in degrees, clockwise.
     """
 
     right: float = 0.0
@@ -30,21 +30,21 @@ class Placement:
     def matrix(
         self, cells: tuple[int, int], monitor: tuple[int, int], image: tuple[int, int]
     ) -> NDArray[np.float64]:
-        """Takes places on the grid of cells to places in the backdrop.
+        """The affine map from the grid of cells to the backdrop.
 
         Parameters
         ----------
         cells : (int, int)
             Columns and rows of the grid over the monitor.
         monitor : (int, int)
-            Its width and height, in square pixels: what is turned keeps its shape on it.
+            Width and height in square pixels: a rotation keeps shapes.
         image : (int, int)
             Width and height of the backdrop.
 
         Returns
         -------
         (2, 3) float64
-            Of (x, y, 1) in cells, from the top left of the grid, to (x, y) in pixels from the top left of the backdrop.
+            Maps (x, y, 1) in cells from the top left of the grid to (x, y) in pixels from the top left of the backdrop.
         """
         columns, rows = cells
         wide, high = monitor
@@ -73,22 +73,22 @@ def place(
     stop: int,
     cells: NDArray[np.float32],
 ) -> None:
-    """Sample a picture over some rows of a grid, four places a cell, between its pixels; beyond it is black.
+    """Sample a picture bilinearly over some rows of a grid, at four points a cell; outside of it is black.
 
     Parameters
     ----------
     image : (h, w, 3) float32
-        What the cells see of the picture, of pixels no smaller than cells, about.
+        The part of the picture that the cells see, with pixels of about the size of a cell or larger.
     size : (int, int)
         Height and width of the picture.
     corner : (int, int)
-        Its row and column that the image begins with.
+        Row and column of the picture at which the image begins.
     matrix : (2, 3) float64
         From cells to pixels of the picture.
     start, stop : int
-        Rows of the grid.
+        Rows of the grid to compute.
     cells : (rows, columns, 3) float32
-        Written between `start` and `stop`.
+        Rows from ``start`` up to ``stop`` are written.
     """
     height, width = size
     top, left = corner

@@ -1,4 +1,4 @@
-"""Composites as integers: rounded exactly as the tone curve says, without a power a pixel."""
+"""Convert composites to integers: exactly rounded under the tone curve, without computing a power for each pixel."""
 
 from functools import cache
 from typing import Literal
@@ -12,7 +12,7 @@ from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import to_light
 
 STEPS = 1 << 14
-"""Places of the look-up that leads close to a code."""
+"""Entries of the look-up table that gives a code close to the right one."""
 ROWS = 64
 
 
@@ -22,23 +22,23 @@ def encode(
     dtype: np.dtype[np.unsignedinteger],
     threads: int,
 ) -> Codes:
-    """A picture as unsigned integers: clipped to 0 to 1, encoded, rounded.
+    """Encode a picture as unsigned integers, clipped to 0 to 1 and rounded.
 
     Parameters
     ----------
     picture : (h, w, 4) float32
-        Linear light, and alpha.
+        Linear light and alpha.
     transfer : str
-        How light is encoded; alpha never is.
+        Tone curve of the colours; alpha is linear.
     dtype : numpy.dtype
         uint8 or uint16.
     threads : int
-        To share the work.
+        Threads to use.
 
     Returns
     -------
     (h, w, 3 or 4) uint8 or uint16
-        Without alpha where it is 1 everywhere.
+        Without alpha if it is 1 everywhere.
     """
     edges, first = _edges(transfer, dtype)
     channels = 3 if (picture[..., 3] == 1).all() else 4
@@ -55,7 +55,7 @@ def encode(
 def _edges(
     transfer: Literal["srgb", "linear"], dtype: np.dtype[np.unsignedinteger]
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """The light at which each code ends and the next begins, and the code at each of `STEPS` + 1 places."""
+    """The light at which each code ends and the next begins, and the code at each of `STEPS` + 1 values of light."""
     top = np.iinfo(dtype).max
     halves = (np.arange(top, dtype=np.float64) + 0.5) / top
     edges = np.append(to_light(halves, transfer), np.inf).astype(np.float32)  # type: ignore[arg-type]
@@ -75,7 +75,7 @@ def _encode(
         for x in range(width):
             for c in range(3):
                 value = picture[y, x, c]
-                if not value > 0:  # no number either
+                if not value > 0:  # NaN as well
                     codes[y, x, c] = 0
                 elif value >= 1:
                     codes[y, x, c] = top

@@ -1,4 +1,4 @@
-"""A matte as it is composited: blocks side by side in one piece, as each call of a kernel costs some microseconds."""
+"""Strips of a matte: blocks side by side in one piece, because each call of a kernel costs some microseconds."""
 
 from collections.abc import Set
 from dataclasses import dataclass, fields
@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from storage.layout.mattes import Block, Matte
 
 LENGTH = 256
-"""Pixels of a strip from left to right; the last one of a row may have fewer."""
+"""Width of a strip in pixels; the last one of a row may have fewer."""
 Blocks = Set[tuple[int, int]]
-"""Block rows and block columns."""
+"""Pairs of block row and block column."""
 
 
 @dataclass(frozen=True)
 class Strip:
-    """Blocks of a block row, up to `LENGTH` pixels of it; h x w pixels.
+    """Blocks of a block row, h x w pixels, up to `LENGTH` wide.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Strip:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of its arrays."""
+        """Size of its arrays."""
         return sum(getattr(self, field.name).nbytes for field in fields(self))
 
 
@@ -57,9 +57,9 @@ def read_strip(matte: Matte, row: int, number: int, there: Blocks | None = None)
     ----------
     matte : Matte
     row, number : int
-        Its block row, and which one it is in it.
+        Its block row, and its number in that row.
     there : set of (int, int), optional
-        The blocks that a matte in the making has; what is not among them counts as not recovered.
+        The blocks that exist of an unfinished matte; all others count as not recovered.
 
     Raises
     ------
@@ -67,14 +67,16 @@ def read_strip(matte: Matte, row: int, number: int, there: Blocks | None = None)
         If a block is missing.
     """
     blocks = [
-        matte.read(row, column) if there is None or (row, column) in there else _nothing(matte, row, column)
+        matte.read(row, column)
+        if there is None or (row, column) in there
+        else _empty_block(matte, row, column)
         for column in columns_of(matte, number)
     ]
 
     def side_by_side(name: str) -> NDArray[Any]:
         return np.concatenate([getattr(block, name) for block in blocks], axis=1)
 
-    # A block's entries come row of pixels by row of pixels, and so do the strip's.
+    # Entries of blocks, and of the strip, are in the order of the rows of pixels.
     ends = [block.count.sum(axis=(1, 2)).cumsum()[:-1] for block in blocks]
 
     def in_rows(name: str) -> NDArray[Any]:
@@ -92,7 +94,7 @@ def read_strip(matte: Matte, row: int, number: int, there: Blocks | None = None)
     )
 
 
-def _nothing(matte: Matte, row: int, column: int) -> Block:
+def _empty_block(matte: Matte, row: int, column: int) -> Block:
     height, width = (span.stop - span.start for span in matte.span(row, column))
     zero, no = np.zeros((height, width, 3), np.float32), np.zeros((height, width), bool)
     count = np.zeros((height, width, 3), np.uint32)

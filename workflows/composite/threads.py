@@ -1,4 +1,4 @@
-"""Threads of this process, for work that releases the interpreter: numba's own may not be used by several callers."""
+"""Threads for work that releases the interpreter lock. Numba's own threads don't support several callers."""
 
 import os
 from collections.abc import Callable, Iterable
@@ -9,9 +9,9 @@ CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os
 
 
 def in_parts(work: Callable[[int], None], parts: Iterable[int], threads: int) -> None:
-    """Do all parts of a work, each by whichever thread is free; with one thread, here.
+    """Call ``work`` with each of ``parts`` on several threads; with one thread, on the calling one.
 
-    Raises what a part raises, when no other of this work is under way any more.
+    An error of a part is raised once all parts under way have ended.
     """
     todo = list(parts)
     if threads == 1 or len(todo) == 1:
@@ -20,15 +20,15 @@ def in_parts(work: Callable[[int], None], parts: Iterable[int], threads: int) ->
         return
     following = iter(todo)  # `next` of a list's iterator is atomic
 
-    def go_on() -> None:
+    def work_on() -> None:
         for part in following:
             work(part)
 
-    futures = [_pool().submit(go_on) for _ in range(min(threads, len(todo)) - 1)]
+    futures = [_pool().submit(work_on) for _ in range(min(threads, len(todo)) - 1)]
     try:
-        go_on()
+        work_on()
     finally:
-        for _ in following:  # after an error nobody takes another
+        for _ in following:  # after an error, take no further parts
             pass
         under_way = [future for future in futures if not future.cancel()]
         wait(under_way)

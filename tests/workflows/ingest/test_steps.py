@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import tifffile
 from numpy.typing import NDArray
+from PIL import Image
 
 from storage.errors import CaptureError, Corrupt, OverLimit
 from storage.layout.captures import Stack
@@ -21,7 +22,7 @@ from tests.parts.captures import nested_program
 from tests.workflows.ingest import peak
 from tests.workflows.ingest.records import record
 from workflows.images.integer_formats import encode_png
-from workflows.ingest import steps as ingest_steps
+from workflows.ingest import steps
 from workflows.jobs import Task
 from workflows.recovery.noise import Noise
 from workflows.simulation.glass_ball import glass_ball
@@ -47,7 +48,7 @@ def shots(count: int, channels: int, dtype: str) -> NDArray[Any]:
     return np.random.default_rng(3).integers(0, top, (count, HEIGHT, WIDTH, channels), dtype, endpoint=True)
 
 
-def bundle_of(
+def archive_of(
     make_zip: Zip, stack: NDArray[Any], patterns: list[int], suffix: str = "png", **more: Any
 ) -> bytes:
     encode = tiff if suffix == "tif" else encode_png
@@ -71,7 +72,7 @@ def test_the_stack_holds_the_very_values(
     mask = np.random.default_rng(4).random((HEIGHT, WIDTH)) < 0.6
     files = {"mask.png": encode_png((mask * 7).astype(np.uint8)[..., None])}
     stack = ingest(
-        "c", bundle_of(make_zip, values, PATTERNS, suffix, mask="mask.png", files=files), memory=memory
+        "c", archive_of(make_zip, values, PATTERNS, suffix, mask="mask.png", files=files), memory=memory
     )
     assert stack.dtype == dtype
     np.testing.assert_array_equal(stack.read(), values)
@@ -111,7 +112,7 @@ def test_patterns_that_are_large_images_are_refused(make_zip: Zip, ingest: Inges
 def test_slabs_in_any_order_and_again_are_the_same_bytes(
     make_zip: Zip, ingest: Ingest, digests: Digests
 ) -> None:
-    data = bundle_of(make_zip, shots(len(PATTERNS), 3, "uint16"), PATTERNS)
+    data = archive_of(make_zip, shots(len(PATTERNS), 3, "uint16"), PATTERNS)
     memory = 6 * HEIGHT * WIDTH * 3 * 2  # slabs of three frames
     ingest("c", data, memory=memory)
     plain = digests("captures/c")
@@ -127,7 +128,7 @@ def test_slabs_in_any_order_and_again_are_the_same_bytes(
 
 
 def test_a_slab_left_out_is_corrupt(make_zip: Zip, ingest: Ingest) -> None:
-    data = bundle_of(make_zip, shots(len(PATTERNS), 3, "uint16"), PATTERNS)
+    data = archive_of(make_zip, shots(len(PATTERNS), 3, "uint16"), PATTERNS)
     with pytest.raises(Corrupt, match=r"frames/c/\d/0/0/0 is missing"):
         ingest("c", data, memory=6 * HEIGHT * WIDTH * 6, order=lambda slabs: iter(slabs[1:]))
 
@@ -142,7 +143,7 @@ def test_a_slab_left_out_is_corrupt(make_zip: Zip, ingest: Ingest) -> None:
     ],
 )
 def test_a_frame_unlike_the_first_is_refused(make_zip: Zip, ingest: Ingest, odd: NDArray[Any]) -> None:
-    data = bundle_of(make_zip, shots(5, 3, "uint8"), [0, 1, 2, 3, 4, 5], files={"5.png": encode_png(odd)})
+    data = archive_of(make_zip, shots(5, 3, "uint8"), [0, 1, 2, 3, 4, 5], files={"5.png": encode_png(odd)})
     with pytest.raises(CaptureError, match="one size and kind") as caught:
         ingest("c", data)
     assert caught.value.fields == {"entry": "5.png"}
@@ -153,7 +154,7 @@ def test_a_frame_unlike_the_first_is_refused(make_zip: Zip, ingest: Ingest, odd:
 def test_a_frame_that_can_not_be_decoded_is_refused(
     make_zip: Zip, ingest: Ingest, at: int, data: bytes
 ) -> None:
-    given = bundle_of(make_zip, shots(6, 3, "uint8"), [0, 1, 2, 3, 4, 5], files={f"{at}.png": data})
+    given = archive_of(make_zip, shots(6, 3, "uint8"), [0, 1, 2, 3, 4, 5], files={f"{at}.png": data})
     with pytest.raises(CaptureError, match=rf"^{at}\.png: ") as caught:
         ingest("c", given)
     assert caught.value.fields["entry"] == f"{at}.png"
@@ -161,7 +162,7 @@ def test_a_frame_that_can_not_be_decoded_is_refused(
 
 def test_a_mask_of_another_size_is_refused(make_zip: Zip, ingest: Ingest) -> None:
     files = {"mask.png": encode_png(np.zeros((WIDTH, HEIGHT, 1), np.uint8))}
-    data = bundle_of(make_zip, shots(6, 3, "uint8"), list(range(6)), mask="mask.png", files=files)
+    data = archive_of(make_zip, shots(6, 3, "uint8"), list(range(6)), mask="mask.png", files=files)
     with pytest.raises(CaptureError, match="the frames are 37 x 21") as caught:
         ingest("c", data)
     assert caught.value.fields == {"entry": "mask.png"}
@@ -173,7 +174,7 @@ def test_a_frame_larger_than_a_quarter_of_the_memory_is_refused(
 ) -> None:
     flat = np.full((6, 100, 100, 3), 9, dtype)
     size = flat[0].nbytes
-    data = bundle_of(make_zip, flat, list(range(6)))
+    data = archive_of(make_zip, flat, list(range(6)))
     ingest("c", data, memory=4 * size)
     with pytest.raises(CaptureError, match="100 x 100 pixels") as caught:
         ingest("c", data, memory=4 * (size - 1))
@@ -211,7 +212,7 @@ def test_an_unknown_response_is_estimated(
                 given["program"]["parts"][0]["levels"] = levels
                 data = json.dumps(given).encode()
             elif camera == "unknown":
-                value = ingest_steps.integer_formats.decode(data, memory=1 << 24) / 65535
+                value = steps.integer_formats.decode(data, memory=1 << 24) / 65535
                 data = encode_png(np.rint(value ** (1 / 2.2) * 65535).astype(np.uint16))
             out.writestr(name, data)
     attributes = ingest("c", changed.getvalue()).attributes
@@ -249,13 +250,13 @@ def test_a_stack_that_takes_more_than_is_allowed_is_refused(make_zip: Zip, inges
 def test_frames_of_more_pixels_than_are_allowed_are_refused(
     make_zip: Zip, put: Put, objects: Objects
 ) -> None:
-    put("c", bundle_of(make_zip, shots(6, 3, "uint8"), list(range(6))))
+    put("c", archive_of(make_zip, shots(6, 3, "uint8"), list(range(6))))
     most = HEIGHT * WIDTH
     task = Task("j", "c", "", {}, Limits(1 << 30, 1 << 26, pixels=most))
-    assert ingest_steps.prepare(objects, task)["tiles"] >= 1
+    assert steps.prepare(objects, task)["tiles"] >= 1
     task = replace(task, limits=Limits(1 << 30, 1 << 26, pixels=most - 1))
     with pytest.raises(OverLimit, match=f"a frame may have {most - 1} pixels") as caught:
-        ingest_steps.prepare(objects, task)
+        steps.prepare(objects, task)
     assert {"name": "capture_pixels", "limit": most - 1, "value": most}.items() <= caught.value.fields.items()
 
 
@@ -265,7 +266,7 @@ def test_a_stack_larger_than_the_memory_is_ingested_within_it(
 ) -> None:
     memory, count = 128 << 20, 100
     patterns = [n % 6 for n in range(count)]
-    put("small", bundle_of(make_zip, shots(6, 3, "uint8"), list(range(6))))
+    put("small", archive_of(make_zip, shots(6, 3, "uint8"), list(range(6))))
     y, x = np.mgrid[:980, :1440]
     smooth = np.stack([x // 4, y // 3, (x + y) // 8], axis=2).astype(np.uint8)
     files = {f"{n}.png": encode_png(smooth + np.uint8(n % 6)) for n in range(6)}
@@ -279,3 +280,39 @@ def test_a_stack_larger_than_the_memory_is_ingested_within_it(
     assert tiles > 4
     assert memory // 3 < grown <= memory
     assert Stack(objects, "large").frames == count
+
+
+def turned_png(orientation: int, pixels: NDArray[np.uint8]) -> bytes:
+    exif = Image.Exif()
+    exif[274] = orientation
+    target = io.BytesIO()
+    Image.fromarray(pixels).save(target, "PNG", exif=exif)
+    return target.getvalue()
+
+
+def test_all_frames_get_the_orientation_of_the_first(make_zip: Zip, ingest: Ingest) -> None:
+    """A camera that looks down on a table may write another orientation from frame to frame."""
+    frames = np.random.default_rng(5).integers(0, 256, (6, 20, 30, 3), np.uint8)
+    files = {f"{n}.png": turned_png(turn, frames[n]) for n, turn in enumerate((6, 6, 1, 3, 6, 8))}
+    mask = np.zeros((30, 20, 1), np.uint8)  # drawn over a frame as it is shown
+    mask[5:25, 5:15] = 255
+    stack = ingest(
+        "c",
+        make_zip(record(list(range(6)), mask="mask.png"), files | {"mask.png": encode_png(mask)}),
+    )
+    assert (stack.width, stack.height) == (20, 30)
+    np.testing.assert_array_equal(stack.read(), np.rot90(frames, 3, axes=(1, 2)))
+    assert stack.attributes["orientation"] == 6
+
+
+def test_a_mask_of_frames_before_rotation_is_refused(make_zip: Zip, ingest: Ingest) -> None:
+    shot = np.zeros((20, 30, 3), np.uint8)
+    files = {f"{n}.png": turned_png(6, shot) for n in range(6)}
+    with pytest.raises(CaptureError, match="turned upright as the first of them says"):
+        ingest(
+            "c",
+            make_zip(
+                record(list(range(6)), mask="mask.png"),
+                files | {"mask.png": encode_png(shot)},
+            ),
+        )

@@ -1,4 +1,4 @@
-"""Pictures that say how they are to be turned come out upright, as every viewer shows them."""
+"""Pictures of every format are decoded upright, as their orientation says."""
 
 import io
 from collections.abc import Callable
@@ -10,9 +10,7 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image, ImageCms, ImageOps
 
-from storage.errors import CaptureError
 from storage.layout.captures import Stack
-from tests.workflows.ingest.records import record
 from workflows.images import camera_raw, decode, float_formats, integer_formats
 
 MEMORY = 1 << 20
@@ -93,33 +91,3 @@ def test_camera_raw(make_dng: Callable[..., bytes], turn: int, quarters: int) ->
     assert camera_raw.orientation(data) == turn
     upright = camera_raw.decode(data, memory=MEMORY)
     np.testing.assert_array_equal(upright, np.rot90(camera_raw.decode(data, memory=MEMORY, turn=1), quarters))
-
-
-def test_all_frames_are_turned_as_the_first_one_is(make_zip: Zip, ingest: Ingest) -> None:
-    """A camera that looks down on a table may write another orientation from frame to frame."""
-    shots = np.random.default_rng(5).integers(0, 256, (6, 20, 30, 3), np.uint8)
-    files = {f"{n}.png": saved("PNG", turn, shots[n]) for n, turn in enumerate((6, 6, 1, 3, 6, 8))}
-    mask = np.zeros((30, 20, 1), np.uint8)  # drawn over a frame as it is shown
-    mask[5:25, 5:15] = 255
-    stack = ingest(
-        "c",
-        make_zip(
-            record(list(range(6)), mask="mask.png"), files | {"mask.png": integer_formats.encode_png(mask)}
-        ),
-    )
-    assert (stack.width, stack.height) == (20, 30)
-    np.testing.assert_array_equal(stack.read(), np.rot90(shots, 3, axes=(1, 2)))
-    assert stack.attributes["orientation"] == 6
-
-
-def test_a_mask_that_is_not_turned_with_the_frames_is_told(make_zip: Zip, ingest: Ingest) -> None:
-    shot = np.zeros((20, 30, 3), np.uint8)
-    files = {f"{n}.png": saved("PNG", 6, shot) for n in range(6)}
-    with pytest.raises(CaptureError, match="turned upright as the first of them says"):
-        ingest(
-            "c",
-            make_zip(
-                record(list(range(6)), mask="mask.png"),
-                files | {"mask.png": integer_formats.encode_png(shot)},
-            ),
-        )
