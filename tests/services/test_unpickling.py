@@ -1,4 +1,4 @@
-"""Nothing here unpickles what it reads: a look at every line, for what does cannot be told by trying."""
+"""No code here unpickles what it reads. Checked in the source, because no test input could show it."""
 
 import ast
 from collections.abc import Iterator
@@ -40,7 +40,7 @@ def unpickling(code: str) -> Iterator[int]:
             case ast.Call(func=ast.Attribute(value=ast.Name(id="np" | "numpy"), attr="load")):
                 if "allow_pickle" not in {word.arg for word in node.keywords}:
                     yield node.lineno
-            # A socket's is told how much: without that it is one of multiprocessing's, which unpickles.
+            # A socket's recv takes a size; without one it is multiprocessing's, which unpickles.
             case ast.Call(func=ast.Attribute(attr="recv"), args=[], keywords=[]):
                 yield node.lineno
             case ast.Constant(value=str(text)) if is_pickle(text) and text.isidentifier():

@@ -40,7 +40,7 @@ if __name__ == "__main__":
     (high, wide, channels), kind = json.loads(sys.argv[1])
     _light(np.full((300, 400, channels), 100, kind))
     large = np.full((high, wide, channels), 100, kind)
-    # Begin anew: compiling, where the kernels were in no cache, took more than what is to be found.
+    # Reset the peak: compiling uncached kernels takes more memory than what is measured.
     Path("/proc/self/clear_refs").write_text("5")
     before = peak()
     _light(large)

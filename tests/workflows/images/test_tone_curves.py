@@ -75,7 +75,7 @@ def stored(levels: np.ndarray, monitor: Curve, camera_gamma: float, noise: float
 LEVELS = np.linspace(0, 1, 9, dtype=np.float32)
 
 
-def told(
+def estimated(
     levels: np.ndarray,
     values: np.ndarray,
     monitor: Response,
@@ -90,7 +90,7 @@ def told(
 
 @pytest.mark.parametrize("gamma", [0.8, 1.5, 1.8, 2.4])
 def test_the_cameras_gamma_is_found(gamma: float) -> None:
-    found = told(LEVELS, stored(LEVELS, "srgb", gamma), "srgb", "unknown")
+    found = estimated(LEVELS, stored(LEVELS, "srgb", gamma), "srgb", "unknown")
     assert found.monitor == "srgb"
     assert isinstance(found.camera, Gamma)
     assert found.camera.gamma == pytest.approx(gamma, abs=0.05)
@@ -102,20 +102,20 @@ def test_the_cameras_gamma_is_found(gamma: float) -> None:
 def test_the_cameras_curve_is_recognised(curve: Literal["linear", "srgb"], bits: int) -> None:
     light = stored(LEVELS, "srgb", 1.0)
     values = np.rint(from_light(light, curve) * (2**bits - 1)) / np.float32(2**bits - 1)
-    assert told(LEVELS, values, "srgb", "unknown") == ("srgb", curve, ())
+    assert estimated(LEVELS, values, "srgb", "unknown") == ("srgb", curve, ())
 
 
 @pytest.mark.parametrize("gamma", [1.4, 1.8, 2.6])
 def test_the_monitors_gamma_is_found(gamma: float) -> None:
     values = stored(LEVELS, Gamma(gamma=gamma), 2.2)
-    found = told(LEVELS, values, "unknown", Gamma(gamma=2.2))
+    found = estimated(LEVELS, values, "unknown", Gamma(gamma=2.2))
     assert found.camera == Gamma(gamma=2.2)
     assert isinstance(found.monitor, Gamma)
     assert found.monitor.gamma == pytest.approx(gamma, abs=0.05)
 
 
 @pytest.mark.parametrize(
-    ("levels", "said", "found"),
+    ("levels", "declared", "found"),
     [
         (LEVELS, ("unknown", "unknown"), ("srgb", "srgb", ("camera", "monitor"))),
         (f32(0, 1), ("linear", "unknown"), ("linear", "srgb", ("camera",))),
@@ -124,10 +124,10 @@ def test_the_monitors_gamma_is_found(gamma: float) -> None:
         (LEVELS, (Gamma(gamma=1.7), "linear"), (Gamma(gamma=1.7), "linear", ())),
     ],
 )
-def test_what_can_not_be_told_is_srgb_and_what_is_known_stays(
-    levels: np.ndarray, said: tuple[Response, Response], found: tuple[Curve, Curve, tuple[str, ...]]
+def test_unknown_curves_are_assumed_srgb_and_known_ones_stay(
+    levels: np.ndarray, declared: tuple[Response, Response], found: tuple[Curve, Curve, tuple[str, ...]]
 ) -> None:
-    assert told(levels, stored(levels, "linear", 1.5), *said) == found
+    assert estimated(levels, stored(levels, "linear", 1.5), *declared) == found
 
 
 @pytest.mark.parametrize(("camera", "gamma"), [("srgb", 2.2), ("linear", 1.6), (2.6, 1.8)])
@@ -138,7 +138,7 @@ def test_exposures_tell_both_curves(camera: Literal["linear", "srgb"] | float, g
     light = exposures[:, None] * (S + rho * to_light(levels, Gamma(gamma=gamma)).astype(np.float64)[:, None])
     light = np.clip(light + rng.normal(0, 0.001, light.shape), 0, 1).astype(np.float32)
     values = from_light(light, camera) if isinstance(camera, str) else light ** np.float32(1 / camera)
-    found = told(levels, values, "unknown", "unknown", exposures)
+    found = estimated(levels, values, "unknown", "unknown", exposures)
     assert found.assumed == ()
     assert isinstance(found.monitor, Gamma)
     assert found.monitor.gamma == pytest.approx(gamma, abs=0.05)
@@ -154,17 +154,17 @@ def test_two_levels_at_two_exposures_tell_the_camera() -> None:
     rng = np.random.default_rng(5)
     light = exposures[:, None] * (0.05 + 0.4 * levels[:, None] * rng.uniform(0.2, 1, 500))
     values = from_light(light.astype(np.float32), "srgb")
-    assert told(levels, values, "unknown", "unknown", exposures) == ("srgb", "srgb", ("monitor",))
+    assert estimated(levels, values, "unknown", "unknown", exposures) == ("srgb", "srgb", ("monitor",))
 
 
 def test_no_usable_pixel_is_srgb() -> None:
-    assert told(LEVELS, np.zeros((9, 0), np.float32), "linear", "unknown").camera == "srgb"
-    assert told(LEVELS, np.zeros((9, 50), np.float32), "linear", "unknown").camera == "srgb"
+    assert estimated(LEVELS, np.zeros((9, 0), np.float32), "linear", "unknown").camera == "srgb"
+    assert estimated(LEVELS, np.zeros((9, 50), np.float32), "linear", "unknown").camera == "srgb"
 
 
 def test_a_camera_that_saw_no_difference_gets_some_curve() -> None:
     values = np.full((9, 50), 0.25, np.float32)
-    assert told(LEVELS, values, "linear", "unknown") == ("linear", "srgb", ("camera",))
+    assert estimated(LEVELS, values, "linear", "unknown") == ("linear", "srgb", ("camera",))
 
 
 @pytest.mark.parametrize("curve", ["linear", "srgb"])

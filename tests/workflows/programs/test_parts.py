@@ -98,7 +98,7 @@ def test_stripes_are_the_bits_of_a_gray_code(axis: str, size: int, other: int) -
         gray = stripe ^ (stripe >> 1)
         words.append(gray)
         assert [int(line[position]) for line in along] == [gray >> 5 - i & 1 for i in range(6)]
-    # What the code is for: neighbours differ in one pattern at most, and all stripes are told apart.
+    # What the code is for: neighbours differ in one pattern at most, and all stripes are distinct.
     assert len(set(words)) == 64
     assert all((a ^ b).bit_count() <= 1 for a, b in pairwise(words))
 

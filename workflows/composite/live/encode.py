@@ -13,7 +13,7 @@ The texture's levels have the columns and rows that the header's ``levels`` name
 ``texture``, so that each level is exactly half as large as the one before: what lies beyond a level's columns and rows
 is as its edge. The glass before a backdrop is then ``S + crosstalk (rho * sum over lookups of share * texture)``.
 
-Of a large matte every ``step``-th pixel is told.
+Of a large matte only every ``step``-th pixel is encoded.
 """
 
 import gzip
@@ -31,11 +31,11 @@ from workflows.composite.threads import in_parts
 from workflows.recovery.pyramid import Pyramid
 
 FORMAT = "live-1"
-"""Another one for whatever changes the bytes."""
+"""Changes with every change of the bytes."""
 LOOKUPS = 4
-"""Of a pixel."""
+"""Lookups of a pixel."""
 MOST_PIXELS = 1 << 19
-"""Of a large matte only so many are told."""
+"""Most pixels that are encoded; a larger matte is subsampled."""
 SIXTEENTHS = 16
 _PLANES = 8
 """Of a lookup."""
@@ -74,14 +74,14 @@ def encode_live(matte: Matte, threads: int, lookups: int = LOOKUPS) -> bytes:
         row, column = blocks[number]
         block = matte.read(row, column)
         y, x = matte.span(row, column)
-        told = [
+        sampled = [
             np.flatnonzero((places >= part.start) & (places < part.stop))
             for places, part in ((ys, y), (xs, x))
         ]
-        if not all(map(len, told)):
+        if not all(map(len, sampled)):
             return
-        of_block = np.ix_(ys[told[0]] - y.start, xs[told[1]] - x.start)
-        at = slice(told[0][0], told[0][-1] + 1), slice(told[1][0], told[1][-1] + 1)
+        of_block = np.ix_(ys[sampled[0]] - y.start, xs[sampled[1]] - x.start)
+        at = slice(sampled[0][0], sampled[0][-1] + 1), slice(sampled[1][0], sampled[1][-1] + 1)
         wanted = np.zeros(block.recovered.shape, bool)
         wanted[of_block] = True
         fitted = fit_lookups(

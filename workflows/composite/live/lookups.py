@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from workflows.recovery.pyramid import Pyramid
 
 FIELDS = ("x", "y", "level", "R", "G", "B")
-"""What is told of a lookup, in this order."""
+"""The values of a lookup, in this order."""
 _FEW = 24
 """Clusters of a pixel that are merged by their distances; of more, neighbours on a grid are merged first."""
 _MOMENTS, _CLUSTER = 4, 7

@@ -1,8 +1,8 @@
-"""A matte before a clip: the steps of a job that composites its frames and makes a video of them.
+"""The steps of a job that composites the frames of a clip and makes a video of them.
 
-Frames keep their times, to the tick of the clip's clock, and none is made up: where some can't be decoded, the one
-before stays for as long as they would have been shown, as it does in a player; a clip that was cut short gives a video
-as long as what is left of it. The job's log says what was lost. Sound is left out.
+Frames keep their times, to the tick of the clip's clock, and none is invented. Where frames can't be decoded, the one
+before stays for as long as they would have been shown, as in a player. A clip that was cut short gives a shorter video.
+The job's log says what was lost. Sound is left out.
 """
 
 import asyncio
@@ -43,25 +43,25 @@ PIXELS = 8_000_000
 CLOCK = 20_000
 """Ticks a second of an MP4 at least, about, where the clip has fewer; it counts those of a frame in 32 bits."""
 SHORT = 0.5
-"""Seconds that may lack at the end before it is said: containers round, and count their sound in."""
+"""Seconds that may lack at the end without a note: containers round, and include their sound."""
 
 
 def prepare(objects: Objects, task: Task) -> dict[str, Any]:
-    """Look a clip over, and write down when its frames are shown.
+    """Read through a clip, and store when its frames are shown.
 
     Returns
     -------
     dict
-        ``tiles``: how many there are; ``length``: frames of one; ``frames``, ``width``, ``height``: of the clip;
+        ``tiles``: their number; ``length``: frames of one; ``frames``, ``width``, ``height``: of the clip;
         ``tick``: seconds of a tick, as numerator and denominator; ``last``: ticks of the last frame; ``rate``: frames a
         second, about; ``notes``: lines for the job's log.
 
     Raises
     ------
     ClipError
-        If it is no clip that can be read.
+        If the clip can't be read.
     """
-    put_before = Matte(objects, task.matte)
+    target = Matte(objects, task.matte)
     with _reading(objects, task) as clip:
         ticks, last = clip.ticks(MOST)
         tick, width, height = clip.time_base, clip.width, clip.height
@@ -72,10 +72,10 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
     if shown * max(tick.denominator, CLOCK) >= 1 << 31:
         raise ClipError(
             f"by its timestamps frame {longest} of the clip is shown for {shown:.0f} s, in ticks of {tick} s, which no "
-            "MP4 can hold: write the clip anew with a video editor"
+            "MP4 can hold: export the clip again with a video editor"
         )
     objects.put(composites.ticks_path(task.job), ticks.astype("<i8").tobytes())
-    pixels = width * height + put_before.width * put_before.height
+    pixels = width * height + target.width * target.height
     length = int(np.clip(PIXELS // pixels, SHORTEST, LONGEST))
     seconds = float((ticks[-1] + last - ticks[0]) * tick)
     return {
@@ -141,12 +141,12 @@ STEPS = Steps("composite", "compositing", prepare, work, missing, finish, scatte
 
 
 def _losses(clip: Clip, ticks: NDArray[np.int64], last: int) -> Iterator[str]:
-    """What a clip lacks, in words."""
+    """What a clip lacks, as lines for the log."""
     tick = clip.tick
     lost = sorted({at for at in clip.lost if at >= ticks[0]} - set(ticks.tolist()))
     if lost:
         yield (
-            f"frames between {lost[0] * tick:.3f} s and {lost[-1] * tick:.3f} s can't be decoded, for the clip is "
+            f"frames between {lost[0] * tick:.3f} s and {lost[-1] * tick:.3f} s can't be decoded, because the clip is "
             "damaged there: the frame before stays in their place"
         )
     ends = (int(ticks[-1]) + last) * tick
@@ -159,11 +159,11 @@ def _losses(clip: Clip, ticks: NDArray[np.int64], last: int) -> Iterator[str]:
 
 @contextmanager
 def _reading(objects: Objects, task: Task) -> Iterator[Clip]:
-    """The clip of a job, opened as hostile; what is wrong with it is told as of a clip, not of a capture."""
+    """The clip of a job, opened as an untrusted file; its faults are raised as `ClipError`."""
     try:
         file = objects.read(composites.clip_path(task.job))
     except FileNotFoundError as error:
-        raise Corrupt("the clip is not in the store any more; send it again") from error
+        raise Corrupt("the clip is no longer in the store; send it again") from error
     try:
         with file, open_clip(file, "the clip", task.limits.image) as clip:
             yield clip

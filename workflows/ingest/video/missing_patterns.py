@@ -15,7 +15,7 @@ class Reason(StrEnum):
     AFTER = "the recording ends before it"
     TORN = "no two frames show it whole"
     SHORT = "no two frames of it are alike: it was too short, or something moved"
-    UNCLEAR = "the changes before and after it can't be told from others, or did not show"
+    UNCLEAR = "the changes before and after it are not visible, or not distinct from others"
     UNNUMBERED = "no frames that stand still show its number in the border"
     DISTURBED = "something changed while it was shown"
     ODD = "it looks unlike others of its kind, as if something had been in front"

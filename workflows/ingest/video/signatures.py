@@ -14,7 +14,7 @@ from workflows.ingest.video.decoder import Clip, tick_of
 CELLS = (32, 24)
 """Columns and rows of a signature."""
 LARGE_CELLS = (128, 96)
-"""Columns and rows of a large frame, on which the cells of a border can be told apart."""
+"""Columns and rows of a large frame, on which the cells of a border are distinct."""
 
 Signatures = NDArray[np.uint8]
 """(frames, rows, columns, 3) uint8: mean RGB codes over each cell of a grid, before rotation."""

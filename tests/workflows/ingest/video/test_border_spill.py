@@ -1,4 +1,4 @@
-"""The cells of a border are told from those of patterns by what they follow."""
+"""The cells of a border are distinguished from those of patterns by what they follow."""
 
 import numpy as np
 import pytest

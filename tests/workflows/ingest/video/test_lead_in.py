@@ -1,4 +1,4 @@
-"""Films of what `envmatte patterns` shows: the lead-in before a preset's patterns is told from them."""
+"""Films of what `envmatte patterns` shows: the lead-in is distinguished from the patterns after it."""
 
 from collections.abc import Callable
 from typing import Any
