@@ -1,11 +1,13 @@
-"""The commands of `envmatte` that prepare an installation: certificates of a cluster."""
+"""The commands of `envmatte` that prepare an installation: certificates of a cluster, compiled kernels."""
 
+import json
 from pathlib import Path
 
 import click
 
 from services.cli.options import as_json
 from services.cli.output import example, print_summary
+from services.cli.progress import Progress
 
 
 @click.command(epilog=example("envmatte certs certs"))
@@ -24,4 +26,23 @@ def certs(folder: Path, as_json: bool) -> None:
     print_summary({"folder": str(folder), "made": made}, as_json, summary)
 
 
-COMMANDS = (certs,)
+@click.command(epilog=example("envmatte warm"))
+@as_json
+def warm(as_json: bool) -> None:
+    """Compile all kernels now, so that no job waits for it.
+
+    The compiled kernels are kept in files and loaded by every later process: in the folder that NUMBA_CACHE_DIR names,
+    or else beside the source, or else, where that can't be written, in the user's cache folder. They fit this machine's
+    kind of processor, and this version of envmatte.
+    """
+    from workflows.kernels import compile_kernels
+
+    with Progress("warm") as bar:
+        done = compile_kernels(bar.show)
+    result = {"cache": str(done.cache), "kernels": done.kernels, "compiled": done.compiled}
+    result["seconds"] = round(done.seconds, 1)
+    summary = f"{done.kernels} kernels in {done.cache}, {done.compiled} compiled in {done.seconds:.1f} s"
+    click.echo(json.dumps(result, indent=2) if as_json else summary)
+
+
+COMMANDS = (certs, warm)
