@@ -71,9 +71,9 @@ class Client:
         name : str
             A name for people.
         progress : callable, optional
-            Told the bytes that the service has, and those there are.
+            Is called with the bytes that the service has, and with all there are.
         webhook : str, optional
-            URL that is told when the capture is ingested.
+            URL to notify when the capture is ingested.
         """
         from services.client import _upload
 
@@ -86,7 +86,7 @@ class Client:
         Parameters
         ----------
         webhook : str, optional
-            URL that is told when the job has ended.
+            URL to notify when the job has ended.
         **options
             As ``GET /v1/options`` lists them.
         """
@@ -111,7 +111,7 @@ class Client:
         Parameters
         ----------
         progress : callable, optional
-            Told the job at every look.
+            Is called with the job each time it is read.
         poll : float
             Seconds between two looks, to begin with; a job that takes long is looked at once a second.
         """
@@ -218,7 +218,7 @@ class Client:
         Parameters
         ----------
         webhook : str, optional
-            URL that is told when the job has ended.
+            URL to notify when the job has ended.
         **wanted
             ``transfer``, ``right``, ``down``, ``scale`` and ``angle``, as the call takes them.
         """
@@ -250,7 +250,7 @@ class Client:
         Parameters
         ----------
         progress : callable, optional
-            Told the bytes that have come, and those there are.
+            Is called with the bytes received, and with all there are.
         """
         part = file.with_name(file.name + ".part")
 
@@ -275,7 +275,7 @@ class Client:
         Parameters
         ----------
         progress : callable, optional
-            Told the bytes that were sent, and those there are; the service checks them after the last.
+            Is called with the bytes sent, and with all there are. The service checks them after the last.
         """
         headers = {"Content-Type": "application/zip", "Content-Length": str(file.stat().st_size)} | _key()
 

@@ -18,7 +18,7 @@ SIZES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
 def declared(file: Path) -> dict[str, int]:
     """``frames`` of a capture, and ``width`` and ``height`` of the first if that is PNG or JPEG.
 
-    What can't be told is left out: what is wrong with a file the service says better.
+    What can't be read is left out: the service explains better what is wrong with a file.
     """
     found: dict[str, int] = {}
     try:

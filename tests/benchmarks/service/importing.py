@@ -1,25 +1,54 @@
-"""Measures the import of the client: `python -m tests.benchmarks.service.importing`.
+"""How much of a core quick commands and imports take: `python -m tests.benchmarks.service.importing`.
 
-Each in a new interpreter with warm file caches, minus the time of an interpreter that imports nothing.
+Each runs in a new interpreter, from files that were read before. Seconds are of the CPU, in user and system mode, with
+what the interpreter itself takes to start.
 """
 
+import resource
 import subprocess
 import sys
+import tempfile
 from statistics import median
 
 RUNS = 21
-SCRIPT = "import time; start = time.process_time(); {}; print(time.process_time() - start)"
+AWAY = ["--url", "http://127.0.0.1:9"]
+COMMAND = ["-m", "services"]
 
 
-def seconds(statement: str) -> list[float]:
-    """CPU seconds of a statement, in several interpreters."""
-    command = [sys.executable, "-c", SCRIPT.format(statement)]
-    return [float(subprocess.check_output(command)) for _ in range(RUNS + 1)][1:]
+def seconds(arguments: list[str], folder: str) -> list[float]:
+    """Seconds of CPU that an interpreter takes with these arguments, in some runs."""
+    taken = []
+    for _ in range(RUNS + 1):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run([sys.executable, *arguments], capture_output=True, cwd=folder)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        taken.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    return taken[1:]
 
 
-for what, statement in (
-    ("import services.client", "import services.client"),
-    ("the same, and the first Client", "import services.client as c; c.Client('http://127.0.0.1:9')"),
-):
-    taken = seconds(statement)
-    print(f"{what}: median {median(taken) * 1e3:.0f} ms, longest {max(taken) * 1e3:.0f} ms, of {RUNS}")
+def main() -> None:
+    """Print them all."""
+    with tempfile.TemporaryDirectory() as folder:
+        subprocess.run(
+            [sys.executable, *COMMAND, "keys", "make", "lab"], cwd=folder, check=True, capture_output=True
+        )
+        for what, arguments in {
+            "python alone": ["-c", "pass"],
+            "import services.client": ["-c", "import services.client"],
+            "the same, and the first Client": [
+                "-c",
+                "import services.client as c; c.Client('http://127.0.0.1:9')",
+            ],
+            "envmatte --help": [*COMMAND, "--help"],
+            "envmatte serve --help": [*COMMAND, "serve", "--help"],
+            "envmatte keys list": [*COMMAND, "keys", "list"],
+            "envmatte status, without a service": [*COMMAND, "status", "j", *AWAY],
+        }.items():
+            taken = seconds(arguments, folder)
+            print(
+                f"{what}: {min(taken):.3f} to {max(taken):.3f} s, median {median(taken):.3f} s, of {RUNS} runs"
+            )
+
+
+if __name__ == "__main__":
+    main()

@@ -278,10 +278,10 @@ def test_what_is_no_url_is_refused(url: str) -> None:
 
 def test_waiting_tells_how_far_it_is_and_how_it_ended() -> None:
     states = [{}, {"progress": 0.75}, {"state": "succeeded", "progress": 1.0}]
-    told: list[float] = []
+    seen: list[float] = []
     with saying(lambda n: ok(JOB | states[n])) as (url, _), Client(url) as client:
-        done = client.wait("j", progress=lambda job: told.append(job.progress), poll=0.01)
-    assert (told, done.ended, done["news"]) == ([0.5, 0.75, 1.0], True, "of a later version")
+        done = client.wait("j", progress=lambda job: seen.append(job.progress), poll=0.01)
+    assert (seen, done.ended, done["news"]) == ([0.5, 0.75, 1.0], True, "of a later version")
     problem = {"title": "t", "status": 500, "detail": "tile 3 failed"}
     with (
         saying(lambda n: ok(JOB | {"state": "failed", "problem": problem})) as (url, _),
