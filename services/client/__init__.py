@@ -11,21 +11,22 @@
         picture = client.composite(matte, np.ones((1080, 1920, 3), np.float32))  # linear light in, and out
         alpha = matte.layers["alpha"]
 
-Captures, jobs and mattes are frozen records with the API's names; where one is wanted its id does too. Importing this
-loads none of numpy and the like, and httpx only with the first `Client`.
+Captures, jobs and mattes are frozen records with the names of the API; wherever one is expected its id works too.
+Importing this package does not load numpy; the first `Client` loads httpx.
 
-Every failure is one of these, with the problem detail (RFC 9457) as ``problem``::
+Every failure is one of these errors, with the problem detail (RFC 9457) as ``problem``::
 
     ServiceError            the service refused
-    ├── Unreachable         no answer came, however often it was asked
-    ├── Busy                asked too often, or out of service for now; ``retry_after``
-    ├── NotAllowed          no key, or one that may not do this
+    ├── Unreachable         the service did not answer, in spite of retries
+    ├── Busy                too many requests, or temporarily unavailable; ``retry_after``
+    ├── NotAllowed          no key, or a key without permission
     ├── NotFound            no such capture, job or matte
-    ├── FileChanged         a file became another one while it was sent
+    ├── FileChanged         a file changed while it was sent
     └── JobFailed           a job failed or was cancelled: ``job``
 
-What is safe to ask again is, with growing pauses, for as long as a service that had answered is away: reads, deletes,
-and whatever carries an Idempotency-Key, as all does here by which something is made. A ``Retry-After`` is waited for.
+Requests that are safe to repeat are retried with growing pauses when a service that has answered before becomes
+unreachable: reads, deletes, and requests with an Idempotency-Key, which every call here that creates something has. The
+client waits as long as ``Retry-After`` says.
 """
 
 from services.client._client import Client

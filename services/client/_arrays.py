@@ -1,4 +1,4 @@
-"""Pictures as arrays; imported with the first of them, for numpy takes its time."""
+"""Pictures as arrays. Imported on first use, because importing numpy takes time."""
 
 import io
 
@@ -10,7 +10,7 @@ Floats = NDArray[np.float32]
 
 
 def encode(light: ArrayLike) -> bytes:
-    """An EXR of linear light.
+    """Encode linear light as an EXR.
 
     Parameters
     ----------
@@ -20,7 +20,7 @@ def encode(light: ArrayLike) -> bytes:
     Raises
     ------
     ValueError
-        If it has another shape, no pixels, or integers, of which nobody knows what light they stand for.
+        If it has another shape, no pixels, or integers, whose encoding is unknown.
     """
     values = np.asarray(light)
     if values.ndim == 2:
@@ -40,7 +40,7 @@ def encode(light: ArrayLike) -> bytes:
 
 
 def decode(data: bytes) -> Floats:
-    """The values of an EXR.
+    """Decode an EXR.
 
     Returns
     -------

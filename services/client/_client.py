@@ -15,13 +15,13 @@ if TYPE_CHECKING:
     from services.client._arrays import Floats
 
 PIECE = 8 << 20
-"""Bytes of a video that are got at once."""
+"""Bytes of a video in one request."""
 SENT = 64 << 10
-"""Bytes of an archive that are sent at once."""
+"""Bytes of an archive that are read and sent at a time."""
 
 
 class Client:
-    """A connection to a service. It may be used by one thread at a time.
+    """A connection to a service, for one thread at a time.
 
     Parameters
     ----------
@@ -33,11 +33,11 @@ class Client:
     Raises
     ------
     ValueError
-        If the URL is none of HTTP.
+        If the URL is not an HTTP URL.
 
     Notes
     -----
-    Every call raises `ServiceError` where the service answers with a problem, or not at all.
+    Every call raises `ServiceError` if the service answers with a problem, or does not answer.
     """
 
     def __init__(self, url: str, key: str | None = None) -> None:
@@ -63,8 +63,8 @@ class Client:
     ) -> Capture:
         """Upload a capture.
 
-        Connections that break and services that are started again are outlived. An upload that was given up is
-        gone on with by calling this again for the same file, until the service has forgotten it.
+        The upload survives lost connections and restarts of the service. To continue one that was interrupted, call
+        this again for the same file before the upload expires.
 
         Parameters
         ----------
@@ -94,26 +94,26 @@ class Client:
         return Job.of(self._http.json("POST", Job.path, json=body, headers=_key()))
 
     def job(self, job: Job | str) -> Job:
-        """A job, as it is now."""
+        """Get the current state of a job."""
         return Job.of(self._http.json("GET", _path(Job, job)))
 
     def cancel(self, job: Job | str) -> Job:
-        """Cancel a job; one that was cancelled stays so."""
+        """Cancel a job; cancelling it again changes nothing."""
         return Job.of(self._http.json("POST", f"{_path(Job, job)}/cancel", safe=True))
 
     def wait(
         self, job: Job | Capture | str, *, progress: Callable[[Job], None] | None = None, poll: float = 0.2
     ) -> Job:
-        """Wait until a job has ended, or the one that ingests a capture; raises `JobFailed` unless it succeeded.
+        """Wait until a job, or the ingest job of a capture, has ended; raises `JobFailed` unless it succeeded.
 
-        A service that is started again meanwhile is outlived.
+        Waiting survives restarts of the service.
 
         Parameters
         ----------
         progress : callable, optional
             Is called with the job each time it is read.
         poll : float
-            Seconds between two looks, to begin with; a job that takes long is looked at once a second.
+            Seconds between polls at first; a long job is polled once a second.
         """
         which = job.job if isinstance(job, Capture) else _id(job)
         begun = time.monotonic()
@@ -128,16 +128,16 @@ class Client:
             time.sleep(max(poll, min((time.monotonic() - begun) / 20, 1.0)))
 
     def capture(self, capture: Capture | str) -> Capture:
-        """A capture, as it is now."""
+        """Get the current state of a capture."""
         return Capture.of(self._http.json("GET", _path(Capture, capture)))
 
     def matte(self, matte: Matte | Job | str) -> Matte:
-        """A matte as it is now, or the one that a job makes."""
+        """Get the current state of a matte, or of the matte that a job makes."""
         which = (matte.matte or "") if isinstance(matte, Job) else matte
         return self._matte(self._http.json("GET", _path(Matte, which)))
 
     def delete(self, record: Capture | Job | Matte) -> None:
-        """Delete a capture, a job that has ended, or a matte; one that is deleted already stays so."""
+        """Delete a capture, a matte, or a job that has ended; a retry of a delete that succeeded is no error."""
         tried = 0
 
         def delete() -> None:
@@ -174,21 +174,21 @@ class Client:
         kind: str = "image/png",
         **wanted: str | float,
     ) -> "bytes | Floats":
-        """Put a matte before a backdrop: an image's file or bytes give an image's bytes, an array an array.
+        """Composite a matte before a backdrop. An image, as a file or bytes, gives an image; an array gives an array.
 
         Parameters
         ----------
         backdrop : bytes, Path, or (height, width) or (height, width, 3) float array
-            Of an image, PNG, JPEG, TIFF or EXR; or linear light. It is stretched over the monitor.
+            An image (PNG, JPEG, TIFF or EXR), or an array of linear light. It is stretched over the monitor.
         kind : str
-            Of the bytes: ``image/png``, ``image/jpeg`` or ``image/x-exr``.
+            Media type of the bytes: ``image/png``, ``image/jpeg`` or ``image/x-exr``.
         **wanted
-            What else the call takes: ``transfer``, ``x``, ``y``, ``width``, ``height``, ``size``, ``scale`` and so on.
+            Further parameters: ``transfer``, ``x``, ``y``, ``width``, ``height``, ``size``, ``scale`` and so on.
 
         Returns
         -------
         bytes, or (height, width, 3 or 4) float32
-            In linear light, of the matte's size unless another was wanted; with alpha where the capture has a mask.
+            Linear light in arrays, of the matte's size unless another was asked for; with alpha if there is a mask.
         """
         if isinstance(backdrop, bytes | Path):
             data = backdrop.read_bytes() if isinstance(backdrop, Path) else backdrop
@@ -213,7 +213,7 @@ class Client:
     def composite_clip(
         self, matte: Matte | str, clip: Path, *, webhook: str | None = None, **wanted: str | float
     ) -> Job:
-        """Queue the composite of a clip, a video file; `video` gets the result of the job.
+        """Queue the composite of a clip, a video file; `video` downloads the result of the job.
 
         Parameters
         ----------
@@ -230,7 +230,7 @@ class Client:
         )
 
     def video(self, job: Job | str, target: BinaryIO) -> None:
-        """Write the video of a composite job, an MP4, to a file, some megabytes at a time."""
+        """Write the video of a composite job, an MP4, to a file, a few megabytes at a time."""
         at, size = 0, 1
         while at < size:
             asked = {"Range": f"bytes={at}-{at + PIECE - 1}"}
@@ -239,7 +239,7 @@ class Client:
             size = int(answer.headers.get("Content-Range", f"/{at}").rpartition("/")[2])
 
     def layer(self, matte: Matte | str, name: str) -> bytes:
-        """A layer of a matte as a file, as ``confidence.png``; ``Matte.layers`` has them as arrays."""
+        """Get a layer of a matte as a file, such as ``confidence.png``; ``Matte.layers`` has them as arrays."""
         return self._http.send("GET", f"{_path(Matte, matte)}/layers/{name}", computing=True).content
 
     def export(
@@ -270,7 +270,7 @@ class Client:
             part.unlink(missing_ok=True)
 
     def import_matte(self, file: Path, *, progress: Callable[[int, int], None] | None = None) -> Matte:
-        """Make a matte of an archive.
+        """Import a matte from an archive.
 
         Parameters
         ----------
@@ -297,12 +297,12 @@ def _path(kind: type[Record], record: Record | str) -> str:
 
 
 def _key() -> dict[str, str]:
-    """What makes a repeat of a call answer with what the first one made."""
+    """A new Idempotency-Key: a retry of the request gets the answer of the first."""
     return {"Idempotency-Key": secrets.token_hex(16)}
 
 
 def _parts(file: Path, progress: Callable[[int, int], None] | None = None) -> Iterator[bytes]:
-    """A file, bit by bit."""
+    """Read a file piece by piece."""
     size = file.stat().st_size
     with file.open("rb") as source:
         while data := source.read(SENT):

@@ -1,4 +1,4 @@
-"""What a capture's archive says of its frames: the service refuses too many, or too large ones, before they come."""
+"""Number and size of the frames of a capture archive, so that the service can refuse them before the upload."""
 
 import json
 import struct
@@ -9,10 +9,10 @@ from typing import IO, Any
 RECORD = "capture.json"
 RECORD_BYTES = 8 << 20
 HEAD = 1 << 16
-"""Bytes of an image in which its size stands; one that is preceded by more is left out."""
+"""Bytes of an image that are searched for its size."""
 PNG = b"\x89PNG\r\n\x1a\n"
 SIZES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
-"""Markers of JPEG that a frame's size follows (ITU-T T.81, table B.1)."""
+"""JPEG markers that precede the size of a frame (ITU-T T.81, table B.1)."""
 
 
 def declared(file: Path) -> dict[str, int]:
@@ -37,7 +37,7 @@ def declared(file: Path) -> dict[str, int]:
 
 
 def _patterns(part: dict[str, Any]) -> int:
-    """How many a part of a program has."""
+    """Number of patterns of a part of a program."""
     for name in ("levels", "colours", "files"):
         if part.get(name):
             return len(part[name])

@@ -1,4 +1,4 @@
-"""What can go wrong for a caller of the service; the tree is drawn in `services.client`."""
+"""Errors of the client; `services.client` draws the tree."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -15,9 +15,9 @@ class ServiceError(Exception):
         The problem detail (RFC 9457): ``type`` (unless the client or a proxy made it), ``title``, ``status``,
         ``detail``, and what locates the fault: ``entry``, ``field``, ``limit``.
     status : int
-        The status of HTTP.
+        HTTP status.
     retry_after : float or None
-        Seconds after which the service asks to be tried again, if it does.
+        Seconds after which the service asks for a retry, if it does.
     """
 
     def __init__(self, problem: dict[str, Any], retry_after: float | None = None) -> None:
@@ -28,15 +28,15 @@ class ServiceError(Exception):
 
 
 class Unreachable(ServiceError):
-    """No answer came, however often the service was asked."""
+    """The service did not answer, in spite of retries."""
 
 
 class Busy(ServiceError):
-    """Asked too often, or out of service for now (429, 502, 503, 504): the same may go well later."""
+    """Too many requests, or temporarily unavailable (429, 502, 503, 504): try again later."""
 
 
 class NotAllowed(ServiceError):
-    """No key, or one that may not do this (401, 403)."""
+    """No key, or a key without permission (401, 403)."""
 
 
 class NotFound(ServiceError):
@@ -44,10 +44,10 @@ class NotFound(ServiceError):
 
 
 class FileChanged(ServiceError):
-    """A file became another one while it was sent."""
+    """A file changed while it was sent."""
 
     def __init__(self) -> None:
-        detail = "the file has become shorter while it was sent; upload it again"
+        detail = "the file became shorter while it was sent; upload it again"
         super().__init__({"title": "The file has changed", "status": 400, "detail": detail})
 
 

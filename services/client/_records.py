@@ -1,4 +1,4 @@
-"""What the service answers with: captures, jobs and mattes."""
+"""Records that the service returns: captures, jobs and mattes."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
@@ -12,16 +12,16 @@ LAYERS = ("S", "rho", "alpha", "confidence")
 
 @dataclass(frozen=True, kw_only=True)
 class Record:
-    """Something that the service keeps.
+    """Something that the service stores.
 
     Attributes
     ----------
     answer : dict
-        All of the service's answer, as JSON has it; ``record["name"]`` is a field of it.
+        The whole JSON object of the answer; ``record["name"]`` reads a field of it.
     """
 
     path: ClassVar[str]
-    """Where the API has those of its kind."""
+    """Path of the collection."""
     id: str
     state: str
     created_at: str
@@ -29,7 +29,7 @@ class Record:
 
     @classmethod
     def of(cls, answer: dict[str, Any], **more: Any) -> Self:
-        """A record of an answer; what a newer service tells besides is in `answer` alone."""
+        """Make a record of an answer. Fields that only a newer service has are in `answer`."""
         known = {f.name: answer[f.name] for f in fields(cls) if f.name != "answer" and f.name not in more}
         return cls(answer=answer, **known, **more)
 
@@ -59,7 +59,7 @@ class Job(Record):
     """A job; ``state`` is ``queued``, ``running``, ``succeeded``, ``failed`` or ``cancelled``.
 
     ``progress`` goes from 0 to 1 and never back; ``tiles`` has ``total``, ``done`` and ``failed``; ``waits_for`` says
-    what keeps the job; ``matte`` is the id of what it makes.
+    what the job waits for; ``matte`` is the id of the matte that it makes.
     """
 
     path = "/v1/jobs"
@@ -77,12 +77,12 @@ class Job(Record):
 
     @property
     def ended(self) -> bool:
-        """Whether it is over, one way or another."""
+        """Whether it has ended, in success or not."""
         return self.state in ("succeeded", "failed", "cancelled")
 
 
 class Layers(Mapping[str, "Floats"]):
-    """The layers of a matte: ``S``, ``rho``, ``alpha`` and ``confidence``, each got from the service when asked for.
+    """The layers of a matte: ``S``, ``rho``, ``alpha`` and ``confidence``, each fetched from the service on access.
 
     (height, width, 3), or (height, width) where it has one channel; float32, linear.
     """
@@ -108,8 +108,8 @@ class Layers(Mapping[str, "Floats"]):
 class Matte(Record):
     """A matte; ``state`` is ``recovering``, ``ready`` or ``failed``.
 
-    ``width`` and ``height`` are in pixels, ``monitor`` has those of the monitor; None until they are known. One that
-    came in an archive has no ``capture`` and no ``job``.
+    ``width`` and ``height`` are in pixels, as is ``monitor``, the size of the monitor; None until they are known. An
+    imported matte has no ``capture`` and no ``job``.
     """
 
     path = "/v1/mattes"

@@ -1,4 +1,4 @@
-"""Calls over HTTP: what went wrong becomes a `ServiceError`, and what is safe to ask again is."""
+"""Requests over HTTP: failures become a `ServiceError`, and requests that are safe to repeat are retried."""
 
 import random
 import time
@@ -15,13 +15,13 @@ from services.client._errors import OF_STATUS, Busy, ServiceError, Unreachable
 T = TypeVar("T")
 Body = bytes | Callable[[], Iterable[bytes]]
 PATIENCE = 120.0
-"""Seconds without progress after which a call, an upload or a job is given up: a service may be started again."""
+"""Seconds without progress after which a request or an upload fails: long enough for a restart of the service."""
 SILENCE = 60.0
-"""Seconds without an answer, or a byte of it, after which a service counts as gone."""
+"""Seconds without a byte of the answer after which the service counts as unreachable."""
 COMPUTING = 600.0
-"""The same where the service computes the whole answer before its first byte."""
+"""The same for answers that the service computes before their first byte."""
 SAFE = ("GET", "HEAD", "PUT", "DELETE")
-"""Methods of which a repeat does no more than the first (RFC 9110, sect. 9.2.2)."""
+"""Idempotent methods (RFC 9110, sect. 9.2.2)."""
 FIRST_PAUSE, LONGEST_PAUSE = 0.1, 5.0
 """Seconds between two attempts; the pause doubles with each."""
 
@@ -39,7 +39,7 @@ class Transport:
     Raises
     ------
     ValueError
-        If the URL is none of HTTP.
+        If the URL is not an HTTP URL.
     """
 
     def __init__(self, url: str, key: str | None) -> None:
@@ -49,7 +49,7 @@ class Transport:
         except httpx2.InvalidURL:
             base = httpx2.URL("")
         if base.scheme not in ("http", "https") or not base.host:
-            raise ValueError(f"{url!r} is no URL of a service: give it as http://HOST:PORT")
+            raise ValueError(f"{url!r} is not the URL of a service: give it as http://HOST:PORT")
         self._http = httpx2.Client(base_url=base, headers=headers, timeout=SILENCE)
         self._answered = False
 
@@ -58,7 +58,7 @@ class Transport:
         self._http.close()
 
     def json(self, method: str, path: str, *, safe: bool = False, **request: Any) -> dict[str, Any]:
-        """As `send`; what the answer's JSON says."""
+        """Send a request as `send` does; returns the JSON object of the answer."""
         answer = self.send(method, path, safe=safe, **request)
         try:
             found = answer.json()
@@ -69,12 +69,12 @@ class Transport:
         return found
 
     def send(self, method: str, path: str, *, safe: bool = False, **request: Any) -> httpx2.Response:
-        """Make a call, again if that is safe and the service is away.
+        """Send a request, and retry it if that is safe and the service is unreachable.
 
         Parameters
         ----------
         safe : bool
-            Whether a repeat does no harm, of a method and without an Idempotency-Key that say so.
+            Whether it may be repeated although neither its method nor an Idempotency-Key says so.
         **request
             As for `once`.
         """
@@ -82,10 +82,9 @@ class Transport:
         return self.patiently(lambda: self.once(method, path, **request), safe=safe)
 
     def patiently(self, call: Callable[[], T], *, safe: bool = True) -> T:
-        """Make a call until it is answered, for as long as a service that was there is away.
+        """Repeat a call until it is answered, while a service that has answered before is unreachable.
 
-        One that asks to be tried again later is waited for; one that was asked too often (429) did nothing, and so
-        is asked again whatever the call.
+        Waits as long as the service asks. A request refused with 429 had no effect, so it is always retried.
         """
         give_up, pause = time.monotonic() + PATIENCE, FIRST_PAUSE
         while True:
@@ -93,7 +92,7 @@ class Transport:
                 return call()
             except (Unreachable, Busy) as error:
                 again = error.status == 429 or (safe and (self._answered or error.retry_after is not None))
-                # Not all at the same time, where many clients lost the same service.
+                # Random, so that many clients do not retry at the same moment.
                 wait = max(error.retry_after or 0.0, pause * random.uniform(0.5, 1))
                 if not again or time.monotonic() + wait > give_up:
                     raise
@@ -103,16 +102,16 @@ class Transport:
     def once(
         self, method: str, path: str, *, content: Body | None = None, computing: bool = False, **request: Any
     ) -> httpx2.Response:
-        """Make a call once.
+        """Send a request once.
 
         Parameters
         ----------
         content : bytes or callable, optional
-            The body; a function that gives its parts, so that they can be sent again.
+            The body, or a function that returns its parts, so that they can be sent again.
         computing : bool
             Whether the service computes before its first byte.
         **request
-            As httpx has it: ``params``, ``headers``, ``json``.
+            As httpx takes them: ``params``, ``headers``, ``json``.
         """
         with self.streamed(method, path, content=content, computing=computing, **request) as answer:
             answer.read()
@@ -122,7 +121,7 @@ class Transport:
     def streamed(
         self, method: str, path: str, *, content: Body | None = None, computing: bool = False, **request: Any
     ) -> Iterator[httpx2.Response]:
-        """An answer whose body has yet to be read; that of a refusal is."""
+        """An answer whose body has not been read yet; the body of an error has been."""
         if computing:
             request["timeout"] = httpx2.Timeout(SILENCE, read=COMPUTING)
         if content is not None:
@@ -141,13 +140,13 @@ class Transport:
             raise Unreachable(problem | {"detail": detail}) from error
 
     def header(self, answer: httpx2.Response, name: str) -> str:
-        """A header that an answer has to have."""
+        """A header that an answer must have."""
         if name not in answer.headers:
             raise self._foreign()
         return str(answer.headers[name])
 
     def _foreign(self) -> ServiceError:
-        detail = f"{self._http.base_url} does not answer as an envmatte service; see that the URL is right"
+        detail = f"{self._http.base_url} does not answer like an envmatte service; check the URL"
         return ServiceError({"title": "Another service", "status": 502, "detail": detail})
 
 
@@ -156,14 +155,14 @@ def _refusal(method: str, answer: httpx2.Response) -> ServiceError:
     retry_after = _seconds(answer.headers.get("retry-after", ""))
     if answer.headers.get("content-type", "").startswith("application/problem+json") and answer.content:
         return kind(answer.json(), retry_after)
-    # Of a proxy between, or to HEAD.
+    # From a proxy, or in answer to HEAD.
     detail = f"{method} {answer.url} was answered with {answer.status_code} {answer.reason_phrase}"
     problem = {"title": answer.reason_phrase, "status": answer.status_code, "detail": detail}
     return kind(problem, retry_after)
 
 
 def _seconds(text: str) -> float | None:
-    """The seconds of a Retry-After, which has them or a date (RFC 9110, sect. 10.2.3)."""
+    """The seconds of a Retry-After header, which holds seconds or a date (RFC 9110, sect. 10.2.3)."""
     if text.strip().isdecimal():
         return float(text)
     try:

@@ -17,27 +17,27 @@ if TYPE_CHECKING:
 
 TUS = {"Tus-Resumable": "1.0.0"}
 LARGEST, SMALLEST = 8 << 20, 64 << 10
-"""Bytes of a file that are sent at once: half as many after a fault, twice as many after a success."""
-PASSING = (408, 409, 423, 429, 460, 500, 502, 503, 504)
-"""Statuses after which an upload is tried again, from where the service says it stands."""
+"""Bytes of a request: halved after a fault, doubled after a success."""
+TEMPORARY = (408, 409, 423, 429, 460, 500, 502, 503, 504)
+"""Statuses after which an upload is retried from the offset that the service has."""
 
 
 def send(
     http: "Transport", file: Path, body: dict[str, Any], progress: Callable[[int, int], None] | None
 ) -> dict[str, Any]:
-    """Upload a file, and make a capture of it; returns the service's answer.
+    """Upload a file and create a capture from it; returns the answer of the service.
 
     Parameters
     ----------
     body : dict
-        What else is said about the capture.
+        Further fields of the request that creates the capture.
     progress : callable, optional
         Is called with the bytes that the service has, and with all there are.
 
     Notes
     -----
-    The Idempotency-Key is made of the file's path, size and time of change, so that nothing about the upload has to
-    be remembered here.
+    The Idempotency-Key is a hash of the file's path, size and modification time, so the client stores nothing about
+    the upload.
     """
     from services.client import _transport
     from services.client._declared import declared
@@ -76,11 +76,11 @@ def send(
             except NotFound:
                 if offset == size or not where:
                     raise
-                offset = size  # another who sends this file may have finished it: then there is a capture
+                offset = size  # another process may have finished this upload: then the capture exists
             except ServiceError as error:
-                nobody = isinstance(error, Unreachable) and not where
+                never_answered = isinstance(error, Unreachable) and not where
                 wait = max(pause, error.retry_after or 0.0)
-                if nobody or error.status not in PASSING or time.monotonic() + wait > give_up:
+                if never_answered or error.status not in TEMPORARY or time.monotonic() + wait > give_up:
                     raise
                 time.sleep(wait)
                 step, pause = max(step // 2, SMALLEST), min(2 * pause, _transport.LONGEST_PAUSE)

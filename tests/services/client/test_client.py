@@ -261,17 +261,17 @@ def test_the_tree_is_drawn_as_it_is() -> None:
     assert all(getattr(face, name).__bases__ == (ServiceError,) for name in drawn)
 
 
-def test_another_server_is_told_from_a_service() -> None:
+def test_another_server_is_recognised() -> None:
     with (
         saying(lambda n: (200, {"Content-Type": "text/html"}, b"<html>")) as (url, _),
         Client(url) as client,
-        pytest.raises(ServiceError, match="does not answer as an envmatte service"),
+        pytest.raises(ServiceError, match="does not answer like an envmatte service"),
     ):
         client.job("j")
 
 
 @pytest.mark.parametrize("url", ["localhost:8000", "ftp://x", "http://", ""])
-def test_what_is_no_url_is_refused(url: str) -> None:
+def test_invalid_url_is_refused(url: str) -> None:
     with pytest.raises(ValueError, match="http://HOST:PORT"):
         Client(url)
 
