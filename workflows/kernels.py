@@ -90,12 +90,6 @@ def compile_kernels(progress: Callable[[float, str], None] = lambda share, what:
     return Compiled(len(kernels), misses, cache_folder(), time.perf_counter() - start)
 
 
-def compile_default() -> None:
-    """Compile the kernels of a recovery with default options and of its composites."""
-    with tempfile.TemporaryDirectory(prefix="envmatte-kernels-") as folder:
-        _composite(_recover(Objects(Path(folder).as_uri()), "lobes"))
-
-
 def find_kernels() -> list[CPUDispatcher]:
     """All kernels of the modules that are imported."""
     modules = [module for name, module in sys.modules.items() if name.startswith(f"{__package__}.")]
