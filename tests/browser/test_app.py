@@ -67,7 +67,9 @@ def test_upload_report_recovery_and_composite(tab: Page, service: Service, ball:
     tab.get_by_label("Choose a capture archive or a film").set_input_files(ball)
     expect(tab).to_have_url(re.compile(r"#/captures/\w+"), timeout=MINUTE)
     expect(tab.get_by_role("heading", name="a ball")).to_be_visible()
-    expect(tab.get_by_role("heading", name="Report")).to_be_visible(timeout=MINUTE)
+    expect(tab.get_by_role("heading", name="Report")).to_be_visible(
+        timeout=3 * MINUTE
+    )  # kernels compile first
     capture = service.client.capture(tab.url.rpartition("/")[2])
     report = service.http.get(capture["report"]).json()
     findings = tab.locator(".findings li")

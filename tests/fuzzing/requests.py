@@ -197,6 +197,7 @@ class Served:
         self._engine = engine
 
     def close(self) -> None:
+        self.app.state.context.decoders.close()
         self._engine.dispose()
         self.loop.close()
 

@@ -27,6 +27,7 @@ def http(tmp_path: Path) -> Iterator[TestClient]:
     engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
     app = build_app(Settings(data=tmp_path), engine, Objects((tmp_path / "store").as_uri()))
     yield TestClient(app, "http://localhost")
+    app.state.context.decoders.close()
     engine.dispose()
 
 
