@@ -1,6 +1,6 @@
 """What every process needs: logs, signals, traces, certificates, problems.
 
-These are all caches and variables that a process keeps from call to call; ``tests/services/test_process_state.py``
+These are all caches and variables that a process keeps from call to call; ``tests/services/runtime/test_process_state.py``
 compares the list with the code.
 
 ================================================== ====== =============================================================

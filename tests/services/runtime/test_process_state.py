@@ -7,7 +7,7 @@ from pathlib import Path
 
 import services.runtime
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 CACHES = {"cache", "lru_cache"}
 
 
