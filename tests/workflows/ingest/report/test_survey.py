@@ -109,7 +109,7 @@ def test_a_curve_that_is_assumed_is_a_warning(ingest: Ingest, bundle: bytes) -> 
     assert made.camera.source == "assumed"
     assert [f for f in made.findings if f.level == "bad"] == []
     assert made.level == found["camera_curve"].level == "warning"
-    assert "name it in capture.json" in found["camera_curve"].remedy
+    assert "state it in capture.json" in found["camera_curve"].remedy
 
 
 def test_a_capture_that_saw_nothing_is_bad(ingest: Ingest, bundle: bytes) -> None:
