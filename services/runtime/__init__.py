@@ -1,7 +1,7 @@
 """What every process needs: logs, signals, traces, certificates, problems.
 
-These are all caches and variables that a process keeps from call to call; ``tests/services/runtime/test_process_state.py``
-compares the list with the code.
+These are all caches and variables that a process keeps from call to call;
+``tests/services/runtime/test_process_state.py`` compares the list with the code.
 
 ================================================== ====== =============================================================
 name                                               size   holds
