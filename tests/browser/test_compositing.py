@@ -17,6 +17,7 @@ from playwright.sync_api import Browser, BrowserContext, Page, Route, expect
 from tests.browser.pages import PHONE
 from tests.end_to_end.conftest import BANDS, Service, png
 from tests.parts.captures import nested_program
+from tests.parts.waiting import until
 from workflows.simulation import glass_ball
 from workflows.simulation.scene import write_capture
 
@@ -209,7 +210,7 @@ def test_camera_is_a_backdrop_and_released_when_leaving(
     page.get_by_role("button", name="Play").click()
     expect(page.get_by_text("Camera: live")).to_be_visible()
     page.get_by_role("navigation").get_by_role("link", name="Mattes").click()
-    page.wait_for_function("stream.getTracks().every((track) => track.readyState === 'ended')")
+    until(lambda: page.evaluate("stream.getTracks().every((track) => track.readyState === 'ended')"))
 
 
 def test_missing_camera_is_explained(context: BrowserContext, service: Service, ball: str) -> None:
@@ -308,7 +309,7 @@ def test_without_webgl_the_service_draws(context: BrowserContext, service: Servi
     assert f"size={SIZE[0]}" in asked[0]
     page.get_by_role("radio", name="Camera").check()
     expect(page.get_by_text("Camera: preview")).to_be_visible(timeout=MINUTE)
-    page.wait_for_function("document.querySelector('.stage img').naturalWidth === 96")
+    until(lambda: page.evaluate("document.querySelector('.stage img').naturalWidth === 96"))
     assert not any(url.endswith("/live") for url in asked)
 
 
@@ -319,7 +320,7 @@ def test_leaving_frees_the_graphics_card(context: BrowserContext, service: Servi
     assert page.evaluate("made.Texture") >= 5
     page.get_by_role("navigation").get_by_role("link", name="Mattes").click()
     expect(page.get_by_role("heading", name="Mattes")).to_be_visible()
-    page.wait_for_function("Object.values(made).every((count) => count === 0)")
+    until(lambda: page.evaluate("Object.values(made).every((count) => count === 0)"))
 
 
 @pytest.mark.parametrize(("kind", "magic"), [("PNG", b"\x89PNG"), ("JPEG", b"\xff\xd8"), ("EXR", b"v/1\x01")])

@@ -3,8 +3,7 @@
 import os
 import shutil
 import subprocess
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from uuid import uuid4
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 
 from services.client import Client
+from tests.parts.waiting import until
 from workflows.images import integer_formats
 from workflows.images.tone_curves import from_light
 from workflows.programs.presets import preset
@@ -72,14 +72,6 @@ class Cluster:
 
 def inspected(container: str, what: str) -> str:
     return run("docker", "inspect", "--format", what, container)
-
-
-def until(true: Callable[[], bool], seconds: float = 120) -> None:
-    """Wait until a callable answers with true."""
-    deadline = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,8 @@ import yaml
 
 from services.runtime.certificates import make
 from services.settings import Settings
-from tests.services.cluster.clusters import address, started, wait
+from tests.parts.waiting import until
+from tests.services.cluster.clusters import address, started
 
 MANIFEST = Path(__file__).parents[2] / "docker" / "kubernetes.yaml"
 OLDEST = "1.25"
@@ -168,7 +169,7 @@ def test_its_commands_make_a_cluster_and_its_probes_find_it_well(tmp_path: Path)
                 found: list[dict[str, Any]] = answer.json()["workers"]
                 return found
 
-            wait(workers)
+            until(workers)
             limit = int(environment("envmatte-worker")["ENVMATTE_WORKER_MEMORY"])
             assert [one["memory_limit_bytes"] for one in workers()] == [limit]
-            wait(lambda: httpx2.get(f"{url}/readyz").status_code == 200)
+            until(lambda: httpx2.get(f"{url}/readyz").status_code == 200)

@@ -15,7 +15,8 @@ import pytest
 from services.client import Client
 from services.runtime.certificates import make
 from tests.end_to_end.conftest import Service, digests, serving
-from tests.services.cluster.clusters import address, started, wait
+from tests.parts.waiting import until
+from tests.services.cluster.clusters import address, started
 from workflows.programs.presets import preset
 from workflows.simulation import glass_ball
 from workflows.simulation.scene import write_capture
@@ -107,13 +108,13 @@ def slurm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Slurm]:
             stack.callback(process.wait, 60)
             stack.callback(process.terminate)
             if command[0] == "munged":
-                wait((folder / "munge" / "socket").exists)
-        wait(lambda: "idle" in running("sinfo", "--noheader", "--format=%t"))
+                until((folder / "munge" / "socket").exists)
+        until(lambda: "idle" in running("sinfo", "--noheader", "--format=%t"))
         try:
             yield running
         finally:
             running("scancel", "--user=root")
-            wait(lambda: running("squeue", "--noheader") == "")
+            until(lambda: running("squeue", "--noheader") == "")
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +141,7 @@ def recovered(client: Client, capture: str) -> dict[str, object]:
 
 def test_a_job_outlives_workers_that_are_cancelled(slurm: Slurm, service: Service, tmp_path: Path) -> None:
     array = slurm.submit("--array=1-2", "--cpus-per-task=1")
-    wait(lambda: len(workers(service)) == 2)
+    until(lambda: len(workers(service)) == 2)
     assert {one["memory_limit_bytes"] for one in workers(service)} == {900_000_000}
     path = tmp_path / "ball.zip"
     write_capture(glass_ball.glass_ball(96, 72, rays=16), preset("quick"), path, name="ball")
@@ -148,24 +149,24 @@ def test_a_job_outlives_workers_that_are_cancelled(slurm: Slurm, service: Servic
     service.client.wait(capture["job"])
     undisturbed = recovered(service.client, capture["id"])
     job = service.client.recover(capture["id"], tile=16)
-    wait(lambda: service.client.job(job["id"])["tiles"]["done"] >= 2)
+    until(lambda: service.client.job(job["id"])["tiles"]["done"] >= 2)
     slurm("scancel", f"{array}_1")
     assert service.client.job(job["id"])["state"] == "running"
     ended = service.client.wait(job["id"])
-    wait(lambda: slurm.state(f"{array}_1") == "CANCELLED")
+    until(lambda: slurm.state(f"{array}_1") == "CANCELLED")
     assert slurm.state(f"{array}_2") == "RUNNING"
     mattes = service.data / "store" / "mattes"
     assert digests(mattes / str(ended["matte"])) == digests(mattes / str(undisturbed["matte"]))
     slurm("scancel", array)
-    wait(lambda: slurm.state(f"{array}_2") == "CANCELLED")
+    until(lambda: slurm.state(f"{array}_2") == "CANCELLED")
     assert list(Path(slurm.environment["TMPDIR"]).iterdir()) == []
 
 
 def test_workers_end_and_queue_up_when_their_time_is_over(slurm: Slurm, service: Service) -> None:
     job = slurm.submit("--array=1", "--cpus-per-task=2")
-    wait(lambda: len(workers(service)) == 2)
+    until(lambda: len(workers(service)) == 2)
     slurm("scancel", "--batch", "--signal=USR1", f"{job}_1")  # what SLURM sends then
-    wait(lambda: slurm.state(f"{job}_1") == "PENDING")
+    until(lambda: slurm.state(f"{job}_1") == "PENDING")
     shown = slurm("scontrol", "show", "job", f"{job}_1").split()
     assert {"Requeue=1", "Restarts=1"} <= set(shown)
     assert list(Path(slurm.environment["TMPDIR"]).iterdir()) == []
@@ -175,5 +176,5 @@ def test_a_script_without_a_cluster_says_what_it_lacks(slurm: Slurm, tmp_path: P
     said = tmp_path / "said"
     bare = {"ENVMATTE_CLUSTER": "", "ENVMATTE_CERTS": "", "SBATCH_OUTPUT": str(said)}
     job = slurm("sbatch", "--parsable", "--mem-per-cpu=100", "--cpus-per-task=1", str(SCRIPT), **bare)
-    wait(lambda: slurm.state(job) == "FAILED")
+    until(lambda: slurm.state(job) == "FAILED")
     assert "ENVMATTE_CLUSTER: name the scheduler" in said.read_text()

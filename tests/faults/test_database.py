@@ -9,7 +9,7 @@ import pytest
 from tests.faults.conftest import Known, check, prepared
 from tests.faults.rig import Rig, Row, freeze, thaw
 from tests.parts.postgres import TEMPLATE, Server
-from tests.services.cluster.clusters import wait
+from tests.parts.waiting import until
 
 pytestmark = pytest.mark.timeout(3600)
 
@@ -70,11 +70,11 @@ def test_late_writer_is_shut_out(on_postgresql: Known, table: list[Row], seldom:
         freeze(rig.process(name))
         try:
             job = rig.ask("GET", "/v1/jobs?limit=1", at=other).json()["jobs"][0]["id"]
-            wait(lambda: rig.job(job, at=other)["state"] == "succeeded" and time.monotonic() > end)
+            until(lambda: rig.job(job, at=other)["state"] == "succeeded" and time.monotonic() > end)
             record = [rig.ask("GET", f"/v1/jobs/{job}{more}", at=other).json() for more in ("", "/log")]
         finally:
             thaw(rig.process(name))
-        wait(lambda: rig.log(name).count(message) > before)
+        until(lambda: rig.log(name).count(message) > before)
         time.sleep(1)  # time to do what it was about to do when frozen
         assert rig.log(name).count(message) == before + 1
         assert rig.driver() != name

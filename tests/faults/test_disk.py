@@ -16,7 +16,7 @@ from tests.end_to_end.conftest import Service, paused, serving
 from tests.faults.conftest import check
 from tests.faults.rig import Row, stored
 from tests.parts.disks import small_disk
-from tests.services.cluster.clusters import wait
+from tests.parts.waiting import until
 
 pytestmark = pytest.mark.timeout(900)
 
@@ -50,7 +50,7 @@ class Small:
 
     def failed_for_room(self, job: str) -> bool:
         """Check that a job fails for lack of room and the service keeps working."""
-        wait(lambda: self.service.client.job(job)["state"] not in ("queued", "running"))
+        until(lambda: self.service.client.job(job)["state"] not in ("queued", "running"))
         found = self.service.client.job(job)
         assert (found["state"], found["problem"]["type"]) == ("failed", "urn:envmatte:problem:no-room"), found
         assert "the disk is full" in found["problem"]["detail"]
@@ -112,7 +112,7 @@ def test_full_disk_during_tiles(small: Small, table: list[Row]) -> None:
 def test_full_disk_of_sqlite(small: Small, table: list[Row]) -> None:
     service, start = small.service, time.monotonic()
     job = service.client.recover(small.capture)
-    wait(lambda: service.client.job(job["id"])["progress"] > 0.1)
+    until(lambda: service.client.job(job["id"])["progress"] > 0.1)
 
     def refused() -> bool:
         """Whether an upload is accepted in the end: SQLite may reuse the room of its own log."""
@@ -131,10 +131,10 @@ def test_full_disk_of_sqlite(small: Small, table: list[Row]) -> None:
             while not refused():
                 pass
         said = log.read_text().count(message)
-        wait(lambda: log.read_text().count(message) > said + 2)
-        wait(lambda: service.http.get("/readyz").status_code == 503)
+        until(lambda: log.read_text().count(message) > said + 2)
+        until(lambda: service.http.get("/readyz").status_code == 503)
         assert service.client.job(job["id"])["state"] == "running"
     assert service.client.wait(job["id"])["state"] == "succeeded"
-    wait(lambda: service.http.get("/readyz").status_code == 200)
+    until(lambda: service.http.get("/readyz").status_code == 200)
     assert "continues after an error" not in log.read_text()
     check(table, small.row("a full disk of SQLite", start, job["matte"]))

@@ -11,7 +11,7 @@ from storage.records import leases
 from tests.faults.conftest import Known, check, prepared
 from tests.faults.hosts import Hosts
 from tests.faults.rig import Row
-from tests.services.cluster.clusters import wait
+from tests.parts.waiting import until
 
 pytestmark = pytest.mark.timeout(3600)
 
@@ -46,7 +46,7 @@ def cut_off(hosts: Known, table: list[Row], name: str, times: int) -> None:
         network.mend(name)
 
     row = hosts.disturb(f"the link of {name} cut, for 20 s", cut, times)
-    wait(lambda: workers_of(hosts.rig.folder / "data" / "envmatte.db") == 2)
+    until(lambda: workers_of(hosts.rig.folder / "data" / "envmatte.db") == 2)
     check(table, row)
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from tests.faults.conftest import Known, check
 from tests.faults.rig import Row, freeze, thaw
-from tests.services.cluster.clusters import wait
+from tests.parts.waiting import until
 
 pytestmark = pytest.mark.timeout(7200)
 
@@ -19,9 +19,8 @@ pytestmark = pytest.mark.timeout(7200)
 @pytest.mark.slow
 def test_killed_worker(known: Known, table: list[Row], times: int) -> None:
     def kill() -> None:
-        while not (there := known.rig.workers()):
-            time.sleep(0.05)
-        random.choice(there).kill()
+        until(known.rig.workers)
+        random.choice(known.rig.workers()).kill()
 
     check(table, known.disturb("SIGKILL of a worker", kill, times))
 
@@ -74,11 +73,11 @@ def test_cancelled_job_frees_workers_and_disk(known: Known) -> None:
     # One tile of nn-dgsr that takes minutes.
     options = {"method": "nn-dgsr", "tile": 1024}
     job = rig.ask("POST", "/v1/jobs", json={"capture": known.capture, "options": options}).json()
-    wait(lambda: rig.job(job["id"])["stage"] == "recovering")
+    until(lambda: rig.job(job["id"])["stage"] == "recovering")
     time.sleep(1)
     cancelled = rig.ask("POST", f"/v1/jobs/{job['id']}/cancel").json()
     assert cancelled["state"] == "cancelled"
-    wait(lambda: not rig.names(job["matte"]), 10)
+    until(lambda: not rig.names(job["matte"]), 10)
     assert rig.ask("GET", f"/v1/mattes/{job['matte']}").status_code == 404
     after = rig.recover(known.capture)
     known.goes_on(after["id"], after["matte"])

@@ -11,7 +11,7 @@ import pytest
 from tests.end_to_end.conftest import digests, serving
 from tests.faults.conftest import check
 from tests.faults.rig import Row
-from tests.services.cluster.clusters import wait
+from tests.parts.waiting import until
 
 pytestmark = pytest.mark.timeout(1800)
 
@@ -47,9 +47,9 @@ def test_worker_out_of_memory(bundle: Path, large: Path, tmp_path: Path, table: 
         service.client.wait(capture["job"])
         undisturbed = service.client.wait(service.client.recover(capture["id"])["id"])["matte"]
         uploaded, start = service.client.upload(large), time.monotonic()
-        wait(lambda: service.client.job(uploaded["job"])["stage"] == "reading")
+        until(lambda: service.client.job(uploaded["job"])["stage"] == "reading")
         other = service.client.recover(capture["id"])
-        wait(lambda: service.client.job(uploaded["job"])["state"] not in ("queued", "running"), 300)
+        until(lambda: service.client.job(uploaded["job"])["state"] not in ("queued", "running"), 300)
         failed = service.client.job(uploaded["job"])
         assert failed["state"] == "failed"
         assert "tile 0 ran out of its worker's memory 3 times" in failed["problem"]["detail"]

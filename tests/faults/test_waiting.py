@@ -8,7 +8,7 @@ import pytest
 from services.client import Client
 from tests.faults.conftest import Known
 from tests.faults.rig import Rig
-from tests.services.cluster.clusters import wait
+from tests.parts.waiting import until
 
 pytestmark = [pytest.mark.exhaustive, pytest.mark.timeout(900)]
 
@@ -21,9 +21,9 @@ def test_waits_for_workers(known: Known) -> None:
     rig = known.rig
     for n in range(2):
         rig.kill(f"worker{n}")
-    wait(lambda: not rig.ask("GET", "/v1/jobs?limit=1").json()["jobs"][0]["workers"])
+    until(lambda: not rig.ask("GET", "/v1/jobs?limit=1").json()["jobs"][0]["workers"])
     job = rig.recover(known.capture)
-    wait(says(rig, job["id"], "no worker is connected"))
+    until(says(rig, job["id"], "no worker is connected"))
     ready = rig.ask("GET", "/readyz", repeat=False)
     assert (ready.status_code, "no worker" in ready.json()["cluster"]) == (503, True)
     for n in range(2):
@@ -35,7 +35,7 @@ def test_waits_for_the_scheduler(known: Known) -> None:
     rig = known.rig
     job = rig.recover(known.capture)
     rig.kill("scheduler")
-    wait(says(rig, job["id"], "no scheduler answers"))
+    until(says(rig, job["id"], "no scheduler answers"))
     rig.start("scheduler")
     known.goes_on(job["id"], job["matte"])
 
@@ -47,7 +47,7 @@ def test_waits_for_a_coordinator(known: Known) -> None:
     with rig.api_alone() as url:
         job = rig.ask("POST", "/v1/jobs", json={"capture": known.capture}, at=url).json()
         here = f"/v1/jobs/{job['id']}"
-        wait(lambda: "no coordinator" in (rig.ask("GET", here, at=url).json()["waits_for"] or ""))
+        until(lambda: "no coordinator" in (rig.ask("GET", here, at=url).json()["waits_for"] or ""))
     for n in range(2):
         rig.start(f"service{n}")
     known.goes_on(job["id"], job["matte"])
@@ -61,7 +61,7 @@ def test_waits_for_capture_and_for_other_jobs(known: Known, bundle_bytes: bytes)
     job = rig.recover(uploaded["id"])
     assert f"its capture {uploaded['id']} is being ingested" in job["waits_for"]
     other = rig.recover(known.capture)
-    wait(says(rig, other["id"], "shares 2 workers with"))
+    until(says(rig, other["id"], "shares 2 workers with"))
     for one in (job, other):
         known.goes_on(one["id"], one["matte"])
 

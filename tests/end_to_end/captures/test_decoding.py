@@ -18,8 +18,9 @@ from services.decoding.pool import SECONDS
 from tests.end_to_end.captures.test_bad_input import ZIP, check_problem
 from tests.end_to_end.conftest import Service, serving
 from tests.end_to_end.mattes.test_composites import SENT, asked
+from tests.parts.waiting import until
 from tests.services.api.mattes.archives import archive
-from tests.services.cluster.clusters import children, decoders, running, wait, workers
+from tests.services.cluster.clusters import children, decoders, running, workers
 from tests.workflows.composite.video.test_steps import clip, even, pictures
 from tests.workflows.ingest.video.camera import capture as filmed
 from tests.workflows.ingest.video.camera import overstated, zipped
@@ -32,7 +33,7 @@ def held(service: Service, matte: str) -> Iterator[tuple[psutil.Process, "Future
     """Stop a decoder in the middle of a request; yields both. The next request gets another decoder."""
     for one in decoders(service.process):
         one.kill()
-    wait(lambda: not decoders(service.process))
+    until(lambda: not decoders(service.process))
     assert asked(service, matte).status_code == 200
     (one,) = decoders(service.process)
     one.suspend()
@@ -65,7 +66,7 @@ def test_hanging_decoder_is_killed_and_others_keep_serving(service: Service, mat
         problem = check_problem(answer.result(), 422, "bad-image")
         assert meanwhile > 3
         assert "takes more than 20 s" in problem["detail"]
-        wait(lambda: not running([one]))
+        until(lambda: not running([one]))
 
 
 @pytest.mark.slow
@@ -83,7 +84,7 @@ def test_decoders_end_with_the_service(tmp_path: Path, end: str, environment: di
         tree = children(service.process)
         getattr(service.process, end)()
         service.process.wait(120)
-        wait(lambda: not running(tree))
+        until(lambda: not running(tree))
 
 
 def taken_at_most(one: psutil.Process) -> int:

@@ -8,7 +8,6 @@ import shutil
 import subprocess
 import sys
 import threading
-import time
 import zipfile
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from tests.end_to_end.captures.test_uploads import CHUNK, TUS, begin, create, go
 from tests.end_to_end.conftest import Service, paused, serving
 from tests.end_to_end.lines import Line
 from tests.parts.processes import interrupt, running
+from tests.parts.waiting import until
 
 MB = 1_000_000
 SIZES = [50 * MB, pytest.param(1000 * MB, marks=[pytest.mark.exhaustive, pytest.mark.timeout(1800)])]
@@ -137,8 +137,7 @@ def test_upload_resumes_after_the_server_is_killed(bundle: Path, tmp_path: Path)
             # An upload that no client continues, killed in the middle of its first part.
             other = create(first, 1000 * MB)
             busy = begin(first, other, 0, 1000 * MB, bytes(20 * MB))
-            while not any("#" in name for name in uploads_of(first) if other.rsplit("/", 1)[1] in name):
-                time.sleep(0.01)
+            until(lambda: any("#" in name for name in uploads_of(first) if other.rsplit("/", 1)[1] in name))
             first.kill()
             busy.close()
             reached = sent_so_far[-1]

@@ -22,6 +22,7 @@ from storage.database.tables import uploads as table
 from tests.end_to_end.captures.test_bad_input import check_problem
 from tests.end_to_end.conftest import Service, paused, serving
 from tests.parts.disks import small_disk
+from tests.parts.waiting import until
 
 TUS = {"Tus-Resumable": "1.0.0"}
 CHUNK = TUS | {"Content-Type": "application/offset+octet-stream"}
@@ -63,10 +64,7 @@ def uploads_of(service: Service) -> set[str]:
 
 def gone(service: Service, upload: str) -> None:
     """Wait until nothing of an upload is stored: an archive is deleted once its capture is ready."""
-    deadline = time.monotonic() + 120
-    while any(upload in name for name in uploads_of(service)):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    until(lambda: not any(upload in name for name in uploads_of(service)))
 
 
 def test_options_list_versions_and_extensions(service: Service) -> None:
@@ -260,10 +258,8 @@ def test_bytes_before_a_broken_connection_are_kept(service: Service) -> None:
     before = uploads_of(service)
     where = create(service, 4 << 20)
     begin(service, where, 0, 4 << 20, b"a" * (3 << 20)).close()
-    deadline = time.monotonic() + 120
-    while not (offset := offset_of(service, where)):
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    until(lambda: offset_of(service, where))
+    offset = offset_of(service, where)
     assert (3 << 20) - (1 << 18) <= offset <= 3 << 20  # the web server drops bytes it has not passed on
     begin(service, where, offset, 1 << 20, b"").close()
     rest = b"b" * ((4 << 20) - offset)
@@ -278,10 +274,7 @@ def test_bytes_before_a_broken_connection_are_kept(service: Service) -> None:
 def test_silent_client_is_disconnected(service: Service) -> None:
     where = create(service, 1000)
     silent = begin(service, where, 0, 1000, b"a" * 300)
-    deadline = time.monotonic() + 120
-    while offset_of(service, where) != 300:
-        assert time.monotonic() < deadline
-        time.sleep(1)
+    until(lambda: offset_of(service, where) == 300)
     silent.close()
     service.http.delete(where, headers=TUS)
 
@@ -315,10 +308,7 @@ def test_unverified_bytes_are_not_kept(service: Service) -> None:
     )
     with socket.create_connection((host.hostname, host.port)) as raw:
         raw.sendall(f"PATCH {where} HTTP/1.1\r\n{head}\r\n".encode() + b"a" * 300)
-    deadline = time.monotonic() + 120
-    while uploads_of(service) != before:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    until(lambda: uploads_of(service) == before)
     assert offset_of(service, where) == 0
     service.http.delete(where, headers=TUS)
 
@@ -403,10 +393,7 @@ def test_abandoned_upload_expires(tmp_path: Path) -> None:
             assert patch(service, unfinished, offset, b"x").status_code == 204
             time.sleep(0.5)
         assert service.http.head(finished, headers=TUS).status_code == 404
-        deadline = time.monotonic() + 120
-        while service.stored():
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
+        until(lambda: not service.stored())
         check_problem(patch(service, unfinished, 6, b"x"), 404, "not-found")
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from tests.end_to_end.captures.test_bad_input import check_problem
 from tests.end_to_end.conftest import Service, paused, serving
+from tests.parts.waiting import until
 
 
 def disk(service: Service) -> int:
@@ -36,15 +37,10 @@ def test_expired_data_is_deleted_unless_a_job_needs_it(bundle: Path, tmp_path: P
             assert found["expires_at"] > found["created_at"]
             assert disk(service) - before >= bundle.stat().st_size
         assert service.client.wait(job["id"])["state"] == "succeeded"
-        deadline = time.monotonic() + 60
         for url in (f"/v1/captures/{capture['id']}", f"/v1/mattes/{job['matte']}"):
-            while service.http.get(url).status_code != 404:
-                assert time.monotonic() < deadline
-                time.sleep(0.1)
+            until(lambda url=url: service.http.get(url).status_code == 404)
             check_problem(service.http.get(url), 404, "not-found")
-        while disk(service) > before:
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
+        until(lambda: disk(service) <= before)
         used = service.http.get("/v1/limits").json()["limits"]
         assert {one["name"]: one["used"] for one in used if one["used"] is not None} == {
             "owner_captures": 0,

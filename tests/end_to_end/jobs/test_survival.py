@@ -14,6 +14,7 @@ import pytest
 from services.client import ServiceError
 from tests.end_to_end.captures.test_uploads import begin, create
 from tests.end_to_end.conftest import Service, digests, png, serving
+from tests.parts.waiting import until
 from tests.services.cluster.clusters import workers
 
 
@@ -23,12 +24,8 @@ def files_of(service: Service, matte: str) -> dict[str, str]:
 
 def gone(service: Service, matte: str) -> None:
     """Wait until nothing of a matte is left."""
-    deadline = time.monotonic() + 120
-    while service.http.get(f"/v1/mattes/{matte}").status_code != 404 or any(
-        matte in n for n in service.stored()
-    ):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    until(lambda: service.http.get(f"/v1/mattes/{matte}").status_code == 404)
+    until(lambda: not any(matte in name for name in service.stored()))
 
 
 def recovered(service: Service, bundle: Path, **options: object) -> dict[str, str]:
@@ -112,14 +109,9 @@ def test_cancelled_ingest_leaves_nothing(service: Service, capture: str, bundle:
     before = service.stored()
     uploaded = service.client.upload(bundle)
     service.client.cancel(uploaded["job"])
-    deadline = time.monotonic() + 120
-    while service.client.capture(uploaded["id"])["state"] == "ingesting":
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    until(lambda: service.client.capture(uploaded["id"])["state"] != "ingesting")
     assert service.client.capture(uploaded["id"])["problem"]["detail"].startswith("the ingest was cancelled")
-    while any(uploaded["id"] in name for name in service.stored() - before):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    until(lambda: not any(uploaded["id"] in name for name in service.stored() - before))
 
 
 @pytest.mark.slow

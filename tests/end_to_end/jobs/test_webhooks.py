@@ -1,7 +1,6 @@
 """Webhooks of a real service, to a receiver on loopback, which its settings allow."""
 
 import base64
-import time
 from pathlib import Path
 
 import pytest
@@ -9,7 +8,8 @@ from standardwebhooks import Webhook
 
 from services.client import NotFound, ServiceError
 from tests.end_to_end.conftest import Service, serving
-from tests.services.webhooks.receivers import Receiver, receiver
+from tests.parts.waiting import until
+from tests.services.webhooks.receivers import receiver
 
 SECRET = "a secret of sixteen and more"
 ALLOWED = {"ENVMATTE_WEBHOOK_SECRET": SECRET, "ENVMATTE_WEBHOOK_PRIVATE": "true"}
@@ -25,14 +25,6 @@ def verified(received: tuple[dict[str, str], bytes]) -> dict:
     return dict(message)
 
 
-def wait_for(found: Receiver, count: int) -> None:
-    deadline = time.monotonic() + 120
-    while len(found.received) < count:
-        assert time.monotonic() < deadline
-        found.news.wait(0.1)
-        found.news.clear()
-
-
 def lines(service: Service, job: str) -> list[str]:
     log = service.http.get(f"/v1/jobs/{job}/log").json()["lines"]
     return [line["text"] for line in log if "webhook" in line["text"]]
@@ -43,26 +35,24 @@ def test_failed_delivery_is_repeated_after_a_kill_and_signed(bundle: Path, tmp_p
     with receiver(lambda n: 500 if n == 0 else 200) as found:
         with serving(tmp_path / "data", "--workers", "1", **ALLOWED) as first:
             capture = first.client.upload(bundle, name="ball", webhook=found.url)
-            wait_for(found, 1)
+            until(lambda: len(found.received) >= 1)
             event = verified(found.received[0])
             assert (event["event"], event["job"]["id"]) == ("job.succeeded", capture.job)
-            while not lines(first, capture.job):
-                time.sleep(0.05)
+            until(lambda: lines(first, capture.job))
             assert lines(first, capture.job) == ["webhook, attempt 1: answered with 500; again in 5 s"]
             first.kill()
         assert len(found.received) == 1
         with serving(tmp_path / "data", "--workers", "1", **ALLOWED) as second:
-            wait_for(found, 2)
+            until(lambda: len(found.received) >= 2)
             assert found.received[1][1] == found.received[0][1]
             verified(found.received[1])
-            while len(lines(second, capture.job)) < 2:
-                time.sleep(0.05)
+            until(lambda: len(lines(second, capture.job)) == 2)
             assert lines(second, capture.job)[1] == "webhook, attempt 2: answered with 200"
             # Cancelled jobs are delivered too, even if their row is deleted before.
             job = second.client.recover(capture, webhook=found.url)
             second.client.cancel(job)
             second.client.delete(job)
-            wait_for(found, 3)
+            until(lambda: len(found.received) >= 3)
             event = verified(found.received[2])
             assert (event["event"], event["job"]["id"]) == ("job.cancelled", job.id)
             with pytest.raises(NotFound):

@@ -2,7 +2,6 @@
 
 import io
 import json
-import time
 import zipfile
 from collections.abc import Iterator
 from itertools import product
@@ -20,6 +19,7 @@ from storage.objects.store import Objects
 from tests.end_to_end.captures.test_bad_input import ZIP, check_problem
 from tests.end_to_end.conftest import Service, digests, png, serving
 from tests.end_to_end.use.test_cli import envmatte
+from tests.parts.waiting import until
 from workflows.simulation import glass_ball
 
 
@@ -189,10 +189,7 @@ def test_killed_service_keeps_only_complete_imports(archive: Path, tmp_path: Pat
         (first.data / "store/uploads/half/all.part").write_bytes(b"x")
         first.kill()
     with serving(tmp_path / "data", "--workers", "1") as second:
-        give_up = time.monotonic() + 60
-        while second.stored() != kept and time.monotonic() < give_up:
-            time.sleep(0.1)
-        assert second.stored() == kept
+        until(lambda: second.stored() == kept)
         assert second.client.matte(whole)["state"] == "ready"
         manifest = json.loads(zipfile.ZipFile(archive).read(MANIFEST))
         assert second.client.matte(whole)["options"] == manifest["matte"]["options"]

@@ -1,8 +1,6 @@
 """From a clip to a video of the glass in front of it, over HTTP."""
 
 import json
-import time
-from collections.abc import Callable
 from contextlib import closing
 from http.client import HTTPConnection
 from pathlib import Path
@@ -14,6 +12,7 @@ import pytest
 from services.client import ServiceError
 from tests.end_to_end.conftest import Service, serving
 from tests.end_to_end.use.test_cli import envmatte
+from tests.parts.waiting import until
 from tests.services.cluster.clusters import workers
 from tests.workflows.composite.video.test_steps import TICK, clip, even, frames_of, pictures
 from workflows.images import integer_formats
@@ -25,13 +24,6 @@ OPTIONS = {"transfer": "srgb", "placement": {"right": 0, "down": 0, "scale": 1, 
 
 def stored(service: Service) -> set[str]:
     return {name for name in service.stored() if name.startswith("composites")}
-
-
-def until(true: Callable[[], bool]) -> None:
-    give_up = time.monotonic() + 60
-    while not true():
-        assert time.monotonic() < give_up
-        time.sleep(0.05)
 
 
 def post(service: Service, matte: str, data: bytes, **headers: str) -> dict:

@@ -19,7 +19,7 @@ from storage.database.engine import open_engine, writing
 from storage.records import api_keys
 from tests.end_to_end.captures.test_bad_input import check_problem
 from tests.end_to_end.conftest import Service, paused, png, serving
-from tests.services.cluster.clusters import wait
+from tests.parts.waiting import until
 
 HEADERS = {
     "content-security-policy",
@@ -258,7 +258,7 @@ def test_the_cluster_and_the_metrics_need_a_key(locked: Locked, bundle: Path) ->
     job = service.client.upload(bundle)["job"]
     service.client.wait(job)
     log = service.data.parent / f"{service.data.name}.log"
-    wait(lambda: f"job={job} succeeded" in log.read_text())
+    until(lambda: f"job={job} succeeded" in log.read_text())
     text = log.read_text()
     time_and_level = r"^[-\d]+ [:,\d]+ {}"
     done = rf"{time_and_level.format('DEBUG')} services\.cluster\.task job={job} tile=0 done in"

@@ -13,7 +13,7 @@ from prometheus_client.parser import text_string_to_metric_families as parse
 
 from services.client import ServiceError
 from tests.end_to_end.conftest import Service, paused, serving
-from tests.services.cluster.clusters import wait
+from tests.parts.waiting import until
 from tests.services.runtime.collector import Collector, collecting
 from tests.workflows.composite.video.test_steps import clip, pictures
 
@@ -133,7 +133,7 @@ def test_metrics_count_uploads_and_queued_tiles(watched: Watched) -> None:
 
 def test_cluster_status(watched: Watched) -> None:
     http = watched.service.http
-    wait(lambda: http.get("/v1/cluster").json()["queue"]["tiles_under_way"] == 0)
+    until(lambda: http.get("/v1/cluster").json()["queue"]["tiles_under_way"] == 0)
     found = http.get("/v1/cluster").json()
     (worker,) = found["workers"]
     assert worker["address"].startswith("tcp://127.0.0.1:")
@@ -179,7 +179,7 @@ def test_failed_tile_is_logged_with_its_traceback(watched: Watched) -> None:
 )
 def test_trace_links_the_request_to_every_tile(watched: Watched, kind: str, asked_by: str) -> None:
     collector, job = watched.collector, getattr(watched, kind)
-    wait(lambda: any(s.name == f"{kind} finish" for s in _of(collector, job)))
+    until(lambda: any(s.name == f"{kind} finish" for s in _of(collector, job)))
     total = watched.service.client.job(job)["tiles"]["total"]
     assert total > 1
     spans = _of(collector, job)
@@ -196,7 +196,7 @@ def test_trace_links_the_request_to_every_tile(watched: Watched, kind: str, aske
 
 
 def test_request_without_traceparent_starts_a_trace(watched: Watched) -> None:
-    wait(lambda: any(s.name == "ingest finish" for s in _of(watched.collector, watched.ingest)))
+    until(lambda: any(s.name == "ingest finish" for s in _of(watched.collector, watched.ingest)))
     spans = _of(watched.collector, watched.ingest)
     (request,) = [s for s in watched.collector.spans if s.name == "POST /v1/captures"]
     assert request.parent == b""
@@ -205,7 +205,7 @@ def test_request_without_traceparent_starts_a_trace(watched: Watched) -> None:
 
 
 def test_trace_shows_failures(watched: Watched) -> None:
-    wait(lambda: any(span.failed for span in _of(watched.collector, watched.failed)))
+    until(lambda: any(span.failed for span in _of(watched.collector, watched.failed)))
     assert not any(span.failed for span in _of(watched.collector, watched.recover))
 
 

@@ -6,7 +6,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ import pytest
 from services.client import Client
 from tests.docs.readmes import block
 from tests.end_to_end.conftest import png
+from tests.parts.waiting import until
 from workflows.simulation import glass_ball
 
 URL = "http://127.0.0.1:8000"
@@ -181,10 +181,7 @@ def test_three_machines(bundle: Path, tmp_path: Path) -> None:
         for name in ("second", "third"):
             shutil.copytree(tmp_path / "first" / "certs", tmp_path / name / "certs")
             stack.enter_context(machine(others, tmp_path / name))
-        deadline = time.monotonic() + 120
-        while len(httpx2.get(f"{url}/v1/cluster").json()["workers"]) < 2:
-            assert time.monotonic() < deadline
-            time.sleep(0.2)
+        until(lambda: len(httpx2.get(f"{url}/v1/cluster").json()["workers"]) == 2)
         with Client(url) as client:
             job = client.wait(client.recover(client.upload(bundle), tile=16))
             assert (job.state, job["tiles"]["done"]) == ("succeeded", 30)

@@ -3,22 +3,13 @@
 import os
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import psutil
 
 from services.decoding.process import NAME
-
-
-def wait(until: Callable[[], object], seconds: float = 120) -> None:
-    """Wait until something becomes true; it fails only if it never does."""
-    end = time.monotonic() + seconds
-    while not until():
-        assert time.monotonic() < end, "it never became true"
-        time.sleep(0.1)
 
 
 @contextmanager

@@ -22,7 +22,8 @@ from distributed.security import Security
 from services.cluster.connect import connect
 from services.runtime import certificates
 from storage.errors import Unavailable
-from tests.services.cluster.clusters import address, children, listening, running, started, wait, workers
+from tests.parts.waiting import until
+from tests.services.cluster.clusters import address, children, listening, running, started, workers
 
 WORKERS = 2
 
@@ -84,7 +85,7 @@ def cluster(folder: Path) -> Iterator[Cluster]:
     at = f"tls://127.0.0.1:{port}"
     (folder / "workers.log").touch()
     with working(folder, at, "--workers", str(WORKERS), "--host", "0.0.0.0") as these:
-        wait(lambda: "waiting for the scheduler" in (folder / "workers.log").read_text())
+        until(lambda: "waiting for the scheduler" in (folder / "workers.log").read_text())
         with ExitStack() as ending:
             scheduler = ending.enter_context(scheduling(folder, port))
             assert urlsplit(address(scheduler)).port == port
@@ -94,7 +95,7 @@ def cluster(folder: Path) -> Iterator[Cluster]:
 @pytest.fixture
 def client(cluster: Cluster) -> Iterator[Client]:
     with connect(cluster.address, cluster.security) as client:
-        wait(lambda: len(client.nthreads()) == WORKERS)
+        until(lambda: len(client.nthreads()) == WORKERS)
         yield client
 
 
@@ -170,7 +171,7 @@ def test_a_silent_server_is_not_waited_for() -> None:
 def test_a_killed_worker_process_is_replaced(cluster: Cluster, client: Client) -> None:
     before = client.nthreads().keys()
     workers(cluster.workers)[0].kill()
-    wait(lambda: len(client.nthreads().keys() - before) == 1 and len(client.nthreads()) == WORKERS)
+    until(lambda: len(client.nthreads().keys() - before) == 1 and len(client.nthreads()) == WORKERS)
     assert client.submit(sum, [1, 2]).result(60) == 3
 
 
@@ -180,10 +181,10 @@ def test_workers_join_a_restarted_scheduler(cluster: Cluster, client: Client) ->
     for _ in range(2):
         cluster.kill_scheduler()
         before = cluster.log.count("waiting for the scheduler")
-        wait(lambda before=before: cluster.log.count("waiting for the scheduler") > before)
+        until(lambda before=before: cluster.log.count("waiting for the scheduler") > before)
         cluster.start_scheduler()
         with connect(cluster.address, cluster.security) as again:
-            wait(lambda again=again: len(again.nthreads()) == WORKERS)
+            until(lambda again=again: len(again.nthreads()) == WORKERS)
             assert again.submit(sum, [1, 2]).result(60) == 3
     assert busy.status != "finished"
 
@@ -209,7 +210,7 @@ def test_finished_tasks_leave_almost_nothing_in_memory(cluster: Cluster, client:
     bursts(1)
     before = sum(client.run(counted).values())
     bursts(150)
-    wait(lambda: client.run_on_scheduler(kept) < 15)
+    until(lambda: client.run_on_scheduler(kept) < 15)
     assert sum(client.run(counted).values()) < before + 50
 
 
@@ -221,7 +222,7 @@ def test_a_task_that_exceeds_the_memory_is_blamed_at_once(
     with working(
         cluster.folder, cluster.address, "--workers", "1", ENVMATTE_WORKER_MEMORY=str(limit)
     ) as process:
-        wait(lambda: len(client.nthreads()) == WORKERS + 1)
+        until(lambda: len(client.nthreads()) == WORKERS + 1)
         (small,) = [
             name
             for name, one in client.scheduler_info(n_workers=-1)["workers"].items()
@@ -231,7 +232,7 @@ def test_a_task_that_exceeds_the_memory_is_blamed_at_once(
         greedy = client.submit(lambda: time.sleep(60 if bytearray(limit * 2) else 0), workers=[small])
         with pytest.raises(KilledWorker):
             greedy.result(60)
-        wait(lambda: workers(process) and workers(process) != before)
+        until(lambda: workers(process) and workers(process) != before)
 
 
 @pytest.mark.slow
@@ -241,41 +242,41 @@ def test_workers_that_are_stopped_leave_nothing(
 ) -> None:
     before = client.nthreads().keys()
     with working(cluster.folder, cluster.address, "--workers", "2", TMPDIR=str(tmp_path)) as process:
-        wait(lambda: len(client.nthreads()) == WORKERS + 2)
+        until(lambda: len(client.nthreads()) == WORKERS + 2)
         assert any(tmp_path.iterdir())
         these = client.nthreads().keys() - before
         busy = [client.submit(time.sleep, 1000, workers=[one], pure=False) for one in these]
-        wait(lambda: all(client.processing()[one] for one in these))
+        until(lambda: all(client.processing()[one] for one in these))
         tree = children(process)
         process.send_signal(number)
         assert process.wait(60) == (0 if number == signal.SIGTERM else 130)
         assert not any(tmp_path.iterdir())
-        wait(lambda: not running(tree))
+        until(lambda: not running(tree))
         client.cancel(busy)
-    wait(lambda: len(client.nthreads()) == WORKERS)
+    until(lambda: len(client.nthreads()) == WORKERS)
     assert "Traceback" not in cluster.log[-2000:]
 
 
 @pytest.mark.slow
 def test_starting_workers_stop_at_sigterm(cluster: Cluster, tmp_path: Path) -> None:
     with working(cluster.folder, cluster.address, "--workers", "2", TMPDIR=str(tmp_path)) as process:
-        wait(lambda: len(workers(process)) == 2)
+        until(lambda: len(workers(process)) == 2)
         tree = children(process)
         process.terminate()
         assert process.wait(60) == 0
         assert not any(tmp_path.iterdir())
-        wait(lambda: not running(tree))
+        until(lambda: not running(tree))
 
 
 @pytest.mark.slow
 def test_workers_die_with_their_nanny(cluster: Cluster, client: Client) -> None:
     with working(cluster.folder, cluster.address, "--workers", "2") as process:
-        wait(lambda: len(client.nthreads()) == WORKERS + 2)
+        until(lambda: len(client.nthreads()) == WORKERS + 2)
         tree = children(process)
         assert len(tree) >= 2
         process.kill()
-        wait(lambda: not running(tree))
-    wait(lambda: len(client.nthreads()) == WORKERS)
+        until(lambda: not running(tree))
+    until(lambda: len(client.nthreads()) == WORKERS)
 
 
 @pytest.mark.exhaustive
@@ -283,7 +284,9 @@ def test_workers_die_with_their_nanny(cluster: Cluster, client: Client) -> None:
 def test_waiting_workers_stop_at_signals(folder: Path, number: signal.Signals) -> None:
     (folder / "workers.log").write_text("")
     with working(folder, "tls://127.0.0.1:9", "--workers", "2") as process:
-        wait(lambda: "waiting for the scheduler at tls://127.0.0.1:9" in (folder / "workers.log").read_text())
+        until(
+            lambda: "waiting for the scheduler at tls://127.0.0.1:9" in (folder / "workers.log").read_text()
+        )
         process.send_signal(number)
         assert process.wait(60) == (0 if number == signal.SIGTERM else 130)
 
@@ -313,7 +316,7 @@ def test_a_scheduler_without_certificates_listens_on_loopback_only(tmp_path: Pat
             started(tmp_path / "log", "worker", "--cluster", at, "--workers", "1", **data) as worker,
             connect(at, None) as client,
         ):
-            wait(lambda: client.nthreads())
+            until(lambda: client.nthreads())
             for one in (psutil.Process(worker.pid), *children(worker)):
                 assert {ip for ip, _ in listening(one)} <= {"127.0.0.1"}
 

@@ -14,6 +14,7 @@ from services.cluster.embedded import embedded
 from services.cluster.task import key_of, read_key
 from services.settings import Settings
 from storage.errors import Unavailable
+from tests.parts.waiting import until
 from workflows.jobs import Task
 from workflows.mattes.steps import STEPS
 from workflows.untrusted.limits import Limits
@@ -56,9 +57,7 @@ def outcomes(dispatcher: Dispatcher, count: int) -> list[Outcome]:
 
 def test_errors_and_dead_workers_are_reported(cluster: LocalCluster, tmp_path: Path) -> None:
     with Dispatcher(lambda: Client(cluster, set_as_default=False), tmp_path.as_uri()) as dispatcher:
-        while not dispatcher.free:
-            time.sleep(0.02)
-        assert dispatcher.free == 1
+        until(lambda: dispatcher.free == 1)
         dispatcher.submit(STEPS, task("a"), 3)
         assert dispatcher.under_way("a") == 1
         (outcome,) = outcomes(dispatcher, 1)

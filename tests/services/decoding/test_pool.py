@@ -20,7 +20,8 @@ from services.decoding import process
 from services.decoding.pool import Decoders
 from services.decoding.process import NAME
 from storage.errors import ImageError, Unavailable
-from tests.services.cluster.clusters import running, wait
+from tests.parts.waiting import until
+from tests.services.cluster.clusters import running
 from workflows.images import decode, float_formats, integer_formats
 from workflows.untrusted import decoder_guard
 
@@ -125,7 +126,7 @@ def refusal_by_stopped_child(decoders: Decoders, after: Callable[[psutil.Process
         after(child)
         with pytest.raises(ImageError) as refused:
             left.result()
-    wait(lambda: not running([child]))
+    until(lambda: not running([child]))
     np.testing.assert_array_equal(decoders.decode(PNG, "srgb"), PIXELS)
     return refused.value.detail
 
@@ -146,7 +147,7 @@ def test_idle_child_that_dies_is_replaced(decoders: Decoders) -> None:
     decoders.decode(PNG, "srgb")
     (child,) = children()
     child.kill()
-    wait(lambda: not psutil.pid_exists(child.pid))  # with all of its threads
+    until(lambda: not psutil.pid_exists(child.pid))  # with all of its threads
     np.testing.assert_array_equal(decoders.decode(PNG, "srgb"), PIXELS)
 
 

@@ -12,6 +12,7 @@ from services.webhooks.sender import Sender
 from storage.database.engine import open_engine, reading, writing
 from storage.database.tables import deliveries as table
 from storage.records import job_log, jobs, leases, webhook_deliveries
+from tests.parts.waiting import until
 from tests.services.webhooks.receivers import receiver
 
 SECRET = "a secret of sixteen and more"
@@ -37,14 +38,14 @@ def ended(engine: Engine, url: str) -> str:
 
 def wait_for_log(engine: Engine, job: str) -> str:
     """Wait until a job's log mentions its webhook, and return that line."""
-    deadline = time.monotonic() + 120
-    while time.monotonic() < deadline:
-        with reading(engine) as c:
-            found = [row.text for row in job_log.lines(c, job, 0, 100) if "webhook" in row.text]
-        if found:
-            return str(found[-1])
-        time.sleep(0.05)
-    raise AssertionError("the log does not mention the webhook")
+    until(lambda: log_of(engine, job))
+    return log_of(engine, job)[-1]
+
+
+def log_of(engine: Engine, job: str) -> list[str]:
+    """The lines of a job's log that mention its webhook."""
+    with reading(engine) as c:
+        return [row.text for row in job_log.lines(c, job, 0, 100) if "webhook" in row.text]
 
 
 def lease(engine: Engine) -> int:

@@ -17,7 +17,7 @@ from storage.errors import NoRoom, Unavailable
 from storage.objects import store as module
 from storage.objects.byte_objects import PART
 from storage.objects.store import Objects, gather
-from tests.services.cluster.clusters import wait
+from tests.parts.waiting import until
 from tests.storage.conftest import DISK
 from tests.storage.installation import stream
 
@@ -145,9 +145,8 @@ def test_writer_leaves_nothing_on_full_disk(disk: Path, piece: int) -> None:
     with pytest.raises(NoRoom, match="free space"):
         stream(objects, "b", os.urandom(2 * DISK), piece)
     assert {path.name for path in disk.rglob("*") if path.is_file()} == {"a", "a.crc32c"}
-    wait(
-        lambda: shutil.disk_usage(disk).free > DISK // 2 + (1 << 20)
-    )  # a part under way holds what was removed
+    # A part under way holds what was removed.
+    until(lambda: shutil.disk_usage(disk).free > DISK // 2 + (1 << 20))
     stream(objects, "b", os.urandom(DISK // 2), piece)
     assert objects.names("") == ["a", "b"]
 

@@ -19,8 +19,8 @@ from services.api.http.slow_clients import Connection
 from services.settings import Settings
 from storage.database.engine import open_engine
 from storage.objects.store import Objects
+from tests.parts.waiting import until
 from tests.services.api.mattes.archives import archive
-from tests.services.cluster.clusters import wait
 
 CHECK_SECONDS = 1.0
 SIZE = 1200, 800
@@ -116,17 +116,17 @@ def test_answers_that_nobody_takes_are_held_on_disk_and_given_up(
         grown = process.memory_info().rss - before
         assert grown < count * len(whole.content) // 2, grown
         assert served.ask(path).content == whole.content
-    wait(lambda: served.count == 0)
+    until(lambda: served.count == 0)
     monkeypatch.setattr(slow_clients, "CHECK_SECONDS", CHECK_SECONDS)
     with served.connected(get(path)) as one:
-        wait(lambda: served.count == 1)
-        wait(lambda: served.count == 0)
+        until(lambda: served.count == 1)
+        until(lambda: served.count == 0)
         assert len(rest(one)) < len(whole.content) // 2
 
 
 def test_client_that_reads_single_bytes_is_disconnected(served: Served) -> None:
     with served.connected(get(f"/v1/mattes/{served.matte}/layers/S.exr")) as one:
-        wait(lambda: one.recv(1) and served.count == 0)
+        until(lambda: one.recv(1) and served.count == 0)
 
 
 @pytest.mark.slow
@@ -148,7 +148,7 @@ def test_half_closed_connection_that_reads_nothing_is_closed(served: Served) -> 
     with served.connected(get(f"/v1/mattes/{served.matte}/archive")) as one:
         assert one.recv(12) == b"HTTP/1.1 200"
         one.shutdown(socket.SHUT_WR)
-        wait(lambda: served.count == 0)
+        until(lambda: served.count == 0)
 
 
 def head(method: str, path: str, **headers: str) -> bytes:
@@ -174,13 +174,13 @@ def test_client_that_stops_sending_its_body_is_disconnected(
     before = files(served)
     sent = head("POST", path.replace("MATTE", served.matte), Content_Type=kind) + b"{" * 2000
     with served.connected(sent) as one:
-        wait(lambda: served.count == 1)
+        until(lambda: served.count == 1)
         with contextlib.suppress(ConnectionError):
             while served.count:
                 one.sendall(trickle)
                 time.sleep(0.1)
         assert rest(one) == b""
-    wait(lambda: files(served) == before)
+    until(lambda: files(served) == before)
 
 
 def test_upload_keeps_the_bytes_that_came_before_the_disconnect(served: Served) -> None:
@@ -194,7 +194,7 @@ def test_upload_keeps_the_bytes_that_came_before_the_disconnect(served: Served) 
         url = f"http://127.0.0.1:{served.port}{where}"
         return httpx2.head(url, headers={"Tus-Resumable": "1.0.0"}).headers["upload-offset"]
 
-    wait(lambda: offset() == "3000")
+    until(lambda: offset() == "3000")
 
 
 def test_slow_client_that_keeps_sending_is_served(served: Served) -> None:
