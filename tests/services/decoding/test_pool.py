@@ -68,38 +68,46 @@ def tiff(pixels: np.ndarray, **options: object) -> bytes:
 PNG = integer_formats.encode_png(PIXELS)
 
 
-@pytest.mark.parametrize(
-    "data",
-    [
-        PNG,
-        integer_formats.encode_png(PIXELS.astype(np.uint16) * 257),
-        integer_formats.encode_png(np.dstack([PIXELS, PIXELS[..., :1]])),
-        integer_formats.encode_png(PIXELS[..., :1]),
-        saved("JPEG"),
-        saved("JPEG", icc_profile=imagecodecs.cms_profile("adobergb")),
-        *(tiff(PIXELS, compression=name) for name in (None, "lzw", "zlib", "packbits", "lzma", "zstd")),
-        tiff(PIXELS.astype(np.uint16), compression="zlib", predictor=True),
-        tiff(PIXELS.astype(np.float32), compression="zlib", predictor=True),
-        float_formats.encode_exr({"RGB": PIXELS.astype(np.float32)}),
-    ],
-    ids=lambda data: data[:4].hex(),
-)
-def test_child_decodes_the_same_pixels(decoders: Decoders, data: bytes) -> None:
-    found = decoders.decode(data, "srgb")
-    expected = decode.decode(data, "srgb", memory=MEMORY)
-    assert found.dtype == expected.dtype
-    np.testing.assert_array_equal(found, expected)
+PICTURES = {
+    "PNG": PNG,
+    "PNG, 16 bits": integer_formats.encode_png(PIXELS.astype(np.uint16) * 257),
+    "PNG, alpha": integer_formats.encode_png(np.dstack([PIXELS, PIXELS[..., :1]])),
+    "PNG, gray": integer_formats.encode_png(PIXELS[..., :1]),
+    "JPEG": saved("JPEG"),
+    "JPEG, Adobe RGB": saved("JPEG", icc_profile=imagecodecs.cms_profile("adobergb")),
+    **{
+        f"TIFF, {name}": tiff(PIXELS, compression=name)
+        for name in (None, "lzw", "zlib", "packbits", "lzma", "zstd")
+    },
+    "TIFF, 16 bits": tiff(PIXELS.astype(np.uint16), compression="zlib", predictor=True),
+    "TIFF, floats": tiff(PIXELS.astype(np.float32), compression="zlib", predictor=True),
+    "EXR": float_formats.encode_exr({"RGB": PIXELS.astype(np.float32)}),
+}
+NO_PICTURES = {
+    "nothing": b"",
+    "text": b"no picture",
+    "cut": PNG[:-30],
+    "too large": saved("PNG", np.zeros((4000, 5000, 3), np.uint8)),
+}
 
 
-@pytest.mark.parametrize(
-    "data", [b"", b"no picture", PNG[:-30], saved("PNG", np.zeros((4000, 5000, 3), np.uint8))]
-)
-def test_child_refuses_with_the_same_error(decoders: Decoders, data: bytes) -> None:
-    with pytest.raises(ImageError) as expected:
-        decode.decode(data, "srgb", memory=MEMORY)
-    with pytest.raises(ImageError) as found:
-        decoders.decode(data, "srgb")
-    assert (found.value.detail, found.value.fields) == (expected.value.detail, expected.value.fields)
+def test_child_decodes_the_same_pixels(decoders: Decoders, subtests: pytest.Subtests) -> None:
+    for name, data in PICTURES.items():
+        with subtests.test(name):
+            found = decoders.decode(data, "srgb")
+            expected = decode.decode(data, "srgb", memory=MEMORY)
+            assert found.dtype == expected.dtype
+            np.testing.assert_array_equal(found, expected)
+
+
+def test_child_refuses_with_the_same_error(decoders: Decoders, subtests: pytest.Subtests) -> None:
+    for name, data in NO_PICTURES.items():
+        with subtests.test(name):
+            with pytest.raises(ImageError) as expected:
+                decode.decode(data, "srgb", memory=MEMORY)
+            with pytest.raises(ImageError) as found:
+                decoders.decode(data, "srgb")
+            assert (found.value.detail, found.value.fields) == (expected.value.detail, expected.value.fields)
     assert len(children()) == 1  # it is still usable
 
 
