@@ -1,6 +1,8 @@
 """Options, markers and fixtures of all tests."""
 
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 
 import pytest
@@ -11,6 +13,7 @@ from tests.parts.s3 import s3, s3_server
 
 EXHAUSTIVE = 3
 """Value of ``--times`` from which on exhaustive tests run too."""
+KERNELS = pytest.StashKey["subprocess.Popen[bytes]"]()
 __all__ = ["postgresql", "postgresql_server", "s3", "s3_server"]
 
 
@@ -28,6 +31,19 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         default=1,
         help=f"How often each fault is injected; {EXHAUSTIVE} or more runs the exhaustive tests, and all others.",
     )
+
+
+def pytest_xdist_setupnodes(config: pytest.Config) -> None:
+    """Compile the kernels beside the first tests: in a fresh tree each process would compile them for itself."""
+    config.stash[KERNELS] = subprocess.Popen(
+        [sys.executable, "-m", "services", "warm"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    if KERNELS in config.stash:
+        config.stash[KERNELS].kill()
+        config.stash[KERNELS].wait()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
