@@ -29,20 +29,10 @@ MEMORY = 1 << 24
 PIXELS = np.random.default_rng(0).integers(0, 256, (30, 40, 3), np.uint8)
 
 
-earlier: set[int] = set()
-"""Decoder processes that tests of other files have left running in this process."""
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _ignore_earlier() -> None:
-    earlier.clear()
-    earlier.update(child.pid for child in children())
-
-
 def children() -> list[psutil.Process]:
-    """The decoder processes of this process that were started here."""
+    """The decoder processes of this process."""
     found = running(psutil.Process().children(recursive=True))
-    return [child for child in found if child.pid not in earlier and child.name() == NAME]
+    return [child for child in found if child.name() == NAME]
 
 
 @pytest.fixture
