@@ -1,4 +1,4 @@
-"""Clusters of the cells of a T by their moments, and the mass on cells of the Gaussians with these."""
+"""Clusters of a row of T, described by their moments, and Gaussians with these moments integrated over cells."""
 
 import math
 
@@ -6,17 +6,17 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-# A lobe is never narrower than a cell: this is the variance of one, in cells squared.
 CELL_VARIANCE = 1 / 12
-# Of a Gaussian: its weight, centre, variances and covariance.
+"""Variance of a uniform cell along an axis, in cells squared: the least variance of a Gaussian."""
 PARAMETERS = 6
-# A cell with less of a T than this is no part of it; a Gaussian neither.
+"""Parameters of a Gaussian: weight, mean (2), covariance (3)."""
 LEAST_MASS = 1e-6
+"""Cells and Gaussians with less mass than this are dropped."""
 
 
 @njit(nogil=True, cache=True)
 def add_moments(moments: NDArray[np.float64], cell: int, columns: int, weight: float) -> None:
-    """Add a weight at a cell's centre to the raw moments of order 0 to 2: 1, x, y, xx, xy, yy."""
+    """Add a weight at a cell's centre to raw moments of order 0 to 2: 1, x, y, xx, xy, yy."""
     row, column = divmod(cell, columns)
     x, y = column + 0.5, row + 0.5
     moments[0] += weight
@@ -34,18 +34,21 @@ def merge_clusters(moments: NDArray[np.float64], count: int, most: int) -> int:
     Parameters
     ----------
     moments : (n, 6 or more) float64
-        Raw moments of the clusters, of positive weight, and whatever else adds up; the first `count` are overwritten.
-    count, most : int
-        How many there are, and may be.
+        Raw moments of the clusters, of positive weight; further columns are added up too. The first `count` rows are
+        overwritten.
+    count : int
+        Number of clusters.
+    most : int
+        Largest number to leave.
 
     Returns
     -------
     int
-        How many are left.
+        Number of clusters left, in the first rows.
 
     Notes
     -----
-    Always the two whose merger adds least to the squared distances from the centres,
+    Each step merges the two clusters whose merger adds least to the squared distances from the centres,
     ``w_a w_b / (w_a + w_b) |c_a - c_b|^2`` (Ward, "Hierarchical grouping to optimize an objective function",
     J. Am. Stat. Assoc., 1963).
     """
@@ -68,71 +71,35 @@ def merge_clusters(moments: NDArray[np.float64], count: int, most: int) -> int:
 
 
 @njit(nogil=True, cache=True)
-def spread(
+def integrate_gaussians(
     moments: NDArray[np.float64], columns: int, reach: float, field: NDArray[np.float32]
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """The mass of Gaussians on the cells of a grid.
+    """Integrate Gaussians over the cells of a grid.
 
     Parameters
     ----------
     moments : (q, 6) float64
-        Raw moments; a Gaussian has their mean and covariance less a cell's own.
+        Raw moments. A Gaussian has their mean, and their covariance less a cell's variance.
     columns : int
         Columns of the grid.
     reach : float
-        Standard deviations at which a Gaussian ends.
+        Standard deviations at which a Gaussian is cut off.
     field : (q or more, rows, columns) float32
         Working space, all zero before and after.
 
     Returns
     -------
     cell : (s,) int32
-        Cells that hold some, ascending.
+        Cells with some mass, ascending.
     mass : (q, s) float32
-        Each Gaussian's on them; together 1.
-
-    Notes
-    -----
-    A Gaussian is integrated over each row, and over the columns given the row, whose x is taken to be normal with
-    the mean and the variance that it has there.
+        Mass of each Gaussian on each cell; the sum over both is 1.
     """
     q, rows = moments.shape[0], field.shape[1]
     left = np.full(rows, columns, np.int64)
     right = np.full(rows, -1, np.int64)
     total = 0.0
     for i in range(q):
-        w = moments[i, 0]
-        x, y = moments[i, 1] / w, moments[i, 2] / w
-        xx = max(moments[i, 3] / w - x * x - CELL_VARIANCE, CELL_VARIANCE)
-        yy = max(moments[i, 5] / w - y * y - CELL_VARIANCE, CELL_VARIANCE)
-        # what the floor or rounding left degenerate stays an ellipse
-        limit = 0.99 * math.sqrt(xx * yy)
-        xy = min(max(moments[i, 4] / w - x * y, -limit), limit)
-        slope = xy / yy
-        narrow = xx - slope * xy
-        sigma = math.sqrt(yy)
-        for r in range(max(int(y - reach * sigma), 0), min(int(y + reach * sigma) + 1, rows)):
-            a, b = (r - y) / sigma, (r + 1 - y) / sigma
-            share = 0.5 * (math.erf(b / math.sqrt(2.0)) - math.erf(a / math.sqrt(2.0)))
-            if share < LEAST_MASS:
-                continue
-            pa = math.exp(-a * a / 2) / math.sqrt(2 * math.pi) / share
-            pb = math.exp(-b * b / 2) / math.sqrt(2 * math.pi) / share
-            inner_yy = min(max(yy * (1 + a * pa - b * pb - (pa - pb) ** 2), 0.0), CELL_VARIANCE)
-            middle = x + slope * sigma * (pa - pb)
-            width = math.sqrt(narrow + slope * slope * inner_yy)
-            start = max(int(middle - reach * width), 0)
-            stop = min(int(middle + reach * width) + 1, columns)
-            if start >= stop:
-                continue
-            edge = math.erf((start - middle) / width / math.sqrt(2.0))
-            for c in range(start, stop):
-                ahead = math.erf((c + 1 - middle) / width / math.sqrt(2.0))
-                held = w * share * 0.5 * (ahead - edge)
-                field[i, r, c] = held
-                total += held
-                edge = ahead
-            left[r], right[r] = min(left[r], start), max(right[r], stop - 1)
+        total = _integrate_gaussian(moments[i], reach, field[i], left, right, total)
     size = 0
     for r in range(rows):
         size += max(right[r] - left[r] + 1, 0)
@@ -140,11 +107,65 @@ def spread(
     s = 0
     for r in range(rows):
         for c in range(left[r], right[r] + 1):
-            held = 0.0
+            cell_mass = 0.0
             for i in range(q):
                 mass[i, s] = field[i, r, c] / total
-                held += mass[i, s]
+                cell_mass += mass[i, s]
                 field[i, r, c] = 0
             cell[s] = r * columns + c
-            s += held > LEAST_MASS
+            s += cell_mass > LEAST_MASS
     return cell[:s].copy(), mass[:, :s].copy()
+
+
+@njit(nogil=True, cache=True)
+def _integrate_gaussian(
+    moments: NDArray[np.float64],
+    reach: float,
+    field: NDArray[np.float32],
+    left: NDArray[np.int64],
+    right: NDArray[np.int64],
+    total: float,
+) -> float:
+    """Write a Gaussian's mass on each cell to `field`, (rows, columns); return `total` plus all of it.
+
+    `left` and `right`, (rows,), the first and last column with mass in each row, are widened to include it.
+
+    Notes
+    -----
+    The Gaussian is integrated over each row exactly. Within a row x is taken to be normal, with its mean and variance
+    there, and integrated over the columns.
+    """
+    rows, columns = field.shape
+    w = moments[0]
+    x, y = moments[1] / w, moments[2] / w
+    xx = max(moments[3] / w - x * x - CELL_VARIANCE, CELL_VARIANCE)
+    yy = max(moments[5] / w - y * y - CELL_VARIANCE, CELL_VARIANCE)
+    # keep the covariance positive definite
+    limit = 0.99 * math.sqrt(xx * yy)
+    xy = min(max(moments[4] / w - x * y, -limit), limit)
+    slope = xy / yy
+    conditional_xx = xx - slope * xy
+    sigma = math.sqrt(yy)
+    for r in range(max(int(y - reach * sigma), 0), min(int(y + reach * sigma) + 1, rows)):
+        a, b = (r - y) / sigma, (r + 1 - y) / sigma
+        share = 0.5 * (math.erf(b / math.sqrt(2.0)) - math.erf(a / math.sqrt(2.0)))
+        if share < LEAST_MASS:
+            continue
+        pa = math.exp(-a * a / 2) / math.sqrt(2 * math.pi) / share
+        pb = math.exp(-b * b / 2) / math.sqrt(2 * math.pi) / share
+        inner_yy = min(max(yy * (1 + a * pa - b * pb - (pa - pb) ** 2), 0.0), CELL_VARIANCE)
+        middle = x + slope * sigma * (pa - pb)
+        width = math.sqrt(conditional_xx + slope * slope * inner_yy)
+        start = max(int(middle - reach * width), 0)
+        stop = min(int(middle + reach * width) + 1, columns)
+        if start >= stop:
+            continue
+        before = math.erf((start - middle) / width / math.sqrt(2.0))
+        for c in range(start, stop):
+            after = math.erf((c + 1 - middle) / width / math.sqrt(2.0))
+            cell_mass = w * share * 0.5 * (after - before)
+            field[r, c] = cell_mass
+            total += cell_mass
+            before = after
+        left[r], right[r] = min(left[r], start), max(right[r], stop - 1)
+    return total

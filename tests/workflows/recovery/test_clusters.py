@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from workflows.recovery.clusters import CELL_VARIANCE, PARAMETERS, add_moments, merge_clusters, spread
+from workflows.recovery.clusters import (
+    CELL_VARIANCE,
+    PARAMETERS,
+    add_moments,
+    integrate_gaussians,
+    merge_clusters,
+)
 
 COLUMNS, ROWS = 32, 24
 COLUMN = np.arange(ROWS * COLUMNS) % COLUMNS
@@ -45,7 +51,7 @@ def raw(cells):
 )
 def test_mass_is_the_integral_over_each_cell(shape):
     field = np.zeros((3, ROWS, COLUMNS), np.float32)
-    cell, mass = spread(moments_of(1.0, *shape)[None], COLUMNS, 6.0, field)
+    cell, mass = integrate_gaussians(moments_of(1.0, *shape)[None], COLUMNS, 6.0, field)
     assert (np.diff(cell) > 0).all()
     assert np.abs(dense_of(cell, mass[0]) - exact(*shape)).sum() < 0.01
     assert (field == 0).all()
@@ -54,7 +60,7 @@ def test_mass_is_the_integral_over_each_cell(shape):
 def test_masses_keep_their_weights_and_end_at_the_reach():
     field = np.zeros((2, ROWS, COLUMNS), np.float32)
     moments = np.stack([moments_of(0.6, 6, 6, 1.5, 1, 0.3), moments_of(0.2, 25, 18, 1, 1, 0)])
-    cell, mass = spread(moments, COLUMNS, 3.0, field)
+    cell, mass = integrate_gaussians(moments, COLUMNS, 3.0, field)
     np.testing.assert_allclose(mass.sum(1), [0.75, 0.25], atol=0.005)
     x, y = cell % COLUMNS + 0.5, cell // COLUMNS + 0.5
     assert np.hypot(x - 25, y - 18)[mass[1] > 0].max() < 3 * np.sqrt(2) + 1
@@ -63,7 +69,7 @@ def test_masses_keep_their_weights_and_end_at_the_reach():
 
 def test_a_gaussian_past_the_edge_has_all_its_mass_on_the_monitor():
     field = np.zeros((1, ROWS, COLUMNS), np.float32)
-    cell, mass = spread(moments_of(1.0, 0.4, 23.8, 2, 1, 1.0)[None], COLUMNS, 3.0, field)
+    cell, mass = integrate_gaussians(moments_of(1.0, 0.4, 23.8, 2, 1, 1.0)[None], COLUMNS, 3.0, field)
     assert (cell >= 0).all()
     assert (cell < ROWS * COLUMNS).all()
     assert mass.sum() == pytest.approx(1, abs=1e-5)
@@ -71,7 +77,7 @@ def test_a_gaussian_past_the_edge_has_all_its_mass_on_the_monitor():
 
 def test_cluster_of_one_cell_is_as_wide_as_a_cell():
     field = np.zeros((1, ROWS, COLUMNS), np.float32)
-    cell, mass = spread(raw([(7, 5, 1.0)]), COLUMNS, 3.0, field)
+    cell, mass = integrate_gaussians(raw([(7, 5, 1.0)]), COLUMNS, 3.0, field)
     expected = exact(7.5, 5.5, CELL_VARIANCE**0.5, CELL_VARIANCE**0.5, 0.0, fine=64)
     assert np.abs(dense_of(cell, mass[0]) - expected).sum() < 0.01
 

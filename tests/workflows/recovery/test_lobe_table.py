@@ -143,6 +143,6 @@ def test_pixels_do_not_depend_on_each_other() -> None:
 
 
 @pytest.mark.parametrize(("most", "aspect"), [(0, 1.0), (4, 0.0)])
-def test_there_is_a_lobe_at_least_and_a_monitor_has_height(most: int, aspect: float) -> None:
-    with pytest.raises(ValueError, match="at least one lobe"):
+def test_ranked_lobes_needs_a_positive_number_and_aspect(most: int, aspect: float) -> None:
+    with pytest.raises(ValueError, match="at least 1 and aspect positive"):
         ranked_lobes(transport([{0: 1.0}]), most, aspect)

@@ -1,4 +1,4 @@
-"""The paper's Gaussian prior: oriented Gaussians fitted on the fly to the clusters of a T, and T filtered by them."""
+"""The paper's Gaussian prior: oriented Gaussians fitted to the clusters of each row of T, which then filter the row."""
 
 import math
 
@@ -6,7 +6,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from workflows.recovery.clusters import LEAST_MASS, PARAMETERS, add_moments, merge_clusters, spread
+from workflows.recovery.clusters import (
+    LEAST_MASS,
+    PARAMETERS,
+    add_moments,
+    integrate_gaussians,
+    merge_clusters,
+)
 from workflows.recovery.dgsr.groups import Rows
 from workflows.recovery.dgsr.options import Constants
 from workflows.recovery.dgsr.pursuit import Problem, System, problem_of
@@ -14,22 +20,22 @@ from workflows.recovery.solvers import inner, posterior_mean, stack_rows, subtra
 
 
 @njit(nogil=True, cache=True)
-def filter_rows(system: System, found: Rows, constants: Constants) -> Rows:
-    """Filter sparse rows by Gaussians, those that they explain better than the row's own cells do.
+def filter_rows(system: System, rows: Rows, constants: Constants) -> Rows:
+    """Filter sparse rows by Gaussians where these explain the measurements better than the row's own cells.
 
     Parameters
     ----------
     system : System
-    found : Rows
-        A cell of weight 0 was a candidate.
+    rows : Rows
+        Solved rows. Candidates that were not chosen have weight 0.
     constants : Constants
 
     Returns
     -------
     Rows
-        Cells need not have been candidates.
+        The filtered rows, whose cells need not have been candidates.
     """
-    begin, cell, weight = found
+    begin, cell, weight = rows
     field = np.zeros((constants.clusters, system.rows, system.columns), np.float32)
     n = system.source.size
     new_begin = np.zeros(n + 1, np.int64)
@@ -37,9 +43,9 @@ def filter_rows(system: System, found: Rows, constants: Constants) -> Rows:
     end = 0
     for p in range(n):
         candidates, x = cell[begin[p] : begin[p + 1]], weight[begin[p] : begin[p + 1]]
-        lit = np.flatnonzero(x > 0)
-        kept_cell, kept = candidates[lit], x[lit]
-        if lit.size > 0:
+        support = np.flatnonzero(x > 0)
+        kept_cell, kept = candidates[support], x[support]
+        if support.size > 0:
             problem = problem_of(system, p)
             plain = score_cells(problem, kept_cell, kept, candidates.size)
             score, filtered_cell, filtered = filter_row(problem, kept_cell, kept, constants, field)
@@ -59,10 +65,9 @@ def filter_rows(system: System, found: Rows, constants: Constants) -> Rows:
 def score_cells(
     problem: Problem, cell: NDArray[np.int32], weight: NDArray[np.float32], candidates: int
 ) -> float:
-    """Minus twice the log-likelihood of a T of k cells out of s candidates, plus what the cells cost, ``2 k ln s``.
+    """Minus twice the log-likelihood of a row of k cells out of s candidates, plus the penalty ``2 k ln s``.
 
-    The misfit counts ``n ln(|f - A t|^2 / n)``, with a mean square of the noise's variance at least. What Gaussians
-    cost is in :func:`filter_row`.
+    The first term is ``n ln(|f - A t|^2 / n)``, the mean square being at least the noise's variance.
     """
     matrix = np.empty((cell.size, problem.target.size), np.float32)
     stack_rows(problem.light, cell, problem.scale, matrix)
@@ -83,13 +88,13 @@ def filter_row(
     constants: Constants,
     field: NDArray[np.float32],
 ) -> tuple[float, NDArray[np.int32], NDArray[np.float32]]:
-    """Filter a T by oriented Gaussians, fitted to its clusters again and again.
+    """Filter a row of T by oriented Gaussians, fitted to its clusters iteratively.
 
     Parameters
     ----------
     problem : Problem
     cell, weight : (s,) int32, float32
-        The T to start from, s at least 1, of positive weights.
+        The row to start from, with positive weights, s at least 1.
     constants : Constants
     field : (clusters, rows, columns) float32
         Working space, all zero before and after.
@@ -99,16 +104,18 @@ def filter_row(
     score : float
         Minus twice the log-likelihood of the best Gaussians, plus 2 for each of their parameters.
     cell, weight : (s,) int32, float32
-        The T filtered by them.
+        The filtered row.
 
     Notes
     -----
-    With m the Gaussians' mass on each cell, together 1, T has the prior ``T ~ N(m, k diag m)`` (eq. 9): only cells
-    inside a Gaussian may be lit, and more so the more of it they hold. Its mean given the measurements f = A t of
-    variance v is ``t = m + M A' (A M A' + v / k)^-1 (f - A m)``, M = diag m, cut off at 0. The most likely k has
-    ``|f - A m|^2 = n (v + k)``, as each of the n rows of A is of +-1. The next Gaussians have the moments of this t.
+    With m the Gaussians' mass on each cell, of sum 1, the prior is ``T ~ N(m, k diag m)`` (eq. 9): only cells inside
+    a Gaussian can have weight, with a prior variance in proportion to their mass. Given the measurements f = A t of
+    variance v, the posterior mean is ``t = m + M A' (A M A' + v / k)^-1 (f - A m)``, M = diag m, cut off at 0. The
+    most likely k satisfies ``|f - A m|^2 = n (v + k)``, since the n rows of A are +-1. The next Gaussians have the
+    moments of this t.
 
-    The clusters are Ward's: first as many as are allowed, then one fewer each time. The best number is kept.
+    Clusters are found by Ward's method, first as many as are allowed, then one fewer each time. The best number is
+    kept.
     """
     moments = np.zeros((cell.size, PARAMETERS))
     for j in range(cell.size):
@@ -135,15 +142,15 @@ def fit_gaussians(
     constants: Constants,
     field: NDArray[np.float32],
 ) -> tuple[float, NDArray[np.int32], NDArray[np.float32]]:
-    """Filter T by Gaussians of given moments (count, 6), fit them to the result, and repeat; returns the best T.
+    """Filter a row by Gaussians of given moments (count, 6), fit them to the result, and repeat; return the best row.
 
-    `gaussians` are overwritten. Without any cell inside a Gaussian the score is infinite and T is the given one.
+    `gaussians` is overwritten. If no cell is inside a Gaussian, the score is infinite and the given row is returned.
     """
     best_score, best_cell, best_weight = np.inf, cell, weight
     n = inner(problem.scale, problem.scale)
     count, before = len(gaussians), np.inf
     for _ in range(constants.fits):
-        inside, mass = spread(gaussians[:count], problem.columns, constants.reach, field)
+        inside, mass = integrate_gaussians(gaussians[:count], problem.columns, constants.reach, field)
         if inside.size == 0:
             break
         matrix = np.empty((inside.size, problem.target.size), np.float32)
@@ -166,12 +173,12 @@ def fit_gaussians(
         if misfit >= (1 - constants.stall) * before:
             break
         before = misfit
-        count = take_moments(inside, t, mean, mass, problem.columns, gaussians, count)
+        count = update_moments(inside, t, mean, mass, problem.columns, gaussians, count)
     return best_score, best_cell, best_weight
 
 
 @njit(nogil=True, cache=True, inline="always")
-def take_moments(
+def update_moments(
     cell: NDArray[np.int32],
     t: NDArray[np.float32],
     mean: NDArray[np.float32],
@@ -180,7 +187,7 @@ def take_moments(
     gaussians: NDArray[np.float64],
     count: int,
 ) -> int:
-    """Write the moments of t to Gaussians, each with its share of the mass; returns how many are not empty."""
+    """Write the moments of t, shared among the Gaussians by their mass; return the number that are not empty."""
     kept = 0
     for i in range(count):
         for k in range(PARAMETERS):
