@@ -1,26 +1,27 @@
 """A matte for graphics hardware: its lookups, S, rho and alpha in a few megabytes, as the web app draws it.
 
-A gzip stream of four bytes, the length n of the header (little-endian); the header, n bytes of JSON; and planes of
-bytes, one after another, each of the header's ``width`` times ``height``, row by row:
+The format is a gzip stream of the header's length n in four bytes (little-endian), the header (n bytes of JSON), and
+planes of bytes. Each plane has the header's ``width`` times ``height`` bytes, row by row:
 
-- of each lookup, from the heaviest on, ``lookups`` times: x and y, 16 bits each in two planes, the higher byte's first,
-  as shares of the texture's first level; the level in sixteenths; and the channels' shares of light, of 255. Of x and
-  y the planes hold what is to be added, modulo 65536, to the value before in the row;
-- S and then rho, by channel: the square root, as a share of 255 of the square root of the header's ``S`` and ``rho``;
-- alpha: 255 where the pixel was recovered.
+- 8 planes for each of the header's ``lookups`` lookups, heaviest first. Four hold x and y, 16 bits each, the higher
+  byte's plane first, as fractions of the texture's first level times 65536; each value is stored as its difference
+  from the one to its left, modulo 65536. One holds the level times 16, three the channels' shares of light times 255.
+- 3 planes of S and 3 of rho, one per channel: 255 times the square root of the value divided by the header's ``S`` or
+  ``rho``.
+- 1 plane of alpha: 255 where the pixel was recovered, else 0.
 
-The texture's levels have the columns and rows that the header's ``levels`` name, of which the first is padded to
-``texture``, so that each level is exactly half as large as the one before: what lies beyond a level's columns and rows
-is as its edge. The glass before a backdrop is then ``S + crosstalk (rho * sum over lookups of share * texture)``.
+The header's ``levels`` are the columns and rows of the texture's levels. The first is padded to ``texture``, and the
+others accordingly, so that each level is exactly half as large as the one before; padding repeats the edge. The
+composite is ``S + crosstalk (rho * sum over lookups of share * texture)``.
 
-Of a large matte only every ``step``-th pixel is encoded.
+Only every ``step``-th row and column of a large matte is encoded.
 """
 
 import gzip
 import json
 import math
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,28 +32,34 @@ from workflows.composite.threads import in_parts
 from workflows.recovery.pyramid import Pyramid
 
 FORMAT = "live-1"
-"""Changes with every change of the bytes."""
+"""To be changed whenever the encoded bytes change."""
 LOOKUPS = 4
 """Lookups of a pixel."""
 MOST_PIXELS = 1 << 19
 """Most pixels that are encoded; a larger matte is subsampled."""
 SIXTEENTHS = 16
+"""Codes per level of the texture."""
 _PLANES = 8
-"""Of a lookup."""
-_LEVEL = 6
-"""Of gzip: higher ones take twice as long for 1 % less."""
+"""Planes of a lookup."""
+_GZIP_LEVEL = 6
+"""Higher levels take twice as long for 1 % less."""
 
 
 def encode_live(matte: Matte, threads: int, lookups: int = LOOKUPS) -> bytes:
-    """A matte for graphics hardware.
+    """Encode a matte for graphics hardware.
 
     Parameters
     ----------
     matte : Matte
     threads : int
-        To share the work; the bytes are the same.
+        Number of threads; the bytes do not depend on it.
     lookups : int
-        Of a pixel.
+        Lookups of a pixel.
+
+    Returns
+    -------
+    bytes
+        In the format of this module.
 
     Raises
     ------
@@ -62,48 +69,22 @@ def encode_live(matte: Matte, threads: int, lookups: int = LOOKUPS) -> bytes:
     step = max(math.ceil(math.sqrt(matte.width * matte.height / MOST_PIXELS)), 1)
     ys, xs = (np.arange(step // 2, size, step) for size in (matte.height, matte.width))
     levels = Pyramid.over(matte.columns, matte.rows).grids
-    whole = 1 << (len(levels) - 1)
-    texture = [whole * size for size in levels[-1]]
-    codes = np.zeros((lookups, 3, len(ys), len(xs)), np.uint16)
-    shares = np.zeros((lookups, 3, len(ys), len(xs)), np.uint8)
-    frames = {name: np.zeros((len(ys), len(xs), 3), np.float32) for name in ("S", "rho")}
-    alpha = np.zeros((len(ys), len(xs)), np.uint8)
+    coarsest = 1 << (len(levels) - 1)
+    texture = [coarsest * size for size in levels[-1]]
+    size = len(ys), len(xs)
+    encoded = _Encoded(
+        np.zeros((lookups, 3, *size), np.uint16),
+        np.zeros((lookups, 3, *size), np.uint8),
+        np.zeros((*size, 3), np.float32),
+        np.zeros((*size, 3), np.float32),
+        np.zeros(size, np.uint8),
+    )
     blocks = list(product(range(matte.block_rows), range(matte.block_columns)))
-
-    def one(number: int) -> None:
-        row, column = blocks[number]
-        block = matte.read(row, column)
-        y, x = matte.span(row, column)
-        sampled = [
-            np.flatnonzero((places >= part.start) & (places < part.stop))
-            for places, part in ((ys, y), (xs, x))
-        ]
-        if not all(map(len, sampled)):
-            return
-        of_block = np.ix_(ys[sampled[0]] - y.start, xs[sampled[1]] - x.start)
-        at = slice(sampled[0][0], sampled[0][-1] + 1), slice(sampled[1][0], sampled[1][-1] + 1)
-        wanted = np.zeros(block.recovered.shape, bool)
-        wanted[of_block] = True
-        fitted = fit_lookups(
-            matte.columns,
-            matte.rows,
-            block.count.reshape(-1, 3),
-            block.shared.reshape(-1),
-            block.cell,
-            block.weight,
-            lookups,
-            wanted.reshape(-1),
-        ).reshape(*block.recovered.shape, lookups, len(FIELDS))[of_block]
-        fitted = np.moveaxis(fitted, (0, 1), (2, 3))
-        for code, scale in enumerate((65536 / texture[0], 65536 / texture[1], SIXTEENTHS)):
-            codes[:, code, *at] = np.minimum(np.rint(fitted[:, code] * np.float32(scale)), 65535)
-        shares[:, :, *at] = _in_bytes(fitted[:, 3:])
-        for name, frame in frames.items():
-            frame[at] = getattr(block, name)[of_block]
-        alpha[at] = 255 * block.recovered[of_block]
-
-    in_parts(one, range(len(blocks)), threads)
-    tops = {name: max(float(frame.max()), 1e-6) for name, frame in frames.items()}
+    in_parts(
+        lambda number: _encode_block(matte, *blocks[number], ys, xs, texture, encoded),
+        range(len(blocks)),
+        threads,
+    )
     header = {
         "width": len(xs),
         "height": len(ys),
@@ -112,13 +93,75 @@ def encode_live(matte: Matte, threads: int, lookups: int = LOOKUPS) -> bytes:
         "levels": levels,
         "texture": texture,
         "crosstalk": matte.attributes["crosstalk"],
-        **tops,
+        "S": max(float(encoded.S.max()), 1e-6),
+        "rho": max(float(encoded.rho.max()), 1e-6),
     }
-    return _packed(header, codes, shares, frames, alpha)
+    return _pack(header, encoded)
 
 
-def _in_bytes(shares: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Shares of light (lookups, 3, ...) in 255ths; the heaviest lookup makes up for what rounding takes or adds."""
+class _Encoded(NamedTuple):
+    """The values of a matte that are encoded, for h rows and w columns of pixels.
+
+    Attributes
+    ----------
+    codes : (lookups, 3, h, w) uint16
+        x, y and level of each lookup.
+    shares : (lookups, 3, h, w) uint8
+        Its shares of each channel's light, in 255ths.
+    S, rho : (h, w, 3) float32
+    alpha : (h, w) uint8
+    """
+
+    codes: NDArray[np.uint16]
+    shares: NDArray[np.uint8]
+    S: NDArray[np.float32]
+    rho: NDArray[np.float32]
+    alpha: NDArray[np.uint8]
+
+
+def _encode_block(
+    matte: Matte,
+    row: int,
+    column: int,
+    ys: NDArray[np.integer],
+    xs: NDArray[np.integer],
+    texture: list[int],
+    encoded: _Encoded,
+) -> None:
+    """Encode the pixels of a block that are in the rows `ys` and the columns `xs`; `encoded` is written."""
+    block = matte.read(row, column)
+    y, x = matte.span(row, column)
+    in_block = [
+        np.flatnonzero((positions >= part.start) & (positions < part.stop))
+        for positions, part in ((ys, y), (xs, x))
+    ]
+    if not all(map(len, in_block)):
+        return
+    source = np.ix_(ys[in_block[0]] - y.start, xs[in_block[1]] - x.start)
+    target = slice(in_block[0][0], in_block[0][-1] + 1), slice(in_block[1][0], in_block[1][-1] + 1)
+    wanted = np.zeros(block.recovered.shape, bool)
+    wanted[source] = True
+    lookups = len(encoded.codes)
+    fitted = fit_lookups(
+        matte.columns,
+        matte.rows,
+        block.count.reshape(-1, 3),
+        block.shared.reshape(-1),
+        block.cell,
+        block.weight,
+        lookups,
+        wanted.reshape(-1),
+    ).reshape(*block.recovered.shape, lookups, len(FIELDS))[source]
+    fitted = np.moveaxis(fitted, (0, 1), (2, 3))
+    for code, scale in enumerate((65536 / texture[0], 65536 / texture[1], SIXTEENTHS)):
+        encoded.codes[:, code, *target] = np.minimum(np.rint(fitted[:, code] * np.float32(scale)), 65535)
+    encoded.shares[:, :, *target] = _quantise_shares(fitted[:, 3:])
+    encoded.S[target], encoded.rho[target] = block.S[source], block.rho[source]
+    encoded.alpha[target] = 255 * block.recovered[source]
+
+
+def _quantise_shares(shares: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Round shares of light (lookups, 3, ...) to 255ths; the heaviest lookup absorbs the rounding errors."""
     rounded = np.rint(shares * np.float32(255)).astype(np.int64)
     total = np.rint(shares.sum(axis=0) * np.float32(255)).astype(np.int64)
     rounded[0] += total - rounded.sum(axis=0)
@@ -126,22 +169,17 @@ def _in_bytes(shares: NDArray[np.float32]) -> NDArray[np.uint8]:
     return codes
 
 
-def _packed(
-    header: dict[str, Any],
-    codes: NDArray[np.uint16],
-    shares: NDArray[np.uint8],
-    frames: dict[str, NDArray[np.float32]],
-    alpha: NDArray[np.uint8],
-) -> bytes:
-    planes = np.empty((_PLANES * len(codes) + 7, *alpha.shape), np.uint8)
-    for k, (lookup, of_channels) in enumerate(zip(codes, shares, strict=True)):
-        to = planes[_PLANES * k :]
-        steps = np.diff(lookup[:2], axis=2, prepend=np.uint16(0))
-        to[0:4:2], to[1:4:2] = steps >> 8, steps & 255
-        to[4], to[5:8] = lookup[2], of_channels
-    for to, (name, frame) in zip((planes[-7:-4], planes[-4:-1]), frames.items(), strict=True):
-        root = np.sqrt(np.clip(frame / np.float32(header[name]), 0, 1))
-        to[:] = np.rint(255 * np.moveaxis(root, 2, 0))
-    planes[-1] = alpha
+def _pack(header: dict[str, Any], encoded: _Encoded) -> bytes:
+    """Compress the header and the planes."""
+    planes = np.empty((_PLANES * len(encoded.codes) + 7, *encoded.alpha.shape), np.uint8)
+    for k, (codes, shares) in enumerate(zip(encoded.codes, encoded.shares, strict=True)):
+        of_lookup = planes[_PLANES * k :]
+        steps = np.diff(codes[:2], axis=2, prepend=np.uint16(0))
+        of_lookup[0:4:2], of_lookup[1:4:2] = steps >> 8, steps & 255
+        of_lookup[4], of_lookup[5:8] = codes[2], shares
+    for name, image, first in (("S", encoded.S, -7), ("rho", encoded.rho, -4)):
+        root = np.sqrt(np.clip(image / np.float32(header[name]), 0, 1))
+        planes[first : first + 3] = np.rint(255 * np.moveaxis(root, 2, 0))
+    planes[-1] = encoded.alpha
     head = json.dumps(header).encode()
-    return gzip.compress(len(head).to_bytes(4, "little") + head + planes.tobytes(), _LEVEL, mtime=0)
+    return gzip.compress(len(head).to_bytes(4, "little") + head + planes.tobytes(), _GZIP_LEVEL, mtime=0)

@@ -1,7 +1,7 @@
-"""T as a few lookups a pixel in a mip-mapped texture: what graphics hardware evaluates while a hand moves a backdrop.
+"""T as a few lookups per pixel in a mipmapped texture, for compositing on graphics hardware.
 
-The texture's levels are the grids of a :class:`~workflows.recovery.pyramid.Pyramid`. A lookup between nodes is
-bilinear, one between levels linear.
+The texture's levels are the grids of a :class:`~workflows.recovery.pyramid.Pyramid`. Lookups are trilinear: bilinear
+between the nodes of a level, and linear between levels.
 """
 
 import math
@@ -15,9 +15,10 @@ from workflows.recovery.pyramid import Pyramid
 FIELDS = ("x", "y", "level", "R", "G", "B")
 """The values of a lookup, in this order."""
 _FEW = 24
-"""Clusters of a pixel that are merged by their distances; of more, neighbours on a grid are merged first."""
-_MOMENTS, _CLUSTER = 4, 7
-"""Of a cluster: weight, times x, times y, times the mean of the axes' second moments; and the channels' weights."""
+"""Most clusters of a pixel that merge by Ward's cost. While there are more, those in each 2 x 2 square of a grid
+merge."""
+_CLUSTER = 7
+"""Values of a cluster: its weight w; w times x, y and the mean second moment of the axes; the channels' weights."""
 
 
 def fit_lookups(
@@ -30,40 +31,40 @@ def fit_lookups(
     most: int,
     wanted: NDArray[np.bool_],
 ) -> NDArray[np.float32]:
-    """The rows of a T as few lookups.
+    """Approximate rows of T by a few texture lookups.
 
     Parameters
     ----------
     columns, rows : int
         The first grid of the cells.
     count, shared, cell, weight : arrays
-        Of n pixels, as :class:`~storage.layout.mattes.Block` has them: (n, 3), (n,), and one after another.
+        T of n pixels, as in :class:`~storage.layout.mattes.Block`, with shapes (n, 3), (n,), (entries,), (entries,).
     most : int
         Lookups of a pixel.
     wanted : (n,) bool
-        Of which pixels; the others get none.
+        Pixels to process; the others get zeros.
 
     Returns
     -------
     (n, most, 6) float32
-        By `FIELDS`, heaviest first and zeros where there are fewer: the place in cells of the first grid, from its top
-        left, the level, and each channel's share of light. The shares of a pixel sum to what its row does.
+        Columns as in `FIELDS`: the position in cells of the first grid, from its top left, the level, and each
+        channel's share of light. Heaviest lookup first; the rest is 0. The shares of a pixel sum to those of its rows.
 
     Notes
     -----
-    Nodes merge, by their moments, always the two of which the merger moves the least light (Ward, "Hierarchical
-    grouping to optimize an objective function", J. Am. Stat. Assoc., 1963), until there are `most`. What is left is
-    looked up at its centre, on the level whose lookup there has the same variance: a bump of level l has
-    ``b_l = 1/12 + (4^l - 1) / 4`` cells squared along each axis ([1, 3, 3, 1] / 8 on a grid of spacing s adds
-    3/4 s^2), a bilinear lookup a share f of the spacing from a node ``f (1 - f) 4^l`` more, and one between two levels
-    what lies between theirs. One node is so looked up as what it is.
+    Nodes merge by their moments, at least cost first (Ward, "Hierarchical grouping to optimize an objective function",
+    J. Am. Stat. Assoc., 1963), until `most` clusters are left. A cluster is looked up at its centre, on the level
+    where a lookup has the cluster's variance. In cells squared along each axis, a bump of level l has the variance
+    ``b_l = 1/12 + (4^l - 1) / 4``, for [1, 3, 3, 1] / 8 on a grid of spacing s adds 3/4 s^2. A bilinear lookup at the
+    fraction f between two nodes adds ``f (1 - f) 4^l``. A lookup between two levels interpolates their variances.
+    A cluster of a single node is exact.
     """
     pyramid = Pyramid.over(columns, rows)
     sizes = count.astype(np.int64)
     begin = np.concatenate([[0], np.cumsum(sizes.sum(axis=1))])
-    room = max(int(np.diff(begin).max(initial=0)), 1)
+    capacity = max(int(np.diff(begin).max(initial=0)), 1)
     lookups = np.zeros((len(sizes), most, len(FIELDS)), np.float32)
-    clusters = np.empty((room, _CLUSTER))
+    clusters = np.empty((capacity, _CLUSTER))
     _fit(
         sizes, begin, wanted, shared, cell, weight, pyramid.starts, pyramid.arrays.columns, clusters, lookups
     )
@@ -83,38 +84,15 @@ def _fit(
     clusters: NDArray[np.float64],
     lookups: NDArray[np.float32],
 ) -> None:
-    """Write the lookups of pixel after pixel."""
-    room = len(clusters)
-    key, was = np.empty(room, np.int64), np.empty((room, _CLUSTER))
-    partner, cost = np.empty(room, np.int64), np.empty(room)
+    """Write the lookups of one pixel after another."""
+    capacity = len(clusters)
+    key, copy = np.empty(capacity, np.int64), np.empty((capacity, _CLUSTER))
+    partner, cost = np.empty(capacity, np.int64), np.empty(capacity)
     for i in np.flatnonzero(wanted):
-        n, entry = 0, begin[i]
-        for channel in range(3):
-            for _ in range(sizes[i, channel]):
-                level = np.searchsorted(starts, cell[entry], "right") - 1
-                row, column = divmod(np.int64(cell[entry]) - starts[level], columns[level])
-                side = 2.0**level
-                x, y = (column + 0.5) * side, (row + 0.5) * side
-                w = np.float64(weight[entry])
-                to = clusters[n]
-                to[4:] = w if shared[i] else 0.0
-                to[4 + channel] = w
-                w = to[4] + to[5] + to[6]
-                to[0], to[1], to[2] = w, w * x, w * y
-                to[3] = w * ((x * x + y * y) / 2 + _variance(level))
-                key[n] = (level * 2**24 + row) * 2**24 + column
-                n, entry = n + 1, entry + 1
+        n = _read_clusters(sizes[i], begin[i], shared[i], cell, weight, starts, columns, clusters, key)
         if not shared[i]:  # the channels' rows have many nodes in common
-            n = _merge_equal(clusters, key, n, was)
-        while n > _FEW:
-            for a in range(n):
-                level, place = divmod(key[a], 2**48)
-                row, column = divmod(place, 2**24)
-                key[a] = (level * 2**24 + row // 2) * 2**24 + column // 2
-            left = _merge_equal(clusters, key, n, was)
-            if left == n and (key[:n] % 2**48 == 0).all():
-                break  # a cluster a grid
-            n = left
+            n = _merge_equal(clusters, key, n, copy)
+        n = _merge_squares(clusters, key, n, copy)
         n = _merge_nearest(clusters, partner, cost, n, lookups.shape[1])
         for k in range(n):
             heaviest = k
@@ -126,12 +104,64 @@ def _fit(
 
 
 @njit(nogil=True, cache=True)
-def _merge_equal(
-    clusters: NDArray[np.float64], key: NDArray[np.int64], n: int, was: NDArray[np.float64]
+def _read_clusters(
+    sizes: NDArray[np.int64],
+    entry: int,
+    shared: bool,
+    cell: NDArray[np.uint32],
+    weight: NDArray[np.float32],
+    starts: NDArray[np.int64],
+    columns: NDArray[np.int64],
+    clusters: NDArray[np.float64],
+    key: NDArray[np.int64],
 ) -> int:
-    """Merge clusters of one key; returns how many are left, at the front."""
+    """Write a cluster for each entry of a pixel's rows, and its level, row and column as a key; return their number.
+
+    `sizes`, (3,), are the entries of each channel; the first is `entry`.
+    """
+    n = 0
+    for channel in range(3):
+        for _ in range(sizes[channel]):
+            level = np.searchsorted(starts, cell[entry], "right") - 1
+            row, column = divmod(np.int64(cell[entry]) - starts[level], columns[level])
+            side = 2.0**level
+            x, y = (column + 0.5) * side, (row + 0.5) * side
+            w = np.float64(weight[entry])
+            cluster = clusters[n]
+            cluster[4:] = w if shared else 0.0
+            cluster[4 + channel] = w
+            w = cluster[4] + cluster[5] + cluster[6]
+            cluster[0], cluster[1], cluster[2] = w, w * x, w * y
+            cluster[3] = w * ((x * x + y * y) / 2 + _variance(level))
+            key[n] = (level * 2**24 + row) * 2**24 + column
+            n, entry = n + 1, entry + 1
+    return n
+
+
+@njit(nogil=True, cache=True)
+def _merge_squares(
+    clusters: NDArray[np.float64], key: NDArray[np.int64], n: int, copy: NDArray[np.float64]
+) -> int:
+    """Merge clusters in each 2 x 2 square of a grid until there are few; return the number left, which come first."""
+    while n > _FEW:
+        for a in range(n):
+            level, node = divmod(key[a], 2**48)
+            row, column = divmod(node, 2**24)
+            key[a] = (level * 2**24 + row // 2) * 2**24 + column // 2
+        left = _merge_equal(clusters, key, n, copy)
+        if left == n and (key[:n] % 2**48 == 0).all():
+            break  # one cluster per level
+        n = left
+    return n
+
+
+@njit(nogil=True, cache=True)
+def _merge_equal(
+    clusters: NDArray[np.float64], key: NDArray[np.int64], n: int, copy: NDArray[np.float64]
+) -> int:
+    """Merge clusters of equal keys; return the number left, which come first. `copy` is working space."""
     order = np.argsort(key[:n], kind="mergesort")
-    was[:n] = clusters[:n]
+    copy[:n] = clusters[:n]
     keys = key[:n].copy()
     left = -1
     for k in range(n):
@@ -139,9 +169,9 @@ def _merge_equal(
         if k == 0 or keys[a] != key[left]:
             left += 1
             key[left] = keys[a]
-            clusters[left] = was[a]
+            clusters[left] = copy[a]
         else:
-            clusters[left] += was[a]
+            clusters[left] += copy[a]
     return left + 1
 
 
@@ -149,7 +179,10 @@ def _merge_equal(
 def _merge_nearest(
     clusters: NDArray[np.float64], partner: NDArray[np.int64], cost: NDArray[np.float64], n: int, most: int
 ) -> int:
-    """Merge clusters until there are no more than `most`, cheapest first; returns how many are left."""
+    """Merge clusters, at least cost first, until no more than `most` are left; return the number left.
+
+    `partner` and `cost`, (n,), are working space.
+    """
     for a in range(n if n > most else 0):
         partner[a], cost[a] = _find_partner(clusters, n, a)
     while n > most:
@@ -160,7 +193,7 @@ def _merge_nearest(
         b = partner[a]
         clusters[a] += clusters[b]
         n -= 1
-        clusters[b] = clusters[n]  # the last one takes its place
+        clusters[b] = clusters[n]
         partner[b], cost[b] = partner[n], cost[n]
         for i in range(n):
             if i in (a, b) or partner[i] in (a, b, n):
@@ -168,42 +201,42 @@ def _merge_nearest(
             else:
                 for other in (a, b):
                     if other > i:
-                        now = _cost(clusters[i], clusters[other])
-                        if now < cost[i]:
-                            partner[i], cost[i] = other, now
+                        new = _cost(clusters[i], clusters[other])
+                        if new < cost[i]:
+                            partner[i], cost[i] = other, new
     return n
 
 
 @njit(nogil=True, cache=True)
 def _find_partner(clusters: NDArray[np.float64], n: int, a: int) -> tuple[int, float]:
-    """Which cluster behind one is the cheapest to merge with it, and at what cost."""
+    """Find the cluster after `a` that is cheapest to merge with it, and the cost."""
     partner, cost = -1, np.inf
     for b in range(a + 1, n):
-        now = _cost(clusters[a], clusters[b])
-        if now < cost:
-            partner, cost = b, now
+        new = _cost(clusters[a], clusters[b])
+        if new < cost:
+            partner, cost = b, new
     return partner, cost
 
 
 @njit(nogil=True, cache=True)
-def _cost(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """How much it moves light to merge two clusters."""
-    wa, wb = one[0], other[0]
-    dx, dy = one[1] / wa - other[1] / wb, one[2] / wa - other[2] / wb
+def _cost(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """Ward's cost of merging two clusters."""
+    wa, wb = a[0], b[0]
+    dx, dy = a[1] / wa - b[1] / wb, a[2] / wa - b[2] / wb
     cost: float = wa * wb / (wa + wb) * (dx * dx + dy * dy)
     return cost
 
 
 @njit(nogil=True, cache=True)
 def _variance(level: int) -> float:
-    """Of a bump, in cells squared along an axis."""
+    """Variance of a bump along an axis, in cells squared."""
     variance: float = 1 / 12 + (4.0**level - 1) / 4
     return variance
 
 
 @njit(nogil=True, cache=True)
 def _variance_of_lookup(x: float, y: float, level: int) -> float:
-    """Of a lookup at a place in cells on a level, the mean of the axes."""
+    """Variance of a lookup at a position in cells, in cells squared, the mean of both axes."""
     side = 2.0**level
     f, g = x / side - 0.5, y / side - 0.5
     f, g = f - math.floor(f), g - math.floor(g)
@@ -213,17 +246,17 @@ def _variance_of_lookup(x: float, y: float, level: int) -> float:
 
 @njit(nogil=True, cache=True)
 def _describe(cluster: NDArray[np.float64], last: int, lookup: NDArray[np.float32]) -> None:
-    """Write a lookup from a cluster's moments."""
+    """Write the lookup of a cluster; `last` is the coarsest level."""
     w = cluster[0]
     x, y = cluster[1] / w, cluster[2] / w
-    wanted = cluster[3] / w - (x * x + y * y) / 2
-    level, here = 0, _variance_of_lookup(x, y, 0)
-    further = 0.0
+    variance = cluster[3] / w - (x * x + y * y) / 2
+    level, finer = 0, _variance_of_lookup(x, y, 0)
+    fraction = 0.0
     while level < last:
-        above = _variance_of_lookup(x, y, level + 1)
-        if above > wanted:
-            further = min(max((wanted - here) / (above - here), 0.0), 1.0) if above > here else 0.0
+        coarser = _variance_of_lookup(x, y, level + 1)
+        if coarser > variance:
+            fraction = min(max((variance - finer) / (coarser - finer), 0.0), 1.0) if coarser > finer else 0.0
             break
-        level, here = level + 1, above
-    lookup[0], lookup[1], lookup[2] = x, y, level + further
+        level, finer = level + 1, coarser
+    lookup[0], lookup[1], lookup[2] = x, y, level + fraction
     lookup[3:] = cluster[4:]
