@@ -1,4 +1,4 @@
-"""Measurements in units of T, and what S, rho and the error to expect are once T is known."""
+"""Measurements in the form that T is solved from; S, rho and the expected error once T is known."""
 
 from typing import NamedTuple
 
@@ -8,20 +8,20 @@ from numpy.typing import NDArray
 from workflows.recovery.noise import Noise
 from workflows.recovery.photometry import Photometry
 
-# Standard deviations that S and S + rho may move when they are fitted once more.
-_TRUST = 2.0
+# Standard deviations that S and S + rho may change by when they are fitted again.
+_MOST_CHANGE = 2.0
 
 
-class Measured(NamedTuple):
-    """Measurements in the +-1 form of eq. 8, where T is all there is between patterns and camera.
+class Measurements(NamedTuple):
+    """Measurements in the +-1 form of eq. 8, free of S and rho: T times the patterns, plus noise.
 
     Attributes
     ----------
     value : (n, 3, m + 2) float32
-        ``2 (C - S) / rho - 1``: T times patterns of -1 (black) and 1 (white). The last two are a black and a white
-        monitor, -1 and 1. 0 where nothing was measured.
+        ``2 (C - S) / rho - 1``, for patterns of -1 (black) and 1 (white). The last two values are those of a black and
+        a white monitor, -1 and 1. 0 where nothing was measured.
     variance : (n, 3, m + 2) float32
-        Of `value`; infinite where nothing was measured.
+        Variance of `value`; infinite where nothing was measured.
     """
 
     value: NDArray[np.float32]
@@ -35,32 +35,42 @@ def normalise(
     least_contrast: float,
     usable: NDArray[np.bool_] | None = None,
     frames: NDArray[np.number] | None = None,
-) -> Measured:
-    """Bring measurements to the +-1 form of eq. 8.
+) -> Measurements:
+    """Convert measurements to the +-1 form of eq. 8.
 
     Parameters
     ----------
     measurements : (n, m, 3) float32
-        Linear camera values C. One that is not finite was not measured.
+        Linear camera values C. Values that are not finite are ignored.
     photometry : Photometry
         S and rho of the n pixels.
     noise : Noise
-        Noise of a frame.
+        Noise of one frame.
     least_contrast : float
-        A channel whose rho is below this many standard deviations of a mid-grey value says nothing of T.
+        A channel whose rho is below this many standard deviations of a mid-grey value is ignored.
     usable : (n, m, 3) bool, optional
-        False where a value says nothing, as where the camera clipped it; all say something if left out.
+        False where a value must be ignored, as where the camera clipped it. Default: all are usable.
     frames : (m,) or (n, m, 3) number, optional
-        Frames averaged into each value, above 0; one each if left out.
+        Frames averaged into each value, above 0. Default: 1.
 
     Returns
     -------
-    Measured
+    Measurements
 
     Raises
     ------
     ValueError
-        If the shapes do not fit.
+        If the shapes do not match.
+
+    Examples
+    --------
+    A pixel under a black, a half lit and a white pattern, then the two constant monitors:
+
+    >>> S, rho, variance = (np.full((1, 3), value, np.float32) for value in (0.1, 0.5, 1e-6))
+    >>> C = np.full((1, 3, 3), [[0.1], [0.35], [0.6]], np.float32)
+    >>> value, variance = normalise(C, Photometry(S, rho, variance, variance), Noise(1e-5, 0), 3.0)
+    >>> print(value[0, 0].round(3), variance[0, 0].round(6))
+    [-1.  0.  1. -1.  1.] [1.6e-04 1.6e-04 1.6e-04 1.6e-05 1.6e-05]
     """
     n = photometry.rho.shape[0]
     if measurements.ndim != 3 or measurements.shape[0] != n or measurements.shape[2] != 3:
@@ -69,50 +79,51 @@ def normalise(
     alive = (rho > 0) & (rho**2 >= least_contrast**2 * noise.variance(S + rho / 2))
     scale = np.where(alive, rho, 1)
     light = np.ascontiguousarray(measurements.transpose(0, 2, 1), dtype=np.float32)
-    there = alive & np.isfinite(light)
+    valid = alive & np.isfinite(light)
     if usable is not None:
-        there &= usable.transpose(0, 2, 1)
-    light = np.where(there, light, 0)
+        valid &= usable.transpose(0, 2, 1)
+    light = np.where(valid, light, 0)
     if frames is not None and frames.ndim == 3:
         frames = frames.transpose(0, 2, 1)
     variance = noise.variance(light) / (1 if frames is None else frames)
-    ends = np.stack([photometry.black, photometry.white], axis=2)
-    value = np.where(there, 2 * (light - S) / scale - 1, 0)
-    known = np.where(alive, np.array([-1, 1], np.float32), 0)
-    spread = np.where(there, 4 * variance / scale**2, np.inf)
-    return Measured(
-        np.concatenate([value, known], axis=2).astype(np.float32),
-        np.concatenate([spread, np.where(alive, 4 * ends / scale**2, np.inf)], axis=2).astype(np.float32),
+    constant_variance = np.stack([photometry.black, photometry.white], axis=2)
+    value = np.where(valid, 2 * (light - S) / scale - 1, 0)
+    variance = np.where(valid, 4 * variance / scale**2, np.inf)
+    constants = np.where(alive, np.array([-1, 1], np.float32), 0)
+    constant_variance = np.where(alive, 4 * constant_variance / scale**2, np.inf)
+    return Measurements(
+        np.concatenate([value, constants], axis=2).astype(np.float32),
+        np.concatenate([variance, constant_variance], axis=2).astype(np.float32),
     )
 
 
-def refit(
+def refit_photometry(
     photometry: Photometry,
-    measured: Measured,
+    measured: Measurements,
     response: NDArray[np.float32],
     kappa: NDArray[np.floating],
 ) -> Photometry:
-    """Fit S and rho once more, now that T says what each pattern was: all frames know of them, not the constant ones.
+    """Fit S and rho again, given T: to all frames, not only those of constant monitors.
 
     Parameters
     ----------
     photometry : Photometry
-        With which the measurements were brought to their form.
-    measured : Measured
+        S and rho with which the measurements were normalised.
+    measured : Measurements
     response : (n, 3, m + 2) float32
-        What T makes of the patterns, in the same form.
+        Predictions of the measurements from T.
     kappa : (n, 3) float
         Variance of a pattern of full contrast that T does not account for.
 
     Returns
     -------
     Photometry
-        The old one where T says nothing, and everywhere within two standard deviations of it: of a T that is wrong,
-        slopes come out too low.
+        S and rho within two standard deviations of the given ones, since a wrong T makes slopes too low. Unchanged
+        where T is empty.
 
     Notes
     -----
-    With ``value = a + g response``, ``S + rho (value + 1) / 2`` is ``S' + rho' (response + 1) / 2`` of
+    A line ``value = a + g response`` is fitted. Then ``S + rho (value + 1) / 2 = S' + rho' (response + 1) / 2`` with
     ``rho' = g rho`` and ``S' = S + rho (1 + a - g) / 2``.
     """
     m = response.shape[2] - 2
@@ -131,7 +142,10 @@ def refit(
     g = np.where(known, np.maximum(g, 0), 1)
     a = np.where(known, (mean_value - g[..., None] * mean)[..., 0], 0)
     S, white = photometry.S, photometry.S + photometry.rho
-    black_range, white_range = _TRUST * np.sqrt(photometry.black), _TRUST * np.sqrt(photometry.white)
+    black_range, white_range = (
+        _MOST_CHANGE * np.sqrt(photometry.black),
+        _MOST_CHANGE * np.sqrt(photometry.white),
+    )
     new_S = np.clip(S + photometry.rho * (1 + a - g) / 2, S - black_range, S + black_range)
     new_white = np.clip(S + photometry.rho * (1 + a + g) / 2, white - white_range, white + white_range)
     S, white = np.where(known, new_S, S), np.where(known, np.maximum(new_white, new_S), white)
@@ -144,30 +158,30 @@ def refit(
 
 
 def expected_error(
-    photometry: Photometry, measured: Measured, misfit: NDArray[np.floating]
+    photometry: Photometry, measured: Measurements, misfit: NDArray[np.floating]
 ) -> NDArray[np.float32]:
-    """The error to expect of composites, from how far T was from explaining the measurements.
+    """Estimate the error of composites from the residuals of the measurements.
 
     Parameters
     ----------
     photometry : Photometry
-    measured : Measured
+    measured : Measurements
     misfit : (n, 3) float
-        Squared residuals of the measurements less their variances, in the mean.
+        Mean of the squared residuals less the variances of the measurements.
 
     Returns
     -------
     (n,) float32
-        Root of the mean square over the channels, in camera units; infinite where no channel was measured.
+        Root mean square error over the channels, in camera units; infinite where no channel was measured.
 
     Notes
     -----
-    A pattern is a backdrop like any other: what T misses of the patterns it misses of composites, times rho / 2, for
-    patterns are +-1. Where the residuals are no larger than noise, the error is at least that of a mean of them.
+    A pattern is a backdrop like any other, so composites have the same error as predictions of patterns, times
+    rho / 2 because patterns are +-1. Its square is at least the variance of the measurements' mean.
     """
-    there = np.isfinite(measured.variance)
-    used = there.sum(axis=2)
-    noise = np.where(there, measured.variance, 0).sum(axis=2) / np.maximum(used, 1) ** 2
+    valid = np.isfinite(measured.variance)
+    used = valid.sum(axis=2)
+    noise = np.where(valid, measured.variance, 0).sum(axis=2) / np.maximum(used, 1) ** 2
     square = (photometry.rho**2 / 4 * np.maximum(misfit, noise)).mean(axis=1)
     error: NDArray[np.float32] = np.where(used.any(axis=1), np.sqrt(square), np.inf).astype(np.float32)
     return error

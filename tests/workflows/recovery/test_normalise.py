@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from workflows.recovery.noise import Noise
-from workflows.recovery.normalise import Measured, expected_error, normalise, refit
+from workflows.recovery.normalise import Measurements, expected_error, normalise, refit_photometry
 from workflows.recovery.photometry import Photometry
 
 NOISE = Noise(4e-6, 5e-5)
@@ -63,7 +63,7 @@ def test_refit_is_weighted_least_squares_in_camera_values(photometry):
     measurements += rng.normal(0, 0.01, measurements.shape)
     measurements[1, 3] = np.nan
     measured = normalise(measurements.astype(np.float32), photometry, NOISE, 3.0)
-    fit = refit(photometry, measured, response, kappa)
+    fit = refit_photometry(photometry, measured, response, kappa)
     for p, c in [(0, 0), (0, 1), (1, 0), (1, 1), (1, 2)]:
         light = (1 + response[p, c].astype(float)) / 2
         S, rho = photometry.S[p, c], photometry.rho[p, c]
@@ -79,10 +79,10 @@ def test_refit_is_weighted_least_squares_in_camera_values(photometry):
 
 
 def test_refit_without_information_keeps_the_photometry(photometry):
-    unknown = Measured(np.zeros((2, 3, 5), np.float32), np.full((2, 3, 5), np.inf, np.float32))
-    flat = Measured(np.full((2, 3, 5), 0.3, np.float32), np.ones((2, 3, 5), np.float32))
+    unknown = Measurements(np.zeros((2, 3, 5), np.float32), np.full((2, 3, 5), np.inf, np.float32))
+    flat = Measurements(np.full((2, 3, 5), 0.3, np.float32), np.ones((2, 3, 5), np.float32))
     for measured in (unknown, flat):
-        fit = refit(photometry, measured, np.zeros((2, 3, 5), np.float32), np.zeros((2, 3)))
+        fit = refit_photometry(photometry, measured, np.zeros((2, 3, 5), np.float32), np.zeros((2, 3)))
         np.testing.assert_array_equal(fit.S, photometry.S)
         np.testing.assert_array_equal(fit.rho, photometry.rho)
 
@@ -92,11 +92,11 @@ def test_refit_ignores_overconfident_transport(photometry):
     response = np.where(np.arange(24) % 2, 1, -1) * np.ones((2, 3, 1))
     value = np.where(np.arange(24) % 4 < 2, response, 0)
     ends = np.tile([-1.0, 1.0], (2, 3, 1))
-    measured = Measured(
+    measured = Measurements(
         np.concatenate([value, ends], axis=2).astype(np.float32), np.full((2, 3, 26), 1e-4, np.float32)
     )
     response = np.concatenate([response, ends], axis=2).astype(np.float32)
-    fit = refit(photometry, measured, response, np.ones((2, 3)))
+    fit = refit_photometry(photometry, measured, response, np.ones((2, 3)))
     black, white = (3 * np.sqrt(variance) for variance in (photometry.black, photometry.white))
     assert (np.abs(fit.S - photometry.S) <= black).all()
     assert (np.abs(fit.rho - photometry.rho) <= black + white).all()
@@ -105,7 +105,7 @@ def test_refit_ignores_overconfident_transport(photometry):
 def test_the_error_to_expect_is_the_misfits_in_camera_units(photometry):
     variance = np.full((2, 3, 6), 1e-3, np.float32)
     variance[1, 2] = np.inf
-    measured = Measured(np.zeros((2, 3, 6), np.float32), variance)
+    measured = Measurements(np.zeros((2, 3, 6), np.float32), variance)
     misfit = np.array([[0.04, 0.01, 0.02], [-0.1, 0.0, 0.0]])
     found = expected_error(photometry, measured, misfit)
     noise = 1e-3 / 6

@@ -1,4 +1,4 @@
-"""Sparse rows of cells on a grid: their neighbours, and the step from a grid to the next finer one."""
+"""Sparse rows of T on a grid, sums over groups of neighbouring cells, and refinement to the next grid."""
 
 from typing import NamedTuple, Self
 
@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from workflows.recovery.sensing import Level
 from workflows.recovery.transport import Transport, ragged_entries
 
-# What a neighbour counts in a cell's group, beside the cell's own 1.
 NEIGHBOUR_SHARE = 0.5
+"""Weight of each of the eight neighbours in a cell's group, where the cell itself has weight 1."""
 
 
 class Rows(NamedTuple):
-    """Sparse rows while they are being solved for, one for each problem.
+    """Sparse rows of T that are being solved for, one per problem.
 
     Attributes
     ----------
@@ -23,7 +23,7 @@ class Rows(NamedTuple):
     cell : (begin[n],) int32
         Cells ``row * columns + column``, ascending within a row.
     weight : (begin[n],) float32
-        Weights, zero or more; solvers write here.
+        Weights, zero or more; solvers overwrite them.
     """
 
     begin: NDArray[np.int64]
@@ -32,7 +32,7 @@ class Rows(NamedTuple):
 
     @classmethod
     def whole(cls, n: int, level: Level) -> Self:
-        """Rows that hold every cell of a level, all of weight 0."""
+        """n rows with every cell of a level, all of weight 0."""
         cells = level.columns * level.rows
         return cls(
             np.arange(n + 1) * cells,
@@ -51,21 +51,21 @@ class Rows(NamedTuple):
         )
 
     def split(self, parent: Level, child: Level, least_group: float, reach: int) -> "Rows":
-        """Prune, widen by the neighbours, and split every cell into its children.
+        """Prune cells, add neighbours of those kept, and split every cell into its children.
 
         Parameters
         ----------
         parent, child : Level
             The level of these rows, and the next finer one.
         least_group : float
-            A cell is kept if its weight plus half of its eight neighbours' is more than this.
+            A cell is kept if its weight plus half the sum of its eight neighbours' weights is above this.
         reach : int
-            Cells at up to this distance of a kept one, diagonals too, are added with their own weight.
+            Cells within this many rows and columns of a kept one are added, with their own weights.
 
         Returns
         -------
         Rows
-            On the finer grid; a child has an equal share of its parent's weight.
+            Rows on the finer grid. The children of a cell have equal shares of its weight.
         """
         across, down = child.columns // parent.columns, child.rows // parent.rows
         split: Rows = split_cells(self, parent.columns, parent.rows, across, down, least_group, reach)
@@ -73,12 +73,12 @@ class Rows(NamedTuple):
 
     def transport(self, level: Level, index: NDArray[np.integer]) -> Transport:
         """Transport of n pixels from ``index (n, 3)``, the row of each channel; -1 gives an empty one."""
-        wanted = index.ravel()
-        found = self.take(wanted[wanted >= 0])
-        count = np.zeros(wanted.size, np.int64)
-        count[wanted >= 0] = np.diff(found.begin)
+        flat = index.ravel()
+        taken = self.take(flat[flat >= 0])
+        count = np.zeros(flat.size, np.int64)
+        count[flat >= 0] = np.diff(taken.begin)
         return Transport.from_rows(
-            level.columns, level.rows, count.reshape(index.shape), found.cell, found.weight
+            level.columns, level.rows, count.reshape(index.shape), taken.cell, taken.weight
         )
 
 
@@ -90,14 +90,14 @@ def group_sums(
     field: NDArray[np.float32],
     out: NDArray[np.float32],
 ) -> None:
-    """Write each cell's value plus half of its eight neighbours'.
+    """Write each cell's value plus half the sum of its eight neighbours' values.
 
     Parameters
     ----------
     cell : (s,) int32
         Cells ``row * columns + column``.
     value : (s,) float32
-        Their values; a cell that is not listed has 0.
+        Their values; other cells have the value 0.
     columns : int
         Columns of the grid.
     field : (rows + 2, columns + 2) float32
@@ -127,7 +127,7 @@ def split_cells(
     """Kernel of :meth:`Rows.split`; a cell of the ``columns`` by ``rows`` grid has ``across * down`` children."""
     begin, cell, weight = coarse
     n = begin.size - 1
-    given = np.zeros((rows + 2, columns + 2), np.float32)
+    field = np.zeros((rows + 2, columns + 2), np.float32)
     kept = np.zeros((rows, columns), np.bool_)
     children = across * down
     new_begin = np.zeros(n + 1, np.int64)
@@ -135,22 +135,13 @@ def split_cells(
     new_weight = np.empty(1024, np.float32)
     end = 0
     for p in range(n):
-        own, mine = cell[begin[p] : begin[p + 1]], weight[begin[p] : begin[p + 1]]
-        group = np.empty(own.size, np.float32)
-        group_sums(own, mine, columns, given, group)
-        top, bottom, left, right = rows, -1, columns, -1
-        marked = 0
-        for e in range(own.size):
-            r, c = divmod(own[e], columns)
-            given[r + 1, c + 1] = mine[e]
-            if group[e] > least_group:
-                r0, r1 = max(r - reach, 0), min(r + reach, rows - 1)
-                c0, c1 = max(c - reach, 0), min(c + reach, columns - 1)
-                top, bottom, left, right = min(top, r0), max(bottom, r1), min(left, c0), max(right, c1)
-                for v in range(r0, r1 + 1):
-                    for u in range(c0, c1 + 1):
-                        marked += not kept[v, u]
-                        kept[v, u] = True
+        cells, weights = cell[begin[p] : begin[p + 1]], weight[begin[p] : begin[p + 1]]
+        group = np.empty(cells.size, np.float32)
+        group_sums(cells, weights, columns, field, group)
+        marked, top, bottom, left, right = _mark_kept(cells, group, least_group, reach, kept)
+        for e in range(cells.size):
+            r, c = divmod(cells[e], columns)
+            field[r + 1, c + 1] = weights[e]
         while end + marked * children > new_cell.size:
             new_cell = np.concatenate((new_cell, np.empty_like(new_cell)))
             new_weight = np.concatenate((new_weight, np.empty_like(new_weight)))
@@ -159,12 +150,47 @@ def split_cells(
                 if kept[v // down, u]:
                     for i in range(across):
                         new_cell[end] = (v * columns + u) * across + i
-                        new_weight[end] = given[v // down + 1, u + 1] / np.float32(children)
+                        new_weight[end] = field[v // down + 1, u + 1] / np.float32(children)
                         end += 1
         for v in range(top, bottom + 1):
             kept[v, left : right + 1] = False
-        for e in range(own.size):
-            r, c = divmod(own[e], columns)
-            given[r + 1, c + 1] = 0
+        for e in range(cells.size):
+            r, c = divmod(cells[e], columns)
+            field[r + 1, c + 1] = 0
         new_begin[p + 1] = end
     return Rows(new_begin, new_cell[:end].copy(), new_weight[:end].copy())
+
+
+@njit(nogil=True, cache=True)
+def _mark_kept(
+    cell: NDArray[np.int32],
+    group: NDArray[np.float32],
+    least_group: float,
+    reach: int,
+    kept: NDArray[np.bool_],
+) -> tuple[int, int, int, int, int]:
+    """Mark the cells within reach of those whose group sum is above `least_group`.
+
+    `kept`, (rows, columns), is all false before.
+
+    Returns
+    -------
+    marked : int
+        Number of cells marked.
+    top, bottom, left, right : int
+        The first and last row and column with a marked cell; the last is below the first if there is none.
+    """
+    rows, columns = kept.shape
+    top, bottom, left, right = rows, -1, columns, -1
+    marked = 0
+    for e in range(cell.size):
+        if group[e] > least_group:
+            r, c = divmod(cell[e], columns)
+            r0, r1 = max(r - reach, 0), min(r + reach, rows - 1)
+            c0, c1 = max(c - reach, 0), min(c + reach, columns - 1)
+            top, bottom, left, right = min(top, r0), max(bottom, r1), min(left, c0), max(right, c1)
+            for v in range(r0, r1 + 1):
+                for u in range(c0, c1 + 1):
+                    marked += not kept[v, u]
+                    kept[v, u] = True
+    return marked, top, bottom, left, right

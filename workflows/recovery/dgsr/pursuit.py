@@ -1,4 +1,4 @@
-"""The search for the cells of a T: non-negative dynamic group sparsity, kernels on the rows of many pixels."""
+"""Non-negative dynamic group sparsity (NN-DGSR): kernels that choose the cells of T's rows and fit their weights."""
 
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ from workflows.recovery.solvers import descend, inner, stack_rows
 
 
 class System(NamedTuple):
-    """The measurements that rows of T on a level's grid are solved from.
+    """The measurements from which n rows of T on a level's grid are solved.
 
     Attributes
     ----------
@@ -23,10 +23,10 @@ class System(NamedTuple):
     source : (n,) int64
         First channel of `light` that a row's measurements belong to.
     scale, target : (n, c * m) float32
-        Measurements in +-1 form of c channels, scaled to one variance, and the scales: zero where a measurement
-        says nothing.
+        Factors that give the measurements of a row equal variances, 0 for unusable ones; and the measurements of c
+        channels in +-1 form, times these factors.
     variance : (n,) float64
-        Of a row's scaled measurements.
+        Variance of a row's scaled measurements.
     """
 
     light: NDArray[np.float32]
@@ -39,7 +39,7 @@ class System(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """The measurements that one row of T is solved from: a row of a `System`.
+    """The measurements from which one row of T is solved: a row of a `System`.
 
     Attributes
     ----------
@@ -73,9 +73,9 @@ def grow_rows(system: System, found: Rows, finest: bool, constants: Constants) -
     ----------
     system : System
     found : Rows
-        Candidates; weights are overwritten.
+        Candidate cells; the weights are overwritten.
     finest : bool
-        Whether to stop growing, and to drop cells, where more cells explain nothing.
+        Whether this is the finest level, where cells that do not improve the fit enough are not added, or dropped.
     constants : Constants
     """
     begin, cell, weight = found
@@ -99,7 +99,7 @@ def grow_row(
     constants: Constants,
     field: NDArray[np.float32],
 ) -> None:
-    """Fit the weights of one row: more and more cells, until more explain nothing.
+    """Fit the weights of one row, with more and more cells until the fit stops improving.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def grow_row(
     best : (s,) float32
         Their weights, 0 at first; changed.
     m : float32
-        Measurements that say something, above 0.
+        Number of usable measurements, above 0.
     finest, constants
         As in :func:`grow_rows`.
     field : (rows + 2, columns + 2) float32
@@ -118,37 +118,37 @@ def grow_row(
     s = cell.size
     most = min(max(int(constants.sparsity * m), 1) if finest else max(int(m), 1), s)
     residual = problem.target.copy()
-    left = inner(residual, residual)
-    price = 2 * np.log(max(s, 2))
+    misfit = inner(residual, residual)
+    penalty = 2 * np.log(max(s, 2))
     proxy, x, chosen = np.empty(s, np.float32), np.empty(s, np.float32), np.empty(s, np.bool_)
     k = min(1, most)
     while True:
-        before, cells = left, np.count_nonzero(best)
+        before, cells = misfit, np.count_nonzero(best)
         for _ in range(constants.rounds):
-            pruned = light_and_prune(problem, cell, best, k, m, residual, constants, field, proxy, x, chosen)
-            now = inner(pruned, pruned)
-            stalled = now >= (1 - constants.stall) * left
-            if now < left:
-                residual, left = pruned, now
+            pruned = add_and_prune(problem, cell, best, k, m, residual, constants, field, proxy, x, chosen)
+            new_misfit = inner(pruned, pruned)
+            stalled = new_misfit >= (1 - constants.stall) * misfit
+            if new_misfit < misfit:
+                residual, misfit = pruned, new_misfit
                 for j in range(s):
                     best[j] = x[j]
             if stalled:
                 break
-        gain = m * np.log(before / max(left, 1e-30))
-        enough = gain <= price * (np.count_nonzero(best) - cells)
-        settled = finest and enough and abs(best.sum() - 1) <= constants.sum_tolerance
-        if settled or k == most:
+        gain = m * np.log(before / max(misfit, 1e-30))
+        no_gain = gain <= penalty * (np.count_nonzero(best) - cells)
+        converged = finest and no_gain and abs(best.sum() - 1) <= constants.sum_tolerance
+        if converged or k == most:
             break
         k = min(max(k + 1, int(k * constants.growth)), most)
     if finest:
         group_sums(cell, best, problem.columns, field, proxy)
         for j in range(s):
-            chosen[j] = best[j] > 0 and proxy[j] > np.sqrt(price * left) / m
+            chosen[j] = best[j] > 0 and proxy[j] > np.sqrt(penalty * misfit) / m
         solve_chosen(problem, cell, chosen, best, constants)
 
 
 @njit(nogil=True, cache=True, inline="always")
-def light_and_prune(
+def add_and_prune(
     problem: Problem,
     cell: NDArray[np.int32],
     best: NDArray[np.float32],
@@ -163,7 +163,7 @@ def light_and_prune(
 ) -> NDArray[np.float32]:
     """One round: add the k groups of cells with the largest proxies, solve, keep the k best groups, solve again.
 
-    `x` is written; what it leaves of the measurements is returned. `proxy` and `chosen` are working space.
+    The weights are written to `x`; their residual is returned. `proxy` and `chosen` are working space.
     """
     correlate(problem.light, cell, problem.scale, residual, proxy)
     for j in range(cell.size):
@@ -186,7 +186,7 @@ def correlate(
     residual: NDArray[np.float32],
     out: NDArray[np.float32],
 ) -> None:
-    """Write the inner products of a residual with the scaled +-1 light of cells.
+    """Write the inner products of a residual with each cell's scaled +-1 light.
 
     Parameters
     ----------
@@ -195,7 +195,7 @@ def correlate(
     cell : (s,) int32
         Cells.
     scale, residual : (channels * m,) float32
-        Factor of each measurement, and what it leaves.
+        Factor and residual of each measurement.
     out : (s,) float32
         Written.
     """
@@ -221,14 +221,14 @@ def choose_groups(
     field: NDArray[np.float32],
     chosen: NDArray[np.bool_],
 ) -> None:
-    """Mark the k cells of positive value whose group has the most energy; of equal ones the first.
+    """Mark the k cells of positive value whose group has the most energy; the first ones if equal.
 
     Parameters
     ----------
     cell, columns, field
         As in :func:`~workflows.recovery.dgsr.groups.group_sums`.
     value : (s,) float32
-        Zero or more; a group's energy is the cell's squared value plus half of its neighbours'.
+        Zero or more. A group's energy is the cell's squared value plus half the sum of its neighbours' squared values.
     k : int
         1 or more.
     chosen : (s,) bool
@@ -236,7 +236,7 @@ def choose_groups(
     """
     energy = np.empty_like(value)
     group_sums(cell, value * value, columns, field, energy)
-    best = np.empty(k, np.int64)  # the most energetic cells so far, falling
+    best = np.empty(k, np.int64)  # the cells with most energy so far, in descending order
     found = 0
     for j in range(value.size):
         chosen[j] = False
@@ -268,7 +268,7 @@ def solve_chosen(
     cell : (s,) int32
         Candidates.
     chosen : (s,) bool
-        Candidates that may be above zero.
+        Candidates whose weight may be above zero.
     x : (s,) float32
         The start; overwritten with the result.
     constants : Constants
@@ -277,7 +277,7 @@ def solve_chosen(
     Returns
     -------
     (c * m,) float32
-        What is left of the target.
+        The residual.
     """
     index = np.flatnonzero(chosen)
     matrix, y = np.empty((index.size, problem.target.size), np.float32), x[index]

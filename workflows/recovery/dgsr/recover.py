@@ -8,17 +8,17 @@ from workflows.recovery.dgsr.groups import Rows
 from workflows.recovery.dgsr.options import DEFAULT, DgsrOptions
 from workflows.recovery.dgsr.pursuit import System, grow_rows
 from workflows.recovery.noise import Noise
-from workflows.recovery.normalise import Measured, expected_error, normalise
+from workflows.recovery.normalise import Measurements, expected_error, normalise
 from workflows.recovery.photometry import Photometry
 from workflows.recovery.sensing import Sensing
 from workflows.recovery.transport import Transport
 
-# Pixels at a time, so that the working arrays stay small whatever a caller passes.
+# Pixels per block: limits the working arrays.
 _BLOCK = 256
-# A measurement so many standard deviations from zero, or with one so much larger than the range, says nothing:
-# squares of the others fit float32.
-_FARTHEST = 1e6
-_WIDEST = 1e3
+# Measurements with larger values, in standard deviations, or larger standard deviations are not used, so that squares
+# do not overflow float32.
+_MOST_SIGMAS = 1e6
+_MOST_DEVIATION = 1e3
 
 
 def recover(
@@ -35,113 +35,138 @@ def recover(
     Parameters
     ----------
     measurements : (n, m, 3) float32
-        Linear camera values of n pixels under the m patterns. One that is not finite is left out.
+        Linear camera values of n pixels under the m patterns. Values that are not finite are ignored.
     photometry : Photometry
         S and rho of the pixels.
     sensing : Sensing
         The program's levels, coarse to fine.
     noise : Noise
-        Noise of a frame.
+        Noise of one frame.
     usable : (n, m, 3) bool, optional
-        False where a measurement says nothing, as where the camera clipped it; all say something if left out.
+        False where a measurement must be ignored, as where the camera clipped it. Default: all are usable.
     frames : (m,) or (n, m, 3) number, optional
-        Frames averaged into each measurement; one each if left out.
+        Frames averaged into each measurement, above 0. Default: 1.
     options : DgsrOptions
 
     Returns
     -------
     Transport
-        On the finest grid; empty rows where the measurements say nothing.
+        T on the finest grid; rows without usable measurements are empty.
 
     Raises
     ------
     ValueError
-        If the shapes do not fit.
+        If the shapes do not match.
 
     Notes
     -----
     Solves eq. 9 in the +-1 form of eq. 8: ``f = 2 (C - S) / rho - 1 = A t``, t >= 0. Each round takes the proxy
-    ``t + A'(f - A t) / m``, lights the cells whose squared proxy plus half of their neighbours' is largest, solves
-    a non-negative least squares on them and the cells so far, and prunes the result in the same way (Huang, Huang
-    and Metaxas, "Learning with dynamic group sparsity", ICCV 2009).
+    ``t + A'(f - A t) / m``, adds the cells whose squared proxy plus half of their neighbours' is largest, solves
+    a non-negative least-squares problem on these and the previous cells, and prunes the result in the same way
+    (Huang, Huang and Metaxas, "Learning with dynamic group sparsity", ICCV 2009).
 
-    Of s cells that explain nothing the best one still lowers ``m ln |r|^2`` by about ``2 ln s``. Growth at the
-    finest level ends when it gains less than that a cell, and cells of a group worth less are dropped.
+    Among s cells unrelated to the measurements the best one still lowers ``m ln |r|^2`` by about ``2 ln s``. At the
+    finest level no more cells are added once they gain less than that each, and cells of groups that gain less are
+    dropped.
 
-    From there on, with the Gaussian prior, iterations at the finest level fit Gaussians to T and solve for T under
-    them (:func:`~workflows.recovery.dgsr.gaussian_prior.filter_row`). A T of few cells that explains the measurements
-    better than any Gaussians, at the same price of ``2 ln s`` a cell, stays as it is.
+    With the Gaussian prior, Gaussians are then fitted to T at the finest level and T is solved for under this prior,
+    iteratively (:func:`~workflows.recovery.dgsr.gaussian_prior.filter_row`). A row of few cells that explains the
+    measurements better than any Gaussians, with a penalty of ``2 ln s`` per cell, is left unchanged.
 
-    All measurements of a channel weigh the same: the variance of one is known from its own noisy value only, and
-    weights by it would favour those that came out dark. Joint channels weigh by their mean inverse variance; seen
-    under grey patterns they become one measurement, else their rows are stacked.
+    All measurements of a channel have equal weights. Their variances are known only from their own noisy values, so
+    weights by variance would favour values that came out too dark. Joint channels are weighted by their mean inverse
+    variances: averaged into one measurement under grey patterns, stacked under coloured ones.
+
+    Examples
+    --------
+    A pixel that sees one cell of a grid of 8 x 6 through the glass, under 40 random patterns:
+
+    >>> from workflows.recovery.sensing import Level
+    >>> light = np.random.default_rng(0).integers(0, 2, (1, 48, 40)).astype(np.float32)
+    >>> sensing = Sensing((Level(8, 6, np.arange(40), light),))
+    >>> S, rho, variance = (np.full((1, 3), value, np.float32) for value in (0.1, 0.7, 1e-6))
+    >>> measurements = (S + rho * light[0, 21, :, np.newaxis])[np.newaxis]
+    >>> transport = recover(measurements, Photometry(S, rho, variance, variance), sensing, Noise(1e-6, 0))
+    >>> transport.cell.tolist(), transport.weight.tolist()
+    ([21, 21, 21], [1.0, 1.0, 1.0])
     """
     constants = options.constants
     measured = normalise(measurements, photometry, noise, constants.least_contrast, usable, frames)
     value, weight = _weigh(measured.value[..., :-2], measured.variance[..., :-2])
-    used = sensing.levels if options.levels == "hierarchical" else sensing.levels[-1:]
     parts = []
     for first in range(0, max(len(value), 1), _BLOCK):
         block = slice(first, first + _BLOCK)
-        alive = weight[block].max(axis=2, initial=0) > 0
-        index = np.full(alive.shape, -1)
-        if options.channels == "joint":
-            pixel = np.flatnonzero(alive.any(axis=1))
-            channel = np.zeros_like(pixel)
-            index[pixel] = np.arange(pixel.size)[:, np.newaxis]
-        else:
-            pixel, channel = map(np.ascontiguousarray, np.nonzero(alive))
-            index[pixel, channel] = np.arange(pixel.size)
-        rows = Rows.whole(pixel.size, used[0])
-        for i, level in enumerate(used):
-            if i > 0:
-                rows = rows.split(used[i - 1], level, constants.least_group, reach=0)
-            finest = level is used[-1]
-            light = np.ascontiguousarray(level.light)
-            source = np.zeros_like(channel) if len(light) == 1 else channel
-            target, scale, variance = _rows_of(
-                value[block][..., level.patterns],
-                weight[block][..., level.patterns],
-                pixel,
-                None if options.channels == "joint" else channel,
-                grey=len(light) == 1,
-            )
-            system = System(light, level.columns, level.rows, source, scale, target, variance)
-            grow_rows(system, rows, finest, constants)
-            if finest and options.prior == "gaussian":
-                rows = filter_rows(system, rows, constants)
-        parts.append(rows.transport(used[-1], np.where(alive, index, -1)))
+        parts.append(_recover_block(value[block], weight[block], sensing, options))
     return Transport.concatenate(parts)
+
+
+def _recover_block(
+    value: NDArray[np.float32], weight: NDArray[np.float32], sensing: Sensing, options: DgsrOptions
+) -> Transport:
+    """Recover some pixels from their measurements and weights, (n, 3, m)."""
+    levels = sensing.levels if options.levels == "hierarchical" else sensing.levels[-1:]
+    joint, constants = options.channels == "joint", options.constants
+    alive = weight.max(axis=2, initial=0) > 0
+    index = np.full(alive.shape, -1)
+    if joint:
+        pixel = np.flatnonzero(alive.any(axis=1))
+        channel = np.zeros_like(pixel)
+        index[pixel] = np.arange(pixel.size)[:, np.newaxis]
+    else:
+        pixel, channel = map(np.ascontiguousarray, np.nonzero(alive))
+        index[pixel, channel] = np.arange(pixel.size)
+    rows = Rows.whole(pixel.size, levels[0])
+    for i, level in enumerate(levels):
+        if i > 0:
+            rows = rows.split(levels[i - 1], level, constants.least_group, reach=0)
+        finest = level is levels[-1]
+        light = np.ascontiguousarray(level.light)
+        grey = len(light) == 1
+        source = np.zeros_like(channel) if grey else channel
+        target, scale, variance = _rows_of(
+            value[..., level.patterns],
+            weight[..., level.patterns],
+            pixel,
+            None if joint else channel,
+            grey=grey,
+        )
+        system = System(light, level.columns, level.rows, source, scale, target, variance)
+        grow_rows(system, rows, finest, constants)
+        if finest and options.prior == "gaussian":
+            rows = filter_rows(system, rows, constants)
+    return rows.transport(levels[-1], np.where(alive, index, -1))
 
 
 def error_of(
     transport: Transport,
     photometry: Photometry,
-    measured: Measured,
+    measured: Measurements,
     sensing: Sensing,
 ) -> NDArray[np.float32]:
-    """The error to expect of composites with a T of the finest level; see :func:`expected_error`.
+    """Estimate the error of composites with a T on the finest grid.
 
     Parameters
     ----------
     transport : Transport
-        Of n pixels.
+        T of n pixels.
     photometry : Photometry
-    measured : Measured
+    measured : Measurements
+        As from :func:`~workflows.recovery.normalise.normalise`.
     sensing : Sensing
 
     Returns
     -------
     (n,) float32
+        As from :func:`~workflows.recovery.normalise.expected_error`.
     """
     level, sizes = sensing.levels[-1], transport.count.ravel().astype(np.int64)
     row = np.repeat(np.arange(sizes.size), sizes)
     channel = np.minimum(row % 3, len(level.light) - 1)
-    seen = level.light[channel, transport.cell] * transport.weight[:, np.newaxis]
+    light = level.light[channel, transport.cell] * transport.weight[:, np.newaxis]
     response = np.zeros((sizes.size, level.patterns.size), np.float32)
     begin = (np.cumsum(sizes) - sizes)[sizes > 0]
     if begin.size:
-        response[sizes > 0] = 2 * np.add.reduceat(seen, begin) - 1
+        response[sizes > 0] = 2 * np.add.reduceat(light, begin) - 1
     value, variance = (array[..., level.patterns] for array in measured)
     used = np.isfinite(variance)
     square = (value - response.reshape(value.shape)) ** 2 - np.where(used, variance, 0)
@@ -152,7 +177,7 @@ def error_of(
 def _weigh(
     value: NDArray[np.float32], variance: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Measurements with the inverse of their channel's mean variance; both 0 for one that says nothing.
+    """Weight measurements by the inverse mean variance of their channel; value and weight are 0 where unusable.
 
     Parameters
     ----------
@@ -163,9 +188,9 @@ def _weigh(
     -------
     value, weight : (n, 3, m) float32
     """
-    usable = np.isfinite(value) & (variance < _WIDEST**2)
-    usable &= np.abs(np.where(usable, value, 0)) < _FARTHEST * np.sqrt(np.where(usable, variance, 1))
-    # one axis at a time over contiguous memory: the order of the sum is the same in any batch
+    usable = np.isfinite(value) & (variance < _MOST_DEVIATION**2)
+    usable &= np.abs(np.where(usable, value, 0)) < _MOST_SIGMAS * np.sqrt(np.where(usable, variance, 1))
+    # contiguous, so that the order of the sum does not depend on the batch
     total = np.ascontiguousarray(np.where(usable, variance, 0)).sum(axis=2, keepdims=True)
     count = usable.sum(axis=2, keepdims=True)
     weight = np.where(usable, count / np.where(total > 0, total, 1), 0)
@@ -180,23 +205,23 @@ def _rows_of(
     *,
     grey: bool,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float64]]:
-    """The measurements of each row to solve for, scaled to one variance.
+    """Scale the measurements of each row to be solved for to equal variances.
 
     Parameters
     ----------
     value, weight : (n, 3, m) float32
         Measurements in +-1 form and their inverse variances.
     pixel, channel : (k,) intp
-        Whose measurements a row has; those of all channels if `channel` is None.
+        Pixel and channel of each row; `channel` is None for all channels together.
     grey : bool
-        Whether the channels saw the same patterns.
+        Whether the patterns are grey, so that all channels saw the same.
 
     Returns
     -------
     target, scale : (k, m or 3 m) float32
-        Scaled measurements, and the scales; a row's squared scales add up to its usable measurements.
+        Scaled measurements, and the scales. The squared scales of a row sum to its number of usable measurements.
     variance : (k,) float64
-        Of a scaled measurement.
+        Variance of a scaled measurement.
     """
     if channel is not None:
         value, weight = value[pixel, channel], weight[pixel, channel]
@@ -207,7 +232,7 @@ def _rows_of(
     else:
         size = 3 * value.shape[2]
         value, weight = value[pixel].reshape(pixel.size, size), weight[pixel].reshape(pixel.size, size)
-    # one axis at a time over contiguous memory: the order of the sum is the same in any batch
+    # contiguous, so that the order of the sum does not depend on the batch
     value, weight = np.ascontiguousarray(value), np.ascontiguousarray(weight)
     count = np.maximum((weight > 0).sum(axis=1), 1)
     mean = weight.sum(axis=1, dtype=np.float64) / count

@@ -14,7 +14,7 @@ from workflows.recovery.lobes.nodes import gather_lobes, rows_of, spread_lobes
 from workflows.recovery.lobes.options import LobesOptions
 from workflows.recovery.lobes.posterior import update
 from workflows.recovery.lobes.search import fit
-from workflows.recovery.normalise import Measured
+from workflows.recovery.normalise import Measurements
 from workflows.recovery.pyramid import Grids
 from workflows.recovery.solvers import subtract
 
@@ -32,16 +32,16 @@ class Pixels(NamedTuple):
     grids : Grids
     code : (nodes, channels m) uint8
         Light of the m patterns on the nodes of the pyramid; 1 or 3 channels.
-    joint : Measured
+    joint : Measurements
         Measurements of all channels together, (n, channels (m + 2)).
-    own : Measured
+    own : Measurements
         Those of each channel, (n, 3, m + 2).
     """
 
     grids: Grids
     code: NDArray[np.uint8]
-    joint: Measured
-    own: Measured
+    joint: Measurements
+    own: Measurements
 
 
 class Explained(NamedTuple):

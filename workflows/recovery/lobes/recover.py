@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from workflows.recovery.lobes.options import FINE, LobesOptions
 from workflows.recovery.lobes.pixels import Explained, Pixels, recover_pixels
 from workflows.recovery.noise import Noise
-from workflows.recovery.normalise import Measured, expected_error, normalise, refit
+from workflows.recovery.normalise import Measurements, expected_error, normalise, refit_photometry
 from workflows.recovery.photometry import Photometry
 from workflows.recovery.sensing import Patterns
 from workflows.recovery.transport import Transport
@@ -89,17 +89,17 @@ def recover(
     parts = []
     for first in range(0, max(n, 1), _BLOCK):
         block = slice(first, first + _BLOCK)
-        of_block = Measured(measured.value[block], measured.variance[block])
+        of_block = Measurements(measured.value[block], measured.variance[block])
         parts.append(
             _recover_block(patterns, of_block, options, response[block], kappa[block], misfit[block])
         )
-    better = refit(photometry, measured, response, kappa)
+    better = refit_photometry(photometry, measured, response, kappa)
     return Recovery(Transport.concatenate(parts), better, expected_error(better, measured, misfit))
 
 
 def _recover_block(
     patterns: Patterns,
-    measured: Measured,
+    measured: Measurements,
     options: LobesOptions,
     response: NDArray[np.float32],
     kappa: NDArray[np.float64],
@@ -108,13 +108,13 @@ def _recover_block(
     """Recover some pixels; `response`, `kappa` and `misfit` are written."""
     columns, rows = patterns.pyramid.grids[0]
     alive = np.isfinite(measured.variance).any(axis=(1, 2))
-    own = Measured(measured.value[alive], measured.variance[alive])
+    own = Measurements(measured.value[alive], measured.variance[alive])
     if patterns.channels == 1:
         joint = _mean(own)
         apart = _disagree(own, joint.value, options.disagreement)
     else:
         n, channels, m = own.value.shape
-        joint = Measured(own.value.reshape(n, channels * m), own.variance.reshape(n, channels * m))
+        joint = Measurements(own.value.reshape(n, channels * m), own.variance.reshape(n, channels * m))
         apart = np.zeros(n, bool)
     counts = np.zeros((len(apart), 3), np.int64)
     seen, left_out, missed = np.zeros_like(own.value), np.zeros(counts.shape), np.zeros(counts.shape)
@@ -134,17 +134,17 @@ def _recover_block(
     return Transport.from_rows(columns, rows, count, node[begin], merged, shared, options.least_weight)
 
 
-def _mean(own: Measured) -> Measured:
+def _mean(own: Measurements) -> Measurements:
     """The mean of the channels, (n, m + 2), each weighed by its precision, and its variance."""
     precision = 1 / own.variance
     total = precision.sum(axis=1)
     with np.errstate(divide="ignore"):
         joint_variance = 1 / total
     joint = (own.value * precision).sum(axis=1) * np.where(total > 0, joint_variance, 0)
-    return Measured(joint, joint_variance)
+    return Measurements(joint, joint_variance)
 
 
-def _disagree(own: Measured, joint: NDArray[np.float32], disagreement: float) -> NDArray[np.bool_]:
+def _disagree(own: Measurements, joint: NDArray[np.float32], disagreement: float) -> NDArray[np.bool_]:
     """(n,) bool: whether the channels differ by more than noise, and S and rho that are not quite known."""
     value, variance = own
     precision, x = 1 / variance, joint[:, np.newaxis]
