@@ -1,1 +1,1 @@
-"""The default method: oriented Gaussian lobes, then the posterior mean of T about them."""
+"""The default method: oriented Gaussian lobes, then the posterior mean of T."""

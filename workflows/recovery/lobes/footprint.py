@@ -1,8 +1,8 @@
-"""An oriented Gaussian lobe on the nodes of a pyramid, and what every pattern says of it.
+"""Sampling of an oriented Gaussian lobe on the nodes of a pyramid, and the patterns' values on these nodes.
 
-A lobe has the parameters (weight, x, y, l00, l10, l11): its centre in cells of the pyramid's first grid, from the top
-left corner, and the Cholesky factor L of its covariance, L = [[l00, 0], [l10, l11]], less that of the bumps it is
-sampled on. It lies on the coarsest grid that resolves it.
+A lobe has the parameters (weight, x, y, l00, l10, l11). Its centre is in cells of the pyramid's first grid, from the
+top left corner. L = [[l00, 0], [l10, l11]] is the Cholesky factor of its covariance less that of the bumps it is
+sampled on. A lobe is sampled on the coarsest grid that resolves it.
 """
 
 import math
@@ -15,28 +15,29 @@ from numpy.typing import NDArray
 from workflows.recovery.pyramid import Grids
 
 PARAMETERS = 6
+"""Parameters of a lobe."""
 NODES = 1024
-"""Nodes that a lobe is sampled on, at most: an even longer one is blurred across."""
+"""Most nodes that a lobe is sampled on. A lobe too long for that goes to a coarser grid."""
 
-# A lobe is cut off at this squared Mahalanobis distance: 0.7 % of it are beyond.
+# Squared Mahalanobis distance at which a lobe is cut off: 0.7 % of its mass is beyond.
 _REACH = 10.0
-# The least standard deviation of a sampled Gaussian, in spacings of its grid: a narrower one falls between nodes.
-_SHARPEST = 0.6
+# Least standard deviation of a sampled Gaussian, in spacings of its grid: a narrower one can miss all nodes.
+_LEAST_SIGMA = 0.6
 
 
-class Shown(NamedTuple):
-    """The patterns that the measurements of a pixel saw.
+class PatternCodes(NamedTuple):
+    """The patterns behind the measurements of a pixel.
 
     Attributes
     ----------
     grids : Grids
-        Of the pyramid.
+        The pyramid's grids.
     code : (nodes, first + groups * m or more) uint8
         Light, 0 (black) to 255 (white), on the nodes of the pyramid.
     first : int
         The column of `code` with the first pattern.
     groups, m : int
-        Groups of measurements, and patterns of each.
+        Groups of measurements, and patterns of each group.
     """
 
     grids: Grids
@@ -59,18 +60,18 @@ def fit_level(lobe: NDArray[np.float64], level: int, columns: NDArray[np.int64],
     Parameters
     ----------
     lobe : (6,) float64
-        Its L is changed so that the lobe with its bumps stays as wide as it is.
+        Changed in place: L, so that the covariance of the lobe including its bumps stays the same.
     level : int
-        The level it lies on.
+        Its present level.
     columns : (levels,) int64
-        Of the pyramid's grids.
+        Columns of the pyramid's grids.
     resolution : float
-        Spacings that the lobe's smaller standard deviation must have, at least.
+        Least standard deviation of the lobe along its minor axis, in spacings of the grid.
 
     Returns
     -------
     int
-        The level it now lies on.
+        Its new level.
     """
     blur = bump_variance(level)
     xx = lobe[3] ** 2 + blur
@@ -85,7 +86,7 @@ def fit_level(lobe: NDArray[np.float64], level: int, columns: NDArray[np.int64],
         if minor < 2 * resolution * spacing and not crowded:
             break
         level += 1
-    blur, least = bump_variance(level), (_SHARPEST * 2.0**level) ** 2
+    blur, least = bump_variance(level), (_LEAST_SIGMA * 2.0**level) ** 2
     low, high = max(mean - half - blur, least), max(mean + half - blur, least)
     cosine, sine = ((xx - yy) / 2 / half, xy / half) if half > 1e-9 else (1.0, 0.0)
     xx, xy = (low + high + (high - low) * cosine) / 2, (high - low) * sine / 2
@@ -104,7 +105,7 @@ def sample(
     node: NDArray[np.int64],
     terms: NDArray[np.float32],
 ) -> int:
-    """The nodes under a lobe, and its share on each.
+    """Write the nodes under a lobe, and its share on each.
 
     Parameters
     ----------
@@ -114,12 +115,12 @@ def sample(
     node : (NODES,) int64
         Written.
     terms : (1 or 6, NODES) float32
-        Written: shares that sum to 1, and their derivatives by x, y, l00, l10 and l11, which sum to 0.
+        Written: shares of sum 1, and their derivatives by x, y, l00, l10 and l11, of sum 0.
 
     Returns
     -------
     int
-        The number of nodes; one at least.
+        The number of nodes, at least 1.
 
     Notes
     -----
@@ -160,6 +161,13 @@ def sample(
         for k in range(terms.shape[0]):
             terms[k, 0] = 1.0 if k == 0 else 0.0
         return 1
+    _normalise(terms, n, total)
+    return n
+
+
+@njit(nogil=True, cache=True)
+def _normalise(terms: NDArray[np.float32], n: int, total: float) -> None:
+    """Divide n shares by their sum `total`, and turn derivatives of their logarithms into derivatives of the shares."""
     for i in range(n):
         terms[0, i] /= total
     for k in range(1, terms.shape[0]):
@@ -168,11 +176,10 @@ def sample(
             mean += terms[0, i] * terms[k, i]
         for i in range(n):
             terms[k, i] = terms[0, i] * (terms[k, i] - mean)
-    return n
 
 
 @njit(nogil=True, cache=True)
-def load(
+def signed_codes(
     code: NDArray[np.uint8],
     first: int,
     m: int,
@@ -181,17 +188,18 @@ def load(
     out: NDArray[np.float32],
     to: int,
 ) -> None:
-    """Write what the patterns send from some nodes, -1 (black) to 1 (white), one row a node.
+    """Write the patterns' light on some nodes, -1 (black) to 1 (white), one row per node.
 
     Parameters
     ----------
-    code : (nodes, m or more) uint8
+    code : (nodes, first + m or more) uint8
         Light, 0 to 255.
     first, m : int
-        The columns of `code` to take.
+        The first column of `code` to read, and the number of columns.
     node : (n or more,) int64
     n : int
     out : (n or more, to + m or more) float32
+        Written.
     to : int
         The first column of `out` to write.
     """
@@ -201,7 +209,7 @@ def load(
             written[k] = np.float32(row[k]) * np.float32(2 / 255) - np.float32(1)
 
 
-# "contract" lets a product and a sum be one operation: fewer roundings, and the same ones on every machine that has it.
+# "contract" allows fused multiply-add: fewer roundings, and the same results on every machine that has it.
 @njit(nogil=True, cache=True, fastmath={"contract"})
 def combine(terms: NDArray[np.float32], rows: NDArray[np.float32], n: int, out: NDArray[np.float32]) -> None:
     """Write ``terms[:, :n] @ rows[:n]``.
@@ -212,6 +220,7 @@ def combine(terms: NDArray[np.float32], rows: NDArray[np.float32], n: int, out: 
     rows : (n or more, m) float32
     n : int
     out : (t, m or more) float32
+        Written.
     """
     m = rows.shape[1]
     for t in range(terms.shape[0]):

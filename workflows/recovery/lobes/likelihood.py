@@ -1,6 +1,7 @@
-"""How likely measurements are before what is predicted of them, and what lobes must be worth to stay.
+"""The likelihood of measurements given a prediction, and the penalty of a model's lobes.
 
-A prediction leaves some of T out; how much, its residuals say: kappa.
+The variance of a residual is the camera's plus kappa times the pattern's contrast within T. kappa, the part of T that
+the prediction misses, is estimated from the residuals.
 """
 
 import math
@@ -12,12 +13,12 @@ from numpy.typing import NDArray
 from workflows.recovery.lobes.footprint import PARAMETERS
 from workflows.recovery.pyramid import Grids
 
-# A pattern's contrast within T is never quite zero.
+# Least contrast of a pattern within T, 1 - f^2.
 _LEAST_CONTRAST = 0.02
 
 
 @njit(nogil=True, cache=True)
-def scatter(
+def estimate_kappa(
     y: NDArray[np.float32],
     f: NDArray[np.float32],
     mean: NDArray[np.float32],
@@ -26,30 +27,32 @@ def scatter(
     parameters: int,
     least: float,
 ) -> tuple[float, float]:
-    """How far T is from what predicts the measurements.
+    """Estimate the variance of measurements that the prediction of T leaves unexplained.
 
     Parameters
     ----------
     y, f, variance : (groups (m + 2),) float32
-        Measurements, prediction, and the camera's share of their variances; infinite for no measurement.
-    mean : like y
-        What the prediction makes of the patterns, without offsets.
-    groups, parameters : int
-        Parameters that were fitted.
+        Measurements, prediction, and variances due to the camera; infinite where nothing was measured.
+    mean : (groups (m + 2),) float32
+        Prediction without offsets.
+    groups : int
+        Groups of measurements.
+    parameters : int
+        Number of fitted parameters.
     least : float
-        The least kappa.
+        Least value of kappa.
 
     Returns
     -------
     kappa : float
-        Variance that a pattern of full contrast has because T is not the prediction's; 1 if T is a single ray.
+        Unexplained variance of a pattern of full contrast; 1 if T is a single ray that the prediction misses.
     misfit : float
-        By how much the squared residuals of the patterns are larger than their variances, in the mean.
+        Mean of the patterns' squared residuals less their camera variances.
 
     Notes
     -----
-    A T of mean t and covariance kappa diag(t) adds the variance kappa (1 - mean^2) to a pattern of +-1. kappa is
-    found by a few scoring steps from its moment estimate.
+    If T has the mean t and the covariance kappa diag(t), a pattern of +-1 has the additional variance
+    kappa (1 - mean^2). kappa starts at its moment estimate and takes a few Fisher scoring steps.
     """
     m = y.size // groups - 2
     kappa, misfit, freedom = 0.0, 0.0, 1.0
@@ -79,26 +82,24 @@ def weigh(
     parameters: int,
     precision: NDArray[np.float32],
 ) -> tuple[float, float]:
-    """The precision of measurements whose prediction leaves some of T out.
+    """Compute the precisions of measurements given a prediction, and the likelihood.
 
     Parameters
     ----------
-    y, f, variance : (groups (m + 2),) float32
-        Measurements, prediction, and the camera's share of their variances; infinite for no measurement.
-    groups, parameters : int
-        Parameters that were fitted.
-    precision : like y
-        Written.
+    y, f, variance, groups, parameters
+        As in :func:`estimate_kappa`.
+    precision : (groups (m + 2),) float32
+        Written: inverse of the camera's variance plus the unexplained one.
 
     Returns
     -------
     kappa : float
-        As from :func:`scatter`.
+        As from :func:`estimate_kappa`.
     objective : float
         -2 ln likelihood, up to a constant.
     """
     m = y.size // groups - 2
-    kappa, _ = scatter(y, f, f, variance, groups, parameters, 0.0)
+    kappa, _ = estimate_kappa(y, f, f, variance, groups, parameters, 0.0)
     objective = 0.0
     for g in range(groups):
         for j in range(g * (m + 2), (g + 1) * (m + 2)):
@@ -111,9 +112,9 @@ def weigh(
 
 
 @njit(nogil=True, cache=True)
-def price(grids: Grids, level: NDArray[np.int64], k: int) -> float:
-    """What k lobes must be worth in -2 ln likelihood: 2 for each shape and weight, and their places among all."""
-    cost = 0.0
+def penalty(grids: Grids, level: NDArray[np.int64], k: int) -> float:
+    """Penalty of k lobes in -2 ln likelihood: 2 per weight and shape parameter, 2 ln(nodes of the level) per centre."""
+    total = 0.0
     for i in range(k):
-        cost += 2 * (PARAMETERS - 2) + 2 * math.log(grids.columns[level[i]] * grids.rows[level[i]])
-    return cost
+        total += 2 * (PARAMETERS - 2) + 2 * math.log(grids.columns[level[i]] * grids.rows[level[i]])
+    return total

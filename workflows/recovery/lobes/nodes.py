@@ -1,4 +1,4 @@
-"""Lobes as weights of single nodes, and the lobes again that such weights make."""
+"""Conversion of lobes to weights of nodes, and back by the moments of these weights."""
 
 import math
 
@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from workflows.recovery.lobes.footprint import NODES, Shown, fit_level, load, sample
+from workflows.recovery.lobes.footprint import NODES, PatternCodes, fit_level, sample, signed_codes
 from workflows.recovery.lobes.mixture import Mixture
 from workflows.recovery.pyramid import Grids
 
@@ -27,19 +27,20 @@ def spread_lobes(
     ----------
     grids : Grids
     mixture : Mixture
-        Changed: lobes are moved to the levels of the resolution.
+        Changed in place: lobes are moved to the levels for this resolution.
     k : int
+        Number of lobes.
     resolution : float
         As in :func:`~workflows.recovery.lobes.footprint.fit_level`.
-    node, weight : (k NODES,)
-        Written, lobe after lobe; a node under two lobes is there twice.
+    node, weight : (k NODES,) int64, float32
+        Written, lobe after lobe; a node under two lobes occurs twice.
     end : (k or more,) int64
         Written: where the nodes of each lobe end.
 
     Returns
     -------
     int
-        How many there are.
+        The number of nodes.
     """
     lobes, level = mixture.lobes, mixture.level
     terms, n, total = np.empty((1, NODES), np.float32), 0, 0.0
@@ -65,7 +66,7 @@ def gather_lobes(
     k: int,
     resolution: float,
 ) -> None:
-    """Give k lobes the moments of the weights under them: what :func:`spread_lobes` did, the other way round.
+    """Give k lobes the moments of the weights of their nodes: the inverse of :func:`spread_lobes`.
 
     Parameters
     ----------
@@ -73,8 +74,9 @@ def gather_lobes(
     node, weight, end
         As from :func:`spread_lobes`, with any weights.
     mixture : Mixture
-        Changed; a lobe with no weight left stays as it is, but for its own.
+        Changed in place. A lobe with a total weight of almost 0 keeps its centre and shape.
     k : int
+        Number of lobes.
     resolution : float
         As in :func:`~workflows.recovery.lobes.footprint.fit_level`.
     """
@@ -85,7 +87,7 @@ def gather_lobes(
         total, sx, sy, sxx, sxy, syy = 1e-30, 0.0, 0.0, 0.0, 0.0, 0.0
         for j in range(begin, end[i]):
             row, column = divmod(node[j] - starts[level[i]], columns[level[i]])
-            # about the lobe's centre, for the squares of small numbers lose nothing
+            # relative to the lobe's centre, to avoid cancellation
             w, x, y = weight[j], (column + 0.5) * spacing - lobe[1], (row + 0.5) * spacing - lobe[2]
             total += w
             sx, sy = sx + w * x, sy + w * y
@@ -103,20 +105,21 @@ def gather_lobes(
 
 
 @njit(nogil=True, cache=True)
-def rows_of(shown: Shown, node: NDArray[np.int64], n: int, A: NDArray[np.float32]) -> None:
-    """Write what the measurements of a pixel would be if all light came from a node.
+def rows_of(patterns: PatternCodes, node: NDArray[np.int64], n: int, A: NDArray[np.float32]) -> None:
+    """Write the response of each node: the measurements of a pixel if all light came from that node.
 
     Parameters
     ----------
-    shown : Shown
+    patterns : PatternCodes
     node : (n or more,) int64
     n : int
+        Number of nodes.
     A : (n or more, groups (m + 2)) float32
         Written.
     """
-    m = shown.m
-    for g in range(shown.groups):
+    m = patterns.m
+    for g in range(patterns.groups):
         to = g * (m + 2)
-        load(shown.code, shown.first + g * m, m, node, n, A, to)
+        signed_codes(patterns.code, patterns.first + g * m, m, node, n, A, to)
         for i in range(n):
             A[i, to + m], A[i, to + m + 1] = -1.0, 1.0

@@ -57,4 +57,4 @@ class LobesOptions(NamedTuple):
 FINE = LobesOptions()
 """The default quality."""
 FAST = LobesOptions(most_lobes=2, resolution=0.8, steps=4, beam=3, doubt=0.03, passes=1, gradients=8)
-"""Half of the time, for two and a half decibels."""
+"""Half the time, at a cost of 2.5 dB."""

@@ -1,17 +1,16 @@
-"""The posterior mean of T about a first estimate: what the lobes of a pixel do not say, its measurements still may."""
+"""The posterior mean of T given the measurements, with the lobes as the prior's mean."""
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from workflows.recovery.lobes.likelihood import scatter
+from workflows.recovery.lobes.likelihood import estimate_kappa
 from workflows.recovery.solvers import inner, subtract
 
-# Standard deviation of the offset of a group, in units of T: S is known better than that.
+# Prior standard deviation of the offset of a group, in units of T: an upper bound of the error of S.
 _OFFSET = 0.03
-# Conjugate gradients end when this share of the squared right-hand side is left.
-_ENOUGH = 1e-5
-# T is never known to be the first estimate.
+# Conjugate gradients end when this fraction of the initial squared residual is left.
+_PRECISION = 1e-5
 _LEAST_KAPPA = 1e-5
 
 
@@ -24,7 +23,7 @@ def add_moments(
 ) -> None:
     """Add the weighted sums of the rows of A, and of their squares, to `mean` and `square`."""
     n = A.shape[0]
-    # two rows at a time: the sums are read and written half as often
+    # two rows at a time, so that the sums are read and written half as often
     for i in range(0, n - 1, 2):
         a, b, v, w = A[i], A[i + 1], weight[i], weight[i + 1]
         for j in range(mean.size):
@@ -47,7 +46,7 @@ def add_products(
 ) -> None:
     """Add ``scale A' diag(weight) A p`` to `out`."""
     n = A.shape[0]
-    # four rows at a time, while they are in the cache
+    # four rows at a time, while they are in the processor's cache
     for i in range(0, n - 3, 4):
         a, b, c, d = A[i], A[i + 1], A[i + 2], A[i + 3]
         s, t, u, v = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
@@ -67,7 +66,7 @@ def add_products(
 
 
 @njit(nogil=True, cache=True)
-def unresolved(
+def total_variance(
     y: NDArray[np.float32],
     f: NDArray[np.float32],
     mean: NDArray[np.float32],
@@ -76,29 +75,29 @@ def unresolved(
     groups: int,
     total: NDArray[np.float32],
 ) -> tuple[float, float]:
-    """kappa about a T, and the variance of measurements for what is finer than its nodes.
+    """Estimate kappa about a T, and the variance of measurements due to the camera and to light finer than T's nodes.
 
     Parameters
     ----------
     y, f : (groups (m + 2),) float32
         Measurements, and their prediction with the offsets.
-    mean, square : like y
-        What the nodes of T make of the measurements, and of their squares, in the mean.
-    variance : like y
+    mean, square : (groups (m + 2),) float32
+        Means of the nodes' responses and of their squares, weighted by T.
+    variance : (groups (m + 2),) float32
         The camera's variance.
     groups : int
-    total : like y
-        Written: the variance, and kappa times the share of the contrast that is within nodes.
+    total : (groups (m + 2),) float32
+        Written: the camera's variance plus kappa times the contrast within nodes.
 
     Returns
     -------
     kappa, misfit : float
-        As from :func:`~workflows.recovery.lobes.likelihood.scatter`.
+        As from :func:`~workflows.recovery.lobes.likelihood.estimate_kappa`.
     """
     m = y.size // groups - 2
-    # a literal would have `scatter` compiled once more
+    # with a literal, numba would compile another version of `estimate_kappa`
     parameters = np.int64(0)
-    kappa, misfit = scatter(y, f, mean, variance, groups, parameters, _LEAST_KAPPA)
+    kappa, misfit = estimate_kappa(y, f, mean, variance, groups, parameters, _LEAST_KAPPA)
     for g in range(groups):
         for j in range(g * (m + 2), (g + 1) * (m + 2)):
             within = kappa * max(1 - square[j], 0.0) if j < g * (m + 2) + m else 0.0
@@ -117,7 +116,7 @@ def apply_covariance(
     p: NDArray[np.float32],
     out: NDArray[np.float32],
 ) -> None:
-    """Write K p, K the covariance of the measurements: of T, of the offsets and, `total`, of each alone."""
+    """Write K p, K the covariance of the measurements due to T, to the offsets, and to independent noise (`total`)."""
     size = p.size // groups
     for j in range(p.size):
         out[j] = total[j] * p[j]
@@ -145,15 +144,15 @@ def solve_covariance(
     steps: int,
     x: NDArray[np.float32],
 ) -> None:
-    """Solve ``K x = r`` by conjugate gradients preconditioned by the diagonal of K; r is overwritten."""
+    """Solve ``K x = r`` by conjugate gradients, preconditioned by the diagonal of K; r is overwritten."""
     z, p, Kp = np.empty_like(r), np.empty_like(r), np.empty_like(r)
     for j in range(r.size):
         x[j], z[j] = 0.0, r[j] / diagonal[j]
         p[j] = z[j]
     left = inner(r, z)
-    enough = left * np.float32(_ENOUGH)
+    goal = left * np.float32(_PRECISION)
     for _ in range(steps):
-        if left <= enough:
+        if left <= goal:
             break
         apply_covariance(A, weight, kappa, total, groups, measured, p, Kp)
         length = left / inner(p, Kp)
@@ -161,24 +160,24 @@ def solve_covariance(
         subtract(r, length, Kp)
         for j in range(r.size):
             z[j] = r[j] / diagonal[j]
-        now = inner(r, z)
+        new = inner(r, z)
         for j in range(r.size):
-            p[j] = z[j] + now / left * p[j]
-        left = now
+            p[j] = z[j] + new / left * p[j]
+        left = new
 
 
 @njit(nogil=True, cache=True, inline="always")
 def reweight(
     A: NDArray[np.float32], kappa: float, x: NDArray[np.float32], weight: NDArray[np.float32]
 ) -> None:
-    """Multiply the weights by ``1 + kappa A x``, cut off at 0, and scale them to a sum of 1."""
-    whole = 0.0
+    """Multiply the weights by ``1 + kappa A x``, clipped at 0, and normalise their sum to 1."""
+    total = 0.0
     for i in range(weight.size):
         weight[i] *= max(1 + np.float32(kappa) * inner(A[i], x), np.float32(0))
-        whole += weight[i]
-    if whole > 0:
+        total += weight[i]
+    if total > 0:
         for i in range(weight.size):
-            weight[i] /= np.float32(whole)
+            weight[i] /= np.float32(total)
 
 
 @njit(nogil=True, cache=True)
@@ -192,33 +191,34 @@ def update(
     passes: int,
     steps: int,
 ) -> tuple[float, float]:
-    """Replace the weights of a T by their posterior mean given the measurements, several times.
+    """Replace the weights of a T by their posterior mean given the measurements, several times in succession.
 
     Parameters
     ----------
     A : (n, groups (m + 2)) float32
-        As from :func:`~workflows.recovery.lobes.nodes.rows_of`.
+        Responses of n nodes, as from :func:`~workflows.recovery.lobes.nodes.rows_of`.
     weight : (n,) float32
-        Zero or more, of sum 1; changed.
+        Zero or more, of sum 1; changed in place.
     y, variance : (groups (m + 2),) float32
+        Measurements, and their variances due to the camera; infinite where nothing was measured.
     groups : int
     offset : (groups,) float64
-        Changed.
+        Changed in place.
     passes : int
-        Each starts from the weights that the one before left.
+        Number of updates; each starts from the weights of the one before.
     steps : int
         Most conjugate gradient steps in a pass.
 
     Returns
     -------
     kappa, misfit : float
-        As from :func:`unresolved`, before the last pass. The misfit estimates the squared error of T times a pattern
-        that it was not fitted to.
+        As from :func:`total_variance`, before the last update. The misfit estimates the squared error of predictions
+        of patterns that T was not fitted to.
 
     Notes
     -----
-    A priori T ~ N(t, kappa diag t), as a sample of 1 / kappa rays of t would be. With K = kappa A' diag(t) A + V, the
-    posterior mean is ``t + kappa t * A K^-1 (y - A' t)``; negative weights are cut off. K is never built:
+    The prior is T ~ N(t, kappa diag t), as of a sample of 1 / kappa rays from t. With K = kappa A' diag(t) A + V, the
+    posterior mean is ``t + kappa t * A K^-1 (y - A' t)``; negative weights are set to 0. K is never built:
     ``K x = r`` is solved by conjugate gradients.
     """
     size = y.size // groups
@@ -232,10 +232,10 @@ def update(
         add_moments(A, weight, mean, square)
         for j in range(y.size):
             f[j] = offset[j // size] + mean[j]
-        kappa, misfit = unresolved(y, f, mean, square, variance, groups, total)
+        kappa, misfit = total_variance(y, f, mean, square, variance, groups, total)
         for j in range(y.size):
             diagonal[j] = total[j] + np.float32(_OFFSET**2) + np.float32(kappa) * square[j]
-            # what was not measured stays as predicted
+            # where nothing was measured the residual is 0
             r[j] = y[j] - f[j] if measured[j] else 0.0
             total[j] = total[j] if measured[j] else 0.0
         solve_covariance(A, weight, kappa, total, diagonal, groups, measured, r, steps, x)

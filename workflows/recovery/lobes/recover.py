@@ -1,33 +1,34 @@
-"""The default recovery: a few oriented Gaussian lobes, and about them the posterior mean of T."""
+"""The default method: fit a few oriented Gaussian lobes to each pixel, then take the posterior mean of T."""
 
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from workflows.recovery.lobes.fits import Pixels
 from workflows.recovery.lobes.options import FINE, LobesOptions
-from workflows.recovery.lobes.pixels import Explained, Pixels, recover_pixels
+from workflows.recovery.lobes.pixels import Diagnostics, recover_pixels
 from workflows.recovery.noise import Noise
 from workflows.recovery.normalise import Measurements, expected_error, normalise, refit_photometry
 from workflows.recovery.photometry import Photometry
 from workflows.recovery.sensing import Patterns
 from workflows.recovery.transport import Transport
 
-# Pixels at a time, so that the working arrays stay small whatever a caller passes.
+# Pixels per block: limits the working arrays.
 _BLOCK = 256
 
 
 class Recovery(NamedTuple):
-    """What was recovered of n pixels.
+    """The result for n pixels.
 
     Attributes
     ----------
     transport : Transport
     photometry : Photometry
-        S and rho, fitted once more with T.
+        S and rho, fitted again given T.
     error : (n,) float32
-        Root of the mean squared error to expect of a composite's channels, in camera units; infinite where nothing
-        could be recovered.
+        Expected root mean square error of a composite over the channels, in camera units; infinite where nothing could
+        be recovered.
     """
 
     transport: Transport
@@ -44,22 +45,22 @@ def recover(
     frames: NDArray[np.number] | None = None,
     options: LobesOptions = FINE,
 ) -> Recovery:
-    """Recover T as a few oriented Gaussian lobes, and then as what the measurements say about these.
+    """Recover T: a few oriented Gaussian lobes, refined to the posterior mean given the measurements.
 
     Parameters
     ----------
     measurements : (n, m, 3) float32
-        Linear camera values of n pixels under the m patterns. One that is not finite is left out.
+        Linear camera values of n pixels under the m patterns. Values that are not finite are ignored.
     photometry : Photometry
         S and rho of the pixels, from constant monitors.
     patterns : Patterns
         The patterns' light on a pyramid over the monitor.
     noise : Noise
-        Noise of a frame.
+        Noise of one frame.
     usable : (n, m, 3) bool, optional
-        False where a value says nothing, as where the camera clipped it.
+        False where a value must be ignored, as where the camera clipped it. Default: all are usable.
     frames : (m,) or (n, m, 3) number, optional
-        Frames averaged into each value, above 0; one each if left out.
+        Frames averaged into each value, above 0. Default: 1.
     options : LobesOptions
 
     Returns
@@ -69,17 +70,35 @@ def recover(
     Raises
     ------
     ValueError
-        If the shapes do not fit.
+        If the shapes do not match.
 
     Notes
     -----
-    The model is eq. 5 with T a sum of the pyramid's bumps. Lobes are added where they explain most
-    (:func:`~workflows.recovery.lobes.search.search`), all of them fitted
-    (:func:`~workflows.recovery.lobes.mixture.refine`), and kept if they pay for themselves. What they leave
-    out, a sharp edge or a bend, is what :func:`~workflows.recovery.lobes.posterior.update` finds.
+    The model is eq. 5, T a sum of the pyramid's bumps. Lobes are added where they improve the fit most
+    (:func:`~workflows.recovery.lobes.search.find_node`), all of them are fitted
+    (:func:`~workflows.recovery.lobes.levenberg_marquardt.refine`), and kept if they lower -2 ln likelihood by more
+    than their penalty. The posterior mean (:func:`~workflows.recovery.lobes.posterior.update`) adds what lobes cannot
+    represent, such as a sharp edge or a bend.
 
-    Channels that saw the same patterns are weighed into one measurement, the others stacked. Where they disagree,
-    each gets its own T, fitted from the common lobes.
+    Channels that saw the same patterns are averaged into one measurement, weighted by precision; others are stacked.
+    Where the channels disagree, each gets its own T, whose fit starts from the common lobes or those of the most
+    precise channel.
+
+    Examples
+    --------
+    A pixel that sees one cell of a grid of 8 x 6 through the glass, under 40 random patterns:
+
+    >>> from workflows.recovery.pyramid import Pyramid
+    >>> pyramid = Pyramid.over(8, 6)
+    >>> code = np.random.default_rng(0).integers(0, 2, (pyramid.nodes, 40)).astype(np.uint8) * np.uint8(255)
+    >>> S, rho, variance = (np.full((1, 3), value, np.float32) for value in (0.1, 0.7, 1e-6))
+    >>> measurements = (S + rho * code[21, :, np.newaxis] / 255).astype(np.float32)[np.newaxis]
+    >>> patterns = Patterns(pyramid, 1, code)
+    >>> found = recover(measurements, Photometry(S, rho, variance, variance), patterns, Noise(1e-6, 0))
+    >>> light = np.zeros((pyramid.nodes, 3), np.float32)
+    >>> light[21] = 1
+    >>> print(found.transport.apply(light).round(2))
+    [[1. 1. 1.]]
     """
     n, m = len(measurements), patterns.count
     if measurements.shape != (n, m, 3):
@@ -105,28 +124,30 @@ def _recover_block(
     kappa: NDArray[np.float64],
     misfit: NDArray[np.float64],
 ) -> Transport:
-    """Recover some pixels; `response`, `kappa` and `misfit` are written."""
+    """Recover T of some pixels; `response`, `kappa` and `misfit` are written, as in `Diagnostics`."""
     columns, rows = patterns.pyramid.grids[0]
     alive = np.isfinite(measured.variance).any(axis=(1, 2))
     own = Measurements(measured.value[alive], measured.variance[alive])
     if patterns.channels == 1:
-        joint = _mean(own)
-        apart = _disagree(own, joint.value, options.disagreement)
+        joint = _average_channels(own)
+        apart = _channels_disagree(own, joint.value, options.disagreement)
     else:
         n, channels, m = own.value.shape
         joint = Measurements(own.value.reshape(n, channels * m), own.variance.reshape(n, channels * m))
         apart = np.zeros(n, bool)
     counts = np.zeros((len(apart), 3), np.int64)
-    seen, left_out, missed = np.zeros_like(own.value), np.zeros(counts.shape), np.zeros(counts.shape)
+    diagnostics = Diagnostics(
+        np.zeros_like(own.value), np.zeros(counts.shape), np.zeros(counts.shape), counts
+    )
     pixels = Pixels(patterns.pyramid.arrays, patterns.code, joint, own)
-    node, weight = recover_pixels(pixels, apart, options, Explained(seen, left_out, missed, counts))
-    response[alive], kappa[alive], misfit[alive] = seen, left_out, missed
+    node, weight = recover_pixels(pixels, apart, options, diagnostics)
+    response[alive], kappa[alive], misfit[alive] = diagnostics[:3]
     count, shared = np.zeros((alive.size, 3), np.int64), np.zeros(alive.size, bool)
     count[alive], shared[alive] = counts, ~apart
     row = np.repeat(np.arange(count.size), count.ravel())
     order = np.lexsort((node, row))
     row, node, weight = row[order], node[order], weight[order]
-    # a node under two lobes is there twice
+    # a node under two lobes occurs twice: add its weights
     new = np.append(True, (np.diff(row) > 0) | (np.diff(node) > 0))[: row.size]
     begin = np.flatnonzero(new)
     merged = np.add.reduceat(weight, begin) if begin.size else weight
@@ -134,8 +155,8 @@ def _recover_block(
     return Transport.from_rows(columns, rows, count, node[begin], merged, shared, options.least_weight)
 
 
-def _mean(own: Measurements) -> Measurements:
-    """The mean of the channels, (n, m + 2), each weighed by its precision, and its variance."""
+def _average_channels(own: Measurements) -> Measurements:
+    """The mean of the channels, (n, m + 2), weighted by precision, and its variance."""
     precision = 1 / own.variance
     total = precision.sum(axis=1)
     with np.errstate(divide="ignore"):
@@ -144,8 +165,10 @@ def _mean(own: Measurements) -> Measurements:
     return Measurements(joint, joint_variance)
 
 
-def _disagree(own: Measurements, joint: NDArray[np.float32], disagreement: float) -> NDArray[np.bool_]:
-    """(n,) bool: whether the channels differ by more than noise, and S and rho that are not quite known."""
+def _channels_disagree(
+    own: Measurements, joint: NDArray[np.float32], disagreement: float
+) -> NDArray[np.bool_]:
+    """Whether the channels differ by more than noise and errors of S and rho, (n,) bool."""
     value, variance = own
     precision, x = 1 / variance, joint[:, np.newaxis]
     total = np.maximum(precision.sum(axis=2, keepdims=True), 1e-12)
@@ -154,7 +177,7 @@ def _disagree(own: Measurements, joint: NDArray[np.float32], disagreement: float
     gain = (precision * dx * dy).sum(axis=2) / np.maximum((precision * dx**2).sum(axis=2), 1e-12)
     chi = (precision * (dy - gain[..., np.newaxis] * dx) ** 2).sum(axis=(1, 2))
     used = np.isfinite(variance).sum(axis=2)
-    # the mean and, of each channel, an offset and a gain are fitted
+    # fitted parameters: the mean of the channels, and an offset and a gain of each
     freedom = used.sum(axis=1) - used.max(axis=1) - 2 * (np.count_nonzero(used, axis=1) - 1)
     disagrees: NDArray[np.bool_] = chi > disagreement * np.maximum(freedom, 1)
     return disagrees

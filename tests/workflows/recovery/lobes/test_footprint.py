@@ -9,8 +9,8 @@ from workflows.recovery.lobes.footprint import (
     bump_variance,
     combine,
     fit_level,
-    load,
     sample,
+    signed_codes,
 )
 from workflows.recovery.pyramid import Pyramid
 
@@ -166,7 +166,7 @@ def test_load_and_combine_are_a_product_of_matrices():
     node, terms = sampled(lobe_of(*SHAPES[0]), 1)
     n = node.size
     rows, out = np.empty((NODES, 33), np.float32), np.empty((PARAMETERS, 33), np.float32)
-    load(code, 5, 33, node, n, rows, 0)
+    signed_codes(code, 5, 33, node, n, rows, 0)
     signed = code[node, 5:38] / 127.5 - 1
     np.testing.assert_allclose(rows[:n], signed, atol=1e-6)
     for kept in (n, n - 1, 3, 0):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from workflows.recovery.lobes.likelihood import price, weigh
+from workflows.recovery.lobes.likelihood import penalty, weigh
 from workflows.recovery.pyramid import Pyramid
 
 
@@ -30,5 +30,5 @@ def test_a_place_among_fewer_nodes_costs_less():
     grids = Pyramid(((64, 48), (32, 24))).arrays
     level = np.array([0, 1])
     expected = 16 + 2 * np.log(64 * 48) + 2 * np.log(32 * 24)
-    assert price(grids, level, 2) == pytest.approx(expected)
-    assert price(grids, level, 0) == 0
+    assert penalty(grids, level, 2) == pytest.approx(expected)
+    assert penalty(grids, level, 0) == 0

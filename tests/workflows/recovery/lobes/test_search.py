@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from workflows.recovery.lobes.footprint import PARAMETERS, Shown, bump_variance
+from workflows.recovery.lobes.footprint import PARAMETERS, PatternCodes, bump_variance
 from workflows.recovery.lobes.mixture import Mixture
 from workflows.recovery.lobes.options import LobesOptions
-from workflows.recovery.lobes.search import fit, search
+from workflows.recovery.lobes.search import find_node, fit
 
 COLUMNS, ROWS, MOST = 64, 48, 3
 SIGMA = 0.01
@@ -50,7 +50,7 @@ def patterns(patterns_of):
 
 @pytest.fixture(scope="module")
 def shown(patterns):
-    return Shown(patterns.pyramid.arrays, patterns.code, 0, 1, patterns.count)
+    return PatternCodes(patterns.pyramid.arrays, patterns.code, 0, 1, patterns.count)
 
 
 @pytest.fixture(scope="module")
@@ -158,18 +158,18 @@ def test_too_few_measurements_give_one_finite_lobe(measure, fitted, truth, known
     assert np.isfinite([found.kappa, found.objective]).all()
 
 
-def test_search_finds_the_node_that_is_missing(patterns, shown):
+def test_find_node_finds_the_node_that_is_missing(patterns, shown):
     m, grids = patterns.count, shown.grids
     for level, column, row in ((0, 41, 17), (1, 9, 20)):
         node = grids.starts[level] + row * grids.columns[level] + column
         f = np.append(np.zeros(m), [-1, 1]).astype(np.float32)
         y = np.append(0.2 * (patterns.code[node] / 127.5 - 1), [-1, 1]).astype(np.float32)
         precision = np.full(m + 2, SIGMA**-2, np.float32)
-        found = search(shown, y, f, precision, 6)
+        found = find_node(shown, y, f, precision, 6)
         assert found[:3] == (level, column, row)
         assert found[4] == pytest.approx(0.2, rel=1e-4)
         d = patterns.code[node] / 127.5 - 1
         z_squared = 0.04 * (d @ d) / SIGMA**2
         places = grids.columns[level] * grids.rows[level]
         assert found[3] == pytest.approx(z_squared - 2 * np.log(places), rel=1e-4)
-    assert search(shown, f, f, precision, 6)[0] == -1
+    assert find_node(shown, f, f, precision, 6)[0] == -1

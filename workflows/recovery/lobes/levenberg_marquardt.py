@@ -1,0 +1,247 @@
+"""The Levenberg-Marquardt fit of all parameters of a mixture to the measurements of a pixel."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from workflows.recovery.lobes.footprint import NODES, PARAMETERS, PatternCodes, fit_level
+from workflows.recovery.lobes.likelihood import penalty, weigh
+from workflows.recovery.lobes.mixture import Mixture, Workspace, copy_mixture, predict
+from workflows.recovery.lobes.options import LobesOptions
+from workflows.recovery.pyramid import Grids
+from workflows.recovery.solvers import inner
+
+# Initial damping, its factors after a failed and a successful step, and the most attempts per step.
+_DAMPING, _HARDER, _EASIER, _ATTEMPTS = 1e-2, 8.0, 0.15, 4
+# Bounds of a lobe's weight.
+_LEAST_WEIGHT, _MOST_WEIGHT = 1e-3, 1.2
+
+
+@njit(nogil=True, cache=True)
+def solve(A: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
+    """Solve A x = b in place by Cholesky decomposition; return false if A is not positive definite."""
+    n = b.size
+    for i in range(n):
+        for j in range(i + 1):
+            s = A[i, j]
+            for k in range(j):
+                s -= A[i, k] * A[j, k]
+            if i > j:
+                A[i, j] = s / A[j, j]
+            elif s > 1e-30:
+                A[i, i] = math.sqrt(s)
+            else:
+                return False
+    for i in range(n):
+        for k in range(i):
+            b[i] -= A[i, k] * b[k]
+        b[i] /= A[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            b[i] -= A[k, i] * b[k]
+        b[i] /= A[i, i]
+    return True
+
+
+@njit(nogil=True, cache=True)
+def step(mixture: Mixture, change: NDArray[np.float64], grids: Grids, resolution: float) -> None:
+    """Add a solved step to the lobes, limited so that they stay well-shaped and near the monitor."""
+    lobes, level, columns, rows = mixture.lobes, mixture.level, grids.columns, grids.rows
+    for i in range(change.size // PARAMETERS):
+        lobe, by = lobes[i], change[PARAMETERS * i : PARAMETERS * (i + 1)]
+        spacing = 2.0 ** level[i]
+        size = max(lobe[3], lobe[5], abs(lobe[4]))
+        far = 2 * size + spacing
+        lobe[0] = min(max(lobe[0] + by[0], _LEAST_WEIGHT), _MOST_WEIGHT)
+        lobe[1] = min(max(lobe[1] + min(max(by[1], -far), far), -20.0), columns[0] + 20.0)
+        lobe[2] = min(max(lobe[2] + min(max(by[2], -far), far), -20.0), rows[0] + 20.0)
+        lobe[3] = max(min(max(lobe[3] + by[3], lobe[3] / 2), 2 * lobe[3]), 0.4 * spacing)
+        lobe[4] += min(max(by[4], -size), size)
+        lobe[5] = max(min(max(lobe[5] + by[5], lobe[5] / 2), 2 * lobe[5]), 0.4 * spacing)
+        level[i] = fit_level(lobe, level[i], columns, resolution)
+
+
+@njit(nogil=True, cache=True)
+def chi_square(
+    y: NDArray[np.float32],
+    f: NDArray[np.float32],
+    precision: NDArray[np.float32],
+    residual: NDArray[np.float32],
+) -> float:
+    """Return chi-square, the sum of squared residuals times their precisions; write the weighted residuals."""
+    for j in range(y.size):
+        residual[j] = (y[j] - f[j]) * math.sqrt(precision[j])
+    return float(inner(residual, residual))
+
+
+class Equations(NamedTuple):
+    """Working space of the steps for n parameters: one offset per group, then the parameters of each lobe.
+
+    Attributes
+    ----------
+    residual : (groups (m + 2),) float32
+        Measurements less prediction, times the square root of the precision.
+    slopes : (n, groups (m + 2)) float32
+        Derivatives of the prediction, times the square root of the precision.
+    A : (n, n) float64
+        Lower triangle of ``slopes slopes'``.
+    b, change : (n,) float64
+        ``slopes residual``, and the solution.
+    damped : (n, n) float64
+        A plus the damping, then its Cholesky factor.
+    """
+
+    residual: NDArray[np.float32]
+    slopes: NDArray[np.float32]
+    A: NDArray[np.float64]
+    b: NDArray[np.float64]
+    change: NDArray[np.float64]
+    damped: NDArray[np.float64]
+
+
+@njit(nogil=True, cache=True, inline="always")
+def linearise(
+    mixture: Mixture,
+    k: int,
+    groups: int,
+    response: NDArray[np.float32],
+    precision: NDArray[np.float32],
+    equations: Equations,
+) -> None:
+    """Write the derivatives by the offsets and k lobes, and the normal equations ``A change = b``."""
+    slopes, residual, A, b = equations.slopes, equations.residual, equations.A, equations.b
+    size = precision.size // groups
+    for g in range(groups):
+        for j in range(precision.size):
+            inside = g * size <= j < (g + 1) * size
+            slopes[g, j] = math.sqrt(precision[j]) if inside else 0.0
+    for i in range(k):
+        for t in range(PARAMETERS):
+            weight = np.float32(1.0 if t == 0 else mixture.lobes[i, 0])
+            slope, of_lobe = slopes[groups + PARAMETERS * i + t], response[i, t]
+            for j in range(precision.size):
+                slope[j] = weight * of_lobe[j] * math.sqrt(precision[j])
+    for i in range(b.size):
+        b[i] = inner(slopes[i], residual)
+        for j in range(i + 1):
+            A[i, j] = inner(slopes[i], slopes[j])
+
+
+@njit(nogil=True, cache=True, inline="always")
+def solve_damped(equations: Equations, damping: float) -> bool:
+    """Write the solution of the damped equations; return false if there is none."""
+    A, damped, change = equations.A, equations.damped, equations.change
+    for i in range(change.size):
+        change[i] = equations.b[i]
+        for j in range(i + 1):
+            damped[i, j] = A[i, j]
+        damped[i, i] += damping * A[i, i] + 1e-6
+    solved: bool = solve(damped, change)
+    return solved
+
+
+@njit(nogil=True, cache=True, inline="always")
+def refine_round(
+    patterns: PatternCodes,
+    y: NDArray[np.float32],
+    mixture: Mixture,
+    k: int,
+    options: LobesOptions,
+    workspace: Workspace,
+    response: NDArray[np.float32],
+    f: NDArray[np.float32],
+    precision: NDArray[np.float32],
+    equations: Equations,
+    new: Mixture,
+) -> None:
+    """Take Levenberg-Marquardt steps at fixed precisions; `mixture`, `response` and `f` are overwritten."""
+    damping = _DAMPING
+    chi = chi_square(y, f, precision, equations.residual)
+    for _ in range(options.steps):
+        linearise(mixture, k, patterns.groups, response, precision, equations)
+        better, new_chi = False, chi
+        for _ in range(_ATTEMPTS):
+            if solve_damped(equations, damping):
+                copy_mixture(k, patterns.groups, mixture, new)
+                for g in range(patterns.groups):
+                    new.offset[g] += equations.change[g]
+                step(new, equations.change[patterns.groups :], patterns.grids, options.fit_resolution)
+                predict(patterns, new, k, workspace, response, f)
+                new_chi = chi_square(y, f, precision, equations.residual)
+                better = new_chi < chi
+                if better:
+                    break
+            damping *= _HARDER
+        if not better:
+            predict(patterns, mixture, k, workspace, response, f)
+            break
+        damping = max(damping * _EASIER, 1e-5)
+        copy_mixture(k, patterns.groups, new, mixture)
+        if chi - new_chi < options.tolerance:
+            break
+        chi = new_chi
+
+
+@njit(nogil=True, cache=True)
+def refine(
+    patterns: PatternCodes,
+    y: NDArray[np.float32],
+    variance: NDArray[np.float32],
+    mixture: Mixture,
+    k: int,
+    options: LobesOptions,
+    bound: float,
+) -> tuple[float, float, NDArray[np.float32], NDArray[np.float32]]:
+    """Fit all parameters of k lobes by the Levenberg-Marquardt method, starting from their present values.
+
+    Parameters
+    ----------
+    patterns : PatternCodes
+    y, variance : (groups (m + 2),) float32
+        As in :func:`~workflows.recovery.lobes.likelihood.weigh`.
+    mixture : Mixture
+        Changed in place.
+    k : int
+    options : LobesOptions
+        `fit_resolution`, `rounds`, `steps` and `tolerance` are used.
+    bound : float
+        Rounds end once the objective plus the penalty is above it.
+
+    Returns
+    -------
+    kappa, objective : float
+        As from :func:`~workflows.recovery.lobes.likelihood.weigh`.
+    f, precision : (groups (m + 2),) float32
+        Prediction and precisions.
+    """
+    groups, size = patterns.groups, patterns.groups * patterns.m
+    M, n = y.size, groups + PARAMETERS * k
+    workspace = Workspace(
+        np.empty(NODES, np.int64),
+        np.empty((PARAMETERS, NODES), np.float32),
+        np.empty((NODES, size), np.float32),
+        np.empty((PARAMETERS, size), np.float32),
+    )
+    response = np.empty((k, PARAMETERS, M), np.float32)
+    f, precision = np.empty_like(y), np.empty_like(y)
+    equations = Equations(
+        np.empty_like(y),
+        np.empty((n, M), np.float32),
+        np.empty((n, n)),
+        np.empty(n),
+        np.empty(n),
+        np.empty((n, n)),
+    )
+    new = Mixture(mixture.lobes.copy(), mixture.level.copy(), mixture.offset.copy())
+    predict(patterns, mixture, k, workspace, response, f)
+    kappa, objective = weigh(y, f, variance, groups, n, precision)
+    for _ in range(options.rounds):
+        before = objective
+        refine_round(patterns, y, mixture, k, options, workspace, response, f, precision, equations, new)
+        kappa, objective = weigh(y, f, variance, groups, n, precision)
+        if abs(before - objective) < 1 or objective + penalty(patterns.grids, mixture.level, k) > bound:
+            break
+    return kappa, objective, f, precision
