@@ -1,1 +1,1 @@
-"""Pixel recovery: arrays in, arrays out."""
+"""Recovery of S, rho and T from measurements: arrays in, arrays out."""

@@ -1,8 +1,8 @@
-"""How the options of a recovery method are declared: a named tuple that says all there is to say about each of them.
+"""Declaration of a recovery method's options, as a named tuple with a type, range, default and description for each.
 
 A field is ``name: Annotated[type, Range(least, most), "What it does."] = default``. A choice is a `Literal` of strings
-and has no range. Kernels take such a tuple whole, as long as it holds only numbers: a method with choices nests the
-numbers in a tuple of their own.
+and has no range. Kernels take such a tuple as an argument if it holds only numbers, so a method with choices nests the
+numbers in another named tuple.
 """
 
 from collections.abc import Iterator, Mapping
@@ -12,14 +12,14 @@ Options = TypeVar("Options", bound=tuple[Any, ...])
 
 
 class Range(NamedTuple):
-    """The least and the greatest value of a number."""
+    """The least and the greatest allowed value of a number."""
 
     least: float
     most: float
 
 
 class Option(NamedTuple):
-    """What a field declares.
+    """The declaration of an option.
 
     Attributes
     ----------
@@ -28,7 +28,7 @@ class Option(NamedTuple):
         `int`, `float`, or a `Literal` of strings.
     default : int, float or str
     range : Range or None
-        None of a choice.
+        None for a choice.
     description : str
     """
 
@@ -40,7 +40,7 @@ class Option(NamedTuple):
 
 
 def declared_options(kind: type[tuple[Any, ...]]) -> Iterator[Option]:
-    """The options that a named tuple declares, in order, with those of the tuples nested in it.
+    """Iterate over the options that a named tuple declares, including those of nested tuples.
 
     Examples
     --------
@@ -59,7 +59,7 @@ def declared_options(kind: type[tuple[Any, ...]]) -> Iterator[Option]:
 
 
 def make_options(kind: type[Options], values: Mapping[str, Any]) -> Options:
-    """The named tuple with the given values of options, nested ones too, and defaults for the others.
+    """Make a named tuple, nested ones included, with the given values of options and defaults for the others.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""A pyramid of smooth bumps laid over the monitor: what T is made of, from the monitor's pixels to its quarters."""
+"""A pyramid of grids over the monitor, whose nodes are smooth bumps: the basis functions of T."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 
 Real = TypeVar("Real", np.float32, np.float64)
 _COARSEST = 32
-"""Nodes along the longer side of the coarsest grid, at most."""
+"""Most nodes along the longer side of the coarsest grid."""
 
 
 class Grids(NamedTuple):
-    """The grids of a pyramid, as kernels take them.
+    """The grids of a pyramid as arrays, for kernels.
 
     Attributes
     ----------
     columns, rows : (levels,) int64
     starts : (levels + 1,) int64
-        The first node of each grid, and at the end the number of nodes.
+        The first node of each grid, and the number of nodes.
     """
 
     columns: NDArray[np.int64]
@@ -30,11 +30,11 @@ class Grids(NamedTuple):
 
 @dataclass(frozen=True)
 class Pyramid:
-    """Grids over the monitor, each of half as many columns and rows as the one before.
+    """Grids over the monitor, each with half as many columns and rows as the one before.
 
-    A node of the first grid is a cell, and sees the mean light over it. A node of a further grid sees the nodes
-    of the grid before it with the weights [1, 3, 3, 1] / 8 along each axis: a smooth bump, close to a quadratic
-    B-spline as wide as three of its cells. Sums of such bumps show no grid.
+    A node of the first grid is a cell, and its light is the mean over the cell. The light of a node of any other grid
+    is a weighted mean over nodes of the grid before, with the weights [1, 3, 3, 1] / 8 along each axis. The result is
+    a smooth bump, close to a quadratic B-spline as wide as three of its cells, so sums of bumps show no grid.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class Pyramid:
 
     Notes
     -----
-    Burt and Adelson, "The Laplacian pyramid as a compact image code", IEEE Trans. Communications 1983.
+    Burt and Adelson, "The Laplacian pyramid as a compact image code", IEEE Trans. Communications, 1983.
 
     Examples
     --------
@@ -64,7 +64,7 @@ class Pyramid:
 
     @cached_property
     def starts(self) -> NDArray[np.int64]:
-        """(len(grids) + 1,) int64: the first node of each grid, and at the end the number of nodes."""
+        """(len(grids) + 1,) int64: the first node of each grid, and the number of nodes."""
         return np.cumsum([0, *(columns * rows for columns, rows in self.grids)])
 
     @property
@@ -79,7 +79,7 @@ class Pyramid:
         return int(self.starts[-1])
 
     def light(self, finest: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The light that every node sees.
+        """The light of every node.
 
         Parameters
         ----------
@@ -93,7 +93,7 @@ class Pyramid:
         Raises
         ------
         ValueError
-            If `finest` is of another grid.
+            If `finest` does not have the size of the first grid.
         """
         if finest.shape[1::-1] != self.grids[0]:
             raise ValueError(f"the light must be on {self.grids[0]} cells, not {finest.shape[1::-1]}")
@@ -103,21 +103,22 @@ class Pyramid:
         return np.concatenate([part.reshape(-1, finest.shape[2]) for part in parts])
 
     def axis_moments(self, axis: int) -> NDArray[np.float64]:
-        """The means of x and of x squared over the bumps along an axis, in cells of the first grid from its edge.
+        """Means of x and of x squared over the bumps along an axis, in cells of the first grid from its edge.
 
         Parameters
         ----------
         axis : int
-            0 for x, by the columns of each grid; 1 for y, by the rows.
+            0 for x, by columns; 1 for y, by rows.
 
         Returns
         -------
         (columns or rows of all grids, 2) float64
-            Grid by grid. A node's bump is the product of its column's and its row's.
+            Grid by grid. A node's bump is the product of its column's and its row's bump.
 
         Notes
         -----
-        What a node sees of the light x and x squared, so exact at the edges too, where bumps are lopsided.
+        Computed as the light of nodes on a monitor with the light x or x squared, so exact at the edges too, where
+        bumps are asymmetric.
         """
         centre = np.arange(self.grids[0][axis]) + 0.5
         parts = [np.stack([centre, centre**2 + 1 / 12], axis=1)]
@@ -127,7 +128,7 @@ class Pyramid:
 
 
 def _halve(image: NDArray[Real], axis: int) -> NDArray[Real]:
-    """Every second place along an axis, seen with the weights [1, 3, 3, 1] / 8; beyond the edge is the edge."""
+    """Filter by [1, 3, 3, 1] / 8 along an axis and take every second value; the edge is repeated."""
     n = image.shape[axis]
     at = 2 * np.arange(-(-n // 2))
     outer = image.take(np.maximum(at - 1, 0), axis) + image.take(np.minimum(at + 2, n - 1), axis)
@@ -140,14 +141,14 @@ def _halve(image: NDArray[Real], axis: int) -> NDArray[Real]:
 def halve_codes(
     fine: NDArray[np.uint8], columns: int, rows: int, coarse: NDArray[np.uint8], sums: NDArray[np.uint16]
 ) -> None:
-    """The same step for many images at once, in whole numbers.
+    """Compute the light of the next grid's nodes, in integers, for m images at once.
 
     Parameters
     ----------
     fine : (rows * columns, m) uint8
-        Nodes of a grid.
+        Light of the nodes of a grid.
     columns, rows : int
-        Of that grid.
+        Size of that grid.
     coarse : (nodes of the next grid, m) uint8
         Written, rounded to nearest.
     sums : (m,) uint16

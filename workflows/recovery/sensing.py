@@ -1,4 +1,4 @@
-"""What the patterns of a program say about each cell of the monitor, on each of the program's grids."""
+"""The light of a program's patterns on the cells of the monitor, on each of the program's grids."""
 
 from dataclasses import dataclass
 
@@ -10,20 +10,18 @@ from workflows.recovery.pyramid import Pyramid
 
 @dataclass(frozen=True)
 class Level:
-    """A grid laid over the monitor, and the light of every pattern on its cells.
+    """A grid over the monitor, and the light of patterns on its cells.
 
-    A pattern of a coarser grid that nests in this one is constant on each cell here, so its row is exact
-    and is listed too.
+    Patterns of a coarser grid that nests in this one are constant on each cell, so they are included.
 
     Attributes
     ----------
     columns, rows : int
         The grid; cell ``row * columns + column``, row 0 at the top.
     patterns : (m,) intp
-        The measurements that this level may use: indices along axis 1 of the measurements, ascending.
+        Indices of the patterns, ascending, along axis 1 of the measurements.
     light : (channels, rows * columns, m) float32
-        Light that each pattern sends from each cell, 0 (black) to 1 (white). One channel if every pattern is
-        grey, else three.
+        Light of each pattern on each cell, 0 (black) to 1 (white). One channel if all patterns are grey, else three.
     """
 
     columns: int
@@ -41,16 +39,16 @@ class Sensing:
 
 @dataclass(frozen=True)
 class Patterns:
-    """The light of every pattern on the nodes of a pyramid over the monitor.
+    """The light of all patterns on the nodes of a pyramid over the monitor.
 
     Attributes
     ----------
     pyramid : Pyramid
     channels : int
-        1 if every pattern is grey, else 3.
+        1 if all patterns are grey, else 3.
     code : (pyramid.nodes, channels * m) uint8
-        Light, 0 (black) to 255 (white), of the m patterns channel after channel. A byte is enough: a lobe sees many
-        nodes, and a camera's noise is larger.
+        Light, 0 (black) to 255 (white), of the m patterns, channel after channel. 8 bits are enough: a lobe averages
+        many nodes, and a camera's noise is larger than the rounding error.
     """
 
     pyramid: Pyramid
@@ -59,5 +57,5 @@ class Patterns:
 
     @property
     def count(self) -> int:
-        """m."""
+        """The number of patterns, m."""
         return int(self.code.shape[1]) // self.channels

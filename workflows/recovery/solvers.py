@@ -1,10 +1,10 @@
-"""Least squares on the few cells of one pixel: kernels that more than one method uses.
+"""Kernels for least squares on the few cells of one pixel, shared by both methods.
 
-A matrix here has one row a cell, as long as the measurements: every inner loop runs over contiguous memory.
+Matrices have one row per cell and one column per measurement, so that inner loops run over contiguous memory.
 
-Kernels that are called from several compiled ones are declared with their types, so that they are compiled when their
-module is loaded. Compiled when first called, they would be optimised together with whichever method came first: the
-sums of both methods would then depend, in their last bits, on which was run first on a machine.
+Kernels that several others call are declared with their types, so that they are compiled when their module is imported.
+If they were compiled at their first call, they would be optimised together with that caller, and the last bits of both
+methods' sums would depend on which method ran first on a machine.
 """
 
 import numpy as np
@@ -12,11 +12,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 
-# "reassoc" lets the sum run in vector lanes. Its order depends on the length and the machine's vector width
-# only, never on where the data lie or what else is in the batch.
+# "reassoc" allows vector instructions. The order of the sum depends on the length and the machine's vector width only,
+# not on memory alignment or the batch.
 @njit("float32(float32[::1], float32[::1])", nogil=True, cache=True, fastmath={"reassoc"})
 def inner(a: NDArray[np.float32], b: NDArray[np.float32]) -> np.float32:
-    """Inner product of two float32 vectors of one length."""
+    """Inner product of two float32 vectors of equal length."""
     total = np.float32(0)
     for k in range(a.size):
         total += a[k] * b[k]
@@ -25,13 +25,13 @@ def inner(a: NDArray[np.float32], b: NDArray[np.float32]) -> np.float32:
 
 @njit("void(float32[::1], float32, float32[::1])", nogil=True, cache=True)
 def subtract(residual: NDArray[np.float32], factor: np.float32, row: NDArray[np.float32]) -> None:
-    """Take ``factor * row`` from `residual`, in place."""
+    """Subtract ``factor * row`` from `residual`, in place."""
     for k in range(residual.size):
         residual[k] -= factor * row[k]
 
 
 @njit(nogil=True, cache=True)
-def descend(
+def solve_nnls(
     matrix: NDArray[np.float32],
     target: NDArray[np.float32],
     x: NDArray[np.float32],
@@ -43,15 +43,15 @@ def descend(
     Parameters
     ----------
     matrix : (s, m) float32
-        One row a cell.
+        One row per cell.
     target : (m,) float32
-        What the rows are to add up to.
+        Measurements.
     x : (s,) float32
-        The start, zero or more; overwritten with the result.
+        Initial value, zero or more; overwritten with the result.
     sweeps : int
-        Most rounds over the cells. Every fourth takes in the cells at zero.
+        Most sweeps over the cells. Every fourth, and the one that confirms convergence, includes the cells at zero.
     tolerance : float
-        The rounds end when none changes an entry by more than this.
+        Sweeps end when one changes no entry by more than this.
 
     Returns
     -------
@@ -69,20 +69,20 @@ def descend(
         energy[j] = inner(matrix[j], matrix[j])
         if x[j] > 0:
             subtract(residual, x[j], matrix[j])
-    settled = False
+    converged = False
     for sweep in range(sweeps):
-        everything = settled or sweep % 4 == 0
+        all_cells = converged or sweep % 4 == 0
         largest = np.float32(0)
         for j in range(s):
-            if energy[j] > 0 and (everything or x[j] > 0):
+            if energy[j] > 0 and (all_cells or x[j] > 0):
                 new = max(x[j] + inner(matrix[j], residual) / energy[j], np.float32(0))
                 change = new - x[j]
                 if change != 0:
                     subtract(residual, change, matrix[j])
                     x[j] = new
                     largest = max(largest, abs(change))
-        settled = bool(largest <= tolerance)
-        if settled and everything:
+        converged = bool(largest <= tolerance)
+        if converged and all_cells:
             break
     return residual
 
@@ -97,22 +97,24 @@ def posterior_mean(
     steps: int,
     precision: float,
 ) -> NDArray[np.float32]:
-    """Mean of ``t ~ N(mean, looseness * diag(mean))`` given measurements, cut off at zero.
+    """Posterior mean of t given measurements, with the prior ``t ~ N(mean, looseness * diag(mean))``, clipped at zero.
 
     Parameters
     ----------
     matrix : (s, n) float32
-        One row a cell.
+        One row per cell.
     residual : (n,) float32
         Measurements less ``mean matrix``.
     mean : (s,) float32
-        Zero or more.
-    variance, looseness : float
-        Of the measurements, and of the prior; zero or more.
+        Prior mean, zero or more.
+    variance : float
+        Variance of the measurements, zero or more.
+    looseness : float
+        Prior variance per unit of the mean; the prior mean is returned if it is not positive.
     steps : int
-        Most conjugate gradients.
+        Most conjugate gradient steps.
     precision : float
-        They end when this share of the right-hand side is left.
+        Steps end when the residual's norm is this fraction of the right-hand side's.
 
     Returns
     -------
@@ -120,7 +122,8 @@ def posterior_mean(
 
     Notes
     -----
-    Conjugate gradients on ``(A M A' + variance / looseness) y = residual``, ``t = mean + M A' y``.
+    Conjugate gradients on ``(A M A' + variance / looseness) y = residual``, then ``t = mean + M A' y``. A is the
+    transpose of `matrix`, and M = diag(mean).
     """
     s, n = matrix.shape
     t = mean.copy()
@@ -128,11 +131,11 @@ def posterior_mean(
         return t
     ridge = np.float32(variance / looseness)
     y = np.zeros(n, np.float32)
-    rest, direction, image = residual.copy(), residual.copy(), np.empty(n, np.float32)
-    energy = inner(rest, rest)
-    enough = np.float32(precision * precision) * energy
+    left, direction, image = residual.copy(), residual.copy(), np.empty(n, np.float32)
+    energy = inner(left, left)
+    goal = np.float32(precision * precision) * energy
     for _ in range(steps):
-        if energy <= enough:
+        if energy <= goal:
             break
         for k in range(n):
             image[k] = ridge * direction[k]
@@ -144,11 +147,11 @@ def posterior_mean(
         step = energy / curvature
         for k in range(n):
             y[k] += step * direction[k]
-            rest[k] -= step * image[k]
-        now = inner(rest, rest)
+            left[k] -= step * image[k]
+        new = inner(left, left)
         for k in range(n):
-            direction[k] = rest[k] + now / energy * direction[k]
-        energy = now
+            direction[k] = left[k] + new / energy * direction[k]
+        energy = new
     for j in range(s):
         t[j] = max(t[j] + mean[j] * inner(matrix[j], y), np.float32(0))
     return t
@@ -162,7 +165,7 @@ def signed_rows(
     first: int,
     out: NDArray[np.float32],
 ) -> None:
-    """Write the +-1 form of the light of a pixel's cells, each measurement scaled.
+    """Write the light of cells in +-1 form, each measurement scaled.
 
     Parameters
     ----------
@@ -173,9 +176,9 @@ def signed_rows(
     scale : (m,) float32
         Factor of each measurement.
     first : int
-        Column of `out` that the first measurement goes to.
+        Column of `out` for the first measurement.
     out : (s, first + m or more) float32
-        Written there: ``scale * (2 light[cell] - 1)``.
+        Written from that column on: ``scale * (2 light[cell] - 1)``.
     """
     for i in range(cell.size):
         row, written = light[cell[i]], out[i, first : first + scale.size]
@@ -195,7 +198,7 @@ def stack_rows(
     Parameters
     ----------
     light : (channels, cells, m) float32
-        Light of the channels, 0 to 1.
+        Light of the channels, 0 (black) to 1 (white).
     cell : (s,) int32
         Cells.
     scale : (channels * m,) float32

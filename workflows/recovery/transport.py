@@ -1,4 +1,4 @@
-"""The value that holds a T: for each pixel and channel, the monitor's cells its light comes from."""
+"""T as a sparse matrix: for each pixel and channel, the monitor's cells that its light comes from."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,21 +10,21 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Transport:
-    """Sparse non-negative rows T of eq. 5, for n pixels and their three channels.
+    """Sparse non-negative rows T of eq. 5, for n pixels with three channels.
 
     Attributes
     ----------
     columns, rows : int
-        The first grid of the pyramid that the cells are nodes of; a method that knows one grid has no others.
+        The first grid of the pyramid whose nodes the cells are. Methods without a pyramid use this grid only.
     count : (n, 3) uint32
         Number of cells of each row; 0 where nothing could be recovered.
     cell : (count.sum(),) uint32
         Nodes of :class:`~workflows.recovery.pyramid.Pyramid` over the grid, ``row * columns + column`` on the grid
-        itself; ascending within a row; rows in the order (pixel, channel).
+        itself. Cells ascend within a row; rows are in the order (pixel, channel).
     weight : (count.sum(),) float32
         Share of the light, positive; each row sums to 1.
     shared : (n,) bool
-        Whether a pixel's first row serves all channels; its others are empty.
+        Whether a pixel's first row serves all channels and its other rows are empty.
     """
 
     columns: int
@@ -45,7 +45,7 @@ class Transport:
         shared: NDArray[np.bool_] | None = None,
         least_weight: float = 1e-4,
     ) -> Self:
-        """Clean the rows of a solver: drop tiny entries, make each row sum to 1.
+        """Make a transport from a solver's rows: drop small entries and normalise each row to a sum of 1.
 
         Parameters
         ----------
@@ -56,11 +56,11 @@ class Transport:
         cell : (count.sum(),) integer
             Cells, ascending within a row.
         weight : (count.sum(),) float
-            Weights, zero or more, of any positive sum; a row that sums to zero ends up empty.
+            Weights, zero or more. A row of sum 0 becomes empty.
         shared : (n,) bool, optional
-            False for every pixel if left out.
+            Default: False for all pixels.
         least_weight : float
-            Entries below this share of their row are dropped.
+            Entries below this share of their row's sum are dropped.
 
         Returns
         -------
@@ -69,7 +69,7 @@ class Transport:
         Raises
         ------
         ValueError
-            If the arrays do not fit together, a weight is negative or not finite, or cells do not ascend.
+            If the shapes do not match, a weight is negative or not finite, or cells do not ascend within a row.
         """
         sizes = count.ravel().astype(np.int64)
         if count.ndim != 2 or count.shape[1] != 3 or not cell.shape == weight.shape == (int(sizes.sum()),):
@@ -97,7 +97,7 @@ class Transport:
 
     @classmethod
     def concatenate(cls, parts: Sequence[Self]) -> Self:
-        """Join the pixels of several transports of one grid, in order.
+        """Concatenate the pixels of several transports on the same grid.
 
         Raises
         ------
@@ -105,7 +105,7 @@ class Transport:
             If there are no parts, or their grids differ.
         """
         if len({(part.columns, part.rows) for part in parts}) != 1:
-            raise ValueError("transports to concatenate must be at least one, all of one grid")
+            raise ValueError("concatenate needs at least one transport, and all must be on the same grid")
         return cls(
             parts[0].columns,
             parts[0].rows,
@@ -116,27 +116,26 @@ class Transport:
         )
 
     def apply(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Light that arrives through the rows: T L of eq. 5.
+        """Apply T to the monitor's light: T L of eq. 5.
 
         Parameters
         ----------
         light : (nodes, 3) float32
-            L, the monitor's light by node of the pyramid and channel; of the first grid alone, if no cell is on
-            another.
+            L, the light of each node of the pyramid and channel. Nodes after the last cell can be left out.
 
         Returns
         -------
         (n, 3) float32
-            0 for an empty row.
+            0 where a row is empty.
 
         Raises
         ------
         ValueError
-            If `light` is not that of the pyramid's nodes.
+            If the shape is wrong or `light` has no row for some cell.
         """
         sizes = self.count.ravel().astype(np.int64)
         if light.ndim != 2 or light.shape[1] != 3 or len(light) <= int(self.cell.max(initial=0)):
-            raise ValueError(f"light must be (nodes, 3), with a row for every cell, not {light.shape}")
+            raise ValueError(f"light must be (nodes, 3) with a row for every cell, not {light.shape}")
         row = np.repeat(np.arange(sizes.size), sizes)
         exact = self.weight.astype(np.float64)
         arrived = np.stack(
@@ -148,12 +147,12 @@ class Transport:
 
 
 def ragged_entries(begin: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Indices of the entries of several runs, run after run.
+    """Concatenate ranges of indices.
 
     Parameters
     ----------
     begin, sizes : (k,) int64
-        First entry of each run, and its length.
+        First index and length of each range.
 
     Returns
     -------

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from workflows.recovery.noise import Noise, estimate_excess, noise_line
+from workflows.recovery.noise import Noise, estimate_excess, fit_noise
 
 
 @pytest.mark.parametrize("trim", [0.9, 1.0])
@@ -11,20 +11,20 @@ def test_line_fits_the_samples(trim):
     rng = np.random.default_rng(0)
     level = rng.uniform(0, 1, 100_000)
     noise = Noise(4e-6, 5e-5)
-    found = noise_line(level, noise.variance(level) * rng.standard_normal(level.size) ** 2, 1e-12, trim=trim)
+    found = fit_noise(level, noise.variance(level) * rng.standard_normal(level.size) ** 2, 1e-12, trim=trim)
     assert found.read == pytest.approx(noise.read, rel=0.15)
     assert found.shot == pytest.approx(noise.shot, rel=0.05)
 
 
 def test_variance_is_at_least_the_floor():
-    found = noise_line(np.linspace(0, 1, 1000), np.zeros(1000), 1e-6)
+    found = fit_noise(np.linspace(0, 1, 1000), np.zeros(1000), 1e-6)
     assert found.read == pytest.approx(1e-6)
     assert found.shot == pytest.approx(0, abs=1e-12)
 
 
 def test_too_few_samples_give_none():
-    assert noise_line(np.linspace(0, 1, 119), np.ones(119), 1e-12) is None
-    assert noise_line(np.linspace(0, 1, 120), np.ones(120), 1e-12) is not None
+    assert fit_noise(np.linspace(0, 1, 119), np.ones(119), 1e-12) is None
+    assert fit_noise(np.linspace(0, 1, 120), np.ones(120), 1e-12) is not None
 
 
 @pytest.mark.parametrize("blocks", [1, 2, 6])

@@ -77,9 +77,9 @@ def test_one_level_is_refused():
 
 def test_shapes_that_do_not_fit_are_refused():
     values, levels, _, _ = constants(2)
-    with pytest.raises(ValueError, match="do not fit"):
+    with pytest.raises(ValueError, match="do not match"):
         estimate_noise(values, levels[:4], np.ones(values.shape, bool), 1 / 255)
-    with pytest.raises(ValueError, match="do not fit"):
+    with pytest.raises(ValueError, match="do not match"):
         estimate_crosstalk(values, levels[:4], np.ones(values.shape, bool))
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from workflows.recovery.solvers import descend, inner, posterior_mean, signed_rows, stack_rows
+from workflows.recovery.solvers import inner, posterior_mean, signed_rows, solve_nnls, stack_rows
 
 
 @pytest.mark.parametrize(("s", "m"), [(6, 20), (30, 40), (40, 30)])
@@ -12,7 +12,7 @@ def test_descend_is_non_negative_least_squares(s, m):
     truth = np.where(rng.random(s) < 0.3, rng.random(s), 0)
     target = (truth @ matrix + 0.05 * rng.standard_normal(m)).astype(np.float32)
     x = rng.random(s).astype(np.float32)
-    residual = descend(matrix, target, x, 5000, 1e-7)
+    residual = solve_nnls(matrix, target, x, 5000, 1e-7)
     expected, norm = nnls(matrix.T.astype(float), target.astype(float))
     assert np.linalg.norm(target - x @ matrix) == pytest.approx(norm, abs=1e-3)
     if s < m:
@@ -25,13 +25,13 @@ def test_descend_leaves_what_no_measurement_sees():
     matrix = np.zeros((2, 3), np.float32)
     matrix[1] = 1
     x = np.array([0.25, 0], np.float32)
-    descend(matrix, np.full(3, 0.5, np.float32), x, 10, 0.0)
+    solve_nnls(matrix, np.full(3, 0.5, np.float32), x, 10, 0.0)
     np.testing.assert_array_equal(x, [0.25, 0.5])
 
 
 def test_descend_without_cells_returns_the_target():
     target = np.ones(3, np.float32)
-    residual = descend(np.empty((0, 3), np.float32), target, np.empty(0, np.float32), 10, 0.0)
+    residual = solve_nnls(np.empty((0, 3), np.float32), target, np.empty(0, np.float32), 10, 0.0)
     np.testing.assert_array_equal(residual, target)
 
 

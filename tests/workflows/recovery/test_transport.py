@@ -56,9 +56,9 @@ def test_concatenate_joins_pixels_in_order(transport):
 
 def test_concatenate_refuses_different_grids(transport):
     other = Transport(2, 3, transport.count, transport.cell, transport.weight, transport.shared)
-    with pytest.raises(ValueError, match="one grid"):
+    with pytest.raises(ValueError, match="same grid"):
         Transport.concatenate([transport, other])
-    with pytest.raises(ValueError, match="one grid"):
+    with pytest.raises(ValueError, match="same grid"):
         Transport.concatenate([])
 
 

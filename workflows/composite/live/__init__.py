@@ -1,1 +1,1 @@
-"""What a browser draws the glass from."""
+"""Mattes encoded for compositing in a browser, on graphics hardware."""

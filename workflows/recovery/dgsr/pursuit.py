@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from workflows.recovery.dgsr.groups import Rows, group_sums
 from workflows.recovery.dgsr.options import Constants
-from workflows.recovery.solvers import descend, inner, stack_rows
+from workflows.recovery.solvers import inner, solve_nnls, stack_rows
 
 
 class System(NamedTuple):
@@ -282,7 +282,9 @@ def solve_chosen(
     index = np.flatnonzero(chosen)
     matrix, y = np.empty((index.size, problem.target.size), np.float32), x[index]
     stack_rows(problem.light, cell[index], problem.scale, matrix)
-    residual: NDArray[np.float32] = descend(matrix, problem.target, y, constants.sweeps, constants.tolerance)
+    residual: NDArray[np.float32] = solve_nnls(
+        matrix, problem.target, y, constants.sweeps, constants.tolerance
+    )
     x[:] = 0
     for i in range(index.size):
         x[index[i]] = y[i]
