@@ -1,1 +1,1 @@
-"""Traced scenes, for the demo and the tests."""
+"""Simulated scenes for the demo and the tests."""

@@ -1,8 +1,8 @@
-"""A glass ball traced before a monitor, with its truth: a capture to try recovery on without a camera.
+"""A ray-traced glass ball in front of a monitor, with exact light transport: test data without a camera.
 
-The ball has radius 1 and stands at the origin. A pinhole camera `CAMERA` radii before it looks along +z at
-its centre and at that of the monitor, which is square to the axis and `MONITOR` radii behind it. x grows with
-an image's columns and y with its rows, in frames and on the monitor alike: what is seen directly is upright.
+The ball has radius 1 and its centre is the origin. A pinhole camera `CAMERA` radii in front of it looks along +z at
+the centres of the ball and of the monitor, which is perpendicular to the axis and `MONITOR` radii behind. x increases
+with the columns and y with the rows, both of frames and of the monitor, so the monitor is upright when seen directly.
 """
 
 import math
@@ -17,29 +17,30 @@ from storage.errors import OptionError
 from workflows.simulation.scene import Floats, Scene, Transport
 
 CAMERA = 5.0
-"""From the pinhole to the ball's centre, in radii of the ball."""
+"""Distance from the pinhole to the ball's centre, in radii of the ball."""
 MONITOR = 3.0
-"""From the ball's centre to the monitor, in radii: beyond the focus, so the ball shows it inverted."""
+"""Distance from the ball's centre to the monitor, in radii: beyond the focus, so the image is inverted."""
 BALL_SHARE = 0.85
 """The ball's width in a frame, as a share of the frame's shorter side."""
 MONITOR_MARGIN = 1.5
-"""The monitor's size over what the camera sees of its plane: light bent by up to some 45 degrees finds it."""
+"""The monitor's size as a multiple of the camera's field of view in its plane, so that light refracted by up to about
+45 degrees reaches it."""
 BATCH_RAYS = 1 << 16
-"""Rays traced at once: some 30 MB of arrays."""
+"""Rays traced at once: about 30 MB of arrays."""
 
 Doubles = NDArray[np.float64]
 Ends = list[tuple[NDArray[np.intp], Doubles, Doubles, Doubles]]
 
 
 def fresnel(cosine: Doubles, index: float) -> tuple[Doubles, Doubles]:
-    """Reflection and refraction of unpolarised light at a surface.
+    """Compute reflection and refraction of unpolarised light at a surface.
 
     Parameters
     ----------
     cosine : (...) float64
-        Of the angle between the incident ray and the normal, above 0.
+        Cosine of the angle between the incident ray and the normal, above 0.
     index : float
-        The refractive index beyond the surface over that before it.
+        Ratio of the refractive indices behind and in front of the surface.
 
     Returns
     -------
@@ -71,7 +72,7 @@ def glass_ball(
     seed: int = 0,
     distance: float = MONITOR,
 ) -> Scene:
-    """Trace a glass ball before a monitor.
+    """Trace a glass ball in front of a monitor.
 
     Parameters
     ----------
@@ -80,18 +81,18 @@ def glass_ball(
     monitor : (int, int)
         The monitor's width and height in pixels.
     rays : int
-        Rays a camera pixel, a square number: one at random in each cell of a square grid.
+        Rays per camera pixel, a square number: one at a random position in each cell of a square grid.
     index : float or three
-        Refractive index of red, green and blue; below 1 it is a bubble.
+        Refractive index for red, green and blue; below 1 for a bubble.
     absorption : float or three
-        Of red, green and blue, per radius of the ball: over a length s the share exp(-absorption s) is left
+        Absorption of red, green and blue per radius of the ball: the share exp(-absorption s) is left after a length s
         (Beer-Lambert).
     bounces : int
-        Reflections inside the ball that are followed.
+        Number of internal reflections that are followed.
     seed : int
-        Of the rays' places; the same seed gives the same scene.
+        Seed of the rays' positions; the same seed gives the same scene.
     distance : float
-        From the ball's centre to the monitor, in radii; its size is that of one at `MONITOR`.
+        Distance from the ball's centre to the monitor, in radii. The monitor's size does not depend on it.
 
     Returns
     -------
@@ -104,13 +105,13 @@ def glass_ball(
 
     Notes
     -----
-    The light's path is followed backwards, from the camera. At each surface a ray's weight is split by
-    Fresnel's equations, nothing is left to chance. What the ball reflects on its outside, and what leaves it
-    towards the camera's side or beside the monitor, meets no light: there rho < 1.
+    Rays are traced backwards from the camera. At each surface a ray's weight is split by Fresnel's equations, not at
+    random. Rays that are reflected by the ball's outside, or that leave it without hitting the monitor, carry no light,
+    so rho < 1 there.
     """
     side = math.isqrt(rays)
     if rays < 1 or side * side != rays:
-        raise OptionError(f"{rays} rays a pixel make no square grid", field="rays")
+        raise OptionError(f"rays must be a square number, not {rays}", field="rays")
     indices = index if isinstance(index, tuple) else (index,) * 3
     absorptions = absorption if isinstance(absorption, tuple) else (absorption,) * 3
     glasses = list(zip(indices, absorptions, strict=True))
@@ -132,7 +133,7 @@ class _Camera:
     distance: float
 
     def trace(self, index: float, absorption: float, bounces: int) -> tuple[Transport, Floats]:
-        """The transport and the coverage of a ball."""
+        """Trace a ball; return its transport and coverage."""
         pixels, rays = self.width * self.height, self.side**2
         step = max(BATCH_RAYS // rays, 1)
         random = np.random.PCG64(self.seed)
@@ -166,7 +167,7 @@ class _Camera:
         return pixels * pitch
 
     def _rays(self, pixel: NDArray[np.intp], random: np.random.PCG64) -> Doubles:
-        """Unit directions (3, n) of rays through pixels, each through a cell of its own."""
+        """Unit directions (3, n) of rays through pixels, one per cell of a pixel."""
         jitter = _uniform(random, 2 * len(pixel))
         cell = np.arange(len(pixel)) % self.side**2
         across = pixel % self.width + (cell % self.side + jitter[::2]) / self.side
@@ -179,42 +180,42 @@ class _Camera:
     def _deposit(
         self, ray: NDArray[np.intp], point: Doubles, direction: Doubles, weight: Doubles
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], Doubles]:
-        """Of rays from points (3, n): those that meet the monitor, the pixel they meet, and their weight."""
+        """Find the rays from points (3, n) that hit the monitor; return them, the pixels hit, and their weights."""
         steps = (self.distance - point[2]) / np.where(direction[2] > 0, direction[2], np.nan)
         x = (point[0] + steps * direction[0]) / self.half_monitor[0]
         y = (point[1] + steps * direction[1]) / self.half_monitor[1]
-        met = (np.abs(x) < 1) & (np.abs(y) < 1) & (weight > 0)
+        hit = (np.abs(x) < 1) & (np.abs(y) < 1) & (weight > 0)
         width, height = self.monitor
-        column = np.minimum((x[met] + 1) / 2 * width, width - 1).astype(np.intp)
-        row = np.minimum((y[met] + 1) / 2 * height, height - 1).astype(np.intp)
-        return ray[met], row * width + column, weight[met]
+        column = np.minimum((x[hit] + 1) / 2 * width, width - 1).astype(np.intp)
+        row = np.minimum((y[hit] + 1) / 2 * height, height - 1).astype(np.intp)
+        return ray[hit], row * width + column, weight[hit]
 
 
 def _through_ball(
     ray: Doubles, index: float, absorption: float, bounces: int
 ) -> tuple[NDArray[np.bool_], Ends]:
-    """Follow rays from the camera (3, n) through the ball.
+    """Trace rays with directions (3, n) from the camera through the ball.
 
     Returns
     -------
     hit : (n,) bool
+        Which rays hit the ball.
     ends : list of (ray (m,) intp, point (3, m), direction (3, m), weight (m,))
-        Where and how rays leave the ball, after each number of inner reflections.
+        The rays that leave the ball after 0, 1, ... internal reflections: index, position, direction and weight.
 
     Notes
     -----
-    In a ball every chord of a path has the same length and meets the surface at the same angles. So one
-    reflectance R holds all along (it is the same from both sides, Born and Wolf, Sect. 1.5.3), and after k
-    inner reflections the share (1 - R)^2 R^k leaves: with the share R that is reflected outside, the whole.
-    A ray that got in can't be held by total inner reflection.
+    In a ball all chords of a path have the same length and the same angles to the surface. So the reflectance R is the
+    same everywhere (also from both sides, Born and Wolf, Sect. 1.5.3). The share (1 - R)^2 R^k leaves after k internal
+    reflections; these and the share R reflected outside sum to 1. A ray that has entered is never totally reflected.
     """
     middle = CAMERA * ray[2]
-    under = middle**2 - (CAMERA**2 - 1)
-    hit = under > 0
-    cosine, direction = np.sqrt(under[hit]), ray[:, hit]
+    discriminant = middle**2 - (CAMERA**2 - 1)
+    hit = discriminant > 0
+    cosine, direction = np.sqrt(discriminant[hit]), ray[:, hit]
     point = (middle[hit] - cosine) * direction
     point[2] -= CAMERA
-    # The radius is 1, so a point on the ball is its normal there; ``cosine`` is that of the ray to it.
+    # The radius is 1, so the normal at a point is the point itself; `cosine` is that of the incident angle.
     reflectance, inner = fresnel(cosine, index)
     direction = direction / index + (cosine / index - inner) * point
     left = np.exp(-2 * absorption * inner)
@@ -231,19 +232,19 @@ def _through_ball(
 
 
 def _uniform(random: np.random.PCG64, count: int) -> Doubles:
-    """Doubles in 0 to 1, of the raw words' top 53 bits: a stable stream, which Generator's is not."""
+    """Doubles from 0 to 1, from the top 53 bits of raw words: unlike Generator's, the same in all versions of numpy."""
     return np.asarray((random.random_raw(count) >> np.uint64(11)) * 2.0**-53, np.float64)
 
 
 def backdrop(width: int = 1280, height: int = 960, seed: int = 0) -> Floats:
-    """A backdrop to judge a composite by: a turned checker with white seams, in softly changing colours.
+    """Make a backdrop to judge composites by: a rotated checkerboard with white seams and smoothly varying colours.
 
     Parameters
     ----------
     width, height : int
-        Pixels.
+        Size in pixels.
     seed : int
-        Of the colours.
+        Seed of the colours.
 
     Returns
     -------
@@ -251,9 +252,9 @@ def backdrop(width: int = 1280, height: int = 960, seed: int = 0) -> Floats:
         Linear light, 0 to 1.
     """
     y, x = np.mgrid[:height, :width] / height
-    turned = np.stack([0.966 * x + 0.259 * y, 0.966 * y - 0.259 * x]) * 22
-    wave = np.sin(np.pi * turned)
-    # Edges are soft over a pixel or so, and lie along no pattern's blocks.
+    rotated = np.stack([0.966 * x + 0.259 * y, 0.966 * y - 0.259 * x]) * 22
+    wave = np.sin(np.pi * rotated)
+    # Edges are about a pixel wide and not parallel to the blocks of patterns.
     dark = np.clip(0.5 + wave[0] * wave[1] * height / 80, 0, 1)[..., None]
     seam = np.clip(1.6 - np.abs(wave).min(axis=0) * height / 80, 0, 1)[..., None]
     phase = _uniform(np.random.PCG64(seed), 3)

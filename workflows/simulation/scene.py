@@ -1,4 +1,4 @@
-"""A transparent object whose light transport is known: what a camera sees of it, and a capture of that."""
+"""A transparent object with known light transport: simulated frames, and captures made of them."""
 
 import json
 import zipfile
@@ -38,7 +38,7 @@ class FilmOptions(TypedDict, total=False):
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A transparent object before a monitor, and the light transport between monitor and camera.
+    """A transparent object in front of a monitor, and the light transport from monitor to camera.
 
     Attributes
     ----------
@@ -47,8 +47,8 @@ class Scene:
     monitor : (int, int)
         The monitor's width and height in pixels.
     transport : three (height * width, monitor height * width) float32 CSR arrays
-        rho T of red, green and blue: what each monitor pixel at full light adds to each camera pixel.
-        Channels that are alike share one array.
+        rho T of red, green and blue: the light that each monitor pixel at full intensity adds to each camera pixel.
+        Identical channels share one array.
     coverage : (height, width) float32
         The share of a camera pixel that the object covers, 0 to 1.
     """
@@ -61,21 +61,21 @@ class Scene:
 
     @cached_property
     def rho(self) -> Floats:
-        """(height, width, 3) float32: the share of an evenly lit monitor's light that arrives, 0 to 1."""
+        """(height, width, 3) float32: the share of a white monitor's light that arrives, 0 to 1."""
         return self.composite(np.ones((1, 1, 1), np.float32))
 
     @property
     def object_mask(self) -> NDArray[np.bool_]:
-        """(height, width) bool: mostly object, and more than 5 % of the light arrives in every channel."""
+        """(height, width) bool: where the object covers over half of a pixel and rho exceeds 5 % in all channels."""
         return (self.coverage > 0.5) & (self.rho > 0.05).all(axis=2)
 
     def composite(self, backdrop: Floats) -> Floats:
-        """The light that arrives without noise, rho T L.
+        """Compute the light that arrives, rho T L, without noise.
 
         Parameters
         ----------
         backdrop : (h, w, 3 or 1) float32
-            Linear light at any size, stretched over the monitor.
+            Linear light of any size, stretched over the monitor.
 
         Returns
         -------
@@ -93,14 +93,14 @@ class Scene:
         return arriving.reshape(self.height, self.width, 3)
 
     def truth(self, backdrop: Floats, *, offset: float = 0.02, gain: float = 0.9) -> Floats:
-        """What the sensor of `film` would see of a backdrop without noise, curve, clipping and rounding.
+        """Compute what the sensor of `film` would measure without noise, tone curve, clipping and rounding.
 
         Parameters
         ----------
         backdrop : (h, w, 3 or 1) float32
-            Linear light at any size, stretched over the monitor.
+            Linear light of any size, stretched over the monitor.
         offset, gain : float
-            As given to `film`.
+            As in `film`.
 
         Returns
         -------
@@ -121,47 +121,45 @@ class Scene:
         seed: int = 0,
         images: Sequence[Floats] = (),
     ) -> Iterator[Frame]:
-        """Film a pattern program, one frame a pattern.
+        """Simulate the frames of a pattern program, one per pattern.
 
         Parameters
         ----------
         program : Program
-            For a monitor of this scene's size. A monitor of ``unknown`` response is filmed as sRGB.
+            Program for a monitor of this scene's size. An ``unknown`` response of the monitor is taken as sRGB.
         offset, gain : float
-            Ambient light, and the sensor's value for an evenly lit monitor seen directly, less that.
+            The sensor's value without light from the monitor, and the increase for a white monitor seen directly.
         noise : float
-            1 is a sensor with a read noise of 0.002 of full scale and a shot noise of 0.006 at full scale.
+            Factor on the noise. 1 is a read noise of 0.002 of full scale and a shot noise of 0.006 at full scale.
         depth : {8, 16}
-            Bits of a frame.
+            Bits per channel of a frame.
         response : {"linear", "srgb"}
-            The camera's curve.
+            The camera's tone curve.
         seed : int
-            Of the noise.
+            Seed of the noise.
         images : sequence of (rows, columns, 1 or 3) float32
             Values sent to the monitor, 0 to 1, for the program's `Images` parts, in order.
 
         Returns
         -------
         iterator of (height, width, 3) uint8 or uint16
-            In order of the patterns.
+            Frames in the order of the patterns.
 
         Raises
         ------
         OptionError
-            If the program is for a monitor of another size, or a number of images does not fit it.
+            If the program's monitor has another size, or the number of images is wrong.
 
         Notes
         -----
-        With v = offset + gain * light and n normal of deviation noise * (0.002 + 0.006 sqrt(v)), a pixel
-        stores curve(clip(v + n)), rounded.
+        A pixel is curve(clip(v + n)), rounded, with v = offset + gain * light and normal noise n of the standard
+        deviation noise * (0.002 + 0.006 sqrt(v)).
         """
         if (program.monitor.width, program.monitor.height) != self.monitor:
-            raise OptionError(
-                "the program is for a monitor of another size than the scene's", field="program"
-            )
-        wanted = sum(part.count for part in program.parts if part.kind == "images")
-        if len(images) != wanted:
-            raise OptionError(f"the program shows {wanted} images, {len(images)} are given", field="images")
+            raise OptionError("the program's monitor has another size than the scene's", field="program")
+        needed = sum(part.count for part in program.parts if part.kind == "images")
+        if len(images) != needed:
+            raise OptionError(f"the program needs {needed} images, not {len(images)}", field="images")
         rng = np.random.Generator(np.random.PCG64(seed))
 
         def frame(light: Floats) -> Frame:
@@ -187,19 +185,20 @@ def write_capture(
     name: str = "",
     **film: Unpack[FilmOptions],
 ) -> int:
-    """Film a program and write the capture, a ZIP in the format envmatte-capture/1.
+    """Simulate the frames of a program and write a capture archive, a ZIP in the format envmatte-capture/1.
+
+    The same arguments write the same bytes.
 
     Parameters
     ----------
     scene : Scene
     program : Program
-        Names of the files of `Images` parts are taken as they are; the files are PNG of 16 bits.
+        Files of its `Images` parts are written under their names, as PNG of 16 bits.
     target : Path or binary file
-        The same arguments write the same bytes.
     mask : bool
-        Whether to add the object's mask.
+        Whether to include the object's mask.
     name : str
-        The capture's name, left out if empty.
+        Name of the capture; omitted if empty.
     **film
         Options of `Scene.film`.
 
@@ -211,7 +210,7 @@ def write_capture(
     Raises
     ------
     OptionError
-        As `Scene.film`, and nothing is written.
+        As from `Scene.film`; nothing is written.
     """
     filmed = scene.film(program, **film)
     frames = [{"file": f"frames/{n:05d}.png", "pattern": n} for n in range(program.count)]
@@ -228,7 +227,7 @@ def write_capture(
 
         def add(entry: str, content: bytes | Frame) -> None:
             info = zipfile.ZipInfo(entry, date_time=(1980, 1, 1, 0, 0, 0))
-            info.create_system = 3  # as on Unix, wherever this runs
+            info.create_system = 3  # Unix, whatever the platform
             archive.writestr(info, content if isinstance(content, bytes) else imagecodecs.png_encode(content))
 
         add("capture.json", json.dumps(record, indent=1).encode())

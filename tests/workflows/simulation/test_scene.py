@@ -152,10 +152,10 @@ def test_what_does_not_fit_is_refused_and_nothing_written(
     ball: Scene, program: Program, tmp_path: Path
 ) -> None:
     path = tmp_path / "ball.zip"
-    with pytest.raises(OptionError, match="monitor of another size"):
+    with pytest.raises(OptionError, match="monitor has another size"):
         write_capture(ball, nested_program((64, 48), bands=((8, 6, 2),)), path)
-    with pytest.raises(OptionError, match="shows 0 images, 1 are given"):
+    with pytest.raises(OptionError, match="needs 0 images, not 1"):
         write_capture(ball, program, path, images=(np.ones((2, 2, 1), np.float32),))
     assert not path.exists()
-    with pytest.raises(OptionError, match="no square grid"):
+    with pytest.raises(OptionError, match="must be a square number"):
         glass_ball(rays=50)
