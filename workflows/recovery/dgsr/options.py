@@ -1,4 +1,4 @@
-"""The options of NN-DGSR: names, defaults, ranges and what they do."""
+"""The options of NN-DGSR: names, types, ranges, defaults and descriptions."""
 
 from typing import Annotated, Literal, NamedTuple
 
@@ -6,7 +6,7 @@ from workflows.recovery.options import Range
 
 
 class Constants(NamedTuple):
-    """The numbers among the options of NN-DGSR: what kernels take."""
+    """The numeric options of NN-DGSR, which are passed to kernels."""
 
     sparsity: Annotated[
         float,
@@ -17,7 +17,7 @@ class Constants(NamedTuple):
     growth: Annotated[
         float,
         Range(1, 100),
-        "Factor by which the number of cells grows, from one, until more cells explain no more.",
+        "Factor by which the number of cells grows, from one, until more cells do not improve the fit.",
     ] = 1.25
     sum_tolerance: Annotated[
         float,
@@ -66,13 +66,12 @@ class DgsrOptions(NamedTuple):
 
     prior: Annotated[
         Literal["gaussian", "none"],
-        "`gaussian` fits oriented Gaussians to the clusters of T and filters T by them (Sect. 4.2.2); `none` leaves T "
-        "as the search found it.",
+        "`gaussian` fits oriented Gaussians to the clusters of T and filters T by them (Sect. 4.2.2); `none` does not.",
     ] = "gaussian"
     levels: Annotated[
         Literal["hierarchical", "direct"],
-        "`hierarchical` goes from coarse to fine grids, and only the children of a level's cells are unknowns of the "
-        "next (Sect. 4.2.3); `direct` solves the finest level at once, with all of its cells, and is much slower.",
+        "`hierarchical` goes from coarse to fine grids, and only the children of a level's cells are unknowns on the "
+        "next (Sect. 4.2.3); `direct` solves for all cells of the finest level at once and is much slower.",
     ] = "hierarchical"
     channels: Annotated[
         Literal["apart", "joint"],

@@ -158,19 +158,19 @@ def leading_channel(variance: NDArray[np.float32]) -> int:
 
 @njit(nogil=True, cache=True, inline="always")
 def fit_pixel(
-    pixels: Pixels, p: int, apart: bool, options: LobesOptions, fits: Fits, buffers: NodeBuffers
+    pixels: Pixels, p: int, separate: bool, options: LobesOptions, fits: Fits, buffers: NodeBuffers
 ) -> None:
     """Write the fits of a pixel that are needed.
 
-    These are the fit of all channels together, and under coloured patterns also one for each channel. If the channels
-    are separate (`apart`), only these. The other fits start from the lobes of the first: the one of all channels, or
-    the one of the most precise channel.
+    If `separate`, these are one fit for each channel, that of the most precise channel first. Otherwise they are the
+    fit of all channels together, and under coloured patterns then also one for each channel. All others start from the
+    lobes of the first.
     """
     own = pixels.own.variance[p]
     groups = pixels.code.shape[1] // (own.shape[1] - 2)
     fits.offset[:] = 0
     fits.k[:], fits.objective[:] = 0, 0
-    lead = leading_channel(own) if apart else ALL
+    lead = leading_channel(own) if separate else ALL
     for turn in range(-1, 3):
         c = lead if turn < 0 else turn
         if turn == lead or (c < ALL and (np.isinf(own[c]).all() or (lead == ALL and groups == 1))):
@@ -198,8 +198,8 @@ def prefers_channels(fits: Fits, size: int) -> bool:
     """
     each = math.log(size)
     together = fits.objective[ALL] + each * (PARAMETERS * fits.k[ALL] + 1)
-    apart = 0.0
+    separate = 0.0
     for c in range(3):
-        apart += fits.objective[c] + each * (PARAMETERS * fits.k[c] + 1)
-    better: bool = apart < together
+        separate += fits.objective[c] + each * (PARAMETERS * fits.k[c] + 1)
+    better: bool = separate < together
     return better

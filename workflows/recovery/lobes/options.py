@@ -1,4 +1,4 @@
-"""The options of the lobes method: names, defaults, ranges and what they do."""
+"""The options of the lobes method: names, types, ranges, defaults and descriptions."""
 
 from typing import Annotated, NamedTuple
 
@@ -12,8 +12,8 @@ class LobesOptions(NamedTuple):
     fit_resolution: Annotated[
         float,
         Range(0.5, 4),
-        "Least standard deviation of a lobe along its narrow axis while it is fitted, in spacings of the grid that it "
-        "is sampled on. It may be up to twice as large.",
+        "Least standard deviation of a lobe along its minor axis while it is fitted, in spacings of the grid that it "
+        "is sampled on. A lobe at least twice as wide goes to the next coarser grid.",
     ] = 0.65
     resolution: Annotated[
         float, Range(0.5, 4), "The same as `fit_resolution`, for the T that is recovered."
@@ -31,13 +31,13 @@ class LobesOptions(NamedTuple):
     doubt: Annotated[
         float,
         Range(0, 1),
-        "Lobes are fitted a second time, from their posterior mean, where they leave more than this unexplained: the "
-        "variance of a black-and-white pattern (-1 to 1) beside them. 1 is a single ray that was not seen.",
+        "Lobes are fitted a second time, starting from their posterior mean, where they leave more than this variance "
+        "of a black-and-white pattern (-1 to 1) unexplained. 1 corresponds to a single ray that the lobes miss.",
     ] = 0.01
     passes: Annotated[
         int,
         Range(1, 20),
-        "How often T is replaced by its posterior mean. Each pass starts from the result of the one before.",
+        "How many times T is replaced by its posterior mean. Each pass starts from the result of the one before.",
     ] = 2
     gradients: Annotated[int, Range(1, 1000), "Most conjugate gradient steps in a pass."] = 9
     disagreement: Annotated[

@@ -80,14 +80,14 @@ def finish_fit(
 
 @njit(nogil=True, cache=True)
 def recover_pixels(
-    pixels: Pixels, apart: NDArray[np.bool_], options: LobesOptions, diagnostics: Diagnostics
+    pixels: Pixels, separate: NDArray[np.bool_], options: LobesOptions, diagnostics: Diagnostics
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Recover T of n pixels, one for all channels or one for each.
 
     Parameters
     ----------
     pixels : Pixels
-    apart : (n,) bool
+    separate : (n,) bool
         Whether each channel gets its own T. Under coloured patterns this is decided here and written.
     options : LobesOptions
     diagnostics : Diagnostics
@@ -116,11 +116,11 @@ def recover_pixels(
     )
     node, weight, end = np.empty(_CAPACITY, np.int64), np.empty(_CAPACITY, np.float32), 0
     for p in range(n):
-        fit_pixel(pixels, p, apart[p], options, fits, buffers)
+        fit_pixel(pixels, p, separate[p], options, fits, buffers)
         if groups == 3:
-            apart[p] = prefers_channels(fits, size)
+            separate[p] = prefers_channels(fits, size)
         diagnostics.nodes[p] = 0
-        for c in range(0 if apart[p] else ALL, ALL if apart[p] else ALL + 1):
+        for c in range(0 if separate[p] else ALL, ALL if separate[p] else ALL + 1):
             if fits.k[c] == 0:
                 continue
             found = finish_fit(pixels, p, c, options, fits, buffers, diagnostics)

@@ -130,20 +130,20 @@ def _recover_block(
     own = Measurements(measured.value[alive], measured.variance[alive])
     if patterns.channels == 1:
         joint = _average_channels(own)
-        apart = _channels_disagree(own, joint.value, options.disagreement)
+        separate = _channels_disagree(own, joint.value, options.disagreement)
     else:
         n, channels, m = own.value.shape
         joint = Measurements(own.value.reshape(n, channels * m), own.variance.reshape(n, channels * m))
-        apart = np.zeros(n, bool)
-    counts = np.zeros((len(apart), 3), np.int64)
+        separate = np.zeros(n, bool)
+    counts = np.zeros((len(separate), 3), np.int64)
     diagnostics = Diagnostics(
         np.zeros_like(own.value), np.zeros(counts.shape), np.zeros(counts.shape), counts
     )
     pixels = Pixels(patterns.pyramid.arrays, patterns.code, joint, own)
-    node, weight = recover_pixels(pixels, apart, options, diagnostics)
+    node, weight = recover_pixels(pixels, separate, options, diagnostics)
     response[alive], kappa[alive], misfit[alive] = diagnostics[:3]
     count, shared = np.zeros((alive.size, 3), np.int64), np.zeros(alive.size, bool)
-    count[alive], shared[alive] = counts, ~apart
+    count[alive], shared[alive] = counts, ~separate
     row = np.repeat(np.arange(count.size), count.ravel())
     order = np.lexsort((node, row))
     row, node, weight = row[order], node[order], weight[order]

@@ -94,7 +94,7 @@ def test_weights_that_explain_the_measurements_stay():
     np.testing.assert_allclose(weight, start, rtol=1e-3)
 
 
-def test_unresolved_finds_the_variance_about_a_first_estimate():
+def test_total_variance_finds_the_variance_about_a_first_estimate():
     rng = np.random.default_rng(0)
     m, kappa = 20_000, 0.05
     code = 255 * rng.integers(0, 2, (6, m)).astype(np.uint8)
