@@ -93,11 +93,11 @@ def posterior_mean(
     residual: NDArray[np.float32],
     mean: NDArray[np.float32],
     variance: float,
-    looseness: float,
+    prior_scale: float,
     steps: int,
     precision: float,
 ) -> NDArray[np.float32]:
-    """Posterior mean of t given measurements, with the prior ``t ~ N(mean, looseness * diag(mean))``, clipped at zero.
+    """Posterior mean of t given measurements and the prior ``t ~ N(mean, prior_scale * diag(mean))``, clipped at zero.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def posterior_mean(
         Prior mean, zero or more.
     variance : float
         Variance of the measurements, zero or more.
-    looseness : float
+    prior_scale : float
         Prior variance per unit of the mean; the prior mean is returned if it is not positive.
     steps : int
         Most conjugate gradient steps.
@@ -122,14 +122,14 @@ def posterior_mean(
 
     Notes
     -----
-    Conjugate gradients on ``(A M A' + variance / looseness) y = residual``, then ``t = mean + M A' y``. A is the
+    Conjugate gradients on ``(A M A' + variance / prior_scale) y = residual``, then ``t = mean + M A' y``. A is the
     transpose of `matrix`, and M = diag(mean).
     """
     s, n = matrix.shape
     t = mean.copy()
-    if looseness <= 0:
+    if prior_scale <= 0:
         return t
-    ridge = np.float32(variance / looseness)
+    ridge = np.float32(variance / prior_scale)
     y = np.zeros(n, np.float32)
     left, direction, image = residual.copy(), residual.copy(), np.empty(n, np.float32)
     energy = inner(left, left)

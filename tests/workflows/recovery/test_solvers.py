@@ -67,11 +67,11 @@ def test_posterior_mean_is_the_closed_form():
     matrix = np.sign(rng.standard_normal((40, 25))).astype(np.float32)
     mean = rng.dirichlet(np.full(40, 5.0)).astype(np.float32)
     target = rng.dirichlet(np.full(40, 5.0)) @ matrix
-    variance, looseness = 1e-3, 0.02
-    gram = looseness * (matrix.T * mean) @ matrix + variance * np.eye(25)
-    gain = looseness * mean * (matrix @ np.linalg.solve(gram, target - mean @ matrix))
+    variance, prior_scale = 1e-3, 0.02
+    gram = prior_scale * (matrix.T * mean) @ matrix + variance * np.eye(25)
+    gain = prior_scale * mean * (matrix @ np.linalg.solve(gram, target - mean @ matrix))
     residual = (target - mean @ matrix).astype(np.float32)
-    found = posterior_mean(matrix, residual, mean, variance, looseness, 200, 1e-6)
+    found = posterior_mean(matrix, residual, mean, variance, prior_scale, 200, 1e-6)
     np.testing.assert_allclose(found, np.maximum(mean + gain, 0), atol=2e-5)
     assert (posterior_mean(matrix, residual, mean, variance, 0.0, 200, 1e-6) == mean).all()
 

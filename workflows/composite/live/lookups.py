@@ -14,7 +14,7 @@ from workflows.recovery.pyramid import Pyramid
 
 FIELDS = ("x", "y", "level", "R", "G", "B")
 """The values of a lookup, in this order."""
-_FEW = 24
+_MOST_CLUSTERS = 24
 """Most clusters of a pixel that merge by Ward's cost. While there are more, those in each 2 x 2 square of a grid
 merge."""
 _CLUSTER = 7
@@ -143,7 +143,7 @@ def _merge_squares(
     clusters: NDArray[np.float64], key: NDArray[np.int64], n: int, copy: NDArray[np.float64]
 ) -> int:
     """Merge clusters in each 2 x 2 square of a grid until there are few; return the number left, which come first."""
-    while n > _FEW:
+    while n > _MOST_CLUSTERS:
         for a in range(n):
             level, node = divmod(key[a], 2**48)
             row, column = divmod(node, 2**24)

@@ -163,9 +163,9 @@ def fit_gaussians(
         for j in range(inside.size):
             subtract(residual, mean[j], matrix[j])
         misfit = inner(residual, residual)
-        looseness = max(misfit / n - problem.variance, 0.0)
+        prior_scale = max(misfit / n - problem.variance, 0.0)
         t = posterior_mean(
-            matrix, residual, mean, problem.variance, looseness, constants.steps, constants.precision
+            matrix, residual, mean, problem.variance, prior_scale, constants.steps, constants.precision
         )
         score = n * math.log(max(misfit / n, problem.variance)) + 2 * PARAMETERS * count
         if score < best_score:

@@ -66,19 +66,19 @@ def problem_of(system: System, p: int) -> Problem:
 
 
 @njit(nogil=True, cache=True)
-def grow_rows(system: System, found: Rows, finest: bool, constants: Constants) -> None:
+def grow_rows(system: System, rows: Rows, finest: bool, constants: Constants) -> None:
     """Fit the weights of sparse rows to measurements by NN-DGSR, from zero.
 
     Parameters
     ----------
     system : System
-    found : Rows
+    rows : Rows
         Candidate cells; the weights are overwritten.
     finest : bool
         Whether this is the finest level, where cells that do not improve the fit enough are not added, or dropped.
     constants : Constants
     """
-    begin, cell, weight = found
+    begin, cell, weight = rows
     field = np.zeros((system.rows + 2, system.columns + 2), np.float32)
     for p in range(system.source.size):
         candidates, best = cell[begin[p] : begin[p + 1]], weight[begin[p] : begin[p + 1]]
@@ -237,18 +237,18 @@ def choose_groups(
     energy = np.empty_like(value)
     group_sums(cell, value * value, columns, field, energy)
     best = np.empty(k, np.int64)  # the cells with most energy so far, in descending order
-    found = 0
+    count = 0
     for j in range(value.size):
         chosen[j] = False
-        if value[j] <= 0 or (found == k and energy[j] <= energy[best[k - 1]]):
+        if value[j] <= 0 or (count == k and energy[j] <= energy[best[k - 1]]):
             continue
-        place = min(found, k - 1)
-        found = place + 1
+        place = min(count, k - 1)
+        count = place + 1
         while place > 0 and energy[best[place - 1]] < energy[j]:
             best[place] = best[place - 1]
             place -= 1
         best[place] = j
-    for i in range(found):
+    for i in range(count):
         chosen[best[i]] = True
 
 

@@ -92,7 +92,7 @@ def recover(
     """
     constants = options.constants
     measured = normalise(measurements, photometry, noise, constants.least_contrast, usable, frames)
-    value, weight = _weigh(measured.value[..., :-2], measured.variance[..., :-2])
+    value, weight = _weight_measurements(measured.value[..., :-2], measured.variance[..., :-2])
     parts = []
     for first in range(0, max(len(value), 1), _BLOCK):
         block = slice(first, first + _BLOCK)
@@ -123,7 +123,7 @@ def _recover_block(
         light = np.ascontiguousarray(level.light)
         grey = len(light) == 1
         source = np.zeros_like(channel) if grey else channel
-        target, scale, variance = _rows_of(
+        target, scale, variance = _scale_rows(
             value[..., level.patterns],
             weight[..., level.patterns],
             pixel,
@@ -174,7 +174,7 @@ def error_of(
     return expected_error(photometry, measured, misfit)
 
 
-def _weigh(
+def _weight_measurements(
     value: NDArray[np.float32], variance: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Weight measurements by the inverse mean variance of their channel; value and weight are 0 where unusable.
@@ -197,7 +197,7 @@ def _weigh(
     return np.where(usable, value, 0).astype(np.float32), weight.astype(np.float32)
 
 
-def _rows_of(
+def _scale_rows(
     value: NDArray[np.float32],
     weight: NDArray[np.float32],
     pixel: NDArray[np.intp],

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from workflows.recovery.lobes.footprint import PARAMETERS, PatternCodes
 from workflows.recovery.lobes.likelihood import penalty
 from workflows.recovery.lobes.mixture import Mixture, copy_mixture
-from workflows.recovery.lobes.nodes import gather_lobes, rows_of, spread_lobes
+from workflows.recovery.lobes.nodes import gather_lobes, node_responses, spread_lobes
 from workflows.recovery.lobes.options import LobesOptions
 from workflows.recovery.lobes.posterior import update
 from workflows.recovery.lobes.search import fit
@@ -116,18 +116,18 @@ def refit_from_posterior(
     tried = Mixture(mixture.lobes.copy(), mixture.level.copy(), mixture.offset.copy())
     n = spread_lobes(patterns.grids, tried, k, options.resolution, buffers.node, buffers.weight, buffers.end)
     A = buffers.rows[: n * y.size].reshape(n, y.size)
-    rows_of(patterns, buffers.node, n, A)
+    node_responses(patterns, buffers.node, n, A)
     # with a literal, numba would compile another version of `update`
     passes = np.int64(1)
     update(A, buffers.weight[:n], y, variance, patterns.groups, tried.offset, passes, options.gradients)
     gather_lobes(patterns.grids, buffers.node, buffers.weight, buffers.end, tried, k, options.fit_resolution)
-    found, _, new = fit(patterns, y, variance, tried, k, options)
-    if new + penalty(patterns.grids, tried.level, found) >= objective + penalty(
+    new_k, _, new = fit(patterns, y, variance, tried, k, options)
+    if new + penalty(patterns.grids, tried.level, new_k) >= objective + penalty(
         patterns.grids, mixture.level, k
     ):
         return k, objective
-    copy_mixture(found, patterns.groups, tried, mixture)
-    return found, new
+    copy_mixture(new_k, patterns.groups, tried, mixture)
+    return new_k, new
 
 
 @njit(nogil=True, cache=True)
@@ -196,10 +196,10 @@ def prefers_channels(fits: Fits, size: int) -> bool:
     Decided by the Bayesian information criterion, with a kappa for each T. Centres are ordinary parameters here, since
     the channels' lobes are near the common ones.
     """
-    each = math.log(size)
-    together = fits.objective[ALL] + each * (PARAMETERS * fits.k[ALL] + 1)
+    log_size = math.log(size)
+    joint = fits.objective[ALL] + log_size * (PARAMETERS * fits.k[ALL] + 1)
     separate = 0.0
     for c in range(3):
-        separate += fits.objective[c] + each * (PARAMETERS * fits.k[c] + 1)
-    better: bool = separate < together
+        separate += fits.objective[c] + log_size * (PARAMETERS * fits.k[c] + 1)
+    better: bool = separate < joint
     return better

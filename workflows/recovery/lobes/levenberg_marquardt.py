@@ -15,7 +15,7 @@ from workflows.recovery.pyramid import Grids
 from workflows.recovery.solvers import inner
 
 # Initial damping, its factors after a failed and a successful step, and the most attempts per step.
-_DAMPING, _HARDER, _EASIER, _ATTEMPTS = 1e-2, 8.0, 0.15, 4
+_DAMPING, _INCREASE, _DECREASE, _ATTEMPTS = 1e-2, 8.0, 0.15, 4
 # Bounds of a lobe's weight.
 _LEAST_WEIGHT, _MOST_WEIGHT = 1e-3, 1.2
 
@@ -47,7 +47,7 @@ def solve(A: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
 
 
 @njit(nogil=True, cache=True)
-def step(mixture: Mixture, change: NDArray[np.float64], grids: Grids, resolution: float) -> None:
+def apply_step(mixture: Mixture, change: NDArray[np.float64], grids: Grids, resolution: float) -> None:
     """Add a solved step to the lobes, limited so that they stay well-shaped and near the monitor."""
     lobes, level, columns, rows = mixture.lobes, mixture.level, grids.columns, grids.rows
     for i in range(change.size // PARAMETERS):
@@ -168,17 +168,17 @@ def refine_round(
                 copy_mixture(k, patterns.groups, mixture, new)
                 for g in range(patterns.groups):
                     new.offset[g] += equations.change[g]
-                step(new, equations.change[patterns.groups :], patterns.grids, options.fit_resolution)
+                apply_step(new, equations.change[patterns.groups :], patterns.grids, options.fit_resolution)
                 predict(patterns, new, k, workspace, response, f)
                 new_chi = chi_square(y, f, precision, equations.residual)
                 better = new_chi < chi
                 if better:
                     break
-            damping *= _HARDER
+            damping *= _INCREASE
         if not better:
             predict(patterns, mixture, k, workspace, response, f)
             break
-        damping = max(damping * _EASIER, 1e-5)
+        damping = max(damping * _DECREASE, 1e-5)
         copy_mixture(k, patterns.groups, new, mixture)
         if chi - new_chi < options.tolerance:
             break

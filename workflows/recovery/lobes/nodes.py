@@ -105,7 +105,7 @@ def gather_lobes(
 
 
 @njit(nogil=True, cache=True)
-def rows_of(patterns: PatternCodes, node: NDArray[np.int64], n: int, A: NDArray[np.float32]) -> None:
+def node_responses(patterns: PatternCodes, node: NDArray[np.int64], n: int, A: NDArray[np.float32]) -> None:
     """Write the response of each node: the measurements of a pixel if all light came from that node.
 
     Parameters

@@ -17,7 +17,7 @@ from workflows.recovery.lobes.fits import (
 )
 from workflows.recovery.lobes.footprint import NODES, PARAMETERS
 from workflows.recovery.lobes.mixture import Mixture
-from workflows.recovery.lobes.nodes import rows_of, spread_lobes
+from workflows.recovery.lobes.nodes import node_responses, spread_lobes
 from workflows.recovery.lobes.options import LobesOptions
 from workflows.recovery.lobes.posterior import update
 from workflows.recovery.solvers import subtract
@@ -62,7 +62,7 @@ def finish_fit(
         patterns.grids, mixture, fits.k[c], options.resolution, buffers.node, buffers.weight, buffers.end
     )
     A, weight = buffers.rows[: n * y.size].reshape(n, y.size), buffers.weight[:n]
-    rows_of(patterns, buffers.node, n, A)
+    node_responses(patterns, buffers.node, n, A)
     kappa, misfit = update(
         A, weight, y, variance, patterns.groups, mixture.offset, options.passes, options.gradients
     )

@@ -15,7 +15,7 @@ _LEAST_KAPPA = 1e-5
 
 
 @njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})
-def add_moments(
+def add_row_moments(
     A: NDArray[np.float32],
     weight: NDArray[np.float32],
     mean: NDArray[np.float32],
@@ -196,7 +196,7 @@ def update(
     Parameters
     ----------
     A : (n, groups (m + 2)) float32
-        Responses of n nodes, as from :func:`~workflows.recovery.lobes.nodes.rows_of`.
+        Responses of n nodes, as from :func:`~workflows.recovery.lobes.nodes.node_responses`.
     weight : (n,) float32
         Zero or more, of sum 1; changed in place.
     y, variance : (groups (m + 2),) float32
@@ -229,7 +229,7 @@ def update(
     kappa, misfit = 0.0, 0.0
     for _ in range(passes):
         mean[:], square[:] = 0, 0
-        add_moments(A, weight, mean, square)
+        add_row_moments(A, weight, mean, square)
         for j in range(y.size):
             f[j] = offset[j // size] + mean[j]
         kappa, misfit = total_variance(y, f, mean, square, variance, groups, total)

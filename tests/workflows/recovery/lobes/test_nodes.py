@@ -5,7 +5,7 @@ import pytest
 
 from workflows.recovery.lobes.footprint import NODES, PARAMETERS, PatternCodes
 from workflows.recovery.lobes.mixture import Mixture
-from workflows.recovery.lobes.nodes import gather_lobes, rows_of, spread_lobes
+from workflows.recovery.lobes.nodes import gather_lobes, node_responses, spread_lobes
 from workflows.recovery.pyramid import Pyramid
 
 M = 50
@@ -18,7 +18,7 @@ def test_rows_are_the_signed_codes_between_black_and_white(groups):
     code = np.random.default_rng(0).integers(0, 256, (9, 2 + groups * M), np.uint8)
     node = np.array([7, 0, 3, 3])
     A = np.full((4, groups * (M + 2)), np.nan, np.float32)
-    rows_of(PatternCodes(GRIDS, code, 2, groups, M), node, 3, A)
+    node_responses(PatternCodes(GRIDS, code, 2, groups, M), node, 3, A)
     assert np.isnan(A[3]).all()
     A = A[:3]
     for g in range(groups):

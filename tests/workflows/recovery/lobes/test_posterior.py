@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from workflows.recovery.lobes.footprint import PatternCodes
-from workflows.recovery.lobes.nodes import rows_of
+from workflows.recovery.lobes.nodes import node_responses
 from workflows.recovery.lobes.posterior import total_variance, update
 from workflows.recovery.pyramid import Pyramid
 
@@ -19,7 +19,7 @@ def problem(groups, n=40, seed=0, sigma=0.02):
     rng = np.random.default_rng(seed)
     code = rng.integers(0, 256, (n, groups * M), np.uint8)
     A = np.empty((n, groups * (M + 2)), np.float32)
-    rows_of(PatternCodes(GRIDS, code, 0, groups, M), np.arange(n), n, A)
+    node_responses(PatternCodes(GRIDS, code, 0, groups, M), np.arange(n), n, A)
     weight, truth = rng.dirichlet(np.full(n, 5.0), 2)
     variance = np.full(groups * (M + 2), sigma**2, np.float32)
     y = truth @ A + sigma * rng.standard_normal(variance.size)
@@ -99,7 +99,7 @@ def test_total_variance_finds_the_variance_about_a_first_estimate():
     m, kappa = 20_000, 0.05
     code = 255 * rng.integers(0, 2, (6, m)).astype(np.uint8)
     A = np.empty((6, m + 2), np.float32)
-    rows_of(PatternCodes(GRIDS, code, 0, 1, m), np.arange(6), 6, A)
+    node_responses(PatternCodes(GRIDS, code, 0, 1, m), np.arange(6), 6, A)
     weight = rng.dirichlet(np.full(6, 5.0)).astype(np.float32)
     f, variance = weight @ A, rng.uniform(1e-4, 2e-3, m + 2).astype(np.float32)
     spread = variance + kappa * np.maximum(1 - f**2, 0)
