@@ -144,9 +144,9 @@ def scene() -> Scene:
 
 
 @pytest.fixture(scope="session")
-def bundle(scene: Scene, program: Program, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def capture_archive(scene: Scene, program: Program, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A capture of the scene."""
-    path = tmp_path_factory.mktemp("bundle") / "ball.zip"
+    path = tmp_path_factory.mktemp("capture") / "ball.zip"
     write_capture(scene, program, path, name="ball")
     return path
 
@@ -159,9 +159,9 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
 
 
 @pytest.fixture(scope="session")
-def capture(service: Service, bundle: Path) -> str:
+def capture(service: Service, capture_archive: Path) -> str:
     """The scene's capture, ingested."""
-    uploaded = service.client.upload(bundle)
+    uploaded = service.client.upload(capture_archive)
     service.client.wait(uploaded["job"])
     return str(uploaded["id"])
 

@@ -45,16 +45,16 @@ def table(pytestconfig: pytest.Config) -> Iterator[list[Row]]:
 
 
 @pytest.fixture(scope="session")
-def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def capture_archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A capture of a glass ball, of 60 tiles."""
-    path = tmp_path_factory.mktemp("bundle") / "ball.zip"
+    path = tmp_path_factory.mktemp("capture") / "ball.zip"
     write_capture(glass_ball.glass_ball(160, 96, rays=9), nested_program(bands=BANDS, levels=5), path)
     return path
 
 
 @pytest.fixture(scope="session")
-def bundle_bytes(bundle: Path) -> bytes:
-    return bundle.read_bytes()
+def archive_bytes(capture_archive: Path) -> bytes:
+    return capture_archive.read_bytes()
 
 
 @dataclass
@@ -83,15 +83,18 @@ def check(table: list[Row], row: Row) -> None:
 
 
 @pytest.fixture(scope="session")
-def known(tmp_path_factory: pytest.TempPathFactory, bundle: Path) -> Iterator[Known]:
+def known(tmp_path_factory: pytest.TempPathFactory, capture_archive: Path) -> Iterator[Known]:
     with Rig(tmp_path_factory.mktemp("rig")) as rig:
-        yield prepared(rig, bundle)
+        yield prepared(rig, capture_archive)
 
 
-def prepared(rig: Rig, bundle: Path) -> Known:
+def prepared(rig: Rig, capture_archive: Path) -> Known:
     """Ingest a capture in a rig and recover it once."""
     uploaded = rig.ask(
-        "POST", "/v1/captures", content=bundle.read_bytes(), headers={"Content-Type": "application/zip"}
+        "POST",
+        "/v1/captures",
+        content=capture_archive.read_bytes(),
+        headers={"Content-Type": "application/zip"},
     ).json()
     assert rig.ended(uploaded["job"])["state"] == "succeeded"
     found = rig.ended(rig.recover(uploaded["id"])["id"])

@@ -21,13 +21,13 @@ ASLEEP = 15.0
 
 @pytest.fixture(scope="module")
 def on_postgresql(
-    postgresql_server: Server, tmp_path_factory: pytest.TempPathFactory, bundle: Path
+    postgresql_server: Server, tmp_path_factory: pytest.TempPathFactory, capture_archive: Path
 ) -> Iterator[Known]:
     with (
         postgresql_server.database(like=TEMPLATE) as url,
         Rig(tmp_path_factory.mktemp("postgresql"), url) as rig,
     ):
-        yield prepared(rig, bundle)
+        yield prepared(rig, capture_archive)
 
 
 @pytest.mark.exhaustive

@@ -59,12 +59,12 @@ class Small:
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory, bundle: Path) -> Iterator[Small]:
+def small(tmp_path_factory: pytest.TempPathFactory, capture_archive: Path) -> Iterator[Small]:
     folder = tmp_path_factory.mktemp("disks")
     with small_disk(folder / "store", STORE) as store, small_disk(folder / "ledger", LEDGER) as ledger:
         where = ("--store", (store / "store").as_uri(), "--database", f"sqlite:///{ledger / 'ledger.db'}")
         with serving(folder / "data", "--workers", "1", *where) as service:
-            uploaded = service.client.upload(bundle)
+            uploaded = service.client.upload(capture_archive)
             service.client.wait(uploaded["job"])
             found = Small(service, store, ledger, uploaded["id"], {})
             found.files = found.matte(
@@ -86,11 +86,11 @@ def full(disk: Path, left: int = 0) -> Iterator[None]:
 
 
 @pytest.mark.exhaustive
-def test_full_disk_during_ingest(small: Small, bundle: Path, table: list[Row]) -> None:
+def test_full_disk_during_ingest(small: Small, capture_archive: Path, table: list[Row]) -> None:
     service, start = small.service, time.monotonic()
     with ExitStack() as filled:
         with paused(service):
-            uploaded = service.client.upload(bundle)
+            uploaded = service.client.upload(capture_archive)
             filled.enter_context(full(small.store, 256 << 10))
         assert small.failed_for_room(uploaded["job"])
     assert small.retried(uploaded["job"]) == "succeeded"

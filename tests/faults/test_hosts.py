@@ -20,9 +20,9 @@ AWAY = 20.0
 
 
 @pytest.fixture(scope="module")
-def hosts(tmp_path_factory: pytest.TempPathFactory, bundle: Path) -> Iterator[Known]:
+def hosts(tmp_path_factory: pytest.TempPathFactory, capture_archive: Path) -> Iterator[Known]:
     with Hosts(tmp_path_factory.mktemp("hosts")) as rig:
-        yield prepared(rig, bundle)
+        yield prepared(rig, capture_archive)
 
 
 @pytest.mark.parametrize("name", ["service0", "scheduler"])

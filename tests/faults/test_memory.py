@@ -24,10 +24,10 @@ TOO_MUCH, ENOUGH = 4 << 30, 64 << 20
 
 
 @pytest.fixture(scope="module")
-def large(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def large(capture_archive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A capture with frames of 3 megapixels, all in one slab if memory allows."""
     path = tmp_path_factory.mktemp("large") / "large.zip"
-    with zipfile.ZipFile(bundle) as source, zipfile.ZipFile(path, "w") as target:
+    with zipfile.ZipFile(capture_archive) as source, zipfile.ZipFile(path, "w") as target:
         manifest = json.loads(source.read("capture.json"))
         target.writestr("capture.json", json.dumps(manifest))
         for frame in manifest["frames"]:
@@ -38,12 +38,12 @@ def large(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.exhaustive
-def test_worker_out_of_memory(bundle: Path, large: Path, tmp_path: Path, table: list[Row]) -> None:
+def test_worker_out_of_memory(capture_archive: Path, large: Path, tmp_path: Path, table: list[Row]) -> None:
     memory = {"ENVMATTE_WORKER_MEMORY": str(LIMIT)}
     with serving(
         tmp_path / "data", "--workers", "2", **memory, ENVMATTE_INGEST_MEMORY=str(TOO_MUCH)
     ) as service:
-        capture = service.client.upload(bundle)
+        capture = service.client.upload(capture_archive)
         service.client.wait(capture["job"])
         undisturbed = service.client.wait(service.client.recover(capture["id"])["id"])["matte"]
         uploaded, start = service.client.upload(large), time.monotonic()

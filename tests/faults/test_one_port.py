@@ -31,11 +31,11 @@ class InTurn(Line):
 
 
 @pytest.mark.exhaustive
-def test_two_services_behind_one_port(known: Known, bundle: Path) -> None:
+def test_two_services_behind_one_port(known: Known, capture_archive: Path) -> None:
     rig = known.rig
-    size = bundle.stat().st_size
+    size = capture_archive.stat().st_size
     with InTurn(rig.urls, cuts=7, mean=size // 4, seed=3) as line, Client(line.url) as client:
-        uploaded = client.upload(bundle)
+        uploaded = client.upload(capture_archive)
         assert line.made == 7
         client.wait(uploaded["job"])
         job = client.wait(client.recover(uploaded["id"])["id"])

@@ -96,14 +96,14 @@ def proxy(s3_server: str) -> Iterator[Proxy]:
 
 @pytest.fixture(scope="module")
 def in_bucket(
-    s3_server: str, proxy: Proxy, tmp_path_factory: pytest.TempPathFactory, bundle: Path
+    s3_server: str, proxy: Proxy, tmp_path_factory: pytest.TempPathFactory, capture_archive: Path
 ) -> Iterator[Known]:
     with pytest.MonkeyPatch.context() as patch:
         for name, value in {"AWS_ENDPOINT_URL": s3_server, **KEYS}.items():
             patch.setenv(name, value)  # the test itself bypasses the proxy
         through = {"AWS_ENDPOINT_URL": proxy.url, "ENVMATTE_ATTEMPTS": "1"}
         with Rig(tmp_path_factory.mktemp("bucket"), store=f"s3://{BUCKET}/faults", **through) as rig:
-            yield prepared(rig, bundle)
+            yield prepared(rig, capture_archive)
 
 
 def test_store_answers_503_at_times(in_bucket: Known, proxy: Proxy, table: list[Row], seldom: int) -> None:

@@ -47,11 +47,11 @@ def deadly(rig: Rig, key: str) -> Iterator[None]:
 
 @pytest.mark.exhaustive
 def test_tile_that_kills_its_workers_fails_only_its_job(
-    known: Known, table: list[Row], bundle_bytes: bytes
+    known: Known, table: list[Row], archive_bytes: bytes
 ) -> None:
     rig = known.rig
     headers = {"Content-Type": "application/zip"}
-    capture = rig.ask("POST", "/v1/captures", content=bundle_bytes, headers=headers).json()
+    capture = rig.ask("POST", "/v1/captures", content=archive_bytes, headers=headers).json()
     assert rig.ended(capture["job"])["state"] == "succeeded"
     # Readers of this chunk wait for ever. It belongs to the corner, which no other tile needs.
     folder = rig.folder / "store" / "captures" / capture["id"] / "frames" / "c" / "0"

@@ -53,10 +53,10 @@ def test_waits_for_a_coordinator(known: Known) -> None:
     known.goes_on(job["id"], job["matte"])
 
 
-def test_waits_for_capture_and_for_other_jobs(known: Known, bundle_bytes: bytes) -> None:
+def test_waits_for_capture_and_for_other_jobs(known: Known, archive_bytes: bytes) -> None:
     rig = known.rig
     uploaded = rig.ask(
-        "POST", "/v1/captures", content=bundle_bytes, headers={"Content-Type": "application/zip"}
+        "POST", "/v1/captures", content=archive_bytes, headers={"Content-Type": "application/zip"}
     ).json()
     job = rig.recover(uploaded["id"])
     assert f"its capture {uploaded['id']} is being ingested" in job["waits_for"]

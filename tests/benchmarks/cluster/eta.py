@@ -75,9 +75,9 @@ def follow(client: Client, job: str) -> dict[str, Any]:
     }
 
 
-def upload(client: Client, bundle: bytes, folder: Path) -> dict[str, Any]:
+def upload(client: Client, capture_archive: bytes, folder: Path) -> dict[str, Any]:
     path = folder / "capture.zip"
-    path.write_bytes(bundle)
+    path.write_bytes(capture_archive)
     made: dict[str, Any] = client.upload(path)
     path.unlink()
     return made
@@ -103,10 +103,10 @@ def main() -> None:
 
         for size in given.size or ("160x120", "320x240"):
             scene = glass_ball.glass_ball(*map(int, size.split("x")), rays=16)
-            bundles = {"stills": stills(scene), "video": video(scene)}
+            archives = {"stills": stills(scene), "video": video(scene)}
             for _ in range(given.repeat):
-                for name, bundle in bundles.items():
-                    made = upload(client, bundle, folder)
+                for name, capture_archive in archives.items():
+                    made = upload(client, capture_archive, folder)
                     follow_and_show(name, size, made["job"])
                     if name == "stills":
                         follow_and_show("recover", size, client.recover(made["id"])["id"])

@@ -46,13 +46,13 @@ def main() -> None:
 
 def throughput(folder: Path, rounds: int) -> list[dict[str, Any]]:
     """The same capture with one and with two workers: tiles a second, and the workers' share of time on tiles."""
-    bundle = folder / "ball.zip"
-    write_capture(glass_ball.glass_ball(320, 240, rays=9), preset("default"), bundle)
+    capture_archive = folder / "ball.zip"
+    write_capture(glass_ball.glass_ball(320, 240, rays=9), preset("default"), capture_archive)
     rows = []
     for n in range(rounds):
         for workers in (1, 2):
             with served(workers) as (client, _):  # one at a time: an idle one takes 5 % of a core
-                capture = _ingested(client, bundle)
+                capture = _ingested(client, capture_archive)
                 client.wait(client.recover(capture)["id"])  # loads code that the next finds loaded
                 job = client.wait(client.recover(capture)["id"])
             row = {"workers": workers, "round": n, "tiles": job["tiles"]["total"]}
@@ -103,8 +103,8 @@ def enlarge(source: Path, target: Path, megapixels: float) -> None:
             out.writestr(name, data)
 
 
-def _ingested(client: Client, bundle: Path) -> str:
-    uploaded = client.upload(bundle)
+def _ingested(client: Client, capture_archive: Path) -> str:
+    uploaded = client.upload(capture_archive)
     client.wait(uploaded["job"])
     return str(uploaded["id"])
 

@@ -1,6 +1,6 @@
 """Measures composites: the kernel beside a plain copy and scipy's product, requests, memory and the cache.
 
-    python -m tests.benchmarks.compositing.composites [--bundle NAME=CAPTURE.zip ...] [--large 1.0] [--json FILE]
+    python -m tests.benchmarks.compositing.composites [--archive NAME=CAPTURE.zip ...] [--large 1.0] [--json FILE]
 
 Recovers through a real service a traced glass ball of 640 x 480 pixels, one enlarged to some megapixels, and
 each named capture archive; then measures in this process and over HTTP. To be run from the root of the repository.
@@ -45,7 +45,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--bundle", action="append", default=[], metavar="NAME=CAPTURE.zip")
+    parser.add_argument("--archive", action="append", default=[], metavar="NAME=CAPTURE.zip")
     parser.add_argument("--large", type=float, default=1.0, help="Megapixels of the enlarged matte.")
     parser.add_argument("--seconds", type=float, default=8.0, help="Of each number of clients.")
     parser.add_argument("--json", type=Path)
@@ -53,19 +53,19 @@ def main() -> None:
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        bundles = {one.partition("=")[0]: Path(one.partition("=")[2]) for one in given.bundle}
-        bundles["ball 640 x 480"] = folder / "ball.zip"
-        write_capture(glass_ball.glass_ball(640, 480, rays=9), preset("quick"), bundles["ball 640 x 480"])
+        archives = {one.partition("=")[0]: Path(one.partition("=")[2]) for one in given.archive}
+        archives["ball 640 x 480"] = folder / "ball.zip"
+        write_capture(glass_ball.glass_ball(640, 480, rays=9), preset("quick"), archives["ball 640 x 480"])
         if given.large:
-            bundles[f"{given.large} megapixels"] = folder / "large.zip"
+            archives[f"{given.large} megapixels"] = folder / "large.zip"
             small = folder / "small.zip"
             write_capture(glass_ball.glass_ball(160, 120, rays=9), preset("quick"), small)
             enlarge(small, folder / "large.zip", given.large)
         data = folder / "data"
         with service(data, CORES) as url, Client(url) as client:
             mattes = {}
-            for title, bundle in bundles.items():
-                made = client.upload(bundle)
+            for title, capture_archive in archives.items():
+                made = client.upload(capture_archive)
                 client.wait(made["job"])
                 mattes[title] = client.wait(client.recover(made["id"], quality="fast")["id"])["matte"]
                 print(f"recovered {title}", flush=True)

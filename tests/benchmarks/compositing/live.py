@@ -141,17 +141,17 @@ def recover(kit: ModuleType, scenes: Path, ball: bool, client: Client, folder: P
     """The mattes, by their titles."""
     patterns = folder / "quick"
     write_folder(preset("quick"), patterns, lambda *_: None)
-    bundles = {}
+    archives = {}
     for scene in sorted(scenes.glob("*.npz")):
-        bundles[scene.stem] = folder / f"{scene.stem}.zip"
+        archives[scene.stem] = folder / f"{scene.stem}.zip"
         with redirect_stdout(None):
-            kit.main(["capture", str(scene), str(bundles[scene.stem]), "--program", str(patterns)])
+            kit.main(["capture", str(scene), str(archives[scene.stem]), "--program", str(patterns)])
     if ball:
-        bundles["ball"] = folder / "ball.zip"
-        write_capture(glass_ball.glass_ball(640, 480, rays=9), preset("quick"), bundles["ball"])
+        archives["ball"] = folder / "ball.zip"
+        write_capture(glass_ball.glass_ball(640, 480, rays=9), preset("quick"), archives["ball"])
     mattes = {}
-    for title, bundle in bundles.items():
-        made = client.upload(bundle)
+    for title, capture_archive in archives.items():
+        made = client.upload(capture_archive)
         client.wait(made["job"])
         mattes[title] = str(client.wait(client.recover(made["id"], quality="fast")["id"])["matte"])
     return mattes

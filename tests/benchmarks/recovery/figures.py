@@ -51,7 +51,7 @@ def measure(
     kit: ModuleType, scene: Path, case: Case, film: list[str], client: Client, folder: Path
 ) -> dict[str, Any]:
     """Film, upload, recover, composite, score."""
-    bundle = folder / "capture.zip"
+    capture_archive = folder / "capture.zip"
     if ":" in case.program:
         program = ["--bands", case.program]
     else:
@@ -60,8 +60,8 @@ def measure(
             write_folder(preset(case.program), patterns, lambda *_: None)
         program = ["--program", str(patterns)]
     with redirect_stdout(None):
-        kit.main(["capture", str(scene), str(bundle), *program, "--mask", *film])
-    uploaded = client.upload(bundle, name=scene.stem)
+        kit.main(["capture", str(scene), str(capture_archive), *program, "--mask", *film])
+    uploaded = client.upload(capture_archive, name=scene.stem)
     job = client.wait(client.recover(uploaded["id"], **case.options)["id"])
     with sqlite3.connect(folder / "data" / "envmatte.db") as ledger:
         (seconds,) = ledger.execute("select sum(seconds) from tiles where job = ?", (job["id"],)).fetchone()

@@ -78,7 +78,7 @@ def measure(
     kit: ModuleType, scene: Path, case: Case, client: Client, folder: Path, stills: float | None
 ) -> dict[str, Any]:
     """Film, upload, compare what was found, recover, score."""
-    clip, bundle, truth = folder / "clip.mp4", folder / "clip.zip", kit.Scene.load(scene)
+    clip, capture_archive, truth = folder / "clip.mp4", folder / "clip.zip", kit.Scene.load(scene)
     given = [
         "--bands",
         NESTED,
@@ -92,11 +92,11 @@ def measure(
     with redirect_stdout(None):
         kit.main(["video", str(scene), str(clip), *given, "--lead", str(LEAD), "--seed", str(SEED)])
     record = json.loads(clip.with_suffix(".json").read_text()) | {"mask": "mask.png"}
-    with zipfile.ZipFile(bundle, "w") as archive:
+    with zipfile.ZipFile(capture_archive, "w") as archive:
         archive.writestr("capture.json", json.dumps(record))
         archive.writestr("mask.png", kit.png(truth.object_pixels.astype(np.uint8) * 255))
         archive.write(clip, clip.name)
-    uploaded = client.upload(bundle, name=f"{scene.stem} {case}")
+    uploaded = client.upload(capture_archive, name=f"{scene.stem} {case}")
     job = client.wait(uploaded["job"])
     stack = Stack(Objects((folder / "data" / "store").as_uri()), uploaded["id"])
     found, count = stack.attributes["video"], uploaded["frames"]
@@ -122,10 +122,12 @@ def measure(
 
 def filmed_as_stills(kit: ModuleType, scene: Path, client: Client, folder: Path) -> float:
     """PSNR of stills of the same program by the same camera."""
-    bundle = folder / "stills.zip"
+    capture_archive = folder / "stills.zip"
     with redirect_stdout(None):
-        kit.main(["capture", str(scene), str(bundle), "--bands", NESTED, "--mask", "--response", "srgb"])
-    capture = client.upload(bundle, name=f"{scene.stem} stills")["id"]
+        kit.main(
+            ["capture", str(scene), str(capture_archive), "--bands", NESTED, "--mask", "--response", "srgb"]
+        )
+    capture = client.upload(capture_archive, name=f"{scene.stem} stills")["id"]
     return psnr(kit, kit.Scene.load(scene), client, capture)
 
 

@@ -65,13 +65,13 @@ def polled(url: str, path: str, pollers: int, seconds: float) -> dict[str, Any]:
 
 
 @contextmanager
-def repeated(client: Client, bundle: Path) -> Iterator[None]:
+def repeated(client: Client, capture_archive: Path) -> Iterator[None]:
     """Upload and ingest a capture, and delete it, again and again."""
     ending = threading.Event()
 
     def ingest() -> None:
         while not ending.is_set():
-            capture = client.upload(bundle)
+            capture = client.upload(capture_archive)
             client.wait(capture["job"])
             client.delete(capture)
 

@@ -76,7 +76,7 @@ class Traffic:
         target = io.BytesIO()
         program = nested_program(bands=((8, 6, 12), (16, 12, 8)), levels=3)
         write_capture(glass_ball.glass_ball(36, 24, rays=4), program, target, name="a ball")
-        self.bundle = target.getvalue()
+        self.capture_archive = target.getvalue()
         light = glass_ball.backdrop(64, 48)
         self.backdrops = (
             png(light, "srgb", np.uint8),

@@ -36,15 +36,17 @@ def film(user: User) -> None:
     if way == "one body":
         key = {"Idempotency-Key": f"{random.random()}"}
         made = [
-            user.ask("upload in one go", "POST", "/v1/captures", content=town.bundle, headers=ZIP | key)
+            user.ask(
+                "upload in one go", "POST", "/v1/captures", content=town.capture_archive, headers=ZIP | key
+            )
             for _ in range(random.randint(1, 2))
         ][-1].json()
     elif way == "pieces":
-        asked = {"upload": user.upload(town.bundle, filename="ball.zip"), "webhook": town.webhook}
+        asked = {"upload": user.upload(town.capture_archive, filename="ball.zip"), "webhook": town.webhook}
         made = user.ask("upload in pieces", "POST", "/v1/captures", json=asked).json()
     else:
         file = town.folder / f"{random.random()}.zip"
-        file.write_bytes(town.bundle)
+        file.write_bytes(town.capture_archive)
         made = user.client.upload(file, name="by the client").answer
         file.unlink()
         town.done["upload by the client"] += 1
@@ -145,7 +147,9 @@ def change_mind(user: User) -> None:
     random, town = user.random, user.town
 
     def ingest() -> None:
-        made = user.ask("upload in one go", "POST", "/v1/captures", content=town.bundle, headers=ZIP).json()
+        made = user.ask(
+            "upload in one go", "POST", "/v1/captures", content=town.capture_archive, headers=ZIP
+        ).json()
         user.ask("cancel an ingest", "POST", f"/v1/jobs/{made['job']}/cancel")
         user.ask("delete", "DELETE", f"/v1/captures/{made['id']}")
 
@@ -174,11 +178,11 @@ def change_mind(user: User) -> None:
 def break_off(user: User) -> None:
     """Break connections, or abandon what was begun."""
     random, town = user.random, user.town
-    half = town.bundle[: len(town.bundle) // 2]
-    size = {"Content-Length": str(len(town.bundle))}
+    half = town.capture_archive[: len(town.capture_archive) // 2]
+    size = {"Content-Length": str(len(town.capture_archive))}
 
     def piece() -> None:
-        create = TUS | {"Upload-Length": str(len(town.bundle))}
+        create = TUS | {"Upload-Length": str(len(town.capture_archive))}
         where = user.ask("create an upload", "POST", "/v1/uploads", headers=create).headers["location"]
         user.break_off("break off a piece", "PATCH", where, CHUNK | size | {"Upload-Offset": "0"}, half)
         if random.random() < 0.3:
@@ -208,17 +212,17 @@ def mistake(user: User) -> None:
     """Send invalid data."""
     random, town = user.random, user.town
 
-    def bundle() -> None:
-        data = bad.remade(io.BytesIO(town.bundle), random.choice(REFUSED))
+    def capture() -> None:
+        data = bad.remade(io.BytesIO(town.capture_archive), random.choice(REFUSED))
         user.ask("send a wrong capture", "POST", "/v1/captures", 422, content=data, headers=ZIP)
 
     def frame() -> None:
-        data = bad.remade(io.BytesIO(town.bundle), random.choice(FAILING))
+        data = bad.remade(io.BytesIO(town.capture_archive), random.choice(FAILING))
         made = user.ask("send a wrong frame", "POST", "/v1/captures", content=data, headers=ZIP).json()
         user.ended(made["job"])
 
     def cut() -> None:
-        data = town.bundle[: random.randrange(len(town.bundle))]
+        data = town.capture_archive[: random.randrange(len(town.capture_archive))]
         if random.random() < 0.5:
             asked = {"upload": user.upload(data)}
             user.ask("upload half a capture in pieces", "POST", "/v1/captures", 422, json=asked)
@@ -254,7 +258,7 @@ def mistake(user: User) -> None:
         user.ask("send no JSON", "POST", "/v1/jobs", 422, content=b"{")
         user.ask("speak another tus", "POST", "/v1/uploads", 412, headers={"Upload-Length": "1"})
 
-    random.choice((bundle, frame, cut, checksum, options, backdrop, video, others))()
+    random.choice((capture, frame, cut, checksum, options, backdrop, video, others))()
 
 
 def watch(user: User) -> None:

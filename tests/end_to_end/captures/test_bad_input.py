@@ -20,9 +20,9 @@ from workflows.images import integer_formats
 ZIP = {"Content-Type": "application/zip"}
 
 
-def remade(bundle: Path | BinaryIO, change: Callable[[dict, dict[str, bytes]], None]) -> bytes:
+def remade(capture_archive: Path | BinaryIO, change: Callable[[dict, dict[str, bytes]], None]) -> bytes:
     """A capture archive with its capture.json and its files changed."""
-    with zipfile.ZipFile(bundle) as archive:
+    with zipfile.ZipFile(capture_archive) as archive:
         files = {name: archive.read(name) for name in archive.namelist()}
     manifest = json.loads(files["capture.json"])
     change(manifest, files)
@@ -108,10 +108,10 @@ def a_video(manifest: dict, files: dict[str, bytes]) -> None:
     ],
 )
 def test_archive_is_refused_at_once(
-    service: Service, bundle: Path, change, entry: str, field: str | None
+    service: Service, capture_archive: Path, change, entry: str, field: str | None
 ) -> None:
     before = service.stored()
-    answer = service.http.post("/v1/captures", content=remade(bundle, change), headers=ZIP)
+    answer = service.http.post("/v1/captures", content=remade(capture_archive, change), headers=ZIP)
     problem = check_problem(answer, 422, "bad-capture")
     assert problem["entry"] == entry
     assert problem.get("field") == field
@@ -119,15 +119,15 @@ def test_archive_is_refused_at_once(
 
 
 @pytest.mark.parametrize("share", [0, 0.3, 0.99])
-def test_truncated_zip_is_refused(service: Service, bundle: Path, share: float) -> None:
+def test_truncated_zip_is_refused(service: Service, capture_archive: Path, share: float) -> None:
     before = service.stored()
-    data = bundle.read_bytes()
+    data = capture_archive.read_bytes()
     answer = service.http.post("/v1/captures", content=data[: int(len(data) * share)], headers=ZIP)
     check_problem(answer, 422, "bad-capture")
     assert service.stored() == before
 
 
-def test_broken_upload_leaves_nothing(service: Service, bundle: Path) -> None:
+def test_broken_upload_leaves_nothing(service: Service, capture_archive: Path) -> None:
     before, captures = service.stored(), service.http.get("/v1/captures").json()
     where = urlsplit(service.url)
     with socket.create_connection((where.hostname, where.port)) as raw:
@@ -137,7 +137,7 @@ def test_broken_upload_leaves_nothing(service: Service, bundle: Path) -> None:
             "Content-Type: application/zip",
             "Content-Length: 99999999",
         ]
-        raw.sendall("\r\n".join([*head, "", ""]).encode() + bundle.read_bytes()[:100_000])
+        raw.sendall("\r\n".join([*head, "", ""]).encode() + capture_archive.read_bytes()[:100_000])
     check_problem(service.http.get("/v1/captures/nothing"), 404, "not-found")
     assert service.stored() == before
     assert service.http.get("/v1/captures").json() == captures
@@ -175,9 +175,9 @@ def unknown_camera(manifest: dict, files: dict[str, bytes]) -> None:
 @pytest.mark.parametrize(
     "change", [of_another_size, of_another_kind, no_image, cut_off, bomb, unknown_camera]
 )
-def test_frame_refused_by_the_ingest(service: Service, bundle: Path, change) -> None:
+def test_frame_refused_by_the_ingest(service: Service, capture_archive: Path, change) -> None:
     before = service.stored()
-    answer = service.http.post("/v1/captures", content=remade(bundle, change), headers=ZIP)
+    answer = service.http.post("/v1/captures", content=remade(capture_archive, change), headers=ZIP)
     assert answer.status_code == 201
     made = answer.json()
     waiting = service.client.recover(made["id"])
@@ -197,9 +197,9 @@ def test_frame_refused_by_the_ingest(service: Service, bundle: Path, change) -> 
         time.sleep(0.05)
 
 
-def test_wrong_media_type_is_refused(service: Service, bundle: Path) -> None:
+def test_wrong_media_type_is_refused(service: Service, capture_archive: Path) -> None:
     answer = service.http.post(
-        "/v1/captures", content=bundle.read_bytes(), headers={"Content-Type": "text/plain"}
+        "/v1/captures", content=capture_archive.read_bytes(), headers={"Content-Type": "text/plain"}
     )
     check_problem(answer, 415, "wrong-media-type")
 
@@ -229,11 +229,11 @@ def test_too_large_bodies_are_refused(service: Service, matte: str) -> None:
 
 
 @pytest.mark.slow
-def test_recovery_needs_nested_grids(service: Service, bundle: Path) -> None:
+def test_recovery_needs_nested_grids(service: Service, capture_archive: Path) -> None:
     def not_nested(manifest: dict, files: dict[str, bytes]) -> None:
         manifest["program"]["parts"][2] |= {"columns": 20, "rows": 15}
 
-    made = service.http.post("/v1/captures", content=remade(bundle, not_nested), headers=ZIP).json()
+    made = service.http.post("/v1/captures", content=remade(capture_archive, not_nested), headers=ZIP).json()
     service.client.wait(made["job"])
     problem = check_problem(service.http.post("/v1/jobs", json={"capture": made["id"]}), 422, "bad-option")
     assert "20 x 15" in problem["detail"]
@@ -277,6 +277,6 @@ def test_calls_in_the_wrong_state_are_refused(service: Service, capture: str, ma
     check_problem(service.http.get(f"/v1/captures/{capture}/frames/57.png"), 404, "not-found")
 
 
-def test_service_survives_bad_input(service: Service, bundle: Path) -> None:
-    assert service.client.wait(service.client.upload(bundle)["job"])["state"] == "succeeded"
+def test_service_survives_bad_input(service: Service, capture_archive: Path) -> None:
+    assert service.client.wait(service.client.upload(capture_archive)["job"])["state"] == "succeeded"
     assert service.process.poll() is None

@@ -97,7 +97,7 @@ def taken_at_most(one: psutil.Process) -> int:
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="it is Linux that limits what a process takes")
 def test_film_that_needs_too_much_memory_fails_only_its_job(
-    bundle: Path, program: Program, tmp_path: Path
+    capture_archive: Path, program: Program, tmp_path: Path
 ) -> None:
     data = overstated(clip(pictures(9), even(9)), 40_000_000)  # FFmpeg would build an index of 2.8 GB
     record, files = filmed(program, data, 2.0)
@@ -106,7 +106,7 @@ def test_film_that_needs_too_much_memory_fails_only_its_job(
     with serving(tmp_path / "data", "--workers", "1", ENVMATTE_INGEST_MEMORY=str(64 << 20)) as service:
         sent = service.http.post("/v1/mattes", content=archive(tmp_path, 40, 30), headers=ZIP)
         matte = sent.json()["id"]
-        service.client.wait(service.client.upload(bundle)["job"])
+        service.client.wait(service.client.upload(capture_archive)["job"])
         (worker,) = workers(service.process)
         before = taken_at_most(worker)
 
@@ -127,4 +127,4 @@ def test_film_that_needs_too_much_memory_fails_only_its_job(
 
         assert workers(service.process) == [worker]
         assert taken_at_most(worker) - before < 500 << 20
-        service.client.wait(service.client.upload(bundle)["job"])
+        service.client.wait(service.client.upload(capture_archive)["job"])

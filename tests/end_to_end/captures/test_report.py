@@ -31,8 +31,8 @@ def test_contact_sheet_is_a_small_picture(service: Service, capture: str) -> Non
         assert sheet.height > 72 * 2
 
 
-def test_no_report_before_the_ingest(service: Service, bundle: Path) -> None:
-    cut = bundle.read_bytes().replace(b"\x89PNG", b"\x89GNP")
+def test_no_report_before_the_ingest(service: Service, capture_archive: Path) -> None:
+    cut = capture_archive.read_bytes().replace(b"\x89PNG", b"\x89GNP")
     made = service.http.post("/v1/captures", content=cut, headers={"Content-Type": "application/zip"}).json()
     assert made["report"] is None
     for what in ("report", "contact-sheet.png"):

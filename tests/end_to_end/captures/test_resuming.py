@@ -30,9 +30,9 @@ MB = 1_000_000
 SIZES = [50 * MB, pytest.param(1000 * MB, marks=[pytest.mark.exhaustive, pytest.mark.timeout(1800)])]
 
 
-def large(bundle: Path, path: Path, size: int) -> Path:
+def large(capture_archive: Path, path: Path, size: int) -> Path:
     """The scene's capture archive, enlarged to a size by an entry of noise."""
-    shutil.copy(bundle, path)
+    shutil.copy(capture_archive, path)
     rng = np.random.default_rng(size)
     with zipfile.ZipFile(path, "a") as archive, archive.open("film.raw", "w", force_zip64=True) as entry:
         for _ in range(-(-size // MB)):
@@ -66,9 +66,9 @@ def sha256(file: Path) -> str:
 @pytest.mark.slow
 @pytest.mark.parametrize("size", SIZES)
 def test_client_survives_a_hundred_broken_connections(
-    service: Service, bundle: Path, tmp_path: Path, size: int
+    service: Service, capture_archive: Path, tmp_path: Path, size: int
 ) -> None:
-    file = large(bundle, tmp_path / "large.zip", size)
+    file = large(capture_archive, tmp_path / "large.zip", size)
     sent_so_far: list[int] = []
     with Line(service.url, cuts=100, mean=size // 200, back=True, seed=1) as line, Client(line.url) as client:
         with paused(service):
@@ -117,8 +117,8 @@ def test_bytes_sent_before_each_broken_connection_are_kept(
 
 
 @pytest.mark.exhaustive
-def test_upload_resumes_after_the_server_is_killed(bundle: Path, tmp_path: Path) -> None:
-    data, file = tmp_path / "data", large(bundle, tmp_path / "large.zip", 50 * MB)
+def test_upload_resumes_after_the_server_is_killed(capture_archive: Path, tmp_path: Path) -> None:
+    data, file = tmp_path / "data", large(capture_archive, tmp_path / "large.zip", 50 * MB)
     made: list[dict] = []
     sent_so_far: list[int] = []
     half = threading.Event()
@@ -157,9 +157,9 @@ def test_upload_resumes_after_the_server_is_killed(bundle: Path, tmp_path: Path)
 
 @pytest.mark.slow
 def test_interrupted_upload_command_resumes_when_run_again(
-    service: Service, bundle: Path, tmp_path: Path
+    service: Service, capture_archive: Path, tmp_path: Path
 ) -> None:
-    file = large(bundle, tmp_path / "large.zip", 50 * MB)
+    file = large(capture_archive, tmp_path / "large.zip", 50 * MB)
     with Line(service.url, pace=0.01) as line:
         command = [sys.executable, "-m", "services", "upload", str(file), "--url", line.url]
         with running(command) as sending:
@@ -176,9 +176,9 @@ def test_interrupted_upload_command_resumes_when_run_again(
 
 
 def test_file_that_shrinks_during_the_upload_is_reported(
-    service: Service, bundle: Path, tmp_path: Path
+    service: Service, capture_archive: Path, tmp_path: Path
 ) -> None:
-    file = large(bundle, tmp_path / "large.zip", 20 * MB)
+    file = large(capture_archive, tmp_path / "large.zip", 20 * MB)
 
     def shrink(sent: int, whole: int) -> None:
         os.truncate(file, 1000)
@@ -205,12 +205,12 @@ print(first.url)
 
 
 @pytest.mark.parametrize("checksum", [False, True])
-def test_tuspy_uploads(service: Service, bundle: Path, checksum: bool) -> None:
-    arguments = {"file": str(bundle), "endpoint": f"{service.url}/v1/uploads", "checksum": checksum}
+def test_tuspy_uploads(service: Service, capture_archive: Path, checksum: bool) -> None:
+    arguments = {"file": str(capture_archive), "endpoint": f"{service.url}/v1/uploads", "checksum": checksum}
     command = [sys.executable, "-c", TUSPY, json.dumps(arguments)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
-    check_sent(service, done.stdout.strip(), bundle)
+    check_sent(service, done.stdout.strip(), capture_archive)
 
 
 def check_sent(service: Service, url: str, file: Path) -> None:
@@ -270,9 +270,9 @@ upload.start();
     [{}, {"chunk": 50_000}, {"chunk": 50_000, "during": True}, {"chunk": 50_000, "stop": True}],
     ids=["whole", "chunks", "with creation", "aborted and resumed"],
 )
-def test_tus_js_client_uploads(service: Service, bundle: Path, tus_js: Path, options: dict) -> None:
-    arguments = {"file": str(bundle), "endpoint": f"{service.url}/v1/uploads"} | options
+def test_tus_js_client_uploads(service: Service, capture_archive: Path, tus_js: Path, options: dict) -> None:
+    arguments = {"file": str(capture_archive), "endpoint": f"{service.url}/v1/uploads"} | options
     command = ["node", "-e", SCRIPT, "tus", json.dumps(arguments)]
     done = subprocess.run(command, cwd=tus_js, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
-    check_sent(service, done.stdout.strip(), bundle)
+    check_sent(service, done.stdout.strip(), capture_archive)

@@ -77,8 +77,8 @@ def test_options_list_versions_and_extensions(service: Service) -> None:
     assert answer.headers["tus-checksum-algorithm"] == "sha1,sha256"
 
 
-def test_capture_from_several_patches(service: Service, bundle: Path) -> None:
-    data = bundle.read_bytes()
+def test_capture_from_several_patches(service: Service, capture_archive: Path) -> None:
+    data = capture_archive.read_bytes()
     metadata = f"filename {base64.b64encode(b'ball.zip').decode()},empty"
     answer = service.http.post(
         "/v1/uploads", headers=TUS | {"Upload-Length": str(len(data)), "Upload-Metadata": metadata}
@@ -210,7 +210,7 @@ def test_invalid_requests_are_refused(service: Service) -> None:
 
 
 @pytest.mark.slow
-def test_upload_limit_is_checked_before_the_first_byte(tmp_path: Path, bundle: Path) -> None:
+def test_upload_limit_is_checked_before_the_first_byte(tmp_path: Path, capture_archive: Path) -> None:
     limit = 1 << 58
     with serving(tmp_path / "data", "--workers", "1", ENVMATTE_UPLOAD_BYTES=str(limit)) as service:
         assert service.http.options("/v1/uploads").headers["tus-max-size"] == str(limit)
@@ -330,8 +330,8 @@ def test_one_of_two_patches_at_the_same_offset_wins(service: Service) -> None:
     service.http.delete(where, headers=TUS)
 
 
-def test_late_patch_damages_nothing(service: Service, bundle: Path) -> None:
-    data = bundle.read_bytes()
+def test_late_patch_damages_nothing(service: Service, capture_archive: Path) -> None:
+    data = capture_archive.read_bytes()
     where = create(service, len(data))
     late = begin(service, where, 0, len(data), bytes(1000))
     assert patch(service, where, 0, data).status_code == 204
@@ -344,10 +344,10 @@ def test_late_patch_damages_nothing(service: Service, bundle: Path) -> None:
 
 
 def test_two_clients_with_the_same_key_share_an_upload(
-    service: Service, bundle: Path, tmp_path: Path
+    service: Service, capture_archive: Path, tmp_path: Path
 ) -> None:
     file = tmp_path / "same.zip"
-    file.write_bytes(bundle.read_bytes())
+    file.write_bytes(capture_archive.read_bytes())
     with ThreadPoolExecutor() as pool:
         made = [*pool.map(lambda _: service.client.upload(file), range(2))]
     # One or two captures: the slower client may finish after the first capture exists.
@@ -357,8 +357,8 @@ def test_two_clients_with_the_same_key_share_an_upload(
     assert service.client.upload(file)["id"] not in {capture["id"] for capture in made}
 
 
-def test_simultaneous_requests_make_one_capture(service: Service, bundle: Path) -> None:
-    data = bundle.read_bytes()
+def test_simultaneous_requests_make_one_capture(service: Service, capture_archive: Path) -> None:
+    data = capture_archive.read_bytes()
     where = create(service, len(data))
     patch(service, where, 0, data)
     body = {"upload": where.rsplit("/", 1)[1]}

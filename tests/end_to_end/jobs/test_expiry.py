@@ -23,19 +23,19 @@ def disk(service: Service) -> int:
 
 
 @pytest.mark.slow
-def test_expired_data_is_deleted_unless_a_job_needs_it(bundle: Path, tmp_path: Path) -> None:
+def test_expired_data_is_deleted_unless_a_job_needs_it(capture_archive: Path, tmp_path: Path) -> None:
     """Both expire long before the recovery begins, and it still succeeds."""
     with serving(
         tmp_path / "data", "--workers", "1", ENVMATTE_CAPTURE_SECONDS="1", ENVMATTE_MATTE_SECONDS="1"
     ) as service:
         before = disk(service)
         with paused(service):
-            capture = service.client.upload(bundle)
+            capture = service.client.upload(capture_archive)
             job = service.client.recover(capture["id"])
             time.sleep(4)  # the second of its lifetime, and the two between checks of the coordinator
             found = service.client.capture(capture["id"])
             assert found["expires_at"] > found["created_at"]
-            assert disk(service) - before >= bundle.stat().st_size
+            assert disk(service) - before >= capture_archive.stat().st_size
         assert service.client.wait(job["id"])["state"] == "succeeded"
         for url in (f"/v1/captures/{capture['id']}", f"/v1/mattes/{job['matte']}"):
             until(lambda url=url: service.http.get(url).status_code == 404)
@@ -52,10 +52,10 @@ def test_expired_data_is_deleted_unless_a_job_needs_it(bundle: Path, tmp_path: P
 
 
 @pytest.mark.exhaustive
-def test_deleted_data_leaves_the_disk(bundle: Path, tmp_path: Path) -> None:
+def test_deleted_data_leaves_the_disk(capture_archive: Path, tmp_path: Path) -> None:
     with serving(tmp_path / "data", "--workers", "1") as service:
         before = disk(service)
-        capture = service.client.upload(bundle)
+        capture = service.client.upload(capture_archive)
         service.client.wait(capture["job"])
         matte = service.client.wait(service.client.recover(capture["id"])["id"])["matte"]
         deadline = time.monotonic() + 60

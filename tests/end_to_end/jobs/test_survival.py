@@ -28,18 +28,18 @@ def gone(service: Service, matte: str) -> None:
     until(lambda: not any(matte in name for name in service.stored()))
 
 
-def recovered(service: Service, bundle: Path, **options: object) -> dict[str, str]:
-    uploaded = service.client.upload(bundle)
+def recovered(service: Service, capture_archive: Path, **options: object) -> dict[str, str]:
+    uploaded = service.client.upload(capture_archive)
     job = service.client.wait(service.client.recover(uploaded["id"], **options)["id"])
     return files_of(service, job["matte"])
 
 
 def test_job_continues_after_the_server_is_killed(
-    service: Service, matte: str, bundle: Path, tmp_path: Path
+    service: Service, matte: str, capture_archive: Path, tmp_path: Path
 ) -> None:
     data = tmp_path / "data"
     with serving(data, "--workers", "1") as first:
-        job = first.client.recover(first.client.upload(bundle)["id"])
+        job = first.client.recover(first.client.upload(capture_archive)["id"])
         while first.client.job(job["id"])["tiles"]["done"] < 5:
             time.sleep(0.01)
         family = psutil.Process(first.process.pid).children(recursive=True)
@@ -58,12 +58,12 @@ def test_job_continues_after_the_server_is_killed(
 
 @pytest.mark.exhaustive
 def test_ingest_continues_after_the_server_is_killed(
-    service: Service, matte: str, bundle: Path, tmp_path: Path
+    service: Service, matte: str, capture_archive: Path, tmp_path: Path
 ) -> None:
     data = tmp_path / "data"
     # A frame takes 20 kB: a budget of 1 MiB makes slabs of a few frames, and many tiles.
     with serving(data, "--workers", "1", ENVMATTE_INGEST_MEMORY=str(1 << 20)) as first:
-        uploaded = first.client.upload(bundle)
+        uploaded = first.client.upload(capture_archive)
         while first.client.job(uploaded["job"])["stage"] == "waiting":
             time.sleep(0.01)
         first.kill()
@@ -75,14 +75,14 @@ def test_ingest_continues_after_the_server_is_killed(
 
 @pytest.mark.slow
 def test_matte_bytes_do_not_depend_on_tiles_or_workers(
-    service: Service, matte: str, bundle: Path, tmp_path: Path
+    service: Service, matte: str, capture_archive: Path, tmp_path: Path
 ) -> None:
     expected = files_of(service, matte)
     assert len(expected) > 200
-    assert recovered(service, bundle, tile=48) == expected
-    assert recovered(service, bundle, tile=1024) == expected
+    assert recovered(service, capture_archive, tile=48) == expected
+    assert recovered(service, capture_archive, tile=1024) == expected
     with serving(tmp_path / "data", "--workers", "3") as other:
-        assert recovered(other, bundle, tile=32) == expected
+        assert recovered(other, capture_archive, tile=32) == expected
 
 
 def test_cancelled_job_leaves_nothing(service: Service, capture: str) -> None:
@@ -96,18 +96,18 @@ def test_cancelled_job_leaves_nothing(service: Service, capture: str) -> None:
     assert service.client.cancel(job["id"])["state"] == "cancelled"
 
 
-def test_job_cancelled_while_waiting_leaves_nothing(service: Service, bundle: Path) -> None:
-    uploaded = service.client.upload(bundle)
+def test_job_cancelled_while_waiting_leaves_nothing(service: Service, capture_archive: Path) -> None:
+    uploaded = service.client.upload(capture_archive)
     job = service.client.recover(uploaded["id"])
     assert service.client.cancel(job["id"])["state"] == "cancelled"
     service.client.wait(uploaded["job"])
     gone(service, job["matte"])
 
 
-def test_cancelled_ingest_leaves_nothing(service: Service, capture: str, bundle: Path) -> None:
+def test_cancelled_ingest_leaves_nothing(service: Service, capture: str, capture_archive: Path) -> None:
     service.client.recover(capture, tile=1024)  # keeps a worker busy
     before = service.stored()
-    uploaded = service.client.upload(bundle)
+    uploaded = service.client.upload(capture_archive)
     service.client.cancel(uploaded["job"])
     until(lambda: service.client.capture(uploaded["id"])["state"] != "ingesting")
     assert service.client.capture(uploaded["id"])["problem"]["detail"].startswith("the ingest was cancelled")
@@ -115,32 +115,34 @@ def test_cancelled_ingest_leaves_nothing(service: Service, capture: str, bundle:
 
 
 @pytest.mark.slow
-def test_ingest_that_failed_for_a_passing_reason_can_be_retried(bundle: Path, tmp_path: Path) -> None:
+def test_ingest_that_failed_for_a_passing_reason_can_be_retried(
+    capture_archive: Path, tmp_path: Path
+) -> None:
     with serving(tmp_path / "data", "--workers", "1") as service:
-        first = service.client.upload(bundle)
+        first = service.client.upload(capture_archive)
         service.client.wait(first["job"])
         busy = service.client.recover(first["id"], tile=1024)
         while service.client.job(busy["id"])["stage"] != "recovering":
             time.sleep(0.01)
         time.sleep(0.3)
-        second = service.client.upload(bundle)
-        (archive,) = (service.data / "store" / "uploads" / second["id"]).glob("*.part")
-        data = archive.read_bytes()
-        archive.unlink()
+        second = service.client.upload(capture_archive)
+        (part,) = (service.data / "store" / "uploads" / second["id"]).glob("*.part")
+        data = part.read_bytes()
+        part.unlink()
         with pytest.raises(ServiceError, match="failed 3 times"):
             service.client.wait(second["job"])
         assert service.client.capture(second["id"])["state"] == "failed"
-        archive.write_bytes(data)
+        part.write_bytes(data)
         assert service.http.post(f"/v1/jobs/{second['job']}/retry").status_code == 202
         service.client.wait(second["job"])
         assert service.client.capture(second["id"])["state"] == "ready"
 
 
 @pytest.mark.exhaustive
-def test_job_cancelled_before_a_kill_leaves_nothing(bundle: Path, tmp_path: Path) -> None:
+def test_job_cancelled_before_a_kill_leaves_nothing(capture_archive: Path, tmp_path: Path) -> None:
     data = tmp_path / "data"
     with serving(data, "--workers", "1") as first:
-        job = first.client.recover(first.client.upload(bundle)["id"])
+        job = first.client.recover(first.client.upload(capture_archive)["id"])
         while first.client.job(job["id"])["tiles"]["done"] < 2:
             time.sleep(0.01)
         first.client.cancel(job["id"])
@@ -178,8 +180,10 @@ def test_damaged_matte_is_reported(service: Service, capture: str) -> None:
 
 
 @pytest.mark.slow
-def test_failing_tile_fails_its_job_and_retry_continues(service: Service, matte: str, bundle: Path) -> None:
-    uploaded = service.client.upload(bundle)
+def test_failing_tile_fails_its_job_and_retry_continues(
+    service: Service, matte: str, capture_archive: Path
+) -> None:
+    uploaded = service.client.upload(capture_archive)
     service.client.wait(uploaded["job"])
     chunk = service.data / "store" / "captures" / uploaded["id"] / "frames" / "c" / "0" / "0" / "1" / "0"
     data = chunk.read_bytes()
@@ -198,9 +202,11 @@ def test_failing_tile_fails_its_job_and_retry_continues(service: Service, matte:
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
-def test_stopped_server_leaves_no_process(bundle: Path, tmp_path: Path, number: int, code: int) -> None:
+def test_stopped_server_leaves_no_process(
+    capture_archive: Path, tmp_path: Path, number: int, code: int
+) -> None:
     with serving(tmp_path / "data", "--workers", "2") as service:
-        service.client.recover(service.client.upload(bundle)["id"])
+        service.client.recover(service.client.upload(capture_archive)["id"])
         sending = begin(service, create(service, 1000), 0, 1000, b"the rest of which never comes")
         family = psutil.Process(service.process.pid).children(recursive=True)
         assert len(family) >= 2

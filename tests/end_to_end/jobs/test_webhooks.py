@@ -31,10 +31,10 @@ def lines(service: Service, job: str) -> list[str]:
 
 
 @pytest.mark.slow
-def test_failed_delivery_is_repeated_after_a_kill_and_signed(bundle: Path, tmp_path: Path) -> None:
+def test_failed_delivery_is_repeated_after_a_kill_and_signed(capture_archive: Path, tmp_path: Path) -> None:
     with receiver(lambda n: 500 if n == 0 else 200) as found:
         with serving(tmp_path / "data", "--workers", "1", **ALLOWED) as first:
-            capture = first.client.upload(bundle, name="ball", webhook=found.url)
+            capture = first.client.upload(capture_archive, name="ball", webhook=found.url)
             until(lambda: len(found.received) >= 1)
             event = verified(found.received[0])
             assert (event["event"], event["job"]["id"]) == ("job.succeeded", capture.job)
@@ -61,12 +61,12 @@ def test_failed_delivery_is_repeated_after_a_kill_and_signed(bundle: Path, tmp_p
 
 
 @pytest.mark.exhaustive
-def test_private_webhook_addresses_are_refused(bundle: Path, tmp_path: Path) -> None:
+def test_private_webhook_addresses_are_refused(capture_archive: Path, tmp_path: Path) -> None:
     with (
         receiver(lambda n: 200) as found,
         serving(tmp_path / "data", "--workers", "1", ENVMATTE_WEBHOOK_SECRET=SECRET) as service,
     ):
-        capture = service.client.upload(bundle)
+        capture = service.client.upload(capture_archive)
         port = found.url.split(":")[2]
         for host in ("127.0.0.1", "2130706433", "0x7f.1", "[::ffff:127.0.0.1]", "localhost"):
             with pytest.raises(ServiceError, match="not public") as caught:

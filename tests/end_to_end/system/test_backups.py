@@ -26,11 +26,11 @@ def tiles_done(service: Service, job: str) -> int:
 
 @pytest.mark.slow
 def test_running_job_continues_in_the_restored_backup(
-    bundle: Path, s3: str, postgresql_server: Server, tmp_path: Path
+    capture_archive: Path, s3: str, postgresql_server: Server, tmp_path: Path
 ) -> None:
     backup, data = str(tmp_path / "backup"), tmp_path / "data"
     with serving(data, "--workers", "1") as first:
-        uploaded = first.client.upload(bundle)
+        uploaded = first.client.upload(capture_archive)
         first.client.wait(uploaded["job"])
         job = first.client.recover(uploaded["id"], quality="fast")
         while tiles_done(first, job["id"]) < 2:

@@ -156,7 +156,7 @@ def command(data: Path, *given: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.fixture(scope="module")
-def locked(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Locked]:
+def locked(capture_archive: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Locked]:
     data = tmp_path_factory.mktemp("locked") / "data"
     data.mkdir()
     made: dict[str, str] = {"wrong": "envmatte_" + 43 * "x"}
@@ -168,7 +168,7 @@ def locked(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[L
     engine.dispose()
     settings = {"ENVMATTE_KEYS": ", ".join(CONFIGURED), "ENVMATTE_LOG_LEVEL": "DEBUG"}
     with serving(data, **settings) as service, Client(service.url, made["write"]) as alice:
-        capture = alice.upload(bundle)
+        capture = alice.upload(capture_archive)
         alice.wait(capture["job"])
         job = alice.wait(alice.recover(capture["id"])["id"])
         asked = {"preset": "quick", "monitor": {"width": 64, "height": 48}}
@@ -242,20 +242,20 @@ def test_any_of_the_configured_keys_is_accepted(locked: Locked) -> None:
         assert http.get("/v1/programs", headers=bearer(key)).json() == {"programs": []}
 
 
-def test_an_upload_needs_a_key(locked: Locked, bundle: Path) -> None:
+def test_an_upload_needs_a_key(locked: Locked, capture_archive: Path) -> None:
     for method in ("OPTIONS", "POST"):
         answer = locked.service.http.request(method, "/v1/uploads", headers=TUS | {"Upload-Length": "1"})
         check_problem(answer, 401, "unauthorized")
-    assert locked.service.client.upload(bundle)["state"] == "ingesting"
+    assert locked.service.client.upload(capture_archive)["state"] == "ingesting"
 
 
-def test_the_cluster_and_the_metrics_need_a_key(locked: Locked, bundle: Path) -> None:
+def test_the_cluster_and_the_metrics_need_a_key(locked: Locked, capture_archive: Path) -> None:
     """And the log of a service without tracing is text."""
     service, key = locked.service, bearer(CONFIGURED[0])
     for path in ("/v1/cluster", "/metrics"):
         assert service.http.get(path).status_code == 401
         assert service.http.get(path, headers=key).status_code == 200
-    job = service.client.upload(bundle)["job"]
+    job = service.client.upload(capture_archive)["job"]
     service.client.wait(job)
     log = service.data.parent / f"{service.data.name}.log"
     until(lambda: f"job={job} succeeded" in log.read_text())
@@ -281,10 +281,10 @@ def test_a_program_needs_a_key_except_for_its_page(locked: Locked) -> None:
     assert http.get(str(httpx2.URL(page.url).join("../../../web/play/play.js"))).status_code == 200
 
 
-def test_idempotency_keys_are_per_owner(locked: Locked, bundle: Path) -> None:
+def test_idempotency_keys_are_per_owner(locked: Locked, capture_archive: Path) -> None:
     for create in (
         {"url": "/v1/uploads", "headers": TUS | {"Upload-Length": "5"}},
-        {"url": "/v1/captures", "headers": ZIP, "content": bundle.read_bytes()},
+        {"url": "/v1/captures", "headers": ZIP, "content": capture_archive.read_bytes()},
     ):
         headers = create["headers"] | {"Idempotency-Key": "the-same"}
         made = [
@@ -310,13 +310,13 @@ def test_programs_are_kept_per_owner(locked: Locked) -> None:
 
 
 @pytest.mark.slow
-def test_revoking_a_key_ends_its_running_requests(locked: Locked, bundle: Path) -> None:
+def test_revoking_a_key_ends_its_running_requests(locked: Locked, capture_archive: Path) -> None:
     service, data = locked.service, locked.service.data
     made = command(data, "make", "passing", "--owner", "carol", "--json")
     key = json.loads(made.stdout)["key"]
     http = service.http
     with paused(service), Client(service.url, key) as carol:
-        job = carol.upload(bundle)["job"]
+        job = carol.upload(capture_archive)["job"]
         upload = http.post("/v1/uploads", headers=TUS | {"Upload-Length": "9"} | bearer(key)).headers[
             "location"
         ]

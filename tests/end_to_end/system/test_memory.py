@@ -37,10 +37,10 @@ def in_one_post(service: Service, file: Path) -> dict[str, Any]:
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("send", [in_pieces, in_one_patch, in_one_post])
 def test_an_upload_of_a_gigabyte_is_streamed(
-    bundle: Path, tmp_path: Path, send: Callable[[Service, Path], dict[str, Any]]
+    capture_archive: Path, tmp_path: Path, send: Callable[[Service, Path], dict[str, Any]]
 ) -> None:
     large = tmp_path / "large.zip"
-    large.write_bytes(bundle.read_bytes())
+    large.write_bytes(capture_archive.read_bytes())
     with zipfile.ZipFile(large, "a") as archive, archive.open("film.raw", "w", force_zip64=True) as entry:
         for _ in range(GIB >> 20):
             entry.write(bytes(1 << 20))
@@ -66,13 +66,13 @@ def test_an_upload_of_a_gigabyte_is_streamed(
 
 
 @pytest.mark.exhaustive
-def test_upload_over_the_limit_is_not_read(bundle: Path, tmp_path: Path) -> None:
-    limit = bundle.stat().st_size - 1
+def test_upload_over_the_limit_is_not_read(capture_archive: Path, tmp_path: Path) -> None:
+    limit = capture_archive.stat().st_size - 1
     with serving(tmp_path / "data", "--workers", "1", ENVMATTE_UPLOAD_BYTES=str(limit)) as service:
         headers = {"Content-Type": "application/zip"}
         for content in (
-            bundle.read_bytes(),
-            iter([bundle.read_bytes()]),
+            capture_archive.read_bytes(),
+            iter([capture_archive.read_bytes()]),
         ):  # the second without Content-Length
             answer = service.http.post("/v1/captures", content=content, headers=headers)
             assert answer.status_code == 413

@@ -51,7 +51,7 @@ GIVEN = json.loads((HERE / "given.json").read_text())
 TUS = {"Tus-Resumable": "1.0.0", "Upload-Length": "5", "Upload-Offset": "0"}
 ZIP, JSON = "application/zip", "application/json"
 MAKING = {
-    "POST /v1/captures": lambda n: (ZIP, (HERE / "bundle.zip").read_bytes()),
+    "POST /v1/captures": lambda n: (ZIP, (HERE / "capture.zip").read_bytes()),
     "POST /v1/jobs": lambda n: (JSON, {"capture": GIVEN["captures"]}),
     "POST /v1/mattes": lambda n: (ZIP, (HERE / "matte.zip").read_bytes()),
     "POST /v1/mattes/{id}/composite": lambda n: ("image/*", (HERE / "backdrop.png").read_bytes()),
@@ -101,27 +101,32 @@ MAKING = {
 """Calls that create something, and their status. An empty service would reveal little."""
 
 
-def things_of(service: Service, bundle: Path, folder: Path) -> dict[str, str]:
+def things_of(service: Service, capture_archive: Path, folder: Path) -> dict[str, str]:
     """Create one of each; returns their ids, and writes bodies for calls that create more."""
-    made = service.client.upload(bundle)
+    made = service.client.upload(capture_archive)
     service.client.wait(made["job"])
     job = service.client.wait(service.client.recover(made["id"])["id"])
     asked = {"preset": "quick", "monitor": {"width": 64, "height": 48}}
     bearer = {"Authorization": f"Bearer {SECRET}"}
     program = service.http.post("/v1/programs", json=asked, headers=bearer).json()
-    shutil.copy(bundle, folder / "bundle.zip")
+    shutil.copy(capture_archive, folder / "capture.zip")
     service.client.export(job["matte"], folder / "matte.zip")
     (folder / "backdrop.png").write_bytes(png(np.full((9, 12, 3), 0.5), "srgb", np.uint8))
     return {"captures": made["id"], "jobs": job["id"], "mattes": job["matte"], "programs": program["id"]}
 
 
 def tried(
-    service: Service, bundle: Path, folder: Path, key: str | None, checks: tuple[str, ...], *options: str
+    service: Service,
+    capture_archive: Path,
+    folder: Path,
+    key: str | None,
+    checks: tuple[str, ...],
+    *options: str,
 ) -> Counter[str]:
     """Run schemathesis against a service; counts the responses by call and status."""
     program = shutil.which("schemathesis", path=str(Path(sys.executable).parent))
     assert program, "schemathesis is one of the tests' requirements"
-    ids = things_of(service, bundle, folder)
+    ids = things_of(service, capture_archive, folder)
     is_foreign = "ignored_auth" not in checks
     (folder / "given.json").write_text(json.dumps(ids | {"foreign": is_foreign}))
     (folder / "hooks.py").write_text(HOOKS)
@@ -157,18 +162,18 @@ def made_in(answers: Counter[str]) -> set[str]:
 
 
 @pytest.mark.slow
-def test_a_few_calls_of_each_route(bundle: Path, tmp_path: Path) -> None:
+def test_a_few_calls_of_each_route(capture_archive: Path, tmp_path: Path) -> None:
     """The same few calls in every run."""
     with serving(tmp_path / "data", "--workers", "1", ENVMATTE_KEYS=SECRET) as service:
         few = ("--phases", "fuzzing,stateful", "--max-examples", "3")
-        answers = tried(service, bundle, tmp_path, SECRET, LOCKED, *few)
+        answers = tried(service, capture_archive, tmp_path, SECRET, LOCKED, *few)
     assert made_in(answers) == set(MAKING)
 
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("who", ["a key", "a key to look with", "no key", "a service without keys"])
 def test_service_conforms_to_its_openapi_document(
-    bundle: Path, tmp_path: Path, who: str, pytestconfig: pytest.Config
+    capture_archive: Path, tmp_path: Path, who: str, pytestconfig: pytest.Config
 ) -> None:
     examples = str(3 * int(pytestconfig.getoption("--times")))
     is_open = who == "a service without keys"
@@ -181,7 +186,7 @@ def test_service_conforms_to_its_openapi_document(
             engine.dispose()
         checks = CHECKS if is_open else LOCKED
         options = ("--phases", "coverage,fuzzing,stateful", "--max-examples", examples)
-        answers = tried(service, bundle, tmp_path, key, checks, *options)
+        answers = tried(service, capture_archive, tmp_path, key, checks, *options)
     statuses = {line.rsplit(" ", 1)[1] for line in answers}
     assert made_in(answers) == (set(MAKING) if is_open or who == "a key" else set())
     assert ("401" in statuses) == (who != "a service without keys")

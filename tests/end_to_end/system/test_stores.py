@@ -13,7 +13,7 @@ from tests.services.cluster.clusters import address, started
 
 @pytest.mark.slow
 def test_matte_is_the_same_in_a_bucket_and_in_a_folder(
-    service: Service, matte: str, bundle: Path, s3: str, tmp_path: Path
+    service: Service, matte: str, capture_archive: Path, s3: str, tmp_path: Path
 ) -> None:
     folder = tmp_path / "certs"
     certificates.make(folder)
@@ -25,7 +25,7 @@ def test_matte_is_the_same_in_a_bucket_and_in_a_folder(
             started(log, "worker", *named, "--workers", "2"),
             serving(tmp_path / "data", *named, "--store", s3) as remote,
         ):
-            uploaded = remote.client.upload(bundle)
+            uploaded = remote.client.upload(capture_archive)
             remote.client.wait(uploaded["job"])
             made = remote.client.wait(remote.client.recover(uploaded["id"])["id"])["matte"]
             objects = Objects(s3)

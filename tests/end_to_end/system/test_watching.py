@@ -38,7 +38,7 @@ class Watched:
 
 
 @pytest.fixture(scope="module")
-def watched(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Watched]:
+def watched(capture_archive: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Watched]:
     data = tmp_path_factory.mktemp("watched") / "data"
     with (
         collecting() as collector,
@@ -52,7 +52,7 @@ def watched(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
             OTEL_BSP_SCHEDULE_DELAY="200",
         ) as service,
     ):
-        uploaded = service.client.upload(bundle)
+        uploaded = service.client.upload(capture_archive)
         service.client.wait(uploaded["job"])
         asked = service.http.post(
             "/v1/jobs", json={"capture": uploaded["id"]}, headers={"traceparent": CALLER}

@@ -23,8 +23,8 @@ def envmatte(service: Service, *arguments: str) -> subprocess.CompletedProcess[s
     return subprocess.run(command, capture_output=True, text=True, timeout=120)
 
 
-def test_from_a_capture_to_a_composite(service: Service, bundle: Path, tmp_path: Path) -> None:
-    uploaded = envmatte(service, "upload", str(bundle), "--name", "by hand")
+def test_from_a_capture_to_a_composite(service: Service, capture_archive: Path, tmp_path: Path) -> None:
+    uploaded = envmatte(service, "upload", str(capture_archive), "--name", "by hand")
     assert uploaded.returncode == 0, uploaded.stderr
     assert "upload: 100%" in uploaded.stderr
     capture = uploaded.stdout.strip()

@@ -11,13 +11,13 @@ from workflows.images import float_formats, integer_formats
 from workflows.simulation import glass_ball
 
 
-def test_from_a_file_to_an_array(service: Service, bundle: Path) -> None:
+def test_from_a_file_to_an_array(service: Service, capture_archive: Path) -> None:
     sent_so_far: list[tuple[int, int]] = []
     with Client(service.url) as client:
         capture = client.upload(
-            str(bundle), name="mine", progress=lambda sent, size: sent_so_far.append((sent, size))
+            str(capture_archive), name="mine", progress=lambda sent, size: sent_so_far.append((sent, size))
         )
-        assert sent_so_far[-1] == (bundle.stat().st_size,) * 2
+        assert sent_so_far[-1] == (capture_archive.stat().st_size,) * 2
         assert client.wait(capture).kind == "ingest"
         capture = client.capture(capture)
         assert (capture.name, capture.state, capture.width, capture.height) == ("mine", "ready", 96, 72)

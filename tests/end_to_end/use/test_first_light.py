@@ -16,13 +16,15 @@ from workflows.programs.program import Images, Program
 from workflows.simulation.scene import Scene, write_capture
 
 
-def test_an_upload_is_ingested(service: Service, bundle: Path, scene: Scene) -> None:
+def test_an_upload_is_ingested(service: Service, capture_archive: Path, scene: Scene) -> None:
     headers = {"Content-Type": "application/zip"}
-    answer = service.http.post("/v1/captures?name=mine", content=bundle.read_bytes(), headers=headers)
+    answer = service.http.post(
+        "/v1/captures?name=mine", content=capture_archive.read_bytes(), headers=headers
+    )
     assert answer.status_code == 201
     made = answer.json()
     assert answer.headers["location"] == f"/v1/captures/{made['id']}"
-    assert (made["name"], made["bytes"]) == ("mine", bundle.stat().st_size)
+    assert (made["name"], made["bytes"]) == ("mine", capture_archive.stat().st_size)
     job = service.client.wait(made["job"])
     assert (job["kind"], job["state"], job["progress"], job["problem"]) == ("ingest", "succeeded", 1, None)
     found = service.client.capture(made["id"])
@@ -58,8 +60,8 @@ def test_a_recovery_goes_from_queued_to_succeeded(service: Service, capture: str
     assert log == ["queued", "preparing", "recovering", "finishing", "succeeded"]
 
 
-def test_a_job_may_be_posted_while_its_capture_is_ingesting(service: Service, bundle: Path) -> None:
-    uploaded = service.client.upload(bundle)
+def test_a_job_may_be_posted_while_its_capture_is_ingesting(service: Service, capture_archive: Path) -> None:
+    uploaded = service.client.upload(capture_archive)
     job = service.client.recover(uploaded["id"])
     assert service.client.wait(job["id"])["state"] == "succeeded"
 
@@ -106,8 +108,8 @@ def test_masked_pixels_are_transparent(service: Service, scene: Scene, program, 
     assert np.unique(confidence).size > 100
 
 
-def test_lists_are_newest_first_and_paged(service: Service, bundle: Path) -> None:
-    made = [service.client.upload(bundle)["id"] for _ in range(3)]
+def test_lists_are_newest_first_and_paged(service: Service, capture_archive: Path) -> None:
+    made = [service.client.upload(capture_archive)["id"] for _ in range(3)]
     ids = [item["id"] for item in service.http.get("/v1/captures?limit=3").json()["captures"]]
     assert ids == made[::-1]
     rest = service.http.get("/v1/captures", params={"limit": 1, "after": ids[0]}).json()["captures"]
@@ -119,10 +121,10 @@ def test_lists_are_newest_first_and_paged(service: Service, bundle: Path) -> Non
     assert states == {"succeeded"}
 
 
-def test_repeated_post_makes_one_thing(service: Service, bundle: Path, capture: str) -> None:
+def test_repeated_post_makes_one_thing(service: Service, capture_archive: Path, capture: str) -> None:
     headers = {"Content-Type": "application/zip", "Idempotency-Key": "upload-1"}
     first, second = (
-        service.http.post("/v1/captures", content=bundle.read_bytes(), headers=headers).json()["id"]
+        service.http.post("/v1/captures", content=capture_archive.read_bytes(), headers=headers).json()["id"]
         for _ in "ab"
     )
     assert first == second
@@ -131,8 +133,8 @@ def test_repeated_post_makes_one_thing(service: Service, bundle: Path, capture: 
     assert len(jobs) == 1
 
 
-def test_deleting_leaves_nothing(service: Service, bundle: Path) -> None:
-    uploaded = service.client.upload(bundle)
+def test_deleting_leaves_nothing(service: Service, capture_archive: Path) -> None:
+    uploaded = service.client.upload(capture_archive)
     job = service.client.wait(service.client.recover(uploaded["id"])["id"])
     assert any(job["matte"] in name for name in service.stored())
     assert service.http.delete(f"/v1/mattes/{job['matte']}").status_code == 204
@@ -165,9 +167,9 @@ def test_patterns_may_come_as_images(
     shown = [pattern.astype(np.float32) for band in bands for pattern in band.bits]
     files = tuple(f"patterns/{n}.png" for n in range(len(shown)))
     same = Program(monitor=program.monitor, parts=(constant, Images(kind="images", files=files)))
-    bundle = tmp_path / "images.zip"
-    write_capture(scene, same, bundle, images=shown)
-    uploaded = service.client.upload(bundle)
+    capture_archive = tmp_path / "images.zip"
+    write_capture(scene, same, capture_archive, images=shown)
+    uploaded = service.client.upload(capture_archive)
     job = service.client.wait(service.client.recover(uploaded["id"])["id"])
     mattes = service.data / "store" / "mattes"
     assert digests(mattes / job["matte"]) == digests(mattes / matte)

@@ -103,13 +103,13 @@ def film(show: Path, target: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def home(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Home]:
+def home(capture_archive: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Home]:
     """What the install command has left, with a smaller capture; and the service, started as the README says."""
     folder = tmp_path_factory.mktemp("home")
     (folder / ".venv/bin").mkdir(parents=True)
     (folder / ".venv/bin/activate").write_text("")
     (folder / "demo").mkdir()
-    shutil.copy(bundle, folder / "demo/glass-ball.zip")
+    shutil.copy(capture_archive, folder / "demo/glass-ball.zip")
     (folder / "demo/backdrop.png").write_bytes(png(glass_ball.backdrop(160, 120), "srgb", np.uint8))
     with ExitStack() as stack:
         script = block("README.md", "Your first composite")
@@ -166,7 +166,7 @@ def test_from_a_film_to_composites(home: Home) -> None:
         assert np.std(made["film"], axis=0).mean() > 0.05
 
 
-def test_three_machines(bundle: Path, tmp_path: Path) -> None:
+def test_three_machines(capture_archive: Path, tmp_path: Path) -> None:
     port = free_port()
     first, others = (
         block("README.md", "Scale out", number=n)
@@ -183,7 +183,7 @@ def test_three_machines(bundle: Path, tmp_path: Path) -> None:
             stack.enter_context(machine(others, tmp_path / name))
         until(lambda: len(httpx2.get(f"{url}/v1/cluster").json()["workers"]) == 2)
         with Client(url) as client:
-            job = client.wait(client.recover(client.upload(bundle), tile=16))
+            job = client.wait(client.recover(client.upload(capture_archive), tile=16))
             assert (job.state, job["tiles"]["done"]) == ("succeeded", 30)
             assert client.composite(client.matte(job), np.ones((4, 4, 3), np.float32)).shape == (72, 96, 3)
     assert (tmp_path / "shared" / "mattes").is_dir()

@@ -63,7 +63,7 @@ def refused(data: bytes, limits: Limits = LIMITS) -> CaptureError:
 
 
 @pytest.mark.parametrize("pack", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
-def test_a_bundle_is_read(make_zip: Zip, pack: int) -> None:
+def test_archive_is_read(make_zip: Zip, pack: int) -> None:
     archive = open_archive(make_zip(RECORD, FILES, pack))
     assert archive.manifest.name == "ball"
     assert archive.manifest.program.count == 5

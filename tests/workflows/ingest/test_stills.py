@@ -1,4 +1,4 @@
-"""Frames of float values and camera RAW, and several exposures, from a bundle into the stack."""
+"""Frames of float values and camera RAW, and several exposures, from a capture archive into the stack."""
 
 import io
 from collections.abc import Callable

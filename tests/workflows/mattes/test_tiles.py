@@ -56,7 +56,7 @@ def scene() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def bundles(scene: Scene) -> dict[bool, bytes]:
+def archives(scene: Scene) -> dict[bool, bytes]:
     """The ball's capture, without a mask and with one."""
     program = nested_program((64, 48), bands=((4, 3, 14), (8, 6, 10)), levels=5)
     made = {}
@@ -95,10 +95,10 @@ def recover(objects: Objects, ingest: Ingest) -> Callable[..., tuple[mattes.Matt
 def test_the_matte_is_the_same_to_the_byte(
     recover: Callable[..., tuple[mattes.Matte, int]],
     digests: Digests,
-    bundles: dict[bool, bytes],
+    archives: dict[bool, bytes],
     method: str,
 ) -> None:
-    matte, pixels = recover(bundles[True], method=method)
+    matte, pixels = recover(archives[True], method=method)
     assert matte.block == 16
     plain = digests("mattes/m")
     frame = 44 * 36 * 3
@@ -111,20 +111,20 @@ def test_the_matte_is_the_same_to_the_byte(
         {"memory": 10 * frame, "tile": 1024},
         {"order": lambda tiles: [*tiles, 0, 3]},  # and some tiles again
     ):
-        _, again = recover(bundles[True], method=method, **variant)
+        _, again = recover(archives[True], method=method, **variant)
         assert digests("mattes/m") == plain, variant
         assert again == pixels or "order" in variant
 
 
 def test_pixels_outside_the_mask_are_empty(
-    recover: Callable[..., tuple[mattes.Matte, int]], scene: Scene, bundles: dict[bool, bytes]
+    recover: Callable[..., tuple[mattes.Matte, int]], scene: Scene, archives: dict[bool, bytes]
 ) -> None:
-    masked, pixels = recover(bundles[True])
+    masked, pixels = recover(archives[True])
     blocks = {(r, c): masked.read(r, c) for r in range(3) for c in range(3)}
     mask = scene.object_mask
     assert pixels == mask.sum()
     assert 0 < pixels < mask.size
-    whole, every = recover(bundles[False])
+    whole, every = recover(archives[False])
     assert every == mask.size
     for place, block in blocks.items():
         inside = mask[whole.span(*place)]
@@ -162,9 +162,9 @@ def test_a_block_that_the_mask_leaves_out_is_empty(
 
 
 def test_the_photometry_is_the_scenes(
-    recover: Callable[..., tuple[mattes.Matte, int]], scene: Scene, bundles: dict[bool, bytes]
+    recover: Callable[..., tuple[mattes.Matte, int]], scene: Scene, archives: dict[bool, bytes]
 ) -> None:
-    matte, _ = recover(bundles[False], tile=1024)
+    matte, _ = recover(archives[False], tile=1024)
     S, rho = np.zeros((2, 36, 44, 3), np.float32)
     for row in range(matte.block_rows):
         for column in range(matte.block_columns):
@@ -176,11 +176,11 @@ def test_the_photometry_is_the_scenes(
 
 
 def test_frames_of_one_pattern_are_averaged(
-    recover: Callable[..., tuple[mattes.Matte, int]], bundles: dict[bool, bytes]
+    recover: Callable[..., tuple[mattes.Matte, int]], archives: dict[bool, bytes]
 ) -> None:
     # Each frame is split into a darker and a lighter one; their mean is the frame.
     split = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(bundles[False])) as archive, zipfile.ZipFile(split, "w") as out:
+    with zipfile.ZipFile(io.BytesIO(archives[False])) as archive, zipfile.ZipFile(split, "w") as out:
         record = json.loads(archive.read("capture.json"))
         frames = record["frames"]
         record["frames"] = []
@@ -192,7 +192,7 @@ def test_frames_of_one_pattern_are_averaged(
                 record["frames"].append({"file": f"{n}{name}.png", "pattern": frame["pattern"]})
         random.Random(0).shuffle(record["frames"])
         out.writestr("capture.json", json.dumps(record))
-    plain = recover(bundles[False], tile=1024)[0].read(1, 1)
+    plain = recover(archives[False], tile=1024)[0].read(1, 1)
     doubled = recover(split.getvalue(), tile=1024)[0].read(1, 1)
     # split frames have another noise, and so S and rho other bounds
     np.testing.assert_allclose(doubled.S, plain.S, atol=4e-3)
@@ -203,9 +203,9 @@ def test_a_damaged_stack_is_corrupt(
     recover: Callable[..., tuple[mattes.Matte, int]],
     objects: Objects,
     folder: Path,
-    bundles: dict[bool, bytes],
+    archives: dict[bool, bytes],
 ) -> None:
-    recover(bundles[False])
+    recover(archives[False])
     chunk = next(path for path in (folder / "captures/c/frames/c").rglob("*") if path.is_file())
     chunk.unlink()
     objects.delete(mattes.path("m"))
@@ -217,9 +217,9 @@ def test_a_damaged_stack_is_corrupt(
 
 
 def test_frames_that_are_moved_back_are_the_same_in_any_tile(
-    ingest: Callable[..., Stack], objects: Objects, digests: Digests, bundles: dict[bool, bytes]
+    ingest: Callable[..., Stack], objects: Objects, digests: Digests, archives: dict[bool, bytes]
 ) -> None:
-    stack = ingest("c", bundles[True])
+    stack = ingest("c", archives[True])
     random = np.random.default_rng(2)
     stack.annotate(
         shifts=random.uniform(-2.5, 2.5, (stack.frames, 2)).tolist(),
@@ -239,11 +239,11 @@ def test_frames_that_are_moved_back_are_the_same_in_any_tile(
 def test_what_the_store_lacks_is_corrupt(
     recover: Callable[..., tuple[mattes.Matte, int]],
     objects: Objects,
-    bundles: dict[bool, bytes],
+    archives: dict[bool, bytes],
     capture: str,
     matte: str,
 ) -> None:
-    recover(bundles[False], tile=1024)
+    recover(archives[False], tile=1024)
     with pytest.raises(Corrupt, match="none is not in the store"):
         run(STEPS, objects, Task("j", capture, matte, {}, Limits(1, 1)), 0)
 

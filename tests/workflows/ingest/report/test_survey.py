@@ -21,17 +21,17 @@ Ingest = Callable[..., Stack]
 
 
 @pytest.fixture(scope="module")
-def bundle() -> bytes:
+def capture_archive() -> bytes:
     target = io.BytesIO()
     scene = glass_ball(120, 90, monitor=(320, 240), rays=16)
     write_capture(scene, preset("default", 320, 240), target, mask=True)
     return target.getvalue()
 
 
-def filmed(bundle: bytes, *, gain: float = 1, less: int = 0, **more: Any) -> bytes:
+def filmed(capture_archive: bytes, *, gain: float = 1, less: int = 0, **more: Any) -> bytes:
     """The capture as another exposure, or a camera that takes something off, would have had it."""
     target = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(bundle)) as archive, zipfile.ZipFile(target, "w") as out:
+    with zipfile.ZipFile(io.BytesIO(capture_archive)) as archive, zipfile.ZipFile(target, "w") as out:
         record = json.loads(archive.read("capture.json"))
         out.writestr("capture.json", json.dumps(record | more))
         out.writestr(record["mask"], archive.read(record["mask"]))
@@ -47,8 +47,8 @@ def reported(ingest: Ingest, data: bytes) -> tuple[Report, dict[str, Finding]]:
     return made, {finding.name: finding for finding in made.findings}
 
 
-def test_a_good_capture_is_good(ingest: Ingest, bundle: bytes) -> None:
-    made, found = reported(ingest, bundle)
+def test_a_good_capture_is_good(ingest: Ingest, capture_archive: bytes) -> None:
+    made, found = reported(ingest, capture_archive)
     assert made.level == "good"
     assert {finding.level for finding in made.findings} == {"good"}
     assert all(finding.message and not finding.remedy for finding in made.findings)
@@ -60,8 +60,8 @@ def test_a_good_capture_is_good(ingest: Ingest, bundle: bytes) -> None:
 
 
 @pytest.mark.slow
-def test_a_white_that_is_clipped_asks_for_less_exposure(ingest: Ingest, bundle: bytes) -> None:
-    made, found = reported(ingest, filmed(bundle, gain=1.3))
+def test_a_white_that_is_clipped_asks_for_less_exposure(ingest: Ingest, capture_archive: bytes) -> None:
+    made, found = reported(ingest, filmed(capture_archive, gain=1.3))
     assert made.level == found["exposure"].level == "bad"
     assert made.clipping.white > 0.3
     assert "expose a stop less" in found["exposure"].remedy
@@ -72,22 +72,22 @@ def test_a_white_that_is_clipped_asks_for_less_exposure(ingest: Ingest, bundle: 
     [(0.4, "warning", "a stop more"), pytest.param(0.1, "bad", "3 stops more", marks=pytest.mark.slow)],
 )
 def test_a_dark_white_asks_for_more_exposure(
-    ingest: Ingest, bundle: bytes, gain: float, level: str, more: str
+    ingest: Ingest, capture_archive: bytes, gain: float, level: str, more: str
 ) -> None:
-    _, found = reported(ingest, filmed(bundle, gain=gain))
+    _, found = reported(ingest, filmed(capture_archive, gain=gain))
     assert found["exposure"].level == level
     assert more in found["exposure"].remedy
 
 
 @pytest.mark.slow
-def test_a_clipped_black_is_found(ingest: Ingest, bundle: bytes) -> None:
-    made, found = reported(ingest, filmed(bundle, less=9))
+def test_a_clipped_black_is_found(ingest: Ingest, capture_archive: bytes) -> None:
+    made, found = reported(ingest, filmed(capture_archive, less=9))
     assert found["black"].level == "bad"
     assert made.clipping.black > 0.9
 
 
 @pytest.mark.slow
-def test_more_noise_and_fewer_patterns_promise_less(ingest: Ingest, bundle: bytes) -> None:
+def test_more_noise_and_fewer_patterns_promise_less(ingest: Ingest, capture_archive: bytes) -> None:
     def promised(data: bytes) -> tuple[float, float]:
         quality = reported(ingest, data)[0].quality
         assert quality is not None
@@ -97,23 +97,23 @@ def test_more_noise_and_fewer_patterns_promise_less(ingest: Ingest, bundle: byte
     noisy, few = io.BytesIO(), io.BytesIO()
     write_capture(scene, preset("default", 320, 240), noisy, noise=6)
     write_capture(scene, preset("sketch", 320, 240), few)
-    best = promised(bundle)
+    best = promised(capture_archive)
     for data in (noisy.getvalue(), few.getvalue()):
         assert all(lesser < b - 2 for lesser, b in zip(promised(data), best, strict=True))
     assert best[0] < best[1] < 60
 
 
 @pytest.mark.slow
-def test_a_curve_that_is_assumed_is_a_warning(ingest: Ingest, bundle: bytes) -> None:
-    made, found = reported(ingest, filmed(bundle, response="unknown"))
+def test_a_curve_that_is_assumed_is_a_warning(ingest: Ingest, capture_archive: bytes) -> None:
+    made, found = reported(ingest, filmed(capture_archive, response="unknown"))
     assert made.camera.source == "assumed"
     assert [f for f in made.findings if f.level == "bad"] == []
     assert made.level == found["camera_curve"].level == "warning"
     assert "state it in capture.json" in found["camera_curve"].remedy
 
 
-def test_a_capture_that_saw_nothing_is_bad(ingest: Ingest, bundle: bytes) -> None:
-    made, found = reported(ingest, filmed(bundle, gain=0))
+def test_a_capture_that_saw_nothing_is_bad(ingest: Ingest, capture_archive: bytes) -> None:
+    made, found = reported(ingest, filmed(capture_archive, gain=0))
     assert made.level == "bad"
     assert made.drift is made.flicker is made.quality is None
     assert found["noise"].level == "bad"
