@@ -21,6 +21,8 @@ from storage.objects.store import Objects
 from tests.parts.captures import nested_program
 from tests.workflows.ingest import peak
 from tests.workflows.ingest.records import record
+from tests.workflows.ingest.video.camera import Camera, Film, capture, film
+from tests.workflows.ingest.video.films import CAMERA, PROGRAM, IngestFilm, program_with
 from workflows.images.integer_formats import encode_png
 from workflows.ingest import steps
 from workflows.jobs import Task
@@ -316,3 +318,45 @@ def test_a_mask_of_frames_before_rotation_is_refused(make_zip: Zip, ingest: Inge
                 files | {"mask.png": encode_png(shot)},
             ),
         )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pack", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+def test_slabs_of_a_video_do_not_change_the_bytes(
+    ingest_film: IngestFilm, digests: Digests, light: list[np.ndarray], pack: int
+) -> None:
+    made = film(light, Camera(fps=24, hold=0.2, readout=0.005, options={"g": "12", "bf": "3"}))
+    whole, stored = ingest_film(made.data, 5, pack=pack).read(), []
+    assert len(whole) == PROGRAM.count
+    for order in (iter, reversed):
+        memory = len(made.shown) * 24 * 32 * 3 * 4  # what sorting takes
+        assert memory // (2 * whole[0].nbytes) < len(whole)  # several slabs
+        few = ingest_film(made.data, 5, pack=pack, memory=memory, order=order)
+        np.testing.assert_array_equal(few.read(), whole)
+        stored.append(digests("captures/c"))
+    assert stored[0] == stored[1]
+
+
+def test_film_of_too_many_patterns_is_refused(ingest_film: IngestFilm, filmed: Film) -> None:
+    with pytest.raises(CaptureError, match="more than the 2000") as caught:
+        ingest_film(filmed.data, program=program_with(count=700))
+    assert caught.value.fields == {"entry": "clip.mp4", "limit": 2000}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="the resident peak is read from Linux's /proc")
+def test_long_video_is_ingested_within_its_memory(
+    make_zip: Zip, put: Callable[[str, bytes], None], objects: Objects, light: list[np.ndarray]
+) -> None:
+    memory, rate = 64 << 20, 1 / CAMERA.hold
+    coarse = [np.kron(picture, np.ones((4, 4, 1), np.float32)) for picture in light]
+    for name, camera in {
+        "small": Camera(options={"g": "20"}),
+        "large": Camera(fps=90, options={"g": "20"}),
+    }.items():
+        made = film(coarse, camera)
+        put(name, make_zip(*capture(PROGRAM, made.data, rate)))
+    decoded = len(made.shown) * coarse[0].size
+    assert decoded > 4 * memory
+    _, grown = peak.of_large_after_small(objects, memory)
+    assert grown <= memory // 2  # eight times less than the frames, decoded

@@ -47,7 +47,7 @@ def through(corners: Any) -> Callable[[np.ndarray], np.ndarray]:
 
 
 @pytest.fixture
-def take(make_zip: Callable[..., bytes], ingest: Callable[..., Any]) -> Callable[..., Any]:
+def ingest_film(make_zip: Callable[..., bytes], ingest: Callable[..., Any]) -> Callable[..., Any]:
     """Films a preset, with a glass ball before the display, and ingests the film."""
     _, _, width, height = BORDER.inner
     program = preset("sketch", width, height)
@@ -75,8 +75,8 @@ def take(make_zip: Callable[..., bytes], ingest: Callable[..., Any]) -> Callable
     return run
 
 
-def wrong(stack: Stack, made: Film, numbers: list[int]) -> list[tuple[int, int]]:
-    """The shares of frames that show something else than their pattern."""
+def misplaced(stack: Stack, made: Film, numbers: list[int]) -> list[tuple[int, int]]:
+    """The frames that were taken for a pattern but show something else: number of the pattern, time."""
     times, tick = np.array(sorted(made.shown)), stack.attributes["video"]["tick"]
     found = []
     for at, ticks, _ in stack.shares().tolist():
@@ -112,11 +112,11 @@ def wrong(stack: Stack, made: Film, numbers: list[int]) -> list[tuple[int, int]]
         pytest.param(Camera(hold=HOLD), ASKEW[::-1], id="upside down", marks=pytest.mark.exhaustive),
     ],
 )
-def test_every_number_is_read(take: Callable[..., Any], camera: Camera, corners: Any) -> None:
-    stack, made, numbers = take(camera, corners)
+def test_every_number_is_read(ingest_film: Callable[..., Any], camera: Camera, corners: Any) -> None:
+    stack, made, numbers = ingest_film(camera, corners)
     assert stack.attributes["video"]["numbered"]
     assert stack.attributes["video"]["missing"] == {}
-    assert wrong(stack, made, numbers) == []
+    assert misplaced(stack, made, numbers) == []
     assert stack.attributes["video"]["patterns_per_second"] == pytest.approx(1 / camera.hold, rel=0.1)
     assert stack.attributes["video"]["first_pattern_seconds"] == pytest.approx(
         made.starts[numbers.index(0)], abs=0.5 * camera.hold
@@ -124,8 +124,8 @@ def test_every_number_is_read(take: Callable[..., Any], camera: Camera, corners:
 
 
 @pytest.mark.slow
-def test_what_is_cut_out_costs_its_patterns_alone(take: Callable[..., Any]) -> None:
-    stack, made, numbers = take(Camera(hold=HOLD, cut=(7.0, 9.0)))
+def test_cut_film_lacks_only_the_patterns_cut_out(ingest_film: Callable[..., Any]) -> None:
+    stack, made, numbers = ingest_film(Camera(hold=HOLD, cut=(7.0, 9.0)))
     gone = [numbers[k] for k in np.flatnonzero((made.starts[1:] > 7.0) & (made.starts[:-1] < 9.0))]
     missing = [int(number) for number in stack.attributes["video"]["missing"]]
     assert stack.attributes["video"]["numbered"]
@@ -134,27 +134,29 @@ def test_what_is_cut_out_costs_its_patterns_alone(take: Callable[..., Any]) -> N
 
 
 @pytest.mark.slow
-def test_a_hand_costs_the_patterns_behind_it(take: Callable[..., Any]) -> None:
-    stack, made, numbers = take(Camera(hold=HOLD, hand=(7.0, 8.0)))
+def test_only_patterns_behind_a_hand_are_missing(ingest_film: Callable[..., Any]) -> None:
+    stack, made, numbers = ingest_film(Camera(hold=HOLD, hand=(7.0, 8.0)))
     behind = [numbers[k] for k in np.flatnonzero((made.starts[1:] > 7.0) & (made.starts[:-1] < 8.0))]
     assert stack.attributes["video"]["numbered"]
     assert {int(number) for number in stack.attributes["video"]["missing"]} <= set(behind)
-    assert {pattern for pattern, _ in wrong(stack, made, numbers)} <= set(behind)
+    assert {pattern for pattern, _ in misplaced(stack, made, numbers)} <= set(behind)
 
 
 @pytest.mark.slow
-def test_without_its_sides_in_the_picture_the_times_tell(take: Callable[..., Any]) -> None:
-    stack, made, numbers = take(
+def test_patterns_are_found_by_their_times_without_the_sides_of_the_border(
+    ingest_film: Callable[..., Any],
+) -> None:
+    stack, made, numbers = ingest_film(
         Camera(hold=HOLD, jitter=0.02), ((-20, 14), (-18, 156), (240, 24), (235, 150))
     )
     assert not stack.attributes["video"]["numbered"]
     assert stack.attributes["video"]["missing"] == {}
-    assert wrong(stack, made, numbers) == []
+    assert misplaced(stack, made, numbers) == []
 
 
-def test_what_is_cut_out_without_numbers_is_refused(take: Callable[..., Any]) -> None:
+def test_cut_film_without_numbers_is_refused(ingest_film: Callable[..., Any]) -> None:
     with pytest.raises(CaptureError, match=r"do not fit|does not look|are found"):
-        take(Camera(hold=HOLD, cut=(7.0, 9.0)), ((-20, 14), (-18, 156), (240, 24), (235, 150)))
+        ingest_film(Camera(hold=HOLD, cut=(7.0, 9.0)), ((-20, 14), (-18, 156), (240, 24), (235, 150)))
 
 
 def test_noise_has_no_numbers() -> None:

@@ -1,55 +1,81 @@
-"""Means of a video's frames: the colours that were filmed, whatever system and depth they are coded in."""
+"""A video is opened with bounds and decoded upright; damage and other files are refused or cost single patterns."""
 
 import gc
 import io
+from collections.abc import Callable
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
 
 from storage.errors import CaptureError
 from tests.workflows.composite.video.test_steps import clip, even, pictures
+from tests.workflows.ingest.video.camera import Camera, Film, boxes, film, turned
+from tests.workflows.ingest.video.films import IngestFilm, error_of, misplaced, missing
 from workflows.ingest.video.decoder import Clip
 from workflows.ingest.video.frame_means import TOTAL_WEIGHT, Share, mean_frames
-from workflows.ingest.video.signatures import take_signatures
+
+TURNS = {
+    90: (0, 1 << 16, 0, -1 << 16, 0, 0, 0, 0, 1 << 30),
+    180: (-1 << 16, 0, 0, 0, -1 << 16, 0, 0, 0, 1 << 30),
+    270: (0, -1 << 16, 0, 1 << 16, 0, 0, 0, 0, 1 << 30),
+}
 
 
-@pytest.mark.parametrize(
-    ("codec", "pixels", "container", "options", "off"),
-    [
-        ("libx264", "yuv420p", "mp4", {"qp": "1"}, 2.0),
-        ("libx264", "yuv444p10le", "mp4", {"qp": "1"}, 0.5),
-        ("libx265", "yuv420p10le", "mp4", {"crf": "4", "x265-params": "log-level=none"}, 0.5),
-        ("mjpeg", "yuvj422p", "mov", {"qmin": "1", "qmax": "1"}, 2.5),
-        ("ffv1", "bgr0", "matroska", {}, 0.2),
-        ("ffv1", "gbrp10le", "matroska", {}, 0.2),
-        ("prores_ks", "yuv422p10le", "mov", {}, 0.5),
-    ],
-)
-def test_a_mean_has_the_colours_that_were_filmed(
-    codec: str, pixels: str, container: str, options: dict[str, str], off: float
+@pytest.mark.parametrize("clockwise", TURNS)
+def test_a_video_is_turned_upright(ingest_film: IngestFilm, filmed: Film, clockwise: int) -> None:
+    flat = ingest_film(filmed.data).read()
+    stack = ingest_film(turned(filmed.data, TURNS[clockwise]))
+    np.testing.assert_array_equal(stack.read(), np.rot90(flat, -clockwise // 90, axes=(1, 2)))
+    assert misplaced(stack, filmed) == []
+
+
+REFUSED: dict[str, tuple[Callable[[bytes], bytes], str]] = {
+    "cut off": (lambda video: video[: len(video) // 2], "cut off or damaged"),
+    "empty": (lambda video: b"", "can't be read"),
+    "no video": (lambda video: b"\x89PNG\r\n" + bytes(5000), "can't be read"),
+    "a playlist": (
+        lambda video: b"#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\nfile:///etc/hostname\n#EXT-X-ENDLIST\n",
+        "can't be read",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_file_that_is_no_whole_video_is_refused(ingest_film: IngestFilm, filmed: Film, case: str) -> None:
+    change, reason = REFUSED[case]
+    with pytest.raises(CaptureError, match=reason) as caught:
+        ingest_film(change(filmed.data))
+    assert caught.value.fields["entry"] == "clip.mp4"
+
+
+def test_damaged_stretch_costs_only_its_patterns(ingest_film: IngestFilm, filmed: Film) -> None:
+    kind, start, size = max(boxes(filmed.data), key=lambda box: box[2])
+    assert kind == "mdat"
+    video = bytearray(filmed.data)
+    video[start + size // 2 : start + size // 2 + 2000] = bytes(2000)
+    stack = ingest_film(bytes(video))
+    assert missing(stack)
+    assert error_of(stack, filmed) < 6
+
+
+def test_frames_larger_than_the_limit_are_refused(ingest_film: IngestFilm, filmed: Film) -> None:
+    with pytest.raises(CaptureError, match="96 x 72 pixels") as caught:
+        ingest_film(filmed.data, memory=4 * 96 * 72 * 6 - 4)
+    assert caught.value.fields == {"entry": "clip.mp4", "limit": 96 * 72 * 6 - 1}
+
+
+@pytest.mark.slow
+def test_frames_larger_than_the_container_says_are_never_decoded(
+    ingest_film: IngestFilm, light: list[np.ndarray]
 ) -> None:
-    random = np.random.Generator(np.random.PCG64(0))
-    codes = random.integers(0, 256, (6, 8, 3), np.uint8)
-    codes[0, :2] = [[255, 255, 255], [0, 0, 0]]
-    picture = codes.repeat(16, axis=0).repeat(16, axis=1)
-    target = io.BytesIO()
-    with av.open(target, "w", format=container) as box:
-        stream = box.add_stream(codec, rate=30)
-        stream.width, stream.height, stream.pix_fmt, stream.options = 128, 96, pixels, options
-        for number in range(8):
-            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
-            frame.pts = number
-            box.mux(stream.encode(frame))
-        box.mux(stream.encode())
-    film = Clip(io.BytesIO(target.getvalue()), "clip", 1 << 24)
-    _, ticks, _ = take_signatures(film, 1 << 24)
-    (mean,) = mean_frames(film, [[Share(int(ticks[2]), 100), Share(int(ticks[5]), TOTAL_WEIGHT - 100)]])
-    film.close()
-    middles = mean[8::16, 8::16]
-    np.testing.assert_array_equal(middles[0, :2], [[65535] * 3, [0] * 3])  # to the end of the scale: clipped
-    assert np.abs(middles / 257 - codes).max() < off
+    large = np.full((2400, 3200, 3), 0.5, np.float32)
+    bomb = bytearray(film([large] * 2, Camera(fps=24, hold=0.1, lead=0, tail=0)).data)
+    at = bomb.index(b"avc1") + 4 + 24  # width and height of the sample entry
+    bomb[at : at + 4] = (96).to_bytes(2, "big") + (72).to_bytes(2, "big")
+    with pytest.raises(CaptureError) as caught:
+        ingest_film(bytes(bomb), memory=1 << 24)
+    assert caught.value.fields["entry"] == "clip.mp4"
 
 
 def decoding() -> list[str]:
@@ -59,8 +85,8 @@ def decoding() -> list[str]:
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="threads are looked up in /proc")
-def test_a_decoder_is_gone_when_its_clip_is() -> None:
-    """And not only when the collector of cycles comes by: each has threads, and frames of tens of megabytes."""
+def test_closed_clip_leaves_no_decoder() -> None:
+    """It doesn't wait for the garbage collector: each decoder has threads, and frames of tens of megabytes."""
     data = clip(pictures(20), even(20))
     gc.collect()
     before = decoding()

@@ -17,7 +17,7 @@ HOLD = 0.5
 
 
 @pytest.fixture
-def take(make_zip: Callable[..., bytes], ingest: Callable[..., Any]) -> Callable[..., Stack]:
+def ingest_film(make_zip: Callable[..., bytes], ingest: Callable[..., Any]) -> Callable[..., Stack]:
     """Films a preset with its lead-in and ingests the film."""
 
     def run(name: str, camera: Camera) -> tuple[Stack, Film, int]:
@@ -55,10 +55,10 @@ def take(make_zip: Callable[..., bytes], ingest: Callable[..., Any]) -> Callable
         pytest.param(Camera(hold=HOLD, jitter=0.03, fps=25, exposure=0.9), id="one that does not quite"),
     ],
 )
-def test_the_lead_in_is_told_from_the_patterns(
-    take: Callable[..., tuple[Stack, Film, int]], name: str, camera: Camera
+def test_lead_in_is_distinguished_from_the_patterns(
+    ingest_film: Callable[..., tuple[Stack, Film, int]], name: str, camera: Camera
 ) -> None:
-    stack, made, before = take(name, camera)
+    stack, made, before = ingest_film(name, camera)
     assert not stack.attributes["video"]["missing"]
     patterns = np.array(stack.attributes["patterns"])
     for at, tick, _ in stack.shares().tolist():
@@ -68,7 +68,7 @@ def test_the_lead_in_is_told_from_the_patterns(
 
 
 @pytest.mark.slow
-def test_a_film_without_the_lead_out_is_read_too(take: Callable[..., tuple[Stack, Film, int]]) -> None:
-    stack, _, _ = take("sketch", Camera(hold=HOLD, jitter=0.0, tail=-4.2))
+def test_a_film_without_the_lead_out_is_read_too(ingest_film: Callable[..., tuple[Stack, Film, int]]) -> None:
+    stack, _, _ = ingest_film("sketch", Camera(hold=HOLD, jitter=0.0, tail=-4.2))
     missing = stack.attributes["video"]["missing"]
     assert set(map(int, missing)) <= set(range(28, 32))

@@ -1,25 +1,12 @@
 """What a report says of the patterns that a recording has no frame of."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
-from storage.layout.captures import Stack
-from tests.parts.captures import nested_program
-from tests.workflows.ingest.video.camera import Camera, capture, film, lights
+from tests.workflows.ingest.video.camera import Camera, film
+from tests.workflows.ingest.video.films import PROGRAM, IngestFilm
 from workflows.ingest.report.report import report
 from workflows.ingest.video.missing_patterns import REMEDIES, by_reason, ranges, remedy
-from workflows.simulation.glass_ball import glass_ball
-
-Zip = Callable[..., bytes]
-Ingest = Callable[..., Stack]
-PROGRAM = nested_program((64, 48), bands=((4, 3, 14), (8, 6, 12), (32, 24, 6)), levels=5)
-
-
-@pytest.fixture(scope="module")
-def light() -> list[np.ndarray]:
-    return lights(glass_ball(96, 72, monitor=(64, 48), rays=16), PROGRAM)
 
 
 @pytest.mark.parametrize(
@@ -31,9 +18,9 @@ def light() -> list[np.ndarray]:
     ids=["a hand in front", "ended too early"],
 )
 def test_patterns_without_a_frame_are_named_with_a_remedy(
-    make_zip: Zip, ingest: Ingest, light: list[np.ndarray], camera: Camera, what: str
+    ingest_film: IngestFilm, light: list[np.ndarray], camera: Camera, what: str
 ) -> None:
-    stack = ingest("c", make_zip(*capture(PROGRAM, film(light, camera).data, 1 / camera.hold)))
+    stack = ingest_film(film(light, camera).data, 1 / camera.hold)
     made = report(stack.attributes, stack.frames)
     (finding,) = (f for f in made.findings if f.name == "frames")
     assert made.frames.missing

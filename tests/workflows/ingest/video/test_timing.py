@@ -1,0 +1,19 @@
+"""Patterns that look alike are distinguished by their times."""
+
+import numpy as np
+
+from tests.workflows.ingest.video.camera import film
+from tests.workflows.ingest.video.films import CAMERA, PROGRAM, IngestFilm, misplaced, missing
+from workflows.programs.program import Program
+
+
+def test_equal_patterns_are_distinguished_by_their_times(
+    ingest_film: IngestFilm, light: list[np.ndarray]
+) -> None:
+    record = PROGRAM.model_dump(mode="json")
+    record["parts"][0]["levels"] = [0.0, 1.0, 1.0, 0.5, 0.5]
+    program = Program.model_validate(record)
+    made = film([light[0], light[4], light[4], light[2], light[2], *light[5:]], CAMERA)
+    stack = ingest_film(made.data, program=program)
+    assert missing(stack) == []
+    assert [pattern for pattern, _ in misplaced(stack, made) if pattern not in (1, 2, 3, 4)] == []
