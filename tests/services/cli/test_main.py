@@ -1,4 +1,4 @@
-"""The command line on its own: its help, its completion, its exit codes."""
+"""The command line without a service: its help, completion and exit codes."""
 
 import json
 import os
@@ -26,7 +26,7 @@ from services.settings import (
     describe_settings,
 )
 from tests.parts.processes import interrupt, running
-from tests.services.client.test_client import JOB, answering, ok, refused, saying
+from tests.services.client.servers import JOB, ok, refusal, scripted_server, web_server
 
 ROOT = Path(__file__).parents[3]
 README = (ROOT / "services/cli/README.md").read_text()
@@ -51,7 +51,7 @@ def commands(group: click.Group = main, *above: str) -> Iterator[tuple[str, clic
 ALL = dict(commands())
 HEAVY = {"alembic", "dask", "distributed", "numba", "numpy", "zarr"}
 """Libraries that take long to import, and that no quick command needs."""
-ELSEWHERE = ["--url", "http://127.0.0.1:9"]
+UNREACHABLE = ["--url", "http://127.0.0.1:9"]
 REMOTE = {
     "upload": ["film.zip"],
     "recover": ["c"],
@@ -67,12 +67,12 @@ REMOTE = {
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_the_help_of_every_command_has_an_example_that_can_be_typed(
+def test_help_of_every_command_has_a_valid_example(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    said = CliRunner().invoke(main, [*name.split(), "--help"]).output
-    lines = re.search(r"Example:\n((?:    .*\n)+)", said)
-    assert lines, said
+    text = CliRunner().invoke(main, [*name.split(), "--help"]).output
+    lines = re.search(r"Example:\n((?:    .*\n)+)", text)
+    assert lines, text
     monkeypatch.chdir(tmp_path)
     for file in ("film.zip", "matte.zip", "backdrop.png"):
         (tmp_path / file).write_bytes(b"any")
@@ -92,7 +92,7 @@ def test_every_command_that_prints_prints_json(name: str) -> None:
     assert any("--json" in parameter.opts for parameter in ALL[name].params) == leaf
 
 
-def test_the_exit_codes_are_the_same_wherever_they_are_told() -> None:
+def test_exit_codes_agree_between_readme_docstring_and_help() -> None:
     table = re.findall(
         r"^\| (\d+) \| (.*) \|$", README.partition("| exit code | |")[2].partition("\n\n")[0], re.M
     )
@@ -104,24 +104,24 @@ def test_the_exit_codes_are_the_same_wherever_they_are_told() -> None:
         assert re.findall(r"\b(\d+) [a-z]", text.partition("Exit codes:")[2]) == [code for code, _ in table]
 
 
-def test_0_done() -> None:
-    with saying(lambda n: ok()) as (url, _):
+def test_exit_code_0_after_success() -> None:
+    with scripted_server(lambda n: ok()) as (url, _):
         done = envmatte("status", "j", "--url", url)
         assert (done.returncode, done.stdout) == (0, "running recovering 0.5\n")
         assert json.loads(envmatte("status", "j", "--url", url, "--json").stdout) == JOB
 
 
-def test_1_refused_failed_or_not_written(tmp_path: Path) -> None:
-    with saying(lambda n: refused(404)) as (url, _):
+def test_exit_code_1_if_refused_failed_or_not_written(tmp_path: Path) -> None:
+    with scripted_server(lambda n: refusal(404)) as (url, _):
         found = envmatte("status", "j", "--url", url)
     assert (found.returncode, found.stdout, found.stderr) == (1, "", "Error: why, and what to do\n")
     failed = JOB | {"state": "failed", "problem": {"detail": "no light"}}
-    with saying(lambda n: ok(failed)) as (url, _):
+    with scripted_server(lambda n: ok(failed)) as (url, _):
         found = envmatte("wait", "j", "--url", url)
     assert (found.returncode, found.stdout) == (1, "")
     assert "no light" in found.stderr
     (tmp_path / "backdrop.png").write_bytes(b"any")
-    with saying(lambda n: ok()) as (url, _):
+    with scripted_server(lambda n: ok()) as (url, _):
         output = tmp_path / "no folder" / "out.png"
         found = envmatte("composite", "m", str(tmp_path / "backdrop.png"), "-o", str(output), "--url", url)
     assert found.returncode == 1
@@ -134,38 +134,38 @@ def test_1_refused_failed_or_not_written(tmp_path: Path) -> None:
     [["fly"], ["status"], ["upload", "no-such-file"], ["status", "j", "--url", "localhost:8000"]],
     ids=" ".join,
 )
-def test_2_wrong_command_line(arguments: list[str]) -> None:
+def test_exit_code_2_for_a_wrong_command_line(arguments: list[str]) -> None:
     found = envmatte(*arguments)
     assert (found.returncode, found.stdout) == (2, "")
     assert "Error: " in found.stderr
     assert "python -m" not in found.stderr
 
 
-def test_3_out_of_reach_or_asked_to_come_later() -> None:
+def test_exit_code_3_if_unreachable_or_busy() -> None:
     found = envmatte("status", "j", "--url", "http://127.0.0.1:9")
     assert (found.returncode, found.stdout) == (3, "")
     assert "envmatte serve" in found.stderr
-    with saying(lambda n: refused(429, **{"Retry-After": "3600"})) as (url, _):
+    with scripted_server(lambda n: refusal(429, **{"Retry-After": "3600"})) as (url, _):
         assert envmatte("status", "j", "--url", url).returncode == 3
 
 
-def interrupted(command: list[str], come: threading.Event) -> tuple[int, str]:
-    """Run a command, and interrupt it once something has come."""
+def interrupted(command: list[str], arrived: threading.Event) -> tuple[int, str]:
+    """Run a command and interrupt it once a request has arrived; returns its exit code and the end of its stderr."""
     with running(command) as process:
-        assert come.wait(120)
+        assert arrived.wait(120)
         return interrupt(process)
 
 
-def test_130_interrupted_layers_leave_nothing(tmp_path: Path) -> None:
-    come, over = threading.Event(), threading.Event()
+def test_exit_code_130_and_no_files_after_interrupted_layers(tmp_path: Path) -> None:
+    arrived, finished = threading.Event(), threading.Event()
     matte = {"id": "m", "state": "ready", "created_at": "", "capture": None, "job": None, "options": {}}
     matte |= {"width": 1, "height": 1, "monitor": [1, 1]}
 
     class Slow(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             if "layers/rho" in self.path:  # the fourth of six
-                come.set()
-                over.wait(60)
+                arrived.set()
+                finished.wait(60)
                 return
             body = b"pixels" if "layers" in self.path else json.dumps(matte).encode()
             self.send_response(200)
@@ -176,44 +176,46 @@ def test_130_interrupted_layers_leave_nothing(tmp_path: Path) -> None:
         def log_message(self, *arguments: object) -> None:
             pass
 
-    with answering(Slow) as url:
+    with web_server(Slow) as url:
         command = [*COMMAND, "layers", "m", str(tmp_path / "out"), "--url", url]
-        code, said = interrupted(command, come)
-        over.set()
+        code, stderr = interrupted(command, arrived)
+        finished.set()
     assert (code, list(tmp_path.iterdir())) == (130, [])
-    assert said.endswith("Interrupted.\n")
+    assert stderr.endswith("Interrupted.\n")
 
 
-def test_130_an_interrupted_composite_of_a_clip_cancels_its_job(tmp_path: Path) -> None:
-    come = threading.Event()
+def test_exit_code_130_and_a_cancelled_job_after_an_interrupted_clip(tmp_path: Path) -> None:
+    arrived = threading.Event()
 
     def answer(n: int):  # type: ignore[no-untyped-def]
         if n == 3:
-            come.set()
+            arrived.set()
         return ok()
 
     clip = tmp_path / "clip.mp4"
     clip.write_bytes(b"\0\0\0\x18ftypisom" + bytes(100))
-    with saying(answer) as (url, calls):
+    with scripted_server(answer) as (url, calls):
         output = tmp_path / "out.mp4"
-        code, _ = interrupted([*COMMAND, "composite", "m", str(clip), "-o", str(output), "--url", url], come)
+        code, _ = interrupted(
+            [*COMMAND, "composite", "m", str(clip), "-o", str(output), "--url", url], arrived
+        )
     assert code == 130
     assert calls[-1]["call"] == "POST /v1/jobs/j/cancel"
     assert [path.name for path in tmp_path.iterdir()] == ["clip.mp4"]
 
 
-def test_130_an_interrupted_recovery_says_how_to_go_on_with_its_job() -> None:
-    come = threading.Event()
+def test_exit_code_130_and_a_way_to_continue_after_an_interrupted_recovery() -> None:
+    arrived = threading.Event()
 
     def answer(n: int):  # type: ignore[no-untyped-def]
         if n == 3:
-            come.set()
+            arrived.set()
         return ok()
 
-    with saying(answer) as (url, calls):
-        code, said = interrupted([*COMMAND, "recover", "c", "--url", url], come)
+    with scripted_server(answer) as (url, calls):
+        code, stderr = interrupted([*COMMAND, "recover", "c", "--url", url], arrived)
     assert code == 130
-    assert "envmatte wait j" in said
+    assert "envmatte wait j" in stderr
     assert not any("cancel" in call["call"] for call in calls)
 
 
@@ -228,7 +230,7 @@ def test_130_an_interrupted_recovery_says_how_to_go_on_with_its_job() -> None:
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_the_help_of_a_process_lists_its_settings(
+def test_help_of_a_process_lists_its_settings(
     command: str, model: type[SchedulerSettings], width: int
 ) -> None:
     text = CliRunner().invoke(main, [command, "--help"], terminal_width=width).output
@@ -265,12 +267,12 @@ def test_listing_keys_imports_nothing_heavy(tmp_path: Path) -> None:
 def test_commands_that_talk_to_a_service_import_nothing_heavy(name: str, tmp_path: Path) -> None:
     for file in ("film.zip", "matte.zip", "backdrop.png"):
         (tmp_path / file).write_bytes(b"any")
-    assert "httpx2" in (found := imported(name, *REMOTE[name], *ELSEWHERE, folder=tmp_path))
+    assert "httpx2" in (found := imported(name, *REMOTE[name], *UNREACHABLE, folder=tmp_path))
     assert not found & (HEAVY | {"sqlalchemy", "pydantic"})
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_completion_is_what_a_shell_takes(shell: str, tmp_path: Path) -> None:
+def test_completion_script_works_in_its_shell(shell: str, tmp_path: Path) -> None:
     done = envmatte("completion", shell)
     assert done.returncode == 0
     assert f"_ENVMATTE_COMPLETE={shell}_complete" in done.stdout

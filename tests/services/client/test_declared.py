@@ -1,4 +1,4 @@
-"""What the client tells of a capture before it sends it."""
+"""What the client declares about a capture before it uploads it."""
 
 import json
 import zipfile
@@ -30,7 +30,7 @@ def archive(path: Path, record: Any, compression: int = zipfile.ZIP_STORED, **fi
     return path
 
 
-def test_a_capture(tmp_path: Path) -> None:
+def test_capture_declares_its_frames_and_their_size(tmp_path: Path) -> None:
     path = tmp_path / "ball.zip"
     program = nested_program(bands=((8, 6, 16),), levels=2)
     write_capture(glass_ball.glass_ball(24, 16, rays=1), program, path)
@@ -38,24 +38,24 @@ def test_a_capture(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("quality", [30, 95])
-def test_jpeg_in_a_packed_archive(tmp_path: Path, quality: int) -> None:
+def test_size_of_a_jpeg_in_a_compressed_archive(tmp_path: Path, quality: int) -> None:
     image = integer_formats.encode_jpeg(np.zeros((33, 70, 3), np.uint8), quality)
     record = {"frames": [{"file": "one", "pattern": 0}] * 5}
     path = archive(tmp_path / "c.zip", record, zipfile.ZIP_DEFLATED, one=image)
     assert declared(path) == {"frames": 5, "width": 70, "height": 33}
 
 
-def test_a_film_has_the_frames_of_its_program(tmp_path: Path) -> None:
+def test_film_declares_the_frames_of_its_program(tmp_path: Path) -> None:
     record = {"program": {"parts": PARTS}, "video": {"file": "film.mp4"}}
     assert declared(archive(tmp_path / "c.zip", record)) == {"frames": 2 + 1 + 16 + 2}
 
 
 @pytest.mark.parametrize("record", [b"{", b"[]", {"frames": 3}, {}, {"program": {"parts": [{}]}}])
-def test_what_is_wrong_is_left_to_the_service(tmp_path: Path, record: Any) -> None:
+def test_invalid_record_declares_nothing(tmp_path: Path, record: Any) -> None:
     assert declared(archive(tmp_path / "c.zip", record)) == {}
 
 
-def test_an_image_of_another_kind_is_left_out(tmp_path: Path) -> None:
+def test_image_of_unknown_format_declares_no_size(tmp_path: Path) -> None:
     record = {"frames": [{"file": "one", "pattern": 0}]}
     assert declared(archive(tmp_path / "c.zip", record, one=b"II*\0 and so on")) == {"frames": 1}
     assert declared(archive(tmp_path / "d.zip", record)) == {"frames": 1}
