@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page
 
-from tests.end_to_end.captures.test_bad_input import check_problem
 from tests.end_to_end.conftest import Service
+from tests.end_to_end.problems import check_problem
 
 ASKED = {"preset": "sketch", "monitor": {"width": 64, "height": 48}}
 SEND = """([url, asked]) => fetch(url, { method: "POST", mode: "no-cors", body: JSON.stringify(asked) })

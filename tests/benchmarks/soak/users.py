@@ -8,7 +8,7 @@ from typing import Any
 import httpx2
 
 from tests.benchmarks.service.traffic import CHUNK, TUS, VIDEO, ZIP, User
-from tests.end_to_end.captures import test_bad_input as bad
+from tests.end_to_end.captures import broken_archives as broken
 
 OPTIONS: Sequence[dict[str, Any]] = (
     {"quality": "fast"},
@@ -17,16 +17,16 @@ OPTIONS: Sequence[dict[str, Any]] = (
     {"method": "nn-dgsr", "prior": "none"},
 )
 REFUSED = (
-    bad.no_manifest,
-    bad.other_format,
-    bad.frame_not_there,
-    bad.pattern_without_frame,
-    bad.one_level,
-    bad.leaves,
-    bad.monitor_of_nothing,
-    bad.program_too_large,
+    broken.no_manifest,
+    broken.other_format,
+    broken.frame_not_there,
+    broken.pattern_without_frame,
+    broken.one_level,
+    broken.path_outside_the_archive,
+    broken.monitor_of_width_zero,
+    broken.program_too_large,
 )
-FAILING = (bad.no_image, bad.bomb)
+FAILING = (broken.frame_that_is_no_image, broken.frame_that_is_a_bomb)
 
 
 def film(user: User) -> None:
@@ -213,11 +213,11 @@ def mistake(user: User) -> None:
     random, town = user.random, user.town
 
     def capture() -> None:
-        data = bad.remade(io.BytesIO(town.capture_archive), random.choice(REFUSED))
+        data = broken.changed_archive(io.BytesIO(town.capture_archive), random.choice(REFUSED))
         user.ask("send a wrong capture", "POST", "/v1/captures", 422, content=data, headers=ZIP)
 
     def frame() -> None:
-        data = bad.remade(io.BytesIO(town.capture_archive), random.choice(FAILING))
+        data = broken.changed_archive(io.BytesIO(town.capture_archive), random.choice(FAILING))
         made = user.ask("send a wrong frame", "POST", "/v1/captures", content=data, headers=ZIP).json()
         user.ended(made["job"])
 

@@ -1,94 +1,36 @@
 """Bad input over HTTP gets a clear problem, leaves nothing behind, and the service keeps running."""
 
-import io
-import json
 import socket
 import time
-import zipfile
-import zlib
-from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO
 from urllib.parse import urlsplit
 
-import numpy as np
 import pytest
 
+from tests.end_to_end.captures.broken_archives import (
+    changed_archive,
+    exposure_of_zero,
+    frame_cut_off,
+    frame_not_there,
+    frame_of_an_unknown_camera,
+    frame_of_another_dtype,
+    frame_of_another_size,
+    frame_that_is_a_bomb,
+    frame_that_is_no_image,
+    monitor_of_width_zero,
+    no_manifest,
+    one_level,
+    other_format,
+    path_outside_the_archive,
+    pattern_out_of_range,
+    pattern_without_frame,
+    program_too_large,
+    video_not_there,
+)
 from tests.end_to_end.conftest import Service
-from workflows.images import integer_formats
+from tests.end_to_end.problems import check_problem
 
 ZIP = {"Content-Type": "application/zip"}
-
-
-def remade(capture_archive: Path | BinaryIO, change: Callable[[dict, dict[str, bytes]], None]) -> bytes:
-    """A capture archive with its capture.json and its files changed."""
-    with zipfile.ZipFile(capture_archive) as archive:
-        files = {name: archive.read(name) for name in archive.namelist()}
-    manifest = json.loads(files["capture.json"])
-    change(manifest, files)
-    if "capture.json" in files:
-        files["capture.json"] = json.dumps(manifest).encode()
-    target = io.BytesIO()
-    with zipfile.ZipFile(target, "w") as archive:
-        for name, data in files.items():
-            archive.writestr(name, data)
-    return target.getvalue()
-
-
-def check_problem(answer, status: int, slug: str) -> dict:
-    assert answer.status_code == status, answer.text
-    assert answer.headers["content-type"] == "application/problem+json"
-    problem = answer.json()
-    assert problem["status"] == status
-    assert problem["type"] == f"urn:envmatte:problem:{slug}"
-    assert problem["title"]
-    assert len(problem["detail"]) > 15
-    return problem
-
-
-def no_manifest(manifest: dict, files: dict[str, bytes]) -> None:
-    del files["capture.json"]
-
-
-def other_format(manifest: dict, files: dict[str, bytes]) -> None:
-    manifest["format"] = "envmatte-capture/9"
-
-
-def frame_not_there(manifest: dict, files: dict[str, bytes]) -> None:
-    manifest["frames"][3]["file"] = "frames/nowhere.png"
-
-
-def pattern_without_frame(manifest: dict, files: dict[str, bytes]) -> None:
-    del manifest["frames"][7]
-
-
-def pattern_out_of_range(manifest: dict, files: dict[str, bytes]) -> None:
-    manifest["frames"][7]["pattern"] = 5000
-
-
-def one_level(manifest: dict, files: dict[str, bytes]) -> None:
-    manifest["program"]["parts"][0]["levels"] = [0.5] * 5
-
-
-def leaves(manifest: dict, files: dict[str, bytes]) -> None:
-    files["../evil.png"] = b"x"
-
-
-def monitor_of_nothing(manifest: dict, files: dict[str, bytes]) -> None:
-    manifest["program"]["monitor"]["width"] = 0
-
-
-def exposure_of_nothing(manifest: dict, files: dict[str, bytes]) -> None:
-    manifest["frames"][2]["exposure"] = 0
-
-
-def program_too_large(manifest: dict, files: dict[str, bytes]) -> None:
-    manifest["program"]["parts"][1] |= {"columns": 1280, "rows": 960, "count": 100_000}
-
-
-def a_video(manifest: dict, files: dict[str, bytes]) -> None:
-    manifest["frames"] = []
-    manifest["video"] = {"file": "clip.mp4", "patterns_per_second": 2.0}
 
 
 @pytest.mark.parametrize(
@@ -100,18 +42,18 @@ def a_video(manifest: dict, files: dict[str, bytes]) -> None:
         (pattern_without_frame, "capture.json", "frames"),
         (pattern_out_of_range, "frames/00007.png", "frames.7.pattern"),
         (one_level, "capture.json", "program"),
-        (leaves, "../evil.png", None),
-        (monitor_of_nothing, "capture.json", "program.monitor.width"),
-        (exposure_of_nothing, "capture.json", "frames.2.exposure"),
+        (path_outside_the_archive, "../evil.png", None),
+        (monitor_of_width_zero, "capture.json", "program.monitor.width"),
+        (exposure_of_zero, "capture.json", "frames.2.exposure"),
         (program_too_large, "capture.json", "program"),
-        (a_video, "clip.mp4", "video.file"),
+        (video_not_there, "clip.mp4", "video.file"),
     ],
 )
 def test_archive_is_refused_at_once(
     service: Service, capture_archive: Path, change, entry: str, field: str | None
 ) -> None:
     before = service.stored()
-    answer = service.http.post("/v1/captures", content=remade(capture_archive, change), headers=ZIP)
+    answer = service.http.post("/v1/captures", content=changed_archive(capture_archive, change), headers=ZIP)
     problem = check_problem(answer, 422, "bad-capture")
     assert problem["entry"] == entry
     assert problem.get("field") == field
@@ -143,41 +85,20 @@ def test_broken_upload_leaves_nothing(service: Service, capture_archive: Path) -
     assert service.http.get("/v1/captures").json() == captures
 
 
-def of_another_size(manifest: dict, files: dict[str, bytes]) -> None:
-    files["frames/00009.png"] = integer_formats.encode_png(np.zeros((72, 95, 3), np.uint8))
-
-
-def of_another_kind(manifest: dict, files: dict[str, bytes]) -> None:
-    files["frames/00009.png"] = integer_formats.encode_png(np.zeros((72, 96, 3), np.uint16))
-
-
-def no_image(manifest: dict, files: dict[str, bytes]) -> None:
-    files["frames/00009.png"] = b"this is no image"
-
-
-def cut_off(manifest: dict, files: dict[str, bytes]) -> None:
-    files["frames/00009.png"] = files["frames/00009.png"][:1000]
-
-
-def bomb(manifest: dict, files: dict[str, bytes]) -> None:
-    # A real PNG whose header claims 60,000 x 60,000 pixels.
-    data = bytearray(files["frames/00009.png"])
-    data[16:24] = (60_000).to_bytes(4, "big") * 2
-    data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")
-    files["frames/00009.png"] = bytes(data)
-
-
-def unknown_camera(manifest: dict, files: dict[str, bytes]) -> None:
-    manifest["frames"][9]["file"] = "frames/00009.nef"
-    files["frames/00009.nef"] = bytes(9000)
-
-
 @pytest.mark.parametrize(
-    "change", [of_another_size, of_another_kind, no_image, cut_off, bomb, unknown_camera]
+    "change",
+    [
+        frame_of_another_size,
+        frame_of_another_dtype,
+        frame_that_is_no_image,
+        frame_cut_off,
+        frame_that_is_a_bomb,
+        frame_of_an_unknown_camera,
+    ],
 )
 def test_frame_refused_by_the_ingest(service: Service, capture_archive: Path, change) -> None:
     before = service.stored()
-    answer = service.http.post("/v1/captures", content=remade(capture_archive, change), headers=ZIP)
+    answer = service.http.post("/v1/captures", content=changed_archive(capture_archive, change), headers=ZIP)
     assert answer.status_code == 201
     made = answer.json()
     waiting = service.client.recover(made["id"])
@@ -233,7 +154,9 @@ def test_recovery_needs_nested_grids(service: Service, capture_archive: Path) ->
     def not_nested(manifest: dict, files: dict[str, bytes]) -> None:
         manifest["program"]["parts"][2] |= {"columns": 20, "rows": 15}
 
-    made = service.http.post("/v1/captures", content=remade(capture_archive, not_nested), headers=ZIP).json()
+    made = service.http.post(
+        "/v1/captures", content=changed_archive(capture_archive, not_nested), headers=ZIP
+    ).json()
     service.client.wait(made["job"])
     problem = check_problem(service.http.post("/v1/jobs", json={"capture": made["id"]}), 422, "bad-option")
     assert "20 x 15" in problem["detail"]

@@ -15,9 +15,9 @@ import pytest
 
 from services.client import ServiceError
 from services.decoding.pool import SECONDS
-from tests.end_to_end.captures.test_bad_input import ZIP, check_problem
 from tests.end_to_end.conftest import Service, serving
 from tests.end_to_end.mattes.test_composites import SENT, asked
+from tests.end_to_end.problems import check_problem
 from tests.parts.waiting import until
 from tests.services.api.mattes.archives import archive
 from tests.services.cluster.clusters import children, decoders, running, workers
@@ -26,6 +26,8 @@ from tests.workflows.ingest.video.camera import capture as filmed
 from tests.workflows.ingest.video.camera import overstated, zipped
 from tests.workflows.untrusted.test_decoder_guard import fragmented
 from workflows.programs.program import Program
+
+ZIP = {"Content-Type": "application/zip"}
 
 
 @contextmanager

@@ -20,7 +20,15 @@ from storage.database.engine import open_engine
 from storage.layout import uploads as stored_uploads
 from storage.objects.store import Objects
 from storage.records import uploads
-from tests.end_to_end.captures.test_uploads import CHUNK, TUS, begin, create, gone, offset_of, uploads_of
+from tests.end_to_end.captures.tus import (
+    CHUNK,
+    TUS,
+    begin_patch,
+    create,
+    offset_of,
+    uploads_of,
+    wait_until_deleted,
+)
 from tests.end_to_end.conftest import Service, paused, serving
 from tests.end_to_end.lines import Line
 from tests.parts.processes import interrupt, running
@@ -79,7 +87,7 @@ def test_client_survives_a_hundred_broken_connections(
         assert sent_so_far == sorted(set(sent_so_far))
         assert sent_so_far[-1] == file.stat().st_size
     assert service.client.wait(made["job"])["state"] == "succeeded"
-    gone(service, made["id"])
+    wait_until_deleted(service, made["id"])
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -136,7 +144,7 @@ def test_upload_resumes_after_the_server_is_killed(capture_archive: Path, tmp_pa
             assert half.wait(60)
             # An upload that no client continues, killed in the middle of its first part.
             other = create(first, 1000 * MB)
-            busy = begin(first, other, 0, 1000 * MB, bytes(20 * MB))
+            busy = begin_patch(first, other, 0, 1000 * MB, bytes(20 * MB))
             until(lambda: any("#" in name for name in uploads_of(first) if other.rsplit("/", 1)[1] in name))
             first.kill()
             busy.close()
@@ -151,7 +159,7 @@ def test_upload_resumes_after_the_server_is_killed(capture_archive: Path, tmp_pa
             assert line.carried - carried < file.stat().st_size - reached + MB
             assert second.client.wait(made[0]["job"])["state"] == "succeeded"
             assert second.http.delete(other, headers=TUS).status_code == 204
-            gone(second, made[0]["id"])
+            wait_until_deleted(second, made[0]["id"])
             assert not uploads_of(second)
 
 

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 
 import httpx2
 
-from tests.end_to_end.captures.test_bad_input import check_problem
 from tests.end_to_end.conftest import Service
+from tests.end_to_end.problems import check_problem
 
 
 def events(answer: httpx2.Response) -> Iterator[tuple[str, dict]]:

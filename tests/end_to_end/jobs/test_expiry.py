@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.end_to_end.captures.test_bad_input import check_problem
 from tests.end_to_end.conftest import Service, paused, serving
+from tests.end_to_end.problems import check_problem
 from tests.parts.waiting import until
 
 

@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 from services.client import ServiceError
-from tests.end_to_end.captures.test_uploads import begin, create
+from tests.end_to_end.captures.tus import begin_patch, create
 from tests.end_to_end.conftest import Service, digests, png, serving
 from tests.parts.waiting import until
 from tests.services.cluster.clusters import workers
@@ -22,7 +22,7 @@ def files_of(service: Service, matte: str) -> dict[str, str]:
     return digests(service.data / "store" / "mattes" / matte)
 
 
-def gone(service: Service, matte: str) -> None:
+def wait_until_deleted(service: Service, matte: str) -> None:
     """Wait until nothing of a matte is left."""
     until(lambda: service.http.get(f"/v1/mattes/{matte}").status_code == 404)
     until(lambda: not any(matte in name for name in service.stored()))
@@ -92,7 +92,7 @@ def test_cancelled_job_leaves_nothing(service: Service, capture: str) -> None:
     assert service.client.cancel(job["id"])["state"] == "cancelled"
     with pytest.raises(ServiceError, match="cancelled"):
         service.client.wait(job["id"])
-    gone(service, job["matte"])
+    wait_until_deleted(service, job["matte"])
     assert service.client.cancel(job["id"])["state"] == "cancelled"
 
 
@@ -101,7 +101,7 @@ def test_job_cancelled_while_waiting_leaves_nothing(service: Service, capture_ar
     job = service.client.recover(uploaded["id"])
     assert service.client.cancel(job["id"])["state"] == "cancelled"
     service.client.wait(uploaded["job"])
-    gone(service, job["matte"])
+    wait_until_deleted(service, job["matte"])
 
 
 def test_cancelled_ingest_leaves_nothing(service: Service, capture: str, capture_archive: Path) -> None:
@@ -152,7 +152,7 @@ def test_job_cancelled_before_a_kill_leaves_nothing(capture_archive: Path, tmp_p
     (data / "store" / "uploads" / "orphan.zip#1").write_bytes(b"and one that was being written")
     with serving(data, "--workers", "1") as second:
         assert not [name for name in second.stored() if "orphan" in name]
-        gone(second, job["matte"])
+        wait_until_deleted(second, job["matte"])
         assert second.client.job(job["id"])["state"] == "cancelled"
         assert second.client.wait(second.client.recover(job["capture"])["id"])["state"] == "succeeded"
 
@@ -207,7 +207,7 @@ def test_stopped_server_leaves_no_process(
 ) -> None:
     with serving(tmp_path / "data", "--workers", "2") as service:
         service.client.recover(service.client.upload(capture_archive)["id"])
-        sending = begin(service, create(service, 1000), 0, 1000, b"the rest of which never comes")
+        sending = begin_patch(service, create(service, 1000), 0, 1000, b"the rest of which never comes")
         family = psutil.Process(service.process.pid).children(recursive=True)
         assert len(family) >= 2
         service.process.send_signal(number)

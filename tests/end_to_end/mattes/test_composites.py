@@ -11,8 +11,8 @@ import psutil
 import pytest
 from PIL import Image
 
-from tests.end_to_end.captures.test_bad_input import check_problem
 from tests.end_to_end.conftest import Service, png
+from tests.end_to_end.problems import check_problem
 from tests.end_to_end.use.test_cli import envmatte
 from tests.services.cluster.clusters import decoders
 from workflows.images import float_formats, integer_formats

@@ -17,8 +17,8 @@ import pytest
 from services.client import Client
 from storage.database.engine import open_engine, writing
 from storage.records import api_keys
-from tests.end_to_end.captures.test_bad_input import check_problem
 from tests.end_to_end.conftest import Service, paused, png, serving
+from tests.end_to_end.problems import check_problem
 from tests.parts.waiting import until
 
 HEADERS = {

@@ -9,7 +9,7 @@ from typing import Any
 import psutil
 import pytest
 
-from tests.end_to_end.captures.test_uploads import create, patch
+from tests.end_to_end.captures.tus import create, patch
 from tests.end_to_end.conftest import Service, serving
 
 GIB = 1 << 30

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.end_to_end.captures.test_uploads import gone
+from tests.end_to_end.captures.tus import wait_until_deleted
 from tests.end_to_end.conftest import Service, digests, png
 from workflows.images import integer_formats
 from workflows.images.tone_curves import to_light
@@ -30,7 +30,7 @@ def test_an_upload_is_ingested(service: Service, capture_archive: Path, scene: S
     found = service.client.capture(made["id"])
     assert (found["state"], found["width"], found["height"], found["frames"]) == ("ready", 96, 72, 57)
     assert datetime.fromisoformat(found["created_at"]).utcoffset() is not None
-    gone(service, made["id"])
+    wait_until_deleted(service, made["id"])
 
 
 def test_frames_are_stored_unchanged(service: Service, capture: str, scene: Scene, program) -> None:

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.end_to_end.captures.test_bad_input import check_problem
 from tests.end_to_end.conftest import Service
+from tests.end_to_end.problems import check_problem
 from workflows.programs.border import Border
 from workflows.programs.files import fit_to_screen, pictures, program_json
 from workflows.programs.preset_names import PRESETS
