@@ -45,10 +45,10 @@ def opened(browser: Browser, **options: Any) -> Iterator[Page]:
 
 def asks_before_closing(page: Page) -> bool:
     """Whether a page asks before it closes, and stays open if the answer is no."""
-    with page.expect_event("dialog") as asked:
+    with page.expect_event("dialog") as dialog:
         page.close(run_before_unload=True)
-    asked.value.dismiss()
-    return asked.value.type == "beforeunload"
+    dialog.value.dismiss()
+    return dialog.value.type == "beforeunload"
 
 
 def is_fitting(page: Page) -> bool:

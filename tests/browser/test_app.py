@@ -114,8 +114,8 @@ def test_backdrop_moves_by_mouse_and_keys(tab: Page, service: Service, ready: tu
     before = shown(tab, ".picture.stage img")
     box = stage.bounding_box()
     assert box
-    asked: list[str] = []
-    tab.on("request", lambda request: asked.append(request.url) if "/composite?" in request.url else None)
+    requests: list[str] = []
+    tab.on("request", lambda request: requests.append(request.url) if "/composite?" in request.url else None)
     tab.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     tab.mouse.down()
     tab.mouse.move(box["x"] + 0.75 * box["width"], box["y"] + box["height"] / 2, steps=5)
@@ -123,8 +123,8 @@ def test_backdrop_moves_by_mouse_and_keys(tab: Page, service: Service, ready: tu
     right = tab.locator("output[for=place-right]")
     expect(right).to_have_text("25 %")
     expect(status).to_be_visible()
-    assert "right=0.25" in asked[-1]
-    assert "size=" not in asked[-1]
+    assert "right=0.25" in requests[-1]
+    assert "size=" not in requests[-1]
     assert np.mean(np.abs(shown(tab, ".picture.stage img") - before.astype(float))) > 5
     tab.mouse.wheel(0, -500)
     expect(tab.locator("output[for=place-scale]")).to_have_text("165 %")
@@ -174,8 +174,8 @@ def test_layers_for_other_tools_are_downloaded(tab: Page, service: Service, read
         with tab.expect_download() as download:
             tab.get_by_role("button", name=name).click()
         assert download.value.suggested_filename == name
-        wanted = service.http.get(f"/v1/mattes/{ready[1]}/layers/{name}").content
-        assert download.value.path().read_bytes() == wanted
+        expected = service.http.get(f"/v1/mattes/{ready[1]}/layers/{name}").content
+        assert download.value.path().read_bytes() == expected
 
 
 @pytest.mark.slow

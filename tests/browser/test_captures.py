@@ -148,9 +148,9 @@ def test_number_and_size_of_frames_are_sent_before_the_archive(
         {"kind": "bernoulli", "columns": 8, "rows": 6, "count": 16, "seed": 1},
     ]
     filmed = {"program": {"parts": parts}, "video": {"file": "film.mp4"}}
-    with zipfile.ZipFile(ball) as given, zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as made:
-        for name in given.namelist():
-            made.writestr(name, given.read(name))
+    with zipfile.ZipFile(ball) as source, zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as made:
+        for name in source.namelist():
+            made.writestr(name, source.read(name))
     for path, about in ((jpeg, record), (film, filmed)):
         with zipfile.ZipFile(path, "w") as made:
             made.writestr("capture.json", json.dumps(about))

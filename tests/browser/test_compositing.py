@@ -33,13 +33,13 @@ COUNTED = """
     for (const kind in made) {
         for (const [name, by] of [[kind === "Sync" ? "fenceSync" : `create${kind}`, 1], [`delete${kind}`, -1]]) {
             const real = type[name];
-            type[name] = function (...given) { made[kind] += by; return real.apply(this, given); };
+            type[name] = function (...args) { made[kind] += by; return real.apply(this, args); };
         }
     }"""
 WITHOUT = """
     const real = HTMLCanvasElement.prototype.getContext;
-    HTMLCanvasElement.prototype.getContext = function (kind, ...given) {
-        return kind === "webgl2" ? null : real.call(this, kind, ...given);
+    HTMLCanvasElement.prototype.getContext = function (kind, ...args) {
+        return kind === "webgl2" ? null : real.call(this, kind, ...args);
     };"""
 COARSER = """async ([id, picture, monitor]) => {
     const { webglContext, createPainter } = await import("/web/app/composite/webgl.js");
@@ -62,7 +62,7 @@ SLOW = """
     window.requestAnimationFrame = (call) => real(() => setTimeout(() => call(performance.now()), 60));"""
 KEPT = """
     const real = navigator.mediaDevices.getUserMedia.bind(navigator.mediaDevices);
-    navigator.mediaDevices.getUserMedia = async (wanted) => (window.stream = await real(wanted));"""
+    navigator.mediaDevices.getUserMedia = async (constraints) => (window.stream = await real(constraints));"""
 
 
 @pytest.fixture(scope="module")
@@ -125,8 +125,8 @@ def filmed(path: Path, frames: int) -> bytes:
 def test_live_picture_agrees_with_service(context: BrowserContext, service: Service, ball: str) -> None:
     page = opened(context, service, ball)
     expect(page.get_by_text(READY)).to_be_visible(timeout=MINUTE)
-    asked: list[str] = []
-    page.on("request", lambda one: asked.append(one.url) if "/composite?" in one.url else None)
+    requests: list[str] = []
+    page.on("request", lambda one: requests.append(one.url) if "/composite?" in one.url else None)
     beach = png(glass_ball.backdrop(640, 480), "srgb", np.uint8)
     choose(page, beach, "beach.png", "image/png")
     expect(page.get_by_text(re.compile("beach.png: exact"))).to_be_visible(timeout=MINUTE)
@@ -134,12 +134,12 @@ def test_live_picture_agrees_with_service(context: BrowserContext, service: Serv
         for name, value in turned.items():
             page.get_by_role("slider", name=name).fill(value)
         expect(page.get_by_text(EXACT)).to_be_visible(timeout=MINUTE)
-        place = {name: value for name, (value,) in parse_qs(urlsplit(asked[-1]).query).items()}
+        place = {name: value for name, (value,) in parse_qs(urlsplit(requests[-1]).query).items()}
         del place["quality"]
         exact = service.http.post(f"/v1/mattes/{ball}/composite", params=place, content=beach)
         error = np.mean((drawn(page) - pixels(exact.content)) ** 2)
         assert 10 * np.log10(255**2 / error) > 30, place
-    assert not any("size=" in url for url in asked)
+    assert not any("size=" in url for url in requests)
 
 
 def test_coarser_live_pictures_agree_with_service(
@@ -156,9 +156,9 @@ def test_coarser_live_pictures_agree_with_service(
     )
     for coarser, one in enumerate(page.evaluate(COARSER, [ball, sent, monitor])):
         every = 2**coarser
-        found, wanted = of_url(one), exact[every // 2 :: every, every // 2 :: every]
-        assert found.shape == wanted.shape
-        assert 10 * np.log10(255**2 / np.mean((found - wanted) ** 2)) > (30, 26, 22)[coarser]
+        found, expected = of_url(one), exact[every // 2 :: every, every // 2 :: every]
+        assert found.shape == expected.shape
+        assert 10 * np.log10(255**2 / np.mean((found - expected) ** 2)) > (30, 26, 22)[coarser]
 
 
 def test_slow_device_draws_fewer_pixels(context: BrowserContext, service: Service, ball: str) -> None:
@@ -283,8 +283,8 @@ def test_two_fingers_move_scale_and_turn(browser: Browser, service: Service, bal
     fingers("touchEnd", {1: (0.1, 0.2)})
     fingers("touchMove", {0: (0.2, -0.2)})
     fingers("touchEnd", {0: (0.2, -0.2)})
-    for name, wanted in (("right", "20 %"), ("down", "0 %"), ("scale", "200 %"), ("angle", "90°")):
-        expect(page.locator(f"output[for=place-{name}]")).to_have_text(wanted)
+    for name, expected in (("right", "20 %"), ("down", "0 %"), ("scale", "200 %"), ("angle", "90°")):
+        expect(page.locator(f"output[for=place-{name}]")).to_have_text(expected)
     context.close()
 
 
@@ -300,17 +300,17 @@ def test_clip_that_browser_cannot_play_is_explained(
 
 def test_without_webgl_the_service_draws(context: BrowserContext, service: Service, ball: str) -> None:
     context.add_init_script(WITHOUT)
-    asked: list[str] = []
+    requests: list[str] = []
     page = opened(context, service, ball)
     expect(page.get_by_text("no WebGL2")).to_be_visible()
-    page.on("request", lambda one: asked.append(one.url))
+    page.on("request", lambda one: requests.append(one.url))
     page.get_by_role("group", name="Composite.").press("ArrowRight")
     expect(page.get_by_text(EXACT)).to_be_visible(timeout=MINUTE)
-    assert f"size={SIZE[0]}" in asked[0]
+    assert f"size={SIZE[0]}" in requests[0]
     page.get_by_role("radio", name="Camera").check()
     expect(page.get_by_text("Camera: preview")).to_be_visible(timeout=MINUTE)
     until(lambda: page.evaluate("document.querySelector('.stage img').naturalWidth === 96"))
-    assert not any(url.endswith("/live") for url in asked)
+    assert not any(url.endswith("/live") for url in requests)
 
 
 def test_leaving_frees_the_graphics_card(context: BrowserContext, service: Service, ball: str) -> None:

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.exhaustive
 
 
 @pytest.fixture(scope="session")
-def given(pytestconfig: pytest.Config) -> tuple[Path, Path]:
+def kit_and_scenes(pytestconfig: pytest.Config) -> tuple[Path, Path]:
     """A kit and a folder of scenes; without them the test is skipped."""
     if not (paths := pytestconfig.getoption("--scenes")):
         pytest.skip("no scenes are given: --scenes KIT SCENES, as the benchmarks take them")
@@ -22,10 +22,10 @@ def given(pytestconfig: pytest.Config) -> tuple[Path, Path]:
 
 @pytest.mark.timeout(1800)
 def test_live_pictures_of_scenes_agree_with_service(
-    given: tuple[Path, Path], desk: Page, service: Service, tmp_path: Path
+    kit_and_scenes: tuple[Path, Path], desk: Page, service: Service, tmp_path: Path
 ) -> None:
-    kit = load(given[0])
-    mattes = recover(kit, given[1], False, service.client, tmp_path)
+    kit = load(kit_and_scenes[0])
+    mattes = recover(kit, kit_and_scenes[1], False, service.client, tmp_path)
     assert mattes
     for title, matte in mattes.items():
         row, _ = measure(title, matte, backdrops_of(kit), service.http, desk, frames=1)

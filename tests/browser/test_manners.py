@@ -101,7 +101,7 @@ def test_every_view_is_accessible_and_stable(
 def test_tab_key_reaches_everything(desk: Page, service: Service, views: dict[str, tuple[str, str]]) -> None:
     for name, view in views.items():
         go(desk, service, view)
-        wanted = desk.evaluate(
+        expected = desk.evaluate(
             """() => {
                 const seen = (e) => e.checkVisibility({ visibilityProperty: true }) && !e.disabled;
                 return [...document.querySelectorAll("a[href], button, input, select, summary, [tabindex='0']")]
@@ -111,12 +111,12 @@ def test_tab_key_reaches_everything(desk: Page, service: Service, views: dict[st
         )
         desk.evaluate("document.body.tabIndex = -1, document.body.focus()")
         reached = set()
-        for _ in range(wanted + 2):
+        for _ in range(expected + 2):
             desk.keyboard.press("Tab")
             reached.add(
                 desk.evaluate("""() => [...document.querySelectorAll("*")].indexOf(document.activeElement)""")
             )
-        assert len(reached) >= wanted, name
+        assert len(reached) >= expected, name
 
 
 def test_api_documentation_is_served_locally(desk: Page, service: Service) -> None:

@@ -44,8 +44,8 @@ def hold(page: Page) -> list[Route]:
     return held
 
 
-def envmatte_keys(data: Path, *given: str) -> str:
-    words = [sys.executable, "-m", "services", "keys", *given, "--data", str(data)]
+def envmatte_keys(data: Path, *arguments: str) -> str:
+    words = [sys.executable, "-m", "services", "keys", *arguments, "--data", str(data)]
     return subprocess.run(words, capture_output=True, text=True, check=True).stdout
 
 
@@ -77,22 +77,22 @@ def test_file_dropped_beside_the_zone_does_not_replace_the_page(desk: Page, serv
             return files;
         }"""
     )
-    heard = """() => new Promise((resolve) => {
+    drop_outside = """() => new Promise((resolve) => {
         addEventListener("drop", (event) => setTimeout(() => resolve(event.defaultPrevented)), { once: true });
         document.querySelector("header").dispatchEvent(new DragEvent("drop", {
             dataTransfer: window.files, bubbles: true, cancelable: true }));
     })"""
     desk.evaluate("(files) => { window.files = files; }", files)
-    assert desk.evaluate(heard)
+    assert desk.evaluate(drop_outside)
     expect(desk.get_by_role("heading", name="Captures")).to_be_visible()
 
 
 def test_interrupted_upload_continues(desk: Page, service: Service, ball: Path) -> None:
-    asked: list[str] = []
+    methods: list[str] = []
 
     def cut(route: Route) -> None:
-        asked.append(route.request.method)
-        if asked.count("PATCH") == 1 and route.request.method == "PATCH":
+        methods.append(route.request.method)
+        if methods.count("PATCH") == 1 and route.request.method == "PATCH":
             route.abort("connectionreset")
         else:
             route.continue_()
@@ -103,7 +103,7 @@ def test_interrupted_upload_continues(desk: Page, service: Service, ball: Path) 
         desk.get_by_label(ZIP).set_input_files(ball)
     expect(desk.get_by_text("trying again")).to_be_visible()
     expect(desk).to_have_url(re.compile(r"#/captures/\w+"), timeout=MINUTE)
-    assert asked == ["PATCH", "HEAD", "PATCH"]
+    assert methods == ["PATCH", "HEAD", "PATCH"]
 
 
 def test_upload_survives_other_views_and_the_back_button(desk: Page, service: Service, ball: Path) -> None:

@@ -33,9 +33,9 @@ DISPLAYS = [(640, 360), (1920, 1080), (1080, 1920), (3440, 1440), (161, 121), (9
 NUMBERS = [LEAD, 0, 1, 62, 63, 64, 1023, MAX_PATTERNS - 1]
 
 
-def posted(service: Service, **asked: Any) -> dict[str, Any]:
+def posted(service: Service, **changes: Any) -> dict[str, Any]:
     answer = service.http.post(
-        "/v1/programs", json={"preset": "sketch", "monitor": SCREEN, "border": True} | asked
+        "/v1/programs", json={"preset": "sketch", "monitor": SCREEN, "border": True} | changes
     )
     assert answer.status_code == 201, answer.text
     found: dict[str, Any] = answer.json()

@@ -12,8 +12,8 @@ from playwright.sync_api import Page
 from tests.end_to_end.conftest import Service
 from tests.end_to_end.problems import check_problem
 
-ASKED = {"preset": "sketch", "monitor": {"width": 64, "height": 48}}
-SEND = """([url, asked]) => fetch(url, { method: "POST", mode: "no-cors", body: JSON.stringify(asked) })
+BODY = {"preset": "sketch", "monitor": {"width": 64, "height": 48}}
+SEND = """([url, body]) => fetch(url, { method: "POST", mode: "no-cors", body: JSON.stringify(body) })
     .then(({ status }) => status, ({ name }) => name)"""
 
 
@@ -36,10 +36,10 @@ def test_foreign_site_cannot_send_to_service_without_keys(tab: Page, service: Se
 
     url, before = f"{service.url}/v1/programs", programs()
     tab.goto(site)
-    assert tab.evaluate(SEND, [url, ASKED]) == "TypeError"  # not even the status of the response is visible
+    assert tab.evaluate(SEND, [url, BODY]) == "TypeError"  # not even the status of the response is visible
     assert programs() == before
     tab.goto(f"{service.url}/docs")  # a page of the service may make the same call
-    assert tab.evaluate(SEND, [url, ASKED]) in (200, 201)
+    assert tab.evaluate(SEND, [url, BODY]) in (200, 201)
     assert len(programs()) > len(before)
 
 

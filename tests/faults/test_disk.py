@@ -130,8 +130,8 @@ def test_full_disk_of_sqlite(small: Small, table: list[Row]) -> None:
             filled.enter_context(full(small.ledger))
             while not refused():
                 pass
-        said = log.read_text().count(message)
-        until(lambda: log.read_text().count(message) > said + 2)
+        count = log.read_text().count(message)
+        until(lambda: log.read_text().count(message) > count + 2)
         until(lambda: service.http.get("/readyz").status_code == 503)
         assert service.client.job(job["id"])["state"] == "running"
     assert service.client.wait(job["id"])["state"] == "succeeded"

@@ -50,7 +50,7 @@ class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server: Proxy
 
-    def _hand_on(self) -> None:
+    def _forward(self) -> None:
         body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
         fate = random.random()
         if fate < self.server.refused:
@@ -62,11 +62,11 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
             time.sleep(3)
             return
-        there = http.client.HTTPConnection(self.server.server, timeout=30)
-        there.request(self.command, self.path, body, dict(self.headers))
-        answer = there.getresponse()
+        upstream = http.client.HTTPConnection(self.server.server, timeout=30)
+        upstream.request(self.command, self.path, body, dict(self.headers))
+        answer = upstream.getresponse()
         self._answer(answer.status, dict(answer.getheaders()), answer.read())
-        there.close()
+        upstream.close()
 
     def _answer(self, status: int, headers: dict[str, str], body: bytes) -> None:
         self.send_response_only(status)
@@ -78,7 +78,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
         self.wfile.write(body)
 
-    do_GET = do_HEAD = do_PUT = do_POST = do_DELETE = _hand_on
+    do_GET = do_HEAD = do_PUT = do_POST = do_DELETE = _forward
 
     def log_message(self, format: str, *arguments: object) -> None:
         """Log nothing."""

@@ -59,8 +59,8 @@ def test_tile_that_kills_its_workers_fails_only_its_job(
     chunk = max(lowest.iterdir(), key=lambda path: int(path.name)) / "0"
     kept = chunk.rename(rig.folder / "kept")
     os.mkfifo(chunk)
-    asked = {"capture": capture["id"], "options": {"tile": TILE}}
-    job = rig.ask("POST", "/v1/jobs", json=asked).json()
+    body = {"capture": capture["id"], "options": {"tile": TILE}}
+    job = rig.ask("POST", "/v1/jobs", json=body).json()
     start = time.monotonic()
     with deadly(rig, f"recover-{job['id']}-{LAST}-"):
         other = rig.recover(known.capture)

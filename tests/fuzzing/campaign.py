@@ -195,9 +195,9 @@ def _batch(
 ) -> None:
     """Run inputs in a process, and send the result of each."""
     warnings.simplefilter("ignore")
-    _be_quiet()
-    _, most = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (_addresses() + ADDRESSES, most))
+    _silence()
+    _, hard = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (_addresses() + ADDRESSES, hard))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     give_up = time.monotonic() + seconds
     for seed in range(first, upto):
@@ -210,9 +210,9 @@ def _batch(
             taken, failure = execute(target, data, Path(folder))
             signal.setitimer(signal.ITIMER_PROF, 0)
             if once_more:  # what is loaded once does not count
-                before = _most_memory()
+                before = _peak_memory()
         took = time.perf_counter() - began
-        grown = _most_memory() - before
+        grown = _peak_memory() - before
         if failure is None and grown > target.memory:
             failure = "memory", f"it took {grown >> 20} MB"
         pipe.send((taken, took, failure))
@@ -229,8 +229,8 @@ def execute(target: Target, data: bytes, folder: Path) -> tuple[bool, tuple[str,
         return False, None
     except Exception as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
-        said = f"{type(error).__name__}: {error}"[:300]
-        return False, ("error", f"{said} ({Path(where.filename).name}:{where.lineno}, {where.name})")
+        message = f"{type(error).__name__}: {error}"[:300]
+        return False, ("error", f"{message} ({Path(where.filename).name}:{where.lineno}, {where.name})")
     finally:
         for left in folder.iterdir():
             if left.name != KEPT:
@@ -242,14 +242,14 @@ KEPT = "kept"
 """Name that a target may leave in its folder for the next execution."""
 
 
-def _be_quiet() -> None:
+def _silence() -> None:
     """Discard what decoders print."""
     nothing = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):
         os.dup2(nothing, stream)
 
 
-def _most_memory() -> int:
+def _peak_memory() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
 
 

@@ -193,8 +193,8 @@ def _other_value(random: Random, document: Any, way: Sequence[Any], ways: Sequen
     if what == 1:
         return _at(json.loads(json.dumps(document)), random.choice(ways))
     if what == 2:
-        most = LARGEST // len(json.dumps(here))
-        return [here] * min(random.choice((1, 2, 3, 1000, 20_000)), most)
+        limit = LARGEST // len(json.dumps(here))
+        return [here] * min(random.choice((1, 2, 3, 1000, 20_000)), limit)
     if what == 3:
         for _ in range(random.choice((1, 30, 190, 300))):
             here = [here] if random.random() < 0.5 else {"parts": here}

@@ -238,10 +238,10 @@ def read(data: bytes, folder: Path) -> None:
         "headers": [(name.lower(), value) for name, value in request.headers],
     }
     sent: list[dict[str, Any]] = []
-    came = iter([{"type": "http.request", "body": body, "more_body": False}])
+    messages = iter([{"type": "http.request", "body": body, "more_body": False}])
 
     async def receive() -> dict[str, Any]:
-        message = next(came, None)
+        message = next(messages, None)
         if message is None:
             await asyncio.sleep(5)  # and hangs up
             return {"type": "http.disconnect"}

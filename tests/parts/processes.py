@@ -24,5 +24,5 @@ def running(command: Sequence[str], **options: Any) -> Iterator["subprocess.Pope
 def interrupt(process: "subprocess.Popen[str]") -> tuple[int, str]:
     """Interrupt a command as Ctrl-C does; returns its exit code and the rest of its stderr."""
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=120)
-    return process.returncode, said
+    _, stderr = process.communicate(timeout=120)
+    return process.returncode, stderr

@@ -41,9 +41,9 @@ def _with_bucket(server: "subprocess.Popen[bytes]", log: Path) -> str:
     """Wait until the server prints its address, and make the bucket."""
     end = time.monotonic() + 120
     while True:
-        said = [word for word in log.read_text().split() if word.startswith("http://127.0.0.1:")]
-        if said:
-            url = said[0].rstrip("/")
+        addresses = [word for word in log.read_text().split() if word.startswith("http://127.0.0.1:")]
+        if addresses:
+            url = addresses[0].rstrip("/")
             signed = {
                 "Authorization": "AWS4-HMAC-SHA256 Credential=somebody/20260101/us-east-1/s3/aws4_request"
             }

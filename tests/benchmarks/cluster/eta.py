@@ -91,9 +91,9 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=1)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--json", type=Path)
-    given = parser.parse_args()
+    args = parser.parse_args()
     rows: list[dict[str, Any]] = []
-    with served(given.workers) as (client, folder):
+    with served(args.workers) as (client, folder):
 
         def follow_and_show(name: str, size: str, job: str) -> None:
             rows.append({"job": name, "size": size, **follow(client, job)})
@@ -101,17 +101,17 @@ def main() -> None:
                 print("  ".join(f"{name:>8}" for name in rows[0]))
             show(rows[-1])
 
-        for size in given.size or ("160x120", "320x240"):
+        for size in args.size or ("160x120", "320x240"):
             scene = glass_ball.glass_ball(*map(int, size.split("x")), rays=16)
             archives = {"stills": stills(scene), "video": video(scene)}
-            for _ in range(given.repeat):
+            for _ in range(args.repeat):
                 for name, capture_archive in archives.items():
                     made = upload(client, capture_archive, folder)
                     follow_and_show(name, size, made["job"])
                     if name == "stills":
                         follow_and_show("recover", size, client.recover(made["id"])["id"])
-    if given.json:
-        given.json.write_text(json.dumps(rows, indent=2))
+    if args.json:
+        args.json.write_text(json.dumps(rows, indent=2))
 
 
 if __name__ == "__main__":

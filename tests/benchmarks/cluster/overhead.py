@@ -39,14 +39,14 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--threads", type=int, default=8, help="Of a worker: sleeping takes no core.")
     parser.add_argument("--json", type=Path)
-    given = parser.parse_args()
-    rows = [measure(tiles, given.seconds, given.workers, given.threads) for tiles in given.tiles]
+    args = parser.parse_args()
+    rows = [measure(tiles, args.seconds, args.workers, args.threads) for tiles in args.tiles]
     names = list(rows[0])
     print("  ".join(f"{name:>22}" for name in names))
     for row in rows:
         print("  ".join(f"{row[name]:>22}" for name in names))
-    if given.json:
-        given.json.write_text(json.dumps(rows, indent=2))
+    if args.json:
+        args.json.write_text(json.dumps(rows, indent=2))
 
 
 def measure(tiles: int, seconds: float, workers: int, threads: int) -> dict[str, Any]:

@@ -31,17 +31,17 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--megapixels", type=float, default=4.2, help="Of the large job.")
     parser.add_argument("--json", type=Path)
-    given = parser.parse_args()
+    args = parser.parse_args()
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
-        if "throughput" in given.parts:
-            rows += throughput(Path(folder), given.rounds)
-        if "sharing" in given.parts:
-            rows += sharing(Path(folder), given.megapixels)
+        if "throughput" in args.parts:
+            rows += throughput(Path(folder), args.rounds)
+        if "sharing" in args.parts:
+            rows += sharing(Path(folder), args.megapixels)
     for row in rows:
         show(row)
-    if given.json:
-        given.json.write_text(json.dumps(rows, indent=2))
+    if args.json:
+        args.json.write_text(json.dumps(rows, indent=2))
 
 
 def throughput(folder: Path, rounds: int) -> list[dict[str, Any]]:

@@ -49,18 +49,18 @@ def main() -> None:
     parser.add_argument("--large", type=float, default=1.0, help="Megapixels of the enlarged matte.")
     parser.add_argument("--seconds", type=float, default=8.0, help="Of each number of clients.")
     parser.add_argument("--json", type=Path)
-    given = parser.parse_args()
+    args = parser.parse_args()
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        archives = {one.partition("=")[0]: Path(one.partition("=")[2]) for one in given.archive}
+        archives = {one.partition("=")[0]: Path(one.partition("=")[2]) for one in args.archive}
         archives["ball 640 x 480"] = folder / "ball.zip"
         write_capture(glass_ball.glass_ball(640, 480, rays=9), preset("quick"), archives["ball 640 x 480"])
-        if given.large:
-            archives[f"{given.large} megapixels"] = folder / "large.zip"
+        if args.large:
+            archives[f"{args.large} megapixels"] = folder / "large.zip"
             small = folder / "small.zip"
             write_capture(glass_ball.glass_ball(160, 120, rays=9), preset("quick"), small)
-            enlarge(small, folder / "large.zip", given.large)
+            enlarge(small, folder / "large.zip", args.large)
         data = folder / "data"
         with service(data, CORES) as url, Client(url) as client:
             mattes = {}
@@ -73,14 +73,14 @@ def main() -> None:
             for title, matte in mattes.items():
                 rows.append({"matte": title} | kernel(objects, matte))
                 print(json.dumps(rows[-1]), flush=True)
-            rows += over_http(url, mattes["ball 640 x 480"], given.seconds)
+            rows += over_http(url, mattes["ball 640 x 480"], args.seconds)
             rows.append({"cache at half a matte": twice(objects, mattes["ball 640 x 480"])})
         with service(data, CORES) as url, Client(url) as client:
             rows.append({"first request after start, ms": first(client, mattes["ball 640 x 480"])})
     for row in rows[len(mattes) :]:
         print(json.dumps(row))
-    if given.json:
-        given.json.write_text(json.dumps(rows, indent=2))
+    if args.json:
+        args.json.write_text(json.dumps(rows, indent=2))
 
 
 def best(work: Callable[[], Any], rounds: int = 15) -> float:

@@ -195,17 +195,17 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--no-ball", dest="ball", action="store_false", help="Only the scenes.")
     parser.add_argument("--json", type=Path)
-    given = parser.parse_args()
-    kit = load(given.kit)
+    args = parser.parse_args()
+    kit = load(args.kit)
     with (
         tempfile.TemporaryDirectory() as folder,
-        service(Path(folder, "data"), given.workers) as url,
+        service(Path(folder, "data"), args.workers) as url,
         Client(url) as client,
     ):
-        mattes = recover(kit, given.scenes, given.ball, client, Path(folder))
-        rows = compare(kit, url, mattes, given.renderer, given.frames)
-    if given.json:
-        given.json.write_text(json.dumps(rows, indent=2))
+        mattes = recover(kit, args.scenes, args.ball, client, Path(folder))
+        rows = compare(kit, url, mattes, args.renderer, args.frames)
+    if args.json:
+        args.json.write_text(json.dumps(rows, indent=2))
 
 
 if __name__ == "__main__":

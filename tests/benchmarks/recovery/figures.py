@@ -107,14 +107,14 @@ def main() -> None:
     parser.add_argument("--film", default="", help="Options of the kit's capture.")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--json", type=Path)
-    given = parser.parse_args()
-    kit = load(given.kit)
+    args = parser.parse_args()
+    kit = load(args.kit)
     rows: list[dict[str, Any]] = []
-    with served(given.workers) as (client, folder):
-        for case in given.case or CASES:
+    with served(args.workers) as (client, folder):
+        for case in args.case or CASES:
             found = []
-            for scene in sorted(given.scenes.glob("*.npz")):
-                row = measure(kit, scene, CASES[case], shlex.split(given.film), client, folder)
+            for scene in sorted(args.scenes.glob("*.npz")):
+                row = measure(kit, scene, CASES[case], shlex.split(args.film), client, folder)
                 found.append({"case": case, **row})
                 if not rows and len(found) == 1:
                     print("  ".join(f"{name:>8}" for name in found[0]))
@@ -124,8 +124,8 @@ def main() -> None:
                 name: round(float(np.mean([row[name] for row in found])), 2) for name in list(found[0])[4:]
             }
             show({"case": case, "scene": "mean", "frames": "", "pixels": "", **means})
-    if given.json:
-        given.json.write_text(json.dumps(rows, indent=2))
+    if args.json:
+        args.json.write_text(json.dumps(rows, indent=2))
 
 
 if __name__ == "__main__":

@@ -159,14 +159,14 @@ def rival(solve: Solve, levels: str) -> Recover:
         for i, level in enumerate(used):
             if i > 0:
                 rows = rows.split(used[i - 1], level, 0.02, reach=0)
-            most = level.patterns.size // (5 if level is used[-1] else 1)
+            limit = level.patterns.size // (5 if level is used[-1] else 1)
             matrix = 2 * level.light[0].T.astype(np.float64) - 1
             for (p, c), row in np.ndenumerate(index):
                 own = slice(rows.begin[row], rows.begin[row + 1])
                 sigma = float(np.sqrt(measured.variance[p, c, level.patterns].mean()))
                 if rows.cell[own].size and np.isfinite(sigma):
                     target = measured.value[p, c, level.patterns].astype(np.float64)
-                    rows.weight[own] = np.maximum(solve(matrix[:, rows.cell[own]], target, sigma, most), 0)
+                    rows.weight[own] = np.maximum(solve(matrix[:, rows.cell[own]], target, sigma, limit), 0)
         return rows.transport(used[-1], index)
 
     return recover
@@ -178,13 +178,13 @@ def _with_sum(matrix: NDArray[np.float64], target: NDArray[np.float64]) -> tuple
 
 
 def pursuit(
-    matrix: NDArray[np.float64], target: NDArray[np.float64], sigma: float, most: int
+    matrix: NDArray[np.float64], target: NDArray[np.float64], sigma: float, limit: int
 ) -> NDArray[np.float64]:
     m = len(target)
     matrix, target = _with_sum(matrix, target)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # it warns when it stops because of linear dependence
-        path = orthogonal_mp(matrix, target, n_nonzero_coefs=min(most, matrix.shape[1]), return_path=True)
+        path = orthogonal_mp(matrix, target, n_nonzero_coefs=min(limit, matrix.shape[1]), return_path=True)
     path = path.reshape(matrix.shape[1], -1)
     left = ((target[:, None] - matrix @ path) ** 2).sum(axis=0)
     quiet = np.flatnonzero(left <= m * sigma**2)
@@ -193,7 +193,7 @@ def pursuit(
 
 
 def lasso(
-    matrix: NDArray[np.float64], target: NDArray[np.float64], sigma: float, most: int
+    matrix: NDArray[np.float64], target: NDArray[np.float64], sigma: float, limit: int
 ) -> NDArray[np.float64]:
     m, s = matrix.shape
     model = Lasso(
@@ -206,7 +206,7 @@ def lasso(
 
 
 def least_squares(
-    matrix: NDArray[np.float64], target: NDArray[np.float64], sigma: float, most: int
+    matrix: NDArray[np.float64], target: NDArray[np.float64], sigma: float, limit: int
 ) -> NDArray[np.float64]:
     answer: NDArray[np.float64] = nnls(*_with_sum(matrix, target), maxiter=20 * matrix.shape[1])[0]
     return answer
@@ -327,12 +327,11 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("--pixels", type=int, default=150, help="pixels of each scene; table 2 takes a tenth")
     parser.add_argument("--json", type=Path)
-    given = parser.parse_args()
-    kit = load(given.kit)
-    scenes = {path.stem: sample(kit, path, given.pixels) for path in sorted(given.scenes.glob("*.npz"))}
+    args = parser.parse_args()
+    kit = load(args.kit)
+    scenes = {path.stem: sample(kit, path, args.pixels) for path in sorted(args.scenes.glob("*.npz"))}
     few = {
-        path.stem: sample(kit, path, max(given.pixels // 10, 1))
-        for path in sorted(given.scenes.glob("*.npz"))
+        path.stem: sample(kit, path, max(args.pixels // 10, 1)) for path in sorted(args.scenes.glob("*.npz"))
     }
     # Compile before the clock starts.
     take = film(kit, next(iter(few.values())), [COARSE, (*FINE, 20)])
@@ -346,8 +345,8 @@ def main() -> None:
     ):
         tables[name] = run(kit, of)
         show(title, tables[name])
-    if given.json:
-        given.json.write_text(json.dumps(tables, indent=2))
+    if args.json:
+        args.json.write_text(json.dumps(tables, indent=2))
 
 
 if __name__ == "__main__":

@@ -98,18 +98,18 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--pixels", type=int, default=max(PIXELS))
-    given = parser.parse_args()
-    kit = load(given.kit)
-    paths = sorted(given.scenes.glob("*.npz"))
-    given.folder.mkdir(parents=True, exist_ok=True)
+    args = parser.parse_args()
+    kit = load(args.kit)
+    paths = sorted(args.scenes.glob("*.npz"))
+    args.folder.mkdir(parents=True, exist_ok=True)
     figures: dict[str, Any] = {"pixels": {}, "frames": {}, "confidence": {}}
 
     trust, axes = pyplot.subplots(1, len(paths), figsize=(4 * len(paths), 4), layout="constrained")
     for path, axis in zip(paths, np.atleast_1d(axes), strict=True):
-        filmed = Filmed(kit, sample(kit, path, given.pixels), preset("default"))
+        filmed = Filmed(kit, sample(kit, path, args.pixels), preset("default"))
         filmed.recover(1)  # compiles
-        figures["pixels"][path.stem] = {n: filmed.recover(n)[1] for n in PIXELS if n <= given.pixels}
-        found, _ = filmed.recover(given.pixels)
+        figures["pixels"][path.stem] = {n: filmed.recover(n)[1] for n in PIXELS if n <= args.pixels}
+        found, _ = filmed.recover(args.pixels)
         error = filmed.errors(found)
         share = np.arange(1, error.size + 1) / error.size
         held, best = (
@@ -128,9 +128,9 @@ def main() -> None:
         axis.set(title=f"{path.stem}: rank correlation {rank:.2f}", xlabel="share of pixels")
         axis.legend()
     np.atleast_1d(axes)[0].set_ylabel("share of squared error")
-    trust.savefig(given.folder / "confidence.png", dpi=100)
+    trust.savefig(args.folder / "confidence.png", dpi=100)
 
-    count = min(500, given.pixels)
+    count = min(500, args.pixels)
     for path in paths:
         of_scene = figures["frames"][path.stem] = {}
         scene = sample(kit, path, count)
@@ -147,8 +147,8 @@ def main() -> None:
         axis.legend()
     by_pixels.set_ylabel("seconds, 132 frames")
     by_frames.set_ylabel("seconds for 1,000 pixels")
-    speed.savefig(given.folder / "speed.png", dpi=100)
-    (given.folder / "plots.json").write_text(json.dumps(figures, indent=2))
+    speed.savefig(args.folder / "speed.png", dpi=100)
+    (args.folder / "plots.json").write_text(json.dumps(figures, indent=2))
     print(json.dumps(figures, indent=2))
 
 

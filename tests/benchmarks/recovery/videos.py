@@ -79,7 +79,7 @@ def measure(
 ) -> dict[str, Any]:
     """Film, upload, compare what was found, recover, score."""
     clip, capture_archive, truth = folder / "clip.mp4", folder / "clip.zip", kit.Scene.load(scene)
-    given = [
+    args = [
         "--bands",
         NESTED,
         "--fps",
@@ -90,7 +90,7 @@ def measure(
         str(case.jitter),
     ]
     with redirect_stdout(None):
-        kit.main(["video", str(scene), str(clip), *given, "--lead", str(LEAD), "--seed", str(SEED)])
+        kit.main(["video", str(scene), str(clip), *args, "--lead", str(LEAD), "--seed", str(SEED)])
     record = json.loads(clip.with_suffix(".json").read_text()) | {"mask": "mask.png"}
     with zipfile.ZipFile(capture_archive, "w") as archive:
         archive.writestr("capture.json", json.dumps(record))
@@ -138,23 +138,23 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--no-recovery", action="store_true", help="Ingest alone.")
     parser.add_argument("--json", type=Path)
-    given = parser.parse_args()
-    kit = load(given.kit)
+    args = parser.parse_args()
+    kit = load(args.kit)
     rows: list[dict[str, Any]] = []
-    with served(given.workers) as (client, folder):
-        for scene in sorted(given.scenes.glob("*.npz")):
-            if given.scene and scene.stem not in given.scene:
+    with served(args.workers) as (client, folder):
+        for scene in sorted(args.scenes.glob("*.npz")):
+            if args.scene and scene.stem not in args.scene:
                 continue
-            stills = None if given.no_recovery else filmed_as_stills(kit, scene, client, folder)
+            stills = None if args.no_recovery else filmed_as_stills(kit, scene, client, folder)
             for case in CASES:
-                if given.fps and case.fps not in given.fps:
+                if args.fps and case.fps not in args.fps:
                     continue
                 rows.append(measure(kit, scene, case, client, folder, stills))
                 if len(rows) == 1:
                     print("  ".join(f"{name:>8}" for name in rows[0]))
                 show(rows[-1])
-                if given.json:
-                    given.json.write_text(json.dumps(rows, indent=2))
+                if args.json:
+                    args.json.write_text(json.dumps(rows, indent=2))
 
 
 if __name__ == "__main__":

@@ -79,8 +79,8 @@ def _block() -> Block:
 
 
 def _acts(store: Objects, frames: np.ndarray, block: Block) -> list[tuple[str, Callable[[], object]]]:
-    given = {"memory": 2 * frames.nbytes, "attributes": {}, "mask": None, "images": ()}
-    create_stack(store, "c", frames.shape, frames.dtype, **given)
+    options = {"memory": 2 * frames.nbytes, "attributes": {}, "mask": None, "images": ()}
+    create_stack(store, "c", frames.shape, frames.dtype, **options)
     matte = stored_mattes.create(store, "m", height=HEIGHT, width=WIDTH, columns=128, rows=96)
     blocks = list(product(range(matte.block_rows), range(matte.block_columns)))
     return [

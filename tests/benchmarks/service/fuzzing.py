@@ -47,17 +47,17 @@ def main() -> int:
     parser.add_argument("--seed", type=int, help="this input alone")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--keep", type=Path, default=Path(tempfile.gettempdir(), "envmatte-fuzzing"))
-    asked = parser.parse_args()
-    chosen = [targets[name] for name in asked.target] or list(ALL)
-    if asked.seed is not None:
+    args = parser.parse_args()
+    chosen = [targets[name] for name in args.target] or list(ALL)
+    if args.seed is not None:
         for target in chosen:
             with tempfile.TemporaryDirectory() as folder:
-                target.run(target.input(asked.seed), Path(folder))
+                target.run(target.input(args.seed), Path(folder))
         return 0
     print("  ".join(f"{name:>10}" for name in COLUMNS), flush=True)
     reported = {}
     for target in chosen:
-        tally = campaign.run(target, asked.first, sys.maxsize, asked.keep, seconds=asked.seconds)
+        tally = campaign.run(target, args.first, sys.maxsize, args.keep, seconds=args.seconds)
         kinds = [tally.count(kind) for kind in ("crash", "hang", "error", "memory")]
         row = (
             *(
@@ -73,8 +73,8 @@ def main() -> int:
         for failure in tally.failures:
             print(failure, flush=True)
         reported[target.name] = asdict(tally)
-    if asked.json:
-        asked.json.write_text(json.dumps(reported, default=str, indent=1))
+    if args.json:
+        args.json.write_text(json.dumps(reported, default=str, indent=1))
     return int(any(tally["failures"] for tally in reported.values()))
 
 

@@ -57,10 +57,12 @@ def polled(url: str, path: str, pollers: int, seconds: float) -> dict[str, Any]:
         await asyncio.gather(*(poll(url, path, n / pollers, until, took) for n in range(pollers)))
 
     asyncio.run(all_of_them())
-    p50, p90, p99, most = np.percentile(took, [50, 90, 99, 100]) * 1e3
+    p50, p90, p99, longest = np.percentile(took, [50, 90, 99, 100]) * 1e3
     return {"requests": len(took)} | {
         name: round(float(value), 1)
-        for name, value in zip(("p50 ms", "p90 ms", "p99 ms", "max ms"), (p50, p90, p99, most), strict=True)
+        for name, value in zip(
+            ("p50 ms", "p90 ms", "p99 ms", "max ms"), (p50, p90, p99, longest), strict=True
+        )
     }
 
 
@@ -92,11 +94,11 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=30)
     parser.add_argument("--megapixels", type=float, default=2, help="Of the captures.")
     parser.add_argument("--json", type=Path)
-    given = parser.parse_args()
+    args = parser.parse_args()
     rows: list[dict[str, Any]] = []
 
     def measure(beside: str, path: str) -> None:
-        rows.append({"beside": beside} | polled(url, path, given.pollers, given.seconds))
+        rows.append({"beside": beside} | polled(url, path, args.pollers, args.seconds))
         show(rows[-1])
 
     with (
@@ -106,7 +108,7 @@ def main() -> None:
     ):
         small, large = Path(folder, "small.zip"), Path(folder, "large.zip")
         write_capture(glass_ball.glass_ball(160, 120, rays=9), nested_program(bands=BANDS, levels=5), small)
-        enlarge(small, large, given.megapixels)
+        enlarge(small, large, args.megapixels)
         capture = client.upload(large)
         client.wait(capture["job"])
         measure("nothing", f"/v1/jobs/{capture['job']}")
@@ -119,8 +121,8 @@ def main() -> None:
             time.sleep(1)
             measure("a recovery, and ingests", path)
         client.cancel(job["id"])
-    if given.json:
-        given.json.write_text(json.dumps(rows, indent=2))
+    if args.json:
+        args.json.write_text(json.dumps(rows, indent=2))
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ ZIP = {"Content-Type": "application/zip"}
 TUS = {"Tus-Resumable": "1.0.0"}
 CHUNK = TUS | {"Content-Type": "application/offset+octet-stream"}
 VIDEO = {"Content-Type": "video/mp4"}
-PASSING = (404, 409)
+ALWAYS_ALLOWED = (404, 409)
 """Statuses that are always allowed: the thing may have gone a moment ago."""
 
 
@@ -47,7 +47,7 @@ class Traffic:
         A URL for webhooks.
     folder : Path
         For files to send.
-    doings : sequence of callable
+    actions : sequence of callable
         Actions that each user repeats, called with the user.
     pause : float
         Mean number of seconds between two actions of a user.
@@ -64,7 +64,7 @@ class Traffic:
     """
 
     def __init__(
-        self, url: str, webhook: str, folder: Path, doings: "Sequence[Doing]", *, pause: float, seed: int
+        self, url: str, webhook: str, folder: Path, actions: "Sequence[Action]", *, pause: float, seed: int
     ) -> None:
         self.url, self.webhook, self.folder, self.pause = url, webhook, folder, pause
         self.done: Counter[str] = Counter()
@@ -72,7 +72,7 @@ class Traffic:
         self.gentle = False
         self.captures: deque[str] = deque(maxlen=12)
         self.mattes: deque[str] = deque(maxlen=12)
-        self.over = threading.Event()
+        self.stopped = threading.Event()
         target = io.BytesIO()
         program = nested_program(bands=((8, 6, 12), (16, 12, 8)), levels=3)
         write_capture(glass_ball.glass_ball(36, 24, rays=4), program, target, name="a ball")
@@ -86,8 +86,10 @@ class Traffic:
         )
         self.clip = clip(pictures(6), even(6))
         self._threads = [
-            threading.Thread(target=self._go_on, args=(User(self, f"{seed} {n}"), do), name=do.__name__)
-            for n, do in enumerate(doings)
+            threading.Thread(
+                target=self._repeat, args=(User(self, f"{seed} {n}"), action), name=action.__name__
+            )
+            for n, action in enumerate(actions)
         ]
 
     def __enter__(self) -> "Traffic":
@@ -96,17 +98,17 @@ class Traffic:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self.over.set()
+        self.stopped.set()
         for thread in self._threads:
             thread.join()
 
-    def _go_on(self, user: "User", do: "Doing") -> None:
+    def _repeat(self, user: "User", action: "Action") -> None:
         with user:
-            while not self.over.wait(user.random.uniform(0, 2 * self.pause)):
+            while not self.stopped.wait(user.random.uniform(0, 2 * self.pause)):
                 try:
-                    do(user)
+                    action(user)
                 except Exception as error:
-                    self.wrong.append(f"{do.__name__}: {error!r}")
+                    self.wrong.append(f"{action.__name__}: {error!r}")
 
 
 class User:
@@ -125,16 +127,16 @@ class User:
         self.http.close()
         self.client.__exit__(None, None, None)
 
-    def ask(self, what: str, method: str, path: str, *fine: int, **request: Any) -> httpx2.Response:
+    def ask(self, what: str, method: str, path: str, *expected: int, **request: Any) -> httpx2.Response:
         """Send a request, and record an unexpected response."""
         answer = self.http.request(method, path, **request)
-        self.note(what, answer, fine)
+        self.note(what, answer, expected)
         return answer
 
-    def note(self, what: str, answer: httpx2.Response, fine: Sequence[int] = ()) -> None:
+    def note(self, what: str, answer: httpx2.Response, expected: Sequence[int] = ()) -> None:
         """Record an action, and an unexpected response."""
         self.town.done[what] += 1
-        if answer.status_code not in (*(fine or (200, 201, 202, 204)), *PASSING):
+        if answer.status_code not in (*(expected or (200, 201, 202, 204)), *ALWAYS_ALLOWED):
             self.town.wrong.append(f"{what}: {answer.status_code} {answer.text[:300]}")
 
     def pick(self, found: Sequence[str]) -> str:
@@ -150,14 +152,14 @@ class User:
                 return found
             time.sleep(0.2)
 
-    def followed(self, job: str, most: int = 1000) -> None:
+    def followed(self, job: str, limit: int = 1000) -> None:
         """Follow a job's events to the end, or disconnect after some."""
         with self.http.stream("GET", f"/v1/jobs/{job}/events") as answer:
             if answer.status_code != 200:
                 answer.read()
             self.note("follow a job", answer)
             for n, _ in enumerate(answer.iter_lines()):
-                if n >= most:
+                if n >= limit:
                     return
 
     def break_off(self, what: str, method: str, path: str, headers: dict[str, str], body: bytes) -> None:
@@ -187,4 +189,4 @@ class User:
         return str(where.rsplit("/", 1)[1])
 
 
-Doing = Callable[[User], None]
+Action = Callable[[User], None]

@@ -271,9 +271,9 @@ def main() -> None:
         "--logs", type=Path, help="A folder for the processes' logs and data, to be looked at afterwards."
     )
     parser.add_argument("--json", type=Path)
-    given = parser.parse_args()
+    args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        found = soak(given.hours, given.minutes, given.logs or Path(folder), given.seed)
+        found = soak(args.hours, args.minutes, args.logs or Path(folder), args.seed)
     print("\n" + ", ".join(f"{what}: {number}" for what, number in found["done"].items()))
     print(f"webhooks delivered: {found['webhooks']}\n")
     print(f"{'':34}{'middle':>12}{'end':>12}{'error':>10}{'allowed':>10}")
@@ -282,8 +282,8 @@ def main() -> None:
         print(
             f"{name:34}{one['first']:12.1f}{one['last']:12.1f}{one['error']:10.1f}{one['allowed']:10.1f}{mark}"
         )
-    if given.json:
-        given.json.write_text(json.dumps(found, indent=2))
+    if args.json:
+        args.json.write_text(json.dumps(found, indent=2))
     print("\n".join(["", *found["said"]] if found["said"] else ["", "flat"]))
     sys.exit(bool(found["said"]))
 

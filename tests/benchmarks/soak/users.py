@@ -42,8 +42,8 @@ def film(user: User) -> None:
             for _ in range(random.randint(1, 2))
         ][-1].json()
     elif way == "pieces":
-        asked = {"upload": user.upload(town.capture_archive, filename="ball.zip"), "webhook": town.webhook}
-        made = user.ask("upload in pieces", "POST", "/v1/captures", json=asked).json()
+        body = {"upload": user.upload(town.capture_archive, filename="ball.zip"), "webhook": town.webhook}
+        made = user.ask("upload in pieces", "POST", "/v1/captures", json=body).json()
     else:
         file = town.folder / f"{random.random()}.zip"
         file.write_bytes(town.capture_archive)
@@ -53,9 +53,9 @@ def film(user: User) -> None:
     if random.random() < 0.5:
         user.ended(made["job"])
     extra = {"webhook": town.webhook} if random.random() < 0.5 else {}
-    asked = {"capture": made["id"], "options": random.choice(OPTIONS)} | extra
+    body = {"capture": made["id"], "options": random.choice(OPTIONS)} | extra
     answer = user.ask(
-        "recover", "POST", "/v1/jobs", json=asked, headers={"Idempotency-Key": f"{random.random()}"}
+        "recover", "POST", "/v1/jobs", json=body, headers={"Idempotency-Key": f"{random.random()}"}
     )
     if answer.status_code != 202:
         return
@@ -81,8 +81,8 @@ def composite(user: User) -> None:
     backdrop = random.choice(town.backdrops)
     kind = {"Accept": random.choice(("image/png", "image/jpeg", "image/x-exr"))}
 
-    def still(what: str, **wanted: Any) -> httpx2.Response:
-        return user.ask(what, "POST", f"{matte}/composite", params=wanted, content=backdrop, headers=kind)
+    def still(what: str, **params: Any) -> httpx2.Response:
+        return user.ask(what, "POST", f"{matte}/composite", params=params, content=backdrop, headers=kind)
 
     def again() -> None:
         tag = still("composite").headers.get("etag")
@@ -116,8 +116,10 @@ def composite(user: User) -> None:
             return
         if archive.status_code == 200:
             key = ZIP | {"Idempotency-Key": f"{random.random()}"}
-            come = user.ask("bring an archive", "POST", "/v1/mattes", content=archive.content, headers=key)
-            town.mattes.append(come.json()["id"])
+            imported = user.ask(
+                "bring an archive", "POST", "/v1/mattes", content=archive.content, headers=key
+            )
+            town.mattes.append(imported.json()["id"])
             user.ask("bring an archive again", "POST", "/v1/mattes", content=archive.content, headers=key)
 
     def look() -> None:
@@ -166,8 +168,8 @@ def change_mind(user: User) -> None:
         user.ask("cancel while it runs", "POST", f"/v1/jobs/{job}/cancel")
 
     def recover(options: dict[str, Any] | None = None) -> str:
-        asked = {"capture": user.pick(town.captures), "options": options or {}, "webhook": town.webhook}
-        return str(user.ask("recover", "POST", "/v1/jobs", json=asked).json().get("id", "none"))
+        body = {"capture": user.pick(town.captures), "options": options or {}, "webhook": town.webhook}
+        return str(user.ask("recover", "POST", "/v1/jobs", json=body).json().get("id", "none"))
 
     if town.gentle:  # a task that continues after it was cancelled takes its worker with it
         user.ended(recover())
@@ -224,8 +226,8 @@ def mistake(user: User) -> None:
     def cut() -> None:
         data = town.capture_archive[: random.randrange(len(town.capture_archive))]
         if random.random() < 0.5:
-            asked = {"upload": user.upload(data)}
-            user.ask("upload half a capture in pieces", "POST", "/v1/captures", 422, json=asked)
+            body = {"upload": user.upload(data)}
+            user.ask("upload half a capture in pieces", "POST", "/v1/captures", 422, json=body)
         else:
             user.ask("send half a capture", "POST", "/v1/captures", 422, content=data, headers=ZIP)
 
@@ -236,8 +238,8 @@ def mistake(user: User) -> None:
         user.ask("send a wrong piece", "PATCH", where, 460, headers=piece, content=b"12345")
 
     def options() -> None:
-        asked = {"capture": user.pick(town.captures), "options": {"speed": 11}}
-        user.ask("ask for a wrong option", "POST", "/v1/jobs", 422, json=asked)
+        body = {"capture": user.pick(town.captures), "options": {"speed": 11}}
+        user.ask("ask for a wrong option", "POST", "/v1/jobs", 422, json=body)
 
     def backdrop() -> None:
         path = f"/v1/mattes/{user.pick(town.mattes)}/composite"
@@ -279,13 +281,13 @@ def watch(user: User) -> None:
 
     def events() -> None:
         for job in user.ask("look around", "GET", "/v1/jobs?limit=3").json()["jobs"]:
-            user.followed(job["id"], most=random.randrange(4))
+            user.followed(job["id"], limit=random.randrange(4))
             user.ask("read a log", "GET", f"/v1/jobs/{job['id']}/log")
 
     def program() -> None:
         monitor = {"width": random.randrange(200, 400), "height": random.randrange(150, 300)}
-        asked = {"preset": "sketch", "monitor": monitor}
-        made = user.ask("make a program", "POST", "/v1/programs", json=asked).json()["id"]
+        body = {"preset": "sketch", "monitor": monitor}
+        made = user.ask("make a program", "POST", "/v1/programs", json=body).json()["id"]
         at = f"/v1/programs/{made}"
         shown = {"phase": "shown", "patterns_per_second": 2}
         user.ask("show a program", "PUT", f"{at}/showing", json=shown)

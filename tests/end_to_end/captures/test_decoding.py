@@ -16,7 +16,7 @@ import pytest
 from services.client import ServiceError
 from services.decoding.pool import SECONDS
 from tests.end_to_end.conftest import Service, serving
-from tests.end_to_end.mattes.test_composites import SENT, asked
+from tests.end_to_end.mattes.test_composites import SENT, post_composite
 from tests.end_to_end.problems import check_problem
 from tests.parts.waiting import until
 from tests.services.api.mattes.archives import archive
@@ -36,7 +36,7 @@ def held(service: Service, matte: str) -> Iterator[tuple[psutil.Process, "Future
     for one in decoders(service.process):
         one.kill()
     until(lambda: not decoders(service.process))
-    assert asked(service, matte).status_code == 200
+    assert post_composite(service, matte).status_code == 200
     (one,) = decoders(service.process)
     one.suspend()
     with ThreadPoolExecutor(2) as threads, httpx2.Client(base_url=service.url, timeout=4 * SECONDS) as http:
@@ -48,21 +48,21 @@ def held(service: Service, matte: str) -> Iterator[tuple[psutil.Process, "Future
 
 
 def test_killed_decoder_costs_one_request(service: Service, matte: str) -> None:
-    expected = asked(service, matte).content
+    expected = post_composite(service, matte).content
     with held(service, matte) as (one, answer):
         one.kill()
         problem = check_problem(answer.result(), 422, "bad-image")
     assert "SIGKILL" in problem["detail"]
-    assert asked(service, matte).content == expected
+    assert post_composite(service, matte).content == expected
 
 
 @pytest.mark.slow
 def test_hanging_decoder_is_killed_and_others_keep_serving(service: Service, matte: str) -> None:
-    expected = asked(service, matte).content
+    expected = post_composite(service, matte).content
     with held(service, matte) as (one, answer):
         meanwhile = 0
         while not answer.done():
-            assert asked(service, matte).content == expected
+            assert post_composite(service, matte).content == expected
             assert service.http.get("/healthz").status_code == 200
             meanwhile += 1
         problem = check_problem(answer.result(), 422, "bad-image")
@@ -81,7 +81,7 @@ def test_decoders_end_with_the_service(tmp_path: Path, end: str, environment: di
     with serving(tmp_path / "data", "--workers", "1", **environment) as service:
         sent = service.http.post("/v1/mattes", content=archive(tmp_path, 40, 30), headers=ZIP)
         matte = sent.json()["id"]
-        assert asked(service, matte).status_code == 200
+        assert post_composite(service, matte).status_code == 200
         assert decoders(service.process)
         tree = children(service.process)
         getattr(service.process, end)()
@@ -89,7 +89,7 @@ def test_decoders_end_with_the_service(tmp_path: Path, end: str, environment: di
         until(lambda: not running(tree))
 
 
-def taken_at_most(one: psutil.Process) -> int:
+def peak_memory(one: psutil.Process) -> int:
     """Peak of a process's resident memory, in bytes."""
     found = re.search(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{one.pid}/status").read_text())
     assert found is not None
@@ -110,7 +110,7 @@ def test_film_that_needs_too_much_memory_fails_only_its_job(
         matte = sent.json()["id"]
         service.client.wait(service.client.upload(capture_archive)["job"])
         (worker,) = workers(service.process)
-        before = taken_at_most(worker)
+        before = peak_memory(worker)
 
         uploaded = service.client.upload(bomb)
         with pytest.raises(ServiceError, match="an index that takes too much memory") as caught:
@@ -128,5 +128,5 @@ def test_film_that_needs_too_much_memory_fails_only_its_job(
             service.client.wait(job)
 
         assert workers(service.process) == [worker]
-        assert taken_at_most(worker) - before < 500 << 20
+        assert peak_memory(worker) - before < 500 << 20
         service.client.wait(service.client.upload(capture_archive)["job"])

@@ -53,22 +53,22 @@ def test_archive_restores_the_matte_in_another_service(
     imported = envmatte(elsewhere, "import", str(path))
     assert imported.returncode == 0, imported.stderr
     assert "import: 100%" in imported.stderr
-    there = imported.stdout.strip()
+    imported_id = imported.stdout.strip()
     store = Path("store/mattes")
-    assert digests(elsewhere.data / store / there) == digests(service.data / store / matte)
+    assert digests(elsewhere.data / store / imported_id) == digests(service.data / store / matte)
 
     backdrop = png(glass_ball.backdrop(160, 120), "srgb", "uint8")
-    assert elsewhere.client.composite(there, backdrop) == service.client.composite(matte, backdrop)
-    before, after = service.client.matte(matte), elsewhere.client.matte(there)
+    assert elsewhere.client.composite(imported_id, backdrop) == service.client.composite(matte, backdrop)
+    before, after = service.client.matte(matte), elsewhere.client.matte(imported_id)
     assert (after["state"], after["capture"], after["job"]) == ("ready", None, None)
     for name in ("width", "height", "monitor", "columns", "rows"):
         assert after[name] == before[name]
     assert after["options"].items() <= before["options"].items()
     assert after["id"] in [m["id"] for m in elsewhere.http.get("/v1/mattes").json()["mattes"]]
 
-    elsewhere.client.export(there, tmp_path / "again.zip")
+    elsewhere.client.export(imported_id, tmp_path / "again.zip")
     assert (tmp_path / "again.zip").read_bytes() == path.read_bytes()
-    assert elsewhere.http.delete(f"/v1/mattes/{there}").status_code == 204
+    assert elsewhere.http.delete(f"/v1/mattes/{imported_id}").status_code == 204
     assert elsewhere.stored() == set()
 
 
@@ -104,13 +104,13 @@ def test_false_archive_is_refused_and_leaves_nothing(
 ) -> None:
     with zipfile.ZipFile(archive) as file:
         files = {name: file.read(name) for name in file.namelist()}
-    lies = io.BytesIO()
-    with zipfile.ZipFile(lies, "w") as file:
+    damaged = io.BytesIO()
+    with zipfile.ZipFile(damaged, "w") as file:
         for name, data in files.items():
             file.writestr(name, data if name != "rho/c/0/0/0" else data[::-1])
     listed = elsewhere.http.get("/v1/mattes").json()
     for body, entry in (
-        (lies.getvalue(), "rho/c/0/0/0"),
+        (damaged.getvalue(), "rho/c/0/0/0"),
         (archive.read_bytes()[:-1000], None),
         (b"", None),
     ):
@@ -118,8 +118,8 @@ def test_false_archive_is_refused_and_leaves_nothing(
         assert check_problem(answer, 422, "bad-archive").get("entry") == entry
     answer = elsewhere.http.post("/v1/mattes", content=b"{}", headers={"Content-Type": "application/json"})
     check_problem(answer, 415, "wrong-media-type")
-    (tmp_path / "lies.zip").write_bytes(lies.getvalue())
-    refused = envmatte(elsewhere, "import", str(tmp_path / "lies.zip"))
+    (tmp_path / "damaged.zip").write_bytes(damaged.getvalue())
+    refused = envmatte(elsewhere, "import", str(tmp_path / "damaged.zip"))
     assert (refused.returncode, refused.stdout) == (1, "")
     assert "rho/c/0/0/0" in refused.stderr
     assert elsewhere.http.get("/v1/mattes").json() == listed
@@ -151,8 +151,8 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A matte whose archive has 22 MB, more than fits into the buffers of a connection."""
     folder = tmp_path_factory.mktemp("large")
     objects = Objects((folder / "store").as_uri())
-    given = {"monitor": [8, 6], "crosstalk": np.eye(3).tolist(), "options": {}}
-    matte = mattes.create(objects, "m", height=768, width=1024, columns=4, rows=3, **given)
+    attributes = {"monitor": [8, 6], "crosstalk": np.eye(3).tolist(), "options": {}}
+    matte = mattes.create(objects, "m", height=768, width=1024, columns=4, rows=3, **attributes)
     rng = np.random.default_rng(0)
     nowhere = np.zeros((64, 64), bool)
     count, cell = np.zeros((64, 64, 3), np.uint32), np.zeros(0, np.uint32)
@@ -166,15 +166,15 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_deleting_a_matte_ends_its_download(elsewhere: Service, large: Path, tmp_path: Path) -> None:
-    there = elsewhere.client.import_matte(large)["id"]
+    imported_id = elsewhere.client.import_matte(large)["id"]
     sent: list[bytes] = []
-    with elsewhere.http.stream("GET", f"/v1/mattes/{there}/archive") as answer:
-        assert elsewhere.http.delete(f"/v1/mattes/{there}").status_code == 204
+    with elsewhere.http.stream("GET", f"/v1/mattes/{imported_id}/archive") as answer:
+        assert elsewhere.http.delete(f"/v1/mattes/{imported_id}").status_code == 204
         with pytest.raises(httpx2.RemoteProtocolError):
             sent.extend(answer.iter_bytes())
     assert not zipfile.is_zipfile(io.BytesIO(b"".join(sent)))
-    with pytest.raises(ServiceError, match=there):
-        elsewhere.client.export(there, tmp_path / "matte.zip")
+    with pytest.raises(ServiceError, match=imported_id):
+        elsewhere.client.export(imported_id, tmp_path / "matte.zip")
     assert list(tmp_path.iterdir()) == []
     assert elsewhere.stored() == set()
 

@@ -55,8 +55,8 @@ def test_clip_becomes_a_video_with_its_timestamps(service: Service, matte: str) 
     assert np.sqrt(np.mean((made[20] - expected) ** 2)) < 12
 
     url, whole = done["video"], video.content
-    for asked, span in {"0-9": (0, 10), "100-": (100, None), "-7": (-7, None)}.items():
-        part = service.http.get(url, headers={"Range": f"bytes={asked}"})
+    for requested, span in {"0-9": (0, 10), "100-": (100, None), "-7": (-7, None)}.items():
+        part = service.http.get(url, headers={"Range": f"bytes={requested}"})
         assert (part.status_code, part.content) == (206, whole[slice(*span)])
     assert part.headers["content-range"] == f"bytes {len(whole) - 7}-{len(whole) - 1}/{len(whole)}"
     assert service.http.get(url, headers={"Range": f"bytes={len(whole)}-"}).status_code == 416

@@ -22,7 +22,7 @@ BACKDROP = np.random.default_rng(0).random((30, 40, 3), np.float32).repeat(4, ax
 SENT = png(BACKDROP, "srgb", np.uint8)
 
 
-def asked(
+def post_composite(
     service: Service, matte: str, body: bytes = SENT, accept: str = "image/png", **query
 ) -> httpx2.Response:
     return service.http.post(
@@ -36,38 +36,42 @@ def decoded(answer: httpx2.Response) -> np.ndarray:
 
 
 def test_png_jpeg_and_exr_show_the_same_picture(service: Service, matte: str) -> None:
-    exr = asked(service, matte, accept="image/x-exr")
+    exr = post_composite(service, matte, accept="image/x-exr")
     assert exr.headers["content-type"] == "image/x-exr"
     light = float_formats.decode(exr.content, memory=1 << 24)
-    shown = decoded(asked(service, matte))
+    shown = decoded(post_composite(service, matte))
     expected = integer_formats.to_integers(from_light(np.clip(light, 0, 1), "srgb"), np.dtype(np.uint8))
     assert np.abs(shown.astype(int) - expected).max() <= 1
     assert (shown == expected).mean() > 0.999
-    jpeg = asked(service, matte, accept="text/html, image/jpeg;q=0.9, image/png;q=0.1", quality=100)
+    jpeg = post_composite(service, matte, accept="text/html, image/jpeg;q=0.9, image/png;q=0.1", quality=100)
     assert jpeg.headers["content-type"] == "image/jpeg"
     assert np.abs(decoded(jpeg).astype(int) - shown).max() <= 6
-    assert len(asked(service, matte, accept="image/jpeg", quality=20).content) < len(jpeg.content) / 3
+    assert (
+        len(post_composite(service, matte, accept="image/jpeg", quality=20).content) < len(jpeg.content) / 3
+    )
 
 
 def test_exr_backdrop_gives_exr_composite(service: Service, matte: str) -> None:
     def seen(gain: float) -> np.ndarray:
         sent = float_formats.encode_exr({"RGB": BACKDROP * np.float32(gain)})
-        return float_formats.decode(asked(service, matte, sent, "image/x-exr").content, memory=1 << 24)
+        return float_formats.decode(
+            post_composite(service, matte, sent, "image/x-exr").content, memory=1 << 24
+        )
 
     dark, once, four = seen(0), seen(1), seen(4)
     assert four.max() > 2
     np.testing.assert_allclose(four - dark, 4 * (once - dark), atol=1e-4)
-    deep = decoded(asked(service, matte, float_formats.encode_exr({"RGB": BACKDROP})))
+    deep = decoded(post_composite(service, matte, float_formats.encode_exr({"RGB": BACKDROP})))
     assert deep.dtype == np.uint16
 
 
 def test_crop_and_preview(service: Service, matte: str) -> None:
-    whole = decoded(asked(service, matte))
-    crop = decoded(asked(service, matte, x=10, y=20, width=31, height=17))
+    whole = decoded(post_composite(service, matte))
+    crop = decoded(post_composite(service, matte, x=10, y=20, width=31, height=17))
     np.testing.assert_array_equal(crop, whole[20:37, 10:41])
-    np.testing.assert_array_equal(decoded(asked(service, matte, x=90, y=70)), whole[70:, 90:])
-    assert decoded(asked(service, matte, size=48)).shape == (36, 48, 3)
-    assert decoded(asked(service, matte, size=500)).shape == whole.shape
+    np.testing.assert_array_equal(decoded(post_composite(service, matte, x=90, y=70)), whole[70:, 90:])
+    assert decoded(post_composite(service, matte, size=48)).shape == (36, 48, 3)
+    assert decoded(post_composite(service, matte, size=500)).shape == whole.shape
 
 
 @pytest.mark.parametrize(
@@ -75,37 +79,37 @@ def test_crop_and_preview(service: Service, matte: str) -> None:
     [({"x": 96}, "x"), ({"y": 60, "height": 13}, "y"), ({"width": 97}, "x"), ({"x": 90, "width": 10}, "x")],
 )
 def test_crop_outside_is_refused(service: Service, matte: str, query: dict[str, int], field: str) -> None:
-    problem = check_problem(asked(service, matte, **query), 422, "bad-option")
+    problem = check_problem(post_composite(service, matte, **query), 422, "bad-option")
     assert problem["field"] == field
     assert "96 x 72" in problem["detail"]
 
 
 @pytest.mark.parametrize("query", [{"size": 0}, {"quality": 101}, {"scale": 0}, {"crop": 1}, {"x": -1}])
 def test_invalid_query_is_refused(service: Service, matte: str, query: dict[str, int]) -> None:
-    assert check_problem(asked(service, matte, **query), 422, "bad-request")["field"] in query
+    assert check_problem(post_composite(service, matte, **query), 422, "bad-request")["field"] in query
 
 
 def test_moved_backdrop(service: Service, matte: str) -> None:
     half = np.zeros_like(BACKDROP)
     half[:, 80:] = BACKDROP[:, :80]
-    moved = decoded(asked(service, matte, right=0.5)).astype(int)
-    expected = decoded(asked(service, matte, png(half, "srgb", np.uint8))).astype(int)
+    moved = decoded(post_composite(service, matte, right=0.5)).astype(int)
+    expected = decoded(post_composite(service, matte, png(half, "srgb", np.uint8))).astype(int)
     assert np.abs(moved - expected).mean() < 1.5
-    assert np.abs(moved - decoded(asked(service, matte))).mean() > 10
+    assert np.abs(moved - decoded(post_composite(service, matte))).mean() > 10
 
 
 def test_backdrop_at_another_depth(service: Service, matte: str) -> None:
-    still = decoded(asked(service, matte)).astype(int)
+    still = decoded(post_composite(service, matte)).astype(int)
     depths = {"distance": 3, "camera": 5}
-    same = decoded(asked(service, matte, depth=3, **depths)).astype(int)
+    same = decoded(post_composite(service, matte, depth=3, **depths)).astype(int)
     assert np.abs(same - still).mean() < 0.5
-    farther = decoded(asked(service, matte, depth=4, **depths)).astype(int)
+    farther = decoded(post_composite(service, matte, depth=4, **depths)).astype(int)
     assert np.abs(farther - still).mean() > 5
     for query in ({"depth": 3}, {"distance": 3}, {"depth": 3, "distance": 3, "other": matte}):
-        found = check_problem(asked(service, matte, **query), 422, "bad-request")
+        found = check_problem(post_composite(service, matte, **query), 422, "bad-request")
         assert "depth, distance and camera" in found["detail"]
     missing = {"depth": 3, "distance": 3, "other": "no-such-id", "other_distance": 4}
-    check_problem(asked(service, matte, **missing), 404, "not-found")
+    check_problem(post_composite(service, matte, **missing), 404, "not-found")
 
 
 def test_known_etag_is_not_computed_again(service: Service, matte: str) -> None:
@@ -118,9 +122,9 @@ def test_known_etag_is_not_computed_again(service: Service, matte: str) -> None:
     check_problem(known, 412, "not-needed")
     assert known.headers["etag"] == tag
     others = [
-        asked(service, matte, size=40),
-        asked(service, matte, png(BACKDROP[::-1], "srgb", np.uint8)),
-        asked(service, matte, accept="image/jpeg"),
+        post_composite(service, matte, size=40),
+        post_composite(service, matte, png(BACKDROP[::-1], "srgb", np.uint8)),
+        post_composite(service, matte, accept="image/jpeg"),
     ]
     assert len({tag, *(other.headers["etag"] for other in others)}) == 4
 
@@ -131,13 +135,15 @@ def test_command_line_gives_the_same_picture(service: Service, matte: str, tmp_p
         out = tmp_path / name
         command = ["composite", matte, str(tmp_path / "backdrop.png"), "-o", str(out)]
         envmatte(service, *command)
-        assert out.read_bytes() == asked(service, matte, accept=kind).content
+        assert out.read_bytes() == post_composite(service, matte, accept=kind).content
 
 
 def test_simultaneous_requests_get_the_same_picture(service: Service, matte: str) -> None:
-    expected = asked(service, matte, accept="image/jpeg").content
+    expected = post_composite(service, matte, accept="image/jpeg").content
     with ThreadPoolExecutor(16) as threads:
-        answers = list(threads.map(lambda _: asked(service, matte, accept="image/jpeg").content, range(64)))
+        answers = list(
+            threads.map(lambda _: post_composite(service, matte, accept="image/jpeg").content, range(64))
+        )
     assert set(answers) == {expected}
 
 
@@ -147,7 +153,7 @@ def test_unfinished_matte_is_composited_as_far_as_recovered(service: Service, ca
     pictures: list[np.ndarray] = []
 
     def look(found: dict) -> None:
-        answer = asked(service, job["matte"])
+        answer = post_composite(service, job["matte"])
         if answer.status_code == 409:
             assert "nothing of it is there yet" in answer.json()["detail"]
             return
@@ -159,38 +165,40 @@ def test_unfinished_matte_is_composited_as_far_as_recovered(service: Service, ca
         )
 
     service.client.wait(job["id"], progress=look, poll=0.05)
-    final = decoded(asked(service, job["matte"]))
+    final = decoded(post_composite(service, job["matte"]))
     assert shares == sorted(shares)
     assert any(0 < share < 1 for share in shares), shares
     for share, picture in zip(shares, pictures, strict=True):
         if share < 1:
-            there = picture[..., 3] > 0
-            tiles = [there[y : y + 16, x : x + 16].any() for y in range(0, 72, 16) for x in range(0, 96, 16)]
+            recovered = picture[..., 3] > 0
+            tiles = [
+                recovered[y : y + 16, x : x + 16].any() for y in range(0, 72, 16) for x in range(0, 96, 16)
+            ]
             assert sum(tiles) == round(share * len(tiles))  # the last row's tiles are lower
-            np.testing.assert_array_equal(picture[there][:, :3], final[there])
-    assert asked(service, job["matte"]).headers["envmatte-recovered"] == "1.0000"
+            np.testing.assert_array_equal(picture[recovered][:, :3], final[recovered])
+    assert post_composite(service, job["matte"]).headers["envmatte-recovered"] == "1.0000"
     assert service.http.delete(f"/v1/mattes/{job['matte']}").status_code == 204
 
 
 @pytest.mark.slow
 def test_matte_deleted_while_it_is_composited(service: Service, capture: str) -> None:
     matte = service.client.wait(service.client.recover(capture)["id"])["matte"]
-    expected = asked(service, matte).content
+    expected = post_composite(service, matte).content
     answers: list[httpx2.Response] = []
 
-    def ask() -> None:
+    def request() -> None:
         with httpx2.Client(base_url=service.url, timeout=60) as http:
             while not answers or answers[-1].status_code == 200:
                 answers.append(
                     http.post(f"/v1/mattes/{matte}/composite", content=SENT, headers={"Accept": "image/png"})
                 )
 
-    asker = threading.Thread(target=ask)
-    asker.start()
+    requester = threading.Thread(target=request)
+    requester.start()
     while len(answers) < 3:
         pass
     assert service.http.delete(f"/v1/mattes/{matte}").status_code == 204
-    asker.join()
+    requester.join()
     assert all(answer.content == expected for answer in answers[:-1])
     check_problem(answers[-1], 404, "not-found")
 
@@ -218,21 +226,21 @@ def saved(picture: Image.Image, kind: str, **options: object) -> bytes:
     ids=["cmyk", "palette", "alpha", "profile", "one pixel", "one column"],
 )
 def test_every_kind_of_picture_is_a_backdrop(service: Service, matte: str, body: bytes) -> None:
-    assert decoded(asked(service, matte, body)).shape == (72, 96, 3)
+    assert decoded(post_composite(service, matte, body)).shape == (72, 96, 3)
 
 
 def test_8_bit_backdrop_with_alpha_gives_8_bits(service: Service, matte: str) -> None:
     codes = (255 * BACKDROP).astype(np.uint8)
     glassy = np.concatenate([codes, np.full((*codes.shape[:2], 1), 100, np.uint8)], axis=2)
-    assert decoded(asked(service, matte, integer_formats.encode_png(glassy))).dtype == np.uint8
+    assert decoded(post_composite(service, matte, integer_formats.encode_png(glassy))).dtype == np.uint8
 
 
 def test_decompression_bomb_is_refused(service: Service, matte: str) -> None:
     bomb = saved(Image.new("1", (20_000, 20_000)), "PNG")
     assert len(bomb) < 1 << 20
-    problem = check_problem(asked(service, matte, bomb), 422, "bad-image")
+    problem = check_problem(post_composite(service, matte, bomb), 422, "bad-image")
     assert "too large" in problem["detail"] or "takes more" in problem["detail"]
-    cut = check_problem(asked(service, matte, SENT[: len(SENT) // 2]), 422, "bad-image")
+    cut = check_problem(post_composite(service, matte, SENT[: len(SENT) // 2]), 422, "bad-image")
     assert "cut off or damaged" in cut["detail"]
 
 
@@ -246,7 +254,11 @@ def test_requests_leak_nothing(service: Service, matte: str, requests: int) -> N
 
     def ask(count: int) -> None:
         with ThreadPoolExecutor(askers) as threads:
-            list(threads.map(lambda _: asked(service, matte, accept="image/jpeg", size=24), range(count)))
+            list(
+                threads.map(
+                    lambda _: post_composite(service, matte, accept="image/jpeg", size=24), range(count)
+                )
+            )
 
     def held() -> dict[int, np.ndarray]:
         """Memory in bytes, open files and threads of each process."""

@@ -40,18 +40,18 @@ def test_running_job_continues_in_the_restored_backup(
             assert made.returncode == 0, made.stderr
             assert "objects" in made.stdout
             assert "backup: 100%" in made.stderr
-            looked = envmatte("verify", "--data", str(data))
-            assert (looked.returncode, looked.stdout) == (0, "no damage found\n"), looked.stderr
-            assert "1 are being written, and were skipped" in looked.stderr
+            verified = envmatte("verify", "--data", str(data))
+            assert (verified.returncode, verified.stdout) == (0, "no damage found\n"), verified.stderr
+            assert "1 are being written, and were skipped" in verified.stderr
             refused = envmatte("restore", backup, "--data", str(data))
             assert (refused.returncode, "another envmatte serves" in refused.stderr) == (1, True)
         matte = first.client.wait(job["id"])["matte"]
         whole = digests(data / "store" / "mattes" / matte)
     with postgresql_server.database() as database:
         where = ("--data", str(tmp_path / "other"), "--database", database, "--store", s3)
-        came = envmatte("restore", backup, *where, "--json")
-        assert came.returncode == 0, came.stderr
-        assert json.loads(came.stdout)["objects"] > 20
+        restored = envmatte("restore", backup, *where, "--json")
+        assert restored.returncode == 0, restored.stderr
+        assert json.loads(restored.stdout)["objects"] > 20
         with serving(tmp_path / "other", "--workers", "1", "--database", database, "--store", s3) as second:
             assert tiles_done(second, job["id"]) >= 2
             ended = second.client.wait(job["id"])
@@ -62,9 +62,9 @@ def test_running_job_continues_in_the_restored_backup(
             data_of = bytearray(Objects(s3).read_raw(chunk))
             data_of[9] ^= 1
             Objects(s3).write_raw(chunk, iter([bytes(data_of)]))
-            looked = envmatte("verify", *where, "--json")
-            report = json.loads(looked.stdout)
-            assert (looked.returncode, report["read"]["unchecked"]) == (1, 0)
+            verified = envmatte("verify", *where, "--json")
+            report = json.loads(verified.stdout)
+            assert (verified.returncode, report["read"]["unchecked"]) == (1, 0)
             assert [(one["what"], one["object"]) for one in report["findings"]] == [("damaged", chunk)]
             problem = second.http.get(f"/v1/mattes/{matte}/layers/S.png")
             assert problem.status_code == 500
@@ -72,7 +72,7 @@ def test_running_job_continues_in_the_restored_backup(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "reason"),
     [
         (("backup", "ftp://x/y"), "give it as a folder, or as s3://BUCKET/PREFIX"),
         (("backup", "target", "--data", "none"), "there is no database"),
@@ -81,11 +81,11 @@ def test_running_job_continues_in_the_restored_backup(
     ],
 )
 def test_invalid_arguments_are_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], said: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], reason: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
     done = envmatte(*arguments, PYTHONPATH=str(Path(__file__).parents[3]))
     assert done.returncode in (1, 2)
-    assert said in done.stderr
+    assert reason in done.stderr
     assert done.stdout == ""
     assert not (tmp_path / "none").exists()

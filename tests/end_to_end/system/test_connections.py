@@ -29,11 +29,11 @@ def connected(service: Service, count: int = 1) -> Iterator[list[socket.socket]]
 
 def answer(connection: socket.socket) -> bytes:
     """Everything received until the other side closes."""
-    came = b""
+    received = b""
     with contextlib.suppress(ConnectionResetError):
         while part := connection.recv(1 << 16):
-            came += part
-    return came
+            received += part
+    return received
 
 
 @pytest.mark.slow
@@ -42,24 +42,24 @@ def test_thousands_of_idle_connections_are_served_around_and_closed(service: Ser
     count = min(10_000, hard - 1000)  # as many in this process as in the service's
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     process = psutil.Process(service.process.pid)
-    before, most = process.num_fds(), 0
+    before, peak = process.num_fds(), 0
     try:
         for _ in range(5):  # a busy machine may still be opening them when the first are closed
             with connected(service, count) as idle:
                 times = []
                 for _ in range(100):
-                    most = max(most, process.num_fds() - before)
+                    peak = max(peak, process.num_fds() - before)
                     start = time.perf_counter()
                     assert service.http.get("/healthz").status_code == 200
                     times.append(time.perf_counter() - start)
                 assert answer(idle[-1]) == b""
             until(lambda: process.num_fds() - before <= 50)
             slowest = 1e3 * statistics.quantiles(times, n=100)[98]
-            print(f"{most} of {count} idle connections held at once: {slowest:.1f} ms at p99")
-            if most > 0.95 * count:
+            print(f"{peak} of {count} idle connections held at once: {slowest:.1f} ms at p99")
+            if peak > 0.95 * count:
                 break
         else:
-            pytest.fail(f"of {count} connections {most} at most were held at once")
+            pytest.fail(f"of {count} connections {peak} at most were held at once")
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 

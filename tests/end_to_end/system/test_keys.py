@@ -149,8 +149,8 @@ def bearer(key: str | None) -> dict[str, str]:
     return {} if key is None else {"Authorization": f"Bearer {key}"}
 
 
-def command(data: Path, *given: str) -> subprocess.CompletedProcess[str]:
-    words = [sys.executable, "-m", "services", "keys", *given, "--data", str(data)]
+def command(data: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    words = [sys.executable, "-m", "services", "keys", *arguments, "--data", str(data)]
     environment = {name: value for name, value in os.environ.items() if name != "ENVMATTE_KEYS"}
     return subprocess.run(words, capture_output=True, text=True, timeout=120, env=environment)
 
@@ -171,8 +171,8 @@ def locked(capture_archive: Path, tmp_path_factory: pytest.TempPathFactory) -> I
         capture = alice.upload(capture_archive)
         alice.wait(capture["job"])
         job = alice.wait(alice.recover(capture["id"])["id"])
-        asked = {"preset": "quick", "monitor": {"width": 64, "height": 48}}
-        program = service.http.post("/v1/programs", json=asked, headers=bearer(made["write"])).json()["id"]
+        body = {"preset": "quick", "monitor": {"width": 64, "height": 48}}
+        program = service.http.post("/v1/programs", json=body, headers=bearer(made["write"])).json()["id"]
         create = TUS | {"Upload-Length": "9"} | bearer(made["write"])
         upload = service.http.post("/v1/uploads", headers=create).headers["location"].rsplit("/", 1)[1]
         ids = {"capture": capture["id"], "job": job["id"], "matte": job["matte"], "program": program}
@@ -270,9 +270,9 @@ def test_the_cluster_and_the_metrics_need_a_key(locked: Locked, capture_archive:
 
 def test_a_program_needs_a_key_except_for_its_page(locked: Locked) -> None:
     http, key = locked.service.http, bearer(CONFIGURED[0])
-    asked = {"preset": "sketch", "monitor": {"width": 320, "height": 240}}
-    check_problem(http.post("/v1/programs", json=asked), 401, "unauthorized")
-    url = http.post("/v1/programs", json=asked, headers=key).headers["location"]
+    body = {"preset": "sketch", "monitor": {"width": 320, "height": 240}}
+    check_problem(http.post("/v1/programs", json=body), 401, "unauthorized")
+    url = http.post("/v1/programs", json=body, headers=key).headers["location"]
     for rest in ("", "/program.json", "/patterns.zip", "/patterns.mp4", "/patterns/0.png"):
         check_problem(http.get(url + rest), 401, "unauthorized")
         assert http.get(url + rest, headers=key).status_code == 200
@@ -297,10 +297,10 @@ def test_idempotency_keys_are_per_owner(locked: Locked, capture_archive: Path) -
 
 
 def test_programs_are_kept_per_owner(locked: Locked) -> None:
-    asked = {"preset": "sketch", "monitor": {"width": 64, "height": 48}}
+    body = {"preset": "sketch", "monitor": {"width": 64, "height": 48}}
     http = locked.service.http
     urls = {
-        http.post("/v1/programs", json=asked, headers=bearer(locked.keys[kind])).headers["location"]
+        http.post("/v1/programs", json=body, headers=bearer(locked.keys[kind])).headers["location"]
         for kind in ("write", "other")
     }
     (url,) = urls
@@ -346,10 +346,10 @@ def test_revoking_a_key_ends_its_running_requests(locked: Locked, capture_archiv
 
 def test_keys_command_reports_errors(tmp_path: Path) -> None:
     assert command(tmp_path, "make", "lab").stdout.startswith("envmatte_")
-    for words, said in (
+    for words, reason in (
         (("make", "lab"), "revoke it first"),
         (("make", "x" * 65), "1 to 64 characters"),
         (("revoke", "none"), "envmatte keys list"),
     ):
         refused = command(tmp_path, *words)
-        assert (refused.returncode, said in refused.stderr) == (1, True), refused.stderr
+        assert (refused.returncode, reason in refused.stderr) == (1, True), refused.stderr

@@ -70,9 +70,9 @@ def before_call(ctx, case, kwargs):
     label, path, method = case.operation.label, case.path_parameters or {}, case.method.upper()
     n = calls[label]
     calls[label] += 1
-    there = GIVEN.get(case.operation.path.split("/")[2]) if "id" in path else None
-    if there and n % 5 != 4 and not re.fullmatch("[0-9a-f]{20}", str(path["id"])):
-        path["id"] = there
+    existing = GIVEN.get(case.operation.path.split("/")[2]) if "id" in path else None
+    if existing and n % 5 != 4 and not re.fullmatch("[0-9a-f]{20}", str(path["id"])):
+        path["id"] = existing
     if method == "DELETE" and path.get("id") in GIVEN.values():
         path["id"] = "gone"
     if n % 2 == 0 and label.startswith(method):
@@ -106,9 +106,9 @@ def things_of(service: Service, capture_archive: Path, folder: Path) -> dict[str
     made = service.client.upload(capture_archive)
     service.client.wait(made["job"])
     job = service.client.wait(service.client.recover(made["id"])["id"])
-    asked = {"preset": "quick", "monitor": {"width": 64, "height": 48}}
+    body = {"preset": "quick", "monitor": {"width": 64, "height": 48}}
     bearer = {"Authorization": f"Bearer {SECRET}"}
-    program = service.http.post("/v1/programs", json=asked, headers=bearer).json()
+    program = service.http.post("/v1/programs", json=body, headers=bearer).json()
     shutil.copy(capture_archive, folder / "capture.zip")
     service.client.export(job["matte"], folder / "matte.zip")
     (folder / "backdrop.png").write_bytes(png(np.full((9, 12, 3), 0.5), "srgb", np.uint8))

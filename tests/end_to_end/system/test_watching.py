@@ -54,12 +54,12 @@ def watched(capture_archive: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     ):
         uploaded = service.client.upload(capture_archive)
         service.client.wait(uploaded["job"])
-        asked = service.http.post(
+        recovered = service.http.post(
             "/v1/jobs", json={"capture": uploaded["id"]}, headers={"traceparent": CALLER}
         ).json()
-        service.client.wait(asked["id"])
+        service.client.wait(recovered["id"])
         composed = service.http.post(
-            f"/v1/mattes/{asked['matte']}/composite",
+            f"/v1/mattes/{recovered['matte']}/composite",
             content=clip(pictures(70), list(range(70))),
             headers={"Content-Type": "video/mp4", "traceparent": CALLER},
         ).json()
@@ -68,7 +68,9 @@ def watched(capture_archive: Path, tmp_path_factory: pytest.TempPathFactory) -> 
         with paused(service):
             cancelled = service.client.recover(uploaded["id"])["id"]
             service.client.cancel(cancelled)
-        yield Watched(service, collector, uploaded["job"], asked["id"], composed["id"], failing, cancelled)
+        yield Watched(
+            service, collector, uploaded["job"], recovered["id"], composed["id"], failing, cancelled
+        )
 
 
 def _without_frames(service: Service, capture: str) -> str:
@@ -114,8 +116,8 @@ def test_metrics_count_the_jobs(watched: Watched) -> None:
 
 
 def test_openmetrics_on_request(watched: Watched) -> None:
-    wanted = {"accept": "application/openmetrics-text; version=1.0.0"}
-    answer = watched.service.http.get("/metrics", headers=wanted)
+    headers = {"accept": "application/openmetrics-text; version=1.0.0"}
+    answer = watched.service.http.get("/metrics", headers=headers)
     assert answer.headers["content-type"].startswith("application/openmetrics-text")
     assert "envmatte_jobs" in {family.name for family in parse_openmetrics(answer.text)}
 

@@ -48,14 +48,14 @@ def test_from_a_capture_to_a_composite(service: Service, capture_archive: Path, 
 def test_refusal_has_exit_code_1(service: Service, tmp_path: Path) -> None:
     broken = tmp_path / "broken.zip"
     broken.write_bytes(b"no zip")
-    for arguments, said in (
+    for arguments, reason in (
         (["upload", str(broken)], "cut off"),
         (["recover", "no-such-capture"], "no-such-capture"),
         (["status", "no-such-job"], "no-such-job"),
     ):
         refused = envmatte(service, *arguments)
         assert (refused.returncode, refused.stdout) == (1, "")
-        assert said in refused.stderr
+        assert reason in refused.stderr
         assert "Traceback" not in refused.stderr
 
 
@@ -77,9 +77,9 @@ def test_interrupt_stops_waiting_but_not_the_job(service: Service, capture: str)
             time.sleep(0.01)
         assert waiting.stderr is not None
         assert "recovery: 0%" in waiting.stderr.readline()
-        code, said = interrupt(waiting)
+        code, stderr = interrupt(waiting)
     assert code == 130
-    assert "Interrupted" in said
+    assert "Interrupted" in stderr
     assert service.client.wait(job["id"])["state"] == "succeeded"
 
 
@@ -120,10 +120,10 @@ def test_patterns_of_a_preset_are_written(preset: str, tmp_path: Path) -> None:
 
 def test_every_preset_is_described_in_the_help() -> None:
     assert set(PRESETS) == set(presets.RECIPES)
-    said = patterns("--help").stdout
+    help_text = patterns("--help").stdout
     for name, text in PRESETS.items():
         assert text.startswith(f"{presets.preset(name).count} frames")
-        assert any(line.split(maxsplit=1) == [name, text] for line in said.splitlines())
+        assert any(line.split(maxsplit=1) == [name, text] for line in help_text.splitlines())
 
 
 def test_patterns_need_a_new_or_empty_folder(tmp_path: Path) -> None:
@@ -138,7 +138,7 @@ def test_patterns_need_a_new_or_empty_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "reason"),
     [
         (["best", "x"], "is not one of 'default'"),
         (["quick"], "OUT"),
@@ -147,11 +147,11 @@ def test_patterns_need_a_new_or_empty_folder(tmp_path: Path) -> None:
         (["quick", "x", "--monitor", "99999x960"], "less than or equal to 16384"),
     ],
 )
-def test_invalid_patterns_are_refused(arguments: list[str], said: str, tmp_path: Path) -> None:
+def test_invalid_patterns_are_refused(arguments: list[str], reason: str, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "services", "patterns", *arguments]
     refused = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert (refused.returncode, refused.stdout) == (2, "")
-    assert said in refused.stderr
+    assert reason in refused.stderr
     assert not list(tmp_path.iterdir())
 
 
@@ -181,7 +181,7 @@ def test_interrupted_patterns_leave_nothing(out: str, first: str, tmp_path: Path
     with running(command) as writing:
         assert writing.stderr is not None
         assert first in writing.stderr.readline()
-        code, said = interrupt(writing)
+        code, stderr = interrupt(writing)
     assert code == 130
-    assert "Interrupted" in said
+    assert "Interrupted" in stderr
     assert not list(tmp_path.iterdir())

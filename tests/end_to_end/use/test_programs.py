@@ -28,8 +28,8 @@ def grid(columns: int, rows: int, count: int) -> dict:
 
 @pytest.fixture(scope="module")
 def program(service: Service) -> dict:
-    asked = {"preset": "sketch", "monitor": {"width": 320, "height": 240}, "border": True}
-    answer = service.http.post("/v1/programs", json=asked)
+    request = {"preset": "sketch", "monitor": {"width": 320, "height": 240}, "border": True}
+    answer = service.http.post("/v1/programs", json=request)
     assert answer.status_code == 201, answer.text
     found: dict = answer.json()
     assert answer.headers["location"] == f"/v1/programs/{found['id']}"
@@ -58,9 +58,9 @@ def test_presets_are_listed(service: Service) -> None:
 
 
 def test_program_is_fitted_to_another_monitor(service: Service) -> None:
-    asked = {"program": program_json(SKETCH), "monitor": {"width": 640, "height": 480}}
+    request = {"program": program_json(SKETCH), "monitor": {"width": 640, "height": 480}}
     for border, size in ((False, (640, 480)), (True, (592, 432))):
-        found = service.http.post("/v1/programs", json=asked | {"border": border}).json()
+        found = service.http.post("/v1/programs", json=request | {"border": border}).json()
         assert (found["monitor"]["width"], found["monitor"]["height"]) == size
     small = service.http.post(
         "/v1/programs", json={"preset": "sketch", "monitor": {"width": 30, "height": 20}}
@@ -101,7 +101,7 @@ def test_video_equals_that_of_the_command_line(service: Service, program: dict, 
 
 
 @pytest.mark.parametrize(
-    ("body", "slug", "said"),
+    ("body", "slug", "reason"),
     [
         ({}, "bad-request", "either a preset or a program"),
         (
@@ -155,10 +155,12 @@ def test_video_equals_that_of_the_command_line(service: Service, program: dict, 
         ),
     ],
 )
-def test_program_that_cannot_be_shown_is_refused(service: Service, body: dict, slug: str, said: str) -> None:
+def test_program_that_cannot_be_shown_is_refused(
+    service: Service, body: dict, slug: str, reason: str
+) -> None:
     before = service.http.get("/v1/programs").json()
     problem = check_problem(service.http.post("/v1/programs", json=body), 422, slug)
-    assert said in problem["detail"]
+    assert reason in problem["detail"]
     assert service.http.get("/v1/programs").json() == before
 
 
@@ -169,13 +171,13 @@ def test_invalid_program_body_is_refused(service: Service) -> None:
 
 
 def test_deleted_program_is_gone_with_its_files(service: Service) -> None:
-    asked = {"preset": "sketch", "monitor": {"width": 200, "height": 150}}
-    url = service.http.post("/v1/programs", json=asked).headers["location"]
+    request = {"preset": "sketch", "monitor": {"width": 200, "height": 150}}
+    url = service.http.post("/v1/programs", json=request).headers["location"]
     assert service.http.delete(url).status_code == 204
     for rest in ("", "/program.json", "/patterns.zip", "/patterns.mp4", "/patterns/0.png"):
         check_problem(service.http.get(url + rest), 404, "not-found")
     check_problem(service.http.delete(url), 404, "not-found")
-    assert service.http.post("/v1/programs", json=asked).headers["location"] == url
+    assert service.http.post("/v1/programs", json=request).headers["location"] == url
 
 
 def test_the_display_has_the_monitor_inside(service: Service, program: dict) -> None:

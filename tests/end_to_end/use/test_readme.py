@@ -91,13 +91,13 @@ def free_port() -> int:
 def film(show: Path, target: Path) -> None:
     """What a camera of 160 x 120 pixels sees of a display that fills its picture, without glass and unclipped."""
     with av.open(str(show)) as source, av.open(str(target), "w") as out:
-        given = source.streams.video[0]
-        stream = out.add_stream("libx264", rate=given.average_rate, options={"crf": "12"})
+        source_stream = source.streams.video[0]
+        stream = out.add_stream("libx264", rate=source_stream.average_rate, options={"crf": "12"})
         stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
-        for n, frame in enumerate(source.decode(given)):
+        for n, frame in enumerate(source.decode(source_stream)):
             pixels = frame.to_ndarray(format="rgb24").reshape(120, 2, 160, 2, 3).mean(axis=(1, 3))
             seen = av.VideoFrame.from_ndarray((16 + 0.8 * pixels).astype(np.uint8), "rgb24")
-            seen.pts, seen.time_base = n, 1 / given.average_rate
+            seen.pts, seen.time_base = n, 1 / source_stream.average_rate
             out.mux(stream.encode(seen))
         out.mux(stream.encode(None))
 
