@@ -1,11 +1,11 @@
 #!/bin/bash
-# Workers of a cluster on SLURM, as an array of N jobs, of four cores each if nothing else is said:
+# Workers of a cluster on SLURM: an array of N jobs, by default of four cores each:
 #
 #   export ENVMATTE_CLUSTER=tls://HOST:8786 ENVMATTE_CERTS=/SHARED/certs   # and AWS_…, if the store is a bucket
 #   sbatch --array=1-N slurm.sh
 #
-# `envmatte` has to be in PATH. The scheduler and the services run where they may stay, and where the nodes reach them.
-# A job whose time is over queues up again, until `scancel`. What #SBATCH says, options of sbatch overrule.
+# `envmatte` must be in PATH. Run the scheduler and the services outside of SLURM, on machines that the nodes reach.
+# A job that reaches its time limit is requeued, until `scancel`. Options of sbatch override the #SBATCH lines.
 
 #SBATCH --job-name=envmatte
 #SBATCH --nodes=1
@@ -15,22 +15,22 @@
 #SBATCH --time=12:00:00
 #SBATCH --requeue
 #SBATCH --open-mode=append
-# A minute before the time is over, and to this shell alone:
+# Sent to this shell only, a minute before the time limit:
 #SBATCH --signal=B:USR1@60
 
 : "${ENVMATTE_CLUSTER:?name the scheduler, tls://HOST:PORT}" "${ENVMATTE_CERTS:?name the folder of certificates}"
 export ENVMATTE_WORKERS=$SLURM_CPUS_ON_NODE
-# SLURM counts in MiB. As MB it leaves 5 % to the process that watches over the workers.
+# SLURM counts in MiB. Taken as MB, the number leaves 5 % for the process that monitors the workers.
 memory=${SLURM_MEM_PER_NODE:-$((SLURM_MEM_PER_CPU * SLURM_CPUS_ON_NODE))}
 export ENVMATTE_WORKER_MEMORY=$((memory * 1000000 / SLURM_CPUS_ON_NODE))
 
 envmatte worker &
 worker=$! asked='' again=''
-trap 'asked=1; kill $worker' TERM          # scancel, or a job that goes first
-trap 'asked=1 again=1; kill $worker' USR1  # the time is over
+trap 'asked=1; kill $worker' TERM          # scancel, or preemption
+trap 'asked=1 again=1; kill $worker' USR1  # the time limit
 wait $worker
 code=$?
-if [ "$asked" ]; then  # a signal ends `wait`, and not the worker
+if [ "$asked" ]; then  # a signal ends `wait` but not the worker
   wait $worker
   code=$?
 fi
