@@ -71,10 +71,10 @@ def test_running_job_is_followed_across_a_reload(
         desk.reload()
         expect(desk.get_by_role("button", name="Cancel")).to_be_visible()
         expect(desk.get_by_role("progressbar")).to_be_visible()
-    asked: list[str] = []
-    desk.on("request", lambda request: asked.append(request.url) if request.url.endswith(job) else None)
+    requests: list[str] = []
+    desk.on("request", lambda request: requests.append(request.url) if request.url.endswith(job) else None)
     expect(desk.get_by_role("link", name="Open the matte")).to_be_visible(timeout=MINUTE)
-    assert asked == []  # events bring the state, without polling
+    assert requests == []  # events bring the state, without polling
 
 
 def test_running_job_shows_progress(desk: Page, service: Service, ready: tuple[str, str]) -> None:
@@ -94,10 +94,12 @@ def test_running_job_shows_progress(desk: Page, service: Service, ready: tuple[s
 
 
 def test_job_is_followed_again_after_sleep(desk: Page, service: Service, ready: tuple[str, str]) -> None:
-    asked: list[str | None] = []
+    requests: list[str | None] = []
     desk.on(
         "request",
-        lambda one: asked.append(one.headers.get("last-event-id")) if one.url.endswith("/events") else None,
+        lambda one: (
+            requests.append(one.headers.get("last-event-id")) if one.url.endswith("/events") else None
+        ),
     )
     read: list[str] = []
     desk.on("request", lambda one: read.append(one.url) if "/log?" in one.url else None)
@@ -109,11 +111,11 @@ def test_job_is_followed_again_after_sleep(desk: Page, service: Service, ready: 
         expect(desk.get_by_label("Progress").get_by_role("term")).not_to_have_count(0)
         while len(read) < 2:  # the log, for the known state and for the first event
             desk.wait_for_timeout(100)
-        assert asked == [None]
+        assert requests == [None]
         desk.clock.fast_forward("08:00:00")
-        while len(asked) == 1:
+        while len(requests) == 1:
             desk.wait_for_timeout(100)
-        assert asked[1]  # resumes after the last event received
+        assert requests[1]  # resumes after the last event received
     expect(desk.get_by_role("link", name="Open the matte")).to_be_visible(timeout=MINUTE)
 
 

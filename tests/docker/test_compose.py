@@ -1,4 +1,4 @@
-"""The image, and the cluster that compose.yaml makes of it; needs a Docker engine, and compose of either kind."""
+"""The image, and the cluster of compose.yaml; needs a Docker engine, and `docker compose` or `docker-compose`."""
 
 import os
 import shutil
@@ -27,7 +27,7 @@ KEY = "a-key-of-the-test"
 
 
 def run(*command: str, **environment: str) -> str:
-    """What a command prints; the test fails with what it says if it fails."""
+    """Run a command and return what it prints; if it fails, the test fails with its output."""
     done = subprocess.run(
         command, capture_output=True, text=True, timeout=600, env=os.environ | environment, check=False
     )
@@ -36,9 +36,9 @@ def run(*command: str, **environment: str) -> str:
 
 
 def compose_command() -> list[str]:
-    """How compose is called here, `docker compose` or `docker-compose`; the test is skipped if nothing can be run."""
+    """The command for compose, `docker compose` or `docker-compose`; skips the test if there is none, or no engine."""
     if shutil.which("docker") is None:
-        pytest.skip("there is no docker command")
+        pytest.skip("docker is not installed")
     if subprocess.run(["docker", "info"], capture_output=True, timeout=60).returncode:
         pytest.skip("no Docker engine answers")
     for command in (["docker", "compose"], ["docker-compose"]):
@@ -47,12 +47,12 @@ def compose_command() -> list[str]:
             and not subprocess.run([*command, "version"], capture_output=True).returncode
         ):
             return command
-    pytest.skip("there is no docker compose")
+    pytest.skip("docker compose is not installed")
 
 
 @dataclass
 class Cluster:
-    """What compose.yaml makes, with SQLite and a folder."""
+    """The cluster of compose.yaml, with SQLite and a folder."""
 
     command: list[str]
     environment: dict[str, str]
@@ -64,19 +64,19 @@ class Cluster:
         return run(*self.command, *files, "-p", self.project, *arguments, **self.environment)
 
     def containers(self, service: str = "", everything: bool = False) -> list[str]:
-        """Ids of those that run, or of everything there ever was."""
+        """Ids of the running containers, or of stopped ones too."""
         label = f"label=com.docker.compose.project={self.project}"
         ours = ["--filter", f"label=com.docker.compose.service={service}"] if service else []
         return run("docker", "ps", "-q", *(["-a"] if everything else []), "--filter", label, *ours).split()
 
 
-def inspected(container: str, what: str) -> str:
-    return run("docker", "inspect", "--format", what, container)
+def inspect(container: str, template: str) -> str:
+    return run("docker", "inspect", "--format", template, container)
 
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Cluster]:
-    """The cluster with two workers; nothing of it is left but the layers of the image, for the next build."""
+    """The cluster with two workers; afterwards only the layers of the image remain, for the next build."""
     name = f"envmatte-test-{uuid4().hex[:8]}"
     environment = {
         "ENVMATTE_IMAGE": name,
@@ -128,7 +128,7 @@ def composite(client: Client, matte: str) -> bytes:
     return client.composite(matte, integer_formats.encode_png(backdrop))
 
 
-def test_every_process_has_no_more_rights_than_it_needs(cluster: Cluster, client: Client) -> None:
+def test_containers_run_unprivileged_and_read_only(cluster: Cluster, client: Client) -> None:
     containers = cluster.containers()
     assert len(containers) == 5  # the API, the coordinator, the scheduler, two workers
     for container in containers:
@@ -142,23 +142,25 @@ def test_every_process_has_no_more_rights_than_it_needs(cluster: Cluster, client
         assert rights.splitlines() == ["700 10001", "600 10001"]
 
 
-def test_nothing_but_the_api_is_published(cluster: Cluster, client: Client) -> None:
+def test_only_the_api_is_published(cluster: Cluster, client: Client) -> None:
     published = [run("docker", "port", container) for container in cluster.containers()]
     assert sorted(published) == [*[""] * 4, f"8000/tcp -> {cluster.url.removeprefix('http://')}"]
     assert cluster.url.startswith("http://127.0.0.1:")
 
 
-def test_those_that_can_tell_are_healthy(cluster: Cluster, client: Client) -> None:
+def test_api_and_scheduler_become_healthy(cluster: Cluster, client: Client) -> None:
     for name in ("api", "scheduler"):
         (container,) = cluster.containers(name)
-        until(lambda id=container: inspected(id, "{{.State.Health.Status}}") == "healthy")
+        until(lambda id=container: inspect(id, "{{.State.Health.Status}}") == "healthy")
 
 
-def test_nobody_without_a_key_gets_in(cluster: Cluster, client: Client) -> None:
+def test_request_without_a_key_is_refused(cluster: Cluster, client: Client) -> None:
     assert httpx2.get(f"{cluster.url}/v1/captures").status_code == 401
 
 
-def test_a_job_outlives_what_works_on_it(cluster: Cluster, client: Client, capture: str) -> None:
+def test_job_survives_the_death_of_workers_and_coordinator(
+    cluster: Cluster, client: Client, capture: str
+) -> None:
     undisturbed = client.wait(client.recover(capture, tile=16)["id"])
     job = client.recover(capture, tile=16)["id"]
     until(lambda: client.job(job)["tiles"]["done"] >= 2)
@@ -166,7 +168,7 @@ def test_a_job_outlives_what_works_on_it(cluster: Cluster, client: Client, captu
     run("docker", "kill", killed)
     (coordinator,) = cluster.containers("coordinator")
     for container in (crashed, coordinator):
-        # The process below init, as if it had died by itself: docker takes what it killed itself for unwanted.
+        # Kill the process below init, as if it had crashed: docker does not restart a container that it killed itself.
         kill = "import os; os.kill(int(open('/proc/1/task/1/children').read().split()[0]), 9)"
         run("docker", "exec", container, "python", "-c", kill)
     assert client.job(job)["state"] == "running"
@@ -174,10 +176,10 @@ def test_a_job_outlives_what_works_on_it(cluster: Cluster, client: Client, captu
     assert ended["tiles"] == undisturbed["tiles"]
     assert composite(client, ended["matte"]) == composite(client, undisturbed["matte"])
     assert cluster.containers("worker") == [crashed]
-    assert [inspected(id, "{{.RestartCount}}") for id in (crashed, coordinator)] == ["1", "1"]
+    assert [inspect(id, "{{.RestartCount}}") for id in (crashed, coordinator)] == ["1", "1"]
 
 
-def test_all_of_them_end_when_asked(cluster: Cluster, client: Client) -> None:
+def test_stopped_containers_exit_with_0(cluster: Cluster, client: Client) -> None:
     containers = cluster.containers()
     run("docker", "stop", "-t", "60", *containers)
-    assert [inspected(id, "{{.State.ExitCode}}") for id in containers] == ["0"] * len(containers)
+    assert [inspect(id, "{{.State.ExitCode}}") for id in containers] == ["0"] * len(containers)

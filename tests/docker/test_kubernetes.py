@@ -1,4 +1,4 @@
-"""kubernetes.yaml, without a Kubernetes: its objects against the schemas of the API, its commands in real processes."""
+"""kubernetes.yaml without Kubernetes: its objects match the schemas of the API, its commands run as processes."""
 
 import re
 import subprocess
@@ -21,20 +21,20 @@ MANIFEST = Path(__file__).parents[2] / "docker" / "kubernetes.yaml"
 OLDEST = "1.25"
 TEXT = MANIFEST.read_text()
 OBJECTS: list[dict[str, Any]] = list(yaml.safe_load_all(TEXT))
-SECRETS = {  # by the commands at the head of the file
+SECRETS = {  # keys by secret, from the commands at the head of the file
     name: re.findall(r"--from-literal=(\w+)", rest)
     for name, rest in re.findall(r"create secret generic (\S+)((?:.*\\\n)*.*)", TEXT)
 }
 KEY = "a-key-of-the-test"
 
 
-def the(kind: str, name: str) -> dict[str, Any]:
+def object_of(kind: str, name: str) -> dict[str, Any]:
     (found,) = [one for one in OBJECTS if (one["kind"], one["metadata"]["name"]) == (kind, name)]
     return found
 
 
 def pod(name: str) -> dict[str, Any]:
-    spec: dict[str, Any] = the("Deployment", name)["spec"]["template"]["spec"]
+    spec: dict[str, Any] = object_of("Deployment", name)["spec"]["template"]["spec"]
     return spec
 
 
@@ -47,11 +47,11 @@ DEPLOYMENTS = [one["metadata"]["name"] for one in OBJECTS if one["kind"] == "Dep
 
 
 def environment(name: str) -> dict[str, str]:
-    """What a container finds in its environment, secrets by their names."""
+    """The environment of a container; secrets are empty."""
     found: dict[str, str] = {}
     for source in container(name)["envFrom"]:
         if "configMapRef" in source:
-            found |= the("ConfigMap", source["configMapRef"]["name"])["data"]
+            found |= object_of("ConfigMap", source["configMapRef"]["name"])["data"]
         else:
             found |= {variable: "" for variable in SECRETS[source["secretRef"]["name"]]}
     return found | {one["name"]: one["value"] for one in container(name).get("env", [])}
@@ -59,13 +59,13 @@ def environment(name: str) -> dict[str, str]:
 
 @pytest.mark.parametrize("version", [OLDEST, kubernetes_validate.latest_version()])
 @pytest.mark.parametrize("object", OBJECTS, ids=lambda one: f"{one['kind']}-{one['metadata']['name']}")
-def test_objects_are_what_the_api_takes(object: dict[str, Any], version: str) -> None:
+def test_objects_match_the_schemas_of_kubernetes(object: dict[str, Any], version: str) -> None:
     kubernetes_validate.validate(object, version, strict=True)
 
 
-def test_what_is_named_is_there() -> None:
+def test_every_name_refers_to_an_object() -> None:
     for name in DEPLOYMENTS:
-        deployment, spec = the("Deployment", name)["spec"], pod(name)
+        deployment, spec = object_of("Deployment", name)["spec"], pod(name)
         assert deployment["selector"]["matchLabels"] == deployment["template"]["metadata"]["labels"]
         volumes = {volume["name"]: volume for volume in spec["volumes"]}
         assert {mount["name"] for mount in container(name)["volumeMounts"]} == set(volumes)
@@ -75,12 +75,14 @@ def test_what_is_named_is_there() -> None:
         (served,) = [
             name
             for name in DEPLOYMENTS
-            if the("Deployment", name)["spec"]["selector"]["matchLabels"] == service["spec"]["selector"]
+            if object_of("Deployment", name)["spec"]["selector"]["matchLabels"] == service["spec"]["selector"]
         ]
         assert port["targetPort"] in [one["name"] for one in container(served)["ports"]]
-    scaled = the("HorizontalPodAutoscaler", "envmatte-worker")["spec"]["scaleTargetRef"]["name"]
-    assert "cpu" in container(scaled)["resources"]["requests"]  # which utilisation is a share of
-    assert "replicas" not in the("Deployment", scaled)["spec"]  # or every `kubectl apply` would set it
+    scaled = object_of("HorizontalPodAutoscaler", "envmatte-worker")["spec"]["scaleTargetRef"]["name"]
+    assert "cpu" in container(scaled)["resources"]["requests"]  # utilisation is relative to the request
+    assert (
+        "replicas" not in object_of("Deployment", scaled)["spec"]
+    )  # otherwise every `kubectl apply` would reset it
 
 
 def test_every_variable_is_a_setting() -> None:
@@ -88,13 +90,13 @@ def test_every_variable_is_a_setting() -> None:
     for name in DEPLOYMENTS:
         ours = {variable for variable in environment(name) if variable.startswith("ENVMATTE_")}
         assert ours <= known
-        # Else Kubernetes would make variables of the names of Services, ENVMATTE_PORT=tcp://… among them.
+        # Otherwise Kubernetes sets variables named after Services, such as ENVMATTE_PORT=tcp://…
         assert pod(name)["enableServiceLinks"] is False
 
 
-def test_addresses_and_ports_are_those_that_are_listened_on() -> None:
+def test_addresses_and_ports_match_the_processes() -> None:
     cluster = urlsplit(environment("envmatte-worker")["ENVMATTE_CLUSTER"])
-    (port,) = the("Service", str(cluster.hostname))["spec"]["ports"]
+    (port,) = object_of("Service", str(cluster.hostname))["spec"]["ports"]
     assert port["port"] == cluster.port
     shown = subprocess.run(
         [sys.executable, "-m", "services", "scheduler", "--help"], capture_output=True, text=True, check=True
@@ -105,7 +107,7 @@ def test_addresses_and_ports_are_those_that_are_listened_on() -> None:
     assert served["containerPort"] == Settings.model_fields["port"].default
 
 
-def test_pods_have_no_more_rights_than_they_need() -> None:
+def test_pods_run_unprivileged_and_get_only_their_secrets() -> None:
     for name in DEPLOYMENTS:
         spec = pod(name)
         assert spec["automountServiceAccountToken"] is False
@@ -120,19 +122,19 @@ def test_pods_have_no_more_rights_than_they_need() -> None:
     assert not set(SECRETS["envmatte-store"]) & set(environment("envmatte-scheduler"))
 
 
-def test_a_worker_is_ended_before_kubernetes_ends_its_pod() -> None:
+def test_worker_reaches_its_own_memory_limit_before_that_of_its_pod() -> None:
     worker = container("envmatte-worker")
     limit = int(worker["resources"]["limits"]["memory"].removesuffix("Gi")) << 30
     assert 0.95 * int(environment("envmatte-worker")["ENVMATTE_WORKER_MEMORY"]) < limit - (200 << 20)
 
 
 @pytest.mark.slow
-def test_its_commands_make_a_cluster_and_its_probes_find_it_well(tmp_path: Path) -> None:
+def test_commands_start_a_cluster_and_probes_pass(tmp_path: Path) -> None:
     certs = tmp_path / "certs"
     make(certs)
 
-    def here(name: str) -> dict[str, str]:
-        """The environment of a container, with what is here in place of what is there."""
+    def local_environment(name: str) -> dict[str, str]:
+        """The environment of a container, with addresses and folders of this machine."""
         local = {
             "ENVMATTE_CERTS": str(certs),
             "ENVMATTE_CLUSTER": cluster,
@@ -144,7 +146,9 @@ def test_its_commands_make_a_cluster_and_its_probes_find_it_well(tmp_path: Path)
 
     cluster = "tls://127.0.0.1:1"
     command = [*container("envmatte-scheduler")["args"], "--port", "0"]
-    with started(tmp_path / "scheduler.log", *command, **here("envmatte-scheduler")) as scheduler:
+    with started(
+        tmp_path / "scheduler.log", *command, **local_environment("envmatte-scheduler")
+    ) as scheduler:
         port = address(scheduler).rsplit(":", 1)[1]
         cluster = f"tls://127.0.0.1:{port}"
         probe = container("envmatte-scheduler")["livenessProbe"]["exec"]["command"]
@@ -153,9 +157,11 @@ def test_its_commands_make_a_cluster_and_its_probes_find_it_well(tmp_path: Path)
         assert "handshake" not in (tmp_path / "scheduler.log").read_text()
         serve = [*container("envmatte")["args"], "--port", "0"]
         with (
-            started(tmp_path / "api.log", *serve, **here("envmatte")) as api,
+            started(tmp_path / "api.log", *serve, **local_environment("envmatte")) as api,
             started(
-                tmp_path / "worker.log", *container("envmatte-worker")["args"], **here("envmatte-worker")
+                tmp_path / "worker.log",
+                *container("envmatte-worker")["args"],
+                **local_environment("envmatte-worker"),
             ),
         ):
             assert api.stdout is not None

@@ -1,4 +1,4 @@
-"""Workers as jobs of SLURM, by docker/slurm.sh; needs its daemons, and root, who alone may run them."""
+"""Workers as jobs of SLURM, started by docker/slurm.sh; needs the daemons of SLURM, and root to run them."""
 
 import os
 import shutil
@@ -50,12 +50,12 @@ PartitionName=all Nodes=ALL Default=YES State=UP
 
 @dataclass
 class Slurm:
-    """A SLURM of one machine, said to have four cores."""
+    """A SLURM of one machine, configured with four cores."""
 
     environment: dict[str, str]
 
     def __call__(self, *command: str, **environment: str) -> str:
-        """What a command of SLURM prints."""
+        """Run a command of SLURM and return what it prints."""
         done = subprocess.run(
             command, capture_output=True, text=True, timeout=60, env=self.environment | environment
         )
@@ -71,12 +71,12 @@ class Slurm:
 
 @pytest.fixture(scope="module")
 def slurm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Slurm]:
-    """SLURM with everything of it in a folder, and in processes that end with the tests."""
+    """SLURM with its files in a temporary folder and its daemons as child processes."""
     missing = [name for name in ("munged", "slurmctld", "slurmd", "sbatch") if shutil.which(name) is None]
     if missing:
         pytest.skip(f"there is no {', '.join(missing)}: install slurmctld, slurmd, slurm-client and munge")
     if os.getuid():
-        pytest.skip("the daemons of SLURM run jobs as other users: they have to be root")
+        pytest.skip("the daemons of SLURM run jobs as other users: they must run as root")
     folder, host = tmp_path_factory.mktemp("slurm"), socket.gethostname().partition(".")[0]
     for name in ("munge", "state", "spool", "tmp"):
         (folder / name).mkdir()
@@ -119,7 +119,7 @@ def slurm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Slurm]:
 
 @pytest.fixture(scope="module")
 def service(slurm: Slurm, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    """A service whose scheduler awaits the workers; the variables for `sbatch` are in the environment of SLURM's."""
+    """A service whose scheduler waits for workers; `slurm.environment` gets the variables for `sbatch`."""
     folder = tmp_path_factory.mktemp("cluster")
     certs = folder / "certs"
     make(certs)
@@ -139,7 +139,7 @@ def recovered(client: Client, capture: str) -> dict[str, object]:
     return client.wait(client.recover(capture, tile=16)["id"])
 
 
-def test_a_job_outlives_workers_that_are_cancelled(slurm: Slurm, service: Service, tmp_path: Path) -> None:
+def test_job_survives_cancelled_workers(slurm: Slurm, service: Service, tmp_path: Path) -> None:
     array = slurm.submit("--array=1-2", "--cpus-per-task=1")
     until(lambda: len(workers(service)) == 2)
     assert {one["memory_limit_bytes"] for one in workers(service)} == {900_000_000}
@@ -162,19 +162,19 @@ def test_a_job_outlives_workers_that_are_cancelled(slurm: Slurm, service: Servic
     assert list(Path(slurm.environment["TMPDIR"]).iterdir()) == []
 
 
-def test_workers_end_and_queue_up_when_their_time_is_over(slurm: Slurm, service: Service) -> None:
+def test_workers_are_requeued_at_their_time_limit(slurm: Slurm, service: Service) -> None:
     job = slurm.submit("--array=1", "--cpus-per-task=2")
     until(lambda: len(workers(service)) == 2)
-    slurm("scancel", "--batch", "--signal=USR1", f"{job}_1")  # what SLURM sends then
+    slurm("scancel", "--batch", "--signal=USR1", f"{job}_1")  # as SLURM does at the time limit
     until(lambda: slurm.state(f"{job}_1") == "PENDING")
     shown = slurm("scontrol", "show", "job", f"{job}_1").split()
     assert {"Requeue=1", "Restarts=1"} <= set(shown)
     assert list(Path(slurm.environment["TMPDIR"]).iterdir()) == []
 
 
-def test_a_script_without_a_cluster_says_what_it_lacks(slurm: Slurm, tmp_path: Path) -> None:
-    said = tmp_path / "said"
-    bare = {"ENVMATTE_CLUSTER": "", "ENVMATTE_CERTS": "", "SBATCH_OUTPUT": str(said)}
+def test_script_without_a_cluster_names_the_missing_variable(slurm: Slurm, tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    bare = {"ENVMATTE_CLUSTER": "", "ENVMATTE_CERTS": "", "SBATCH_OUTPUT": str(log)}
     job = slurm("sbatch", "--parsable", "--mem-per-cpu=100", "--cpus-per-task=1", str(SCRIPT), **bare)
     until(lambda: slurm.state(job) == "FAILED")
-    assert "ENVMATTE_CLUSTER: name the scheduler" in said.read_text()
+    assert "ENVMATTE_CLUSTER: name the scheduler" in log.read_text()

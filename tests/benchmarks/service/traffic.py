@@ -33,7 +33,7 @@ TUS = {"Tus-Resumable": "1.0.0"}
 CHUNK = TUS | {"Content-Type": "application/offset+octet-stream"}
 VIDEO = {"Content-Type": "video/mp4"}
 ALWAYS_ALLOWED = (404, 409)
-"""Statuses that are always allowed: the thing may have gone a moment ago."""
+"""Statuses that are always allowed: a thing may have expired or been deleted a moment ago."""
 
 
 class Traffic:
@@ -58,9 +58,9 @@ class Traffic:
     done : Counter
         What was done, and how often.
     wrong : list of str
-        Answers that should not have been.
+        Unexpected responses.
     gentle : bool
-        Whether to leave the workers alive from now on: nobody cancels what runs.
+        Whether to leave the workers alive from now on: no running job is cancelled.
     """
 
     def __init__(
@@ -114,11 +114,11 @@ class Traffic:
 class User:
     """A user with a connection to the service."""
 
-    def __init__(self, town: Traffic, seed: str) -> None:
-        self.town = town
+    def __init__(self, traffic: Traffic, seed: str) -> None:
+        self.traffic = traffic
         self.random = random.Random(seed)
-        self.client = Client(town.url)
-        self.http = httpx2.Client(base_url=town.url, timeout=120)
+        self.client = Client(traffic.url)
+        self.http = httpx2.Client(base_url=traffic.url, timeout=120)
 
     def __enter__(self) -> "User":
         return self
@@ -135,9 +135,9 @@ class User:
 
     def note(self, what: str, answer: httpx2.Response, expected: Sequence[int] = ()) -> None:
         """Record an action, and an unexpected response."""
-        self.town.done[what] += 1
+        self.traffic.done[what] += 1
         if answer.status_code not in (*(expected or (200, 201, 202, 204)), *ALWAYS_ALLOWED):
-            self.town.wrong.append(f"{what}: {answer.status_code} {answer.text[:300]}")
+            self.traffic.wrong.append(f"{what}: {answer.status_code} {answer.text[:300]}")
 
     def pick(self, found: Sequence[str]) -> str:
         """One of those that existed recently."""
@@ -162,9 +162,9 @@ class User:
                 if n >= limit:
                     return
 
-    def break_off(self, what: str, method: str, path: str, headers: dict[str, str], body: bytes) -> None:
+    def disconnect(self, what: str, method: str, path: str, headers: dict[str, str], body: bytes) -> None:
         """Begin a request, then disconnect."""
-        where = urlsplit(self.town.url)
+        where = urlsplit(self.traffic.url)
         head = [
             f"{method} {path} HTTP/1.1",
             "Host: localhost",
@@ -173,7 +173,7 @@ class User:
         with socket.create_connection((where.hostname, where.port), timeout=60) as line:
             line.sendall("\r\n".join([*head, "", ""]).encode() + body)
             time.sleep(self.random.uniform(0, 0.2))
-        self.town.done[what] += 1
+        self.traffic.done[what] += 1
 
     def upload(self, data: bytes, **metadata: str) -> str:
         """Send bytes in pieces, with a pause between them; returns the upload's id."""

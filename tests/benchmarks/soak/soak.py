@@ -2,12 +2,12 @@
 
     python -m tests.benchmarks.soak.soak [--hours 24] [--minutes 8] [--json FILE]
 
-A scheduler, two workers and a service in their own processes, and many users (`users`) that uploads, recovers,
-composites, cancels, breaks off and errs. Captures, mattes, uploads and jobs are kept for two to three simulated hours,
-and workers are killed now and then. At the end of each hour memory, open files and threads of every process are looked
-at, the rows of every table, and what lies in the store. From the middle on none of it may grow; of workers, rows and
-the store the last quarter counts, when nobody is killed or cancelled. Then the town goes to bed, and all that expires
-has to be gone.
+A scheduler, two workers and a service in their own processes, and many users (`users`) that upload, recover,
+composite, cancel, disconnect and send invalid data. Captures, mattes, uploads and jobs are kept for two to three
+simulated hours, and workers are killed now and then. At the end of each hour the memory, open files and threads of
+every process are measured, and the rows of every table and the objects in the store are counted. From the middle of
+the day on, none of them may grow; for workers, rows and the store only the last quarter counts, in which no worker is
+killed and no job cancelled. Then the users stop, and everything that expires must be gone.
 """
 
 import argparse
@@ -51,8 +51,7 @@ ALLOWED = {
 }
 """Growth that is tolerated, by quantity.
 
-The store's threads, obstore's, are as many as its busiest moment took; rows and bytes follow the traffic, and are all
-gone in the end if none is left behind.
+obstore keeps as many threads as its busiest moment took. Rows and bytes follow the traffic; at the end all are gone.
 """
 STORE = "tokio-rt-worker"
 """Name of obstore's threads."""
@@ -120,7 +119,7 @@ def memory_of(name: str, process: psutil.Process) -> int:
     return int(process.memory_info().rss if name == "fork server" else process.memory_full_info().uss)
 
 
-def look(service: Running) -> Sample:
+def take_sample(service: Running) -> Sample:
     """Everything that may grow, as it is now."""
     sample: Sample = {}
     for name, processes in service.named():
@@ -151,28 +150,28 @@ def look(service: Running) -> Sample:
     return sample | {"store: objects": len(sizes) - 1, "store: bytes": sum(sizes)}
 
 
-def live(service: Running, town: Traffic, hours: int, hour: float) -> list[Sample]:
+def run_day(service: Running, traffic: Traffic, hours: int, hour: float) -> list[Sample]:
     """Run the day; takes a sample every hour."""
     samples: list[Sample] = []
     begun = time.monotonic()
     for n in range(1, hours + 1):
-        town.gentle = n > 2 * hours // 3
-        if n % 4 == 2 and not town.gentle:
+        traffic.gentle = n > 2 * hours // 3
+        if n % 4 == 2 and not traffic.gentle:
             killed = workers(service.workers)[:1]
             for one in killed:
                 one.kill()
-            town.done["kill a worker"] += len(killed)
+            traffic.done["kill a worker"] += len(killed)
         time.sleep(max(0.0, begun + n * hour - time.monotonic()))
-        samples.append(look(service))
-        show(n, samples[-1], town)
+        samples.append(take_sample(service))
+        show(n, samples[-1], traffic)
     return samples
 
 
-def left(service: Running, hour: float) -> Sample:
+def leftovers(service: Running, hour: float) -> Sample:
     """Data that should have expired but still exist."""
     end = time.monotonic() + max(KEPT.values()) * hour + PATIENCE
     while True:
-        sample = look(service)
+        sample = take_sample(service)
         rows = {
             f"{table.name}: rows": sample[f"{table.name}: rows"]
             for table in tables.metadata.sorted_tables
@@ -187,10 +186,11 @@ def left(service: Running, hour: float) -> Sample:
         time.sleep(1)
 
 
-def judged(samples: list[Sample]) -> dict[str, Trend]:
+def trends_of(samples: list[Sample]) -> dict[str, Trend]:
     """The trend of every quantity over the hours that count.
 
-    While nobody cancels there is more of everything, and workers live: those hours alone count for both.
+    While no job is cancelled and no worker killed there is more of everything: for workers and data only those hours
+    count.
     """
     trends = {}
     for name in samples[-1]:
@@ -204,7 +204,7 @@ def judged(samples: list[Sample]) -> dict[str, Trend]:
 COLUMNS = ("API", "scheduler", "nannies", "fork server", "worker")
 
 
-def show(hour: int, sample: Sample, town: Traffic) -> None:
+def show(hour: int, sample: Sample, traffic: Traffic) -> None:
     """Print a line of the table: of each process private MB, open files and threads."""
     if hour == 1:
         heads = [f"{name:>16}" for name in COLUMNS]
@@ -220,7 +220,7 @@ def show(hour: int, sample: Sample, town: Traffic) -> None:
     rows = sum(value for name, value in sample.items() if name.endswith(": rows"))
     kept = [sample[f"{name}: rows"] for name in ("captures", "mattes", "jobs")]
     print(
-        f"{hour:4}{sum(town.done.values()):8}",
+        f"{hour:4}{sum(traffic.done.values()):8}",
         *(f"{one:>16}" for one in held),
         f"{kept[0]:9}{kept[1]:7}{kept[2]:6}{rows:7}{sample['envmatte.db: bytes'] / 1e3:7.0f}"
         f"{sample['store: objects']:8}{sample['store: bytes'] / 1e3:7.0f}",
@@ -230,33 +230,33 @@ def show(hour: int, sample: Sample, town: Traffic) -> None:
 
 def verdict(trends: dict[str, Trend], remains: Sample, wrong: list[str]) -> list[str]:
     """The problems found, in words."""
-    said = [
+    problems = [
         f"{name} grows: from {one.first:.1f} to {one.last:.1f}, ± {one.error:.1f}; {one.allowed:.1f} is allowed"
         for name, one in trends.items()
         if one.grows
     ]
-    said += [f"{name}: {value:.0f} are left when all has expired" for name, value in remains.items()]
-    return said + [f"answered wrongly: {one}" for one in sorted(set(wrong))]
+    problems += [f"{name}: {value:.0f} are left when all has expired" for name, value in remains.items()]
+    return problems + [f"answered wrongly: {one}" for one in sorted(set(wrong))]
 
 
 def soak(hours: int, minutes: float, folder: Path, seed: int = 1) -> dict[str, Any]:
     """Run the day and report it."""
     hour = 60 * minutes / hours
     with receiver(lambda n: 500 if n % 8 == 5 else 200) as webhooks, running(folder, hour) as service:
-        town = Traffic(service.url, webhooks.url, folder, users.ALL, pause=hour / 20, seed=seed)
-        with town:
-            samples = live(service, town, hours, hour)
-        remains = left(service, hour)
-        samples.append(look(service))
-    trends = judged(samples[:-1])
+        traffic = Traffic(service.url, webhooks.url, folder, users.ALL, pause=hour / 20, seed=seed)
+        with traffic:
+            samples = run_day(service, traffic, hours, hour)
+        remains = leftovers(service, hour)
+        samples.append(take_sample(service))
+    trends = trends_of(samples[:-1])
     return {
         "hours": hours,
         "minutes": minutes,
-        "done": dict(sorted(town.done.items())),
+        "done": dict(sorted(traffic.done.items())),
         "webhooks": len(webhooks.received),
         "samples": samples,
         "trends": {name: asdict(one) | {"grows": one.grows} for name, one in trends.items()},
-        "said": verdict(trends, remains, town.wrong),
+        "problems": verdict(trends, remains, traffic.wrong),
     }
 
 
@@ -265,7 +265,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--hours", type=int, default=24)
-    parser.add_argument("--minutes", type=float, default=8.0, help="That they take.")
+    parser.add_argument("--minutes", type=float, default=8.0, help="Minutes that they take.")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument(
         "--logs", type=Path, help="A folder for the processes' logs and data, to be looked at afterwards."
@@ -284,8 +284,8 @@ def main() -> None:
         )
     if args.json:
         args.json.write_text(json.dumps(found, indent=2))
-    print("\n".join(["", *found["said"]] if found["said"] else ["", "flat"]))
-    sys.exit(bool(found["said"]))
+    print("\n".join(["", *found["problems"]] if found["problems"] else ["", "flat"]))
+    sys.exit(bool(found["problems"]))
 
 
 if __name__ == "__main__":

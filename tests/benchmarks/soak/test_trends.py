@@ -12,13 +12,13 @@ def noisy(growth: float, scatter: float, seed: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_growth_is_told_from_scatter(seed: int) -> None:
+def test_growth_is_distinguished_from_scatter(seed: int) -> None:
     assert trend(noisy(20, 1, seed), least=4, share=0.02).grows
     assert not trend(noisy(0, 5, seed), least=4, share=0.02).grows
     assert not trend(noisy(-20, 1, seed), least=4, share=0.02).grows
 
 
-def test_what_is_allowed_is_none() -> None:
+def test_allowed_growth_does_not_count() -> None:
     values = np.linspace(100, 106, 12)
     assert trend(values, least=4, share=0).grows
     assert not trend(values, least=7, share=0).grows
@@ -27,5 +27,5 @@ def test_what_is_allowed_is_none() -> None:
     assert (found.first, found.last, found.error) == pytest.approx((100, 106, 0))
 
 
-def test_a_constant_is_flat() -> None:
+def test_constant_series_does_not_grow() -> None:
     assert not trend([3, 3, 3, 3], least=0, share=0).grows

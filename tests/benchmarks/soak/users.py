@@ -1,4 +1,4 @@
-"""Actions of people and machines on a service, also careless ones; each function is one action."""
+"""Actions of people and machines on a service, including mistakes; each function is one action."""
 
 import io
 import time
@@ -31,28 +31,31 @@ FAILING = (broken.frame_that_is_no_image, broken.frame_that_is_a_bomb)
 
 def film(user: User) -> None:
     """Upload a capture in one of several ways, recover its matte, and perhaps delete them."""
-    random, town = user.random, user.town
+    random, traffic = user.random, user.traffic
     way = random.choice(("one body", "pieces", "client"))
     if way == "one body":
         key = {"Idempotency-Key": f"{random.random()}"}
         made = [
             user.ask(
-                "upload in one go", "POST", "/v1/captures", content=town.capture_archive, headers=ZIP | key
+                "upload in one go", "POST", "/v1/captures", content=traffic.capture_archive, headers=ZIP | key
             )
             for _ in range(random.randint(1, 2))
         ][-1].json()
     elif way == "pieces":
-        body = {"upload": user.upload(town.capture_archive, filename="ball.zip"), "webhook": town.webhook}
+        body = {
+            "upload": user.upload(traffic.capture_archive, filename="ball.zip"),
+            "webhook": traffic.webhook,
+        }
         made = user.ask("upload in pieces", "POST", "/v1/captures", json=body).json()
     else:
-        file = town.folder / f"{random.random()}.zip"
-        file.write_bytes(town.capture_archive)
+        file = traffic.folder / f"{random.random()}.zip"
+        file.write_bytes(traffic.capture_archive)
         made = user.client.upload(file, name="by the client").answer
         file.unlink()
-        town.done["upload by the client"] += 1
+        traffic.done["upload by the client"] += 1
     if random.random() < 0.5:
         user.ended(made["job"])
-    extra = {"webhook": town.webhook} if random.random() < 0.5 else {}
+    extra = {"webhook": traffic.webhook} if random.random() < 0.5 else {}
     body = {"capture": made["id"], "options": random.choice(OPTIONS)} | extra
     answer = user.ask(
         "recover", "POST", "/v1/jobs", json=body, headers={"Idempotency-Key": f"{random.random()}"}
@@ -60,11 +63,11 @@ def film(user: User) -> None:
     if answer.status_code != 202:
         return
     job = answer.json()
-    town.captures.append(made["id"])
+    traffic.captures.append(made["id"])
     if random.random() < 0.5:
         user.followed(job["id"])
     if user.ended(job["id"]).get("state") == "succeeded":
-        town.mattes.append(job["matte"])
+        traffic.mattes.append(job["matte"])
     for path, chance in (
         ("captures/" + made["id"], 0.2),
         ("mattes/" + job["matte"], 0.1),
@@ -76,9 +79,9 @@ def film(user: User) -> None:
 
 def composite(user: User) -> None:
     """Look at a matte and composite it."""
-    random, town = user.random, user.town
-    matte = f"/v1/mattes/{user.pick(town.mattes)}"
-    backdrop = random.choice(town.backdrops)
+    random, traffic = user.random, user.traffic
+    matte = f"/v1/mattes/{user.pick(traffic.mattes)}"
+    backdrop = random.choice(traffic.backdrops)
     kind = {"Accept": random.choice(("image/png", "image/jpeg", "image/x-exr"))}
 
     def still(what: str, **params: Any) -> httpx2.Response:
@@ -99,7 +102,9 @@ def composite(user: User) -> None:
 
     def move() -> None:
         video = VIDEO | {"Idempotency-Key": f"{random.random()}"}
-        answer = user.ask("composite a clip", "POST", f"{matte}/composite", content=town.clip, headers=video)
+        answer = user.ask(
+            "composite a clip", "POST", f"{matte}/composite", content=traffic.clip, headers=video
+        )
         if answer.status_code == 202:
             job = answer.json()["id"]
             if user.ended(job).get("state") == "succeeded":
@@ -112,14 +117,14 @@ def composite(user: User) -> None:
     def carry() -> None:
         try:
             archive = user.ask("fetch an archive", "GET", f"{matte}/archive")
-        except httpx2.RemoteProtocolError:  # the thing was deleted meanwhile
+        except httpx2.RemoteProtocolError:  # the matte was deleted meanwhile
             return
         if archive.status_code == 200:
             key = ZIP | {"Idempotency-Key": f"{random.random()}"}
             imported = user.ask(
                 "bring an archive", "POST", "/v1/mattes", content=archive.content, headers=key
             )
-            town.mattes.append(imported.json()["id"])
+            traffic.mattes.append(imported.json()["id"])
             user.ask("bring an archive again", "POST", "/v1/mattes", content=archive.content, headers=key)
 
     def look() -> None:
@@ -145,12 +150,12 @@ def composite(user: User) -> None:
 
 
 def change_mind(user: User) -> None:
-    """Cancel jobs: queued, running and ended ones."""
-    random, town = user.random, user.town
+    """Cancel jobs that are ingesting, queued or running."""
+    random, traffic = user.random, user.traffic
 
     def ingest() -> None:
         made = user.ask(
-            "upload in one go", "POST", "/v1/captures", content=town.capture_archive, headers=ZIP
+            "upload in one go", "POST", "/v1/captures", content=traffic.capture_archive, headers=ZIP
         ).json()
         user.ask("cancel an ingest", "POST", f"/v1/jobs/{made['job']}/cancel")
         user.ask("delete", "DELETE", f"/v1/captures/{made['id']}")
@@ -168,63 +173,67 @@ def change_mind(user: User) -> None:
         user.ask("cancel while it runs", "POST", f"/v1/jobs/{job}/cancel")
 
     def recover(options: dict[str, Any] | None = None) -> str:
-        body = {"capture": user.pick(town.captures), "options": options or {}, "webhook": town.webhook}
+        body = {"capture": user.pick(traffic.captures), "options": options or {}, "webhook": traffic.webhook}
         return str(user.ask("recover", "POST", "/v1/jobs", json=body).json().get("id", "none"))
 
-    if town.gentle:  # a task that continues after it was cancelled takes its worker with it
+    if traffic.gentle:  # a cancelled task that keeps running ends its worker
         user.ended(recover())
     else:
         random.choice((ingest, queued, running))()
 
 
-def break_off(user: User) -> None:
-    """Break connections, or abandon what was begun."""
-    random, town = user.random, user.town
-    half = town.capture_archive[: len(town.capture_archive) // 2]
-    size = {"Content-Length": str(len(town.capture_archive))}
+def disconnect(user: User) -> None:
+    """Break connections, and leave uploads unfinished."""
+    random, traffic = user.random, user.traffic
+    half = traffic.capture_archive[: len(traffic.capture_archive) // 2]
+    size = {"Content-Length": str(len(traffic.capture_archive))}
 
     def piece() -> None:
-        create = TUS | {"Upload-Length": str(len(town.capture_archive))}
+        create = TUS | {"Upload-Length": str(len(traffic.capture_archive))}
         where = user.ask("create an upload", "POST", "/v1/uploads", headers=create).headers["location"]
-        user.break_off("break off a piece", "PATCH", where, CHUNK | size | {"Upload-Offset": "0"}, half)
+        user.disconnect(
+            "disconnect during a piece", "PATCH", where, CHUNK | size | {"Upload-Offset": "0"}, half
+        )
         if random.random() < 0.3:
             user.ask("delete an upload", "DELETE", where, headers=TUS)
 
     def whole() -> None:
-        user.break_off("break off an upload", "POST", "/v1/captures", ZIP | size, half)
+        user.disconnect("disconnect during an upload", "POST", "/v1/captures", ZIP | size, half)
 
     def archive() -> None:
-        user.break_off("break off an archive", "POST", "/v1/mattes", ZIP | size, half)
+        user.disconnect("disconnect during an archive", "POST", "/v1/mattes", ZIP | size, half)
 
     def video() -> None:
-        path = f"/v1/mattes/{user.pick(town.mattes)}/composite"
-        user.break_off("break off a clip", "POST", path, VIDEO | {"Content-Length": "99999"}, town.clip[:900])
+        path = f"/v1/mattes/{user.pick(traffic.mattes)}/composite"
+        user.disconnect(
+            "disconnect during a clip", "POST", path, VIDEO | {"Content-Length": "99999"}, traffic.clip[:900]
+        )
 
     def head() -> None:
-        user.break_off("break off a head", "GET", "/v1/jobs", {"X-Half": "a"}, b"X-")
+        user.disconnect("disconnect during a head", "GET", "/v1/jobs", {"X-Half": "a"}, b"X-")
 
     def download() -> None:
-        path = f"/v1/mattes/{user.pick(town.mattes)}/archive"
-        user.break_off("break off a download", "GET", path, {}, b"")
+        path = f"/v1/mattes/{user.pick(traffic.mattes)}/archive"
+        user.disconnect("disconnect during a download", "GET", path, {}, b"")
 
     random.choice((piece, piece, whole, archive, video, head, download))()
 
 
 def mistake(user: User) -> None:
     """Send invalid data."""
-    random, town = user.random, user.town
+    random, traffic = user.random, user.traffic
 
     def capture() -> None:
-        data = broken.changed_archive(io.BytesIO(town.capture_archive), random.choice(REFUSED))
+        data = broken.changed_archive(io.BytesIO(traffic.capture_archive), random.choice(REFUSED))
         user.ask("send a wrong capture", "POST", "/v1/captures", 422, content=data, headers=ZIP)
 
     def frame() -> None:
-        data = broken.changed_archive(io.BytesIO(town.capture_archive), random.choice(FAILING))
+        data = broken.changed_archive(io.BytesIO(traffic.capture_archive), random.choice(FAILING))
         made = user.ask("send a wrong frame", "POST", "/v1/captures", content=data, headers=ZIP).json()
         user.ended(made["job"])
 
     def cut() -> None:
-        data = town.capture_archive[: random.randrange(len(town.capture_archive))]
+        data = traffic.capture_archive[: random.randrange(len(traffic.capture_archive))]
         if random.random() < 0.5:
             body = {"upload": user.upload(data)}
             user.ask("upload half a capture in pieces", "POST", "/v1/captures", 422, json=body)
@@ -238,15 +247,15 @@ def mistake(user: User) -> None:
         user.ask("send a wrong piece", "PATCH", where, 460, headers=piece, content=b"12345")
 
     def options() -> None:
-        body = {"capture": user.pick(town.captures), "options": {"speed": 11}}
+        body = {"capture": user.pick(traffic.captures), "options": {"speed": 11}}
         user.ask("ask for a wrong option", "POST", "/v1/jobs", 422, json=body)
 
     def backdrop() -> None:
-        path = f"/v1/mattes/{user.pick(town.mattes)}/composite"
+        path = f"/v1/mattes/{user.pick(traffic.mattes)}/composite"
         user.ask("send a wrong backdrop", "POST", path, 422, content=b"no image at all")
 
     def video() -> None:
-        path = f"/v1/mattes/{user.pick(town.mattes)}/composite"
+        path = f"/v1/mattes/{user.pick(traffic.mattes)}/composite"
         answer = user.ask("send a wrong clip", "POST", path, content=b"no clip" * 99, headers=VIDEO)
         if answer.status_code == 202:
             user.ended(answer.json()["id"])
@@ -265,7 +274,7 @@ def mistake(user: User) -> None:
 
 def watch(user: User) -> None:
     """Requests of a dashboard, a browser and Prometheus."""
-    random, town = user.random, user.town
+    random, traffic = user.random, user.traffic
 
     def pages() -> None:
         for path in ("captures", "jobs", "mattes", "programs", "limits", "cluster", "options", "network"):
@@ -275,7 +284,7 @@ def watch(user: User) -> None:
         user.ask("look around", "GET", "/readyz", 200, 503)  # while a killed worker is replaced
 
     def capture() -> None:
-        at = f"/v1/captures/{user.pick(town.captures)}"
+        at = f"/v1/captures/{user.pick(traffic.captures)}"
         for path in ("report", "contact-sheet.png", f"frames/{random.randrange(20)}.png"):
             user.ask("look at a capture", "GET", f"{at}/{path}")
 
@@ -300,5 +309,5 @@ def watch(user: User) -> None:
     random.choice((pages, capture, events, program))()
 
 
-ALL = (film, film, composite, composite, change_mind, break_off, mistake, watch)
+ALL = (film, film, composite, composite, change_mind, disconnect, mistake, watch)
 """All actions."""

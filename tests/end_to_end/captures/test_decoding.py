@@ -75,7 +75,7 @@ def test_hanging_decoder_is_killed_and_others_keep_serving(service: Service, mat
 @pytest.mark.parametrize(
     ("end", "environment"),
     [("terminate", {}), ("kill", {}), ("kill", {"ENVMATTE_COORDINATE": "false"})],
-    ids=["asked", "killed", "killed without workers"],
+    ids=["terminated", "killed", "killed without workers"],
 )
 def test_decoders_end_with_the_service(tmp_path: Path, end: str, environment: dict[str, str]) -> None:
     with serving(tmp_path / "data", "--workers", "1", **environment) as service:

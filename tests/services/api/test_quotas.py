@@ -189,7 +189,7 @@ def test_bytes_stored(serve: Serve, archive: bytes, tmp_path: Path, name: str, o
 
 @pytest.mark.parametrize(("name", "others"), [("owner_bytes", False), ("store_bytes", True)])
 def test_bytes_of_programs(serve: Serve, name: str, others: bool) -> None:
-    def asked(seed: int) -> dict[str, Any]:
+    def body(seed: int) -> dict[str, Any]:
         parts = [
             {"kind": "constant", "levels": [0, 1]},
             {"kind": "bernoulli", "columns": 2, "rows": 2, "count": 5, "seed": seed},
@@ -197,7 +197,7 @@ def test_bytes_of_programs(serve: Serve, name: str, others: bool) -> None:
         return {"program": {"monitor": {"width": 8, "height": 8}, "parts": parts}}
 
     bob = serve("bob")
-    kept = [bob.post("/v1/programs", json=asked(seed)).json()["program"] for seed in (1, 2)]
+    kept = [bob.post("/v1/programs", json=body(seed)).json()["program"] for seed in (1, 2)]
     sizes = [len(json.dumps(program)) for program in kept]
     assert used(bob) == {
         "owner_captures": 0,
@@ -207,19 +207,19 @@ def test_bytes_of_programs(serve: Serve, name: str, others: bool) -> None:
     }
     most = (4 if others else 2) * sizes[0]
     alice = serve(**{name: most})
-    first, second = (alice.post("/v1/programs", json=asked(seed)) for seed in (1, 2))
+    first, second = (alice.post("/v1/programs", json=body(seed)) for seed in (1, 2))
     assert (first.status_code, second.status_code) == (201, 201)
     assert used(alice)["owner_bytes"] == sum(sizes)
-    problem = alice.post("/v1/programs", json=asked(3)).json()
+    problem = alice.post("/v1/programs", json=body(3)).json()
     assert (problem["status"], problem["name"], problem["limit"]) == (507, name, most)
     assert problem["missing"] == sizes[0]
     assert create(alice, 1).status_code == 507
     assert [one["id"] for one in alice.get("/v1/programs").json()["programs"]] == [
         answer.json()["id"] for answer in (second, first)
     ]
-    assert alice.post("/v1/programs", json=asked(1)).json() == first.json()  # a repeat takes no room
+    assert alice.post("/v1/programs", json=body(1)).json() == first.json()  # a repeat takes no room
     assert alice.delete(f"/v1/programs/{first.json()['id']}").status_code == 204
-    assert alice.post("/v1/programs", json=asked(3)).status_code == 201
+    assert alice.post("/v1/programs", json=body(3)).status_code == 201
 
 
 def test_frames_of_a_capture(serve: Serve, archive: bytes, tmp_path: Path) -> None:

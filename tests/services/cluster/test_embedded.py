@@ -15,23 +15,23 @@ from tests.services.cluster.clusters import listening
 def test_workers_scale_with_tiles_and_stop_when_idle(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 0.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
-    asked: list[int] = []
-    scale = Scale(asked.append, 4)
+    targets: list[int] = []
+    scale = Scale(targets.append, 4)
     scale(0)
     now = 400.0
     scale(0)
     scale(0)
-    assert asked == [1]
+    assert targets == [1]
     scale(3)
     scale(2)
     scale(100)
-    assert asked == [1, 3, 4]
+    assert targets == [1, 3, 4]
     now = 600.0
     scale(0)
-    assert asked == [1, 3, 4]
+    assert targets == [1, 3, 4]
     now = 701.0
     scale(0)
-    assert asked == [1, 3, 4, 1]
+    assert targets == [1, 3, 4, 1]
 
 
 def test_the_embedded_cluster_listens_on_loopback_only(tmp_path: Path) -> None:

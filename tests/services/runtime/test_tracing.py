@@ -23,10 +23,10 @@ REQUEST = f"""
     import asyncio, sys
     from services.runtime import tracing
     tracing.start("service")
-    asked = []
+    traceparents = []
 
     async def app(scope, receive, send):
-        asked.append(tracing.current_traceparent())
+        traceparents.append(tracing.current_traceparent())
         await send({{"type": "http.response.start", "status": 201, "headers": []}})
 
     async def send(message): pass
@@ -65,14 +65,14 @@ def run(script: str, **environment: str) -> str:
 
 
 def test_opentelemetry_is_not_imported_without_an_endpoint() -> None:
-    script = REQUEST + "    print(asked, [name for name in sys.modules if 'opentelemetry' in name])"
+    script = REQUEST + "    print(traceparents, [name for name in sys.modules if 'opentelemetry' in name])"
     # The caller's trace is passed on all the same: workers may trace.
     assert run(script) == f"{[CALLER, *[None] * 6, CALLER, None]} []\n"
 
 
 def test_requests_that_make_jobs_are_spans_in_the_callers_trace() -> None:
     with collecting() as collector:
-        printed = run(REQUEST + "    print(*asked)", OTEL_EXPORTER_OTLP_ENDPOINT=collector.url).split()
+        printed = run(REQUEST + "    print(*traceparents)", OTEL_EXPORTER_OTLP_ENDPOINT=collector.url).split()
     first, *others, last = collector.spans
     names = ["/v1/jobs", "/v1/jobs", "/v1/captures", "/v1/jobs/{id}/retry", "/v1/mattes/{id}/composite"]
     assert [span.name for span in collector.spans] == [f"POST {name}" for name in names]
@@ -109,10 +109,10 @@ def test_a_retried_job_continues_in_the_trace_of_the_retry(tmp_path: Path) -> No
     with writing(engine) as c:
         mattes.add_imported(c, "m", {}, {})
         job = jobs.add(c, "composite", "", {}, "m", CALLER)
-    for asked in (again, None):  # a retry without a trace keeps the one before
+    for sent in (again, None):  # a retry without a trace keeps the one before
         with writing(engine) as c:
             jobs.end(c, job, "failed", {"detail": "", "status": 500})
-        headers = {} if asked is None else {"traceparent": asked}
+        headers = {} if sent is None else {"traceparent": sent}
         assert client.post(f"/v1/jobs/{job}/retry", headers=headers).status_code == 202
         with reading(engine) as c:
             assert jobs.get(c, job).trace == again

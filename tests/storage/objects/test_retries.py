@@ -71,7 +71,7 @@ def unreachable(
 def test_every_call_reports_unreachable_bucket(unreachable: str) -> None:
     objects = Objects(unreachable)
     array = np.zeros(3)
-    asked: list[Callable[[], object]] = [
+    requests: list[Callable[[], object]] = [
         objects.check_reachable,
         lambda: objects.read("a"),
         lambda: objects.put("a", b"1"),
@@ -87,9 +87,9 @@ def test_every_call_reports_unreachable_bucket(unreachable: str) -> None:
         lambda: zarr.create_array(objects.zarr, name="a", data=array),
         lambda: zarr.open_group(objects.zarr, path="a"),
     ]
-    for ask in asked:
+    for request in requests:
         with pytest.raises(Unavailable, match="try again"):
-            ask()
+            request()
 
 
 def test_bucket_that_disconnects_during_read(impatient: None, s3: str) -> None:

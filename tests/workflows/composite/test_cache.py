@@ -143,10 +143,10 @@ def test_a_matte_that_is_deleted_while_it_is_read_is_told_to_all(
 
     monkeypatch.setattr(Matte, "read", deleted)
     with ThreadPoolExecutor(4) as threads:
-        asked = [threads.submit(cache.strip, "m", 0, 0) for _ in range(4)]
+        strips = [threads.submit(cache.strip, "m", 0, 0) for _ in range(4)]
         time.sleep(0.1)
         gate.set()
-        for one in asked:
+        for one in strips:
             assert isinstance(one.exception(10), Corrupt)
 
 

@@ -27,7 +27,7 @@ def test_a_program_comes_from_a_preset_or_a_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "error", "said"),
+    ("text", "error", "reason"),
     [
         ("{", OptionError, "is not JSON"),
         ("[1]", ValidationError, "valid dictionary"),
@@ -36,11 +36,11 @@ def test_a_program_comes_from_a_preset_or_a_file(tmp_path: Path) -> None:
     ],
 )
 def test_a_file_without_a_program_is_refused(
-    text: str, error: type[Exception], said: str, tmp_path: Path
+    text: str, error: type[Exception], reason: str, tmp_path: Path
 ) -> None:
     file = tmp_path / "program.json"
     file.write_text(text)
-    with pytest.raises(error, match=said):
+    with pytest.raises(error, match=reason):
         load_program(str(file))
     with pytest.raises(OptionError, match=r"is not one of 'default'.* nor a file"):
         load_program(str(tmp_path))

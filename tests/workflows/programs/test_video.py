@@ -95,7 +95,7 @@ def test_a_file_that_is_there_is_kept(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("program", "rate", "said"),
+    ("program", "rate", "reason"),
     [
         (GREY, 0.0, "0.0 patterns a second"),
         (GREY, float("nan"), "nan patterns a second"),
@@ -109,9 +109,9 @@ def test_a_file_that_is_there_is_kept(name: str, tmp_path: Path) -> None:
     ids=["rate", "nan", "border", "patterns"],
 )
 def test_what_can_not_be_filmed_is_refused_and_leaves_nothing(
-    program: Program, rate: float, said: str, tmp_path: Path
+    program: Program, rate: float, reason: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(OptionError, match=said):
+    with pytest.raises(OptionError, match=reason):
         write_video(program, tmp_path / "new" / "film.mkv", rate, lambda done, of: None)
     assert not list(tmp_path.rglob("*.*"))
 

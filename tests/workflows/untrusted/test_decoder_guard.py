@@ -176,16 +176,16 @@ def fragmented(samples: int) -> bytes:
 
 @linux
 @pytest.mark.parametrize(
-    ("film", "said"),
+    ("film", "reason"),
     [
         (overstated(clip(pictures(9), even(9)), 40_000_000), "an index that takes too much memory"),
         (fragmented(4_000_000), "Invalid data found" if COUNTS_SAMPLES else "takes more than the 264 MB"),
     ],
     ids=["at once", "bit by bit"],
 )
-def test_a_film_of_some_kilobytes_does_not_take_gigabytes(film: bytes, said: str) -> None:
+def test_a_film_of_some_kilobytes_does_not_take_gigabytes(film: bytes, reason: str) -> None:
     assert len(film) < 20_000
     ran = subprocess.run([sys.executable, "-c", PEAK], input=film, stdout=subprocess.PIPE, check=True)
     grown, _, detail = ran.stdout.decode().partition(" ")
     assert int(grown) < 300
-    assert said in detail
+    assert reason in detail

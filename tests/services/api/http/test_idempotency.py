@@ -69,13 +69,13 @@ def test_repeat_after_deletion_is_not_found(engine: Engine) -> None:
 def test_concurrent_repeat_answers_with_quicker_one(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
     """As with PostgreSQL, where two transactions may both find the key unused."""
     first = idempotent(engine, "a", CALL, jobs.get, create)
-    real, asked = idempotency.find, []
+    real, keys = idempotency.find, []
 
     def blind_at_first(connection: Connection, key: str, call: str) -> str | None:
-        asked.append(key)
-        return None if len(asked) == 1 else real(connection, key, call)
+        keys.append(key)
+        return None if len(keys) == 1 else real(connection, key, call)
 
     monkeypatch.setattr(idempotency, "find", blind_at_first)
     assert idempotent(engine, "a", CALL, jobs.get, create).id == first.id
-    assert len(asked) == 2
+    assert len(keys) == 2
     assert count(engine) == 1
