@@ -20,6 +20,8 @@ from pathlib import Path
 from random import Random
 from typing import Any, NamedTuple
 
+from workflows.untrusted.limits import Limits
+
 ROOT = str(Path(__file__).parents[2])
 CPU_SECONDS, SECONDS = 10.0, 60.0
 """Limits of one execution, in processor time and in wall time: the machine may be busy."""
@@ -27,6 +29,8 @@ MEMORY = 128 << 20
 """Bytes by which one execution may grow its process: limits of parsers are a few megabytes here."""
 GUARDED = 384 << 20
 """The same for guarded decoders, which have room for large films however small the limits are."""
+LIMITS = Limits(unpacked=1 << 22, memory=1 << 22, frames=20_000, pixels=1 << 20)
+"""Limits of the parsers."""
 ADDRESSES = 6 << 30
 """Bytes of address space the process may add, so that no execution takes all memory of the machine."""
 BATCH = 2000
@@ -49,7 +53,7 @@ class Target:
     run : callable
         Reads an input, given an empty working folder. It returns if the input was accepted, and
         raises `Refused` if it was refused as documented; any other error is a failure.
-    whole : callable, optional
+    valid : callable, optional
         Makes the valid files: once, and outside of the monitored processes.
     quick : int
         Number of executions that take about a second.
@@ -60,13 +64,13 @@ class Target:
     name: str
     make: Callable[[Random, Any], bytes]
     run: Callable[[bytes, Path], object]
-    whole: Callable[[], Any] = tuple
+    valid: Callable[[], Any] = tuple
     quick: int = 300
     memory: int = MEMORY
 
-    def input(self, seed: int, whole: Any = None) -> bytes:
-        """The input of a seed; `whole` are the valid files, if they exist already."""
-        return self.make(Random(f"{self.name} {seed}"), whole or self.whole())
+    def input(self, seed: int, valid: Any = None) -> bytes:
+        """The input of a seed; `valid` are the valid files, if they exist already."""
+        return self.make(Random(f"{self.name} {seed}"), valid or self.valid())
 
 
 class Failure(NamedTuple):
@@ -88,7 +92,7 @@ class Tally:
     """Results of the executions of a target."""
 
     executions: int = 0
-    taken: int = 0
+    accepted: int = 0
     refused: int = 0
     seconds: float = 0.0
     slowest: float = 0.0
@@ -122,7 +126,7 @@ def run(
     cpu : float
         Processor seconds that one execution may take.
     """
-    whole = target.whole()
+    valid = target.valid()
     tally, start, seed = Tally(), time.monotonic(), first
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["tests.fuzzing.targets"])  # unless other tests have started one
@@ -136,7 +140,7 @@ def run(
             ours, theirs = context.Pipe(duplex=False)
             upto = min(first + count, seed + BATCH)
             process = context.Process(
-                target=_batch, args=(target, whole, seed, upto, left, cpu, folder, theirs)
+                target=_batch, args=(target, valid, seed, upto, left, cpu, folder, theirs)
             )
             process.start()
             theirs.close()
@@ -172,10 +176,10 @@ def _watch(process: Any, pipe: Connection, target: Target, seed: int, keep: Path
         if result is None:
             process.join()
             return seed
-        taken, took, failure = result
+        accepted, took, failure = result
         tally.executions += 1
-        tally.taken += taken and failure is None
-        tally.refused += not taken and failure is None
+        tally.accepted += accepted and failure is None
+        tally.refused += not accepted and failure is None
         if took > tally.slowest:
             tally.slowest, tally.slowest_seed = took, seed
         if failure is not None:
@@ -185,7 +189,7 @@ def _watch(process: Any, pipe: Connection, target: Target, seed: int, keep: Path
 
 def _batch(
     target: Target,
-    whole: Any,
+    valid: Any,
     first: int,
     upto: int,
     seconds: float,
@@ -203,11 +207,11 @@ def _batch(
     for seed in range(first, upto):
         if time.monotonic() > give_up:
             break
-        data = target.input(seed, whole)
+        data = target.input(seed, valid)
         for once_more in (True, False) if seed == first else (False,):
             began = time.perf_counter()
             signal.setitimer(signal.ITIMER_PROF, cpu)
-            taken, failure = execute(target, data, Path(folder))
+            accepted, failure = execute(target, data, Path(folder))
             signal.setitimer(signal.ITIMER_PROF, 0)
             if once_more:  # what is loaded once does not count
                 before = _peak_memory()
@@ -215,7 +219,7 @@ def _batch(
         grown = _peak_memory() - before
         if failure is None and grown > target.memory:
             failure = "memory", f"it took {grown >> 20} MB"
-        pipe.send((taken, took, failure))
+        pipe.send((accepted, took, failure))
         if grown > target.memory:
             break  # the peak hides later executions that take as much
     pipe.send(None)

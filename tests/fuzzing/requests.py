@@ -151,7 +151,7 @@ def other_text(random: Random, text: str) -> str:
     return text
 
 
-def make(random: Random, whole: object) -> bytes:
+def make(random: Random, valid: object) -> bytes:
     """A request with correct framing and something else wrong."""
     headers = random.sample(HEADERS, random.randrange(4))
     if random.random() < 0.4:

@@ -17,6 +17,8 @@ from PIL import Image, ImageCms
 from tests.workflows.images.dngs import dng
 from workflows.images.integer_formats import encode_png
 
+Files = tuple[bytes, ...]
+"""Valid files."""
 PIXELS = np.random.default_rng(9).integers(0, 255, (24, 36, 3), np.uint8)
 LIGHT = (PIXELS / 255).astype(np.float32)
 COUNTS = PIXELS[:, :, 0].astype(np.uint16) * 16

@@ -4,11 +4,10 @@
     --target NAME --seed N
 
 Runs damaged files and requests (`tests/fuzzing/`) through each parser for N seconds, in monitored processes, and
-prints the results: executions, how many inputs were refused and how many taken, crashes, hangs, errors of another
-kind than the documented, executions over the memory that they may take, and the longest. Inputs that fail are kept in
-the folder. Input N of a target is always the same: with `--seed` it is run alone, here, so that a debugger sees it; the
-next campaign goes on where `--first` says. Exit status 1 if anything failed. With `TMPDIR` in memory those that store
-something are twice as fast.
+prints the results: executions, inputs refused and accepted, crashes, hangs, undocumented errors, executions over their
+memory limit, and the slowest execution. Inputs that fail are kept in FOLDER. Input N of a target is always the same:
+`--seed` runs one of them alone in this process, for a debugger, and `--first` continues an earlier campaign. The exit
+status is 1 if anything failed. With `TMPDIR` in memory, targets that store something are twice as fast.
 """
 
 import argparse
@@ -27,7 +26,7 @@ COLUMNS = (
     "executions",
     "a second",
     "refused",
-    "taken",
+    "accepted",
     "crashes",
     "hangs",
     "errors",
@@ -54,7 +53,7 @@ def main() -> int:
             with tempfile.TemporaryDirectory() as folder:
                 target.run(target.input(args.seed), Path(folder))
         return 0
-    print("  ".join(f"{name:>10}" for name in COLUMNS), flush=True)
+    print("  ".join(f"{name:>15}" for name in COLUMNS), flush=True)
     reported = {}
     for target in chosen:
         tally = campaign.run(target, args.first, sys.maxsize, args.keep, seconds=args.seconds)
@@ -65,11 +64,11 @@ def main() -> int:
                 tally.executions,
                 round(tally.executions / tally.seconds),
                 tally.refused,
-                tally.taken,
+                tally.accepted,
             ),
             *(*kinds, f"{tally.slowest:.2f}"),
         )
-        print("  ".join(f"{value:>10}" for value in row), flush=True)
+        print("  ".join(f"{value:>15}" for value in row), flush=True)
         for failure in tally.failures:
             print(failure, flush=True)
         reported[target.name] = asdict(tally)
