@@ -15,36 +15,40 @@ RUN_BY = {
         ("docker/README.md", "What it survives"),
         ("tests/README.md", "Running them"),
     ],
-    "tests/end_to_end/use/test_demo.py::test_the_demo_leaves_its_picture": [
+    "tests/end_to_end/use/test_demo.py::test_demo_writes_its_picture_and_files": [
         ("README.md", "Install and try it")
     ],
-    "tests/end_to_end/use/test_readme.py::test_first_composite": [("README.md", "Your first composite")],
+    "tests/end_to_end/use/test_readme.py::test_first_composite_by_command_curl_and_client": [
+        ("README.md", "Your first composite")
+    ],
     "tests/end_to_end/use/test_readme.py::test_from_a_film_to_composites": [
         ("README.md", "Film your own glass"),
         ("README.md", "Command line and Python"),
     ],
-    "tests/end_to_end/use/test_readme.py::test_three_machines": [("README.md", "Scale out")],
-    "tests/end_to_end/use/test_folder_readmes.py::test_keys_and_backups": [
+    "tests/end_to_end/use/test_readme.py::test_service_scales_to_three_machines": [
+        ("README.md", "Scale out")
+    ],
+    "tests/end_to_end/use/test_folder_readmes.py::test_keys_are_made_and_backups_taken": [
         ("README.md", "Run the service"),
         ("README.md", "Security and backups"),
         ("services/README.md", "Keys, owners, limits"),
         ("storage/README.md", "Backups"),
     ],
-    "tests/end_to_end/use/test_folder_readmes.py::test_completion": [
+    "tests/end_to_end/use/test_folder_readmes.py::test_completion_is_enabled": [
         ("services/cli/README.md", "Shell completion")
     ],
-    "tests/end_to_end/use/test_folder_readmes.py::test_webhooks": [
+    "tests/end_to_end/use/test_folder_readmes.py::test_webhook_is_verified_by_the_example": [
         ("services/webhooks/README.md", "The secret"),
         ("services/webhooks/README.md", "Verifying"),
     ],
-    "tests/end_to_end/use/test_folder_readmes.py::test_patterns": [
+    "tests/end_to_end/use/test_folder_readmes.py::test_patterns_are_written_as_video_and_as_pictures": [
         ("workflows/programs/README.md", "As a video"),
         ("workflows/programs/README.md", "As pictures"),
     ],
-    "tests/end_to_end/use/test_folder_readmes.py::test_a_program_over_http": [
+    "tests/end_to_end/use/test_folder_readmes.py::test_program_is_created_with_curl": [
         ("workflows/programs/README.md", "In the browser")
     ],
-    "tests/end_to_end/use/test_folder_readmes.py::test_a_matte_elsewhere": [
+    "tests/end_to_end/use/test_folder_readmes.py::test_matte_is_exported_imported_and_read": [
         ("workflows/mattes/README.md", "Layers for other tools"),
         ("workflows/mattes/README.md", "Moving a matte elsewhere"),
         ("workflows/mattes/README.md", "Reading a matte without envmatte"),

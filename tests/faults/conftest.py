@@ -24,7 +24,7 @@ def times(pytestconfig: pytest.Config) -> int:
 
 
 @pytest.fixture(scope="session")
-def seldom(times: int) -> int:
+def fewer_times(times: int) -> int:
     """How often faults that take half a minute are injected."""
     return max(1, times // 2)
 
@@ -58,7 +58,7 @@ def archive_bytes(capture_archive: Path) -> bytes:
 
 
 @dataclass
-class Known:
+class Prepared:
     """A rig, a capture in it, and the files of its matte without faults."""
 
     rig: Rig
@@ -69,7 +69,7 @@ class Known:
         """Inject a fault at random moments of jobs; returns what became of them."""
         return self.rig.disturb(fault, act, self.capture, self.files, times)
 
-    def goes_on(self, job: str, matte: str) -> None:
+    def check_continues(self, job: str, matte: str) -> None:
         """Check that a job succeeds with the expected matte and waits for nothing."""
         assert self.rig.ended(job)["state"] == "succeeded"
         assert self.rig.job(job)["waits_for"] is None
@@ -83,12 +83,12 @@ def check(table: list[Row], row: Row) -> None:
 
 
 @pytest.fixture(scope="session")
-def known(tmp_path_factory: pytest.TempPathFactory, capture_archive: Path) -> Iterator[Known]:
+def prepared(tmp_path_factory: pytest.TempPathFactory, capture_archive: Path) -> Iterator[Prepared]:
     with Rig(tmp_path_factory.mktemp("rig")) as rig:
-        yield prepared(rig, capture_archive)
+        yield prepare(rig, capture_archive)
 
 
-def prepared(rig: Rig, capture_archive: Path) -> Known:
+def prepare(rig: Rig, capture_archive: Path) -> Prepared:
     """Ingest a capture in a rig and recover it once."""
     uploaded = rig.ask(
         "POST",
@@ -99,4 +99,4 @@ def prepared(rig: Rig, capture_archive: Path) -> Known:
     assert rig.ended(uploaded["job"])["state"] == "succeeded"
     found = rig.ended(rig.recover(uploaded["id"])["id"])
     assert found["state"] == "succeeded"
-    return Known(rig, uploaded["id"], rig.files(found["matte"]))
+    return Prepared(rig, uploaded["id"], rig.files(found["matte"]))

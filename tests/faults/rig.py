@@ -121,8 +121,8 @@ class Rig:
     def process(self, name: str) -> psutil.Process:
         return psutil.Process(self._processes[name].pid)
 
-    def driver(self) -> str:
-        """The name of the service whose coordinator drives the jobs."""
+    def leader(self) -> str:
+        """The name of the service whose coordinator runs the jobs."""
         logs = {n: self.log(f"service{n}") for n in range(2)}
         at = {n: max(log.rfind("runs the jobs from now on"), 0) for n, log in logs.items()}
         lines = {n: logs[n][: at[n]].rsplit("\n", 1)[-1][:23] for n in at}

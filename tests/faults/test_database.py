@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults.conftest import Known, check, prepared
+from tests.faults.conftest import Prepared, check, prepare
 from tests.faults.rig import Rig, Row, freeze, thaw
 from tests.parts.postgres import TEMPLATE, Server
 from tests.parts.waiting import until
@@ -22,17 +22,17 @@ ASLEEP = 15.0
 @pytest.fixture(scope="module")
 def on_postgresql(
     postgresql_server: Server, tmp_path_factory: pytest.TempPathFactory, capture_archive: Path
-) -> Iterator[Known]:
+) -> Iterator[Prepared]:
     with (
         postgresql_server.database(like=TEMPLATE) as url,
         Rig(tmp_path_factory.mktemp("postgresql"), url) as rig,
     ):
-        yield prepared(rig, capture_archive)
+        yield prepare(rig, capture_archive)
 
 
 @pytest.mark.exhaustive
 def test_restarted_database(
-    on_postgresql: Known, postgresql_server: Server, table: list[Row], times: int
+    on_postgresql: Prepared, postgresql_server: Server, table: list[Row], times: int
 ) -> None:
     row = on_postgresql.disturb("restart of PostgreSQL", postgresql_server.restart, times)
     check(table, row)
@@ -40,7 +40,7 @@ def test_restarted_database(
 
 @pytest.mark.exhaustive
 def test_database_that_stays_away(
-    on_postgresql: Known, postgresql_server: Server, table: list[Row], times: int
+    on_postgresql: Prepared, postgresql_server: Server, table: list[Row], times: int
 ) -> None:
     rig = on_postgresql.rig
     answers: set[int] = set()
@@ -59,12 +59,12 @@ def test_database_that_stays_away(
 
 
 @pytest.mark.exhaustive
-def test_late_writer_is_shut_out(on_postgresql: Known, table: list[Row], seldom: int) -> None:
+def test_late_writer_is_shut_out(on_postgresql: Prepared, table: list[Row], fewer_times: int) -> None:
     rig = on_postgresql.rig
     message = "another coordinator runs the jobs now"
 
     def sleep() -> None:
-        name = rig.driver()
+        name = rig.leader()
         before, end = rig.log(name).count(message), time.monotonic() + ASLEEP
         other = rig.urls[1 - int(name[-1])]
         freeze(rig.process(name))
@@ -77,7 +77,7 @@ def test_late_writer_is_shut_out(on_postgresql: Known, table: list[Row], seldom:
         until(lambda: rig.log(name).count(message) > before)
         time.sleep(1)  # time to do what it was about to do when frozen
         assert rig.log(name).count(message) == before + 1
-        assert rig.driver() != name
+        assert rig.leader() != name
         assert record == [rig.ask("GET", f"/v1/jobs/{job}{more}").json() for more in ("", "/log")]
 
-    check(table, on_postgresql.disturb("SIGSTOP of a coordinator, for 15 s", sleep, seldom))
+    check(table, on_postgresql.disturb("SIGSTOP of a coordinator, for 15 s", sleep, fewer_times))

@@ -8,7 +8,7 @@ import pytest
 
 from storage.database.engine import open_engine, reading
 from storage.records import leases
-from tests.faults.conftest import Known, check, prepared
+from tests.faults.conftest import Prepared, check, prepare
 from tests.faults.hosts import Hosts
 from tests.faults.rig import Row
 from tests.parts.waiting import until
@@ -20,23 +20,25 @@ AWAY = 20.0
 
 
 @pytest.fixture(scope="module")
-def hosts(tmp_path_factory: pytest.TempPathFactory, capture_archive: Path) -> Iterator[Known]:
+def hosts(tmp_path_factory: pytest.TempPathFactory, capture_archive: Path) -> Iterator[Prepared]:
     with Hosts(tmp_path_factory.mktemp("hosts")) as rig:
-        yield prepared(rig, capture_archive)
+        yield prepare(rig, capture_archive)
 
 
 @pytest.mark.parametrize("name", ["service0", "scheduler"])
 @pytest.mark.exhaustive
-def test_cut_link_of_service_or_scheduler(hosts: Known, table: list[Row], seldom: int, name: str) -> None:
-    cut_off(hosts, table, name, seldom)
+def test_cut_link_of_service_or_scheduler(
+    hosts: Prepared, table: list[Row], fewer_times: int, name: str
+) -> None:
+    cut_off(hosts, table, name, fewer_times)
 
 
 @pytest.mark.exhaustive
-def test_cut_link_of_a_worker(hosts: Known, table: list[Row], seldom: int) -> None:
-    cut_off(hosts, table, "worker0", seldom)
+def test_cut_link_of_a_worker(hosts: Prepared, table: list[Row], fewer_times: int) -> None:
+    cut_off(hosts, table, "worker0", fewer_times)
 
 
-def cut_off(hosts: Known, table: list[Row], name: str, times: int) -> None:
+def cut_off(hosts: Prepared, table: list[Row], name: str, times: int) -> None:
     assert isinstance(hosts.rig, Hosts)
     network = hosts.rig.network
 

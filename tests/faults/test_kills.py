@@ -9,7 +9,7 @@ from contextlib import suppress
 import psutil
 import pytest
 
-from tests.faults.conftest import Known, check
+from tests.faults.conftest import Prepared, check
 from tests.faults.rig import Row, freeze, thaw
 from tests.parts.waiting import until
 
@@ -17,68 +17,68 @@ pytestmark = pytest.mark.timeout(7200)
 
 
 @pytest.mark.slow
-def test_killed_worker(known: Known, table: list[Row], times: int) -> None:
+def test_killed_worker(prepared: Prepared, table: list[Row], times: int) -> None:
     def kill() -> None:
-        until(known.rig.workers)
-        random.choice(known.rig.workers()).kill()
+        until(prepared.rig.workers)
+        random.choice(prepared.rig.workers()).kill()
 
-    check(table, known.disturb("SIGKILL of a worker", kill, times))
+    check(table, prepared.disturb("SIGKILL of a worker", kill, times))
 
 
 @pytest.mark.exhaustive
-def test_all_workers_killed(known: Known, table: list[Row], times: int) -> None:
+def test_all_workers_killed(prepared: Prepared, table: list[Row], times: int) -> None:
     def kill() -> None:
-        for worker in known.rig.workers():
+        for worker in prepared.rig.workers():
             worker.kill()
 
-    check(table, known.disturb("SIGKILL of all workers", kill, times))
+    check(table, prepared.disturb("SIGKILL of all workers", kill, times))
 
 
 @pytest.mark.exhaustive
-def test_killed_scheduler(known: Known, table: list[Row], times: int) -> None:
-    rig = known.rig
-    row = known.disturb("SIGKILL of the scheduler", lambda: rig.restart("scheduler"), times)
+def test_killed_scheduler(prepared: Prepared, table: list[Row], times: int) -> None:
+    rig = prepared.rig
+    row = prepared.disturb("SIGKILL of the scheduler", lambda: rig.restart("scheduler"), times)
     check(table, row)
 
 
 @pytest.mark.slow
-def test_killed_leading_service(known: Known, table: list[Row], times: int) -> None:
-    rig = known.rig
-    row = known.disturb("SIGKILL of API and coordinator", lambda: rig.restart(rig.driver()), times)
+def test_killed_leading_service(prepared: Prepared, table: list[Row], times: int) -> None:
+    rig = prepared.rig
+    row = prepared.disturb("SIGKILL of API and coordinator", lambda: rig.restart(rig.leader()), times)
     check(table, row)
 
 
 @pytest.mark.exhaustive
-def test_frozen_worker(known: Known, table: list[Row]) -> None:
+def test_frozen_worker(prepared: Prepared, table: list[Row]) -> None:
     frozen: list[psutil.Process] = []
 
     def act() -> None:
-        frozen.append(known.rig.workers()[0])
+        frozen.append(prepared.rig.workers()[0])
         freeze(frozen[0])
 
     start = time.monotonic()
-    row = known.disturb("SIGSTOP of a worker, for 60 s", act, 1)
+    row = prepared.disturb("SIGSTOP of a worker, for 60 s", act, 1)
     time.sleep(max(0.0, 60 - (time.monotonic() - start)))
     with suppress(psutil.NoSuchProcess):  # its nanny may have killed it meanwhile
         thaw(frozen[0])
     time.sleep(3)  # time to do what it was about to do when frozen
-    (matte, *_) = known.rig.ask("GET", "/v1/mattes").json()["mattes"]
-    assert known.rig.files(matte["id"]) == known.files
+    (matte, *_) = prepared.rig.ask("GET", "/v1/mattes").json()["mattes"]
+    assert prepared.rig.files(matte["id"]) == prepared.files
     check(table, row)
 
 
 @pytest.mark.slow
-def test_cancelled_job_frees_workers_and_disk(known: Known) -> None:
-    rig = known.rig
+def test_cancelled_job_frees_workers_and_disk(prepared: Prepared) -> None:
+    rig = prepared.rig
     # One tile of nn-dgsr that takes minutes.
     options = {"method": "nn-dgsr", "tile": 1024}
-    job = rig.ask("POST", "/v1/jobs", json={"capture": known.capture, "options": options}).json()
+    job = rig.ask("POST", "/v1/jobs", json={"capture": prepared.capture, "options": options}).json()
     until(lambda: rig.job(job["id"])["stage"] == "recovering")
     time.sleep(1)
     cancelled = rig.ask("POST", f"/v1/jobs/{job['id']}/cancel").json()
     assert cancelled["state"] == "cancelled"
     until(lambda: not rig.names(job["matte"]), 10)
     assert rig.ask("GET", f"/v1/mattes/{job['matte']}").status_code == 404
-    after = rig.recover(known.capture)
-    known.goes_on(after["id"], after["matte"])
+    after = rig.recover(prepared.capture)
+    prepared.check_continues(after["id"], after["matte"])
     assert not rig.names(job["matte"])

@@ -9,7 +9,7 @@ import pytest
 from services.client import Client
 from tests.end_to_end.conftest import png
 from tests.end_to_end.lines import Line
-from tests.faults.conftest import Known
+from tests.faults.conftest import Prepared
 
 pytestmark = pytest.mark.timeout(900)
 
@@ -31,15 +31,15 @@ class InTurn(Line):
 
 
 @pytest.mark.exhaustive
-def test_two_services_behind_one_port(known: Known, capture_archive: Path) -> None:
-    rig = known.rig
+def test_two_services_behind_one_port(prepared: Prepared, capture_archive: Path) -> None:
+    rig = prepared.rig
     size = capture_archive.stat().st_size
     with InTurn(rig.urls, cuts=7, mean=size // 4, seed=3) as line, Client(line.url) as client:
         uploaded = client.upload(capture_archive)
         assert line.made == 7
         client.wait(uploaded["job"])
         job = client.wait(client.recover(uploaded["id"])["id"])
-    assert rig.files(job["matte"]) == known.files
+    assert rig.files(job["matte"]) == prepared.files
     seen = [rig.ask("GET", f"/v1/jobs/{job['id']}", at=url).json() for url in rig.urls]
     assert seen[0] == seen[1] == job.answer
     backdrop = png(np.full((2, 2, 3), 0.5, np.float32), "srgb", np.uint8)

@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from tests.faults.conftest import Known, check, prepared
+from tests.faults.conftest import Prepared, check, prepare
 from tests.faults.rig import Rig, Row
 from tests.parts.s3 import BUCKET, KEYS
 
@@ -97,45 +97,49 @@ def proxy(s3_server: str) -> Iterator[Proxy]:
 @pytest.fixture(scope="module")
 def in_bucket(
     s3_server: str, proxy: Proxy, tmp_path_factory: pytest.TempPathFactory, capture_archive: Path
-) -> Iterator[Known]:
+) -> Iterator[Prepared]:
     with pytest.MonkeyPatch.context() as patch:
         for name, value in {"AWS_ENDPOINT_URL": s3_server, **KEYS}.items():
             patch.setenv(name, value)  # the test itself bypasses the proxy
         through = {"AWS_ENDPOINT_URL": proxy.url, "ENVMATTE_ATTEMPTS": "1"}
         with Rig(tmp_path_factory.mktemp("bucket"), store=f"s3://{BUCKET}/faults", **through) as rig:
-            yield prepared(rig, capture_archive)
+            yield prepare(rig, capture_archive)
 
 
-def test_store_answers_503_at_times(in_bucket: Known, proxy: Proxy, table: list[Row], seldom: int) -> None:
+def test_store_answers_503_at_times(
+    in_bucket: Prepared, proxy: Proxy, table: list[Row], fewer_times: int
+) -> None:
     proxy.refused, before = SHARE, proxy.lost
-    row = in_bucket.disturb("503 from the store, of one in 5", lambda: None, seldom)
+    row = in_bucket.disturb("503 from the store, of one in 5", lambda: None, fewer_times)
     proxy.refused = 0
     assert proxy.lost > before
     check(table, row)
 
 
 def test_store_does_not_answer_at_times(
-    in_bucket: Known, proxy: Proxy, table: list[Row], seldom: int
+    in_bucket: Prepared, proxy: Proxy, table: list[Row], fewer_times: int
 ) -> None:
     def act() -> None:
         proxy.silent = SHARE
         time.sleep(5)
         proxy.silent = 0
 
-    row = in_bucket.disturb("no answer from the store, of one in 5", act, seldom)
+    row = in_bucket.disturb("no answer from the store, of one in 5", act, fewer_times)
     check(table, row)
 
 
-def test_store_away_for_a_while(in_bucket: Known, proxy: Proxy, table: list[Row], seldom: int) -> None:
+def test_store_away_for_a_while(
+    in_bucket: Prepared, proxy: Proxy, table: list[Row], fewer_times: int
+) -> None:
     def act() -> None:
         proxy.refused = 1
         time.sleep(AWAY)
         proxy.refused = 0
 
-    check(table, in_bucket.disturb("503 from the store, for 10 s", act, seldom))
+    check(table, in_bucket.disturb("503 from the store, for 10 s", act, fewer_times))
 
 
-def test_store_that_stays_away(in_bucket: Known, proxy: Proxy, table: list[Row]) -> None:
+def test_store_that_stays_away(in_bucket: Prepared, proxy: Proxy, table: list[Row]) -> None:
     rig = in_bucket.rig
     job = rig.recover(in_bucket.capture)
     while rig.job(job["id"])["progress"] < 0.2:

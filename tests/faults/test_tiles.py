@@ -11,7 +11,7 @@ import pytest
 from distributed import Client
 
 from services.coordinator.job_run import LOSSES
-from tests.faults.conftest import Known, check
+from tests.faults.conftest import Prepared, check
 from tests.faults.rig import Rig, Row
 from tests.services.cluster.clusters import listening
 
@@ -22,7 +22,7 @@ TILE, LAST = 64, 5
 
 
 @contextmanager
-def deadly(rig: Rig, key: str) -> Iterator[None]:
+def killing_workers(rig: Rig, key: str) -> Iterator[None]:
     """Kill every worker that works on a tile until the block ends."""
     done = threading.Event()
 
@@ -47,9 +47,9 @@ def deadly(rig: Rig, key: str) -> Iterator[None]:
 
 @pytest.mark.exhaustive
 def test_tile_that_kills_its_workers_fails_only_its_job(
-    known: Known, table: list[Row], archive_bytes: bytes
+    prepared: Prepared, table: list[Row], archive_bytes: bytes
 ) -> None:
-    rig = known.rig
+    rig = prepared.rig
     headers = {"Content-Type": "application/zip"}
     capture = rig.ask("POST", "/v1/captures", content=archive_bytes, headers=headers).json()
     assert rig.ended(capture["job"])["state"] == "succeeded"
@@ -62,8 +62,8 @@ def test_tile_that_kills_its_workers_fails_only_its_job(
     body = {"capture": capture["id"], "options": {"tile": TILE}}
     job = rig.ask("POST", "/v1/jobs", json=body).json()
     start = time.monotonic()
-    with deadly(rig, f"recover-{job['id']}-{LAST}-"):
-        other = rig.recover(known.capture)
+    with killing_workers(rig, f"recover-{job['id']}-{LAST}-"):
+        other = rig.recover(prepared.capture)
         found, beside = rig.ended(job["id"]), rig.ended(other["id"])
     assert found["state"] == "failed"
     assert f"{LOSSES} workers died while doing it" in found["problem"]["detail"]
@@ -76,7 +76,7 @@ def test_tile_that_kills_its_workers_fails_only_its_job(
     assert rig.ask("POST", f"/v1/jobs/{job['id']}/retry").status_code == 202
     row = Row("a tile that kills its workers", 1, lost=int(rig.ended(job["id"])["state"] != "succeeded"))
     row.seconds.append(round(time.monotonic() - start, 2))
-    row.differing = sum(rig.files(made["matte"]) != known.files for made in (job, other))
+    row.differing = sum(rig.files(made["matte"]) != prepared.files for made in (job, other))
     check(table, row)
 
 

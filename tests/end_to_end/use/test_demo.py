@@ -11,7 +11,7 @@ from PIL import Image
 
 
 @pytest.mark.slow
-def test_the_demo_leaves_its_picture(tmp_path: Path) -> None:
+def test_demo_writes_its_picture_and_files(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "services", "demo", "-o", "picture.png", "--keep", "kept", "--json"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=280)
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""The commands of the READMEs beside the code, as they stand there, against a real service."""
+"""The commands of the READMEs in the folders of the code, run unchanged against a real service."""
 
 import json
 import re
@@ -39,7 +39,7 @@ def run(script: str, folder: Path, **settings: str) -> str:
     return done.stdout
 
 
-def test_patterns(tmp_path: Path) -> None:
+def test_patterns_are_written_as_video_and_as_pictures(tmp_path: Path) -> None:
     for section in ("As a video", "As pictures"):
         run(block("workflows/programs/README.md", section).replace("1920x1080", "320x240"), tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"patterns", "patterns.mp4", "patterns.json"}
@@ -49,13 +49,13 @@ def test_patterns(tmp_path: Path) -> None:
 @pytest.mark.skipif(
     shutil.which("curl") is None, reason="the README's line needs curl, which is not installed"
 )
-def test_a_program_over_http(service: Service, tmp_path: Path) -> None:
+def test_program_is_created_with_curl(service: Service, tmp_path: Path) -> None:
     line = block("workflows/programs/README.md", "In the browser").replace(URL, service.url)
     (program,) = re.findall(r'"id":"([^"]+)"', run(line, tmp_path))
     assert service.http.get(f"/v1/programs/{program}/play").headers["content-type"].startswith("text/html")
 
 
-def test_a_matte_elsewhere(service: Service, matte: str, tmp_path: Path) -> None:
+def test_matte_is_exported_imported_and_read(service: Service, matte: str, tmp_path: Path) -> None:
     readme = "workflows/mattes/README.md"
     export = block(readme, "Moving a matte elsewhere").replace(URL, service.url)
     lines = (block(readme, "Layers for other tools") + export).replace("MATTE", matte)
@@ -79,8 +79,8 @@ def test_a_matte_elsewhere(service: Service, matte: str, tmp_path: Path) -> None
     )
 
 
-def test_keys_and_backups(tmp_path: Path) -> None:
-    """On an installation that no service runs on."""
+def test_keys_are_made_and_backups_taken(tmp_path: Path) -> None:
+    """In a data folder without a running service."""
     (keys,) = {block("README.md", "Run the service"), block("services/README.md", "Keys, owners, limits")}
     (backups,) = {block("README.md", "Security and backups"), block("storage/README.md", "Backups")}
     (tmp_path / "home").mkdir()
@@ -90,13 +90,13 @@ def test_keys_and_backups(tmp_path: Path) -> None:
     assert (tmp_path / "monday/manifest.jsonl").exists()
 
 
-def test_completion(tmp_path: Path) -> None:
+def test_completion_is_enabled(tmp_path: Path) -> None:
     lines = block("services/cli/README.md", "Shell completion")
     assert "envmatte" in run(f"{lines}complete -p envmatte", tmp_path)
 
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="the README's line needs openssl")
-def test_webhooks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_webhook_is_verified_by_the_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     readme = "services/webhooks/README.md"
     run(block(readme, "The secret"), tmp_path)
     monkeypatch.chdir(tmp_path)
@@ -108,7 +108,7 @@ def test_webhooks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert headers.keys() == {codes(name)[0] for name, _ in table(readme, "header", "holds")}
 
 
-def test_metrics(service: Service) -> None:
+def test_metrics_are_those_documented(service: Service) -> None:
     documented = {
         name
         for names, _, _ in table("services/README.md", "metric", "labels", "counts")

@@ -1,4 +1,4 @@
-"""The commands of the README, as a new user pastes them, against real processes."""
+"""The commands of the README, run as a new user would, with real processes."""
 
 import os
 import shutil
@@ -47,14 +47,14 @@ class Home:
 
 
 def environment(**settings: str) -> dict[str, str]:
-    """One in which `envmatte` and `python3` are those of this interpreter, and services have one worker."""
+    """An environment with this interpreter's `envmatte` and `python3`, and one worker for each service."""
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     return os.environ | {"PATH": path, "ENVMATTE_WORKERS": "1"} | settings
 
 
 @contextmanager
 def machine(script: str, folder: Path, **settings: str) -> Iterator[subprocess.Popen[str]]:
-    """Lines of shell as on a machine of their own: a process group, in a folder of its own."""
+    """Run lines of shell in a folder and a process group of their own, as on another machine, until the block ends."""
     folder.mkdir(exist_ok=True)
     with (folder / "log").open("w") as log:
         process = subprocess.Popen(
@@ -76,7 +76,7 @@ def machine(script: str, folder: Path, **settings: str) -> Iterator[subprocess.P
 
 
 def url_of(serving: subprocess.Popen[str], folder: Path) -> str:
-    """The address at which `envmatte serve` says that it serves."""
+    """The URL that `envmatte serve` prints."""
     assert serving.stdout is not None
     while " at http" not in (line := serving.stdout.readline()):
         assert line, (folder / "log").read_text()
@@ -104,7 +104,7 @@ def film(show: Path, target: Path) -> None:
 
 @pytest.fixture(scope="module")
 def home(capture_archive: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Home]:
-    """What the install command has left, with a smaller capture; and the service, started as the README says."""
+    """A folder as after the install command, with a smaller capture, and the service, started as the README says."""
     folder = tmp_path_factory.mktemp("home")
     (folder / ".venv/bin").mkdir(parents=True)
     (folder / ".venv/bin/activate").write_text("")
@@ -118,7 +118,7 @@ def home(capture_archive: Path, tmp_path_factory: pytest.TempPathFactory) -> Ite
         yield Home(folder, url, stack.enter_context(Client(url)))
 
 
-def test_first_composite(home: Home) -> None:
+def test_first_composite_by_command_curl_and_client(home: Home) -> None:
     home.run(block("README.md", "Your first composite", number=1))
     by_command = (home.folder / "composite.png").read_bytes()
     (home.folder / "composite.png").unlink()
@@ -166,7 +166,7 @@ def test_from_a_film_to_composites(home: Home) -> None:
         assert np.std(made["film"], axis=0).mean() > 0.05
 
 
-def test_three_machines(capture_archive: Path, tmp_path: Path) -> None:
+def test_service_scales_to_three_machines(capture_archive: Path, tmp_path: Path) -> None:
     port = free_port()
     first, others = (
         block("README.md", "Scale out", number=n)

@@ -60,7 +60,9 @@ def test_a_recovery_goes_from_queued_to_succeeded(service: Service, capture: str
     assert log == ["queued", "preparing", "recovering", "finishing", "succeeded"]
 
 
-def test_a_job_may_be_posted_while_its_capture_is_ingesting(service: Service, capture_archive: Path) -> None:
+def test_job_posted_during_the_ingest_of_its_capture_succeeds(
+    service: Service, capture_archive: Path
+) -> None:
     uploaded = service.client.upload(capture_archive)
     job = service.client.recover(uploaded["id"])
     assert service.client.wait(job["id"])["state"] == "succeeded"
@@ -81,7 +83,7 @@ def test_a_composite_is_close_to_the_truth(
     assert -10 * np.log10(np.mean(error[scene.object_mask] ** 2)) > 32
 
 
-def test_a_composite_says_where_its_time_went(service: Service, matte: str) -> None:
+def test_composite_reports_how_long_each_step_took(service: Service, matte: str) -> None:
     answer = service.http.post(
         f"/v1/mattes/{matte}/composite", content=png(np.ones((4, 4, 3), "f4"), "srgb", np.uint8)
     )
@@ -121,7 +123,9 @@ def test_lists_are_newest_first_and_paged(service: Service, capture_archive: Pat
     assert states == {"succeeded"}
 
 
-def test_repeated_post_makes_one_thing(service: Service, capture_archive: Path, capture: str) -> None:
+def test_repeated_post_with_one_key_creates_once(
+    service: Service, capture_archive: Path, capture: str
+) -> None:
     headers = {"Content-Type": "application/zip", "Idempotency-Key": "upload-1"}
     first, second = (
         service.http.post("/v1/captures", content=capture_archive.read_bytes(), headers=headers).json()["id"]
@@ -145,7 +149,7 @@ def test_deleting_leaves_nothing(service: Service, capture_archive: Path) -> Non
         assert service.http.get(f"/v1/{path}").status_code == 404
 
 
-def test_health(service: Service) -> None:
+def test_running_service_is_alive_and_ready(service: Service) -> None:
     assert service.http.get("/healthz").json() == {"status": "alive"}
     answer = service.http.get("/readyz")
     assert answer.status_code == 200, answer.text
@@ -160,7 +164,7 @@ def test_options_are_described(service: Service) -> None:
     assert all(option["description"] for option in options.values())
 
 
-def test_patterns_may_come_as_images(
+def test_program_of_images_gives_the_same_matte(
     service: Service, matte: str, scene: Scene, program: Program, tmp_path: Path
 ) -> None:
     constant, *bands = program.parts

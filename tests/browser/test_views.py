@@ -25,8 +25,8 @@ SHIFTS = """
         }
     }).observe({ type: "layout-shift", buffered: true });
 """
-MOST_SHIFT = 0.1
-"""The most that Core Web Vitals call good."""
+MAX_SHIFT = 0.1
+"""The limit of what Core Web Vitals call good."""
 DEVICES: dict[str, dict[str, Any]] = {
     "desk": {"viewport": {"width": 1200, "height": 800}},
     "phone": {"viewport": PHONE, "has_touch": True, "is_mobile": True},
@@ -88,7 +88,7 @@ def test_every_view_is_accessible_and_stable(
             assert is_fitting(page), name
             page.screenshot(path=folder / f"{name}-{device}-{scheme}.png", full_page=True)
             shifts = page.evaluate("window.shifts")
-            assert sum(shift[0] for shift in shifts) < MOST_SHIFT, (name, shifts)
+            assert sum(shift[0] for shift in shifts) < MAX_SHIFT, (name, shifts)
             found = axe.run(page).response["violations"]
             wrong = [
                 (one["id"], [node["html"] for node in one["nodes"]])
@@ -103,9 +103,9 @@ def test_tab_key_reaches_everything(desk: Page, service: Service, views: dict[st
         go(desk, service, view)
         expected = desk.evaluate(
             """() => {
-                const seen = (e) => e.checkVisibility({ visibilityProperty: true }) && !e.disabled;
+                const visible = (e) => e.checkVisibility({ visibilityProperty: true }) && !e.disabled;
                 return [...document.querySelectorAll("a[href], button, input, select, summary, [tabindex='0']")]
-                    .filter(seen)
+                    .filter(visible)
                     .filter((e) => e.type !== "radio" || e.checked).length;
             }"""
         )
@@ -127,7 +127,7 @@ def test_api_documentation_is_served_locally(desk: Page, service: Service) -> No
     expect(desk.locator(".opblock.is-open .parameters")).to_be_visible()
 
 
-def test_app_is_small_and_its_policy_strict(service: Service, views: dict[str, tuple[str, str]]) -> None:
+def test_app_is_small_and_has_a_strict_policy(service: Service, views: dict[str, tuple[str, str]]) -> None:
     files = [path for path in WEB.rglob("*") if path.is_file()]
     assert sum(path.stat().st_size for path in files) < 300_000
     for path in ("/", f"/{views['play'][0]}", "/docs"):
