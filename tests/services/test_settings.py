@@ -16,7 +16,7 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.delenv(f"ENVMATTE_{name.upper()}", raising=False)
 
 
-def test_the_environment_and_env_lines_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_environment_and_env_file_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
     Path(".env").write_text("ENVMATTE_PORT=9000\nENVMATTE_WORKERS=3\n")
     monkeypatch.setenv("ENVMATTE_WORKERS", "2")
     monkeypatch.setenv("ENVMATTE_KEYS", "one, two,")
@@ -25,7 +25,7 @@ def test_the_environment_and_env_lines_are_read(monkeypatch: pytest.MonkeyPatch)
     assert Settings(workers=1).workers == 1
 
 
-def test_what_is_empty_is_not_set(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_empty_values_count_as_not_set(monkeypatch: pytest.MonkeyPatch) -> None:
     unset = Settings()
     Path(".env").write_text("ENVMATTE_STORE=\n")
     for name in Settings.model_fields:
@@ -51,7 +51,7 @@ def test_a_process_has_only_the_settings_that_it_reads() -> None:
     assert described == ["ENVMATTE_DATA", "ENVMATTE_CERTS", "ENVMATTE_LOG", "ENVMATTE_LOG_LEVEL"]
 
 
-def test_paths_with_odd_names_make_urls_that_lead_back(tmp_path: Path) -> None:
+def test_special_characters_of_a_path_are_escaped_in_its_url(tmp_path: Path) -> None:
     settings = Settings(data=tmp_path / "a folder, 100 % ä")
     assert settings.store_url.startswith("file:///")
     assert " " not in settings.store_url
@@ -60,7 +60,7 @@ def test_paths_with_odd_names_make_urls_that_lead_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "wrong", [{"port": 70000}, {"workers": 0}, {"ingest_memory": 5}, {"attempts": 0}, {"log": "xml"}]
 )
-def test_what_is_out_of_range_is_refused(wrong: dict[str, int]) -> None:
+def test_values_out_of_range_are_refused(wrong: dict[str, int]) -> None:
     with pytest.raises(ValidationError, match=next(iter(wrong))):
         Settings(**wrong)
 
@@ -72,7 +72,7 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_laptop_needs_nothing(tmp_path: Path) -> None:
+def test_no_setting_is_required_on_one_machine(tmp_path: Path) -> None:
     settings = Settings(data=tmp_path)
     assert settings.cluster is None
     assert settings.coordinate
@@ -118,7 +118,7 @@ def test_on_loopback_a_cluster_needs_neither_tls_nor_a_store(address: str) -> No
     "address",
     ["scheduler:8786", "tls://", "tls://host", "http://127.0.0.1:80", "tcp://127.0.0.1:x", "", "tls:"],
 )
-def test_what_is_no_address_is_refused(address: str) -> None:
+def test_invalid_address_is_refused(address: str) -> None:
     with pytest.raises(ValidationError, match="tls://HOST:PORT"):
         ClusterSettings(cluster=address)
 

@@ -74,12 +74,12 @@ def test_nothing_is_unpickled() -> None:
         "Column(PickleType)",
     ],
 )
-def test_what_unpickles_would_be_found(code: str) -> None:
+def test_unpickling_code_is_found(code: str) -> None:
     assert list(unpickling(code)) == [1]
 
 
 @pytest.mark.parametrize(
     "code", ["np.load(file, allow_pickle=False)", "connection.recv(1 << 16)", "json.load(file)"]
 )
-def test_what_does_not_is_let_be(code: str) -> None:
+def test_other_code_is_not_reported(code: str) -> None:
     assert list(unpickling(code)) == []

@@ -160,7 +160,7 @@ def test_a_client_of_another_cluster_gets_an_error(cluster: Cluster) -> None:
 
 
 @pytest.mark.slow
-def test_a_silent_server_is_not_waited_for() -> None:
+def test_server_that_does_not_answer_is_unavailable() -> None:
     with socket.socket() as silent:
         silent.bind(("127.0.0.1", 0))
         silent.listen()
@@ -215,7 +215,7 @@ def test_finished_tasks_leave_almost_nothing_in_memory(cluster: Cluster, client:
 
 
 @pytest.mark.slow
-def test_a_task_that_exceeds_the_memory_is_blamed_at_once(
+def test_task_over_the_memory_limit_is_blamed_at_once(
     cluster: Cluster, client: Client, tmp_path: Path
 ) -> None:
     limit = 700 << 20

@@ -103,7 +103,7 @@ def test_a_job_continues_where_the_ledger_says(connection: Connection, job: str)
     assert list(start(connection, job).to_do) == [FINISH]
 
 
-def test_tiles_that_are_gone_are_repeated_without_blame(connection: Connection, job: str) -> None:
+def test_lost_tiles_are_repeated_without_counting_as_failures(connection: Connection, job: str) -> None:
     run = working(connection, job)
     for _ in range(20):
         assert advance(connection, run, Outcome(job, 1))
@@ -124,7 +124,7 @@ def test_a_step_is_tried_three_times(connection: Connection, job: str, tile: int
     assert mattes.get(connection, "mat").state == "failed"
 
 
-def test_only_errors_that_may_pass_are_retried(connection: Connection, job: str) -> None:
+def test_only_transient_errors_are_retried(connection: Connection, job: str) -> None:
     run = working(connection, job)
     assert advance(connection, run, Outcome(job, 0, error=Unavailable("the store is away")))
     assert not advance(connection, run, Outcome(job, 0, error=Corrupt("it is damaged")))

@@ -77,9 +77,7 @@ def test_only_expired_rows_are_deleted(engine: Engine) -> None:
 
 @pytest.mark.parametrize("kind", ["recover", "composite"])
 @pytest.mark.parametrize("state", ["queued", "running"])
-def test_what_an_active_job_uses_does_not_expire_before_it_ends(
-    engine: Engine, kind: str, state: str
-) -> None:
+def test_data_of_an_active_job_does_not_expire(engine: Engine, kind: str, state: str) -> None:
     add(engine, "alice", "used", seconds=60.0)
     with writing(engine) as c:
         job = jobs.add(c, kind, "used", {}, "used")
@@ -117,7 +115,7 @@ def listed(engine: Engine) -> set[str]:
         return set(c.scalars(select(tables.jobs.c.id)))
 
 
-def test_old_jobs_are_deleted_unless_what_they_made_exists(engine: Engine, objects: Objects) -> None:
+def test_old_jobs_are_deleted_unless_their_results_exist(engine: Engine, objects: Objects) -> None:
     add(engine, "alice", "kept")
     add(engine, "bob", "gone")
     with writing(engine) as c:
@@ -145,7 +143,7 @@ def test_old_jobs_are_deleted_unless_what_they_made_exists(engine: Engine, objec
             assert set(c.scalars(select(table.c.job))) <= listed(engine)
 
 
-def test_an_idempotency_key_is_kept_as_long_as_what_it_made(engine: Engine, objects: Objects) -> None:
+def test_idempotency_key_is_kept_as_long_as_its_result(engine: Engine, objects: Objects) -> None:
     add(engine, "alice", "thing")
     with writing(for_owner(engine, "alice")) as c:
         for key, made in (("capture", "thing"), ("job", "thing-r"), ("gone", "another")):

@@ -212,7 +212,7 @@ class CompromisedDecoder:
 
 
 @pytest.mark.parametrize("number", range(len(BAD_ANSWERS)))
-def test_what_one_answers_is_not_believed(
+def test_invalid_answer_of_a_child_is_refused(
     decoders: Decoders, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
     monkeypatch.setattr(process, "_serve", CompromisedDecoder(number))
@@ -228,7 +228,7 @@ def test_closed_pool_is_unavailable(decoders: Decoders) -> None:
         decoders.decode(PNG, "srgb")
 
 
-def test_kernel_that_can_not_be_cached_is_used_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernel_that_cannot_be_cached_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     """As on a new installation: numba adds a compiled kernel before it fails to write the cache."""
     real, failures = decode.decode, [errno.EFBIG]
 

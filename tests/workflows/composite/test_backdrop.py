@@ -41,7 +41,7 @@ def smooth() -> NDArray[np.float32]:
 @pytest.mark.parametrize("size", [(60, 80), (120, 160), (31, 47), (200, 333), (1, 1), (1, 500), (997, 3)])
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("threads", [1, 3])
-def test_it_is_the_mean_over_cells_and_that_of_coarser_grids(
+def test_light_is_the_mean_over_cells_of_each_grid(
     size: tuple[int, int], channels: int, threads: int
 ) -> None:
     picture = np.random.default_rng(0).random((*size, channels), np.float32)
@@ -107,7 +107,7 @@ def test_threads_change_nothing(placement: dict[str, float]) -> None:
 @pytest.mark.parametrize(
     "placement", [{"scale": 1.0}, {"scale": 0.3, "angle": 20}, {"scale": 5, "angle": 20}]
 )
-def test_a_placed_backdrop_of_codes_is_as_one_of_their_light(
+def test_placed_backdrop_of_codes_equals_that_of_its_light(
     channels: int, placement: dict[str, float]
 ) -> None:
     codes = np.random.default_rng(0).integers(0, 256, (150, 200, channels), np.uint8)
@@ -123,7 +123,7 @@ def test_a_placed_backdrop_of_codes_is_as_one_of_their_light(
 
 
 @pytest.mark.parametrize("placement", [{"scale": 47}, {"scale": 47, "angle": 30, "right": 15, "down": -12}])
-def test_what_is_seen_of_an_enlarged_backdrop_is_as_if_all_of_it_were_held(
+def test_visible_part_of_an_enlarged_backdrop_equals_that_of_the_whole(
     placement: dict[str, float],
 ) -> None:
     picture = np.random.default_rng(0).random((3000, 4000, 1), np.float32)
@@ -146,7 +146,9 @@ def test_what_is_seen_of_an_enlarged_backdrop_is_as_if_all_of_it_were_held(
         ((2000, 3000, 1), "float32"),
     ],
 )
-def test_a_large_backdrop_takes_little_memory_beside_its_own(shape: tuple[int, int, int], dtype: str) -> None:
+def test_large_backdrop_takes_little_more_than_its_own_memory(
+    shape: tuple[int, int, int], dtype: str
+) -> None:
     size, grown = peak.of_large_after_small(shape, dtype)
     assert grown < size / 2
 
@@ -178,13 +180,13 @@ def test_integers_are_encoded_as_asked(codes: np.ndarray) -> None:
     np.testing.assert_allclose(light_of(data, "linear"), unit, rtol=1e-6)
 
 
-def test_float_values_are_light_and_what_is_no_number_is_black() -> None:
+def test_float_values_are_light_and_nan_is_black() -> None:
     picture = np.array([[[0.5, 2, 4], [np.nan, np.inf, -np.inf]]], np.float32)
     assert light_of(float_formats.encode_exr({"RGB": picture})).tolist() == [[[0.5, 2, 4], [0, 0, 0]]]
 
 
 @pytest.mark.parametrize("depth", [np.uint8, np.uint16])
-def test_what_is_transparent_is_black_in_proportion(codes: np.ndarray, depth: type) -> None:
+def test_transparent_pixels_are_darkened_in_proportion(codes: np.ndarray, depth: type) -> None:
     top = np.iinfo(depth).max
     deep = (codes.astype(np.uint32) * (top // 255)).astype(depth)
     alpha = np.full((5, 7, 1), top, depth)
@@ -228,11 +230,11 @@ def _png16(codes: np.ndarray, profile: bytes) -> bytes:
     return plain[:33] + chunk + plain[33:]  # after IHDR
 
 
-def test_a_colour_profile_that_is_none_is_refused(codes: np.ndarray) -> None:
+def test_invalid_colour_profile_is_refused(codes: np.ndarray) -> None:
     with pytest.raises(ImageError, match="colour profile"):
         light_of(saved(Image.fromarray(codes), icc_profile=b"no profile" * 20))
 
 
-def test_one_that_is_too_large_is_refused_before_it_is_decoded() -> None:
+def test_backdrop_that_is_too_large_is_refused_before_it_is_decoded() -> None:
     with pytest.raises(ImageError, match="takes more than"):
         light_of(saved(Image.new("RGB", (6000, 4000))))

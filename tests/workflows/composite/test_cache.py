@@ -69,7 +69,7 @@ def test_least_recently_used_strips_are_dropped(
     assert len(reads) == 5
 
 
-def test_a_matte_of_twice_the_memory_is_read_all_the_same(objects: Objects, matte: Matte) -> None:
+def test_matte_of_twice_the_memory_is_read(objects: Objects, matte: Matte) -> None:
     memory = 2 * (read_strip(matte, 0, 0).nbytes + read_strip(matte, 0, 1).nbytes)
     cache = Cache(objects, memory)
     for _ in range(2):
@@ -117,7 +117,7 @@ def test_threads_that_ask_for_the_same_read_it_once(
     assert reads == [(2, 8), (2, 9)]
 
 
-def test_a_block_that_is_missing_is_told_to_all_and_asked_for_again(objects: Objects) -> None:
+def test_missing_block_is_an_error_for_all_readers_and_read_again_later(objects: Objects) -> None:
     made = mattes.create(objects, "n", height=16, width=16, columns=8, rows=6, crosstalk=np.eye(3).tolist())
     cache = Cache(objects, 1 << 20)
     with ThreadPoolExecutor(4) as threads:
@@ -131,7 +131,7 @@ def test_a_block_that_is_missing_is_told_to_all_and_asked_for_again(objects: Obj
     assert number(cache.strip("n", 0, 0)) == 0
 
 
-def test_a_matte_that_is_deleted_while_it_is_read_is_told_to_all(
+def test_matte_deleted_while_it_is_read_is_an_error_for_all_readers(
     objects: Objects, matte: Matte, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cache, gate = Cache(objects, 1 << 20), threading.Event()

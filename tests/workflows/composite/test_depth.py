@@ -78,7 +78,7 @@ def psnr(scene: Scene, seen: np.ndarray, backdrop: np.ndarray, where: np.ndarray
     return float(-10 * np.log10(np.mean(error[where] ** 2)))
 
 
-def test_a_second_matte_tells_the_rays(
+def test_second_matte_gives_the_rays(
     made: dict[float, Matte], scenes: dict[float, Scene], backdrop: np.ndarray
 ) -> None:
     first, second = (places_of(made[at], CORES) for at in (NEAR, FAR))
@@ -95,7 +95,7 @@ def test_a_second_matte_tells_the_rays(
     assert moved > still + 10
 
 
-def test_one_matte_tells_them_by_the_camera_s_lines_of_sight(
+def test_one_matte_gives_the_rays_by_the_camera_s_lines_of_sight(
     made: dict[float, Matte], scenes: dict[float, Scene], backdrop: np.ndarray
 ) -> None:
     places = places_of(made[NEAR], CORES)

@@ -123,7 +123,7 @@ def test_a_window_lies_in_the_matte(dense: Dense, crop: tuple[int, int, int, int
     assert caught.value.fields["field"] == field
 
 
-def test_blocks_that_are_not_there_yet_are_left_out(dense: Dense) -> None:
+def test_blocks_not_yet_recovered_are_left_out(dense: Dense) -> None:
     matte, *_ = dense
     backdrop = np.ones((4, 6, 3), np.float32)
     there = {(0, 0), (1, 2)}

@@ -16,7 +16,7 @@ def gathered(light: Any, cell: Any, weight: Any, start: int, stop: int) -> Any:
 
 @pytest.mark.parametrize("stop", [*range(7, 17), 499, 500])
 @pytest.mark.parametrize("nodes", [1, 40, 10_000])
-def test_it_is_the_sum_of_weighted_light(nodes: int, stop: int) -> None:
+def test_gathered_light_is_the_weighted_sum(nodes: int, stop: int) -> None:
     rng = np.random.default_rng(stop)
     light = rng.random((nodes + 1, 3), np.float32)
     light[-1] = np.nan  # read along with the last node, and let go

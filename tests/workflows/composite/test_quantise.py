@@ -33,7 +33,7 @@ def test_light_is_encoded_and_rounded(transfer: Literal["srgb", "linear"], dtype
     assert (codes[..., 1:] == top).all()
 
 
-def test_what_is_no_light_is_black() -> None:
+def test_values_that_are_no_light_are_black() -> None:
     picture = np.full((1, 3, 4), [[np.nan] * 4, [-np.inf] * 4, [np.inf] * 4], np.float32).reshape(1, 3, 4)
     picture[..., 3] = 0.5
     codes = encode(picture, "srgb", np.dtype(np.uint8), 1)

@@ -27,7 +27,7 @@ def expected(counts: NDArray[Any]) -> NDArray[Any]:
     return np.stack([red, (light[::2, 1::2] + light[1::2, ::2]) / 2, blue], axis=2)
 
 
-def test_raw_is_told_by_the_name() -> None:
+def test_raw_is_recognised_by_the_name() -> None:
     assert is_raw("frames/IMG_0001.CR3")
     assert is_raw("a.dng")
     assert not is_raw("dng/a.tif")
@@ -78,12 +78,12 @@ def plain_tiff() -> bytes:
         (plain_tiff(), "RAW"),
     ],
 )
-def test_what_libraw_does_not_know_is_refused(data: bytes, why: str) -> None:
+def test_raw_unknown_to_libraw_is_refused(data: bytes, why: str) -> None:
     with pytest.raises(ImageError, match=why):
         decode(data, memory=MEMORY)
 
 
-def test_the_filters_colours_may_lie_otherwise(make_dng: Dng) -> None:
+def test_colour_filter_may_have_another_order(make_dng: Dng) -> None:
     light = decode(make_dng(COUNTS, BLACK, WHITE, pattern=(2, 1, 1, 0)), memory=MEMORY)
     np.testing.assert_allclose(light, expected(COUNTS)[:, :, ::-1], atol=1e-6)
 
@@ -174,7 +174,7 @@ def test_a_dng_of_floats_is_refused(make_dng: Dng, shape: tuple[int, ...]) -> No
         decode(make_dng(np.ones(shape, np.float32), 0, 1), memory=MEMORY)
 
 
-def test_a_dng_in_a_compression_that_libraw_has_not_is_refused(make_dng: Dng) -> None:
+def test_dng_in_a_compression_unknown_to_libraw_is_refused(make_dng: Dng) -> None:
     data = make_dng(PIXELS, BLACK, WHITE, compression=tifffile.COMPRESSION.JPEGXL_DNG)
     with pytest.raises(ImageError, match="other than JPEG XL"):
         decode(data, memory=MEMORY)

@@ -72,7 +72,7 @@ def test_a_backdrop_is_upright_with_its_profile_and_its_transparency() -> None:
 
 
 @pytest.mark.parametrize("turn", [0, 9, 65535])
-def test_what_is_no_orientation_turns_nothing(turn: int) -> None:
+def test_invalid_orientation_is_ignored(turn: int) -> None:
     for data in (saved("JPEG", turn), tiff(turn, PIXELS)):
         assert integer_formats.orientation(data) == 1
         assert integer_formats.decode(data, memory=MEMORY).shape == PIXELS.shape

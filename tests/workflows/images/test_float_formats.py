@@ -98,7 +98,7 @@ def test_integers_and_others_are_no_floats() -> None:
         ),
     ],
 )
-def test_odd_ones_are_refused(data: bytes, why: str | None) -> None:
+def test_unsupported_files_are_refused(data: bytes, why: str | None) -> None:
     if why is None:  # grey with alpha is not odd
         assert decode(data, memory=MEMORY).shape == (19, 23, 1)
         return
@@ -144,7 +144,7 @@ def test_tiles_much_larger_than_the_image_are_refused() -> None:
         decode(bytes(data), memory=MEMORY)
 
 
-def test_a_tiff_whose_width_is_a_text_costs_no_memory() -> None:
+def test_tiff_with_text_as_its_width_takes_no_memory() -> None:
     data = bytearray(tiff(np.zeros((16, 16, 3), np.float32), photometric="rgb", tile=(16, 16)))
     for tag, kind, value in ((256, 2, ord("$")), (257, 4, 1 << 30)):  # ImageWidth, ImageLength
         at = data.index(struct.pack("<HHII", tag, 4, 1, 16))

@@ -146,12 +146,12 @@ def test_a_tiff_that_holds_a_jpeg_is_read() -> None:
         saved(Image.new("RGB", (4, 4)), "WEBP"),
     ],
 )
-def test_what_is_no_image_is_refused(data: bytes) -> None:
+def test_file_that_is_no_image_is_refused(data: bytes) -> None:
     with pytest.raises(ImageError, match="not a PNG or TIFF or JPEG"):
         decode(data, memory=MEMORY)
 
 
-def test_a_format_that_is_not_taken_is_refused() -> None:
+def test_unsupported_format_is_refused() -> None:
     data = saved(Image.new("RGB", (4, 4)), "JPEG")
     with pytest.raises(ImageError, match="not a PNG or TIFF image"):
         decode(data, memory=MEMORY, formats=("PNG", "TIFF"))
@@ -170,7 +170,7 @@ def test_a_format_that_is_not_taken_is_refused() -> None:
         saved(Image.new("P", (700, 700)), "PNG"),
     ],
 )
-def test_what_is_too_large_is_refused_by_its_header(data: bytes) -> None:
+def test_image_that_is_too_large_is_refused_by_its_header(data: bytes) -> None:
     start = time.process_time()
     with pytest.raises(ImageError, match=r"too large|takes more than") as caught:
         decode(data, memory=MEMORY)
@@ -203,7 +203,7 @@ def test_the_limit_is_that_of_the_decoded_bytes(dtype: str, channels: int) -> No
         ),
     ],
 )
-def test_odd_ones_are_refused(data: bytes) -> None:
+def test_unsupported_variants_are_refused(data: bytes) -> None:
     with pytest.raises(ImageError):
         decode(data, memory=MEMORY)
 
@@ -269,7 +269,7 @@ def test_a_damaged_file_is_an_image_error_or_an_image(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["tiff", "lzw", "deflate", "jpeg in tiff"])
-def test_a_tiff_whose_tags_lie_is_an_image_error_or_an_image(kind: str) -> None:
+def test_tiff_with_false_tags_is_an_image_error_or_an_image(kind: str) -> None:
     (first,) = struct.unpack_from("<I", VALID[kind], 4)
     (tags,) = struct.unpack_from("<H", VALID[kind], first)
     for tag in range(tags):
@@ -280,7 +280,7 @@ def test_a_tiff_whose_tags_lie_is_an_image_error_or_an_image(kind: str) -> None:
                 tried(bytes(data))
 
 
-def test_a_jpeg_in_a_tiff_that_lies_about_its_size_costs_no_memory() -> None:
+def test_jpeg_in_a_tiff_with_a_false_size_takes_no_memory() -> None:
     data = bytearray(VALID["jpeg in tiff"])
     struct.pack_into(">HH", data, data.index(b"\xff\xc0") + 5, 20000, 20000)
     tracemalloc.start()

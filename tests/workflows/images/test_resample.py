@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from workflows.images.resample import area_mean, smallest_grid, stretch
 
 
-def test_the_smallest_grid_loses_nothing() -> None:
+def test_smallest_grid_loses_no_detail() -> None:
     rng = np.random.default_rng(3)
     small = rng.random((6, 5, 3), np.float32)
     for down, across in ((1, 1), (4, 1), (3, 7)):

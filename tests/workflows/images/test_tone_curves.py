@@ -39,7 +39,7 @@ def test_curves_invert_each_other(curve: str) -> None:
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
-def test_a_code_survives_the_way_to_light_and_back(dtype: str) -> None:
+def test_code_is_unchanged_by_light_and_back(dtype: str) -> None:
     codes = np.arange(np.iinfo(dtype).max + 1)
     back = from_light(table("srgb", np.dtype(dtype)), "srgb") * np.float32(codes[-1])
     np.testing.assert_array_equal(np.rint(back), codes)
@@ -124,7 +124,7 @@ def test_the_monitors_gamma_is_found(gamma: float) -> None:
         (LEVELS, (Gamma(gamma=1.7), "linear"), (Gamma(gamma=1.7), "linear", ())),
     ],
 )
-def test_unknown_curves_are_assumed_srgb_and_known_ones_stay(
+def test_unknown_curves_count_as_srgb_and_known_ones_are_kept(
     levels: np.ndarray, declared: tuple[Response, Response], found: tuple[Curve, Curve, tuple[str, ...]]
 ) -> None:
     assert estimated(levels, stored(levels, "linear", 1.5), *declared) == found
@@ -162,13 +162,13 @@ def test_no_usable_pixel_is_srgb() -> None:
     assert estimated(LEVELS, np.zeros((9, 50), np.float32), "linear", "unknown").camera == "srgb"
 
 
-def test_a_camera_that_saw_no_difference_gets_some_curve() -> None:
+def test_camera_without_contrast_gets_a_default_curve() -> None:
     values = np.full((9, 50), 0.25, np.float32)
     assert estimated(LEVELS, values, "linear", "unknown") == ("linear", "srgb", ("camera",))
 
 
 @pytest.mark.parametrize("curve", ["linear", "srgb"])
-def test_a_black_value_is_no_light_and_what_is_below_is_negative(curve: Curve) -> None:
+def test_black_value_is_zero_light_and_lower_values_are_negative(curve: Curve) -> None:
     made = table(curve, np.dtype(np.uint16), BLACK)
     assert made[BLACK] == 0
     assert made[65535] == pytest.approx(1)

@@ -85,7 +85,7 @@ def test_unknown_fields_and_files_are_accepted(make_zip: Zip) -> None:
     assert archive.manifest == open_archive(make_zip(RECORD, FILES)).manifest
 
 
-def test_a_record_is_needed(make_zip: Zip) -> None:
+def test_archive_without_a_record_is_refused(make_zip: Zip) -> None:
     assert refused(make_zip(None, FILES)).fields == {"entry": "capture.json"}
     deeper = make_zip(None, {"ball/capture.json": b"{}"})
     assert refused(deeper).fields == {"entry": "capture.json"}
@@ -129,7 +129,7 @@ def test_a_record_is_needed(make_zip: Zip) -> None:
         (lambda r: r.update(video=VIDEO | {"patterns_per_second": 0}), "video.patterns_per_second", ""),
     ],
 )
-def test_a_record_that_does_not_hold_together_is_refused(
+def test_inconsistent_record_is_refused(
     make_zip: Zip, change: Callable[[dict[str, Any]], object], field: str, why: str
 ) -> None:
     error = refused(make_zip(changed(change), FILES))
@@ -138,7 +138,7 @@ def test_a_record_that_does_not_hold_together_is_refused(
     assert why in error.detail
 
 
-def test_a_folder_is_no_frame(make_zip: Zip) -> None:
+def test_folder_as_a_frame_is_refused(make_zip: Zip) -> None:
     record = changed(lambda r: r["frames"][0].update(file="frames/x/"))
     error = refused(make_zip(record, FILES | {"frames/x/": b""}))
     assert error.fields == {"entry": "frames/x/", "field": "frames.0.file"}
@@ -219,7 +219,7 @@ def test_an_entry_takes_a_quarter_of_the_memory_at_most(make_zip: Zip) -> None:
     assert caught.value.fields == {"entry": "large", "limit": 1 << 18}
 
 
-def test_a_directory_that_lies_about_sizes_costs_no_memory(make_zip: Zip) -> None:
+def test_directory_with_false_sizes_takes_no_memory(make_zip: Zip) -> None:
     size = 100 << 20
     data = bytearray(make_zip(RECORD, FILES | {"z": bytes(size)}, zipfile.ZIP_DEFLATED))
     at = data.rindex(b"PK\x01\x02")
@@ -237,7 +237,7 @@ def test_a_directory_that_lies_about_sizes_costs_no_memory(make_zip: Zip) -> Non
 
 @pytest.mark.parametrize(("field", "value"), [(20, 0), (20, 5), (24, 99), (42, 0xFFFFFFFE), (42, None)])
 @pytest.mark.parametrize("pack", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
-def test_a_directory_that_lies_is_refused_when_it_is_read(
+def test_false_directory_is_refused_when_an_entry_is_read(
     make_zip: Zip, pack: int, field: int, value: int | None
 ) -> None:
     data = bytearray(make_zip(RECORD, FILES, pack))
@@ -251,7 +251,7 @@ def test_a_directory_that_lies_is_refused_when_it_is_read(
     assert archive.read("frames/3.png") == FILES["frames/3.png"]
 
 
-def test_an_offset_beyond_all_is_refused(make_zip: Zip) -> None:
+def test_offset_beyond_the_file_is_refused(make_zip: Zip) -> None:
     data = make_zip(RECORD, FILES)
     at, end = data.rindex(b"PK\x01\x02"), data.rindex(b"PK\x05\x06")
     entry, extra = bytearray(data[at:end]), struct.pack("<HHQ", 1, 8, 2**64 - 1)
@@ -265,7 +265,7 @@ def test_an_offset_beyond_all_is_refused(make_zip: Zip) -> None:
     assert caught.value.fields == {"entry": "frames/4.png"}
 
 
-def test_a_name_that_is_not_there(make_zip: Zip) -> None:
+def test_missing_entry_is_refused(make_zip: Zip) -> None:
     with pytest.raises(CaptureError) as caught:
         open_archive(make_zip(RECORD, FILES)).read("none")
     assert caught.value.fields == {"entry": "none"}
@@ -328,7 +328,7 @@ def test_a_directory_of_too_many_entries_is_refused(make_zip: Zip) -> None:
         open_archive(make_zip(RECORD, files))
 
 
-def test_a_directory_that_is_a_bomb_is_not_read(make_zip: Zip) -> None:
+def test_directory_that_is_a_zip_bomb_is_not_read(make_zip: Zip) -> None:
     data = make_zip(RECORD, FILES | {f"{n:05d}" + 60_000 * "x": b"" for n in range(400)})
     tracemalloc.start()
     try:
@@ -345,7 +345,7 @@ def test_an_entry_larger_than_a_directory_may_be_is_read(make_zip: Zip) -> None:
     assert archive.read("large") == large
 
 
-def test_a_record_larger_than_any_is_refused(make_zip: Zip) -> None:
+def test_record_over_its_limit_is_refused(make_zip: Zip) -> None:
     limits = Limits(unpacked=1 << 24, memory=1 << 24)
     error = refused(make_zip(b" " * ((4 << 20) + 1), FILES, zipfile.ZIP_DEFLATED), limits)
     assert error.fields == {"entry": "capture.json", "limit": 4 << 20}

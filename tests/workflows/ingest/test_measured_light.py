@@ -18,7 +18,7 @@ def merged(codes: NDArray[np.uint8], given: dict[str, Any], count: int) -> Light
     )[0]
 
 
-def test_merged_light_leaves_out_what_is_clipped() -> None:
+def test_merged_light_leaves_out_clipped_values() -> None:
     codes = np.array(
         [[[51, 0, 255]], [[102, 0, 255]], [[204, 4, 255]], [[255, 8, 255]], [[10, 20, 30]]], np.uint8
     )
@@ -30,7 +30,7 @@ def test_merged_light_leaves_out_what_is_clipped() -> None:
     np.testing.assert_allclose(light[0, 1] * 255, [5, 10, 15], rtol=1e-6)
 
 
-def test_a_clipped_repeat_takes_its_whole_exposure_out() -> None:
+def test_clipped_repeat_excludes_its_whole_exposure() -> None:
     codes = np.array([[[250, 100, 9]], [[255, 110, 0]]], np.uint8)
     given = {"patterns": [0, 0], "exposures": [1.0, 1.0]}
     light, usable, worth = merged(codes, given, 1)
@@ -39,7 +39,7 @@ def test_a_clipped_repeat_takes_its_whole_exposure_out() -> None:
     np.testing.assert_array_equal(worth, 2)
 
 
-def test_the_gain_of_a_pattern_is_that_of_its_frames_by_what_they_count() -> None:
+def test_gain_of_a_pattern_is_the_weighted_gain_of_its_frames() -> None:
     codes = np.array([[[50, 100, 0]], [[100, 255, 0]]], np.uint8)
     given = {"patterns": [0, 0], "exposures": [1.0, 3.0], "gains": [1.2, 0.8]}
     _, gain = merge(lambda n: (LOOK_UP[codes[n]], (codes[n] > 0) & (codes[n] < 255)), given, 1, 1)
@@ -64,7 +64,7 @@ def test_a_picture_that_moved_is_moved_back(shift: tuple[float, float]) -> None:
     np.testing.assert_array_equal(part, moved[5 : 30 - 2 * margin, 7 : 44 - 2 * margin])
 
 
-def test_a_value_made_of_clipped_ones_is_clipped() -> None:
+def test_value_merged_from_clipped_ones_is_clipped() -> None:
     codes = np.full((20, 20, 3), 100, np.uint8)
     codes[10, 10, 1] = 255
     _, whole = unclipped_light(codes, (0.4, 0.0), 4, LOOK_UP)

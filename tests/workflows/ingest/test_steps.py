@@ -67,7 +67,7 @@ PATTERNS = [4, 0, 1, 5, 0, 2, 3, 1, 4, 0]
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("memory", [1 << 24, 40_000])
-def test_the_stack_holds_the_very_values(
+def test_stack_holds_the_exact_values(
     make_zip: Zip, ingest: Ingest, suffix: str, dtype: str, channels: int, memory: int
 ) -> None:
     values = shots(len(PATTERNS), channels, dtype)
@@ -129,7 +129,7 @@ def test_slabs_in_any_order_and_again_are_the_same_bytes(
     assert digests("captures/c") == plain
 
 
-def test_a_slab_left_out_is_corrupt(make_zip: Zip, ingest: Ingest) -> None:
+def test_missing_slab_is_corrupt(make_zip: Zip, ingest: Ingest) -> None:
     data = archive_of(make_zip, shots(len(PATTERNS), 3, "uint16"), PATTERNS)
     with pytest.raises(Corrupt, match=r"frames/c/\d/0/0/0 is missing"):
         ingest("c", data, memory=6 * HEIGHT * WIDTH * 6, order=lambda slabs: iter(slabs[1:]))
@@ -153,9 +153,7 @@ def test_a_frame_unlike_the_first_is_refused(make_zip: Zip, ingest: Ingest, odd:
 
 @pytest.mark.parametrize("at", [0, 3])
 @pytest.mark.parametrize("data", [b"no image", encode_png(shots(1, 3, "uint8")[0])[:-30], b""])
-def test_a_frame_that_can_not_be_decoded_is_refused(
-    make_zip: Zip, ingest: Ingest, at: int, data: bytes
-) -> None:
+def test_frame_that_cannot_be_decoded_is_refused(make_zip: Zip, ingest: Ingest, at: int, data: bytes) -> None:
     given = archive_of(make_zip, shots(6, 3, "uint8"), [0, 1, 2, 3, 4, 5], files={f"{at}.png": data})
     with pytest.raises(CaptureError, match=rf"^{at}\.png: ") as caught:
         ingest("c", given)
@@ -225,7 +223,7 @@ def test_an_unknown_response_is_estimated(
             assert attributes[name] == curve
 
 
-def test_the_noise_is_the_cameras(ingest: Ingest) -> None:
+def test_measured_noise_is_that_of_the_camera(ingest: Ingest) -> None:
     scene = glass_ball(80, 60, monitor=(64, 48), rays=4)
     target = io.BytesIO()
     write_capture(scene, nested_program((64, 48), bands=((4, 3, 2),), levels=8), target, noise=2.0, depth=16)
@@ -236,7 +234,7 @@ def test_the_noise_is_the_cameras(ingest: Ingest) -> None:
         assert deviation == pytest.approx(2 * (0.002 + 0.006 * value**0.5), rel=0.25)
 
 
-def test_a_stack_that_takes_more_than_is_allowed_is_refused(make_zip: Zip, ingest: Ingest) -> None:
+def test_stack_over_the_limit_is_refused(make_zip: Zip, ingest: Ingest) -> None:
     # One small file, named by a hundred thousand frames.
     flat = encode_png(np.full((100, 100, 3), 9, np.uint8))
     given = record([n % 6 for n in range(100_000)])

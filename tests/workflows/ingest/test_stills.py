@@ -79,7 +79,7 @@ def test_float_frames_are_stored_in_units_of_the_white_frame(
     assert stack.attributes["assumed_curves"] == []
 
 
-def test_what_is_no_number_or_out_of_range_is_clipped(make_zip: Zip, ingest: Ingest) -> None:
+def test_nan_and_values_out_of_range_are_clipped(make_zip: Zip, ingest: Ingest) -> None:
     frames = light(1.0)
     frames[2, 5, 5] = 1e6  # a glint does not set the scale
     frames[4, 0, 0] = np.inf, np.nan, -np.inf

@@ -88,7 +88,7 @@ def test_an_identity_is_an_stmap_of_pixel_centres_from_the_bottom_left(identity:
 
 
 @pytest.mark.parametrize("name", layers.NAMES)
-def test_single_layers_are_what_the_matte_holds(identity: Matte, name: str) -> None:
+def test_single_layers_equal_the_data_of_the_matte(identity: Matte, name: str) -> None:
     held = {
         "S": identity.layer("S"),
         "rho": identity.layer("rho"),
@@ -105,7 +105,7 @@ def test_single_layers_are_what_the_matte_holds(identity: Matte, name: str) -> N
     )
 
 
-def test_all_layers_come_back(identity: Matte) -> None:
+def test_all_layers_are_read_back_from_one_exr(identity: Matte) -> None:
     channels, spec = read(layers.everything(identity, 2))
     of_lobe = ("u", "v", "weight.R", "weight.G", "weight.B", "sigma_u", "sigma_v", "theta")
     assert set(channels) == {
@@ -132,7 +132,7 @@ def test_all_layers_come_back(identity: Matte) -> None:
     assert not any(channels[f"lobe1.{name}"].any() for name in of_lobe)
 
 
-def test_what_it_holds_is_told_beforehand(identity: Matte) -> None:
+def test_size_of_all_layers_is_known_beforehand(identity: Matte) -> None:
     for lobes in (1, 4):
         _, spec = read(layers.everything(identity, lobes))
         assert spec.pixel_bytes(True) * 30 * 50 == layers.bytes_of_everything(50, 30, lobes)

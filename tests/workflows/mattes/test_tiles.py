@@ -236,7 +236,7 @@ def test_frames_that_are_moved_back_are_the_same_in_any_tile(
 
 
 @pytest.mark.parametrize(("capture", "matte"), [("c", "none"), ("none", "m")])
-def test_what_the_store_lacks_is_corrupt(
+def test_missing_capture_or_matte_is_corrupt(
     recover: Callable[..., tuple[mattes.Matte, int]],
     objects: Objects,
     archives: dict[bool, bytes],

@@ -87,7 +87,7 @@ def test_codes_are_all_different_and_neighbours_differ_in_one_bit_and_the_parity
 
 
 @pytest.mark.parametrize("border", DISPLAYS, ids=lambda b: f"{b.width}x{b.height}")
-def test_the_picture_is_shown_as_it_is_and_the_light_of_the_border_is_constant(border: Border) -> None:
+def test_picture_is_unchanged_and_light_of_the_border_constant(border: Border) -> None:
     x, y, w, h = border.inner
     picture = np.random.default_rng(0).integers(0, 256, (h, w, 3), np.uint8)
     light = set()
@@ -152,7 +152,7 @@ def test_a_torn_frame_shows_two_numbers_and_where_it_is_torn() -> None:
         np.testing.assert_array_equal(odd, below)  # 42 + 1 is odd
 
 
-def test_a_film_of_a_camera_that_runs_by_itself_is_read_whole() -> None:
+def test_film_of_an_unsynchronised_camera_is_read_completely() -> None:
     rng = np.random.default_rng(8)
     rate, frames_a_second, exposure, rolling = 2.0, 29.97, 1 / 60, 0.02
     steps = schedule(60, rate)
@@ -190,7 +190,7 @@ def test_one_cell_in_the_shade_is_not_certain() -> None:
     assert not read_numbers(wrong.astype(float))[1]
 
 
-def test_the_schedule_leads_in_shows_each_pattern_as_long_and_leads_out() -> None:
+def test_schedule_has_a_lead_in_equal_times_and_a_lead_out() -> None:
     steps = schedule(5, 4)
     for before, after in pairwise(steps):
         assert after.start == pytest.approx(before.start + before.seconds)

@@ -46,7 +46,7 @@ def test_a_file_without_a_program_is_refused(
         load_program(str(tmp_path))
 
 
-def test_a_screen_is_the_monitor_or_has_it_inside_a_border() -> None:
+def test_screen_equals_the_monitor_or_surrounds_it_with_a_border() -> None:
     def size(of: str | Program, screen: tuple[int, int] | None, bordered: bool) -> tuple[int, int]:
         monitor = fit_to_screen(of, screen, bordered=bordered).monitor
         return monitor.width, monitor.height
@@ -60,7 +60,7 @@ def test_a_screen_is_the_monitor_or_has_it_inside_a_border() -> None:
         assert fit_to_screen(SKETCH, None, bordered=bordered) == SKETCH
 
 
-def test_what_has_no_room_on_a_screen_or_is_files_already_is_refused() -> None:
+def test_program_that_cannot_be_fitted_to_a_screen_is_refused() -> None:
     with pytest.raises(OptionError, match=r"on a monitor of 90 x 90 pixels: a grid of .* is finer"):
         fit_to_screen(SKETCH, (90, 90), bordered=False)
     images = program_json(SKETCH)

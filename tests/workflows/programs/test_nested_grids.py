@@ -115,7 +115,7 @@ def test_offset_patterns_are_averaged_over_the_cells_from_their_own_grid_on() ->
             np.testing.assert_allclose(level.light[:, :, m], cells.reshape(-1, 3).T, atol=1e-6)
 
 
-def test_grids_without_an_offset_make_the_levels_where_there_are_any() -> None:
+def test_grids_without_an_offset_are_preferred_as_levels() -> None:
     made = program(grid(5, 7, 2, offset=True), grid(8, 6), grid(64, 48, 1, 2, offset=True), grid(16, 12))
     assert made.bands() == [(8, 6), (16, 12)]
     coarse, fine = made.sensing("linear").levels
@@ -215,7 +215,7 @@ def test_grids_that_do_not_nest_are_refused(other: tuple[int, int]) -> None:
         [grid(512, 512, 1000), grid(1024, 1024, 5)],
     ],
 )
-def test_what_is_too_large_is_refused_without_using_memory(parts: list[dict[str, Any]]) -> None:
+def test_level_that_is_too_large_is_refused_without_using_memory(parts: list[dict[str, Any]]) -> None:
     tracemalloc.start()
     try:
         with pytest.raises((OptionError, ValidationError), match=f"more than {SENSING_BYTES}"):

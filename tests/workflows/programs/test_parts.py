@@ -27,7 +27,7 @@ def test_bits_are_the_raw_words_of_pcg64() -> None:
 
 
 @pytest.mark.parametrize(("columns", "rows", "colour"), [(16, 12, "grey"), (7, 5, "rgb"), (3, 3, "grey")])
-def test_one_pattern_is_the_one_among_all(columns: int, rows: int, colour: str) -> None:
+def test_single_pattern_equals_that_of_the_whole_part(columns: int, rows: int, colour: str) -> None:
     part = Bernoulli.model_validate(grid(columns, rows, count=40, colour=colour))
     np.testing.assert_array_equal([part.pattern(i) for i in range(40)], part.bits)
 

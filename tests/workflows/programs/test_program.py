@@ -11,7 +11,7 @@ from tests.workflows.programs.parts import grid, program, shown, stripes
 from workflows.programs.program import Program
 
 
-def test_a_function_of_each_value_alone_may_come_before_the_pixels() -> None:
+def test_function_of_each_value_may_be_applied_before_enlarging() -> None:
     rng = np.random.default_rng(0)
     rolled = grid(5, 4, 3, colour="rgb", offset=True)
     files = {"kind": "images", "files": ["small.png", "large.png"]}
@@ -108,6 +108,6 @@ def test_patterns_are_numbered_through_the_parts() -> None:
         ([{"kind": "constant", "levels": [0, 1]}, grid(1, 1, count=99_999)], "100001 patterns, more than"),
     ],
 )
-def test_programs_that_can_not_work_are_refused(parts: list[dict[str, Any]], why: str) -> None:
+def test_invalid_programs_are_refused(parts: list[dict[str, Any]], why: str) -> None:
     with pytest.raises(ValidationError, match=why):
         Program.model_validate({"monitor": {"width": 96, "height": 72}, "parts": parts})

@@ -60,7 +60,7 @@ def test_codes_are_the_pictures() -> None:
     check(laid_out, light)
 
 
-def test_a_constant_between_patterns_is_passed_over() -> None:
+def test_constant_between_patterns_is_skipped() -> None:
     program = program_of(GREY, Constant(kind="constant", levels=(0.5,)), STRIPES, CONSTANT)
     apart = lay_out(program, "linear")
     together = lay_out(program_of(GREY, STRIPES), "linear")
@@ -77,7 +77,7 @@ def test_coloured_patterns_are_laid_out_channel_after_channel() -> None:
     np.testing.assert_array_equal(cells[2::5, 2::5], 255 * RGB.bits.transpose(1, 2, 3, 0))
 
 
-def test_a_grey_pattern_beside_coloured_ones_is_of_three_like_channels() -> None:
+def test_grey_pattern_among_coloured_ones_has_three_equal_channels() -> None:
     program = program_of(GREY, RGB)
     laid_out = lay_out(program, "linear")
     assert (laid_out.channels, laid_out.count) == (3, 9)

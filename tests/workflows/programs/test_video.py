@@ -33,7 +33,7 @@ COLOURED = fit_to_screen("sketch", (320, 240), bordered=True)
 @pytest.mark.parametrize("end", [".mp4", ".mkv"])
 @pytest.mark.parametrize(("program", "off"), [(GREY, 0), (COLOURED, 1)], ids=["grey", "coloured"])
 @pytest.mark.parametrize("rate", [2.0, 7.5])
-def test_every_picture_comes_back_for_its_time(
+def test_every_picture_is_shown_for_its_time(
     program: Program, off: int, end: str, rate: float, tmp_path: Path
 ) -> None:
     path = tmp_path / f"film{end}"
@@ -70,7 +70,7 @@ def test_every_picture_comes_back_for_its_time(
     assert start == pytest.approx(2 * sum(LEAD_SECONDS) + program.count / rate, abs=10 * spacing)
 
 
-def test_beside_the_video_is_what_the_capture_needs(tmp_path: Path) -> None:
+def test_record_beside_the_video_is_a_valid_capture_json(tmp_path: Path) -> None:
     write_video(COLOURED, tmp_path / "sketch.mp4", 3.0, lambda done, of: None)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["sketch.json", "sketch.mp4"]
     record = json.loads((tmp_path / "sketch.json").read_text())
@@ -87,7 +87,7 @@ def test_the_same_program_gives_the_same_bytes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["film.mp4", "film.json"])
-def test_a_file_that_is_there_is_kept(name: str, tmp_path: Path) -> None:
+def test_existing_file_is_kept(name: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text("mine")
     with pytest.raises(OptionError, match=f"{name} exists already"):
         write_video(COLOURED, tmp_path / "film.mp4", 2.0, lambda done, of: None)
@@ -108,7 +108,7 @@ def test_a_file_that_is_there_is_kept(name: str, tmp_path: Path) -> None:
     ],
     ids=["rate", "nan", "border", "patterns"],
 )
-def test_what_can_not_be_filmed_is_refused_and_leaves_nothing(
+def test_program_that_cannot_be_filmed_is_refused_and_leaves_nothing(
     program: Program, rate: float, reason: str, tmp_path: Path
 ) -> None:
     with pytest.raises(OptionError, match=reason):

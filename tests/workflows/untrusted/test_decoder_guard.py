@@ -39,14 +39,14 @@ Clip(Film(), "film.mp4", 1 << 20)
 @pytest.mark.parametrize(
     "hang", ["time.sleep(1000)", "sum(range(1 << 60))"], ids=["waits", "holds the interpreter"]
 )
-def test_a_decoder_that_hangs_ends_its_process_and_says_where(hang: str) -> None:
+def test_hanging_decoder_ends_its_process_and_logs_where(hang: str) -> None:
     ran = subprocess.run([sys.executable, "-c", SCRIPT.format(hang)], stderr=subprocess.PIPE, text=True)
     assert ran.returncode == 1
     assert "Timeout (0:00:01)!" in ran.stderr
     assert "in read" in ran.stderr
 
 
-def test_what_ends_in_time_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_decoder_that_ends_in_time_continues(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(decoder_guard, "SECONDS", 0.2)
     for _ in range(3):
         with Guard("film.mp4", 1 << 20).on():
@@ -90,7 +90,7 @@ def test_a_decoder_is_refused_more_memory_than_it_may_take(small: Guard) -> None
 
 
 @linux
-def test_a_decoder_that_says_nothing_of_memory_is_understood(small: Guard) -> None:
+def test_unspecific_error_for_lack_of_memory_is_recognised(small: Guard) -> None:
     def decode() -> None:
         try:
             bytearray(MUCH)
@@ -104,7 +104,7 @@ def test_a_decoder_that_says_nothing_of_memory_is_understood(small: Guard) -> No
 
 
 @linux
-def test_what_a_decoder_takes_is_added_up_and_what_others_take_is_not(small: Guard) -> None:
+def test_only_memory_of_guarded_decoders_is_added_up(small: Guard) -> None:
     kept = []
     for _ in range(3):
         with small.on():
@@ -122,7 +122,7 @@ def test_what_a_decoder_takes_is_added_up_and_what_others_take_is_not(small: Gua
 
 
 @linux
-def test_a_lower_limit_of_the_process_holds(small: Guard) -> None:
+def test_lower_limit_of_the_process_is_kept(small: Guard) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
     lower = decoder_guard.in_use() + 20 * MIB
     resource.setrlimit(resource.RLIMIT_DATA, (lower, hard))
@@ -183,7 +183,7 @@ def fragmented(samples: int) -> bytes:
     ],
     ids=["at once", "bit by bit"],
 )
-def test_a_film_of_some_kilobytes_does_not_take_gigabytes(film: bytes, reason: str) -> None:
+def test_film_of_a_few_kilobytes_does_not_take_gigabytes(film: bytes, reason: str) -> None:
     assert len(film) < 20_000
     ran = subprocess.run([sys.executable, "-c", PEAK], input=film, stdout=subprocess.PIPE, check=True)
     grown, _, detail = ran.stdout.decode().partition(" ")

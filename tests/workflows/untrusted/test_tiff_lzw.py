@@ -23,7 +23,7 @@ def pictures() -> list[NDArray[np.uint8]]:
 
 
 @pytest.mark.parametrize("by", ["libtiff", "imagecodecs"])
-def test_what_encoders_write_is_read(by: str) -> None:
+def test_files_of_common_encoders_are_read(by: str) -> None:
     for pixels in pictures():
         target = io.BytesIO()
         if by == "libtiff":

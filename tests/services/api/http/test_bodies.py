@@ -37,14 +37,14 @@ def test_announced_length_over_the_limit_is_refused() -> None:
     assert caught.value.fields == {"name": "upload_bytes", "limit": 10, "value": 11}
 
 
-def test_body_over_the_limit_is_refused_while_it_comes() -> None:
+def test_body_over_the_limit_is_refused_while_it_arrives() -> None:
     assert asyncio.run(collect(BodyLimit(4).stream(request([b"ab", b"cd"])))) == [b"ab", b"cd"]
     with pytest.raises(TooLarge, match="may have 3 bytes") as caught:
         asyncio.run(collect(BodyLimit(3).stream(request([b"ab", b"cd", b"ef"]))))
     assert caught.value.fields == {"limit": 3}
 
 
-def test_bytes_that_came_before_count() -> None:
+def test_earlier_bytes_count_towards_the_limit() -> None:
     with pytest.raises(TooLarge):
         BodyLimit(4).check_announced(request(content_length="2"), start=3)
     with pytest.raises(TooLarge):

@@ -191,14 +191,14 @@ def test_linear_codes_are_light(make: Make, matte: Matte) -> None:
     assert np.sqrt(np.mean((made[0][10:HEIGHT, 10:WIDTH] / 255 - expected) ** 2)) < 0.03
 
 
-def test_a_video_is_the_same_in_whatever_order_and_however_often(make: Make) -> None:
+def test_order_and_repetition_of_segments_do_not_change_the_video(make: Make) -> None:
     data = clip(pictures(50), even(50))
     first = make(data)
     assert make(data, "other", lambda tiles: [*reversed(tiles), tiles[1]]) == first
     assert hashlib.sha256(make(data)).digest() == hashlib.sha256(first).digest()
 
 
-def test_it_plays_while_it_loads_and_says_its_colours(make: Make) -> None:
+def test_video_can_be_played_while_it_loads_and_states_its_colours(make: Make) -> None:
     video = make(clip(pictures(3), even(3)))
     assert video.index(b"moov") < video.index(b"mdat")
     with av.open(io.BytesIO(video)) as container:
@@ -231,9 +231,7 @@ def test_one_frame_is_a_video(make: Make) -> None:
     assert lasts > 0
 
 
-def test_a_clip_that_ends_early_is_composited_as_far_as_it_goes(
-    make: Make, objects: Objects, matte: Matte
-) -> None:
+def test_clip_that_ends_early_is_composited_to_its_end(make: Make, objects: Objects, matte: Matte) -> None:
     data = clip(pictures(80), even(80), crf="1")
     short = data[: len(data) * 5 // 8]
     for name, whole in (("mp4", data), ("mkv", clip(pictures(80), even(80), "matroska", crf="1"))):
@@ -265,7 +263,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("kind", REFUSED)
-def test_what_is_no_clip_is_refused(objects: Objects, matte: Matte, kind: str) -> None:
+def test_file_that_is_no_clip_is_refused(objects: Objects, matte: Matte, kind: str) -> None:
     with pytest.raises(ClipError, match="can't be read as a video"):
         plan_of(objects, REFUSED[kind])
 
@@ -276,7 +274,7 @@ def test_frames_larger_than_the_limit_are_refused(objects: Objects, matte: Matte
     assert caught.value.fields == {"limit": 72 * 54 * 6 - 1}
 
 
-def test_a_frame_that_is_shown_for_days_is_refused(objects: Objects, matte: Matte) -> None:
+def test_frame_shown_for_days_is_refused(objects: Objects, matte: Matte) -> None:
     with pytest.raises(ClipError, match="frame 1 of the clip is shown for"):
         plan_of(objects, clip(pictures(3), [0, 20, 600 * 86400 * 5], "matroska"))
 
@@ -289,7 +287,7 @@ def test_more_frames_than_are_taken_are_refused(
         plan_of(objects, clip(pictures(10), even(10)))
 
 
-def test_a_segment_that_is_missing_is_named_and_done_again(make: Make, objects: Objects) -> None:
+def test_missing_segment_is_named_and_repeated(make: Make, objects: Objects) -> None:
     data = clip(pictures(50), even(50))
     whole = make(data)
     task = Task("j", "c", "m", {"transfer": "srgb", "placement": {}}, LIMITS)
@@ -302,7 +300,7 @@ def test_a_segment_that_is_missing_is_named_and_done_again(make: Make, objects: 
         assert file.read() == whole
 
 
-def test_a_clip_that_is_gone_is_said(make: Make, objects: Objects) -> None:
+def test_deleted_clip_is_reported(make: Make, objects: Objects) -> None:
     make(clip(pictures(2), even(2)))
     composites.remove_inputs(objects, "j")
     assert objects.names(composites.path("j")) == [composites.VIDEO]

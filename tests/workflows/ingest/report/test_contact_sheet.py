@@ -19,7 +19,7 @@ Ingest = Callable[..., Stack]
 
 @pytest.mark.parametrize(("width", "height"), [(40, 30), (30, 40), (500, 31)])
 @pytest.mark.parametrize("depth", [8, 16])
-def test_what_is_clipped_is_marked(ingest: Ingest, width: int, height: int, depth: int) -> None:
+def test_clipped_pixels_are_marked(ingest: Ingest, width: int, height: int, depth: int) -> None:
     target = io.BytesIO()
     scene = glass_ball(width, height, monitor=(64, 48), rays=4)
     program = nested_program((64, 48), bands=((4, 3, 4), (8, 6, 5)), levels=3)

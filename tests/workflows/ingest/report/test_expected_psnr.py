@@ -50,7 +50,7 @@ def test_no_more_is_promised_than_was_measured(program: Program, measured: tuple
         assert low - 0.7 < psnr < high + 2
 
 
-def test_grids_without_offsets_promise_what_their_finest_blocks_tell() -> None:
+def test_grids_without_offsets_are_rated_by_their_finest_blocks() -> None:
     quality = expected(still(96), SURVEY)
     assert quality is not None
     assert quality.blocks == 96
@@ -73,7 +73,7 @@ def parts(*parts: dict[str, Any]) -> Program:
     return Program.model_validate({"monitor": {"width": 64, "height": 48}, "parts": [constant, *parts]})
 
 
-def test_nothing_is_promised_of_what_was_never_measured() -> None:
+def test_nothing_is_promised_without_a_measurement() -> None:
     for part in ({"kind": "images", "files": ["a.png"]}, {"kind": "stripes", "axis": "x", "count": 5}):
         assert expected(parts(part), SURVEY) is None
     assert expected(preset("default"), SURVEY | {"contrast": 0.0}) is None

@@ -115,7 +115,7 @@ def steady(ball: Ball) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 @pytest.mark.parametrize("ball", [pytest.param("default", marks=pytest.mark.slow), "quick"], indirect=True)
-def test_what_is_steady_is_left_alone(ingest: Ingest, objects: Objects, digests: Digests, ball: Ball) -> None:
+def test_steady_frames_are_unchanged(ingest: Ingest, objects: Objects, digests: Digests, ball: Ball) -> None:
     stack = ingest("c", filmed(ball, *steady(ball)))
     made = report(stack.attributes, stack.frames)
     assert made.drift is not None

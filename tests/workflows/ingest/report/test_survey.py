@@ -47,7 +47,7 @@ def reported(ingest: Ingest, data: bytes) -> tuple[Report, dict[str, Finding]]:
     return made, {finding.name: finding for finding in made.findings}
 
 
-def test_a_good_capture_is_good(ingest: Ingest, capture_archive: bytes) -> None:
+def test_good_capture_has_no_warnings(ingest: Ingest, capture_archive: bytes) -> None:
     made, found = reported(ingest, capture_archive)
     assert made.level == "good"
     assert {finding.level for finding in made.findings} == {"good"}
@@ -112,7 +112,7 @@ def test_a_curve_that_is_assumed_is_a_warning(ingest: Ingest, capture_archive: b
     assert "state it in capture.json" in found["camera_curve"].remedy
 
 
-def test_a_capture_that_saw_nothing_is_bad(ingest: Ingest, capture_archive: bytes) -> None:
+def test_capture_without_light_is_bad(ingest: Ingest, capture_archive: bytes) -> None:
     made, found = reported(ingest, filmed(capture_archive, gain=0))
     assert made.level == "bad"
     assert made.drift is made.flicker is made.quality is None

@@ -28,7 +28,7 @@ def looks(count: int, bordered: bool) -> dict[int, NDArray[np.float64]]:
 
 
 @pytest.mark.parametrize("name", ["default", "quick", "sketch"])
-def test_what_follows_the_numbers_is_left_out(name: str) -> None:
+def test_cells_that_follow_the_numbers_are_left_out(name: str) -> None:
     program = preset(name)
     seen = looks(program.count, bordered=True)
     left = without_border(program, seen)
@@ -38,7 +38,7 @@ def test_what_follows_the_numbers_is_left_out(name: str) -> None:
 
 
 @pytest.mark.parametrize(("count", "bordered"), [(132, False), (10, True), (4, True), (0, True)])
-def test_all_is_kept_where_there_is_none_or_no_telling(count: int, bordered: bool) -> None:
+def test_all_cells_are_kept_without_a_border_or_enough_patterns(count: int, bordered: bool) -> None:
     seen = looks(count, bordered)
     left = without_border(preset("default"), seen)
     assert left.keys() == seen.keys()
@@ -46,6 +46,6 @@ def test_all_is_kept_where_there_is_none_or_no_telling(count: int, bordered: boo
         np.testing.assert_array_equal(left[number], look.reshape(-1, 3))
 
 
-def test_of_a_border_alone_all_is_kept() -> None:
+def test_all_cells_are_kept_if_only_the_border_is_visible() -> None:
     seen = {number: look[:1] for number, look in looks(132, bordered=True).items()}
     assert without_border(preset("default"), seen)[5].shape == (COLUMNS, 3)

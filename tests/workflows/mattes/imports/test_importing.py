@@ -66,7 +66,7 @@ def put(at: int, value: float) -> Callable[[np.ndarray[Any, Any]], None]:
     return lambda values: values.__setitem__(at, value)
 
 
-def test_a_matte_comes_back_as_the_same_bytes(objects: Objects, folder: Path, archive: bytes) -> None:
+def test_imported_matte_exports_to_the_same_bytes(objects: Objects, folder: Path, archive: bytes) -> None:
     bring(objects, archive)
     assert digests(folder / "mattes/n") == digests(folder / "mattes/m")
     again = Archive(objects, "n")
@@ -74,19 +74,19 @@ def test_a_matte_comes_back_as_the_same_bytes(objects: Objects, folder: Path, ar
     assert again.size == len(archive)
 
 
-def test_it_composites_as_before(objects: Objects, archive: bytes, matte: Any) -> None:
+def test_imported_matte_composites_as_before(objects: Objects, archive: bytes, matte: Any) -> None:
     there = take_in(io.BytesIO(archive), objects, "n", LIMITS)
     np.testing.assert_array_equal(composite(there, BACKDROP), composite(matte, BACKDROP))
 
 
-def test_one_that_was_packed_again_is_taken(objects: Objects, folder: Path, archive: bytes) -> None:
+def test_repacked_archive_is_accepted(objects: Objects, folder: Path, archive: bytes) -> None:
     files = unpacked(archive)
     shuffled = {name: files[name] for name in sorted(files, reverse=True)}
     bring(objects, packed(shuffled, zipfile.ZIP_DEFLATED))
     assert digests(folder / "mattes/n") == digests(folder / "mattes/m")
 
 
-def test_one_from_before_there_were_checksums_comes_in_as_one_with_them(
+def test_archive_without_checksums_is_imported_with_checksums(
     objects: Objects, folder: Path, archive: bytes
 ) -> None:
     files = unpacked(archive)
@@ -100,9 +100,7 @@ def test_one_from_before_there_were_checksums_comes_in_as_one_with_them(
 
 
 @pytest.mark.parametrize("name", ["rho/c/0/0/0", "T/1.1/cell/c/0", "zarr.json", "T/0.0/weight/zarr.json"])
-def test_what_had_rotted_before_it_was_exported_is_refused(
-    objects: Objects, archive: bytes, name: str
-) -> None:
+def test_data_damaged_before_the_export_is_refused(objects: Objects, archive: bytes, name: str) -> None:
     files = unpacked(archive)
     at = len(files[name]) // 2
     files[name] = files[name][:at] + bytes([files[name][at] ^ 1]) + files[name][at + 1 :]
@@ -267,7 +265,7 @@ WHOLE: dict[str, tuple[str, str, Change]] = {
 
 
 @pytest.mark.parametrize("case", WHOLE)
-def test_what_lies_is_refused_by_name(objects: Objects, archive: bytes, case: str) -> None:
+def test_false_entry_is_refused_by_name(objects: Objects, archive: bytes, case: str) -> None:
     entry, match, change = WHOLE[case]
     files = unpacked(archive)
     change(files)
@@ -328,7 +326,7 @@ def test_manifest_that_differs_from_the_archive_is_refused(
     assert "entry" in refused(objects, packed(files), match).fields
 
 
-def test_of_many_faults_of_the_manifest_the_first_is_found_alone(objects: Objects, archive: bytes) -> None:
+def test_only_the_first_fault_of_the_manifest_is_reported(objects: Objects, archive: bytes) -> None:
     files = unpacked(archive)
     documented(MANIFEST, lambda d: d.update(members={name: {"size": -1} for name in d["members"]}))(files)
     error = refused(objects, packed(files), "members.*size")
@@ -349,7 +347,7 @@ def test_names_that_leave_the_archive(objects: Objects, archive: bytes, name: st
     assert refused(objects, signed(unpacked(archive) | {name: b"x"}), match).fields["entry"]
 
 
-def test_links_and_names_that_come_twice(objects: Objects, archive: bytes) -> None:
+def test_links_and_duplicate_names_are_refused(objects: Objects, archive: bytes) -> None:
     for mode, match in ((stat.S_IFLNK, "link"), (stat.S_IFREG, "twice")):
         target = io.BytesIO(archive)
         info = zipfile.ZipInfo("zarr.json")
@@ -360,12 +358,12 @@ def test_links_and_names_that_come_twice(objects: Objects, archive: bytes) -> No
         assert error.fields["entry"] == "zarr.json"
 
 
-def test_more_entries_than_there_may_be(objects: Objects, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_entries_are_refused(objects: Objects, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reader, "ENTRIES", 20)
     refused(objects, packed({str(n): b"" for n in range(21)}), "21 entries, more than 20")
 
 
-def test_an_archive_that_unpacks_to_more_than_is_allowed(objects: Objects, archive: bytes) -> None:
+def test_archive_that_unpacks_to_too_much_is_refused(objects: Objects, archive: bytes) -> None:
     error = refused(objects, archive, "more than the 20000 allowed", Limits(20_000, 1 << 20))
     assert error.fields["limit"] == 20_000
     files = unpacked(archive)
