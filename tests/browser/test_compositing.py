@@ -1,4 +1,4 @@
-"""The glass before a backdrop in a real browser: what it draws itself, beside what the service makes of it."""
+"""Compositing in a real browser: the live pictures that it draws agree with the composites of the service."""
 
 import base64
 import io

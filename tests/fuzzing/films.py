@@ -1,4 +1,4 @@
-"""Films, clips and captures with them: how damaged ones are made, and what must hold for what is read."""
+"""Films, clips and captures with them: how damaged ones are made, and what must hold for the result."""
 
 import asyncio
 import io

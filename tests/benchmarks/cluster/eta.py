@@ -5,7 +5,7 @@
 For each size it traces a glass ball, films the preset `default` as stills and as an unsynchronised video, ingests both
 through a real service and recovers the stills, and prints for each job: its tiles, seconds from its start to its end,
 the ETA when a fifth of the tiles was done, the seconds that passed from then on until it had succeeded, and by how many
-per cent the ETA was off. To be run from the root of the repository.
+per cent the ETA was off. Run it from the root of the repository.
 """
 
 import argparse

@@ -1,7 +1,7 @@
 """Measures the overhead of a tile: time and memory of the coordinator and the scheduler.
 
-A real scheduler and real workers in their own processes, a real coordinator and database in this one; a tile's work is
-to sleep. Prints a table, and JSON to a file if one is named.
+The scheduler and the workers run in their own processes, the coordinator and the database in this one; a tile only
+sleeps. Prints a table, and writes JSON to a file if one is named.
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """Measures how jobs share a cluster: throughput by workers, a small job beside a large one, a cancelled job.
 
-Through the HTTP service with its own cluster. Prints a table, and JSON to a file if one is named.
+Uses the HTTP service with its own cluster. Prints a table, and writes JSON to a file if one is named.
 """
 
 import argparse

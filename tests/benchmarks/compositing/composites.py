@@ -3,7 +3,7 @@
     python -m tests.benchmarks.compositing.composites [--archive NAME=CAPTURE.zip ...] [--large 1.0] [--json FILE]
 
 Recovers through a real service a traced glass ball of 640 x 480 pixels, one enlarged to some megapixels, and
-each named capture archive; then measures in this process and over HTTP. To be run from the root of the repository.
+each named capture archive; then measures in this process and over HTTP. Run it from the root of the repository.
 """
 
 import argparse

@@ -2,13 +2,17 @@
 
     python -m tests.benchmarks.compositing.live KIT SCENES [--renderer default] [--frames 60] [--no-ball] [--json FILE]
 
-KIT is the path of a `kit.py` that makes captures of scenes, SCENES a folder of its scenes (`*.npz`). Recovers each
-through a real service from the program `quick` at the quality `fast`, and a traced glass ball of 640 x 480 pixels;
-draws them in Chromium before the kit's backdrops at several placements; and prints the PSNR of 8-bit sRGB pictures over
-the whole frame, the least of the placements; the milliseconds of a picture, median and 95th percentile, until the
-graphics card has drawn it, and those of processor time, which other work on the machine changes less, of all pixels and
-of the share that is drawn at least while a backdrop moves; and the megabytes that the browser gets, with the seconds
-that the service took to make them. `--renderer` names one of ANGLE's.
+KIT is the path of a `kit.py` that makes captures of scenes, SCENES a folder of its scenes (`*.npz`). A real service
+recovers each of them, and a traced glass ball of 640 x 480 pixels, from the program `quick` at the quality `fast`.
+Chromium draws them before the kit's backdrops at several placements. For each scene it prints
+
+- the PSNR of 8-bit sRGB pictures over the whole frame, the lowest of the placements;
+- the milliseconds until the graphics card has drawn a picture, median and 95th percentile, for all pixels and for the
+  smallest share of them that is drawn while a backdrop moves;
+- the same in processor time, which depends less on other work on the machine;
+- the megabytes that the browser loads, and the seconds that the service took to make them.
+
+`--renderer` names one of ANGLE's.
 """
 
 import base64

@@ -2,7 +2,7 @@
 
     python -m tests.benchmarks.service.app [--times 10]
 
-Starts a service on loopback and opens its views in a fresh Chromium, each time with an empty cache. To be run from the
+Starts a service on loopback and opens its views in a fresh Chromium, each time with an empty cache. Run it from the
 root of the repository.
 """
 
@@ -40,7 +40,7 @@ def main() -> None:
         sync_playwright() as playwright,
     ):
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        print("view        first paint, ms: median  most    loaded, ms: median    kB received")
+        print("view        first paint, ms: median   max    loaded, ms: median    kB received")
         for view in VIEWS:
             found = [_open(browser, f"{url}/#/{view}") for _ in range(times)]
             paints, loads, sizes = zip(*found, strict=True)

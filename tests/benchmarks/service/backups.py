@@ -1,9 +1,9 @@
 """Measures the cost of checksums and the speed of `envmatte verify`, `backup` and `restore`.
 
-A capture of 132 frames of 640 x 480 pixels with a camera's noise, and a matte of that size with 24 cells a pixel;
-written and read with and without checksums in turns, the best of several rounds. Seconds are of the processor, all
-threads together, and so are megabytes a second but for those that say wall: other work on the machine changes them
-little.
+A capture of 132 frames of 640 x 480 pixels with a camera's noise, and a matte of that size with 24 cells a pixel, are
+written and read with and without checksums in turns; the best of several rounds counts. Seconds, and megabytes a
+second, are of processor time in all threads, which depends little on other work on the machine; those of wall time say
+so.
 """
 
 import argparse

@@ -1,7 +1,7 @@
-"""How much of a core quick commands and imports take: `python -m tests.benchmarks.service.importing`.
+"""Measures the processor time of quick commands and imports: `python -m tests.benchmarks.service.importing`.
 
-Each runs in a new interpreter, from files that were read before. Seconds are of the CPU, in user and system mode, with
-what the interpreter itself takes to start.
+Each runs in a new interpreter, with its files in the file cache. Seconds are of the CPU, in user and system mode,
+including the start of the interpreter.
 """
 
 import resource
@@ -16,7 +16,7 @@ COMMAND = ["-m", "services"]
 
 
 def seconds(arguments: list[str], folder: str) -> list[float]:
-    """Seconds of CPU that an interpreter takes with these arguments, in some runs."""
+    """Seconds of CPU that an interpreter takes with these arguments, for each of several runs."""
     taken = []
     for _ in range(RUNS + 1):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)

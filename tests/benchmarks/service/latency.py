@@ -2,8 +2,8 @@
 
     python -m tests.benchmarks.service.latency [--pollers 50] [--seconds 30] [--megapixels 2] [--json FILE]
 
-Through a real service with two workers. Each poller asks once a second, as a waiting client does, over a connection of
-its own. Prints the latency of all their requests, alone and beside ever more work. To be run from the root of the
+A real service has two workers. Each poller sends a request a second over its own connection, as a waiting client does.
+Prints the latency of all their requests, without other work and with more and more of it. Run it from the root of the
 repository.
 """
 

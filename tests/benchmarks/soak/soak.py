@@ -115,12 +115,12 @@ def threads_of(process: psutil.Process) -> list[str]:
 
 
 def memory_of(name: str, process: psutil.Process) -> int:
-    """Private memory of a process in bytes; for the fork server also what it shares with workers, or did."""
+    """Private memory of a process in bytes; for the fork server including what it shares with workers."""
     return int(process.memory_info().rss if name == "fork server" else process.memory_full_info().uss)
 
 
 def take_sample(service: Running) -> Sample:
-    """Everything that may grow, as it is now."""
+    """Measure everything that may grow."""
     sample: Sample = {}
     for name, processes in service.named():
         held: list[tuple[float, int, int, int]] = []

@@ -16,9 +16,9 @@ from storage.layout import mattes
 from storage.layout.matte_archive import MANIFEST, Archive
 from storage.layout.mattes import Block
 from storage.objects.store import Objects
+from tests.end_to_end.command_line import envmatte
 from tests.end_to_end.conftest import Service, digests, png, serving
 from tests.end_to_end.problems import check_problem
-from tests.end_to_end.use.test_cli import envmatte
 from tests.parts.waiting import until
 from workflows.simulation import glass_ball
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from services.client import ServiceError
+from tests.end_to_end.command_line import envmatte
 from tests.end_to_end.conftest import Service, serving
-from tests.end_to_end.use.test_cli import envmatte
 from tests.parts.waiting import until
 from tests.services.cluster.clusters import workers
 from tests.workflows.composite.video.test_steps import TICK, clip, even, frames_of, pictures

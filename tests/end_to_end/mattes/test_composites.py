@@ -11,9 +11,9 @@ import psutil
 import pytest
 from PIL import Image
 
+from tests.end_to_end.command_line import envmatte
 from tests.end_to_end.conftest import Service, png
 from tests.end_to_end.problems import check_problem
-from tests.end_to_end.use.test_cli import envmatte
 from tests.services.cluster.clusters import decoders
 from workflows.images import float_formats, integer_formats
 from workflows.images.tone_curves import from_light

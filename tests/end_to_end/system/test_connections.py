@@ -97,7 +97,7 @@ def test_malformed_request_is_refused_and_disconnected(service: Service, sent: b
 
 
 def test_half_closed_connection_is_closed(service: Service) -> None:
-    """It looks like a closed one until it is written to, and computing for nobody would cost more."""
+    """Until it is written to it looks like a closed one, and an answer that no client reads would cost more."""
     for sent in (b"GET /v1/jobs HTTP/1.1\r\nHost: localhost\r\n\r\n", b"GET /healthz HT"):
         with connected(service) as (half,):
             half.sendall(sent)

@@ -10,17 +10,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.end_to_end.command_line import envmatte
 from tests.end_to_end.conftest import Service, paused, png
 from tests.parts.processes import interrupt, running
 from workflows.images import integer_formats
 from workflows.programs import presets
 from workflows.programs.preset_names import PRESETS
 from workflows.programs.program import Program
-
-
-def envmatte(service: Service, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "services", *arguments, "--url", service.url]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120)
 
 
 def test_from_a_capture_to_a_composite(service: Service, capture_archive: Path, tmp_path: Path) -> None:
