@@ -19,11 +19,11 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
-from kits import load, parser_of, served, show
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
 from services.client import Client
+from tests.benchmarks.recovery.kits import load, parser_of, served, show
 from workflows.images import integer_formats
 from workflows.programs.files import write_folder
 from workflows.programs.presets import preset

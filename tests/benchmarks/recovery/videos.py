@@ -18,13 +18,13 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
-from figures import NESTED
-from kits import load, parser_of, served, show
 from numpy.typing import NDArray
 
 from services.client import Client
 from storage.layout.captures import Stack
 from storage.objects.store import Objects
+from tests.benchmarks.recovery.figures import NESTED
+from tests.benchmarks.recovery.kits import load, parser_of, served, show
 from workflows.images import integer_formats
 
 LEAD, SEED = 1.0, 7
