@@ -6,12 +6,15 @@ So every kernel is called with the types that it will be called with, and no lis
 """
 
 import io
+import multiprocessing
 import os
 import sys
 import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +23,7 @@ import tifffile
 from numba.core.registry import CPUDispatcher
 
 from storage.layout import uploads
-from storage.layout.mattes import Matte
+from storage.layout.mattes import Block, Matte, create
 from storage.objects.store import Objects
 from storage.steps import FINISH, PREPARE
 from workflows.composite import composite
@@ -29,6 +32,7 @@ from workflows.composite.depth import from_two, places_of
 from workflows.composite.live.encode import encode_live
 from workflows.composite.placement import Placement
 from workflows.composite.quantise import encode
+from workflows.composite.threads import CORES
 from workflows.images import integer_formats
 from workflows.images.decode import decode
 from workflows.images.tone_curves import from_light
@@ -67,27 +71,26 @@ class Compiled(NamedTuple):
 
 
 def compile_kernels(progress: Callable[[float, str], None] = lambda share, what: None) -> Compiled:
-    """Compile every kernel that the cache lacks.
+    """Compile every kernel that the cache lacks, on all cores.
 
     Parameters
     ----------
     progress : callable, optional
-        Is called with the share that is done, 0 to 1, and what comes next.
+        Is called with the share that is done, 0 to 1, and what is under way.
     """
     start = time.perf_counter()
-    with tempfile.TemporaryDirectory(prefix="envmatte-kernels-") as folder:
-        objects = Objects(Path(folder).as_uri())
-        progress(0, "the default recovery")
-        matte = _recover(objects, "lobes")
-        _composite(matte)
-        progress(0.5, "the recovery of the paper")
-        _recover(objects, "nn-dgsr")
-        progress(0.8, "live view, depth and file formats")
-        _compile_rest(matte)
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(CORES, len(PARTS)), context) as pool:
+        left = {pool.submit(_compile, part): part for part in PARTS}
+        misses = 0
+        while left:
+            progress(1 - len(left) / len(PARTS), ", ".join(left.values()))
+            done, _ = wait(left, return_when=FIRST_COMPLETED)
+            for future in done:
+                misses += future.result()
+                del left[future]
     progress(1, "done")
-    kernels = find_kernels()
-    misses = sum(sum(kernel.stats.cache_misses.values()) for kernel in kernels)
-    return Compiled(len(kernels), misses, cache_folder(), time.perf_counter() - start)
+    return Compiled(len(find_kernels()), misses, cache_folder(), time.perf_counter() - start)
 
 
 def find_kernels() -> list[CPUDispatcher]:
@@ -102,16 +105,22 @@ def cache_folder() -> Path:
     return Path(os.path.commonpath([kernel.stats.cache_path for kernel in find_kernels()]))
 
 
-def _recover(objects: Objects, method: str) -> Matte:
+def _compile(part: str) -> int:
+    """Compile the kernels of a part, one of `PARTS`; returns how many types of calls the cache lacked."""
+    with tempfile.TemporaryDirectory(prefix="envmatte-kernels-") as folder:
+        PARTS[part](Objects(Path(folder).as_uri()))
+    return sum(sum(kernel.stats.cache_misses.values()) for kernel in find_kernels())
+
+
+def _recover(method: str, objects: Objects) -> None:
     """Ingest a capture of a glass ball and recover its matte."""
     file = io.BytesIO()
     scene = glass_ball(WIDTH, HEIGHT, monitor=MONITOR, rays=4)
     write_capture(scene, preset("sketch", *MONITOR), file)
-    objects.put(uploads.part_path(method, "all"), file.getvalue())
-    uploads.seal(objects, method, [uploads.Part("all", len(file.getvalue()))])
-    _run(INGEST, objects, Task("job", method, "", {}, LIMITS))
-    _run(RECOVER, objects, Task("job", method, method, {"method": method}, LIMITS))
-    return Matte(objects, method)
+    objects.put(uploads.part_path("c", "all"), file.getvalue())
+    uploads.seal(objects, "c", [uploads.Part("all", len(file.getvalue()))])
+    _run(INGEST, objects, Task("job", "c", "", {}, LIMITS))
+    _run(RECOVER, objects, Task("job", "c", "m", {"method": method}, LIMITS))
 
 
 def _run(steps: Steps, objects: Objects, task: Task) -> None:
@@ -123,8 +132,9 @@ def _run(steps: Steps, objects: Objects, task: Task) -> None:
     run(steps, objects, task, FINISH)
 
 
-def _composite(matte: Matte) -> None:
-    """Composite backdrops of all types, stretched over the monitor and placed."""
+def _use(objects: Objects) -> None:
+    """Composite backdrops of all types with a matte, and do what else has kernels."""
+    matte = _matte(objects)
     light = backdrop(*MONITOR)
     composite(matte, light)
     composite(matte, light, placement=Placement(scale=0.9))
@@ -132,13 +142,38 @@ def _composite(matte: Matte) -> None:
         codes = integer_formats.to_integers(from_light(light, "srgb"), dtype)
         picture = composite(matte, backdrop_of(codes, "srgb"))
         encode(picture, "srgb", dtype, threads=1)
-
-
-def _compile_rest(matte: Matte) -> None:
-    """Run what else has kernels: live view, backdrops at a depth, layers, the check of LZW."""
     encode_live(matte, threads=1)
     places = places_of(matte, threads=1)
-    composite(matte, backdrop(*MONITOR), rays=from_two(places, places, (1.0, 2.0), 2.0))
+    composite(matte, light, rays=from_two(places, places, (1.0, 2.0), 2.0))
     file = io.BytesIO()
     tifffile.imwrite(file, np.zeros((8, 8, 3), np.uint8), compression="lzw")
     decode(file.getvalue(), "srgb", memory=LIMITS.memory)
+
+
+def _matte(objects: Objects) -> Matte:
+    """A matte of one block whose pixels see two cells each."""
+    matte = create(
+        objects,
+        "m",
+        height=HEIGHT,
+        width=WIDTH,
+        columns=64,
+        rows=48,
+        monitor=MONITOR,
+        crosstalk=np.eye(3).tolist(),
+    )
+    shape = HEIGHT, WIDTH
+    ones, count = np.ones((*shape, 3), np.float32), np.full((*shape, 3), 2, np.uint32)
+    cells = np.tile(np.array([3, 70], np.uint32), ones.size)
+    weights = np.full(cells.size, 0.5, np.float32)
+    whole = np.ones(shape, bool)
+    matte.write(0, 0, Block(0 * ones, ones, 0 * ones[..., 0], whole, ~whole, count, cells, weights))
+    return Matte(objects, "m")
+
+
+PARTS: dict[str, Callable[[Objects], None]] = {
+    "the default recovery": partial(_recover, "lobes"),
+    "composites, live view and depth": _use,
+    "the recovery of the paper": partial(_recover, "nn-dgsr"),
+}
+"""What has kernels of its own, by what it is: compiled side by side, the longest first."""
