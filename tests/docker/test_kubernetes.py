@@ -122,6 +122,18 @@ def test_pods_run_unprivileged_and_get_only_their_secrets() -> None:
     assert not set(SECRETS["envmatte-store"]) & set(environment("envmatte-scheduler"))
 
 
+@pytest.mark.parametrize("name", ["envmatte", "envmatte-worker"])
+def test_pods_with_kernels_begin_with_those_of_the_image(name: str) -> None:
+    (first,) = pod(name)["initContainers"]
+    cache = re.search(r"NUMBA_CACHE_DIR=(\S+)", MANIFEST.with_name("Dockerfile").read_text())
+    assert cache is not None
+    (target,) = first["volumeMounts"]
+    assert first["command"] == ["cp", "-R", f"{cache[1]}/.", target["mountPath"]]
+    assert target | {"mountPath": cache[1]} in container(name)["volumeMounts"]
+    assert first["image"] == container(name)["image"]
+    assert first["securityContext"] == container(name)["securityContext"]
+
+
 def test_worker_reaches_its_own_memory_limit_before_that_of_its_pod() -> None:
     worker = container("envmatte-worker")
     limit = int(worker["resources"]["limits"]["memory"].removesuffix("Gi")) << 30
