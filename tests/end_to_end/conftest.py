@@ -57,6 +57,10 @@ class Service:
             if path.removesuffix(SUFFIX) == path or path.removesuffix(SUFFIX) not in found
         }
 
+    def stored_ids(self) -> set[str]:
+        """The ids that files of the store belong to, which do not change while an earlier capture is ingested."""
+        return {name.split("/")[1] for name in self.stored()}
+
 
 @contextmanager
 def serving(data: Path, *options: str, **environment: str) -> Iterator[Service]:

@@ -57,6 +57,7 @@ def ran(*command: str) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.slow
 def test_after_warm_nothing_is_compiled(tmp_path: Path) -> None:
     warmed = ran("-m", "services", "warm", "--json")
     assert set(warmed) == {"cache", "kernels", "compiled", "seconds"}
