@@ -129,7 +129,7 @@ def run(
     valid = target.valid()
     tally, start, seed = Tally(), time.monotonic(), first
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["tests.fuzzing.targets"])  # unless other tests have started one
+    context.set_forkserver_preload(["tests.fuzzing.targets", "tests.fuzzing.wrong"])  # unless one runs
     if ROOT not in sys.path:  # the processes inherit it; pytest itself does not add it
         sys.path.append(ROOT)
     while seed < first + count and len(tally.failures) < failures:
