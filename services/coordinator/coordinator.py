@@ -40,6 +40,8 @@ WRITE = 0.25
 """Seconds between two writes of progress, whatever the number of jobs and tiles."""
 DYING = 1.2
 """Seconds until no worker works on a cancelled job any more, see `services.cluster.worker_preload`."""
+AGAIN = 10.0
+"""Seconds until files that could not be removed are removed again."""
 DELETE = 30.0
 """Seconds between two searches for old jobs to delete."""
 SWEEP = 3600.0
@@ -207,9 +209,10 @@ class Coordinator:
             if not JOB_KINDS[row.kind].is_due(c, row):
                 return
         with self._writing() as c:
-            tiles.add_steps(c, row.id)
             run = self._run_of(c, row)
-            jobs.enter_stage(c, row.id, run.stage)
+            if not jobs.enter_stage(c, row.id, run.stage):
+                return  # it was cancelled after it was read
+            tiles.add_steps(c, row.id)
         run.start = min((other.used() for other in self._runs.values()), default=0.0)
         self._runs[row.id] = run
         logger.info("%s, from the stage %s on", row.kind, run.stage)
@@ -281,7 +284,15 @@ class Coordinator:
         now = time.monotonic()
         while self._discards and self._discards[0][0] <= now:
             _, row = self._discards.popleft()
-            self._housekeeping.submit(_logged, JOB_KINDS[row.kind].remove_files, self._objects, row)
+            self._housekeeping.submit(self._remove_files, row)
+
+    def _remove_files(self, row: Row[Any]) -> None:
+        """Remove the files of a job, now or later: on a busy machine a worker may take long to end."""
+        try:
+            JOB_KINDS[row.kind].remove_files(self._objects, row)
+        except Exception:
+            logger.warning("the files of job %s are removed in %g s", row.id, AGAIN, exc_info=True)
+            self._discards.append((time.monotonic() + AGAIN, row))
 
     def _submit(self) -> None:
         """Submit tiles for all free threads, first of the job that has used the fewest worker seconds.

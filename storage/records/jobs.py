@@ -108,16 +108,16 @@ def change(connection: Connection, job: str, **values: Any) -> None:
     connection.execute(update(jobs).where(jobs.c.id == job).values(values))
 
 
-def enter_stage(connection: Connection, job: str, stage: str) -> None:
-    """Move an active job to a stage; its first stage starts it."""
-    row = get(connection, job)
-    if row.state not in ACTIVE:
-        return
+def enter_stage(connection: Connection, job: str, stage: str) -> bool:
+    """Move an active job to a stage; its first stage starts it. Returns false and changes nothing if it has ended."""
     now = time.time()
-    values = {"state": "running", "stage": stage, "started_at": row.started_at or now, "stage_at": now}
+    started = func.coalesce(jobs.c.started_at, now)
+    values = {"state": "running", "stage": stage, "started_at": started, "stage_at": now}
     values |= {"moved_at": now, "paced_at": None}
-    connection.execute(update(jobs).where(jobs.c.id == job).values(values))
-    job_log.add(connection, job, stage)
+    result = connection.execute(update(jobs).where(jobs.c.id == job, jobs.c.state.in_(ACTIVE)).values(values))
+    if result.rowcount:
+        job_log.add(connection, job, stage)
+    return bool(result.rowcount)
 
 
 def end(connection: Connection, job: str, state: str, problem: dict[str, Any] | None = None) -> bool:

@@ -1,12 +1,113 @@
-"""The cost of progress: finished tiles are written many at once."""
+"""Jobs that end before they start, files that are still written when they are removed, and the cost of progress."""
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
+from sqlalchemy import Connection, Engine, Row
 
-from services.coordinator.coordinator import WRITE
+from services.coordinator import coordinator
+from services.coordinator.coordinator import WRITE, Coordinator
+from services.coordinator.job_kinds import JOB_KINDS
+from services.settings import CoordinatorSettings
+from storage.database.engine import open_engine, reading, writing
+from storage.errors import Unavailable
+from storage.layout import uploads
+from storage.objects.store import Objects
+from storage.records import captures, jobs
 from tests.benchmarks.cluster.overhead import measure
+from tests.parts.waiting import until
 
 OTHERS = 15
 """Writes once per job, or every few seconds in any case: start, stages, lease."""
+
+
+class Idle:
+    """A dispatcher whose cluster has one free thread that never ends a task."""
+
+    free = threads = 1
+
+    def __init__(self) -> None:
+        self.news = threading.Event()
+        self.cluster: dict[str, Any] = {}
+        self.submitted: list[tuple[str, int]] = []
+
+    def want(self, tiles: int) -> None:
+        pass
+
+    def under_way(self, job: str) -> int:
+        return sum(one == job for one, _ in self.submitted)
+
+    def submit(self, steps: Any, task: Any, tile: int, trace: str | None = None) -> bool:
+        self.submitted.append((task.job, tile))
+        return True
+
+    def collect(self) -> list[Any]:
+        return []
+
+    def drop(self, job: str) -> None:
+        pass
+
+
+@pytest.fixture
+def engine(tmp_path: Path) -> Iterator[Engine]:
+    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
+    yield engine
+    engine.dispose()
+
+
+@pytest.fixture
+def objects(tmp_path: Path) -> Objects:
+    return Objects((tmp_path / "store").as_uri())
+
+
+@pytest.fixture
+def job(engine: Engine, objects: Objects) -> str:
+    """A queued ingest of the capture ``c``."""
+    with writing(engine) as c:
+        job = jobs.add(c, "ingest", "c", {})
+        captures.add(c, "c", job, name="", bytes=3, frames=1, program={})
+    objects.put(uploads.part_path("c", "all"), b"zip")
+    return job
+
+
+def test_job_cancelled_while_it_is_started_is_not_run(
+    engine: Engine, objects: Objects, job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def cancelled_meanwhile(connection: Connection, row: Row[Any]) -> bool:
+        with writing(engine) as c:
+            jobs.cancel(c, row.id)
+        return True
+
+    monkeypatch.setattr(JOB_KINDS["ingest"], "is_due", cancelled_meanwhile)
+    dispatcher = Idle()
+    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, dispatcher):  # type: ignore[arg-type]
+        until(lambda: not objects.paths_below("uploads"))
+    assert dispatcher.submitted == []
+    with reading(engine) as c:
+        assert (jobs.get(c, job).state, jobs.get(c, job).started_at) == ("cancelled", None)
+
+
+def test_files_that_cannot_be_removed_are_removed_later(
+    engine: Engine, objects: Objects, job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failures = [OSError("Directory not empty"), Unavailable("the store does not answer")]
+    remove = JOB_KINDS["ingest"].remove_files
+
+    def failing(objects: Objects, row: Row[Any]) -> None:
+        if failures:
+            raise failures.pop()
+        remove(objects, row)
+
+    monkeypatch.setattr(JOB_KINDS["ingest"], "remove_files", failing)
+    monkeypatch.setattr(coordinator, "AGAIN", 0.1)
+    with writing(engine) as c:
+        jobs.cancel(c, job)
+    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, Idle()):  # type: ignore[arg-type]
+        until(lambda: not objects.paths_below("uploads"))
+    assert failures == []
 
 
 @pytest.mark.exhaustive

@@ -55,7 +55,7 @@ def test_job_ends_once(connection: Connection, state: str) -> None:
     before = jobs.get(connection, job)
     for again in ("succeeded", "failed", "cancelled"):
         assert not jobs.end(connection, job, again, {"detail": "late"})
-    jobs.enter_stage(connection, job, "recovering")
+    assert not jobs.enter_stage(connection, job, "recovering")
     assert jobs.get(connection, job) == before
     assert before.problem == problem
     assert log_of(connection, job)[-1] == ("failed: a chunk is gone" if problem else state)
