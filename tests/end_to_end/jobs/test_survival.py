@@ -157,6 +157,7 @@ def test_job_cancelled_before_a_kill_leaves_nothing(capture_archive: Path, tmp_p
         assert second.client.wait(second.client.recover(job["capture"])["id"])["state"] == "succeeded"
 
 
+@pytest.mark.slow
 def test_killed_worker_changes_no_byte(service: Service, matte: str, capture: str) -> None:
     job = service.client.recover(capture)
     while service.client.job(job["id"])["tiles"]["done"] < 3:
@@ -226,6 +227,7 @@ def test_second_service_on_the_same_folder_is_refused(service: Service) -> None:
     assert service.http.get("/healthz").status_code == 200
 
 
+@pytest.mark.slow
 def test_public_address_without_keys_is_refused(tmp_path: Path) -> None:
     command = [
         sys.executable,

@@ -147,6 +147,7 @@ def test_simultaneous_requests_get_the_same_picture(service: Service, matte: str
     assert set(answers) == {expected}
 
 
+@pytest.mark.slow
 def test_unfinished_matte_is_composited_as_far_as_recovered(service: Service, capture: str) -> None:
     job = service.client.recover(capture, tile=16)
     shares: list[float] = []

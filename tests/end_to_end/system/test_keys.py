@@ -200,6 +200,7 @@ def test_clip_needs_a_matte_of_the_same_owner(locked: Locked) -> None:
     assert not any(path.startswith("composites/") for path in locked.service.stored())
 
 
+@pytest.mark.slow
 def test_every_route_with_every_kind_of_key(locked: Locked) -> None:
     document = locked.service.http.get("/openapi.json").json()
     routes = {f"{method.upper()} {path}" for path, calls in document["paths"].items() for method in calls}

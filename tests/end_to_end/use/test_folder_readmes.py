@@ -39,6 +39,7 @@ def run(script: str, folder: Path, **settings: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_patterns_are_written_as_video_and_as_pictures(tmp_path: Path) -> None:
     for section in ("As a video", "As pictures"):
         run(block("workflows/programs/README.md", section).replace("1920x1080", "320x240"), tmp_path)
@@ -55,6 +56,7 @@ def test_program_is_created_with_curl(service: Service, tmp_path: Path) -> None:
     assert service.http.get(f"/v1/programs/{program}/play").headers["content-type"].startswith("text/html")
 
 
+@pytest.mark.slow
 def test_matte_is_exported_imported_and_read(service: Service, matte: str, tmp_path: Path) -> None:
     readme = "workflows/mattes/README.md"
     export = block(readme, "Moving a matte elsewhere").replace(URL, service.url)
@@ -79,6 +81,7 @@ def test_matte_is_exported_imported_and_read(service: Service, matte: str, tmp_p
     )
 
 
+@pytest.mark.slow
 def test_keys_are_made_and_backups_taken(tmp_path: Path) -> None:
     """In a data folder without a running service."""
     (keys,) = {block("README.md", "Run the service"), block("services/README.md", "Keys, owners, limits")}

@@ -64,6 +64,7 @@ def sealed(target: Objects, lines: list[bytes]) -> None:
     target.write_raw(MANIFEST, iter([*lines[:-1], json.dumps(last).encode()]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("url", ["sqlite"], indirect=True)
 def test_from_sqlite_and_folder_to_postgresql_and_bucket_and_back(
     engine: Engine,

@@ -260,6 +260,7 @@ def test_frames_of_more_pixels_than_are_allowed_are_refused(
     assert {"name": "capture_pixels", "limit": most - 1, "value": most}.items() <= caught.value.fields.items()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="the resident peak is read from Linux's /proc")
 def test_a_stack_larger_than_the_memory_is_ingested_within_it(
     make_zip: Zip, put: Put, objects: Objects

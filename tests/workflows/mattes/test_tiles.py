@@ -91,7 +91,7 @@ def recover(objects: Objects, ingest: Ingest) -> Callable[..., tuple[mattes.Matt
     return whole
 
 
-@pytest.mark.parametrize("method", ["lobes", "nn-dgsr"])
+@pytest.mark.parametrize("method", ["lobes", pytest.param("nn-dgsr", marks=pytest.mark.slow)])
 def test_the_matte_is_the_same_to_the_byte(
     recover: Callable[..., tuple[mattes.Matte, int]],
     digests: Digests,
@@ -289,7 +289,7 @@ def test_exposures_are_merged_by_their_weight(objects: Objects, ingest: Ingest) 
     assert many < 0.4 * one
 
 
-@pytest.mark.parametrize("method", ["lobes", "nn-dgsr"])
+@pytest.mark.parametrize("method", ["lobes", pytest.param("nn-dgsr", marks=pytest.mark.slow)])
 def test_patterns_that_a_video_lacks_are_done_without(
     recover: Callable[..., tuple[mattes.Matte, int]],
     objects: Objects,

@@ -22,7 +22,9 @@ TURNS = {
 }
 
 
-@pytest.mark.parametrize("clockwise", TURNS)
+@pytest.mark.parametrize(
+    "clockwise", [90, *(pytest.param(turn, marks=pytest.mark.slow) for turn in TURNS if turn != 90)]
+)
 def test_a_video_is_turned_upright(ingest_film: IngestFilm, filmed: Film, clockwise: int) -> None:
     flat = ingest_film(filmed.data).read()
     stack = ingest_film(turned(filmed.data, TURNS[clockwise]))

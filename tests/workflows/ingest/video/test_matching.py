@@ -30,7 +30,7 @@ from workflows.programs.program import Program
         pytest.param(Camera(fps=30, jitter=0.03, readout=0.033, seed=7), marks=pytest.mark.slow),
         pytest.param(Camera(codec="libx265", seed=8), marks=pytest.mark.slow),
         pytest.param(Camera(codec="mjpeg", container="mov", seed=9), marks=pytest.mark.exhaustive),
-        Camera(codec="mjpeg", container="avi", seed=10),
+        pytest.param(Camera(codec="mjpeg", container="avi", seed=10), marks=pytest.mark.slow),
         pytest.param(Camera(container="matroska", seed=11), marks=pytest.mark.slow),
         pytest.param(Camera(idle=0.0, lead=1.3, seed=12), marks=pytest.mark.exhaustive),
         pytest.param(Camera(lead=0.1, tail=0.1, seed=13), marks=pytest.mark.slow),
