@@ -12,6 +12,8 @@ from playwright.sync_api import Page
 from tests.end_to_end.conftest import Service
 from tests.end_to_end.problems import check_problem
 
+pytestmark = pytest.mark.slow
+
 BODY = {"preset": "sketch", "monitor": {"width": 64, "height": 48}}
 SEND = """([url, body]) => fetch(url, { method: "POST", mode: "no-cors", body: JSON.stringify(body) })
     .then(({ status }) => status, ({ name }) => name)"""

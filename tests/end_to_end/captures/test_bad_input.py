@@ -30,6 +30,8 @@ from tests.end_to_end.conftest import Service
 from tests.end_to_end.problems import check_problem
 from tests.parts.waiting import until
 
+pytestmark = pytest.mark.slow
+
 ZIP = {"Content-Type": "application/zip"}
 
 
@@ -148,7 +150,6 @@ def test_too_large_bodies_are_refused(service: Service, matte: str) -> None:
     assert check_problem(answer, 413, "too-large")["limit"] == 128 << 20
 
 
-@pytest.mark.slow
 def test_recovery_needs_nested_grids(service: Service, capture_archive: Path) -> None:
     def not_nested(manifest: dict, files: dict[str, bytes]) -> None:
         manifest["program"]["parts"][2] |= {"columns": 20, "rows": 15}

@@ -27,6 +27,8 @@ from tests.workflows.ingest.video.camera import overstated, zipped
 from tests.workflows.untrusted.test_decoder_guard import fragmented
 from workflows.programs.program import Program
 
+pytestmark = pytest.mark.slow
+
 ZIP = {"Content-Type": "application/zip"}
 
 
@@ -56,7 +58,6 @@ def test_killed_decoder_costs_one_request(service: Service, matte: str) -> None:
     assert post_composite(service, matte).content == expected
 
 
-@pytest.mark.slow
 def test_hanging_decoder_is_killed_and_others_keep_serving(service: Service, matte: str) -> None:
     expected = post_composite(service, matte).content
     with held(service, matte) as (one, answer):
@@ -71,7 +72,6 @@ def test_hanging_decoder_is_killed_and_others_keep_serving(service: Service, mat
         until(lambda: not running([one]))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("end", "environment"),
     [("terminate", {}), ("kill", {}), ("kill", {"ENVMATTE_COORDINATE": "false"})],
@@ -96,7 +96,6 @@ def peak_memory(one: psutil.Process) -> int:
     return int(found[1]) << 10
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="it is Linux that limits what a process takes")
 def test_film_that_needs_too_much_memory_fails_only_its_job(
     capture_archive: Path, program: Program, tmp_path: Path

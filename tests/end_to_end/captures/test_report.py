@@ -3,9 +3,12 @@
 import io
 from pathlib import Path
 
+import pytest
 from PIL import Image
 
 from tests.end_to_end.conftest import Service
+
+pytestmark = pytest.mark.slow
 
 
 def test_capture_links_to_its_report(service: Service, capture: str) -> None:

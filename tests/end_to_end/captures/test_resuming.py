@@ -34,6 +34,8 @@ from tests.end_to_end.lines import Line
 from tests.parts.processes import interrupt, running
 from tests.parts.waiting import until
 
+pytestmark = pytest.mark.slow
+
 MB = 1_000_000
 SIZES = [50 * MB, pytest.param(1000 * MB, marks=[pytest.mark.exhaustive, pytest.mark.timeout(1800)])]
 
@@ -71,7 +73,6 @@ def sha256(file: Path) -> str:
         return hashlib.file_digest(source, "sha256").hexdigest()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("size", SIZES)
 def test_client_survives_a_hundred_broken_connections(
     service: Service, capture_archive: Path, tmp_path: Path, size: int
@@ -163,7 +164,6 @@ def test_upload_resumes_after_the_server_is_killed(capture_archive: Path, tmp_pa
             assert not uploads_of(second)
 
 
-@pytest.mark.slow
 def test_interrupted_upload_command_resumes_when_run_again(
     service: Service, capture_archive: Path, tmp_path: Path
 ) -> None:
@@ -272,7 +272,6 @@ upload.start();
 """
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [{}, {"chunk": 50_000}, {"chunk": 50_000, "during": True}, {"chunk": 50_000, "stop": True}],

@@ -3,6 +3,8 @@
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import pytest
+
 from tests.end_to_end.captures.tus import (
     TUS,
     begin_patch,
@@ -13,6 +15,8 @@ from tests.end_to_end.captures.tus import (
     wait_until_deleted,
 )
 from tests.end_to_end.conftest import Service, paused
+
+pytestmark = pytest.mark.slow
 
 
 def test_one_of_two_patches_at_the_same_offset_wins(service: Service) -> None:
@@ -40,7 +44,8 @@ def test_late_patch_damages_nothing(service: Service, capture_archive: Path) -> 
     with paused(service):
         made = service.http.post("/v1/captures", json={"upload": where.rsplit("/", 1)[1]}).json()
         late.send(bytes(len(data) - 1000))
-        assert late.getresponse().status == 404
+        # 409 if the server looked at the late request only when the other had been read.
+        assert late.getresponse().status in (404, 409)
         late.close()
     assert service.client.wait(made["job"])["state"] == "succeeded"
 

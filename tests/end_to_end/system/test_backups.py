@@ -14,6 +14,8 @@ from tests.end_to_end.conftest import Service, digests, paused, serving
 from tests.faults.rig import stored
 from tests.parts.postgres import Server
 
+pytestmark = pytest.mark.slow
+
 
 def envmatte(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "services", *arguments]
@@ -24,7 +26,6 @@ def tiles_done(service: Service, job: str) -> int:
     return int(service.client.job(job)["tiles"]["done"])
 
 
-@pytest.mark.slow
 def test_running_job_continues_in_the_restored_backup(
     capture_archive: Path, s3: str, postgresql_server: Server, tmp_path: Path
 ) -> None:

@@ -21,6 +21,8 @@ from tests.end_to_end.conftest import Service, paused, png, serving
 from tests.end_to_end.problems import check_problem
 from tests.parts.waiting import until
 
+pytestmark = pytest.mark.slow
+
 HEADERS = {
     "content-security-policy",
     "cross-origin-resource-policy",
@@ -200,7 +202,6 @@ def test_clip_needs_a_matte_of_the_same_owner(locked: Locked) -> None:
     assert not any(path.startswith("composites/") for path in locked.service.stored())
 
 
-@pytest.mark.slow
 def test_every_route_with_every_kind_of_key(locked: Locked) -> None:
     document = locked.service.http.get("/openapi.json").json()
     routes = {f"{method.upper()} {path}" for path, calls in document["paths"].items() for method in calls}
@@ -310,7 +311,6 @@ def test_programs_are_kept_per_owner(locked: Locked) -> None:
     check_problem(http.get(url, headers=bearer(locked.keys["other"])), 404, "not-found")
 
 
-@pytest.mark.slow
 def test_revoking_a_key_ends_its_running_requests(locked: Locked, capture_archive: Path) -> None:
     service, data = locked.service, locked.service.data
     made = command(data, "make", "passing", "--owner", "carol", "--json")

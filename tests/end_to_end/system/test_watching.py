@@ -17,6 +17,8 @@ from tests.parts.waiting import until
 from tests.services.runtime.collector import Collector, collecting
 from tests.workflows.composite.video.test_steps import clip, pictures
 
+pytestmark = pytest.mark.slow
+
 CALLER = "00-0123456789abcdef0123456789abcdef-0123456789abcdef-01"
 
 

@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from PIL import Image
 
+from services.cli.main import main
 from tests.end_to_end.command_line import envmatte
 from tests.end_to_end.conftest import Service, paused, png
 from tests.parts.processes import interrupt, running
@@ -143,10 +145,12 @@ def test_patterns_need_a_new_or_empty_folder(tmp_path: Path) -> None:
         (["quick", "x", "--monitor", "99999x960"], "less than or equal to 16384"),
     ],
 )
-def test_invalid_patterns_are_refused(arguments: list[str], reason: str, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "services", "patterns", *arguments]
-    refused = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
-    assert (refused.returncode, refused.stdout) == (2, "")
+def test_invalid_patterns_are_refused(
+    arguments: list[str], reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    refused = CliRunner().invoke(main, ["patterns", *arguments])
+    assert (refused.exit_code, refused.stdout) == (2, "")
     assert reason in refused.stderr
     assert not list(tmp_path.iterdir())
 

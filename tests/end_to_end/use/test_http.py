@@ -64,7 +64,7 @@ def test_job_posted_during_the_ingest_of_its_capture_succeeds(
     service: Service, capture_archive: Path
 ) -> None:
     uploaded = service.client.upload(capture_archive)
-    job = service.client.recover(uploaded["id"])
+    job = service.client.recover(uploaded["id"], quality="fast")
     assert service.client.wait(job["id"])["state"] == "succeeded"
 
 
@@ -96,7 +96,7 @@ def test_masked_pixels_are_transparent(service: Service, scene: Scene, program, 
     masked = tmp_path / "masked.zip"
     write_capture(scene, program, masked, mask=True)
     uploaded = service.client.upload(masked)
-    job = service.client.wait(service.client.recover(uploaded["id"])["id"])
+    job = service.client.wait(service.client.recover(uploaded["id"], quality="fast")["id"])
     assert job["pixels"] == scene.object_mask.sum()
     answer = service.client.composite(job["matte"], png(np.ones((4, 4, 3), "f4"), "srgb", np.uint8))
     with Image.open(io.BytesIO(answer)) as picture:
@@ -135,11 +135,12 @@ def test_repeated_post_with_one_key_creates_once(
     key = {"Idempotency-Key": "job-1"}
     jobs = {service.http.post("/v1/jobs", json={"capture": capture}, headers=key).json()["id"] for _ in "ab"}
     assert len(jobs) == 1
+    service.client.cancel(jobs.pop())
 
 
 def test_deleting_leaves_nothing(service: Service, capture_archive: Path) -> None:
     uploaded = service.client.upload(capture_archive)
-    job = service.client.wait(service.client.recover(uploaded["id"])["id"])
+    job = service.client.wait(service.client.recover(uploaded["id"], quality="fast")["id"])
     assert any(job["matte"] in name for name in service.stored())
     assert service.http.delete(f"/v1/mattes/{job['matte']}").status_code == 204
     assert service.http.delete(f"/v1/captures/{uploaded['id']}").status_code == 204
@@ -174,6 +175,6 @@ def test_program_of_images_gives_the_same_matte(
     capture_archive = tmp_path / "images.zip"
     write_capture(scene, same, capture_archive, images=shown)
     uploaded = service.client.upload(capture_archive)
-    job = service.client.wait(service.client.recover(uploaded["id"])["id"])
+    job = service.client.wait(service.client.recover(uploaded["id"], quality="fast")["id"])
     mattes = service.data / "store" / "mattes"
     assert digests(mattes / job["matte"]) == digests(mattes / matte)

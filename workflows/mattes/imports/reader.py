@@ -156,7 +156,7 @@ class Reader:
         packed = self._read(name, size + (size >> 7) + 1024)  # what zstd makes of noise
         if name.partition("/c/")[0] in self._checked:
             if not is_intact(packed):
-                raise refused(name, "it is not what its checksum was made of")
+                raise refused(name, "its checksum does not match")
             packed = packed[:-SUM]
         values = bytearray(size)
         try:
@@ -178,7 +178,7 @@ class Reader:
         except ValueError as error:
             raise refused(name, "it is no JSON") from error
         except Corrupt as error:
-            raise refused(name, "it is not what its checksum was made of") from error
+            raise refused(name, "its checksum does not match") from error
 
     def _read(self, name: str, most: int) -> bytes:
         info = self._entries.get(name)
@@ -186,7 +186,7 @@ class Reader:
             raise refused(name, "it is not in the archive")
         data = zip_files.read(self._archive, info, most, ArchiveError)
         if name != MANIFEST and hashlib.sha256(data).hexdigest() != self._members[name].sha256:
-            raise refused(name, f"it is not what its checksum in {MANIFEST} was made of")
+            raise refused(name, f"its checksum in {MANIFEST} does not match")
         return data
 
     def _check_members(self) -> None:

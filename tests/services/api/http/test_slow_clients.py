@@ -165,9 +165,9 @@ def head(method: str, path: str, **headers: str) -> bytes:
     ("path", "kind"),
     [
         ("/v1/captures", "application/zip"),
-        ("/v1/mattes", "application/zip"),
-        ("/v1/jobs", "application/json"),
-        ("/v1/mattes/MATTE/composite", "image/png"),
+        pytest.param("/v1/mattes", "application/zip", marks=pytest.mark.slow),
+        pytest.param("/v1/jobs", "application/json", marks=pytest.mark.slow),
+        pytest.param("/v1/mattes/MATTE/composite", "image/png", marks=pytest.mark.slow),
         ("/v1/mattes/MATTE/composite", "video/mp4"),
     ],
 )
