@@ -173,4 +173,4 @@ def capture(service: Service, capture_archive: Path) -> str:
 @pytest.fixture(scope="session")
 def matte(service: Service, capture: str) -> str:
     """The scene's matte, recovered."""
-    return str(service.client.wait(service.client.recover(capture, quality="fast")["id"])["matte"])
+    return str(service.client.wait(service.client.recover(capture)["id"])["matte"])

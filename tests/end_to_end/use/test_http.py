@@ -175,6 +175,6 @@ def test_program_of_images_gives_the_same_matte(
     capture_archive = tmp_path / "images.zip"
     write_capture(scene, same, capture_archive, images=shown)
     uploaded = service.client.upload(capture_archive)
-    job = service.client.wait(service.client.recover(uploaded["id"], quality="fast")["id"])
+    job = service.client.wait(service.client.recover(uploaded["id"])["id"])
     mattes = service.data / "store" / "mattes"
     assert digests(mattes / job["matte"]) == digests(mattes / matte)

@@ -3,6 +3,7 @@
 import hashlib
 import io
 import json
+import shutil
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -82,16 +83,26 @@ def make_matte(objects: Objects) -> Matte:
     return made
 
 
-@pytest.fixture
-def matte(objects: Objects) -> Matte:
-    """The same."""
-    return make_matte(objects)
+@pytest.fixture(scope="session")
+def template(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, bytes]:
+    """A store with that matte, and the archive of it."""
+    folder = tmp_path_factory.mktemp("template")
+    objects = Objects(folder.as_uri())
+    make_matte(objects)
+    return folder, b"".join(Archive(objects, "m"))
 
 
 @pytest.fixture
-def archive(objects: Objects, matte: Matte) -> bytes:
+def matte(objects: Objects, folder: Path, template: tuple[Path, bytes]) -> Matte:
+    """The same, in a store of its own."""
+    shutil.copytree(template[0], folder, dirs_exist_ok=True)
+    return Matte(objects, "m")
+
+
+@pytest.fixture
+def archive(matte: Matte, template: tuple[Path, bytes]) -> bytes:
     """The matte's archive."""
-    return b"".join(Archive(objects, "m"))
+    return template[1]
 
 
 def unpacked(archive: bytes) -> Files:
