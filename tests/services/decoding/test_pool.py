@@ -1,5 +1,6 @@
 """Pictures decoded in child processes: the same pixels, and children that die, hang, use memory or send garbage."""
 
+import contextlib
 import errno
 import io
 import pickle
@@ -30,9 +31,12 @@ PIXELS = np.random.default_rng(0).integers(0, 256, (30, 40, 3), np.uint8)
 
 
 def children() -> list[psutil.Process]:
-    """The decoder processes of this process."""
-    found = running(psutil.Process().children(recursive=True))
-    return [child for child in found if child.name() == NAME]
+    """The decoders that this process has started; services of other tests have their own below it."""
+    found = []
+    for child in psutil.Process().children():
+        with contextlib.suppress(psutil.NoSuchProcess):
+            found += child.children()
+    return [child for child in running(found) if child.name() == NAME]
 
 
 @pytest.fixture
