@@ -7,8 +7,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from workflows.recovery.clusters import merge_clusters
-from workflows.recovery.lobe_clusters import (
+from workflows.recovery.clusters.gaussians import merge_clusters
+from workflows.recovery.clusters.merging import (
     CLUSTER_VALUES,
     MOMENTS,
     central_moments,
@@ -61,10 +61,9 @@ def ranked_lobes(transport: Transport, most: int, aspect: float) -> NDArray[np.f
     Notes
     -----
     Each node starts as a cluster with the mean and the variance of its bump, cut off at the edges of the monitor.
-    Clusters merge by their moments, at least cost first (Ward, see
-    :func:`~workflows.recovery.clusters.merge_clusters`). The first merges are limited to clusters that overlap and
-    whose grids are at most one level apart, so that a sharp lobe on a broad one stays separate. If more than `most`
-    are left, any two may merge.
+    Clusters merge by their moments, at least cost first (Ward, see :func:`.clusters.gaussians.merge_clusters`). The
+    first merges are limited to clusters that overlap and whose grids are at most one level apart, so that a sharp lobe
+    on a broad one stays separate. If more than `most` are left, any two may merge.
 
     The three channels' rows of a pixel are clustered together, so a lobe has one centre and three weights. Channels
     with different centres get separate lobes, even where these overlap.

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from workflows.recovery.clusters import (
+from workflows.recovery.clusters.gaussians import (
     LEAST_MASS,
     PARAMETERS,
     add_moments,

@@ -5,7 +5,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 MOMENTS = 6
-"""A cluster begins with its raw moments of order 0 to 2, as in :func:`~workflows.recovery.clusters.add_moments`."""
+"""A cluster begins with its raw moments of order 0 to 2, see :func:`.gaussians.add_moments`."""
 CLUSTER_VALUES = MOMENTS + 9
 """After its moments come the weights of the three channels, the same times x, and the same times y."""
 

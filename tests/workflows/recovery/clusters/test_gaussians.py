@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from workflows.recovery.clusters import (
+from workflows.recovery.clusters.gaussians import (
     CELL_VARIANCE,
     PARAMETERS,
     add_moments,

@@ -1,0 +1,1 @@
+"""Clusters of a row of T: as Gaussians, and which of them merge."""
