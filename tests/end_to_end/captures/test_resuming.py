@@ -172,7 +172,7 @@ def test_interrupted_upload_command_resumes_when_run_again(
         command = [sys.executable, "-m", "services", "upload", str(file), "--url", line.url]
         with running(command) as sending:
             assert sending.stderr is not None
-            while "upload: " not in (line := sending.stderr.readline()) or "upload: 0%" in line:
+            while "upload: " not in (shown := sending.stderr.readline()) or "upload: 0%" in shown:
                 assert sending.poll() is None
             assert interrupt(sending)[0] == 130
         before = line.carried
