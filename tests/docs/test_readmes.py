@@ -2,6 +2,7 @@
 
 import importlib.util
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -136,6 +137,12 @@ def test_commands_of_pytest_find_tests() -> None:
                 assert (ROOT / word.partition("::")[0]).exists(), command
             if word.startswith("--"):
                 assert _is_option(word.partition("=")[0]), command
+
+
+def test_every_folder_of_tests_is_run() -> None:
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["pytest"]["ini_options"]
+    folders = {path.relative_to(ROOT / "tests").parts[0] for path in (ROOT / "tests").rglob("test_*.py")}
+    assert set(settings["testpaths"]) == {f"tests/{name}" for name in folders}
 
 
 def test_the_commands_of_the_readme_have_the_shape_that_ci_looks_for() -> None:
