@@ -1,5 +1,6 @@
 """Options, markers and fixtures of all tests."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -36,13 +37,17 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_xdist_setupnodes(config: pytest.Config) -> None:
     """Compile the kernels beside the first tests: in a fresh tree each process would compile them for itself."""
     config.stash[KERNELS] = subprocess.Popen(
-        [sys.executable, "-m", "services", "warm"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        [sys.executable, "-m", "services", "warm"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
     )
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
+    """Interrupt what still compiles, with the processes it has started, so that nothing is left of it."""
     if KERNELS in config.stash:
-        config.stash[KERNELS].kill()
+        os.killpg(config.stash[KERNELS].pid, signal.SIGINT)
         config.stash[KERNELS].wait()
 
 
