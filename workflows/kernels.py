@@ -1,8 +1,8 @@
 """Compile every kernel now, so that later processes load it from numba's cache.
 
 numba compiles a kernel when it is first called, for the types of that call, and keeps the result in files. Here a
-capture of a few pixels goes all the way from archive to composite, through the functions that jobs and requests call.
-So every kernel is called with the types that it will be called with, and no list of them has to be kept.
+capture of a few pixels goes from archive to matte by each method, and a matte of a few pixels through all that uses
+one, by the functions that jobs and requests call. So no list of kernels and their types has to be kept.
 """
 
 import io

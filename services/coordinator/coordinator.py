@@ -10,7 +10,7 @@ import os
 import socket
 import threading
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -69,7 +69,7 @@ class Coordinator:
         self._name = f"{socket.gethostname()}:{os.getpid()}"
         self._token: int | None = None
         self._runs: dict[str, JobRun] = {}
-        self._discards: deque[tuple[float, Row[Any]]] = deque()
+        self._discards: list[tuple[float, Row[Any]]] = []
         """Jobs whose files are to be removed: the earliest time, and the job's row."""
         self._troubles: Counter[str] = Counter()
         self._beat_at = self._deleted_at = self._swept_at = self._wrote_at = self._read_at = -1e9
@@ -282,9 +282,9 @@ class Coordinator:
     def _discard(self) -> None:
         """Remove the files of ended jobs on which no worker works any more."""
         now = time.monotonic()
-        while self._discards and self._discards[0][0] <= now:
-            _, row = self._discards.popleft()
-            self._housekeeping.submit(self._remove_files, row)
+        for due in [one for one in list(self._discards) if one[0] <= now]:
+            self._discards.remove(due)
+            self._housekeeping.submit(self._remove_files, due[1])
 
     def _remove_files(self, row: Row[Any]) -> None:
         """Remove the files of a job, now or later: on a busy machine a worker may take long to end."""
