@@ -1,6 +1,5 @@
 """Keys and what they allow, with a real database."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -9,16 +8,9 @@ from sqlalchemy import Engine
 from services.api.auth import ADMIN, ANYONE, Caller, identify, require_keys_unless_loopback
 from services.runtime.problems import Unauthorized
 from services.settings import Settings
-from storage.database.engine import open_engine, writing
+from storage.database.engine import writing
 from storage.errors import InvalidInput
 from storage.records import api_keys
-
-
-@pytest.fixture
-def engine(tmp_path: Path) -> Iterator[Engine]:
-    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
-    yield engine
-    engine.dispose()
 
 
 def test_service_that_never_had_a_key_is_open(engine: Engine, tmp_path: Path) -> None:

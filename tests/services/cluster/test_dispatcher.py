@@ -81,10 +81,7 @@ def test_a_missing_scheduler_is_reported_as_a_problem() -> None:
         raise Unavailable("no scheduler answers at tcp://127.0.0.1:1")
 
     with Dispatcher(connect, "file:///store") as dispatcher:
-        end = time.monotonic() + 120
-        while "no scheduler answers" not in dispatcher.cluster["problem"]:
-            assert time.monotonic() < end
-            time.sleep(0.02)
+        until(lambda: "no scheduler answers" in dispatcher.cluster["problem"])
         assert (dispatcher.free, dispatcher.threads) == (0, 0)
         assert dispatcher.collect() == []
         dispatcher.drop("a")

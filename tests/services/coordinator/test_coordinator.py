@@ -1,7 +1,6 @@
 """Jobs that end before they start, files that are still written when they are removed, and the cost of progress."""
 
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ from services.coordinator import coordinator
 from services.coordinator.coordinator import WRITE, Coordinator
 from services.coordinator.job_kinds import JOB_KINDS
 from services.settings import CoordinatorSettings
-from storage.database.engine import open_engine, reading, writing
+from storage.database.engine import reading, writing
 from storage.errors import Unavailable
 from storage.layout import uploads
 from storage.objects.store import Objects
@@ -49,18 +48,6 @@ class Idle:
 
     def drop(self, job: str) -> None:
         pass
-
-
-@pytest.fixture
-def engine(tmp_path: Path) -> Iterator[Engine]:
-    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
-    yield engine
-    engine.dispose()
-
-
-@pytest.fixture
-def objects(tmp_path: Path) -> Objects:
-    return Objects((tmp_path / "store").as_uri())
 
 
 @pytest.fixture

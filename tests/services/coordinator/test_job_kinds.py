@@ -1,15 +1,12 @@
 """What the end of a composite job changes in a real database and a real store."""
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 from sqlalchemy import Engine
 
 from services.coordinator.job_kinds import JOB_KINDS
 from services.coordinator.job_run import JobRun, write_failure
 from services.coordinator.retention import sweep
-from storage.database.engine import open_engine, writing
+from storage.database.engine import writing
 from storage.errors import ClipError, Conflict, EnvmatteError, GaveUp, NotFound
 from storage.layout import composites
 from storage.objects.store import Objects
@@ -17,18 +14,6 @@ from storage.records import jobs, mattes, tiles
 from workflows.untrusted.limits import Limits
 
 MADE = (composites.clip_path, composites.ticks_path, composites.video_path)
-
-
-@pytest.fixture
-def engine(tmp_path: Path) -> Iterator[Engine]:
-    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
-    yield engine
-    engine.dispose()
-
-
-@pytest.fixture
-def objects(tmp_path: Path) -> Objects:
-    return Objects((tmp_path / "store").as_uri())
 
 
 @pytest.fixture

@@ -28,11 +28,6 @@ def engine(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Engine]:
     engine.dispose()
 
 
-@pytest.fixture
-def objects(tmp_path: Path) -> Objects:
-    return Objects((tmp_path / "store").as_uri())
-
-
 def add(engine: Engine, owner: str, name: str, **times: float) -> None:
     """Add a capture and a matte of it, both of one name, with their finished jobs."""
     with writing(for_owner(engine, owner)) as c:

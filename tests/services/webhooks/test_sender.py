@@ -1,28 +1,19 @@
 """Which coordinator sends webhooks, and what happens to those that are not accepted."""
 
 import time
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from sqlalchemy import Engine, select
 
 from services.settings import Settings
 from services.webhooks.sender import Sender
-from storage.database.engine import open_engine, reading, writing
+from storage.database.engine import reading, writing
 from storage.database.tables import deliveries as table
 from storage.records import job_log, jobs, leases, webhook_deliveries
 from tests.parts.waiting import until
 from tests.services.webhooks.receivers import receiver
 
 SECRET = "a secret of sixteen and more"
-
-
-@pytest.fixture
-def engine(tmp_path: Path) -> Iterator[Engine]:
-    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
-    yield engine
-    engine.dispose()
 
 
 def settings(*, private: bool = True) -> Settings:

@@ -1,25 +1,15 @@
 """Repeated requests with one Idempotency-Key: one thing is created, and every answer is about it."""
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 from sqlalchemy import Connection, Engine
 
 from services.api.http import idempotency
 from services.api.http.idempotency import find_earlier, idempotent
-from storage.database.engine import open_engine, reading, writing
+from storage.database.engine import reading, writing
 from storage.errors import NotFound
 from storage.records import jobs
 
 CALL = "POST /v1/jobs"
-
-
-@pytest.fixture
-def engine(tmp_path: Path) -> Iterator[Engine]:
-    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
-    yield engine
-    engine.dispose()
 
 
 def create(connection: Connection) -> str:

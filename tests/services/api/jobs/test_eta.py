@@ -1,7 +1,5 @@
 """Time until a job succeeds, from the rows of a database."""
 
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -9,19 +7,12 @@ from sqlalchemy import Connection, Engine, update
 
 from services.api.jobs.eta import TYPICAL, seconds_left
 from storage.database import tables
-from storage.database.engine import open_engine, writing
+from storage.database.engine import writing
 from storage.records import jobs, tiles
 from storage.steps import FINISH
 
 PLAN = {"tiles": 10, "slab": 4, "width": 160, "height": 120, "frames": 40, "video": False, "notes": []}
 FINISHING = TYPICAL * 40 * (160 * 120 + 100_000)
-
-
-@pytest.fixture
-def engine(tmp_path: Path) -> Iterator[Engine]:
-    opened = open_engine(f"sqlite:///{tmp_path / 'ledger.db'}")
-    yield opened
-    opened.dispose()
 
 
 def running(connection: Connection, kind: str, done: int, plan: dict[str, Any] = PLAN, **values: Any) -> str:

@@ -12,19 +12,12 @@ from sqlalchemy import Engine, event, update
 from services.api.app import build_app
 from services.settings import Settings
 from storage.database import tables
-from storage.database.engine import open_engine, writing
+from storage.database.engine import writing
 from storage.objects.store import Objects
 from storage.records import captures, jobs, leases
 from storage.records import tiles as tile_records
 
 PROGRAM = {"parts": []}
-
-
-@pytest.fixture
-def engine(tmp_path: Path) -> Iterator[Engine]:
-    opened = open_engine(f"sqlite:///{tmp_path / 'ledger.db'}")
-    yield opened
-    opened.dispose()
 
 
 @pytest.fixture
