@@ -26,6 +26,10 @@ from workflows.simulation import glass_ball
 from workflows.simulation.scene import Scene, write_capture
 
 BANDS = ((8, 6, 16), (16, 12, 16), (32, 24, 20))
+WIDTH, HEIGHT = 64, 48
+"""Pixels of the scene."""
+TILES = 12
+"""Of the scene's recovery, unless another size of tiles is asked for."""
 
 
 @dataclass
@@ -144,7 +148,7 @@ def program() -> Program:
 
 @pytest.fixture(scope="session")
 def scene() -> Scene:
-    return glass_ball.glass_ball(96, 72, rays=16)
+    return glass_ball.glass_ball(WIDTH, HEIGHT, rays=16)
 
 
 @pytest.fixture(scope="session")

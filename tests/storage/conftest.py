@@ -1,7 +1,8 @@
 """Real stores and databases for the tests of storage.
 
 A test with `objects` runs with a folder and with a bucket, or only with a folder if it also uses `folder`; a test with
-`engine` runs with SQLite and with PostgreSQL. The bucket is in the default run where the store itself is tested.
+`engine` runs with SQLite and with PostgreSQL. The bucket is in the default run where the store itself is tested with a
+few objects.
 """
 
 import hashlib
@@ -29,7 +30,8 @@ def folder(tmp_path: Path) -> Path:
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "store" in metafunc.fixturenames:
         tests_the_store = metafunc.module.__name__.startswith("tests.storage.objects.")
-        bucket = pytest.param("bucket", marks=() if tests_the_store else pytest.mark.slow)
+        quick = tests_the_store and "filled" not in metafunc.fixturenames
+        bucket = pytest.param("bucket", marks=() if quick else pytest.mark.slow)
         kinds = ["folder"] if "folder" in metafunc.fixturenames else ["folder", bucket]
         metafunc.parametrize("store", kinds, indirect=True)
 

@@ -10,6 +10,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from tests.end_to_end.conftest import HEIGHT, WIDTH
 from workflows.images import integer_formats
 
 
@@ -76,11 +77,11 @@ def video_not_there(manifest: dict, files: dict[str, bytes]) -> None:
 
 
 def frame_of_another_size(manifest: dict, files: dict[str, bytes]) -> None:
-    files["frames/00009.png"] = integer_formats.encode_png(np.zeros((72, 95, 3), np.uint8))
+    files["frames/00009.png"] = integer_formats.encode_png(np.zeros((HEIGHT, WIDTH - 1, 3), np.uint8))
 
 
 def frame_of_another_dtype(manifest: dict, files: dict[str, bytes]) -> None:
-    files["frames/00009.png"] = integer_formats.encode_png(np.zeros((72, 96, 3), np.uint16))
+    files["frames/00009.png"] = integer_formats.encode_png(np.zeros((HEIGHT, WIDTH, 3), np.uint16))
 
 
 def frame_that_is_no_image(manifest: dict, files: dict[str, bytes]) -> None:

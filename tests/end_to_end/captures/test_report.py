@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from tests.end_to_end.conftest import Service
+from tests.end_to_end.conftest import HEIGHT, WIDTH, Service
 
 pytestmark = pytest.mark.slow
 
@@ -30,8 +30,8 @@ def test_contact_sheet_is_a_small_picture(service: Service, capture: str) -> Non
     answer = service.http.get(f"/v1/captures/{capture}/contact-sheet.png")
     assert answer.headers["content-type"] == "image/png"
     with Image.open(io.BytesIO(answer.content)) as sheet:
-        assert sheet.width > 96 * 4
-        assert sheet.height > 72 * 2
+        assert sheet.width > WIDTH * 4
+        assert sheet.height > HEIGHT * 2
 
 
 def test_no_report_before_the_ingest(service: Service, capture_archive: Path) -> None:

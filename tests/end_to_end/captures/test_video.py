@@ -8,7 +8,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from tests.end_to_end.conftest import Service, png
+from tests.end_to_end.conftest import HEIGHT, WIDTH, Service, png
 from tests.workflows.ingest.video.camera import Camera, capture, film, lights
 from workflows.images import integer_formats
 from workflows.images.tone_curves import to_light
@@ -39,13 +39,13 @@ def uploaded(service: Service, scene: Scene, program: Program) -> dict:
 
 
 def test_ingest_reports_what_it_found(service: Service, uploaded: dict, program: Program) -> None:
-    assert (uploaded["state"], uploaded["width"], uploaded["height"]) == ("ready", 96, 72)
+    assert (uploaded["state"], uploaded["width"], uploaded["height"]) == ("ready", WIDTH, HEIGHT)
     assert program.count - 6 <= uploaded["frames"] < program.count
     lines = [line["text"] for line in service.http.get(f"/v1/jobs/{uploaded['job']}/log").json()["lines"]]
     assert any(f"{uploaded['frames']} of {program.count} patterns found" in line for line in lines), lines
     assert any(line.startswith("no frame of pattern") for line in lines), lines
     frame = service.http.get(f"/v1/captures/{uploaded['id']}/frames/0.png")
-    assert integer_formats.decode(frame.content, memory=1 << 24).shape == (72, 96, 3)
+    assert integer_formats.decode(frame.content, memory=1 << 24).shape == (HEIGHT, WIDTH, 3)
 
 
 def test_a_composite_is_close_to_the_truth(service: Service, uploaded: dict, scene: Scene) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from services.client import ServiceError
 from tests.end_to_end.command_line import envmatte
-from tests.end_to_end.conftest import Service, serving
+from tests.end_to_end.conftest import HEIGHT, WIDTH, Service, serving
 from tests.parts.waiting import until
 from tests.services.cluster.clusters import workers
 from tests.workflows.composite.video.test_steps import TICK, clip, even, frames_of, pictures
@@ -42,7 +42,7 @@ def test_clip_becomes_a_video_with_its_timestamps(service: Service, matte: str) 
     assert post(service, matte, data, **{"Idempotency-Key": "once"})["id"] == job["id"]
     assert (job["kind"], job["matte"], job["options"]) == ("composite", matte, OPTIONS)
     done = service.client.wait(job["id"])
-    assert done["pixels"] == 40 * 96 * 72
+    assert done["pixels"] == 40 * WIDTH * HEIGHT
     log = service.http.get(f"/v1/jobs/{job['id']}/log").json()["lines"]
     assert any("the clip has 40 frames of 72 x 54 pixels" in line["text"] for line in log)
 

@@ -2,7 +2,7 @@
 
 import json
 
-from tests.end_to_end.conftest import Service
+from tests.end_to_end.conftest import HEIGHT, WIDTH, Service
 
 PROBLEM = "application/problem+json"
 
@@ -12,8 +12,8 @@ def test_live_data_is_made_once(service: Service, matte: str) -> None:
     assert (first.status_code, first.headers["content-encoding"]) == (200, "gzip")
     start = 4 + int.from_bytes(first.content[:4], "little")
     header = json.loads(first.content[4:start])
-    assert (header["width"], header["height"], header["step"]) == (96, 72, 1)
-    assert len(first.content) - start == 96 * 72 * (8 * header["lookups"] + 7)
+    assert (header["width"], header["height"], header["step"]) == (WIDTH, HEIGHT, 1)
+    assert len(first.content) - start == WIDTH * HEIGHT * (8 * header["lookups"] + 7)
     assert (service.data / "store" / "mattes" / matte / "live-1" / "zarr.json").exists()
     again = service.http.get(f"/v1/mattes/{matte}/live")
     assert again.content == first.content

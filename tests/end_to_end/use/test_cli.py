@@ -13,7 +13,7 @@ from PIL import Image
 
 from services.cli.main import main
 from tests.end_to_end.command_line import envmatte
-from tests.end_to_end.conftest import Service, paused, png
+from tests.end_to_end.conftest import HEIGHT, WIDTH, Service, paused, png
 from tests.parts.processes import interrupt, running
 from workflows.images import integer_formats
 from workflows.programs import presets
@@ -39,7 +39,7 @@ def test_from_a_capture_to_a_composite(service: Service, capture_archive: Path, 
     composite = tmp_path / "composite.png"
     done = envmatte(service, "composite", job["matte"], str(backdrop), "-o", str(composite))
     assert done.stdout.strip() == str(composite)
-    assert integer_formats.decode(composite.read_bytes(), memory=1 << 24).shape == (72, 96, 3)
+    assert integer_formats.decode(composite.read_bytes(), memory=1 << 24).shape == (HEIGHT, WIDTH, 3)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["backdrop.png", "composite.png"]
 
 

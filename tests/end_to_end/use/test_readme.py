@@ -18,7 +18,7 @@ import pytest
 
 from services.client import Client
 from tests.docs.readmes import block
-from tests.end_to_end.conftest import png
+from tests.end_to_end.conftest import HEIGHT, TILES, WIDTH, png
 from tests.parts.waiting import until
 from workflows.simulation import glass_ball
 
@@ -184,6 +184,10 @@ def test_service_scales_to_three_machines(capture_archive: Path, tmp_path: Path)
         until(lambda: len(httpx2.get(f"{url}/v1/cluster").json()["workers"]) == 2)
         with Client(url) as client:
             job = client.wait(client.recover(client.upload(capture_archive), tile=16))
-            assert (job.state, job["tiles"]["done"]) == ("succeeded", 30)
-            assert client.composite(client.matte(job), np.ones((4, 4, 3), np.float32)).shape == (72, 96, 3)
+            assert (job.state, job["tiles"]["done"]) == ("succeeded", TILES)
+            assert client.composite(client.matte(job), np.ones((4, 4, 3), np.float32)).shape == (
+                HEIGHT,
+                WIDTH,
+                3,
+            )
     assert (tmp_path / "shared" / "mattes").is_dir()

@@ -23,8 +23,8 @@ from tests.parts.waiting import until
 from tests.services.api.mattes.archives import archive
 
 CHECK_SECONDS = 1.0
-SIZE = 720, 480
-"""Of a matte whose layers have about 4 MB."""
+SIZE = 560, 400
+"""Of a matte whose layers have about 2.7 MB."""
 SEND_BUFFER = 1 << 16
 """Of the server's sockets, in bytes, so that a layer does not fit in it."""
 
@@ -142,7 +142,7 @@ def test_slow_client_that_keeps_reading_gets_the_whole_answer(served: Served) ->
         received = 0
         while part := one.recv(1 << 16):
             received += len(part)
-            time.sleep(0.02)
+            time.sleep(0.04)
     assert received > size
     assert time.monotonic() - started > 2 * CHECK_SECONDS
 
