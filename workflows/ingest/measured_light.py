@@ -11,7 +11,9 @@ from pydantic import TypeAdapter
 from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import Curve, table
+from workflows.programs.border import border_light
 from workflows.programs.program import Program
+from workflows.recovery.lobes.recover import Conditions
 
 LOBES = 3
 """Lobes on either side of the Lanczos kernel that frames are shifted with."""
@@ -156,6 +158,47 @@ def merge(
         np.copyto(gain, np.where(times > 0, mean_gain, 1)[:, np.newaxis], where=~usable)
         gain /= worth
     return Light(light, usable, worth), gain if gains else None
+
+
+def conditions_of(stack: Stack, program: Program) -> Conditions:
+    """What else than T the frames of a capture show, as far as its ingest found it."""
+    attributes = stack.attributes
+    return Conditions(
+        stack.channels == 1,
+        stray_light(attributes, program),
+        attributes.get("model_error", 0.0),
+    )
+
+
+def stray_light(attributes: dict[str, Any], program: Program) -> Floats:
+    """What changes with the patterns' numbers but is none of their light: the border of a film, seen in the glass.
+
+    Parameters
+    ----------
+    attributes : dict
+        Of the stack.
+    program : Program
+
+    Returns
+    -------
+    (s, m + 2) float32
+        A row of ones, then one row for each bit of the border, of mean 0; columns as of
+        :class:`~workflows.recovery.lobes.footprint.PatternCodes`.
+
+    Notes
+    -----
+    S and S + rho are the ends of a line that is fitted to the constant frames, so the border's light in them is the
+    same linear function of its light in these frames.
+    """
+    shown = program.measured
+    if not attributes.get("border"):
+        return np.ones((1, shown.size + 2), np.float32)
+    border = border_light(range(program.count))
+    numbers, sent = program.constants_among(attributes["patterns"])
+    slope = np.stack([np.ones(len(numbers)), sent.mean(axis=1)], axis=1)
+    ends = np.array([[1, 0], [1, 1]]) @ np.linalg.pinv(slope)
+    rows = np.concatenate([border[:, shown], border[:, numbers] @ ends.T.astype(np.float32)], axis=1)
+    return np.concatenate([np.ones((1, rows.shape[1]), np.float32), rows])
 
 
 def black_patterns(program: Program) -> NDArray[np.intp]:

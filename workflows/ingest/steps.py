@@ -105,6 +105,7 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
             else list(filmed.shares),
             "exposures": [frame.exposure for frame in manifest.frames] or [1.0] * frames,
             **({"orientation": turn} if filmed is None else {"video": filmed.record}),
+            "border": manifest.video is not None and manifest.video.border is not None,
         },
         mask=mask,
         images=patterns,

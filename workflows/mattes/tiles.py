@@ -12,12 +12,13 @@ from storage.layout.captures import Stack
 from storage.layout.mattes import Block, Matte
 from storage.objects.store import Objects
 from workflows.images.tone_curves import Curve, to_light
-from workflows.ingest.measured_light import read_light
+from workflows.ingest.measured_light import conditions_of, read_light
 from workflows.mattes.options import RecoveryOptions
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out, pyramid_of
 from workflows.recovery.dgsr import recover as dgsr
 from workflows.recovery.dgsr.options import DgsrOptions
+from workflows.recovery.glare import add_glare, filter_patterns
 from workflows.recovery.lobes import recover as lobes
 from workflows.recovery.noise import Noise
 from workflows.recovery.normalise import normalise
@@ -99,7 +100,16 @@ def _recover_block(
         error = dgsr.error_of(transport, photometry, measured, sensing)
     else:
         patterns = patterns_of(objects, capture)
-        transport, photometry, error = lobes.recover(measurements, photometry, patterns, *given, method)
+        transport, photometry, error = lobes.recover(
+            measurements,
+            photometry,
+            patterns,
+            *given,
+            method,
+            conditions_of(stack, program),
+        )
+        if attributes.get("glare"):
+            transport = add_glare(transport, attributes["glare"], method.least_weight)
 
     def spread(values: NDArray[Scalar], *channels: int) -> NDArray[Scalar]:
         """Values of the recovered pixels, and zeros for the others."""
@@ -145,9 +155,11 @@ def sensing_of(objects: Objects, capture: str) -> Sensing:
 
 @lru_cache(maxsize=1)
 def patterns_of(objects: Objects, capture: str) -> Patterns:
-    """A capture's patterns on a pyramid."""
+    """A capture's patterns on a pyramid, as they arrive through its glare."""
     program, monitor = program_of(objects, capture)
-    return lay_out(program, monitor, _images_of(objects, capture))
+    patterns = lay_out(program, monitor, _images_of(objects, capture))
+    glare = Stack(objects, capture).attributes.get("glare")
+    return filter_patterns(patterns, glare) if glare else patterns
 
 
 def _images_of(objects: Objects, capture: str) -> list[NDArray[np.float32]]:

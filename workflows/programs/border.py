@@ -22,7 +22,7 @@ References
 F. Gray, Pulse code communication, US patent 2,632,058, 1953.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -201,6 +201,18 @@ def number_cells(number: int) -> NDArray[np.bool_]:
 def tick_cells(number: int) -> NDArray[np.bool_]:
     """Which cells along each side are lit for a pattern, (2 TICKS,) bool: they show the lowest bit of number + 1."""
     return _pairs([(number + 1) & 1] * TICKS)
+
+
+def border_light(numbers: Sequence[int]) -> NDArray[np.float32]:
+    """The light of the border as it changes from pattern to pattern, (s, patterns) float32, of mean 0.
+
+    What any mixture of cells shows is a sum of these rows and a constant. Bits that never change have no row, nor has
+    the tick, which is the parity.
+    """
+    bits = np.array([number_cells(n)[::2] for n in numbers]).T
+    lit = np.where(bits[(bits != bits[:, :1]).any(axis=1)], 1, -1)
+    light: NDArray[np.float32] = (lit - lit.mean(axis=1, keepdims=True)).astype(np.float32)
+    return light
 
 
 def _pairs(bits: list[int]) -> NDArray[np.bool_]:

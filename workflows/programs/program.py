@@ -253,14 +253,26 @@ class Program(Record):
                 yield from (to_light(v, curve) for v in self._values(start, start + part.count, images))
 
     def _grids_of_others(self, images: Sequence[NDArray[np.float32]]) -> list[tuple[int, int]]:
-        """A chain of the grids of the images, and of grids on which the stripes along both axes are exact."""
+        """Nested grids of the images and stripes, whose columns and rows are refined together.
+
+        Both axes have their own chain, since patterns of one axis have a single column or row.
+        """
         grids = {(image.shape[1], image.shape[0]) for image in images}
         stripes = [part for part in self.parts if isinstance(part, Stripes)]
-        if stripes:
-            x, y = np.max([part.grid(part.count - 1) for part in stripes], axis=0).tolist()
+        for part in stripes:
+            columns, rows = part.grid(part.count - 1)
             widest = min(part.first for part in stripes) + 1
-            grids |= {(min(2**i, x), min(2**i, y)) for i in range(widest, max(x, y).bit_length())}
-        return chain(grids)
+            grids |= {
+                (min(2**i, columns), min(2**i, rows)) for i in range(widest, max(columns, rows).bit_length())
+            }
+        across = chain({(columns, 1) for columns, _ in grids if columns > 1})
+        down = chain({(1, rows) for _, rows in grids if rows > 1})
+        if not across or not down:
+            return across or down or sorted(grids)
+        return [
+            (across[min(i, len(across) - 1)][0], down[min(i, len(down) - 1)][1])
+            for i in range(max(len(across), len(down)))
+        ]
 
     def _shapes(self, images: Sequence[NDArray[np.float32]]) -> list[Shape]:
         """The shapes of the patterns that are not constant."""

@@ -96,6 +96,27 @@ class Transport:
         )
 
     @classmethod
+    def from_entries(
+        cls,
+        columns: int,
+        rows: int,
+        count: NDArray[np.integer],
+        cell: NDArray[np.integer],
+        weight: NDArray[np.floating],
+        shared: NDArray[np.bool_],
+        least_weight: float = 1e-4,
+    ) -> Self:
+        """As `from_rows`, of entries whose cells need not ascend within a row and may repeat: weights are added."""
+        row = np.repeat(np.arange(count.size), count.ravel())
+        order = np.lexsort((cell, row))
+        row, cell, weight = row[order], cell[order], weight[order]
+        new = np.append(True, (np.diff(row) > 0) | (np.diff(cell) > 0))[: row.size]
+        begin = np.flatnonzero(new)
+        merged = np.add.reduceat(weight, begin) if begin.size else weight
+        count = np.bincount(row[begin], minlength=count.size).reshape(count.shape)
+        return cls.from_rows(columns, rows, count, cell[begin], merged, shared, least_weight)
+
+    @classmethod
     def concatenate(cls, parts: Sequence[Self]) -> Self:
         """Concatenate the pixels of several transports on the same grid.
 

@@ -7,7 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from workflows.images.tone_curves import table
-from workflows.ingest.measured_light import Light, margin_of, merge, unclipped_light
+from workflows.ingest.measured_light import Light, margin_of, merge, stray_light, unclipped_light
+from workflows.programs.border import border_light
+from workflows.programs.presets import preset
 
 LOOK_UP = table("linear", np.dtype(np.uint8))
 
@@ -74,3 +76,20 @@ def test_value_merged_from_clipped_ones_is_clipped() -> None:
     assert 2 <= np.count_nonzero(~whole) <= 4
     _, still = unclipped_light(codes, (0.0, 0.0), 4, LOOK_UP)
     assert np.count_nonzero(~still) == 1
+
+
+def test_stray_light_of_constant_frames_is_what_s_and_rho_are_fitted_to() -> None:
+    program = preset("quick", 640, 480)
+    patterns = list(range(program.count))
+    plain = stray_light({"patterns": patterns}, program)
+    np.testing.assert_array_equal(plain, 1)
+    assert plain.shape == (1, program.measured.size + 2)
+    strays = stray_light({"patterns": patterns, "border": True}, program)
+    lit = border_light(patterns)
+    np.testing.assert_array_equal(strays[0], 1)
+    np.testing.assert_array_equal(strays[1:, :-2], lit[:, program.measured])
+    numbers, sent = program.constants
+    level = sent.mean(axis=1)
+    for row, ends in zip(lit[:, numbers], strays[1:, -2:], strict=True):
+        slope, start = np.polyfit(level, row, 1)
+        np.testing.assert_allclose(ends, [start, start + slope], atol=1e-5)

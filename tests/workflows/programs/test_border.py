@@ -16,6 +16,7 @@ from workflows.programs.border import (
     Border,
     Box,
     Step,
+    border_light,
     draw_border,
     number_cells,
     read_numbers,
@@ -205,3 +206,16 @@ def test_more_patterns_than_numbers_are_refused() -> None:
     assert schedule(MAX_PATTERNS, 2)[-6].number == MAX_PATTERNS - 1
     with pytest.raises(OptionError, match=r"4096 patterns.*4095"):
         schedule(MAX_PATTERNS + 1, 2)
+
+
+def test_any_mixture_of_cells_is_a_sum_of_the_rows_of_border_light() -> None:
+    numbers = range(130)
+    rows = border_light(numbers)
+    np.testing.assert_allclose(rows.mean(axis=1), 0, atol=1e-6)
+    assert len(rows) == 9  # eight bits of numbers up to 131, and the parity
+    assert np.linalg.matrix_rank(rows) == len(rows)
+    cells = np.array([[*number_cells(n), *tick_cells(n)] for n in numbers], float)
+    mixture = cells @ np.random.default_rng(0).random(cells.shape[1])
+    design = np.concatenate([np.ones((1, len(numbers))), rows])
+    left = mixture - np.linalg.lstsq(design.T, mixture)[0] @ design
+    np.testing.assert_allclose(left, 0, atol=1e-5)

@@ -223,3 +223,17 @@ def test_level_that_is_too_large_is_refused_without_using_memory(parts: list[dic
         assert tracemalloc.get_traced_memory()[1] < 20_000_000
     finally:
         tracemalloc.stop()
+
+
+def test_images_of_either_axis_are_sensed_along_both() -> None:
+    rng = np.random.default_rng(0)
+    sizes = [(1, 4), (1, 8), (1, 32), (3, 1), (6, 1), (24, 1)]
+    images = [rng.random((*size, 1), np.float32) for size in sizes]
+    names = [f"{n}.png" for n in range(len(images))]
+    levels = program({"kind": "images", "files": names}).sensing("linear", images).levels
+    assert [(level.columns, level.rows) for level in levels] == [(4, 3), (8, 6), (32, 24)]
+    assert [level.patterns.tolist() for level in levels] == [[0, 3], [0, 1, 3, 4], list(range(6))]
+    for level in levels:
+        for m, n in enumerate(level.patterns):
+            cells = level.light[0, :, m].reshape(level.rows, level.columns, 1)
+            np.testing.assert_allclose(shown(cells, 96, 72), shown(images[n], 96, 72), rtol=1e-6)

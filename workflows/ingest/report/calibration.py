@@ -64,6 +64,7 @@ def measure(stack: Stack, gains: Sequence[float] | None = None) -> None:
         camera_curve=_as_json(found.camera),
         assumed_curves=found.assumed,
         noise={"read": noise.read, "shot": noise.shot},
+        assumed_noise=bool("video" not in stack.attributes and np.count_nonzero(some) < 4),
         crosstalk=estimate_crosstalk(light, shown, usable).tolist(),
     )
 

@@ -10,7 +10,7 @@ _NOISE = (19.0, 0.040), (5.5, 0.0044)  # k and c at the low and the high end
 _FIXED_GRIDS = (0.45, 1.2), (0.00045, 0.35)  # a and b at the low and the high end
 
 
-def expected(program: Program, survey: dict[str, Any]) -> Quality | None:
+def expected(program: Program, survey: dict[str, Any], model_error: float) -> Quality | None:
     """Predict the PSNR of composites from the noise, the contrast, and the program's patterns.
 
     Parameters
@@ -18,6 +18,8 @@ def expected(program: Program, survey: dict[str, Any]) -> Quality | None:
     program : Program
     survey : dict
         See `workflows.ingest.report.survey`.
+    model_error : float
+        See `workflows.ingest.report.unexplained`, as a share of rho.
 
     Returns
     -------
@@ -28,9 +30,10 @@ def expected(program: Program, survey: dict[str, Any]) -> Quality | None:
     -----
     The squared error is modelled as ``k s^2 / m + c rho^2 / m^1.2``. The first term is noise of standard deviation s in
     about k parameters of T, S and rho. The second is what m patterns leave undetermined, in proportion to the contrast
-    rho. If random patterns have offsets, m counts all patterns but the random ones without. Otherwise it counts all,
-    and ``a rho^2 / n^b`` is added for n blocks along the monitor's shorter side in the finest grid: it is not known
-    where in a block the light comes from, which costs clear glass most and frosted glass least.
+    rho. What no T explains of the patterns is not explained of a backdrop either, and is added. If random patterns have
+    offsets, m counts all patterns but the random ones without. Otherwise it counts all, and ``a rho^2 / n^b`` is added
+    for n blocks along the monitor's shorter side in the finest grid: it is not known where in a block the light comes
+    from, which costs clear glass most and frosted glass least.
 
     The constants are fitted to three traced scenes of 160 x 120 pixels (a clear ball, a dispersing solid and a frosted
     lens) and the mean of four backdrops (`tests.benchmarks.recovery.figures`): k and c from the presets of 128, 49 and
@@ -40,6 +43,7 @@ def expected(program: Program, survey: dict[str, Any]) -> Quality | None:
     warnings in their report, may be below.
     """
     rho, s2 = survey["contrast"], survey["deviation"] ** 2
+    unexplained = (model_error * rho) ** 2
     shown = [part for part in program.parts if not isinstance(part, Constant)]
     random = [part for part in shown if isinstance(part, Bernoulli)]
     if rho <= 0 or not random:
@@ -50,6 +54,6 @@ def expected(program: Program, survey: dict[str, Any]) -> Quality | None:
     blocks = max(min(part.columns, part.rows) for part in random) if fixed else None
     ends = []
     for (k, c), (a, b) in zip(_NOISE, _FIXED_GRIDS, strict=True):
-        error = k * s2 / patterns + c * rho**2 / patterns**1.2
+        error = k * s2 / patterns + c * rho**2 / patterns**1.2 + unexplained
         ends.append(-10 * log10(error if blocks is None else error + a * rho**2 / blocks**b))
     return Quality(low=ends[0], high=ends[1], blocks=blocks)

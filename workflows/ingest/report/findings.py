@@ -38,6 +38,7 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
         *_steadiness(attributes.get("steadiness")),
         *_drift(figures.drift),
         *_flicker(figures.flicker),
+        *_glare(attributes.get("glare")),
         _noise(figures, attributes["survey"]),
         _crosstalk(figures, program),
         *_curves(figures, program),
@@ -191,6 +192,24 @@ def _flicker(flicker: Flicker | None) -> list[Finding]:
                 if flicker.corrected
                 else ": it is not corrected, because it is not certain, or no frame is black"
             ),
+        )
+    ]
+
+
+def _glare(shares: list[float] | None) -> list[Finding]:
+    """Glare below 1 % is not reported: it is left out of recovery too."""
+    if not shares:
+        return []
+    level = _graded(sum(shares), 0.03, 0.3)
+    return [
+        Finding(
+            name="glare",
+            level=level,
+            message=f"veiling glare: {100 * sum(shares):.0f} % of the light comes from around the place that a pixel "
+            "sees, scattered in the lens, the room or the glass. Composites have it too",
+            remedy=""
+            if level == "good"
+            else "clean the lens, darken the room, and keep bright things beside the monitor out of the picture",
         )
     ]
 

@@ -65,7 +65,7 @@ def report(attributes: dict[str, Any], frames: int) -> Report:
         ),
         crosstalk=attributes["crosstalk"],
         **curves,
-        quality=expected(program, survey),
+        quality=expected(program, survey, attributes.get("model_error", 0.0)),
         video=attributes.get("video"),
     )
     found = findings(figures, program, attributes)

@@ -12,8 +12,10 @@ from storage.layout.captures import Stack
 from workflows.images.tone_curves import Curve
 from workflows.ingest.measured_light import black_patterns
 from workflows.ingest.report.trial_recovery import FURTHEST, Doubles, Trial, take_sample, try_recovery
+from workflows.ingest.report.unexplained import find_unexplained
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out
+from workflows.recovery.glare import filter_patterns
 
 ROUNDS = 10
 """Rounds of measuring and correcting, at most."""
@@ -32,6 +34,9 @@ REST = 0.25
 """The last round may leave at most this share of what was found."""
 EXPLAINED = np.array([2.4, 1.5])
 """Largest residuals with which shifts and gains are believed, in standard deviations of the noise."""
+LEFT = 0.3
+"""The squared residual may keep this share of its excess over noise. If it keeps more, the frames differ from what is
+predicted in ways that only look like shifts and gains."""
 MEMORY = 4
 """Rounds before the last one from which the next is extrapolated."""
 MIN_FRAMES = 8
@@ -81,22 +86,29 @@ def find_steadiness(stack: Stack) -> None:
     ----------
     H. F. Walker and P. Ni, Anderson acceleration for fixed-point iterations, SIAM J. Numer. Anal. 49, 2011.
     """
-    stack.annotate(steadiness=None, shifts=None, gains=None)  # a retried ingest must not find old ones
+    stack.annotate(
+        steadiness=None, shifts=None, gains=None, glare=None, model_error=0.0
+    )  # a retried ingest must not find old ones
     program = Program.model_validate(stack.attributes["program"])
     sample = take_sample(stack)
     if sample is None:
         return
     monitor: Curve = TypeAdapter[Curve](Curve).validate_python(stack.attributes["monitor_curve"])
+    light = lay_out(program, monitor, stack.images())
+    at_rest = np.zeros((stack.frames, 3))
+    find_unexplained(stack, program, monitor, light, sample, at_rest)
+    glare = stack.attributes["glare"]
     try_out = partial(
-        try_recovery, stack, program, monitor, lay_out(program, monitor, stack.images()), sample
+        try_recovery, stack, program, monitor, filter_patterns(light, glare) if glare else light, sample
     )
     patterns = np.array(stack.attributes["patterns"])
     shown = np.isin(patterns, program.measured)
-    first = try_out(np.zeros((stack.frames, 3)))
+    first = try_out(at_rest)
     if first is None or np.count_nonzero(np.isfinite(first.off[shown]).all(axis=1)) < MIN_FRAMES:
         return
     found, last = _fill_gaps(first.off, shown), first
     moves = flickers = False
+    believed = np.ones(2, bool)
     least = np.array([MIN_DRIFT, MIN_FLICKER])
     size, error = _sizes(found, first, shown)
     if ((size > TRIFLE * least) & (size > LOOK_AGAIN * error)).any():
@@ -105,11 +117,17 @@ def find_steadiness(stack: Stack) -> None:
         size, error = _sizes(found, last, shown)
         there = (size >= least) & (size >= SURE * error)
         sure = there & (_sizes(left, last, shown)[0] <= REST * size) & _within(found, shown)
-        believed = last.residual < np.minimum(EXPLAINED, first.residual)
+        believed = (last.residual < EXPLAINED) & (
+            last.residual**2 - 1 <= LEFT * max(first.residual**2 - 1, 0.0)
+        )
         moves = bool(sure[0] and believed[0])
         # Movement that is not a common shift looks like flicker.
         flickers = bool(sure[1] and believed[1] and has_black and (moves or not there[0]))
-    if not moves and not flickers and last.residual > EXPLAINED[0]:
+    if (
+        not moves
+        and not flickers
+        and (last.residual > EXPLAINED[0] or (last is not first and not believed.any()))
+    ):
         stack.annotate(steadiness={})
         return
     if not moves and not flickers:
@@ -125,6 +143,8 @@ def find_steadiness(stack: Stack) -> None:
         **({"shifts": found[:, :2].round(4).tolist()} if moves else {}),
         **({"gains": gain.round(5).tolist()} if flickers else {}),
     )
+    if moves or flickers:
+        find_unexplained(stack, program, monitor, light, sample, found * [moves, moves, flickers])
 
 
 def _settle(

@@ -29,7 +29,10 @@ def survey(stack: Stack) -> None:
     """
     find_steadiness(stack)
     if stack.attributes["gains"] is not None:
+        noise = stack.attributes["noise"]
         measure(stack, stack.attributes["gains"])
+        if stack.attributes["assumed_noise"]:
+            stack.annotate(noise=noise)
     attributes = stack.attributes
     program = Program.model_validate(attributes["program"])
     look_up = look_up_of(stack)

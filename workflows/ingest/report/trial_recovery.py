@@ -9,11 +9,19 @@ from numpy.typing import NDArray
 from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import Curve, to_light
-from workflows.ingest.measured_light import LOBES, exposures_of, light_of, look_up_of, unclipped_light
+from workflows.ingest.measured_light import (
+    LOBES,
+    Light,
+    conditions_of,
+    exposures_of,
+    light_of,
+    look_up_of,
+    unclipped_light,
+)
 from workflows.programs.program import Program
 from workflows.recovery.lobes.recover import recover
 from workflows.recovery.noise import Noise
-from workflows.recovery.photometry import fit_photometry
+from workflows.recovery.photometry import Photometry, fit_photometry
 from workflows.recovery.sensing import Patterns
 from workflows.recovery.transport import Transport
 
@@ -129,29 +137,75 @@ def _see(stack: Stack, sample: Sample, shifts: Doubles) -> _Seen:
     return _Seen(values, whole, (across, down))
 
 
-def try_recovery(
+class RecoveredSample(NamedTuple):
+    """The recovery of a sample.
+
+    Attributes
+    ----------
+    light : Light
+        Of each pattern, at the n pixels of the sample.
+    photometry : Photometry
+    transport : Transport
+        Without glare.
+    strays : (s, m + 2) float32
+        As in :class:`~workflows.recovery.lobes.recover.Conditions`.
+    alive : (n, 3) bool
+        Where there is enough contrast.
+    seen : _Seen
+    """
+
+    light: Light
+    photometry: Photometry
+    transport: Transport
+    strays: Floats
+    alive: NDArray[np.bool_]
+    seen: _Seen
+
+
+def recover_sample(
     stack: Stack, program: Program, monitor: Curve, patterns: Patterns, sample: Sample, state: Doubles
-) -> Trial | None:
-    """Recover the sample from frames corrected by ``state``, (frames, 3), and measure what remains."""
+) -> RecoveredSample | None:
+    """Recover the sample from frames corrected by ``state``, (frames, 3); None if it has too little contrast."""
     seen, gains = _see(stack, sample, state[:, :2]), np.exp(state[:, 2])
     attributes = stack.attributes | {"gains": gains.tolist() if state[:, 2].any() else None}
     noise = Noise(**attributes["noise"])
-    light, usable, worth = light_of(
-        lambda n: (seen.values[n], seen.whole[n]), attributes, program, len(sample.chosen[0])
-    )
+    found = light_of(lambda n: (seen.values[n], seen.whole[n]), attributes, program, len(sample.chosen[0]))
+    light, usable, worth = found
     numbers, sent = program.constants_among(attributes["patterns"])
     levels = to_light(sent, monitor)
     photometry = fit_photometry(light[:, numbers], levels, usable[:, numbers], noise, worth[:, numbers])
     alive = photometry.rho**2 > CONTRAST**2 * noise.variance(photometry.S + photometry.rho / 2)
     if np.count_nonzero(alive.any(axis=1)) < MIN_PIXELS:
         return None
-    shown = program.measured
+    shown, conditions = program.measured, conditions_of(stack, program)
     transport, photometry, _ = recover(
-        np.ascontiguousarray(light[:, shown]), photometry, patterns, noise, usable[:, shown], worth[:, shown]
+        np.ascontiguousarray(light[:, shown]),
+        photometry,
+        patterns,
+        noise,
+        usable[:, shown],
+        worth[:, shown],
+        conditions=conditions,
     )
+    assert conditions.strays is not None
+    return RecoveredSample(found, photometry, transport, conditions.strays, alive, seen)
+
+
+def try_recovery(
+    stack: Stack, program: Program, monitor: Curve, patterns: Patterns, sample: Sample, state: Doubles
+) -> Trial | None:
+    """Recover the sample from frames corrected by ``state``, (frames, 3), and measure what remains."""
+    found = recover_sample(stack, program, monitor, patterns, sample, state)
+    if found is None:
+        return None
+    _, photometry, transport, _, alive, seen = found
+    attributes, gains = stack.attributes, np.exp(state[:, 2])
+    noise, model_error = Noise(**attributes["noise"]), attributes["model_error"]
+    numbers, sent = program.constants_among(attributes["patterns"])
+    shown = program.measured
     predicted = np.zeros((program.count, *alive.shape), np.float32)
     predicted[shown] = photometry.rho * _arrived(transport, patterns)
-    predicted[numbers] = photometry.rho * levels[:, np.newaxis]
+    predicted[numbers] = photometry.rho * to_light(sent, monitor)[:, np.newaxis]
     exposures = exposures_of(attributes)
     apart = np.linalg.inv(np.array(attributes["crosstalk"])).astype(np.float32).T
     off, error = np.full((2, stack.frames, 3), np.nan)
@@ -161,7 +215,9 @@ def try_recovery(
             np.broadcast_to(v[n] / exposures[n], alive.shape) @ apart for v in (seen.values, *seen.slopes)
         )
         lit = np.float32(gains[n]) * predicted[pattern]
-        weight = exposures[n] ** 2 / noise.variance(exposures[n] * value)
+        weight = 1 / (
+            noise.variance(exposures[n] * value) / exposures[n] ** 2 + (model_error * photometry.rho) ** 2
+        )
         good = alive & np.broadcast_to(seen.whole[n], alive.shape)
         if not lit[good].any():
             continue

@@ -33,12 +33,15 @@ class Pixels(NamedTuple):
         Measurements of all channels together, (n, channels (m + 2)).
     own : Measurements
         Measurements of each channel, (n, 3, m + 2).
+    strays : (s, m + 2) float32
+        As in :class:`~workflows.recovery.lobes.footprint.PatternCodes`.
     """
 
     grids: Grids
     code: NDArray[np.uint8]
     joint: Measurements
     own: Measurements
+    strays: NDArray[np.float32]
 
 
 class Fits(NamedTuple):
@@ -48,7 +51,7 @@ class Fits(NamedTuple):
     ----------
     lobes : (4, most, 6) float64
     level : (4, most) int64
-    offset : (4, 3) float64
+    stray : (4, 3 s) float64
         As in :class:`~workflows.recovery.lobes.mixture.Mixture`.
     k : (4,) int64
         Number of lobes of each fit; 0 where there is no fit.
@@ -58,7 +61,7 @@ class Fits(NamedTuple):
 
     lobes: NDArray[np.float64]
     level: NDArray[np.int64]
-    offset: NDArray[np.float64]
+    stray: NDArray[np.float64]
     k: NDArray[np.int64]
     objective: NDArray[np.float64]
 
@@ -113,20 +116,20 @@ def refit_from_posterior(
     k : int
     objective : float
     """
-    tried = Mixture(mixture.lobes.copy(), mixture.level.copy(), mixture.offset.copy())
+    tried = Mixture(mixture.lobes.copy(), mixture.level.copy(), mixture.stray.copy())
     n = spread_lobes(patterns.grids, tried, k, options.resolution, buffers.node, buffers.weight, buffers.end)
     A = buffers.rows[: n * y.size].reshape(n, y.size)
     node_responses(patterns, buffers.node, n, A)
     # with a literal, numba would compile another version of `update`
     passes = np.int64(1)
-    update(A, buffers.weight[:n], y, variance, patterns.groups, tried.offset, passes, options.gradients)
+    update(A, buffers.weight[:n], y, variance, patterns.strays, tried.stray, passes, options.gradients)
     gather_lobes(patterns.grids, buffers.node, buffers.weight, buffers.end, tried, k, options.fit_resolution)
     new_k, _, new = fit(patterns, y, variance, tried, k, options)
     if new + penalty(patterns.grids, tried.level, new_k) >= objective + penalty(
         patterns.grids, mixture.level, k
     ):
         return k, objective
-    copy_mixture(new_k, patterns.groups, tried, mixture)
+    copy_mixture(new_k, patterns.groups * len(patterns.strays), tried, mixture)
     return new_k, new
 
 
@@ -135,12 +138,13 @@ def measurements_of(
     pixels: Pixels, p: int, c: int
 ) -> tuple[PatternCodes, NDArray[np.float32], NDArray[np.float32]]:
     """The patterns, measurements and variances for fit c of pixel p."""
-    grids, code, joint, own = pixels
+    grids, code, joint, own, _ = pixels
     m = own.value.shape[2] - 2
     groups = code.shape[1] // m
     if c == ALL:
-        return PatternCodes(grids, code, 0, groups, m), joint.value[p], joint.variance[p]
-    return PatternCodes(grids, code, c * m if groups == 3 else 0, 1, m), own.value[p, c], own.variance[p, c]
+        return PatternCodes(grids, code, 0, groups, m, pixels.strays), joint.value[p], joint.variance[p]
+    first = c * m if groups == 3 else 0
+    return PatternCodes(grids, code, first, 1, m, pixels.strays), own.value[p, c], own.variance[p, c]
 
 
 @njit(nogil=True, cache=True, inline="always")
@@ -168,17 +172,17 @@ def fit_pixel(
     """
     own = pixels.own.variance[p]
     groups = pixels.code.shape[1] // (own.shape[1] - 2)
-    fits.offset[:] = 0
+    fits.stray[:] = 0
     fits.k[:], fits.objective[:] = 0, 0
     lead = leading_channel(own) if separate else ALL
     for turn in range(-1, 3):
         c = lead if turn < 0 else turn
         if turn == lead or (c < ALL and (np.isinf(own[c]).all() or (lead == ALL and groups == 1))):
             continue
-        mixture = Mixture(fits.lobes[c], fits.level[c], fits.offset[c])
+        mixture = Mixture(fits.lobes[c], fits.level[c], fits.stray[c])
         if turn >= 0:
             fits.k[c] = fits.k[lead]
-            first = Mixture(fits.lobes[lead], fits.level[lead], fits.offset[lead])
+            first = Mixture(fits.lobes[lead], fits.level[lead], fits.stray[lead])
             copy_mixture(fits.k[lead], np.int64(0), first, mixture)
         patterns, y, variance = measurements_of(pixels, p, c)
         k, kappa, objective = fit(patterns, y, variance, mixture, fits.k[c], options)

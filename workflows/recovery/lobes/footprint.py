@@ -38,6 +38,9 @@ class PatternCodes(NamedTuple):
         The column of `code` with the first pattern.
     groups, m : int
         Groups of measurements, and patterns of each group.
+    strays : (s, m + 2) float32
+        Light that does not come from the patterns, as it would be measured: first a constant, 1, then what else changes
+        from frame to frame, as the border of a film does.
     """
 
     grids: Grids
@@ -45,6 +48,7 @@ class PatternCodes(NamedTuple):
     first: int
     groups: int
     m: int
+    strays: NDArray[np.float32]
 
 
 @njit(nogil=True, cache=True)

@@ -11,6 +11,7 @@ from workflows.recovery.lobes.footprint import NODES, PARAMETERS, PatternCodes, 
 from workflows.recovery.lobes.likelihood import penalty, weigh
 from workflows.recovery.lobes.mixture import Mixture, Workspace, copy_mixture, predict
 from workflows.recovery.lobes.options import LobesOptions
+from workflows.recovery.lobes.strays import STRAY
 from workflows.recovery.pyramid import Grids
 from workflows.recovery.solvers import inner
 
@@ -78,7 +79,7 @@ def chi_square(
 
 
 class Equations(NamedTuple):
-    """Working space of the steps for n parameters: one offset per group, then the parameters of each lobe.
+    """Working space of the steps for n parameters: stray light of each group, then the parameters of each lobe.
 
     Attributes
     ----------
@@ -104,30 +105,37 @@ class Equations(NamedTuple):
 
 @njit(nogil=True, cache=True, inline="always")
 def linearise(
+    patterns: PatternCodes,
     mixture: Mixture,
     k: int,
-    groups: int,
     response: NDArray[np.float32],
     precision: NDArray[np.float32],
     equations: Equations,
 ) -> None:
-    """Write the derivatives by the offsets and k lobes, and the normal equations ``A change = b``."""
+    """Write the derivatives by stray light and k lobes, and the normal equations ``A change = b``."""
     slopes, residual, A, b = equations.slopes, equations.residual, equations.A, equations.b
-    size = precision.size // groups
+    strays, groups = patterns.strays, patterns.groups
+    count, size = strays.shape
     for g in range(groups):
-        for j in range(precision.size):
-            inside = g * size <= j < (g + 1) * size
-            slopes[g, j] = math.sqrt(precision[j]) if inside else 0.0
+        for s in range(count):
+            slope = slopes[g * count + s]
+            slope[:] = 0
+            for j in range(size):
+                slope[g * size + j] = strays[s, j] * math.sqrt(precision[g * size + j])
     for i in range(k):
         for t in range(PARAMETERS):
             weight = np.float32(1.0 if t == 0 else mixture.lobes[i, 0])
-            slope, of_lobe = slopes[groups + PARAMETERS * i + t], response[i, t]
+            slope, of_lobe = slopes[groups * count + PARAMETERS * i + t], response[i, t]
             for j in range(precision.size):
                 slope[j] = weight * of_lobe[j] * math.sqrt(precision[j])
     for i in range(b.size):
         b[i] = inner(slopes[i], residual)
         for j in range(i + 1):
             A[i, j] = inner(slopes[i], slopes[j])
+    for i in range(groups * count):
+        if i % count > 0:
+            A[i, i] += 1 / STRAY**2
+            b[i] -= mixture.stray[i] / STRAY**2
 
 
 @njit(nogil=True, cache=True, inline="always")
@@ -158,17 +166,17 @@ def refine_round(
     new: Mixture,
 ) -> None:
     """Take Levenberg-Marquardt steps at fixed precisions; `mixture`, `response` and `f` are overwritten."""
-    damping = _DAMPING
+    damping, strays = _DAMPING, patterns.groups * len(patterns.strays)
     chi = chi_square(y, f, precision, equations.residual)
     for _ in range(options.steps):
-        linearise(mixture, k, patterns.groups, response, precision, equations)
+        linearise(patterns, mixture, k, response, precision, equations)
         better, new_chi = False, chi
         for _ in range(_ATTEMPTS):
             if solve_damped(equations, damping):
-                copy_mixture(k, patterns.groups, mixture, new)
-                for g in range(patterns.groups):
-                    new.offset[g] += equations.change[g]
-                apply_step(new, equations.change[patterns.groups :], patterns.grids, options.fit_resolution)
+                copy_mixture(k, strays, mixture, new)
+                for s in range(strays):
+                    new.stray[s] += equations.change[s]
+                apply_step(new, equations.change[strays:], patterns.grids, options.fit_resolution)
                 predict(patterns, new, k, workspace, response, f)
                 new_chi = chi_square(y, f, precision, equations.residual)
                 better = new_chi < chi
@@ -179,10 +187,59 @@ def refine_round(
             predict(patterns, mixture, k, workspace, response, f)
             break
         damping = max(damping * _DECREASE, 1e-5)
-        copy_mixture(k, patterns.groups, new, mixture)
+        copy_mixture(k, strays, new, mixture)
         if chi - new_chi < options.tolerance:
             break
         chi = new_chi
+
+
+@njit(nogil=True, cache=True)
+def fit_amounts(
+    patterns: PatternCodes, y: NDArray[np.float32], variance: NDArray[np.float32], mixture: Mixture, k: int
+) -> None:
+    """Fit the amounts of stray light and the weights of the lobes with the precisions that the fitted lobes leave.
+
+    Those of the fit itself were known before the lobes were, when most of the patterns' light was unexplained.
+
+    Parameters
+    ----------
+    patterns, y, variance
+        As in :func:`refine`.
+    mixture : Mixture
+        Its stray light and weights are changed.
+    k : int
+    """
+    strays, groups = patterns.strays, patterns.groups
+    count, size = strays.shape
+    light = groups * patterns.m
+    workspace = Workspace(
+        np.empty(NODES, np.int64),
+        np.empty((1, NODES), np.float32),
+        np.empty((NODES, light), np.float32),
+        np.empty((1, light), np.float32),
+    )
+    f, precision, response = np.empty_like(y), np.empty_like(y), np.empty((k, 1, y.size), np.float32)
+    predict(patterns, mixture, k, workspace, response, f)
+    n = groups * count + k
+    weigh(y, f, variance, groups, n, precision)
+    rows = np.zeros((n, y.size), np.float32)
+    for i in range(groups * count):
+        g = i // count
+        rows[i, g * size : (g + 1) * size] = strays[i % count]
+    for i in range(k):
+        rows[groups * count + i] = response[i, 0]
+    A, b, wanted = np.empty((n, n)), np.empty(n), y * precision
+    for i in range(n):
+        b[i] = inner(rows[i], wanted)
+        weighted = rows[i] * precision
+        for j in range(i + 1):
+            A[i, j] = inner(weighted, rows[j])
+        if i < groups * count and i % count > 0:
+            A[i, i] += 1 / STRAY**2
+    if solve(A, b) and (k == 0 or b[groups * count :].min() > 0):
+        mixture.stray[: groups * count] = b[: groups * count]
+        for i in range(k):
+            mixture.lobes[i, 0] = b[groups * count + i]
 
 
 @njit(nogil=True, cache=True)
@@ -218,7 +275,7 @@ def refine(
         Prediction and precisions.
     """
     groups, size = patterns.groups, patterns.groups * patterns.m
-    M, n = y.size, groups + PARAMETERS * k
+    M, n = y.size, groups * len(patterns.strays) + PARAMETERS * k
     workspace = Workspace(
         np.empty(NODES, np.int64),
         np.empty((PARAMETERS, NODES), np.float32),
@@ -235,7 +292,7 @@ def refine(
         np.empty(n),
         np.empty((n, n)),
     )
-    new = Mixture(mixture.lobes.copy(), mixture.level.copy(), mixture.offset.copy())
+    new = Mixture(mixture.lobes.copy(), mixture.level.copy(), mixture.stray.copy())
     predict(patterns, mixture, k, workspace, response, f)
     kappa, objective = weigh(y, f, variance, groups, n, precision)
     for _ in range(options.rounds):

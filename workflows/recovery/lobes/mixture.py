@@ -2,8 +2,9 @@
 
 The measurements y of a pixel are in groups: one for each channel that T is fitted to, or one for the mean of channels
 that saw the same patterns. A group is its m patterns in +-1 form, a black monitor and a white one. The model is
-``y = offset + sum_k w_k D_k``, D_k the response of lobe k alone. The weights w_k need not sum to 1, since the black and
-the white monitor constrain the sum. Each group has a free offset.
+``y = sum_s a_s B_s + sum_k w_k D_k``, D_k the response of lobe k alone and B_s stray light. The weights w_k need not
+sum to 1, since the black and the white monitor constrain the sum. Each group has its own amounts a_s of stray light.
+The first, of constant light, is free.
 """
 
 from typing import NamedTuple
@@ -13,10 +14,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from workflows.recovery.lobes.footprint import PARAMETERS, PatternCodes, combine, sample, signed_codes
+from workflows.recovery.lobes.strays import add_strays
 
 
 class Mixture(NamedTuple):
-    """Up to n lobes of a T, and the offsets.
+    """Up to n lobes of a T, and stray light.
 
     Attributes
     ----------
@@ -24,12 +26,13 @@ class Mixture(NamedTuple):
         Parameters as in :mod:`~workflows.recovery.lobes.footprint`.
     level : (n,) int64
         The level that each lobe is sampled on.
-    offset : (groups or more,) float64
+    stray : (groups s or more,) float64
+        The amounts of each group's stray light.
     """
 
     lobes: NDArray[np.float64]
     level: NDArray[np.int64]
-    offset: NDArray[np.float64]
+    stray: NDArray[np.float64]
 
 
 class Workspace(NamedTuple):
@@ -75,9 +78,7 @@ def predict(
     node, terms, light, sums = workspace
     first = np.int64(0)  # with a literal, numba would compile another version of `signed_codes`
     groups, m = patterns.groups, patterns.m
-    for g in range(groups):
-        for j in range(g * (m + 2), (g + 1) * (m + 2)):
-            f[j] = mixture.offset[g]
+    add_strays(patterns.strays, mixture.stray, 0, f)
     for i in range(k):
         n = sample(mixture.lobes[i], mixture.level[i], patterns.grids, node, terms)
         signed_codes(patterns.code, patterns.first, light.shape[1], node, n, light, first)
@@ -96,12 +97,12 @@ def predict(
 
 
 @njit(nogil=True, cache=True)
-def copy_mixture(k: int, groups: int, mixture: Mixture, to: Mixture) -> None:
-    """Copy the first k lobes and the offsets."""
+def copy_mixture(k: int, strays: int, mixture: Mixture, to: Mixture) -> None:
+    """Copy the first k lobes and the first amounts of stray light."""
     # loops compile faster than slices
     for i in range(k):
         to.level[i] = mixture.level[i]
         for t in range(PARAMETERS):
             to.lobes[i, t] = mixture.lobes[i, t]
-    for g in range(groups):
-        to.offset[g] = mixture.offset[g]
+    for s in range(strays):
+        to.stray[s] = mixture.stray[s]

@@ -16,10 +16,12 @@ from workflows.recovery.lobes.fits import (
     prefers_channels,
 )
 from workflows.recovery.lobes.footprint import NODES, PARAMETERS
+from workflows.recovery.lobes.levenberg_marquardt import fit_amounts
 from workflows.recovery.lobes.mixture import Mixture
 from workflows.recovery.lobes.nodes import node_responses, spread_lobes
 from workflows.recovery.lobes.options import LobesOptions
 from workflows.recovery.lobes.posterior import update
+from workflows.recovery.lobes.strays import add_strays, subtract_strays
 from workflows.recovery.solvers import subtract
 
 # Initial capacity for the entries of a block's rows.
@@ -31,8 +33,8 @@ class Diagnostics(NamedTuple):
 
     Attributes
     ----------
-    response : (n, 3, m + 2) float32
-        Predictions of the measurements.
+    response, stray : (n, 3, m + 2) float32
+        Predictions of the measurements: by T, and by stray light that is not constant.
     kappa, misfit : (n, 3) float64
         As from :func:`~workflows.recovery.lobes.posterior.update`.
     nodes : (n, 3) int64
@@ -40,9 +42,20 @@ class Diagnostics(NamedTuple):
     """
 
     response: NDArray[np.float32]
+    stray: NDArray[np.float32]
     kappa: NDArray[np.float64]
     misfit: NDArray[np.float64]
     nodes: NDArray[np.int64]
+
+    def at(self, pixels: slice | NDArray[np.bool_]) -> "Diagnostics":
+        """Those of some pixels."""
+        return Diagnostics(
+            self.response[pixels],
+            self.stray[pixels],
+            self.kappa[pixels],
+            self.misfit[pixels],
+            self.nodes[pixels],
+        )
 
 
 @njit(nogil=True, cache=True, inline="always")
@@ -57,14 +70,22 @@ def finish_fit(
 ) -> int:
     """Write the posterior mean for the lobes of a fit to `buffers`, and its diagnostics; return its number of nodes."""
     patterns, y, variance = measurements_of(pixels, p, c)
-    mixture = Mixture(fits.lobes[c], fits.level[c], fits.offset[c])
+    mixture = Mixture(fits.lobes[c], fits.level[c], fits.stray[c])
+    stray = np.zeros_like(y)
+    count, size = patterns.strays.shape
+    offset = mixture.stray[::count].copy()
+    if count > 1:
+        fit_amounts(patterns, y, variance, mixture, fits.k[c])
+        add_strays(patterns.strays, mixture.stray, 1, stray)
+        y, variance, offset[:] = y.copy(), variance.copy(), 0
+        subtract_strays(y, variance, stray, size)
     n: int = spread_lobes(
         patterns.grids, mixture, fits.k[c], options.resolution, buffers.node, buffers.weight, buffers.end
     )
     A, weight = buffers.rows[: n * y.size].reshape(n, y.size), buffers.weight[:n]
     node_responses(patterns, buffers.node, n, A)
     kappa, misfit = update(
-        A, weight, y, variance, patterns.groups, mixture.offset, options.passes, options.gradients
+        A, weight, y, variance, patterns.strays[:1], offset, options.passes, options.gradients
     )
     f = np.zeros_like(y)
     for i in range(n):
@@ -75,6 +96,7 @@ def finish_fit(
             first = d * (patterns.m + 2) if patterns.groups == 3 else 0
             for j in range(patterns.m + 2):
                 diagnostics.response[p, d, j] = f[first + j]
+                diagnostics.stray[p, d, j] = stray[first + j]
     return n
 
 
@@ -104,7 +126,7 @@ def recover_pixels(
     fits = Fits(
         np.empty((4, most, PARAMETERS)),
         np.empty((4, most), np.int64),
-        np.zeros((4, 3)),
+        np.zeros((4, 3 * len(pixels.strays))),
         np.zeros(4, np.int64),
         np.zeros(4),
     )

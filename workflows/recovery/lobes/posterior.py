@@ -5,6 +5,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from workflows.recovery.lobes.likelihood import estimate_kappa
+from workflows.recovery.lobes.strays import STRAY, add_strays
 from workflows.recovery.solvers import inner, subtract
 
 # Prior standard deviation of the offset of a group, in units of T: an upper bound of the error of S.
@@ -12,6 +13,12 @@ _OFFSET = 0.03
 # Conjugate gradients end when this fraction of the initial squared residual is left.
 _PRECISION = 1e-5
 _LEAST_KAPPA = 1e-5
+
+
+@njit(nogil=True, cache=True, inline="always")
+def stray_variance(s: int) -> float:
+    """Prior variance of an amount of stray light, by its row."""
+    return _OFFSET**2 if s == 0 else STRAY**2
 
 
 @njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})
@@ -111,21 +118,19 @@ def apply_covariance(
     weight: NDArray[np.float32],
     kappa: float,
     total: NDArray[np.float32],
-    groups: int,
+    strays: NDArray[np.float32],
     measured: NDArray[np.bool_],
     p: NDArray[np.float32],
     out: NDArray[np.float32],
 ) -> None:
-    """Write K p, K the covariance of the measurements due to T, to the offsets, and to independent noise (`total`)."""
-    size = p.size // groups
+    """Write K p, K the covariance of the measurements due to T, to stray light, and to independent noise (`total`)."""
+    count, size = strays.shape
     for j in range(p.size):
         out[j] = total[j] * p[j]
-    for g in range(groups):
-        offset = np.float32(0)
-        for j in range(g * size, (g + 1) * size):
-            offset += p[j]
-        for j in range(g * size, (g + 1) * size):
-            out[j] += np.float32(_OFFSET**2) * offset
+    for g in range(p.size // size):
+        of_group, to = p[g * size : (g + 1) * size], out[g * size : (g + 1) * size]
+        for s in range(count):
+            subtract(to, -np.float32(stray_variance(s)) * inner(strays[s], of_group), strays[s])
     add_products(A, np.float32(kappa), weight, p, out)
     for j in range(p.size):
         out[j] = out[j] if measured[j] else 0.0
@@ -138,7 +143,7 @@ def solve_covariance(
     kappa: float,
     total: NDArray[np.float32],
     diagonal: NDArray[np.float32],
-    groups: int,
+    strays: NDArray[np.float32],
     measured: NDArray[np.bool_],
     r: NDArray[np.float32],
     steps: int,
@@ -154,7 +159,7 @@ def solve_covariance(
     for _ in range(steps):
         if left <= goal:
             break
-        apply_covariance(A, weight, kappa, total, groups, measured, p, Kp)
+        apply_covariance(A, weight, kappa, total, strays, measured, p, Kp)
         length = left / inner(p, Kp)
         subtract(x, -length, p)
         subtract(r, length, Kp)
@@ -186,8 +191,8 @@ def update(
     weight: NDArray[np.float32],
     y: NDArray[np.float32],
     variance: NDArray[np.float32],
-    groups: int,
-    offset: NDArray[np.float64],
+    strays: NDArray[np.float32],
+    stray: NDArray[np.float64],
     passes: int,
     steps: int,
 ) -> tuple[float, float]:
@@ -201,9 +206,10 @@ def update(
         Zero or more, of sum 1; changed in place.
     y, variance : (groups (m + 2),) float32
         Measurements, and their variances due to the camera; infinite where nothing was measured.
-    groups : int
-    offset : (groups,) float64
-        Changed in place.
+    strays : (s, m + 2) float32
+        As in :class:`~workflows.recovery.lobes.footprint.PatternCodes`.
+    stray : (groups s or more,) float64
+        The amounts of stray light, changed in place.
     passes : int
         Number of updates; each starts from the weights of the one before.
     steps : int
@@ -221,7 +227,8 @@ def update(
     posterior mean is ``t + kappa t * A K^-1 (y - A' t)``; negative weights are set to 0. K is never built:
     ``K x = r`` is solved by conjugate gradients.
     """
-    size = y.size // groups
+    count, size = strays.shape
+    groups = y.size // size
     f, total, diagonal, r, x = (
         np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y)
     )  # fmt: skip
@@ -230,16 +237,20 @@ def update(
     for _ in range(passes):
         mean[:], square[:] = 0, 0
         add_row_moments(A, weight, mean, square)
+        add_strays(strays, stray, 0, f)
         for j in range(y.size):
-            f[j] = offset[j // size] + mean[j]
+            f[j] += mean[j]
         kappa, misfit = total_variance(y, f, mean, square, variance, groups, total)
         for j in range(y.size):
-            diagonal[j] = total[j] + np.float32(_OFFSET**2) + np.float32(kappa) * square[j]
+            diagonal[j] = total[j] + np.float32(kappa) * square[j]
+            for s in range(count):
+                diagonal[j] += np.float32(stray_variance(s)) * strays[s, j % size] ** 2
             # where nothing was measured the residual is 0
             r[j] = y[j] - f[j] if measured[j] else 0.0
             total[j] = total[j] if measured[j] else 0.0
-        solve_covariance(A, weight, kappa, total, diagonal, groups, measured, r, steps, x)
-        for j in range(y.size):
-            offset[j // size] += _OFFSET**2 * x[j]
+        solve_covariance(A, weight, kappa, total, diagonal, strays, measured, r, steps, x)
+        for g in range(groups):
+            for s in range(count):
+                stray[g * count + s] += stray_variance(s) * inner(strays[s], x[g * size : (g + 1) * size])
         reweight(A, kappa, x, weight)
     return kappa, misfit

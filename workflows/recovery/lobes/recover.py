@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from workflows.recovery.lobes.fits import Pixels
 from workflows.recovery.lobes.options import FINE, LobesOptions
 from workflows.recovery.lobes.pixels import Diagnostics, recover_pixels
+from workflows.recovery.lobes.strays import subtract_strays
 from workflows.recovery.noise import Noise
 from workflows.recovery.normalise import Measurements, expected_error, normalise, refit_photometry
 from workflows.recovery.photometry import Photometry
@@ -16,6 +17,28 @@ from workflows.recovery.transport import Transport
 
 # Pixels per block: limits the working arrays.
 _BLOCK = 256
+# Least difference of white and black without stray light, of 2 with it, for which S and rho are corrected.
+_LEAST_CONTRAST = 0.5
+
+
+class Conditions(NamedTuple):
+    """What else than T the frames of a capture show.
+
+    Attributes
+    ----------
+    grey : bool
+        Whether the three channels are one, repeated, which must not count three times.
+    strays : (s, m + 2) float32 or None
+        Light that does not come from the patterns, as in :class:`~workflows.recovery.lobes.footprint.PatternCodes`. Its
+        last two values are those under a black and a white monitor. None is constant light alone.
+    model_error : float
+        Standard deviation of what no T explains, as a share of rho: of light that bounces, and of a camera or a monitor
+        that is not quite linear.
+    """
+
+    grey: bool = False
+    strays: NDArray[np.float32] | None = None
+    model_error: float = 0.0
 
 
 class Recovery(NamedTuple):
@@ -36,6 +59,9 @@ class Recovery(NamedTuple):
     error: NDArray[np.float32]
 
 
+_PLAIN = Conditions()
+
+
 def recover(
     measurements: NDArray[np.float32],
     photometry: Photometry,
@@ -44,6 +70,7 @@ def recover(
     usable: NDArray[np.bool_] | None = None,
     frames: NDArray[np.number] | None = None,
     options: LobesOptions = FINE,
+    conditions: Conditions = _PLAIN,
 ) -> Recovery:
     """Recover T: a few oriented Gaussian lobes, refined to the posterior mean given the measurements.
 
@@ -62,6 +89,7 @@ def recover(
     frames : (m,) or (n, m, 3) number, optional
         Frames averaged into each value, above 0. Default: 1.
     options : LobesOptions
+    conditions : Conditions
 
     Returns
     -------
@@ -103,56 +131,71 @@ def recover(
     n, m = len(measurements), patterns.count
     if measurements.shape != (n, m, 3):
         raise ValueError(f"measurements must be (n, {m}, 3), not {measurements.shape}")
+    if conditions.grey:
+        usable = np.ones(measurements.shape, bool) if usable is None else usable.copy()
+        usable[:, :, 1:] = False
     measured = normalise(measurements, photometry, noise, options.least_contrast, usable, frames)
-    response, kappa, misfit = np.zeros_like(measured.value), np.zeros((n, 3)), np.zeros((n, 3))
+    strays = np.ones((1, m + 2), np.float32) if conditions.strays is None else conditions.strays
+    counts = np.zeros((n, 3), np.int64)
+    found = Diagnostics(
+        np.zeros_like(measured.value),
+        np.zeros_like(measured.value),
+        np.zeros((n, 3)),
+        np.zeros((n, 3)),
+        counts,
+    )
     parts = []
     for first in range(0, max(n, 1), _BLOCK):
         block = slice(first, first + _BLOCK)
         of_block = Measurements(measured.value[block], measured.variance[block])
         parts.append(
-            _recover_block(patterns, of_block, options, response[block], kappa[block], misfit[block])
+            _recover_block(patterns, of_block, options, conditions.model_error, strays, found.at(block))
         )
-    better = refit_photometry(photometry, measured, response, kappa)
-    return Recovery(Transport.concatenate(parts), better, expected_error(better, measured, misfit))
+    if found.stray.any():
+        photometry, measured = _without_strays(photometry, measured, found.stray)
+    better = refit_photometry(
+        photometry, _less_certain(measured, conditions.model_error), found.response, found.kappa
+    )
+    if conditions.grey:
+        better = Photometry(*(np.repeat(values[:, :1], 3, axis=1) for values in vars(better).values()))
+    return Recovery(Transport.concatenate(parts), better, expected_error(better, measured, found.misfit))
 
 
 def _recover_block(
     patterns: Patterns,
     measured: Measurements,
     options: LobesOptions,
-    response: NDArray[np.float32],
-    kappa: NDArray[np.float64],
-    misfit: NDArray[np.float64],
+    model_error: float,
+    strays: NDArray[np.float32],
+    found: Diagnostics,
 ) -> Transport:
-    """Recover T of some pixels; `response`, `kappa` and `misfit` are written, as in `Diagnostics`."""
+    """Recover T of some pixels, and write `found`."""
     columns, rows = patterns.pyramid.grids[0]
-    alive = np.isfinite(measured.variance).any(axis=(1, 2))
+    alive: NDArray[np.bool_] = np.any(np.isfinite(measured.variance), axis=(1, 2))
     own = Measurements(measured.value[alive], measured.variance[alive])
     if patterns.channels == 1:
         joint = _average_channels(own)
         separate = _channels_disagree(own, joint.value, options.disagreement)
+        # The channels' errors of the model are alike, so their mean has the same.
+        joint, own = (_less_certain(part, model_error) for part in (joint, own))
     else:
         n, channels, m = own.value.shape
+        own = _less_certain(own, model_error)
         joint = Measurements(own.value.reshape(n, channels * m), own.variance.reshape(n, channels * m))
         separate = np.zeros(n, bool)
-    counts = np.zeros((len(separate), 3), np.int64)
-    diagnostics = Diagnostics(
-        np.zeros_like(own.value), np.zeros(counts.shape), np.zeros(counts.shape), counts
+    of_alive = found.at(alive)
+    pixels = Pixels(patterns.pyramid.arrays, patterns.code, joint, own, strays)
+    node, weight = recover_pixels(pixels, separate, options, of_alive)
+    found.response[alive], found.stray[alive], found.nodes[alive] = (
+        of_alive.response,
+        of_alive.stray,
+        of_alive.nodes,
     )
-    pixels = Pixels(patterns.pyramid.arrays, patterns.code, joint, own)
-    node, weight = recover_pixels(pixels, separate, options, diagnostics)
-    response[alive], kappa[alive], misfit[alive] = diagnostics[:3]
-    count, shared = np.zeros((alive.size, 3), np.int64), np.zeros(alive.size, bool)
-    count[alive], shared[alive] = counts, ~separate
-    row = np.repeat(np.arange(count.size), count.ravel())
-    order = np.lexsort((node, row))
-    row, node, weight = row[order], node[order], weight[order]
-    # a node under two lobes occurs twice: add its weights
-    new = np.append(True, (np.diff(row) > 0) | (np.diff(node) > 0))[: row.size]
-    begin = np.flatnonzero(new)
-    merged = np.add.reduceat(weight, begin) if begin.size else weight
-    count = np.bincount(row[begin], minlength=count.size).reshape(count.shape)
-    return Transport.from_rows(columns, rows, count, node[begin], merged, shared, options.least_weight)
+    found.kappa[alive], found.misfit[alive] = of_alive.kappa, of_alive.misfit
+    shared = np.zeros(alive.size, bool)
+    shared[alive] = ~separate
+    # A node under two lobes occurs twice.
+    return Transport.from_entries(columns, rows, found.nodes, node, weight, shared, options.least_weight)
 
 
 def _average_channels(own: Measurements) -> Measurements:
@@ -163,6 +206,41 @@ def _average_channels(own: Measurements) -> Measurements:
         joint_variance = 1 / total
     joint = (own.value * precision).sum(axis=1) * np.where(total > 0, joint_variance, 0)
     return Measurements(joint, joint_variance)
+
+
+def _without_strays(
+    photometry: Photometry, measured: Measurements, stray: NDArray[np.float32]
+) -> tuple[Photometry, Measurements]:
+    """S and rho without stray light, and the measurements that are normalised with these."""
+    black, white = (measured.value[:, :, at] - stray[:, :, at] for at in (-2, -1))
+    value, variance = measured.value.copy(), measured.variance.copy()
+    subtract_strays(value.reshape(-1), variance.reshape(-1), stray.reshape(-1), value.shape[2])
+    known = np.isfinite(measured.variance[:, :, -1]) & (white - black > _LEAST_CONTRAST)
+    S = photometry.S + photometry.rho * (black + 1) / 2
+    rho = photometry.rho * (white - black) / 2
+    return (
+        Photometry(
+            np.where(known, S, photometry.S).astype(np.float32),
+            np.where(known, rho, photometry.rho).astype(np.float32),
+            photometry.black,
+            photometry.white,
+        ),
+        Measurements(
+            np.where(known[..., np.newaxis], value, measured.value),
+            np.where(known[..., np.newaxis], variance, measured.variance),
+        ),
+    )
+
+
+def _less_certain(measured: Measurements, model_error: float) -> Measurements:
+    """Add the error of the model to the variances of patterns, but not to those of the black and white monitor.
+
+    The contrast of patterns is twice that of the unit of `model_error`.
+    """
+    variance = measured.variance.copy()
+    size = measured.value.shape[-1]
+    variance[..., : size - 2] += np.float32(4 * model_error**2)
+    return Measurements(measured.value, variance)
 
 
 def _channels_disagree(

@@ -16,6 +16,11 @@ from workflows.recovery.pyramid import Grids
 # The fit of another lobe is abandoned after a round that leaves -2 ln likelihood higher than before by more than this.
 _MOST_LOSS = 30.0
 _HUGE = 1e30
+# How many times as many nodes are examined for the first lobe. Most of the light comes from it, and a wrong one
+# is not found out.
+_FIRST = 4
+# Least share of chi-square that counts as left unexplained by a first node.
+_LEAST_LEFT = 1e-6
 
 
 @njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})
@@ -96,6 +101,7 @@ def find_node(
     f: NDArray[np.float32],
     precision: NDArray[np.float32],
     beam: int,
+    first: bool,
 ) -> tuple[int, int, int, float, float]:
     """Find the node where more light would improve the fit most, by a beam search from the coarsest grid to finer ones.
 
@@ -106,6 +112,9 @@ def find_node(
         Measurements, prediction, and precisions.
     beam : int
         Nodes of a grid whose children are scored.
+    first : bool
+        Whether there is no lobe yet. The precisions are then those of measurements that nothing explains, so their
+        scale is unknown.
 
     Returns
     -------
@@ -115,18 +124,31 @@ def find_node(
         Gain in -2 ln likelihood, less the penalty of a centre on that level.
     amount : float
         Light to move there, as a share.
+
+    Notes
+    -----
+    Moving light to a node lowers chi-square by z^2. The gain is z^2 where the variances are known. Where they are known
+    only up to a factor, its maximum likelihood estimate from m measurements gives ``m ln(chi^2 / (chi^2 - z^2))``: what
+    a node explains of all there is to explain. A node of the finest grid that explains everything then outweighs the
+    wide one about it, which the fit could not make narrow.
     """
     columns, rows, starts = patterns.grids
     code_of_f, residual, weight = _in_codes(patterns, y, f, precision)
-    best_level, best_column, best_row, gain, amount, best_z = -1, 0, 0, -_HUGE, 0.0, 0.0
+    best_level, best_column, best_row, gain, best_z = -1, 0, 0, -_HUGE, 0.0
+    if first:
+        beam *= _FIRST
     parents, scores = np.empty((beam, 2), np.int64), np.empty(beam)
     children = np.empty((beam, 2), np.int64)
     count = 0
+    chi, used = 0.0, 0
+    for j in range(weight.size):
+        if weight[j] > 0:
+            chi += residual[j] ** 2 / weight[j]
+            used += 1
     for level in range(columns.size - 1, -1, -1):
         wide, high = columns[level], rows[level]
         whole = level == columns.size - 1
-        penalty_of_centre = 2 * math.log(wide * high)
-        found, highest = 0, -_HUGE
+        found = 0
         for p in range(wide * high if whole else 4 * count):
             if whole:
                 column, row = p % wide, p // wide
@@ -136,16 +158,23 @@ def find_node(
                 continue
             node = starts[level] + row * wide + column
             codes = patterns.code[node, patterns.first : patterns.first + residual.size]
-            z, share = score(codes, code_of_f, residual, weight)
-            highest = max(highest, z)
-            if z > 0 and z * z - penalty_of_centre > gain:
-                best_level, best_column, best_row = level, column, row
-                gain, amount, best_z = z * z - penalty_of_centre, share, z
+            z, _ = score(codes, code_of_f, residual, weight)
             found = _insert(z, column, row, scores, children, found)
-        if highest < 0.7 * best_z:
+        z = scores[0]
+        if z > 0:
+            explained = used * math.log(chi / max(chi - z * z, _LEAST_LEFT * chi)) if first else z * z
+            if explained - 2 * math.log(wide * high) > gain:
+                best_level, best_column, best_row = level, children[0, 0], children[0, 1]
+                gain, best_z = explained - 2 * math.log(wide * high), z
+        if z < 0.7 * best_z:
             break
         count = found
         parents, children = children, parents
+    amount = 0.0
+    if best_level >= 0:
+        node = starts[best_level] + best_row * columns[best_level] + best_column
+        codes = patterns.code[node, patterns.first : patterns.first + residual.size]
+        _, amount = score(codes, code_of_f, residual, weight)
     return best_level, best_column, best_row, gain, amount
 
 
@@ -201,6 +230,7 @@ def fit(
         As from :func:`~workflows.recovery.lobes.likelihood.weigh`.
     """
     grids, groups, m = patterns.grids, patterns.groups, patterns.m
+    strays = groups * len(patterns.strays)
     f, precision = np.zeros_like(y), np.empty_like(y)
     for g in range(groups):
         # initial prediction: light from the whole monitor, where patterns have a mean of about 0
@@ -211,12 +241,12 @@ def fit(
     else:
         kappa, objective = weigh(y, f, variance, groups, groups, precision)
         objective = _HUGE
-    tried = Mixture(mixture.lobes.copy(), mixture.level.copy(), mixture.offset.copy())
+    tried = Mixture(mixture.lobes.copy(), mixture.level.copy(), mixture.stray.copy())
     while k < options.most_lobes:
-        level, column, row, gain, amount = find_node(patterns, y, f, precision, options.beam)
+        level, column, row, gain, amount = find_node(patterns, y, f, precision, options.beam, k == 0)
         if k > 0 and gain < 2 * (PARAMETERS - 2):
             break
-        copy_mixture(k, groups, mixture, tried)
+        copy_mixture(k, strays, mixture, tried)
         _add_lobe(tried, k, grids, level, column, row, amount, options.fit_resolution)
         new_kappa, new, new_f, new_precision = refine(
             patterns, y, variance, tried, k + 1, options, objective + _MOST_LOSS
@@ -226,5 +256,5 @@ def fit(
             break
         k += 1
         kappa, objective, f, precision = new_kappa, new, new_f, new_precision
-        copy_mixture(k, groups, tried, mixture)
+        copy_mixture(k, strays, tried, mixture)
     return k, kappa, objective - penalty(grids, mixture.level, k)

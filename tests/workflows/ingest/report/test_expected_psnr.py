@@ -1,5 +1,6 @@
 """What is promised of a program's composites, against what was measured of it."""
 
+from math import log10
 from typing import Any
 
 import pytest
@@ -15,7 +16,7 @@ NESTED = tuple((16 << n, 12 << n, 20) for n in range(6))
 
 
 def ends(program: Program, **other: float) -> tuple[float, float]:
-    quality = expected(program, SURVEY | other)
+    quality = expected(program, SURVEY | other, 0.0)
     assert quality is not None
     assert quality.low < quality.high
     return quality.low, quality.high
@@ -51,10 +52,10 @@ def test_no_more_is_promised_than_was_measured(program: Program, measured: tuple
 
 
 def test_grids_without_offsets_are_rated_by_their_finest_blocks() -> None:
-    quality = expected(still(96), SURVEY)
+    quality = expected(still(96), SURVEY, 0.0)
     assert quality is not None
     assert quality.blocks == 96
-    assert expected(preset("default"), SURVEY).blocks is None  # type: ignore[union-attr]
+    assert expected(preset("default"), SURVEY, 0.0).blocks is None  # type: ignore[union-attr]
     coarse, fine = ends(still(24)), ends(still(384))
     assert coarse[0] < fine[0] - 8
     assert coarse[1] < fine[1]
@@ -75,5 +76,14 @@ def parts(*parts: dict[str, Any]) -> Program:
 
 def test_nothing_is_promised_without_a_measurement() -> None:
     for part in ({"kind": "images", "files": ["a.png"]}, {"kind": "stripes", "axis": "x", "count": 5}):
-        assert expected(parts(part), SURVEY) is None
-    assert expected(preset("default"), SURVEY | {"contrast": 0.0}) is None
+        assert expected(parts(part), SURVEY, 0.0) is None
+    assert expected(preset("default"), SURVEY | {"contrast": 0.0}, 0.0) is None
+
+
+def test_what_no_t_explains_is_not_promised() -> None:
+    program = preset("default")
+    ideal, real = (expected(program, SURVEY, error) for error in (0.0, 0.02))
+    assert ideal is not None
+    assert real is not None
+    assert real.high < -20 * log10(0.02 * SURVEY["contrast"]) < ideal.high
+    assert real.low < ideal.low

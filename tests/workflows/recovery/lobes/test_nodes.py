@@ -18,7 +18,7 @@ def test_rows_are_the_signed_codes_between_black_and_white(groups):
     code = np.random.default_rng(0).integers(0, 256, (9, 2 + groups * M), np.uint8)
     node = np.array([7, 0, 3, 3])
     A = np.full((4, groups * (M + 2)), np.nan, np.float32)
-    node_responses(PatternCodes(GRIDS, code, 2, groups, M), node, 3, A)
+    node_responses(PatternCodes(GRIDS, code, 2, groups, M, np.ones((1, M + 2), np.float32)), node, 3, A)
     assert np.isnan(A[3]).all()
     A = A[:3]
     for g in range(groups):

@@ -12,6 +12,8 @@ from workflows.recovery.pyramid import Pyramid
 OFFSET = 0.03
 M = 50
 GRIDS = Pyramid.over(8, 6).arrays
+# No stray light but constant light, an offset.
+CONSTANT = np.ones((1, M + 2), np.float32)
 
 
 def problem(groups, n=40, seed=0, sigma=0.02):
@@ -19,7 +21,7 @@ def problem(groups, n=40, seed=0, sigma=0.02):
     rng = np.random.default_rng(seed)
     code = rng.integers(0, 256, (n, groups * M), np.uint8)
     A = np.empty((n, groups * (M + 2)), np.float32)
-    node_responses(PatternCodes(GRIDS, code, 0, groups, M), np.arange(n), n, A)
+    node_responses(PatternCodes(GRIDS, code, 0, groups, M, CONSTANT), np.arange(n), n, A)
     weight, truth = rng.dirichlet(np.full(n, 5.0), 2)
     variance = np.full(groups * (M + 2), sigma**2, np.float32)
     y = truth @ A + sigma * rng.standard_normal(variance.size)
@@ -36,7 +38,7 @@ def test_a_pass_is_the_closed_form(groups, left_out):
         variance[~there] = np.inf
         y[~there] = 100
     start, offset = weight.copy(), np.full(groups, 0.01)
-    kappa, misfit = update(A, weight, y, variance, groups, offset, 1, 500)
+    kappa, misfit = update(A, weight, y, variance, CONSTANT, offset, 1, 500)
 
     rows, t = A[:, there].astype(float), start.astype(float)
     group, of_patterns = np.divmod(np.flatnonzero(there), M + 2)
@@ -61,7 +63,7 @@ def test_more_passes_come_closer_to_the_truth():
     errors = []
     for _ in range(3):
         errors.append(np.abs(weight - truth).sum())
-        update(A, weight, y, variance, 1, np.zeros(1), 1, 50)
+        update(A, weight, y, variance, CONSTANT, np.zeros(1), 1, 50)
     assert errors[2] < 0.8 * errors[0]
 
 
@@ -72,7 +74,7 @@ def test_weights_stay_shares(seed):
         weight[::3] = 0
         weight /= weight.sum()
     empty = weight == 0
-    update(A, weight, y, variance, 1, np.zeros(1), 4, 10)
+    update(A, weight, y, variance, CONSTANT, np.zeros(1), 4, 10)
     assert weight.min() >= 0
     assert weight.sum() == pytest.approx(1, abs=1e-5)
     assert (weight[empty] == 0).all()
@@ -82,7 +84,7 @@ def test_weights_stay_without_measurements():
     A, weight, y, variance, _ = problem(1)
     variance[:] = np.inf
     start, offset = weight.copy(), np.full(1, 0.02)
-    update(A, weight, y, variance, 1, offset, 3, 10)
+    update(A, weight, y, variance, CONSTANT, offset, 3, 10)
     np.testing.assert_allclose(weight, start, rtol=1e-6)
     assert offset[0] == 0.02
 
@@ -90,7 +92,7 @@ def test_weights_stay_without_measurements():
 def test_weights_that_explain_the_measurements_stay():
     A, weight, _, variance, _ = problem(1)
     start, exact = weight.copy(), weight @ A
-    update(A, weight, exact, variance, 1, np.zeros(1), 3, 10)
+    update(A, weight, exact, variance, CONSTANT, np.zeros(1), 3, 10)
     np.testing.assert_allclose(weight, start, rtol=1e-3)
 
 
@@ -99,7 +101,7 @@ def test_total_variance_finds_the_variance_about_a_first_estimate():
     m, kappa = 20_000, 0.05
     code = 255 * rng.integers(0, 2, (6, m)).astype(np.uint8)
     A = np.empty((6, m + 2), np.float32)
-    node_responses(PatternCodes(GRIDS, code, 0, 1, m), np.arange(6), 6, A)
+    node_responses(PatternCodes(GRIDS, code, 0, 1, m, CONSTANT), np.arange(6), 6, A)
     weight = rng.dirichlet(np.full(6, 5.0)).astype(np.float32)
     f, variance = weight @ A, rng.uniform(1e-4, 2e-3, m + 2).astype(np.float32)
     spread = variance + kappa * np.maximum(1 - f**2, 0)

@@ -345,6 +345,39 @@ def test_a_pyramid_of_one_grid(patterns_of, gaussian, observe):
     assert np.abs(weights - T[0, 0]).sum() < 0.2
 
 
+def test_grey_camera_counts_once(patterns, truth, observe):
+    measurements, photometry, noise = observe(patterns, truth((25.3, 18.6, 3.0, 1.0), (40.1, 30.2, 1.0, 1.0)))
+    grey = np.repeat(measurements[..., :1], 3, axis=2)
+    found = lobes.recover(grey, photometry, patterns, noise, conditions=lobes.Conditions(grey=True))
+    assert found.transport.shared.all()
+    for values in (found.photometry.S, found.photometry.rho):
+        np.testing.assert_array_equal(values, np.repeat(values[:, :1], 3, axis=1))
+    usable = np.zeros(grey.shape, bool)
+    usable[..., 0] = True
+    alone = lobes.recover(grey, photometry, patterns, noise, usable)
+    np.testing.assert_array_equal(found.transport.weight, alone.transport.weight)
+
+
+def test_error_of_the_model_is_left_unexplained(patterns, truth, observe):
+    measurements, photometry, noise = observe(
+        patterns, truth(*[(x, 18.6, 1.5, 1.0) for x in range(8, 56, 4)])
+    )
+    wrong = (
+        0.04
+        * photometry.rho[:, np.newaxis]
+        * np.random.default_rng(0).standard_normal(patterns.count)[:, np.newaxis]
+    )
+    seen = (measurements + wrong).astype(np.float32)
+    T = truth(*[(x, 18.6, 1.5, 1.0) for x in range(8, 56, 4)])
+    off = [
+        np.abs(
+            dense(patterns, lobes.recover(seen, photometry, patterns, noise, conditions=c).transport) - T
+        ).sum()
+        for c in (lobes.Conditions(model_error=0.04), lobes.Conditions())
+    ]
+    assert off[0] < 0.8 * off[1]
+
+
 def test_shapes_that_do_not_fit_are_refused(patterns, truth, observe):
     measurements, photometry, noise = observe(patterns, truth((25.3, 18.6, 3.0, 1.0)))
     for wrong in (measurements[:, 1:], measurements[..., :1], measurements[0]):

@@ -50,7 +50,14 @@ def patterns(patterns_of):
 
 @pytest.fixture(scope="module")
 def shown(patterns):
-    return PatternCodes(patterns.pyramid.arrays, patterns.code, 0, 1, patterns.count)
+    return PatternCodes(
+        patterns.pyramid.arrays,
+        patterns.code,
+        0,
+        1,
+        patterns.count,
+        np.ones((1, patterns.count + 2), np.float32),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +80,7 @@ def fitted(shown):
         mixture = Mixture(np.zeros((MOST, PARAMETERS)), np.zeros(MOST, np.int64), np.zeros(1))
         k, kappa, objective = fit(shown, y, variance, mixture, 0, OPTIONS._replace(most_lobes=most))
         order = np.argsort(-mixture.lobes[:k, 0], kind="stable")
-        return Fitted(mixture.lobes[order], mixture.level[order], mixture.offset, kappa, objective)
+        return Fitted(mixture.lobes[order], mixture.level[order], mixture.stray, kappa, objective)
 
     return run
 
@@ -165,11 +172,22 @@ def test_find_node_finds_the_node_that_is_missing(patterns, shown):
         f = np.append(np.zeros(m), [-1, 1]).astype(np.float32)
         y = np.append(0.2 * (patterns.code[node] / 127.5 - 1), [-1, 1]).astype(np.float32)
         precision = np.full(m + 2, SIGMA**-2, np.float32)
-        found = find_node(shown, y, f, precision, 6)
+        found = find_node(shown, y, f, precision, 6, False)
         assert found[:3] == (level, column, row)
         assert found[4] == pytest.approx(0.2, rel=1e-4)
         d = patterns.code[node] / 127.5 - 1
         z_squared = 0.04 * (d @ d) / SIGMA**2
         places = grids.columns[level] * grids.rows[level]
         assert found[3] == pytest.approx(z_squared - 2 * np.log(places), rel=1e-4)
-    assert find_node(shown, f, f, precision, 6)[0] == -1
+    assert find_node(shown, f, f, precision, 6, False)[0] == -1
+
+
+def test_first_node_that_explains_all_outweighs_the_wide_one_about_it(patterns_of):
+    patterns = patterns_of([(8, 6, 5), (16, 12, 5), (32, 24, 5), (COLUMNS, ROWS, 5)], 1)
+    few = PatternCodes(patterns.pyramid.arrays, patterns.code, 0, 1, 20, np.ones((1, 22), np.float32))
+    y = np.append(patterns.code[17 * COLUMNS + 41] / 127.5 - 1, [-1, 1]).astype(np.float32)
+    f = np.append(np.zeros(20), [-1, 1]).astype(np.float32)
+    precision = np.ones(22, np.float32)  # as if nothing were explained
+    level, column, row, gain, _ = find_node(few, y, f, precision, 6, True)
+    assert (level, column, row) == (0, 41, 17)
+    assert gain > 100  # not 20, the chi-square of 20 measurements

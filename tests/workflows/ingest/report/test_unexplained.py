@@ -1,0 +1,104 @@
+"""Captures with glare, with noise that constant frames don't tell, and with errors of the model: all are measured."""
+
+import io
+import json
+import zipfile
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from storage.layout.captures import Stack
+from tests.parts.captures import nested_program
+from workflows.images.integer_formats import encode_png
+from workflows.images.tone_curves import to_light
+from workflows.programs.program import Program
+from workflows.recovery.glare import WIDTHS
+from workflows.simulation.glass_ball import glass_ball
+from workflows.simulation.scene import Scene
+
+Ingest = Callable[..., Stack]
+WIDTH, HEIGHT, MONITOR = 80, 60, (160, 120)
+NOISE = 0.004
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return glass_ball(WIDTH, HEIGHT, monitor=MONITOR, rays=4)
+
+
+@pytest.fixture(scope="module")
+def program() -> Program:
+    """With two constant frames, which don't tell the noise."""
+    bands = ((8, 6, 12), (16, 12, 12), (32, 24, 12), (80, 60, 16))
+    return nested_program(MONITOR, bands=bands, levels=2)
+
+
+def filmed(
+    scene: Scene,
+    program: Program,
+    glare: float = 0.0,
+    error: float = 0.0,
+    channels: int = 3,
+    noise: float = NOISE,
+) -> bytes:
+    """A capture: a share of the light comes through a broad Gaussian, and frames differ by a share of themselves."""
+    rng, target, sigma = np.random.default_rng(7), io.BytesIO(), WIDTHS[1] * MONITOR[0]
+    with zipfile.ZipFile(target, "w") as archive:
+        frames = [{"file": f"{n}.png", "pattern": n} for n in range(program.count)]
+        record = {
+            "format": "envmatte-capture/1",
+            "program": program.model_dump(mode="json"),
+            "frames": frames,
+        }
+        archive.writestr("capture.json", json.dumps(record | {"response": "linear"}))
+        inside = gaussian_filter(np.ones(MONITOR[::-1]), sigma, mode="constant")[..., np.newaxis]
+        for n, picture in enumerate(program.pictures(0, program.count)):
+            light = to_light(picture, "srgb")
+            blurred = gaussian_filter(light, (sigma, sigma, 0), mode="constant") / inside
+            seen = scene.composite(((1 - glare) * light + glare * blurred).astype(np.float32))
+            if n in program.measured:
+                seen = seen * (1 + error * rng.standard_normal((HEIGHT, WIDTH, 1)))
+            value = (0.02 + 0.7 * seen)[..., :channels]
+            value = value + noise * rng.standard_normal(value.shape)
+            archive.writestr(f"{n}.png", encode_png(np.rint(np.clip(value, 0, 1) * 65535).astype(np.uint16)))
+    return target.getvalue()
+
+
+def deviation(stack: Stack) -> NDArray[np.float64]:
+    """Of the noise at black and at half of full scale."""
+    noise = stack.attributes["noise"]
+    return np.sqrt(noise["read"] + noise["shot"] * np.array([0.0, 0.5]))
+
+
+def test_nothing_is_found_where_there_is_nothing(scene: Scene, program: Program, ingest: Ingest) -> None:
+    stack = ingest("c", filmed(scene, program))
+    assert stack.attributes["glare"] is None
+    assert stack.attributes["model_error"] < 0.006
+    np.testing.assert_allclose(deviation(stack), NOISE, rtol=0.3)
+
+
+def test_glare_is_measured(scene: Scene, program: Program, ingest: Ingest) -> None:
+    shares = ingest("c", filmed(scene, program, glare=0.1)).attributes["glare"]
+    assert sum(shares) == pytest.approx(0.1, abs=0.025)
+    assert shares[1] > 0.06
+
+
+@pytest.mark.parametrize("noise", [0.002, 0.01])
+def test_noise_is_measured_from_patterns(
+    scene: Scene, program: Program, ingest: Ingest, noise: float
+) -> None:
+    stack = ingest("c", filmed(scene, program, channels=1, noise=noise))
+    assert stack.attributes["assumed_noise"]
+    np.testing.assert_allclose(deviation(stack), noise, rtol=0.3)
+
+
+def test_error_of_the_model_is_what_channels_have_in_common(
+    scene: Scene, program: Program, ingest: Ingest
+) -> None:
+    stack = ingest("c", filmed(scene, program, error=0.03))
+    # half of the light is black, which has no error
+    assert stack.attributes["model_error"] == pytest.approx(0.03 / np.sqrt(2), rel=0.3)
+    np.testing.assert_allclose(deviation(stack), NOISE, rtol=0.4)

@@ -1,0 +1,67 @@
+"""Stray light: added, taken out, and found beside a T that is recovered as if there were none."""
+
+import numpy as np
+import pytest
+
+from workflows.recovery.lobes.recover import Conditions, recover
+from workflows.recovery.lobes.strays import add_strays, subtract_strays
+
+COLUMNS, ROWS = 64, 48
+BANDS = [(8, 6, 24), (16, 12, 24), (32, 24, 24), (COLUMNS, ROWS, 24)]
+
+
+def test_amounts_of_each_group_are_added() -> None:
+    strays = np.array([[1, 1, 1], [1, -1, 0.5]], np.float32)
+    f = np.full(6, np.nan, np.float32)
+    add_strays(strays, np.array([0.1, 0.2, 0.3, 0.4]), 0, f)
+    np.testing.assert_allclose(f, [0.3, -0.1, 0.2, 0.7, -0.1, 0.5], rtol=1e-6)
+    add_strays(strays, np.array([0.1, 0.2, 0.3, 0.4]), 1, f)
+    np.testing.assert_allclose(f, [0.2, -0.2, 0.1, 0.4, -0.4, 0.2], rtol=1e-6)
+
+
+def test_what_is_left_is_normalised_again() -> None:
+    plain = np.array([0.3, -0.5, -1, 1], np.float32)
+    stray = np.array([0.1, -0.1, 0.02, -0.04], np.float32)
+    y, variance = plain + stray, np.full(4, 1e-4, np.float32)
+    subtract_strays(y, variance, stray, 4)
+    np.testing.assert_allclose(y, plain, atol=1e-6)
+    np.testing.assert_allclose(variance, 1e-4, rtol=1e-5)
+    squeezed = 0.9 * plain + 0.05 + stray
+    subtract_strays(squeezed, variance, stray, 4)
+    np.testing.assert_allclose(squeezed, plain, atol=1e-6)
+    np.testing.assert_allclose(variance, 1e-4 / 0.81, rtol=1e-5)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_t_is_recovered_beside_stray_light(patterns_of, gaussian, observe, channels: int) -> None:
+    shown = patterns_of(BANDS, 1, channels=channels)
+    T = np.concatenate([gaussian(COLUMNS, ROWS, x, 20.6, 1.5, 1.0) for x in (14.6, 30.2, 45.3)])
+    measurements, photometry, noise = observe(shown, T)
+    rng = np.random.default_rng(0)
+    lit = np.sign(rng.standard_normal((4, shown.count + 2))).astype(np.float32)
+    lit -= lit[:, :-2].mean(axis=1, keepdims=True)
+    strays = np.concatenate([np.ones((1, lit.shape[1]), np.float32), lit])
+    amount = rng.uniform(-0.03, 0.03, (3, 1, 4)) * photometry.rho[..., np.newaxis]
+    light = amount @ lit
+    seen = measurements + light[..., :-2].transpose(0, 2, 1).astype(np.float32)
+    from_constants = type(photometry)(
+        (photometry.S + light[..., -2]).astype(np.float32),
+        (photometry.rho + light[..., -1] - light[..., -2]).astype(np.float32),
+        photometry.black,
+        photometry.white,
+    )
+    clean = recover(measurements, photometry, shown, noise)
+    beside = recover(seen, from_constants, shown, noise, conditions=Conditions(strays=strays))
+    ignored = recover(seen, from_constants, shown, noise)
+    np.testing.assert_allclose(beside.photometry.S, clean.photometry.S, atol=2e-3)
+    np.testing.assert_allclose(beside.photometry.rho, clean.photometry.rho, atol=4e-3)
+    backdrop = np.sin(np.arange(COLUMNS) / 5)[np.newaxis, :, np.newaxis] * np.ones((ROWS, 1, 3)) / 2 + 0.5
+    nodes = shown.pyramid.light(backdrop.astype(np.float32))
+
+    def error(found) -> float:
+        composite = found.photometry.S + found.photometry.rho * found.transport.apply(nodes)
+        expected = photometry.S + photometry.rho * (T @ backdrop.reshape(-1, 3)[:, :1])[..., 0]
+        return float(np.sqrt(np.mean((composite - expected) ** 2)))
+
+    assert error(beside) < 2 * error(clean)
+    assert error(beside) < error(ignored) / 3

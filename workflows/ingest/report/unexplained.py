@@ -1,0 +1,212 @@
+"""What frames show beside T, S and rho: veiling glare, noise that constant frames don't tell, errors of the model."""
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from storage.layout.captures import Stack
+from workflows.images.tone_curves import Curve
+from workflows.ingest.report.trial_recovery import Doubles, Floats, RecoveredSample, Sample, recover_sample
+from workflows.programs.program import Program
+from workflows.recovery.glare import LEAST, Spread, centres, filter_patterns, fit_shares, spread_patterns
+from workflows.recovery.noise import Noise, fit_noise
+from workflows.recovery.normalise import normalise
+from workflows.recovery.pyramid import Pyramid
+from workflows.recovery.sensing import Patterns
+from workflows.recovery.transport import Transport
+
+ROUNDS = 5
+"""Recoveries of the sample, at most: each sees the patterns through the glare that the one before has found."""
+SETTLED = 0.003
+"""Rounds end when no share of the glare changes by more."""
+FLAT = 0.98
+"""A pixel sees a pattern as black or white if the pattern is, about its place, by more than this, of 1. What differs is
+then no error of T."""
+SEEN = 0.9
+"""T must give more than this of it. (If T decided alone, noise that T has fitted would be left out.)"""
+DETAIL = 0.02
+"""Variance of a black-and-white pattern within T that is expected to be unexplained where glare is fitted."""
+LEAST_ERROR = 0.002
+"""An error of the model below this share of rho is none."""
+MOST = 0.98
+"""Quantile of squared residuals beyond which they count no more."""
+MIN_FLAT = 120
+"""Values that the noise and the error of the model are measured from, at least."""
+CONTRAST = 3.0
+"""As `least_contrast` of a recovery."""
+
+
+def find_unexplained(
+    stack: Stack, program: Program, monitor: Curve, patterns: Patterns, sample: Sample, state: Doubles
+) -> None:
+    """Estimate what T leaves unexplained in a sample of the pixels, and annotate the stack with it.
+
+    ``glare`` are its shares of the light (`workflows.recovery.glare`), or None below 1 %. ``model_error`` is the
+    standard deviation of what neither T nor noise explains, as a share of rho. ``noise`` is replaced if it was only
+    assumed, for want of constant frames.
+
+    Parameters
+    ----------
+    stack : Stack
+    program : Program
+    monitor : Curve
+    patterns : Patterns
+        The program's, without glare.
+    sample : Sample
+    state : (frames, 3) float64
+        Shifts and logarithms of the gains to correct.
+
+    Notes
+    -----
+    Where T lies in a part of a pattern that is all black or all white, no error of T's place or shape matters. What
+    still differs there is glare, whose shares are fitted, and then noise and errors of the model: scattered light, a
+    curve that is not quite right, a monitor whose white depends on the picture. Errors of the model are alike in the
+    three channels, and noise is not, so that the covariance of the channels tells them apart.
+    """
+    stack.annotate(glare=None, model_error=0.0)
+    noise, assumed = Noise(**stack.attributes["noise"]), stack.attributes["assumed_noise"]
+    spreads, through = spread_patterns(patterns), patterns
+    shares, error = np.zeros(len(spreads)), 0.0
+    for _ in range(ROUNDS):
+        stack.annotate(noise={"read": noise.read, "shot": noise.shot}, model_error=error)
+        found = recover_sample(stack, program, monitor, through, sample, state)
+        if found is None:
+            return
+        rest = _Rest(found, program, patterns, through, spreads, noise, stack.channels)
+        before = shares
+        shares = rest.shares(error)
+        if shares.sum() < LEAST:
+            shares = np.zeros(len(spreads))
+        known = noise
+        noise, error = rest.noise_and_error(noise, assumed)
+        settled = np.abs(shares - before).max() < SETTLED
+        if settled and abs(noise.variance(_GREY)[0] / known.variance(_GREY)[0] - 1) < 0.2:
+            break
+        through = filter_patterns(patterns, shares.tolist()) if shares.any() else patterns
+    stack.annotate(
+        noise={"read": noise.read, "shot": noise.shot},
+        model_error=error,
+        glare=[round(float(share), 5) for share in shares] if shares.any() else None,
+    )
+
+
+_GREY = np.array([0.5], np.float32)
+
+
+class _Rest:
+    """The residuals of a recovered sample, in units of T from -1 to 1; arrays are (n, channels, m)."""
+
+    def __init__(
+        self,
+        found: RecoveredSample,
+        program: Program,
+        patterns: Patterns,
+        through: Patterns,
+        spreads: list[Spread],
+        noise: Noise,
+        channels: int,
+    ) -> None:
+        shown, at = program.measured, slice(None, channels)
+        light, usable, worth = (
+            found.light.values[:, shown],
+            found.light.usable[:, shown],
+            found.light.worth[:, shown],
+        )
+        measured = normalise(light, found.photometry, noise, CONTRAST, usable, worth)
+        value, self.variance = (part[:, at, :-2] for part in measured)
+        self.plain, seen = (predict(found.transport, p)[:, at] for p in (patterns, through))
+        self.known = (
+            np.isfinite(self.variance) & (found.transport.count.sum(axis=1) > 0)[:, np.newaxis, np.newaxis]
+        )
+        self.rho = np.broadcast_to(found.photometry.rho[:, at, np.newaxis], value.shape)
+        self.worth = worth.transpose(0, 2, 1)[:, at]
+        # Not as measured: then values of a bin would have been chosen by their noise.
+        self.level = found.photometry.S[:, at, np.newaxis] + self.rho * (1 + seen) / 2
+        strays = found.strays[1:, :-2]
+        self.rest = _without(np.where(self.known, value - seen, 0), strays)
+        self.from_plain = _without(np.where(self.known, value - self.plain, 0), strays)
+        x, y = mean_places(found.transport, patterns.pyramid)
+        self.parts = np.empty((*self.plain.shape, len(spreads)), np.float32)
+        for k, spread in enumerate(spreads):
+            for c in range(channels):
+                lit = spread.at(x[:, c], y[:, c]).reshape(len(x), -1, patterns.count)
+                self.parts[:, c, :, k] = lit[:, c % lit.shape[1]]
+        near, sign = self.parts[..., 0], np.sign(self.plain)
+        self.flat = self.known & (sign * near > FLAT) & (sign * self.plain > SEEN)
+
+    def shares(self, error: float) -> NDArray[np.float64]:
+        """The shares of the glare that explain the residuals best."""
+        parts = self.parts - self.plain[..., np.newaxis]
+        brightness = self.rho / max(float(np.median(self.rho)), 1e-6)
+        weight = np.minimum(brightness, 2) ** 2
+        weight /= np.where(self.known, self.variance, 1) + 4 * error**2 + DETAIL * (1 - self.plain**2)
+        return fit_shares(parts[self.known], self.from_plain[self.known], weight[self.known])
+
+    def noise_and_error(self, noise: Noise, assumed: bool) -> tuple[Noise, float]:
+        """The noise of a frame, if it is only assumed, and the error of the model."""
+        if np.count_nonzero(self.flat) < MIN_FLAT:
+            return noise, 0.0
+        if self.rest.shape[1] == 3:
+            flat = self.flat & np.roll(self.flat, -1, axis=1)
+            if np.count_nonzero(flat) < MIN_FLAT:
+                return noise, 0.0
+            own, other = self.rest[flat], np.roll(self.rest, -1, axis=1)[flat]
+            common = _mean_without_outliers(own * other)
+            # The variance of a difference, in units of T, is the sum of two: that of a frame over rho squared of each.
+            rho, of_other = self.rho[flat] ** 2, np.roll(self.rho, -1, axis=1)[flat] ** 2
+            square = (own - other) ** 2 / 4 * rho * of_other / (rho + of_other)
+        else:
+            flat = self.flat
+            square = (self.rest[flat] / 2 * self.rho[flat]) ** 2
+            common = 0.0 if assumed else _mean_without_outliers(self.rest[flat] ** 2)
+            common -= 0.0 if assumed else float(self.variance[flat].mean())
+        if assumed:
+            level, square = (
+                self.level[flat].astype(np.float64),
+                (square * self.worth[flat]).astype(np.float64),
+            )
+            noise = fit_noise(level, square, noise.read / 100) or noise
+        error = float(np.sqrt(max(common, 0.0)) / 2)
+        return noise, error if error >= LEAST_ERROR else 0.0
+
+
+def predict(transport: Transport, patterns: Patterns) -> Floats:
+    """The patterns as T gives them, -1 to 1, (n, 3, m) float32."""
+    cells, place = np.unique(transport.cell, return_inverse=True)
+    ends = np.concatenate([[0], np.cumsum(transport.count, dtype=np.int64)])
+    size = len(transport.shared)
+    T = sp.csr_array((transport.weight, place, ends), shape=(3 * size, len(cells)))
+    light = (patterns.code[cells] / np.float32(127.5) - 1).reshape(
+        len(cells), patterns.channels, patterns.count
+    )
+    predicted = np.empty((size, 3, patterns.count), np.float32)
+    for c in range(3):
+        rows = 3 * np.arange(size) + np.where(transport.shared, 0, c)
+        predicted[:, c] = T[rows] @ light[:, c % patterns.channels]
+    return predicted
+
+
+def mean_places(transport: Transport, pyramid: Pyramid) -> tuple[Doubles, Doubles]:
+    """The mean place that each row of T sees, x and y in cells of the first grid, (n, 3) float64 each."""
+    row = np.repeat(np.arange(transport.count.size), transport.count.ravel())
+    n, channels = transport.count.shape
+    own = np.where(transport.shared[:, np.newaxis], 0, np.arange(channels))
+    total = np.maximum(np.bincount(row, transport.weight, n * channels), 1e-12)
+    places = []
+    for centre in centres(pyramid):
+        mean = np.bincount(row, transport.weight * centre[transport.cell], n * channels) / total
+        places.append(np.take_along_axis(mean.reshape(n, channels), own, axis=1))
+    return places[0], places[1]
+
+
+def _without(rest: Floats, strays: Floats) -> Floats:
+    """Residuals without what stray light explains in each."""
+    if not len(strays):
+        return rest
+    left: Floats = rest - (rest @ np.linalg.pinv(strays).astype(np.float32)) @ strays
+    return left
+
+
+def _mean_without_outliers(values: Floats) -> float:
+    limit = np.quantile(np.abs(values), MOST)
+    return float(np.clip(values, -limit, limit).mean())
