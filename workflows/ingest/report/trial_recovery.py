@@ -204,7 +204,7 @@ def try_recovery(
     numbers, sent = program.constants_among(attributes["patterns"])
     shown = program.measured
     predicted = np.zeros((program.count, *alive.shape), np.float32)
-    predicted[shown] = photometry.rho * _arrived(transport, patterns)
+    predicted[shown] = photometry.rho * (predict(transport, patterns).transpose(2, 0, 1) + 1) / 2
     predicted[numbers] = photometry.rho * to_light(sent, monitor)[:, np.newaxis]
     exposures = exposures_of(attributes)
     apart = np.linalg.inv(np.array(attributes["crosstalk"])).astype(np.float32).T
@@ -236,18 +236,20 @@ def try_recovery(
     return Trial(off, error, float(np.sqrt(np.mean(squares))) if squares else np.inf)
 
 
-def _arrived(transport: Transport, patterns: Patterns) -> Floats:
-    """The light T L of each pattern, (m, n, 3)."""
+def predict(transport: Transport, patterns: Patterns) -> Floats:
+    """The patterns as T gives them, -1 to 1, (n, 3, m) float32."""
     cells, place = np.unique(transport.cell, return_inverse=True)
     ends = np.concatenate([[0], np.cumsum(transport.count, dtype=np.int64)])
     size = len(transport.shared)
     T = sp.csr_array((transport.weight, place, ends), shape=(3 * size, len(cells)))
-    light = (patterns.code[cells] / np.float32(255)).reshape(len(cells), patterns.channels, patterns.count)
-    arrived = np.empty((patterns.count, size, 3), np.float32)
+    light = (patterns.code[cells] / np.float32(127.5) - 1).reshape(
+        len(cells), patterns.channels, patterns.count
+    )
+    predicted = np.empty((size, 3, patterns.count), np.float32)
     for c in range(3):
         rows = 3 * np.arange(size) + np.where(transport.shared, 0, c)
-        arrived[:, :, c] = (T[rows] @ light[:, c % patterns.channels]).T
-    return arrived
+        predicted[:, c] = T[rows] @ light[:, c % patterns.channels]
+    return predicted
 
 
 def _fit(

@@ -1,12 +1,18 @@
 """What frames show beside T, S and rho: veiling glare, noise that constant frames don't tell, errors of the model."""
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import Curve
-from workflows.ingest.report.trial_recovery import Doubles, Floats, RecoveredSample, Sample, recover_sample
+from workflows.ingest.report.trial_recovery import (
+    Doubles,
+    Floats,
+    RecoveredSample,
+    Sample,
+    predict,
+    recover_sample,
+)
 from workflows.programs.program import Program
 from workflows.recovery.glare import LEAST, Spread, centres, filter_patterns, fit_shares, spread_patterns
 from workflows.recovery.noise import Noise, fit_noise
@@ -168,22 +174,6 @@ class _Rest:
             noise = fit_noise(level, square, noise.read / 100) or noise
         error = float(np.sqrt(max(common, 0.0)) / 2)
         return noise, error if error >= LEAST_ERROR else 0.0
-
-
-def predict(transport: Transport, patterns: Patterns) -> Floats:
-    """The patterns as T gives them, -1 to 1, (n, 3, m) float32."""
-    cells, place = np.unique(transport.cell, return_inverse=True)
-    ends = np.concatenate([[0], np.cumsum(transport.count, dtype=np.int64)])
-    size = len(transport.shared)
-    T = sp.csr_array((transport.weight, place, ends), shape=(3 * size, len(cells)))
-    light = (patterns.code[cells] / np.float32(127.5) - 1).reshape(
-        len(cells), patterns.channels, patterns.count
-    )
-    predicted = np.empty((size, 3, patterns.count), np.float32)
-    for c in range(3):
-        rows = 3 * np.arange(size) + np.where(transport.shared, 0, c)
-        predicted[:, c] = T[rows] @ light[:, c % patterns.channels]
-    return predicted
 
 
 def mean_places(transport: Transport, pyramid: Pyramid) -> tuple[Doubles, Doubles]:
