@@ -11,11 +11,17 @@ from pydantic import TypeAdapter
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import Curve
 from workflows.ingest.measured_light import black_patterns
-from workflows.ingest.report.trial_recovery import FURTHEST, Doubles, Trial, take_sample, try_recovery
+from workflows.ingest.report.trial_recovery import (
+    FURTHEST,
+    Doubles,
+    Trial,
+    measure_rest,
+    take_sample,
+    try_recovery,
+)
 from workflows.ingest.report.unexplained import find_unexplained
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out
-from workflows.recovery.glare import filter_patterns
 
 ROUNDS = 10
 """Rounds of measuring and correcting, at most."""
@@ -96,15 +102,15 @@ def find_steadiness(stack: Stack) -> None:
     monitor: Curve = TypeAdapter[Curve](Curve).validate_python(stack.attributes["monitor_curve"])
     light = lay_out(program, monitor, stack.images())
     at_rest = np.zeros((stack.frames, 3))
-    find_unexplained(stack, program, monitor, light, sample, at_rest)
-    glare = stack.attributes["glare"]
-    try_out = partial(
-        try_recovery, stack, program, monitor, filter_patterns(light, glare) if glare else light, sample
-    )
+    recovered = find_unexplained(stack, program, monitor, light, sample, at_rest)
+    if recovered is None:
+        return
+    at_first, through = recovered
+    first = measure_rest(stack, program, monitor, through, sample, at_rest, at_first)
+    try_out = partial(try_recovery, stack, program, monitor, through, sample)
     patterns = np.array(stack.attributes["patterns"])
     shown = np.isin(patterns, program.measured)
-    first = try_out(at_rest)
-    if first is None or np.count_nonzero(np.isfinite(first.off[shown]).all(axis=1)) < MIN_FRAMES:
+    if np.count_nonzero(np.isfinite(first.off[shown]).all(axis=1)) < MIN_FRAMES:
         return
     found, last = _fill_gaps(first.off, shown), first
     moves = flickers = False

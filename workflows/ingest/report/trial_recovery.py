@@ -196,8 +196,19 @@ def try_recovery(
 ) -> Trial | None:
     """Recover the sample from frames corrected by ``state``, (frames, 3), and measure what remains."""
     found = recover_sample(stack, program, monitor, patterns, sample, state)
-    if found is None:
-        return None
+    return found and measure_rest(stack, program, monitor, patterns, sample, state, found)
+
+
+def measure_rest(
+    stack: Stack,
+    program: Program,
+    monitor: Curve,
+    patterns: Patterns,
+    sample: Sample,
+    state: Doubles,
+    found: RecoveredSample,
+) -> Trial:
+    """Measure how the frames differ from what the recovery of a sample predicts."""
     _, photometry, transport, _, alive, seen = found
     attributes, gains = stack.attributes, np.exp(state[:, 2])
     noise, model_error = Noise(**attributes["noise"]), attributes["model_error"]

@@ -23,8 +23,8 @@ from workflows.recovery.transport import Transport
 
 ROUNDS = 5
 """Recoveries of the sample, at most: each sees the patterns through the glare that the one before has found."""
-SETTLED = 0.003
-"""Rounds end when no share of the glare changes by more."""
+SETTLED, NOISE_SETTLED = 0.003, 0.2
+"""Rounds end when no share of the glare changes by more, and the variance of the noise by no larger share."""
 FLAT = 0.98
 """A pixel sees a pattern as black or white if the pattern is, about its place, by more than this, of 1. What differs is
 then no error of T."""
@@ -44,7 +44,7 @@ CONTRAST = 3.0
 
 def find_unexplained(
     stack: Stack, program: Program, monitor: Curve, patterns: Patterns, sample: Sample, state: Doubles
-) -> None:
+) -> tuple[RecoveredSample, Patterns] | None:
     """Estimate what T leaves unexplained in a sample of the pixels, and annotate the stack with it.
 
     ``glare`` are its shares of the light (`workflows.recovery.glare`), or None below 1 %. ``model_error`` is the
@@ -62,6 +62,12 @@ def find_unexplained(
     state : (frames, 3) float64
         Shifts and logarithms of the gains to correct.
 
+    Returns
+    -------
+    (RecoveredSample, Patterns) or None
+        The last recovery of the sample, and the patterns through the glare that it was recovered from; None if the
+        sample has too little contrast.
+
     Notes
     -----
     Where T lies in a part of a pattern that is all black or all white, no error of T's place or shape matters. What
@@ -73,11 +79,13 @@ def find_unexplained(
     noise, assumed = Noise(**stack.attributes["noise"]), stack.attributes["assumed_noise"]
     spreads, through = spread_patterns(patterns), patterns
     shares, error = np.zeros(len(spreads)), 0.0
-    for _ in range(ROUNDS):
+    rounds = 0
+    while True:
+        rounds += 1
         stack.annotate(noise={"read": noise.read, "shot": noise.shot}, model_error=error)
         found = recover_sample(stack, program, monitor, through, sample, state)
         if found is None:
-            return
+            return None
         rest = _Rest(found, program, patterns, through, spreads, noise, stack.channels)
         before = shares
         shares = rest.shares(error)
@@ -85,15 +93,16 @@ def find_unexplained(
             shares = np.zeros(len(spreads))
         known = noise
         noise, error = rest.noise_and_error(noise, assumed)
-        settled = np.abs(shares - before).max() < SETTLED
-        if settled and abs(noise.variance(_GREY)[0] / known.variance(_GREY)[0] - 1) < 0.2:
-            break
+        settled = bool(np.abs(shares - before).max() < SETTLED)
+        settled &= bool(abs(noise.variance(_GREY)[0] / known.variance(_GREY)[0] - 1) < NOISE_SETTLED)
+        if settled or rounds == ROUNDS:
+            stack.annotate(
+                noise={"read": noise.read, "shot": noise.shot},
+                model_error=error,
+                glare=[round(float(share), 5) for share in shares] if shares.any() else None,
+            )
+            return found, through
         through = filter_patterns(patterns, shares.tolist()) if shares.any() else patterns
-    stack.annotate(
-        noise={"read": noise.read, "shot": noise.shot},
-        model_error=error,
-        glare=[round(float(share), 5) for share in shares] if shares.any() else None,
-    )
 
 
 _GREY = np.array([0.5], np.float32)
@@ -145,7 +154,9 @@ class _Rest:
         parts = self.parts - self.plain[..., np.newaxis]
         brightness = self.rho / max(float(np.median(self.rho)), 1e-6)
         weight = np.minimum(brightness, 2) ** 2
-        weight /= np.where(self.known, self.variance, 1) + 4 * error**2 + DETAIL * (1 - self.plain**2)
+        weight /= (
+            np.where(self.known, self.variance, 1) + 4 * error**2 + DETAIL * np.maximum(1 - self.plain**2, 0)
+        )
         return fit_shares(parts[self.known], self.from_plain[self.known], weight[self.known])
 
     def noise_and_error(self, noise: Noise, assumed: bool) -> tuple[Noise, float]:
