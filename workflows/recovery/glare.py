@@ -5,6 +5,7 @@ shares are common to all pixels. They are far too small and too wide to be found
 that have to explain them are too wide or off their place.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -13,7 +14,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from workflows.recovery.lobes.footprint import NODES, bump_variance, fit_level, sample
 from workflows.recovery.pyramid import Grids, Pyramid, halve_codes
 from workflows.recovery.sensing import Patterns
 from workflows.recovery.transport import Transport
@@ -27,6 +27,8 @@ LEAST = 0.01
 _ROWS = 8
 # Nodes of a Gaussian are as far apart as it allows: its smallest standard deviation in their spacings.
 _RESOLUTION = 0.8
+# Squared Mahalanobis distance at which a Gaussian is cut off.
+_REACH = 10.0
 
 
 class Spread(NamedTuple):
@@ -60,7 +62,8 @@ def spread_patterns(patterns: Patterns) -> list[Spread]:
         while level < len(pyramid.grids) - 1 and 2 ** (level + 1) <= sigma / 2:
             level += 1
         light = _light_of(patterns, level)
-        blur = np.sqrt(max(sigma**2 - bump_variance(level), 0.0)) / 2**level
+        bump = 1 / 12 + (4**level - 1) / 4  # the variance of what a node is a mean of
+        blur = np.sqrt(max(sigma**2 - bump, 0.0)) / 2**level
         # Beside the monitor there is no light, and a white monitor is 1 everywhere.
         inside = gaussian_filter(np.ones(light.shape[:2], np.float32), blur, mode="constant")[..., np.newaxis]
         blurred = gaussian_filter(light, (blur, blur, 0), mode="constant")
@@ -219,47 +222,65 @@ def _add_to_rows(
     whole: NDArray[np.int64],
     shares: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
-    own = 1 - shares.sum()
-    new_count = np.zeros_like(count)
-    out, out_weight, end = np.empty(2 * node.size + 1, np.int64), np.empty(2 * node.size + 1, np.float32), 0
-    found, terms = np.empty(NODES, np.int64), np.empty((1, NODES), np.float32)
-    lobe, begin = np.empty(6), 0
+    columns, rows, starts = grids
+    new_count, own = np.zeros_like(count), 1 - shares.sum()
+    out, out_weight, end = np.empty(4 * node.size + 1, np.int64), np.empty(4 * node.size + 1, np.float32), 0
+    begin = 0
     for row in range(count.size):
         if count[row] == 0:
             continue
-        total, sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        for i in range(begin, begin + count[row]):
-            w, a, b = weight[i], x[node[i]], y[node[i]]
-            total, sx, sy = total + w, sx + w * a, sy + w * b
-        sx, sy = sx / max(total, 1e-12), sy / max(total, 1e-12)
-        for i in range(begin, begin + count[row]):
-            w, a, b = weight[i], x[node[i]] - sx, y[node[i]] - sy
-            sxx, sxy, syy = sxx + w * a * a, sxy + w * a * b, syy + w * b * b
-        needed = end + count[row] + sigma.size * NODES + whole.size
-        if needed > out.size:
-            grown, grown_weight = np.empty(2 * needed, np.int64), np.empty(2 * needed, np.float32)
-            grown[:end], grown_weight[:end] = out[:end], out_weight[:end]
-            out, out_weight = grown, grown_weight
-        first = end
-        for i in range(begin, begin + count[row]):
+        first, entries = end, range(begin, begin + count[row])
+        begin += count[row]
+        total, mx, my, vxx, vxy, vyy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for i in entries:
+            total, mx, my = total + weight[i], mx + weight[i] * x[node[i]], my + weight[i] * y[node[i]]
+        mx, my = mx / max(total, 1e-12), my / max(total, 1e-12)
+        for i in entries:
+            w, dx, dy = weight[i] / max(total, 1e-12), x[node[i]] - mx, y[node[i]] - my
+            vxx, vxy, vyy = vxx + w * dx * dx, vxy + w * dx * dy, vyy + w * dy * dy
+        while end + count[row] + whole.size > out.size:
+            out, out_weight = (
+                np.append(out, np.empty_like(out)),
+                np.append(out_weight, np.empty_like(out_weight)),
+            )
+        for i in entries:
             out[end], out_weight[end] = node[i], weight[i] * own
             end += 1
-        begin += count[row]
+        for i in range(whole.size if shares[-1] > 0 else 0):
+            out[end], out_weight[end] = whole[i], shares[-1] * total / whole.size
+            end += 1
         for k in range(sigma.size):
             if shares[k] == 0:
                 continue
-            xx, xy, yy = sxx / total + sigma[k] ** 2, sxy / total, syy / total + sigma[k] ** 2
-            lobe[0], lobe[1], lobe[2] = 1.0, sx, sy
-            lobe[3] = np.sqrt(xx - bump_variance(0))
-            lobe[4] = xy / lobe[3]
-            lobe[5] = np.sqrt(max(yy - bump_variance(0) - lobe[4] ** 2, 1e-3))
-            level = fit_level(lobe, np.int64(0), grids.columns, _RESOLUTION)
-            n = sample(lobe, level, grids, found, terms)
-            for i in range(n):
-                out[end], out_weight[end] = found[i], np.float32(terms[0, i] * shares[k] * total)
-                end += 1
-        for i in range(whole.size if shares[-1] > 0 else 0):
-            out[end], out_weight[end] = whole[i], np.float32(shares[-1] * total / whole.size)
-            end += 1
+            xx, xy, yy = vxx + sigma[k] ** 2, vxy, vyy + sigma[k] ** 2
+            minor = math.sqrt((xx + yy) / 2 - math.hypot((xx - yy) / 2, xy))
+            level = 0
+            while level < columns.size - 1 and minor >= 2 * _RESOLUTION * 2.0**level:
+                level += 1
+            spacing = 2.0**level
+            blur = 1 / 12 + (4.0**level - 1) / 4  # the variance of the nodes' own bumps
+            xx, yy = max(xx - blur, 0.3 * spacing**2), max(yy - blur, 0.3 * spacing**2)
+            area = max(xx * yy - xy**2, 0.01 * xx * yy)
+            left = max(math.floor((mx - math.sqrt(_REACH * xx)) / spacing), 0)
+            right = min(math.ceil((mx + math.sqrt(_REACH * xx)) / spacing), columns[level] - 1)
+            top = max(math.floor((my - math.sqrt(_REACH * yy)) / spacing), 0)
+            bottom = min(math.ceil((my + math.sqrt(_REACH * yy)) / spacing), rows[level] - 1)
+            while end + (right - left + 1) * (bottom - top + 1) > out.size:
+                out, out_weight = (
+                    np.append(out, np.empty_like(out)),
+                    np.append(out_weight, np.empty_like(out_weight)),
+                )
+            start, lit = end, 0.0
+            for v in range(top, bottom + 1):
+                for u in range(left, right + 1):
+                    dx, dy = (u + 0.5) * spacing - mx, (v + 0.5) * spacing - my
+                    far = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / area
+                    if far < _REACH:
+                        share = math.exp(-far / 2)
+                        out[end], out_weight[end] = starts[level] + v * columns[level] + u, share
+                        lit += share
+                        end += 1
+            for i in range(start, end):
+                out_weight[i] *= shares[k] * total / lit
         new_count[row] = end - first
     return new_count, out[:end], out_weight[:end]

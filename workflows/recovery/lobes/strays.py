@@ -32,7 +32,8 @@ def add_strays(
                 of_group[j] += share * strays[s, j]
 
 
-@njit(nogil=True, cache=True)
+# With types, since it is called by a kernel and by itself: see `workflows.recovery.solvers`.
+@njit("void(float32[::1], float32[::1], float32[::1], int64)", nogil=True, cache=True)
 def subtract_strays(
     y: NDArray[np.float32], variance: NDArray[np.float32], stray: NDArray[np.float32], size: int
 ) -> None:
