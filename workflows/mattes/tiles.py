@@ -18,7 +18,7 @@ from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out, pyramid_of
 from workflows.recovery.dgsr import recover as dgsr
 from workflows.recovery.dgsr.options import DgsrOptions
-from workflows.recovery.glare import add_glare, filter_patterns
+from workflows.recovery.glare import add_glare, filter_patterns, spread_patterns
 from workflows.recovery.lobes import recover as lobes
 from workflows.recovery.noise import Noise
 from workflows.recovery.normalise import normalise
@@ -159,7 +159,7 @@ def patterns_of(objects: Objects, capture: str) -> Patterns:
     program, monitor = program_of(objects, capture)
     patterns = lay_out(program, monitor, _images_of(objects, capture))
     glare = Stack(objects, capture).attributes.get("glare")
-    return filter_patterns(patterns, glare) if glare else patterns
+    return filter_patterns(patterns, spread_patterns(patterns), glare) if glare else patterns
 
 
 def _images_of(objects: Objects, capture: str) -> list[NDArray[np.float32]]:

@@ -125,11 +125,20 @@ def fit_shares(
     return shares
 
 
-def filter_patterns(patterns: Patterns, shares: Sequence[float]) -> Patterns:
-    """The patterns as they arrive through glare: what a T without glare would have to see."""
+def filter_patterns(patterns: Patterns, parts: Sequence[Spread], shares: Sequence[float]) -> Patterns:
+    """The patterns as they arrive through glare: what a T without glare would have to see.
+
+    Parameters
+    ----------
+    patterns : Patterns
+    parts : sequence of Spread
+        As from :func:`spread_patterns`.
+    shares : sequence of float
+        As from :func:`fit_shares`.
+    """
     pyramid, code = patterns.pyramid, np.empty_like(patterns.code)
     columns, rows = pyramid.grids[0]
-    parts, own = spread_patterns(patterns), 1 - sum(shares)
+    own = 1 - sum(shares)
     x = np.tile(np.arange(columns) + 0.5, _ROWS)
     for first in range(0, rows, _ROWS):
         last = min(first + _ROWS, rows)

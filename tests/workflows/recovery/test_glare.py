@@ -38,9 +38,9 @@ def patterns() -> Patterns:
 
 def test_a_white_monitor_stays_white(patterns: Patterns) -> None:
     white = replace(patterns, code=np.full_like(patterns.code, 255))
-    np.testing.assert_array_equal(filter_patterns(white, SHARES).code, 255)
+    np.testing.assert_array_equal(filter_patterns(white, spread_patterns(white), SHARES).code, 255)
     black = replace(patterns, code=np.zeros_like(patterns.code))
-    np.testing.assert_array_equal(filter_patterns(black, SHARES).code, 0)
+    np.testing.assert_array_equal(filter_patterns(black, spread_patterns(black), SHARES).code, 0)
 
 
 def transport_of(count: list[int], cell: list[int], weight: list[float]) -> Transport:
@@ -55,7 +55,7 @@ def test_light_through_glare_is_that_of_a_row_with_glare(patterns: Patterns, sha
     """A T that sees the filtered patterns sees the same as T with glare, of the patterns as they are."""
     plain = transport_of([2, 1], [40 * COLUMNS + 70, 41 * COLUMNS + 70, 90 * COLUMNS + 30], [0.4, 0.6, 1.0])
     glaring = add_glare(plain, shares)
-    filtered = filter_patterns(patterns, shares)
+    filtered = filter_patterns(patterns, spread_patterns(patterns), shares)
     for at in range(M):
         seen, through = (np.repeat(p.code[:, at, None] / np.float32(255), 3, 1) for p in (patterns, filtered))
         with_glare, expected = glaring.apply(seen), plain.apply(through)

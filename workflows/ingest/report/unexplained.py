@@ -41,6 +41,8 @@ MIN_FLAT = 120
 CONTRAST = 3.0
 """As `least_contrast` of a recovery."""
 
+_GREY = np.array([0.5], np.float32)
+
 
 def find_unexplained(
     stack: Stack, program: Program, monitor: Curve, patterns: Patterns, sample: Sample, state: Doubles
@@ -102,10 +104,7 @@ def find_unexplained(
                 glare=[round(float(share), 5) for share in shares] if shares.any() else None,
             )
             return found, through
-        through = filter_patterns(patterns, shares.tolist()) if shares.any() else patterns
-
-
-_GREY = np.array([0.5], np.float32)
+        through = filter_patterns(patterns, spreads, shares.tolist()) if shares.any() else patterns
 
 
 class _Rest:
