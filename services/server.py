@@ -10,12 +10,14 @@ from services.cluster.connect import dispatcher_of
 from services.cluster.dask_config import configure_dask
 from services.coordinator.coordinator import Coordinator
 from services.runtime import tracing
-from services.runtime.data_lock import lock_data
+from services.runtime.addresses import bind, url_of
+from services.runtime.data_folder import lock_data, make_data
 from services.runtime.logs import configure_logging
 from services.runtime.malloc import limit_arenas
 from services.runtime.signals import exit_on_sigterm
 from services.settings import CoordinatorSettings, Settings
 from services.webhooks.sender import Sender
+from storage.database.disk_reserve import keep_reserve
 from storage.database.engine import open_engine
 from storage.objects.store import Objects
 
@@ -29,7 +31,7 @@ def serve(settings: Settings) -> None:
     Raises
     ------
     Conflict
-        If another service uses the data folder.
+        If another service uses the data folder, or it can't listen at its address.
     """
     # A coordinator alone needs none of these, and starts without them.
     import uvicorn
@@ -37,6 +39,7 @@ def serve(settings: Settings) -> None:
     from services.api.app import build_app
     from services.api.auth import require_keys_unless_loopback
     from services.api.http.browser_security import SecurityHeaders
+    from services.api.http.shutdown import Server
     from services.api.http.slow_clients import Connection, raise_file_limit
 
     raise_file_limit()
@@ -55,14 +58,14 @@ def serve(settings: Settings) -> None:
             lifespan="off",
             timeout_graceful_shutdown=GRACE,
         )
-        socket = stack.enter_context(config.bind_socket())
+        socket = stack.enter_context(bind(settings.host, settings.port))
         if settings.coordinate:
             _run_jobs(stack, settings, engine, objects)
         socket.listen()  # from here on connections are accepted, and answered soon
         host, port = socket.getsockname()[:2]
         where = settings.data if settings.alone else "jobs"
-        print(f"envmatte serves {where} at http://{host}:{port}", flush=True)
-        uvicorn.Server(config).run(sockets=[socket])
+        print(f"envmatte serves {where} at {url_of(host, port)}", flush=True)
+        Server(config).run(sockets=[socket])
 
 
 def coordinate(settings: CoordinatorSettings) -> None:
@@ -90,10 +93,11 @@ def _opened(settings: CoordinatorSettings, role: str) -> Iterator[tuple[ExitStac
     configure_logging(settings.log, settings.log_level, role)
     configure_dask()
     tracing.start(role)
-    settings.data.mkdir(parents=True, exist_ok=True)
+    make_data(settings.data)
     with ExitStack() as stack:
         if settings.alone:
             stack.enter_context(lock_data(settings.data))
         engine = open_engine(settings.database_url)
         stack.callback(engine.dispose)
+        keep_reserve(engine)
         yield stack, engine, Objects(settings.store_url)

@@ -289,6 +289,15 @@ class Settings(CoordinatorSettings):
     )
     backdrop_bytes: int = _setting(128 << 20, "Largest backdrop, in bytes, both as a file and decoded.", ge=1)
     matte_memory: int = _setting(1 << 30, "Bytes of mattes kept in memory for further composites.", ge=0)
+    request_memory: int = _setting(
+        512 << 20,
+        "Bytes that requests for frames and pixels may take together; further ones wait. Those of one owner may take "
+        "half of it.",
+        ge=64 << 20,
+    )
+    request_seconds: int = _setting(
+        300, "How long a request may compute a composite, a layer or a picture, in seconds.", ge=1
+    )
 
     @field_validator("keys", mode="before")
     @classmethod
@@ -301,7 +310,7 @@ class Settings(CoordinatorSettings):
 GROUPS = {
     "Storage": ("data", "database", "store"),
     "Cluster": ("cluster", "certs", "workers", "worker_memory", "coordinate", "attempts", "ingest_memory"),
-    "API": ("host", "port", "keys", "matte_memory"),
+    "API": ("host", "port", "keys", "matte_memory", "request_memory", "request_seconds"),
     "Limits": ("upload_bytes", "unpacked_bytes", "capture_frames", "capture_pixels", "backdrop_bytes"),
     "Quotas": ("owner_captures", "owner_jobs", "owner_bytes", "store_bytes"),
     "Retention": ("upload_seconds", "capture_seconds", "matte_seconds", "job_seconds"),

@@ -27,6 +27,11 @@ DISK_FULL = (
     "before is kept"
 )
 
+NEARLY_FULL = (
+    "the disk is full, apart from a reserve for what is under way: delete captures, mattes or uploads, or free space "
+    "on the disk, and try again; everything stored before is kept"
+)
+
 
 class EnvmatteError(Exception):
     """Base of every error that a caller can act on.

@@ -38,8 +38,11 @@ from workflows.images.decode import decode
 from workflows.images.tone_curves import from_light
 from workflows.ingest.steps import STEPS as INGEST
 from workflows.jobs import Steps, Task, run
+from workflows.mattes.lobes import rows_of
 from workflows.mattes.steps import STEPS as RECOVER
 from workflows.programs.presets import preset
+from workflows.programs.pyramid_light import lay_out
+from workflows.recovery.glare import WIDTHS, add_glare, filter_patterns, spread_patterns
 from workflows.simulation.glass_ball import backdrop, glass_ball
 from workflows.simulation.scene import write_capture
 from workflows.untrusted.limits import Limits
@@ -132,7 +135,7 @@ def _run(steps: Steps, objects: Objects, task: Task) -> None:
     run(steps, objects, task, FINISH)
 
 
-def _use(objects: Objects) -> None:
+def use_matte(objects: Objects) -> None:
     """Composite backdrops of all types with a matte, and do what else has kernels."""
     matte = _matte(objects)
     light = backdrop(*MONITOR)
@@ -143,6 +146,10 @@ def _use(objects: Objects) -> None:
         picture = composite(matte, backdrop_of(codes, "srgb"))
         encode(picture, "srgb", dtype, threads=1)
     encode_live(matte, threads=1)
+    shares = [0.01] * (len(WIDTHS) + 1)  # few captures have any glare
+    add_glare(rows_of(matte, matte.read(0, 0)), shares)
+    patterns = lay_out(preset("sketch", *MONITOR), "linear")
+    filter_patterns(patterns, spread_patterns(patterns), shares)
     places = places_of(matte, threads=1)
     composite(matte, light, rays=from_two(places, places, (1.0, 2.0), 2.0))
     file = io.BytesIO()
@@ -173,7 +180,7 @@ def _matte(objects: Objects) -> Matte:
 
 PARTS: dict[str, Callable[[Objects], None]] = {
     "the default recovery": partial(_recover, "lobes"),
-    "composites, live view and depth": _use,
+    "composites, live view and depth": use_matte,
     "the recovery of the paper": partial(_recover, "nn-dgsr"),
 }
 """What has kernels of its own, by what it is: compiled side by side, the longest first."""

@@ -12,6 +12,7 @@ from services.api.jobs import events, jobs
 from services.api.mattes import archives, clips, composites, layers, live, mattes
 from services.api.programs import pattern_files, playback, programs
 from services.api.system import cluster, health, limits, metrics, network, pages
+from services.api.work import Shares
 from services.decoding.pool import Decoders
 from services.runtime import tracing
 from services.settings import Settings
@@ -44,7 +45,9 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
         objects,
         Cache(objects, settings.matte_memory),
         Decoders(settings.backdrop_bytes),
+        Shares(settings.request_memory, settings.request_memory // 2, "request_memory"),
     )
+    app.state.checks = health.checks(engine, objects)
     errors.register(app)
     app.add_middleware(tus.Protocol)
     app.add_middleware(tracing.TracingMiddleware)

@@ -28,6 +28,8 @@ class Caller:
     scope: str
     known: bool = True
     """Whether there was a key."""
+    number: int | None = None
+    """The key's number in the database, if it is there."""
 
     def may(self, scope: str) -> bool:
         """Whether the key allows what a scope allows."""
@@ -56,7 +58,7 @@ def identify(settings: Settings, engine: Engine, key: str | None) -> Caller:
     with reading(engine) as c:
         row = api_keys.find(c, key) if key is not None else None
         if row is not None:
-            return Caller(row.owner, row.scope)
+            return Caller(row.owner, row.scope, number=row.number)
         if not settings.keys and not api_keys.any_created(c):
             return ANYONE
     raise Unauthorized("send a key of this service: `Authorization: Bearer KEY`")

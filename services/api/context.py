@@ -1,27 +1,30 @@
 """What request handlers work with: settings, database and store, bound to the owner of the request's key."""
 
+import asyncio
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Annotated
+from typing import Annotated, TypeVar
 
-from anyio import CapacityLimiter
 from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials
 from sqlalchemy import Engine
 
 from services.api.auth import ADMIN, Caller, bearer, check_method, identify, require_scope
 from services.api.http.browser_security import require_own_site
+from services.api.together import Together
+from services.api.work import Shares, run
 from services.decoding.pool import Decoders
 from services.settings import Settings
-from storage.database.owners import NOBODY, for_owner
+from storage.database.owners import for_owner
 from storage.errors import Unavailable
 from storage.objects.store import Objects
 from workflows.composite.cache import Cache
 from workflows.composite.threads import CORES
 
+T = TypeVar("T")
 KEY_CHECK = 1.0
 """Seconds between two checks of a caller's key during a download."""
 
@@ -38,21 +41,50 @@ class Context:
     """Strips of mattes."""
     decoders: Decoders
     """Processes that decode uploaded pictures."""
-    pictures: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(4))
-    """Pictures of programs drawn at once. Like the limiters below, it bounds the memory that they take."""
-    films: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(1))
+    memory: Shares
+    """Bytes that frames and pixels of mattes take while they are read and encoded."""
+    lists: Shares = field(default_factory=lambda: Shares(4, 2))
+    """Lists, captures and reports made at once: a capture's program may take 60 MB."""
+    pictures: Shares = field(default_factory=lambda: Shares(4, 3))
+    """Pictures of programs drawn at once. Like the shares below, it bounds the memory that they take."""
+    films: Shares = field(default_factory=lambda: Shares(2, 1))
     """Videos of programs encoded at once."""
-    composites: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(CORES + 1))
+    composites: Shares = field(default_factory=lambda: Shares(CORES + 1, CORES))
     """Composites computed at once: one more than there are cores."""
-    captures: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(2))
+    captures: Shares = field(default_factory=lambda: Shares(2, 1))
     """Capture archives checked at once; one may take 200 MB."""
-    imports: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(2))
+    imports: Shares = field(default_factory=lambda: Shares(2, 1))
     """Archives of mattes unpacked at once."""
-    layers: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(1))
+    layers: Shares = field(default_factory=lambda: Shares(2, 1))
     """Layers of mattes encoded at once."""
+    together: Together = field(default_factory=Together)
+    """Reads what streams of events follow."""
     caller: Caller = ADMIN
     check_key: Callable[[], object] = lambda: None
     """Checks again that the caller's key is valid, as `auth.identify` does: for requests that take long."""
+
+    async def compute(self, request: Request, shares: Shares, work: Callable[[], T], amount: int = 1) -> T:
+        """Do the work of a request in a thread, see `services.api.work.run`."""
+        return await run(request, self.caller.owner, self.settings.request_seconds, shares, work, amount)
+
+    async def follow(self, what: Hashable, read: Callable[[], T]) -> T:
+        """Read something of the owner's again, in a moment, together with what other requests follow.
+
+        Parameters
+        ----------
+        what : hashable
+            What ``read`` reads.
+
+        Raises
+        ------
+        Unauthorized
+            If the key was revoked.
+        """
+        _, found = await asyncio.gather(
+            self.together.read(self.caller.owner, self.caller, self.check_key),
+            self.together.read(self.caller.owner, what, read),
+        )
+        return found
 
     def while_allowed(self, pieces: Iterable[bytes]) -> Iterator[bytes]:
         """The pieces of a download, as long as the caller's key is valid.
@@ -109,12 +141,3 @@ def _for_admins(request: Request, context: OwnerContext) -> Context:
 
 AdminContext = Annotated[Context, Depends(_for_admins)]
 """For routes that take an admin's key: sees what belongs to any owner."""
-
-
-def _for_anyone(request: Request) -> Context:
-    context = _service_context(request)
-    return replace(context, engine=for_owner(context.engine, NOBODY))
-
-
-AnonymousContext = Annotated[Context, Depends(_for_anyone)]
-"""For routes that take no key: sees nothing that belongs to an owner."""

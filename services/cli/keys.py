@@ -23,12 +23,13 @@ SCOPES = ("read", "write", "admin")
 @contextmanager
 def _opened(given: dict[str, Any]) -> Iterator["Engine"]:
     from services.runtime import environment
+    from services.runtime.data_folder import make_data
     from storage.database.engine import open_engine
 
     found = environment.read_environment(("data", "database")) | drop_unset(given)
     data, database = Path(found.get("data", environment.DATA)), found.get("database")
     if database is None:
-        data.mkdir(parents=True, exist_ok=True)
+        make_data(data)
     try:
         engine = open_engine(environment.database_url(data, database))
     except InvalidInput as error:

@@ -11,7 +11,12 @@ from services.cli.demo import demo
 from services.cli.keys import keys
 from services.cli.output import example
 from services.client import Busy, ServiceError, Unreachable
+from services.runtime.addresses import PortTaken
 from storage.errors import EnvmatteError
+
+
+class _PortTaken(click.ClickException):
+    exit_code = 4
 
 
 class _Main(click.Group):
@@ -20,7 +25,8 @@ class _Main(click.Group):
         try:
             return super().invoke(context)
         except EnvmatteError as error:
-            raise click.ClickException(error.detail) from error
+            kind = _PortTaken if isinstance(error, PortTaken) else click.ClickException
+            raise kind(error.detail) from error
         except ValueError as error:
             from pydantic import ValidationError
 
@@ -39,7 +45,8 @@ def main() -> None:
     """Environment mattes: film glass in front of a monitor, put it in front of anything.
 
     Exit codes: 0 done; 1 the service refused, a job failed, a file can't be written, or something stored is damaged;
-    2 wrong command line; 3 the service can't be reached, or asks to try again later; 130 interrupted.
+    2 wrong command line; 3 the service can't be reached, or asks to try again later; 4 another process has the port;
+    130 interrupted.
     """
 
 

@@ -137,7 +137,7 @@ def restore(source: str, as_json: bool, **given: Any) -> None:
     """
     from urllib.request import url2pathname
 
-    from services.runtime.data_lock import lock_data
+    from services.runtime.data_folder import lock_data, make_data
     from services.settings import Settings
     from storage.database import dialects
     from storage.errors import NotFound
@@ -148,7 +148,7 @@ def restore(source: str, as_json: bool, **given: Any) -> None:
     if source.startswith("file:") and not folder.is_dir():  # opening it would create it
         raise NotFound(f"there is no folder {folder}: name the one that `envmatte backup` wrote to")
     settings = Settings(**drop_unset(given))
-    settings.data.mkdir(parents=True, exist_ok=True)
+    make_data(settings.data)
     engine = dialects.make_engine(settings.database_url)
     try:
         with lock_data(settings.data) if settings.alone else nullcontext(), _shown("restore") as progress:

@@ -52,19 +52,22 @@ class _ProcessCommand(click.Command):
 @click.option("--workers", type=int, help="Worker processes.")
 @click.option("--cluster", help="Scheduler of a cluster to use: tls://HOST:PORT.")
 @_certs
-@click.option("--database", help="Database to use: postgresql://USER:PASSWORD@HOST/NAME.")
+@click.option(
+    "--database",
+    help="Database to use: postgresql://USER@HOST/NAME. A URL with a password goes into ENVMATTE_DATABASE, because "
+    "other users can list commands.",
+)
 @click.option("--store", help="Store to use: s3://BUCKET/PREFIX or file:///FOLDER.")
 def serve(**given: Any) -> None:
     """Run the service: API and web app, with database, store and workers on this machine unless others are named."""
     from services.cluster.dask_config import configure_dask
-    from services.cluster.forkserver import DECODING, PRELOAD, start_forkserver
+    from services.cluster.forkserver import PRELOAD, start_forkserver
     from services.settings import Settings
 
     settings = Settings(**drop_unset(given))
-    starts_workers = settings.coordinate and settings.cluster is None
     configure_dask()  # which says how processes are started
-    # At the same time as this process imports the rest.
-    start_forkserver(DECODING, *([PRELOAD] if starts_workers else []))
+    if settings.coordinate and settings.cluster is None:
+        start_forkserver(PRELOAD)  # at the same time as this process imports the rest
     from services.server import serve as run
 
     run(settings)
@@ -77,7 +80,10 @@ def serve(**given: Any) -> None:
 )
 @click.option("--cluster", help="Scheduler to hand work to: tls://HOST:PORT.")
 @_certs
-@click.option("--database", help="Database that the API uses: postgresql://USER:PASSWORD@HOST/NAME.")
+@click.option(
+    "--database",
+    help="Database that the API uses: postgresql://USER@HOST/NAME. A URL with a password goes into ENVMATTE_DATABASE.",
+)
 @click.option("--store", help="Store that all processes use: s3://BUCKET/PREFIX or file:///FOLDER.")
 def coordinator(**given: Any) -> None:
     """Run a coordinator without an API. Of several, one runs the jobs, and another takes over when it dies."""

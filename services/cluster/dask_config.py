@@ -1,10 +1,12 @@
 """How dask is configured in every process of a cluster, and the arguments of its schedulers and workers."""
 
+import time
 from typing import Any
 
 import dask
-from distributed import Scheduler
+from distributed import Scheduler, batched
 from distributed.scheduler import DEFAULT_EXTENSIONS
+from tornado.ioloop import IOLoop
 
 CONFIG: dict[str, Any] = {
     # A tile of an innocent job must not be blamed for the workers that died with it: the ledger counts its losses.
@@ -63,3 +65,14 @@ SCHEDULER: dict[str, Any] = NO_DASHBOARD | {"extensions": DEFAULT_EXTENSIONS | {
 def configure_dask() -> None:
     """Configure dask in this process, before it has a client, a scheduler or a nanny; nannies pass it on to workers."""
     dask.config.set(CONFIG)
+    use_steady_clock()
+
+
+def use_steady_clock() -> None:
+    """Let the event loops of this process wait by elapsed time.
+
+    They wait until a time of day otherwise: after a clock that goes back by an hour, messages and heartbeats would stop
+    for that long.
+    """
+    IOLoop.time = lambda loop: time.monotonic()  # type: ignore[method-assign, assignment]
+    batched.time = time.monotonic  # its deadlines are for the loop

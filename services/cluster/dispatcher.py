@@ -256,6 +256,7 @@ def _worker(address: str, found: dict[str, Any]) -> dict[str, Any]:
         "threads": found["nthreads"],
         "memory_bytes": found["metrics"].get("memory", 0),
         "memory_limit_bytes": found["memory_limit"],
+        "unconfined_decoders": found["metrics"].get("unconfined_decoders"),
     }
 
 

@@ -8,6 +8,8 @@ from distributed import LocalCluster
 
 from services.cluster.dask_config import SCHEDULER
 from services.cluster.forkserver import PRELOAD, START, start_forkserver
+from services.cluster.nanny import Nanny
+from services.runtime import certificates
 from services.settings import CoordinatorSettings
 
 IDLE = 300.0
@@ -16,13 +18,19 @@ IDLE = 300.0
 
 @contextmanager
 def embedded(settings: CoordinatorSettings) -> Iterator[LocalCluster]:
-    """Start a scheduler and worker processes on loopback, and stop them on exit."""
+    """Start a scheduler and worker processes on loopback, and stop them on exit.
+
+    Any program that could talk to them could run code as this user. So they take no connection without a certificate
+    that only they have: other users of the machine can't join.
+    """
     start_forkserver(PRELOAD)
     with LocalCluster(
         n_workers=settings.workers,
         threads_per_worker=1,
         processes=True,
         host="127.0.0.1",
+        protocol="tls://",
+        security=certificates.new_security(),
         dashboard_address=None,
         scheduler_kwargs=SCHEDULER,
         local_directory=str(settings.data.resolve() / "scratch"),
@@ -30,6 +38,7 @@ def embedded(settings: CoordinatorSettings) -> Iterator[LocalCluster]:
         silence_logs=30,
         death_timeout=f"{START} s",
         preload=PRELOAD,
+        worker_class=Nanny,
     ) as cluster:
         yield cluster
 

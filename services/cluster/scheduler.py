@@ -6,12 +6,12 @@ from contextlib import asynccontextmanager
 from distributed import Scheduler
 
 from services.cluster.dask_config import SCHEDULER, configure_dask
-from services.runtime.addresses import is_loopback
+from services.runtime.addresses import cannot_listen, is_loopback
 from services.runtime.certificates import security_of
 from services.runtime.logs import configure_logging
 from services.runtime.signals import run_until_signal
 from services.settings import SchedulerSettings
-from storage.errors import Conflict, InvalidInput
+from storage.errors import InvalidInput
 
 
 def schedule(settings: SchedulerSettings, host: str, port: int) -> None:
@@ -58,7 +58,7 @@ def schedule(settings: SchedulerSettings, host: str, port: int) -> None:
         except RuntimeError as error:
             if not isinstance(error.__cause__, OSError):
                 raise
-            raise Conflict(f"can't listen on {host}, port {port}: {error.__cause__.strerror}") from error
+            raise cannot_listen(host, port, error.__cause__) from error
         print(f"envmatte schedules at {running.address}", flush=True)
         try:
             yield

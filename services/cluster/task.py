@@ -8,7 +8,7 @@ from uuid import uuid4
 
 from services.runtime import tracing
 from services.runtime.logs import about
-from storage.errors import EnvmatteError
+from storage.errors import EnvmatteError, InvalidInput
 from storage.objects.store import Objects
 from storage.steps import FINISH, PREPARE
 from workflows import jobs
@@ -47,7 +47,8 @@ def run(steps: Steps, store: str, task: Task, tile: int, trace: str | None) -> t
         try:
             seconds, result = jobs.run(steps, _objects(store), task, tile)
         except EnvmatteError as error:
-            logger.warning("failed: %s", error.detail, exc_info=True)
+            if not isinstance(error, InvalidInput):  # the caller's fault is for the job to tell
+                logger.warning("failed: %s", error.detail, exc_info=True)
             # Sent back without its cause: an error of a library may not be picklable, and would take this one with it.
             error.__cause__ = error.__context__ = None
             raise

@@ -10,12 +10,12 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from urllib.parse import urlsplit
 
-from distributed import Nanny
 from distributed.security import Security
 
 from services.cluster.connect import reach
 from services.cluster.dask_config import NO_DASHBOARD, configure_dask
 from services.cluster.forkserver import PRELOAD, START, start_forkserver
+from services.cluster.nanny import Nanny
 from services.runtime.addresses import is_loopback
 from services.runtime.logs import configure_logging
 from services.runtime.signals import run_until_signal

@@ -18,10 +18,12 @@ from tornado.ioloop import PeriodicCallback
 import workflows.composite.video.steps
 import workflows.ingest.steps
 import workflows.mattes.steps  # noqa: F401
+from services.cluster.dask_config import use_steady_clock
 from services.cluster.task import read_key
 from services.runtime import tracing
 from services.runtime.logs import about, configure_worker_logging
 from services.runtime.malloc import limit_arenas
+from workflows.untrusted import confinement
 
 logger = logging.getLogger(__name__)
 
@@ -35,10 +37,17 @@ NICE = 10
 
 def dask_setup(worker: Worker) -> None:
     """Configure this worker process, and end it when a task runs that is no longer wanted."""
+    use_steady_clock()  # before the worker's callbacks start
     os.nice(NICE)  # of this thread and the ones it starts
     limit_arenas()
     configure_worker_logging()
+    # dask logs what a task raised, and `services.cluster.task` has done so.
+    logging.getLogger("distributed.worker").addFilter(lambda record: "Compute Failed" not in str(record.msg))
     tracing.start("worker")
+    lacking = confinement.missing()
+    worker.metrics["unconfined_decoders"] = lambda _: lacking  # sent with every heartbeat
+    if lacking:
+        logger.warning("%s", lacking)
     since: dict[str, float] = {}
 
     def end_strays() -> None:

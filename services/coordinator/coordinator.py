@@ -21,11 +21,20 @@ from sqlalchemy import Connection, Engine, Row
 from services.cluster.dispatcher import Dispatcher
 from services.coordinator.job_kinds import JOB_KINDS
 from services.coordinator.job_run import JobRun, write_failure
-from services.coordinator.retention import count_bytes, delete_expired, delete_old_jobs, remove, sweep
+from services.coordinator.retention import (
+    count_bytes,
+    delete_expired,
+    delete_old_jobs,
+    remove,
+    sweep,
+    sweep_uploads,
+)
 from services.runtime.logs import about
 from services.settings import CoordinatorSettings
+from storage.database.disk_reserve import keep_reserve
 from storage.database.engine import reading, writing
 from storage.errors import EnvmatteError, GaveUp, NoRoom, Unavailable
+from storage.maintenance.inventory import GRACE_SECONDS
 from storage.objects.store import Objects
 from storage.records import jobs, leases, tiles
 from storage.records.leases import Superseded
@@ -43,7 +52,7 @@ DYING = 1.2
 AGAIN = 10.0
 """Seconds until files that could not be removed are removed again."""
 DELETE = 30.0
-"""Seconds between two searches for old jobs to delete."""
+"""Seconds between two searches for old jobs to delete, and two checks of the database's reserve."""
 SWEEP = 3600.0
 """Seconds between two sweeps of the store."""
 
@@ -79,7 +88,8 @@ class Coordinator:
 
     def __enter__(self) -> "Coordinator":
         if self._settings.alone:  # and nothing writes to the store yet
-            sweep(self._engine, self._objects, seconds=0)
+            sweep_uploads(self._engine, self._objects)
+            self._tidy_store(self._objects.clock())
         self._thread.start()
         return self
 
@@ -133,13 +143,23 @@ class Coordinator:
             self._housekeeping.submit(_logged, remove, self._objects, path)
         if now - self._deleted_at > DELETE:
             self._deleted_at = now
+            self._housekeeping.submit(_logged, keep_reserve, self._engine)
             kept = self._settings.job_seconds
             self._housekeeping.submit(_logged, delete_old_jobs, self._engine, self._objects, kept)
         if now - self._swept_at > SWEEP:
-            self._swept_at = now
-            self._housekeeping.submit(_logged, sweep, self._engine, self._objects)
-            self._housekeeping.submit(_logged, count_bytes, self._engine, self._objects)
+            self._tidy_store()
         return True
+
+    def _tidy_store(self, before: float | None = None) -> None:
+        """Sweep the store, by default of what is older than the time of grace, and count what is there."""
+        self._swept_at = time.monotonic()
+        self._housekeeping.submit(_logged, self._sweep, before)
+        self._housekeeping.submit(_logged, count_bytes, self._engine, self._objects)
+
+    def _sweep(self, before: float | None) -> None:
+        if before is None:
+            before = self._objects.clock() - GRACE_SECONDS
+        sweep(self._engine, self._objects, before)
 
     def _stand_down(self) -> None:
         """Drop all jobs: another coordinator runs them now."""
@@ -276,6 +296,7 @@ class Coordinator:
         """Remove what a cancelled job wrote, once no worker works on it."""
         with self._writing() as c:
             JOB_KINDS[row.kind].cancelled(c, row)
+            jobs.change(c, row.id, leftovers=False)
         dying = DYING if row.started_at else 0
         self._discards.append((time.monotonic() + dying, row))
 

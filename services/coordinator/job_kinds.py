@@ -10,7 +10,7 @@ from storage.layout import captures as stored_captures
 from storage.layout import composites, uploads
 from storage.layout import mattes as stored_mattes
 from storage.objects.store import Objects
-from storage.records import captures, jobs, mattes, tiles
+from storage.records import captures, jobs, mattes
 from storage.records.jobs import is_retryable
 from workflows.composite.video import steps as video_steps
 from workflows.ingest import steps as ingest_steps
@@ -54,7 +54,7 @@ class JobKind:
         """Record that a job failed."""
 
     def cancelled(self, connection: Connection, row: Row[Any]) -> None:
-        """Record that a job was cancelled, so that `jobs.cancelled_with_leftovers` does not list it any more."""
+        """Record that what a cancelled job made is removed."""
 
     def retried(self, connection: Connection, row: Row[Any]) -> None:
         """Record that a failed job is queued again.
@@ -162,7 +162,6 @@ class Composite(JobKind):
             jobs.change(connection, task.job, stored=0)
 
     def cancelled(self, connection: Connection, row: Row[Any]) -> None:
-        tiles.delete_all(connection, row.id)
         jobs.change(connection, row.id, stored=0)
 
     def retried(self, connection: Connection, row: Row[Any]) -> None:

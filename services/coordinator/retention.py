@@ -4,6 +4,7 @@ import logging
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from itertools import islice
 
 from sqlalchemy import Connection, Engine, delete, exists, select, update
 
@@ -12,21 +13,21 @@ from storage.database.engine import reading, writing
 from storage.layout import captures, composites, mattes
 from storage.layout import uploads as stored_uploads
 from storage.maintenance import inventory
-from storage.maintenance.inventory import GRACE_SECONDS
 from storage.objects.store import Objects
-from storage.records import jobs, uploads
+from storage.records import bodies, jobs, uploads
 
 logger = logging.getLogger(__name__)
 
 MOST = 1000
-"""Rows that are deleted in one transaction, while other writers wait."""
+"""Rows that are deleted in one transaction, while other writers wait, or looked up by one query."""
 
 
 def delete_expired(connection: Connection) -> list[str]:
     """Delete the rows of expired uploads, captures and mattes; returns their folders in the store.
 
-    What an active job works on is kept until the job has ended.
+    What an active job works on is kept until the job has ended. Rows of dead processes' requests are deleted too.
     """
+    bodies.delete_lapsed(connection)
     gone = [stored_uploads.path(upload) for upload in uploads.delete_expired(connection)]
     for table, making, where in (
         (tables.captures, "ingesting", (captures.path, stored_uploads.path)),
@@ -102,25 +103,32 @@ def count_bytes(engine: Engine, objects: Objects) -> None:
                 c.execute(update(table).where(*uncounted).values(stored=stored))
 
 
-def sweep(engine: Engine, objects: Objects, seconds: float = GRACE_SECONDS) -> None:
-    """Remove what has no row in the database: killed processes have left it.
+def sweep_uploads(engine: Engine, objects: Objects) -> None:
+    """Remove what killed requests have left of uploads; only while no request is under way."""
+    with writing(engine) as c:
+        bodies.delete_lapsed(c, 0)
+    objects.sweep("uploads")
+    with reading(engine) as c:
+        known = list(inventory.items(c, only="uploads"))
+    for item in known:
+        stored_uploads.sweep(objects, item.id, item.parts)
+
+
+def sweep(engine: Engine, objects: Objects, before: float) -> None:
+    """Remove what has no row in the database and was written before a time: killed processes have left it.
 
     Parameters
     ----------
-    seconds : float
-        For how long nothing was written to it. Pass 0 only if nothing can be writing.
+    before : float
+        By the store's clock, see `Objects.clock`. What was written later may be about to get a row.
     """
-    with reading(engine) as c:
-        items = list(inventory.items(c))
-    known = {item.folder for item in items}
     for folder in inventory.FOLDERS:
-        kept = {path.removeprefix(f"{folder}/") for path in known}
-        for name in objects.stale_names(folder, seconds, but={*kept, "zarr.json"}):
-            logger.info("removing %s/%s, which nothing refers to", folder, name)
-            objects.delete(f"{folder}/{name}")
-    if not seconds:
-        objects.sweep("uploads")
-        objects.sweep("composites")
-        for item in items:
-            if item.kind == "upload":
-                stored_uploads.sweep(objects, item.id, item.parts)
+        names = iter(objects.names(folder))
+        while some := list(islice(names, MOST)):
+            with reading(engine) as c:
+                strangers = set(some) - inventory.known_names(c, folder, some) - {"zarr.json"}
+            for path in (f"{folder}/{name}" for name in sorted(strangers)):
+                if objects.written_at(path) < before:
+                    logger.info("removing %s, which nothing refers to", path)
+                    objects.delete(path)
+    objects.sweep("composites", before)

@@ -1,1 +1,1 @@
-"""Decoding of untrusted pictures in child processes."""
+"""Decoding of the untrusted pictures of requests."""

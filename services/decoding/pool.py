@@ -1,19 +1,19 @@
-"""A pool of child processes that decode untrusted pictures.
+"""A pool of decoders for the pictures of requests.
 
-Decoders are native code: a hostile file may crash one, hang it, or make it use all memory. So each picture is decoded
-in a child process with limits of memory and time. If the child fails, only its own request is refused. Children are
-forked from the fork server that workers are forked from.
+If a decoder fails, only its own request is refused.
 """
 
 import logging
 import threading
 
-from services.decoding.process import ADVICE, Decoder, Refused
 from storage.errors import ImageError, Unavailable
-from workflows.images.decode import Transfer
+from workflows.images.decode import Transfer, decode_file
 from workflows.images.float_formats import Floats
 from workflows.images.integer_formats import Codes
-from workflows.untrusted import decoder_guard
+from workflows.untrusted import confinement
+from workflows.untrusted.decoder import Decoder, DecoderEnded
+from workflows.untrusted.decoder_process import ADVICE
+from workflows.untrusted.decoder_server import server
 
 logger = logging.getLogger(__name__)
 
@@ -23,7 +23,7 @@ USUAL_BYTES = 128 << 20
 
 
 class Decoders:
-    """Child processes that decode pictures: one for each concurrent request, kept for later requests.
+    """Processes that decode pictures: one for each concurrent request, kept for later requests.
 
     Parameters
     ----------
@@ -38,8 +38,11 @@ class Decoders:
         self._seconds = SECONDS * max(memory / USUAL_BYTES, 1) if seconds is None else seconds
         self._lock = threading.Lock()
         self._idle: list[Decoder] = []
-        self._children: set[Decoder] = set()
+        self._decoders: set[Decoder] = set()
         self._closed = False
+        if lacking := confinement.missing():
+            logger.warning("%s", lacking)
+        server.start()  # at the same time as the service
 
     def decode(self, data: bytes, transfer: Transfer) -> Codes | Floats:
         """Decode a picture, as `workflows.images.decode.decode` does. Any number of threads may call it.
@@ -51,62 +54,65 @@ class Decoders:
         Unavailable
             If the pool is closed.
         """
-        child = self._take()
+        decoder = self._take()
         try:
-            answer = child.ask(data, transfer, self._memory, self._seconds)
-        except BaseException as error:
-            with self._lock:
-                self._children.discard(child)
-            ended = child.end()
-            if isinstance(error, TimeoutError):
-                logger.warning("decoding a picture of %d bytes took too long", len(data))
-                raise ImageError(
-                    f"decoding the image takes more than {self._seconds:g} s: send a smaller one, or {ADVICE}"
-                ) from error
-            if isinstance(error, OSError | EOFError | ValueError):
-                logger.warning("a picture of %d bytes ended its decoder: %s, %r", len(data), ended, error)
-                raise ImageError(
-                    f"decoding the image ended the process of the decoder ({ended}): {ADVICE}"
-                ) from error
-            raise
-        with self._lock:
-            if not self._closed:
-                self._idle.append(
-                    child
-                )  # the most recently used child is taken next: its memory is still mapped
-        if isinstance(answer, Refused):
-            raise ImageError(answer.detail, **({} if answer.limit is None else {"limit": answer.limit}))
-        return answer
+            return decoder.picture(decode_file, data, transfer=transfer, memory=self._memory)
+        except MemoryError as error:
+            raise ImageError(
+                f"decoding the image takes too much memory: send a smaller one, or {ADVICE}"
+            ) from error
+        except TimeoutError as error:
+            logger.warning("decoding a picture of %d bytes took too long", len(data))
+            raise ImageError(
+                f"decoding the image takes more than {self._seconds:g} s: send a smaller one, or {ADVICE}"
+            ) from error
+        except DecoderEnded as error:
+            logger.warning(
+                "a picture of %d bytes ended its decoder: %s, %.300r", len(data), error, error.__cause__
+            )
+            raise ImageError(
+                f"decoding the image ended the process of the decoder ({error}): {ADVICE}"
+            ) from error
+        finally:
+            self._give_back(decoder)
 
     def close(self) -> None:
-        """Kill all children, also busy ones."""
+        """Kill all decoders, also busy ones."""
         with self._lock:
             self._closed = True
-            children = list(self._children)
-        for child in children:
-            child.end()
+            decoders = list(self._decoders)
+        for decoder in decoders:
+            decoder.end()
 
     def _take(self) -> Decoder:
-        """Take an idle child, or start one."""
-        while (child := self._idle_one()) is not None:
-            if child.is_waiting():
-                return child
-            logger.warning("an idle decoder has ended: %s", child.end())
-            with self._lock:
-                self._children.discard(child)
-        child = Decoder(decoder_guard.room(self._memory))
+        """Take an idle decoder, or start one."""
+        while (decoder := self._idle_one()) is not None:
+            if decoder.is_waiting():
+                return decoder
+            logger.warning("an idle decoder has ended: %s", decoder.end())
+            self._give_back(decoder)
+        decoder = Decoder(self._memory, self._seconds)
         with self._lock:
-            self._children.add(child)
-        if self._closed:  # while the child was started
-            child.end()
+            self._decoders.add(decoder)
+        if self._closed:  # while it was started
+            decoder.end()
             raise _stopping()
-        return child
+        return decoder
 
     def _idle_one(self) -> Decoder | None:
         with self._lock:
             if self._closed:
                 raise _stopping()
+            # The most recently used one: its memory is still mapped.
             return self._idle.pop() if self._idle else None
+
+    def _give_back(self, decoder: Decoder) -> None:
+        with self._lock:
+            if not decoder.has_ended and not self._closed:
+                self._idle.append(decoder)
+                return
+            self._decoders.discard(decoder)
+        decoder.end()
 
 
 def _stopping() -> Unavailable:

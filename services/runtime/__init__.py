@@ -18,6 +18,7 @@ workflows.mattes.imports.reader._document_of_one   1 each the zarr.json of an ar
 workflows.mattes.tiles.patterns_of                 1      the patterns of the last capture recovered by lobes
 workflows.mattes.tiles.program_of                  2      the program and the monitor curve of a capture
 workflows.mattes.tiles.sensing_of                  1      the sensing matrices of the last capture recovered by NN-DGSR
+workflows.untrusted.decoder_process._signs         1      in a decoder, when it last gave a sign of life
 ================================================== ====== =============================================================
 
 Besides, each `Objects` keeps the metadata of the 64 arrays it opened last, and the API and each task that composites a

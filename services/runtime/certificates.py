@@ -51,6 +51,22 @@ def make(certs: Path) -> bool:
                 f"{error.detail}. Remove them first, or name another folder"
             ) from error
         return False
+    made = _make()
+    certs.mkdir(parents=True, exist_ok=True)
+    # The key last: after an interrupt the set is incomplete, and is reported so.
+    for file in (CA, CERT, KEY):
+        _write(certs / file, made[file])
+    return True
+
+
+def new_security() -> "Security":
+    """The TLS settings of a cluster whose certificates are in memory only, and gone with this process."""
+    made = {name: data.decode() for name, data in _make().items()}
+    return _security(made[CA], made[CERT], made[KEY])
+
+
+def _make() -> dict[str, bytes]:
+    """New certificates by their files' names."""
     authority, key = ec.generate_private_key(ec.SECP256R1()), ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "envmatte cluster")])
     issued = (
@@ -81,16 +97,11 @@ def make(certs: Path) -> bool:
             critical=True,
         )
     )
-    secret = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
-    certs.mkdir(parents=True, exist_ok=True)
-    # The key last: after an interrupt the set is incomplete, and is reported so.
-    for file, data in (
-        (CA, root.sign(authority, SHA256()).public_bytes(Encoding.PEM)),
-        (CERT, issued.sign(authority, SHA256()).public_bytes(Encoding.PEM)),
-        (KEY, secret),
-    ):
-        _write(certs / file, data)
-    return True
+    return {
+        CA: root.sign(authority, SHA256()).public_bytes(Encoding.PEM),
+        CERT: issued.sign(authority, SHA256()).public_bytes(Encoding.PEM),
+        KEY: key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()),
+    }
 
 
 def security_of(certs: Path) -> "Security":
@@ -124,6 +135,11 @@ def security_of(certs: Path) -> "Security":
                 f"{one.not_valid_after_utc:%Y-%m-%d}, and today is {now:%Y-%m-%d}: check the clock, or make "
                 "new ones with `envmatte certs DIR` and copy them to every host of the cluster"
             )
+    return _security(ca, cert, key)
+
+
+def _security(ca: str, cert: str, key: str) -> "Security":
+    """The TLS settings of a member of a cluster, from files' names or from their contents."""
     from distributed.security import Security  # with all of dask, which `envmatte certs` needs nothing of
 
     return Security(

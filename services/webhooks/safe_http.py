@@ -20,8 +20,14 @@ SECONDS = 15.0
 """Time for a whole request and its answer."""
 EMBEDDING = (ipaddress.IPv6Network("64:ff9b::/96"), ipaddress.IPv6Network("::/96"))
 """Networks whose last 32 bits are an IPv4 address: NAT64 (RFC 6052) and IPv4-compatible addresses (RFC 4291)."""
-LOCAL = (ipaddress.IPv6Network("64:ff9b:1::/48"), ipaddress.IPv6Network("100::/64"))
-"""Networks that are not public (RFC 8215, RFC 6666), which not every version of Python knows."""
+LOCAL = tuple(
+    ipaddress.ip_network(network)
+    for network in ("192.0.0.0/24", "192.88.99.0/24", "64:ff9b:1::/48", "100::/64", "3fff::/20")
+)
+"""Networks that are not public (RFC 6890, RFC 7526, RFC 8215, RFC 6666, RFC 9637); Python takes some of them for
+public."""
+ISATAP = (0x00005EFE, 0x02005EFE)
+"""Bits 64 to 95 of IPv6 addresses whose last 32 bits are an IPv4 address (RFC 5214, section 6.1)."""
 
 
 class Refused(OSError):
@@ -31,17 +37,22 @@ class Refused(OSError):
 def is_public(address: str) -> bool:
     """Whether an address is public: not private, loopback, link-local, multicast or reserved.
 
-    An IPv6 address that embeds an IPv4 address (mapped, 6to4, NAT64) is public if that address is.
+    An IPv6 address that embeds an IPv4 address (mapped, 6to4, NAT64) is public if that address is; one that leads
+    through a tunnel to an IPv4 address (ISATAP) only if both are.
     """
     ip = ipaddress.ip_address(address)
     if isinstance(ip, ipaddress.IPv6Address):
         embedded = ip.ipv4_mapped or ip.sixtofour
+        last = ipaddress.IPv4Address(int(ip) & 0xFFFFFFFF)
         if embedded is None and any(ip in network for network in EMBEDDING):
-            embedded = ipaddress.IPv4Address(int(ip) & 0xFFFFFFFF)
+            embedded = last
         if embedded is not None:
             return is_public(str(embedded))
-        if ip.is_site_local or any(ip in network for network in LOCAL):
+        is_tunnel = int(ip) >> 32 & 0xFFFFFFFF in ISATAP
+        if ip.is_site_local or (is_tunnel and not is_public(str(last))):
             return False
+    if any(ip in network for network in LOCAL):
+        return False
     return ip.is_global and not (ip.is_multicast or ip.is_reserved)
 
 

@@ -3,6 +3,8 @@
 import logging
 import sqlite3
 import time
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from sqlalchemy import URL, Connection, Engine, Float, create_engine, event, make_url
@@ -77,6 +79,7 @@ def make_engine(url: str) -> Engine:
     if name == "sqlite":
         engine = create_engine(parsed)
         event.listen(engine, "connect", _set_up_sqlite)
+        event.listen(engine, "connect", _make_private)
     elif name == "postgresql":
         engine = create_engine(
             parsed.set(drivername="postgresql+psycopg"),
@@ -110,6 +113,19 @@ def _set_up_sqlite(connection: Any, record: object) -> None:
                 raise
             time.sleep(0.01)
     cursor.close()
+
+
+def _make_private(connection: Any, record: object) -> None:
+    """Take others' rights to the files of a SQLite database: they hold hashes of keys and the URLs of webhooks.
+
+    SQLite gives the write-ahead log the rights of the database, but an old one may lie there.
+    """
+    file = connection.execute("PRAGMA database_list").fetchone()[2]
+    for path in (Path(file + end) for end in ("", "-wal", "-shm") if file):
+        with suppress(FileNotFoundError, PermissionError):  # it is another user's
+            mode = path.stat().st_mode
+            if mode & 0o077:
+                path.chmod(mode & 0o7700)
 
 
 def _set_up_postgresql(connection: Any, record: object) -> None:

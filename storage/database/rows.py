@@ -1,13 +1,17 @@
 """Rows of tables that have ids: new ids, lookup by id, and pages."""
 
+import json
 import secrets
 import time
-from collections.abc import Sequence
+from collections.abc import Container, Iterator
 from typing import Any
 
 from sqlalchemy import Connection, Row, Table, select
 
 from storage.errors import NotFound
+
+ROW = 1000
+"""Bytes that a row of a capture, matte, job or upload takes, with what an attempt at a job logs."""
 
 
 def new_id() -> str:
@@ -19,6 +23,11 @@ def lifetime(seconds: float | None) -> dict[str, float | None]:
     """``created_at`` and ``expires_at`` of a row created now; it never expires if `seconds` is None."""
     now = time.time()
     return {"created_at": now, "expires_at": None if seconds is None else now + seconds}
+
+
+def json_bytes(document: Any) -> int:
+    """Bytes that a document takes in a row: users choose how large some are, so they count as stored."""
+    return len(json.dumps(document))
 
 
 def find(connection: Connection, table: Table, id: str) -> Row[Any]:
@@ -37,14 +46,21 @@ def find(connection: Connection, table: Table, id: str) -> Row[Any]:
 
 
 def page(
-    connection: Connection, table: Table, limit: int, after: str | None, **equal: str | None
-) -> Sequence[Row[Any]]:
+    connection: Connection,
+    table: Table,
+    limit: int,
+    after: str | None,
+    without: Container[str] = (),
+    **equal: str | None,
+) -> Iterator[Row[Any]]:
     """One page of a table's rows, newest first; the table has the columns ``id`` and ``number``.
 
     Parameters
     ----------
     after : str, optional
         The id of the last row of the previous page.
+    without : container of str
+        Columns that are not read.
     **equal : str or None
         Values that columns must have; None matches any value.
 
@@ -53,7 +69,8 @@ def page(
     NotFound
         If there is no row with the id ``after``.
     """
-    query = select(table).order_by(table.c.number.desc()).limit(limit)
+    columns = [column for column in table.c if column.name not in without]
+    query = select(*columns).order_by(table.c.number.desc()).limit(limit)
     for column, value in equal.items():
         if value is not None:
             query = query.where(table.c[column] == value)
@@ -65,4 +82,5 @@ def page(
                 field="after",
             )
         query = query.where(table.c.number < number)
-    return connection.execute(query).all()
+    # Few rows are in memory at a time: a program takes up to a megabyte once it is read.
+    return iter(connection.execute(query.execution_options(yield_per=20)))

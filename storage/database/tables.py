@@ -3,6 +3,7 @@
 from sqlalchemy import (
     JSON,
     BigInteger,
+    Boolean,
     Column,
     Float,
     ForeignKey,
@@ -13,6 +14,7 @@ from sqlalchemy import (
     Table,
     Text,
     UniqueConstraint,
+    false,
 )
 
 from storage.database import owners
@@ -49,7 +51,12 @@ captures = Table(
     _owner(),
     Column("expires_at", Float, index=True),
     Column("stored", BigInteger),  # bytes in the store; null until counted
+    Column(
+        "row_bytes", BigInteger, nullable=False, server_default="0"
+    ),  # of the program, see `rows.json_bytes`
     Index("captures_by_owner", "owner", "number"),
+    Index("captures_by_state", "state", "bytes"),
+    Index("captures_by_size", "stored", "state", "owner", "bytes", "row_bytes"),
 )
 
 mattes = Table(
@@ -67,6 +74,8 @@ mattes = Table(
     Column("expires_at", Float, index=True),
     Column("stored", BigInteger),  # as for a capture
     Index("mattes_by_owner", "owner", "number"),
+    Index("mattes_by_state", "state"),
+    Index("mattes_by_size", "stored", "state", "owner"),
 )
 
 programs = Table(
@@ -88,7 +97,7 @@ jobs = Table(
     Column("number", Integer, primary_key=True, autoincrement=True),
     Column("id", String(32), nullable=False, unique=True),
     Column("kind", String(16), nullable=False),
-    Column("state", String(16), nullable=False, index=True),
+    Column("state", String(16), nullable=False),
     Column("stage", String(16), nullable=False),
     Column("capture", String(32), nullable=False),  # empty for a composite of an imported matte
     Column("matte", String(32)),
@@ -111,7 +120,14 @@ jobs = Table(
     Column("stored", BigInteger),  # bytes in the store, of a composite
     Index("jobs_by_owner", "owner", "number"),
     Column("webhook", Text),  # URL to notify when the job has ended
+    Column("row_bytes", BigInteger, nullable=False, server_default="0"),  # of the plan
+    Column("leftovers", Boolean, nullable=False, server_default=false()),  # see `storage.records.jobs.end`
+    Index("jobs_by_state", "state", "leftovers"),
+    Index("jobs_by_owner_and_state", "owner", "state", "number"),
+    Index("jobs_by_kind", "kind", "state", "stored", "total", "done", "failed"),
+    Index("jobs_by_size", "owner", "stored", "row_bytes", "total"),
 )
+"""Its sums are read from indexes alone, as there may be millions of jobs."""
 
 tiles = Table(
     "tiles",
@@ -170,8 +186,25 @@ uploads = Table(
     Column("created_at", Float, nullable=False),
     Column("expires_at", Float, nullable=False, index=True),
     _owner(),
+    Column("moved_at", Float, nullable=False, server_default="0"),  # when it was created, or bytes last came
     UniqueConstraint("owner", "key"),
 )
+
+bodies = Table(
+    "bodies",
+    metadata,
+    Column("id", String(32), primary_key=True),
+    Column(
+        "upload", ForeignKey("uploads.id", ondelete="CASCADE"), unique=True
+    ),  # null for one outside of uploads
+    Column("length", BigInteger, nullable=False),  # bytes that are expected at least
+    Column("bytes", BigInteger, nullable=False),  # of these, reserved
+    Column("stored", BigInteger, nullable=False),  # of these, on the disk when the row was last renewed
+    Column("renewed_at", Float, nullable=False),
+    Column("wanted_at", Float),  # when another request asked for the upload
+    _owner(),
+)
+"""Bodies of requests under way, and the bytes reserved for each. See `storage.records.bodies`."""
 
 upload_parts = Table(
     "upload_parts",

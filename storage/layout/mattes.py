@@ -138,6 +138,16 @@ class Matte:
         # ``count`` is written last: a block with counts is complete.
         gather(write("count"))
 
+    def counts(self, row: int, column: int) -> NDArray[np.uint32]:
+        """The counts of a block, (h, w, 3): what reading all of it takes.
+
+        Raises
+        ------
+        Corrupt
+            If they are missing or damaged.
+        """
+        return np.asarray(self._frames["count"][self.span(row, column)])
+
     def read(self, row: int, column: int) -> Block:
         """Read a block.
 

@@ -1,6 +1,6 @@
 """What the store should hold according to the database: for clean-up, verification and backups."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -10,8 +10,13 @@ from storage.database.tables import metadata
 from storage.layout import captures, composites, mattes, uploads
 from storage.records.jobs import is_retryable
 
-FOLDERS = ("captures", "mattes", "uploads", "composites")
-"""The top folders of the store."""
+FOLDERS = {
+    "captures": ("captures",),
+    "mattes": ("mattes",),
+    "uploads": ("uploads", "captures"),
+    "composites": ("jobs",),
+}
+"""The top folders of the store, and the tables whose rows have items in each."""
 GRACE_SECONDS = 3600.0
 """Seconds for which objects without a row are left alone: their row may be about to be added."""
 COLUMNS = {
@@ -50,14 +55,39 @@ class Item:
     parts: tuple[str, ...] = ()
 
 
-def items(connection: Connection, tables: Mapping[str, Table] = metadata.tables) -> Iterator[Item]:
-    """All items according to the database."""
-    for name, columns in COLUMNS.items():
-        query = select(*(tables[name].c[column] for column in columns))
+def items(
+    connection: Connection,
+    tables: Mapping[str, Table] = metadata.tables,
+    *,
+    only: str | None = None,
+    ids: Collection[str] | None = None,
+) -> Iterator[Item]:
+    """Items according to the database.
+
+    Parameters
+    ----------
+    tables : mapping of str to Table
+        The tables of the database, which may have an earlier revision.
+    only : str, optional
+        The table whose rows are read; all by default.
+    ids : collection of str, optional
+        The ids of the rows that are read; all by default.
+    """
+    for name in [only] if only else COLUMNS:
+        table = tables[name]
+        query = select(*(table.c[column] for column in COLUMNS[name]))
         if name == "jobs":
-            query = query.where(tables[name].c.kind == "composite")
+            query = query.where(table.c.kind == "composite")
+        if ids is not None:
+            query = query.where(table.c.id.in_(ids))
         for row in connection.execute(query).mappings():
             yield from items_of_row(connection, tables, name, dict(row))
+
+
+def known_names(connection: Connection, folder: str, names: Collection[str]) -> set[str]:
+    """Those of some names in a top folder that belong to an item."""
+    found = {item.folder for table in FOLDERS[folder] for item in items(connection, only=table, ids=names)}
+    return {name for name in names if f"{folder}/{name}" in found}
 
 
 def family_of(table: str, row: Mapping[str, Any]) -> str | None:

@@ -1,16 +1,33 @@
 """The rows of a database of any revision as lines of JSON, for backups.
 
 A line is a list of two: the name of a table, and a row as an object. The coordinator's lease is left out, because it
-means nothing to the restored installation, and so are webhook deliveries, because the original service makes them.
+means nothing to the restored installation, and so are the requests under way, and webhook deliveries, because the
+original service makes them.
 """
 
 import json
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import groupby, islice
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import JSON, Connection, Engine, MetaData, Table, func, insert, inspect, or_, select
+from sqlalchemy import (
+    JSON,
+    Boolean,
+    Column,
+    Connection,
+    Engine,
+    Float,
+    Integer,
+    MetaData,
+    Table,
+    func,
+    insert,
+    inspect,
+    or_,
+    select,
+)
 
 from storage.database import dialects, migrations
 from storage.database.engine import reading
@@ -18,9 +35,22 @@ from storage.database.revision import revision
 from storage.database.tables import metadata
 from storage.errors import Conflict, InvalidInput
 
-SKIPPED = ("coordinator", "deliveries")
+SKIPPED = ("coordinator", "deliveries", "bodies")
 BATCH = 500
 """Rows in memory at a time."""
+ID = re.compile("[A-Za-z0-9_-]{1,64}")
+"""Ids become names of folders in the store, so none may lead out of it."""
+IDS = ("id", "capture", "matte", "job", "upload")
+CHOICES = {
+    "captures.state": ("ingesting", "ready", "failed"),
+    "mattes.state": ("recovering", "ready", "failed"),
+    "jobs.kind": ("ingest", "recover", "composite"),
+    "jobs.state": ("queued", "running", "succeeded", "failed", "cancelled"),
+    "tiles.state": ("queued", "done", "missing", "failed"),
+}
+"""The values of columns that the code takes to have no others."""
+LATEST = 253402300799
+"""The end of the year 9999 in seconds since 1970: later times can't be shown."""
 Line = tuple[str, Mapping[str, Any]]
 
 
@@ -131,6 +161,11 @@ def insert_lines(connection: Connection, source: Iterable[bytes]) -> int:
             for row in some:
                 if row.keys() != set(table.columns.keys()):
                     raise InvalidInput(f"the backup's ledger has a row of {name} with unexpected columns")
+                for column in table.columns:
+                    if not _is_valid(column, row[column.name]):
+                        raise InvalidInput(
+                            f"the backup's ledger has a row of {name} with an invalid {column.name}"
+                        )
                 if name == "jobs" and row["state"] == "running":
                     row |= {"state": "queued", "stage": "waiting"}
             connection.execute(insert(table), some)
@@ -138,10 +173,28 @@ def insert_lines(connection: Connection, source: Iterable[bytes]) -> int:
     return read
 
 
+def _is_valid(column: Column[Any], value: Any) -> bool:
+    """Whether a column may have a value. SQLite would take any, and the service would stumble over it."""
+    name, kind = f"{column.table.name}.{column.name}", column.type
+    if value is None:
+        return bool(column.nullable)
+    if column.name in IDS or name == "upload_parts.name":
+        return isinstance(value, str) and bool(ID.fullmatch(value) or (name, value) == ("jobs.capture", ""))
+    if name in CHOICES:
+        return value in CHOICES[name]
+    if isinstance(kind, Boolean):
+        return isinstance(value, bool)
+    if isinstance(kind, Integer):
+        return type(value) is int and abs(value) < 1 << 63
+    if isinstance(kind, Float):
+        return type(value) in (int, float) and 0 <= value <= LATEST
+    return isinstance(kind, JSON) or isinstance(value, str)
+
+
 def _loaded(line: bytes) -> tuple[str, dict[str, Any]]:
     try:
         name, row = json.loads(line)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InvalidInput("the backup's ledger has a line that is not a row") from error
     if not (isinstance(name, str) and isinstance(row, dict)):
         raise InvalidInput("the backup's ledger has a line that is not a row")

@@ -81,11 +81,10 @@ def _items(engine: Engine) -> list[Item]:
 def _unexpected(objects: Objects, items: list[Item]) -> list[Finding]:
     """Objects without a row that have not changed for a while; newer ones may be about to get a row."""
     known = {item.folder for item in items}
+    before = objects.clock() - GRACE_SECONDS
     remedy = "no row refers to it; a running service removes it within an hour"
     return [
-        Finding("unexpected", f"{folder}/{name}", remedy)
-        for folder in FOLDERS
-        for name in objects.stale_names(
-            folder, GRACE_SECONDS, but={"zarr.json", *(path.removeprefix(f"{folder}/") for path in known)}
-        )
+        Finding("unexpected", path, remedy)
+        for path in (f"{folder}/{name}" for folder in FOLDERS for name in objects.names(folder))
+        if path not in known and not path.endswith("/zarr.json") and objects.written_at(path) < before
     ]

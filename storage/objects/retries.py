@@ -32,13 +32,25 @@ UNREACHABLE = re.compile(r"HTTP error|status code: (429|5\d\d)|error sending req
 
 @contextmanager
 def translate_errors() -> Iterator[None]:
-    """Translate errors of obstore, which have neither number nor specific class, to `NoRoom` and `Unavailable`."""
+    """Translate errors of obstore, which have neither number nor specific class.
+
+    Raises
+    ------
+    NoRoom
+        If the disk is full.
+    FileNotFoundError
+        If the folder of an object is removed while it is written.
+    Unavailable
+        If a bucket does not answer.
+    """
     try:
         yield
     except (BaseError, OSError) as error:
         message = str(error).partition("\n")[0]
         if any(f"(os error {number})" in str(error) for number in (errno.ENOSPC, errno.EDQUOT)):
             raise NoRoom(DISK_FULL) from error
+        if f"(os error {errno.ENOENT})" in str(error):
+            raise FileNotFoundError(errno.ENOENT, message) from error
         if message.startswith("Generic S3 error") and UNREACHABLE.search(message):
             raise Unavailable(
                 f"the store cannot be reached; try again later ({message.rpartition(' - ')[2].strip(': ')})"

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import io
+import secrets
 import shutil
 import threading
-import time
 from contextlib import asynccontextmanager, contextmanager, suppress
 from functools import cache, lru_cache, partial
 from pathlib import Path
@@ -23,13 +24,20 @@ from zarr.buffer import default_buffer_prototype
 from zarr.storage import MemoryStore, StorePath
 from zarr.storage import ObjectStore as ZarrStore
 
+from storage import disks
 from storage.objects import byte_objects, checksums, zarr_store
 from storage.objects.byte_objects import PART, Writer
 from storage.objects.checksums import SUFFIX
 from storage.objects.retries import REQUESTS, RETRIES, translate_errors
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Collection, Coroutine, Iterable, Iterator
+    from collections.abc import AsyncIterator, Coroutine, Iterable, Iterator
+
+
+TRIES = 20
+"""How often a folder is removed that others write into meanwhile, as the live form of a matte that is being viewed."""
+CROSSED = (errno.ENOENT, errno.ENOTEMPTY, errno.EISDIR)
+"""Errors of a removal that others have crossed."""
 
 
 def gather(*work: Coroutine[Any, Any, Any]) -> list[Any]:
@@ -272,25 +280,17 @@ class Objects:
                 meta["path"]: meta["size"] for batch in obstore.list(self._store, folder) for meta in batch
             }
 
-    def stale_names(self, folder: str, seconds: float, but: Collection[str] = ()) -> list[str]:
-        """Names of what lies directly in a folder and has not changed for some time, for clean-up.
+    def clock(self) -> float:
+        """The time by the clock that dates objects of this store; a bucket's has whole seconds."""
+        probe = f"clock-{secrets.token_hex(8)}"
+        with translate_errors():
+            obstore.put(self._store, probe, b"")
+        try:
+            return self.written_at(probe)
+        finally:
+            self.delete(probe)
 
-        Parameters
-        ----------
-        seconds : float
-            How long no object of it was written, or removed from a local folder: from the time by the store's clock
-            to now by this machine's clock.
-        but : collection of str
-            Names to skip.
-        """
-        end = time.time() - seconds
-        return [
-            name
-            for name in self.names(folder)
-            if name not in but and self._written_at(f"{folder}/{name}") < end
-        ]
-
-    def _written_at(self, path: str) -> float:
+    def written_at(self, path: str) -> float:
         """When the newest object at or below a path was written; infinity if there is none any more."""
         if self._folder is not None:  # unfinished files (see `sweep`) and folders count too
             newest = -np.inf
@@ -309,11 +309,8 @@ class Objects:
         """Remove an object, or everything below a folder; it is not an error if there is nothing."""
         if self._folder is not None:  # with its folders and unfinished files, see `sweep`
             target = self._folder / path
-            if target.is_dir():
-                shutil.rmtree(target)
-            else:
-                target.unlink(missing_ok=True)
-                target.with_name(target.name + SUFFIX).unlink(missing_ok=True)
+            _remove(target)
+            _remove(target.with_name(target.name + SUFFIX))
             return
         with translate_errors():
             obstore.delete(
@@ -322,21 +319,53 @@ class Objects:
             for batch in obstore.list(self._store, path, chunk_size=500):
                 obstore.delete(self._store, [meta["path"] for meta in batch])
 
-    def sweep(self, path: str) -> None:
-        """Remove what killed writers have left below a folder that no process writes to.
+    def sweep(self, path: str, before: float = np.inf) -> None:
+        """Remove what killed writers have left below a folder, if it was written before a time by the store's clock.
 
         In a local folder, an object is first written to a file with ``#`` in its name and then renamed. A bucket has no
         such objects; incomplete multipart uploads are removed by a lifecycle rule of the bucket.
         """
         if self._folder is not None:
             for part in (self._folder / path).rglob("*#*"):
-                part.unlink()
+                with suppress(FileNotFoundError):
+                    if part.stat().st_mtime < before:
+                        part.unlink()
 
     def free_bytes(self) -> int | None:
         """Free bytes on the disk of a folder; None for a bucket, which has no limit."""
         return shutil.disk_usage(self._folder).free if self._folder is not None else None
 
+    def spare_bytes(self) -> int | None:
+        """Bytes that uploads may still take of the disk of a folder, see `storage.disks`; None for a bucket."""
+        return disks.spare_bytes(self._folder) if self._folder is not None else None
+
+    def require_reserve(self) -> None:
+        """Check that the disk of a folder has room for jobs, see `storage.disks`.
+
+        Raises
+        ------
+        NoRoom
+        """
+        if self._folder is not None:
+            disks.require_reserve(self._folder)
+
     def check_reachable(self) -> None:
         """Send the store one request, which raises an error if the store cannot be reached."""
         with translate_errors():
             obstore.list_with_delimiter(self._store, None)
+
+
+def _remove(path: Path) -> None:
+    """Remove a file, or a folder with everything in it, also if others write into it or remove it meanwhile."""
+    for _ in range(TRIES):
+        try:
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+        except OSError as error:
+            if error.errno not in CROSSED:
+                raise
+        if not path.exists():
+            return
+    raise OSError(errno.ENOTEMPTY, "objects are written faster than they can be removed", str(path))

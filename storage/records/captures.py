@@ -4,7 +4,7 @@ from typing import Any
 
 from sqlalchemy import Connection, Row, insert, select, update
 
-from storage.database.rows import find, lifetime
+from storage.database.rows import find, json_bytes, lifetime
 from storage.database.tables import captures
 
 
@@ -13,6 +13,7 @@ def add(
 ) -> None:
     """Add a capture that is being ingested by a job; it expires after `seconds`, or never if that is None."""
     row = {"id": capture, "state": "ingesting", "job": job, **lifetime(seconds), **record}
+    row["row_bytes"] = json_bytes(row["program"])
     connection.execute(insert(captures).values(row))
 
 

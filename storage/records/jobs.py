@@ -9,10 +9,10 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import Connection, Row, exists, func, insert, or_, select, update
+from sqlalchemy import Connection, Row, func, insert, select, update
 
-from storage.database.rows import find, new_id
-from storage.database.tables import captures, jobs, mattes, tiles
+from storage.database.rows import ROW, find, new_id
+from storage.database.tables import jobs, tiles
 from storage.errors import Conflict
 from storage.records import job_log, webhook_deliveries
 
@@ -88,19 +88,8 @@ def is_retryable(problem: dict[str, Any]) -> bool:
 
 
 def cancelled_with_leftovers(connection: Connection) -> Sequence[Row[Any]]:
-    """Cancelled jobs that have left something in the store: an unfinished matte, capture or composite."""
-    # A composite has no record besides its job: it has leftovers while it has tiles, see `tiles.delete_all`.
-    left = (jobs.c.kind == "composite") & exists().where(tiles.c.job == jobs.c.id)
-    query = (
-        select(jobs)
-        .outerjoin(mattes, mattes.c.job == jobs.c.id)
-        .outerjoin(captures, captures.c.job == jobs.c.id)
-        .where(
-            jobs.c.state == "cancelled",
-            or_(mattes.c.state == "recovering", captures.c.state == "ingesting", left),
-        )
-    )
-    return connection.execute(query).all()
+    """Cancelled jobs whose unfinished capture, matte or composite is still to be removed."""
+    return connection.execute(select(jobs).where(jobs.c.state == "cancelled", jobs.c.leftovers)).all()
 
 
 def change(connection: Connection, job: str, **values: Any) -> None:
@@ -121,12 +110,13 @@ def enter_stage(connection: Connection, job: str, stage: str) -> bool:
 
 
 def end(connection: Connection, job: str, state: str, problem: dict[str, Any] | None = None) -> bool:
-    """End an active job and queue its webhook; returns false and changes nothing if it has already ended."""
-    result = connection.execute(
-        update(jobs)
-        .where(jobs.c.id == job, jobs.c.state.in_(ACTIVE))
-        .values(state=state, stage=state, problem=problem, finished_at=time.time())
-    )
+    """End an active job and queue its webhook; returns false and changes nothing if it has already ended.
+
+    A cancelled job has leftovers until the coordinator has removed what it made.
+    """
+    values = {"state": state, "stage": state, "problem": problem, "finished_at": time.time()}
+    values["leftovers"] = state == "cancelled"
+    result = connection.execute(update(jobs).where(jobs.c.id == job, jobs.c.state.in_(ACTIVE)).values(values))
     if result.rowcount:
         job_log.add(connection, job, f"{state}: {problem['detail']}" if problem else state)
         row = get(connection, job)
@@ -172,7 +162,7 @@ def retry(connection: Connection, job: str, *, replan: bool = False, trace: str 
         raise Conflict(f"job {job} is {row.state}; only a failed job can be retried")
     if replan:
         connection.execute(tiles.delete().where(tiles.c.job == job))
-        nothing = {"plan": None, "total": 0, "pixels": 0}
+        nothing = {"plan": None, "total": 0, "pixels": 0, "row_bytes": 0}
         connection.execute(update(jobs).where(jobs.c.id == job).values(nothing))
     connection.execute(
         update(tiles)
@@ -182,6 +172,7 @@ def retry(connection: Connection, job: str, *, replan: bool = False, trace: str 
     done = (tiles.c.job == job, tiles.c.tile >= 0, tiles.c.state == "done")
     values = {"state": "queued", "stage": "waiting", "failed": 0, "problem": None, "finished_at": None}
     values["trace"] = trace or row.trace
+    values["row_bytes"] = jobs.c.row_bytes + ROW  # the log goes on
     values["done"] = connection.scalar(select(func.count()).where(*done))
     connection.execute(update(jobs).where(jobs.c.id == job).values(values))
     job_log.add(connection, job, "queued again")

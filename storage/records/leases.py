@@ -3,7 +3,8 @@
 The lease is a row of the database with a token that grows by one whenever it changes hands. A coordinator renews the
 lease with each heartbeat and checks the token first in every transaction that writes. A coordinator that was frozen or
 cut off while another took over finds a different token, and nothing that it writes is committed. Times are by the
-database's clock, so the clocks of hosts may differ.
+database's clock, so the clocks of hosts may differ. If that clock jumps, another coordinator may take over early, but
+never late: a lease that ends in more than `SECONDS` was written before the clock went back.
 """
 
 from dataclasses import dataclass
@@ -31,7 +32,7 @@ class Heartbeat:
     holder : str or None
         The process that sent it; None if it has released the lease.
     seconds : float
-        Its age.
+        Its age; for a moment more if the clock has jumped.
     cluster : dict
         The cluster as the coordinator saw it: ``workers``, and ``problem``, a text or None.
     """
@@ -60,7 +61,7 @@ def acquire(connection: Connection, holder: str, *, seize: bool = False) -> int 
         values = {"id": 1, "token": 1, "holder": holder, "cluster": EMPTY_CLUSTER}
         connection.execute(insert(coordinator).values(beat_at=now, expires_at=now + SECONDS, **values))
         return 1
-    if row.holder is not None and row.expires_at > row.now and not seize:
+    if row.holder is not None and 0 < row.expires_at - row.now < 2 * SECONDS and not seize:
         return None
     values = {"token": row.token + 1, "holder": holder, "cluster": EMPTY_CLUSTER}
     connection.execute(update(coordinator).values(beat_at=row.now, expires_at=row.now + SECONDS, **values))
@@ -97,12 +98,7 @@ def release(connection: Connection, token: int) -> None:
     connection.execute(update(coordinator).where(coordinator.c.token == token).values(holder=None))
 
 
-def check_writable(connection: Connection) -> None:
-    """Check that the database accepts writes, without changing anything."""
-    connection.execute(update(coordinator).values(token=coordinator.c.token))
-
-
 def last_heartbeat(connection: Connection) -> Heartbeat | None:
     """The last heartbeat of a coordinator; None if there never was one."""
     row = connection.execute(select(coordinator, clock().label("now"))).one_or_none()
-    return None if row is None else Heartbeat(row.holder, row.now - row.beat_at, row.cluster)
+    return None if row is None else Heartbeat(row.holder, abs(row.now - row.beat_at), row.cluster)

@@ -10,19 +10,15 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import Column, Connection, bindparam, delete, insert, select, update
+from sqlalchemy import Column, Connection, bindparam, insert, select, update
 
+from storage.database.rows import json_bytes
 from storage.database.tables import jobs, tiles, totals
 from storage.records import job_log
 from storage.records.jobs import get
 from storage.steps import FINISH, PREPARE, step_name
 
 REMAINING = ("queued", "missing")
-
-
-def delete_all(connection: Connection, job: str) -> None:
-    """Delete the tiles of a cancelled job; the job itself keeps its totals."""
-    connection.execute(delete(tiles).where(tiles.c.job == job))
 
 
 def add_steps(connection: Connection, job: str) -> None:
@@ -38,7 +34,11 @@ def add_plan(connection: Connection, job: str, plan: dict[str, Any]) -> None:
     if get(connection, job).plan is not None:
         return
     connection.execute(insert(tiles), [_tile(job, tile) for tile in range(plan["tiles"])])
-    connection.execute(update(jobs).where(jobs.c.id == job).values(plan=plan, total=plan["tiles"]))
+    connection.execute(
+        update(jobs)
+        .where(jobs.c.id == job)
+        .values(plan=plan, total=plan["tiles"], row_bytes=json_bytes(plan))
+    )
 
 
 def _tile(job: str, tile: int) -> dict[str, Any]:

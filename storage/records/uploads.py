@@ -5,18 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from itertools import accumulate
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from sqlalchemy import Connection, Row, func, insert, select, update
+from sqlalchemy import Connection, Row, insert, select, update
 
-from storage.database.owners import across_owners
 from storage.database.tables import upload_parts as table
 from storage.database.tables import uploads
-from storage.errors import Conflict, NoRoom, NotFound
+from storage.errors import Conflict, NotFound
 from storage.layout.uploads import Part
-
-if TYPE_CHECKING:
-    from storage.objects.store import Objects
 
 MAX_PARTS = 10_000
 """Most parts of an upload: keeps its index below a megabyte."""
@@ -40,7 +36,8 @@ def add(
     """
     now = time.time()
     row = {"id": upload, "key": key, "offset": 0, "parts": 0, "length": length, "metadata": metadata}
-    connection.execute(insert(uploads).values(row | {"created_at": now, "expires_at": now + seconds}))
+    times = {"created_at": now, "moved_at": now, "expires_at": now + seconds}
+    connection.execute(insert(uploads).values(row | times))
 
 
 def get(connection: Connection, upload: str) -> Row[Any]:
@@ -119,23 +116,3 @@ def delete_expired(connection: Connection) -> list[str]:
     """Delete the rows of expired uploads; returns their ids."""
     query = uploads.delete().where(uploads.c.expires_at <= time.time()).returning(uploads.c.id)
     return list(connection.scalars(query))
-
-
-def check_room(connection: Connection, objects: Objects, length: int) -> None:
-    """Check that the store has room for more bytes, in addition to those that unfinished uploads still need.
-
-    Raises
-    ------
-    NoRoom
-    """
-    free = objects.free_bytes()
-    if free is None:
-        return
-    promised = connection.scalar(across_owners(select(func.sum(uploads.c.length - uploads.c.offset)))) or 0
-    missing = length + int(promised) - free
-    if missing > 0:
-        raise NoRoom(
-            f"the store has no room for {length} bytes: {free} bytes are free, of which unfinished uploads need "
-            f"{promised}. Delete captures, mattes or uploads, or free {missing} bytes on the disk",
-            missing=missing,
-        )

@@ -204,6 +204,7 @@ def test_matte_is_downloaded_and_deleted_items_are_gone(
         assert service.http.get(f"/v1/{kind}/{id}").status_code == 404
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_expiry_dates_are_shown(
     browser: Browser, tab: Page, service: Service, ready: tuple[str, str], ball: Path, tmp_path: Path

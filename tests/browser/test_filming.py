@@ -32,11 +32,11 @@ def test_preset_is_fitted_to_the_screen(desk: Page, service: Service) -> None:
     expect(desk.get_by_role("alert")).to_be_visible()
     desk.get_by_label("Height").fill("800")
     desk.get_by_role("button", name="Continue").click()
-    expect(desk.get_by_role("heading", name="32 patterns on a screen of 1200 × 800")).to_be_visible()
+    expect(desk.get_by_role("heading", name="37 patterns on a screen of 1200 × 800")).to_be_visible()
     made = service.http.get(f"/v1/programs/{desk.url.rpartition('/')[2]}").json()
-    assert (made["patterns"], made["display"]) == (32, {"width": 1200, "height": 800})
+    assert (made["patterns"], made["display"]) == (37, {"width": 1200, "height": 800})
     desk.get_by_role("link", name="Filming").click()
-    expect(desk.get_by_role("link", name="32 patterns on a screen of 1200 × 800").first).to_be_visible()
+    expect(desk.get_by_role("link", name="37 patterns on a screen of 1200 × 800").first).to_be_visible()
 
 
 def test_program_is_followed_and_recorded(browser: Browser, desk: Page, service: Service) -> None:
@@ -48,9 +48,9 @@ def test_program_is_followed_and_recorded(browser: Browser, desk: Page, service:
     with opened(browser, viewport=PHONE, is_mobile=True, has_touch=True) as phone:
         phone.goto(url)
         before = phone.get_by_role("checkbox")
-        expect(before).to_have_count(7)
+        expect(before).to_have_count(8)
         phone.get_by_text("Darken the room").tap()
-        expect(before.nth(1)).to_be_checked()
+        expect(before.nth(4)).to_be_checked()
         live = phone.get_by_role("timer")
         expect(live).to_have_text("Not started")
         desk.get_by_role("button", name="Use a camera of this device").click()

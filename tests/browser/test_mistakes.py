@@ -241,6 +241,7 @@ def test_file_removed_during_upload_is_named(desk: Page, service: Service, tmp_p
     assert held[0].request.header_value("upload-offset") == str(8 << 20)
 
 
+@pytest.mark.exhaustive
 def test_wrong_key_then_key_revoked_during_upload(browser: Browser, ball: Path, tmp_path: Path) -> None:
     data = tmp_path / "data"
     with serving(data, "--workers", "1", ENVMATTE_KEYS="first") as locked, opened(browser) as page:
@@ -289,6 +290,7 @@ def test_full_disk_is_reported_and_upload_continues_with_room(
             expect(page.get_by_role("heading", name="a ball")).to_be_visible()
 
 
+@pytest.mark.exhaustive
 def test_service_restarts_with_another_key_during_upload(
     browser: Browser, ball: Path, tmp_path: Path
 ) -> None:

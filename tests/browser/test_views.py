@@ -1,7 +1,9 @@
 """Every view of the app, light and dark, on a desktop and a phone: accessible, and without layout shifts."""
 
+import json
 import os
 import re
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from tests.browser.pages import PHONE, is_fitting, opened
 from tests.end_to_end.conftest import Service
+from tests.parts.waiting import until
 
 pytestmark = pytest.mark.slow
 
@@ -142,3 +145,28 @@ def test_app_is_small_and_has_a_strict_policy(service: Service, views: dict[str,
             assert file.headers["cache-control"] == "no-cache"
     scripts = {str(path.relative_to(WEB)) for path in (WEB / "app").rglob("*.js")}
     assert scripts == set(re.findall(r"web/(app/[\w/]+\.js)", service.http.get("/").text))
+
+
+def test_names_that_look_like_html_are_shown_as_text(
+    desk: Page, service: Service, ball: Path, tmp_path: Path
+) -> None:
+    name = '<img src=x onerror="window.ran = 1">'
+    renamed = tmp_path / f"{name}.zip"
+    with zipfile.ZipFile(ball) as source, zipfile.ZipFile(renamed, "w") as target:
+        manifest = json.loads(source.read("capture.json")) | {"name": name}
+        for frame in manifest["frames"]:
+            content = source.read(frame["file"])
+            if frame["pattern"] == 0:  # which is no picture, so that a problem names it
+                frame["file"], content = name, b"none"
+            target.writestr(frame["file"], content)
+        target.writestr("capture.json", json.dumps(manifest))
+    uploaded = service.client.upload(renamed)
+    assert uploaded["name"] == name
+    until(lambda: service.client.job(uploaded["job"])["state"] == "failed")
+    problem = service.client.job(uploaded["job"])["problem"]
+    assert name in problem["detail"]
+    for path in ("jobs", f"jobs/{uploaded['job']}", "captures", f"captures/{uploaded['id']}"):
+        desk.goto(f"{service.url}/#/{path}")
+        expect(desk.get_by_text(name).first).to_be_visible()
+        desk.wait_for_load_state("networkidle")
+        assert desk.evaluate("window.ran") is None, path

@@ -16,6 +16,7 @@ from services.runtime.certificates import make
 from services.settings import Settings
 from tests.parts.waiting import until
 from tests.services.cluster.clusters import address, started
+from workflows.untrusted.decoder import room
 
 MANIFEST = Path(__file__).parents[2] / "docker" / "kubernetes.yaml"
 OLDEST = "1.25"
@@ -85,6 +86,19 @@ def test_every_name_refers_to_an_object() -> None:
     )  # otherwise every `kubectl apply` would reset it
 
 
+def test_only_the_port_of_the_api_is_open_to_others() -> None:
+    api, cluster = (object_of("NetworkPolicy", name)["spec"] for name in ("envmatte", "envmatte-cluster"))
+    assert (
+        api["podSelector"]["matchLabels"]
+        == object_of("Deployment", "envmatte")["spec"]["selector"]["matchLabels"]
+    )
+    assert api["ingress"] == [{"ports": [{"port": "http"}]}]
+    (selected,) = cluster["podSelector"]["matchExpressions"]
+    assert {"envmatte", *selected["values"]} == set(DEPLOYMENTS)
+    ((allowed,),) = (rule["from"] for rule in cluster["ingress"])
+    assert set(allowed["podSelector"]["matchExpressions"][0]["values"]) == set(DEPLOYMENTS)
+
+
 def test_every_variable_is_a_setting() -> None:
     known = {f"ENVMATTE_{name.upper()}" for name in Settings.model_fields}
     for name in DEPLOYMENTS:
@@ -134,10 +148,13 @@ def test_pods_with_kernels_begin_with_those_of_the_image(name: str) -> None:
     assert first["securityContext"] == container(name)["securityContext"]
 
 
-def test_worker_reaches_its_own_memory_limit_before_that_of_its_pod() -> None:
+def test_worker_reaches_its_own_memory_limit_before_that_of_its_pod(tmp_path: Path) -> None:
     worker = container("envmatte-worker")
     limit = int(worker["resources"]["limits"]["memory"].removesuffix("Gi")) << 30
-    assert 0.95 * int(environment("envmatte-worker")["ENVMATTE_WORKER_MEMORY"]) < limit - (200 << 20)
+    decoder = room(Settings(data=tmp_path).limits.image)
+    assert 0.95 * int(environment("envmatte-worker")["ENVMATTE_WORKER_MEMORY"]) < limit - decoder - (
+        200 << 20
+    )
 
 
 @pytest.mark.slow

@@ -4,8 +4,7 @@ import hashlib
 import os
 import subprocess
 import sys
-import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ import pytest
 
 from services.client import Client
 from storage.objects.checksums import SUFFIX
+from tests.parts.background import repeating
 from tests.parts.captures import nested_program
 from tests.services.cluster.clusters import workers
 from workflows.images import integer_formats
@@ -47,6 +47,10 @@ class Service:
         self.process.kill()
         self.process.wait(120)
 
+    def log(self) -> str:
+        """What it and its processes have logged."""
+        return log_of(self.data).read_text()
+
     def stored(self) -> set[str]:
         """Every file of the store that belongs to an upload, a capture or a matte; checksums count with their file."""
         store = self.data / "store"
@@ -66,12 +70,19 @@ class Service:
         return {name.split("/")[1] for name in self.stored()}
 
 
+def log_of(data: Path) -> Path:
+    """The file with the log of the services that have served a folder."""
+    return data.parent / f"{data.name}.log"
+
+
 @contextmanager
-def serving(data: Path, *options: str, **environment: str) -> Iterator[Service]:
-    """Serve a folder on a free port until the block ends."""
-    command = [sys.executable, "-m", "services", "serve", "--data", str(data), "--port", "0", *options]
+def serving(
+    data: Path, *options: str, within: Sequence[str] = (sys.executable,), **environment: str
+) -> Iterator[Service]:
+    """Serve a folder on a free port until the block ends; ``within`` runs Python with the arguments that follow."""
+    command = [*within, "-m", "services", "serve", "--data", str(data), "--port", "0", *options]
     data.parent.mkdir(parents=True, exist_ok=True)
-    with (data.parent / f"{data.name}.log").open("ab") as log:
+    with log_of(data).open("ab") as log:
         process = subprocess.Popen(
             command,
             stdout=subprocess.PIPE,
@@ -83,7 +94,7 @@ def serving(data: Path, *options: str, **environment: str) -> Iterator[Service]:
     assert process.stdout is not None
     try:
         line = process.stdout.readline()
-        assert " at http" in line, (data.parent / f"{data.name}.log").read_text()
+        assert " at http" in line, log_of(data).read_text()
         url = line.rsplit(" at ", 1)[1].strip()
         key = environment.get("ENVMATTE_KEYS", "").partition(",")[0] or None
         with Client(url, key) as client, httpx2.Client(base_url=url, timeout=120) as http:
@@ -100,25 +111,20 @@ def paused(service: Service) -> Iterator[None]:
 
     The scheduler replaces a worker that is silent for half a minute; the new one is suspended too.
     """
-    over = threading.Event()
 
     def hold() -> None:
-        while not over.wait(0.1):
-            for worker in workers(service.process):
-                with suppress(psutil.NoSuchProcess):
-                    worker.suspend()
+        for worker in workers(service.process):
+            with suppress(psutil.NoSuchProcess):
+                worker.suspend()
 
     held = workers(service.process)
     assert held
     for worker in held:
         worker.suspend()
-    holding = threading.Thread(target=hold)
-    holding.start()
     try:
-        yield
+        with repeating(hold, 0.1):
+            yield
     finally:
-        over.set()
-        holding.join()
         for worker in workers(service.process):
             with suppress(psutil.NoSuchProcess):
                 worker.resume()

@@ -2,10 +2,13 @@
 
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
 
+from services.client import Client
+from storage.objects.store import Objects
 from tests.faults.conftest import Prepared, check, prepare
 from tests.faults.rig import Rig, Row, freeze, thaw
 from tests.parts.postgres import TEMPLATE, Server
@@ -56,6 +59,30 @@ def test_database_that_stays_away(
 
     check(table, on_postgresql.disturb("PostgreSQL stopped, for 5 s", stop, times))
     assert answers == {503}
+
+
+@pytest.mark.exhaustive
+def test_restarted_database_during_an_import(
+    on_postgresql: Prepared, postgresql_server: Server, tmp_path: Path, times: int
+) -> None:
+    """The client repeats what failed, and one matte comes of it."""
+    rig, file = on_postgresql.rig, tmp_path / "matte.zip"
+    restarts: list[int] = []
+
+    def restart(at: int, sent: int, size: int) -> None:
+        if sent * times >= at * size and len(restarts) < at:
+            restarts.append(sent)
+            postgresql_server.restart()
+
+    with Client(rig.urls[0]) as client:
+        (first, *_) = rig.ask("GET", "/v1/mattes").json()["mattes"]
+        client.export(first["id"], file)
+        for number in range(1, times + 1):
+            made = client.import_matte(file, progress=partial(restart, number))
+            assert len(restarts) == number
+            assert rig.files(made["id"]) == rig.files(first["id"])
+    known = {matte["id"] for matte in rig.ask("GET", "/v1/mattes").json()["mattes"]}
+    assert set(Objects(rig.store).names("mattes")) - {"zarr.json"} == known
 
 
 @pytest.mark.exhaustive

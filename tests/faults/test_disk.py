@@ -20,7 +20,7 @@ from tests.parts.waiting import until
 
 pytestmark = pytest.mark.timeout(900)
 
-STORE, LEDGER = 64 << 20, 8 << 20
+STORE, LEDGER = 64 << 20, 32 << 20
 
 
 @dataclass
@@ -110,31 +110,54 @@ def test_full_disk_during_tiles(small: Small, table: list[Row]) -> None:
 
 @pytest.mark.exhaustive
 def test_full_disk_of_sqlite(small: Small, table: list[Row]) -> None:
+    """The job goes on, as the database has a reserve within its files."""
     service, start = small.service, time.monotonic()
     job = service.client.recover(small.capture)
     until(lambda: service.client.job(job["id"])["progress"] > 0.1)
-
-    def refused() -> bool:
-        """Whether an upload is accepted in the end: SQLite may reuse the room of its own log."""
-        headers = {"Tus-Resumable": "1.0.0", "Upload-Length": "1", "Upload-Metadata": "name " + "QUFB" * 1000}
-        answer = service.http.post("/v1/uploads", headers=headers)
-        assert answer.status_code in (201, 507), answer.text
-        if answer.status_code == 507:
-            assert "the disk is full" in answer.json()["detail"]
-        return answer.status_code == 507
-
-    log = service.data.parent / f"{service.data.name}.log"
-    message = "trying again in a second: the disk is full"
-    with ExitStack() as filled:
-        with paused(service):
-            filled.enter_context(full(small.ledger))
-            while not refused():
-                pass
-        count = log.read_text().count(message)
-        until(lambda: log.read_text().count(message) > count + 2)
-        until(lambda: service.http.get("/readyz").status_code == 503)
-        assert service.client.job(job["id"])["state"] == "running"
-    assert service.client.wait(job["id"])["state"] == "succeeded"
+    with full(small.ledger):
+        check_full(service)
+        assert service.client.wait(job["id"])["state"] == "succeeded"
     until(lambda: service.http.get("/readyz").status_code == 200)
-    assert "continues after an error" not in log.read_text()
     check(table, small.row("a full disk of SQLite", start, job["matte"]))
+
+
+def check_full(service: Service) -> None:
+    """Check that a service on a full disk says so, and refuses what is new."""
+    headers = {"Tus-Resumable": "1.0.0", "Upload-Length": "1"}
+    answer = service.http.post("/v1/uploads", headers=headers)
+    assert (answer.status_code, answer.json()["type"]) == (507, "urn:envmatte:problem:no-room")
+    assert "the disk is full" in answer.json()["detail"]
+    until(lambda: service.http.get("/readyz").status_code == 503)  # it looks once a second
+    assert "full" in service.http.get("/readyz").json()["database"]
+
+
+def test_full_disk_can_be_left_by_calls(tmp_path: Path, capture_archive: Path) -> None:
+    with (
+        small_disk(tmp_path / "disk", STORE) as disk,
+        serving(disk / "data", "--workers", "1") as service,
+        paused(service),
+    ):
+        made = service.client.upload(capture_archive)
+        uploads = []
+        size = shutil.disk_usage(disk).free
+        while size > 1 << 19:  # uploads to the last byte that is accepted
+            headers = {"Tus-Resumable": "1.0.0", "Upload-Length": str(size), "Upload-Offset": "0"}
+            chunk = headers | {"Content-Type": "application/offset+octet-stream"}
+            answer = service.http.post("/v1/uploads", headers=chunk, content=bytes(size))
+            if answer.status_code == 201:
+                uploads.append(answer.headers["location"])
+            else:
+                assert answer.status_code == 507
+                size //= 2
+        usage = shutil.disk_usage(disk)
+        assert 0.04 * usage.total < usage.free < 0.07 * usage.total  # the reserve
+        until(lambda: service.http.get("/readyz").status_code == 200)
+        with full(disk):
+            check_full(service)
+            assert service.http.post(f"/v1/jobs/{made['job']}/cancel").json()["state"] == "cancelled"
+            for path in (uploads[0], f"/v1/captures/{made['id']}"):
+                assert service.http.delete(path, headers={"Tus-Resumable": "1.0.0"}).status_code == 204
+            until(lambda: not (disk / "data/store/uploads" / made["id"]).exists())
+            assert shutil.disk_usage(disk).free > usage.free
+        until(lambda: service.http.get("/readyz").status_code == 200)
+        assert "trying again in a second" not in (disk / "data.log").read_text()

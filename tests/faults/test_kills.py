@@ -5,12 +5,15 @@ the byte.
 import random
 import time
 from contextlib import suppress
+from pathlib import Path
 
 import psutil
 import pytest
 
+from storage.objects.store import Objects
+from tests.end_to_end.conftest import serving
 from tests.faults.conftest import Prepared, check
-from tests.faults.rig import Row, freeze, thaw
+from tests.faults.rig import Row, freeze, stored, thaw
 from tests.parts.waiting import until
 
 pytestmark = pytest.mark.timeout(7200)
@@ -82,3 +85,32 @@ def test_cancelled_job_frees_workers_and_disk(prepared: Prepared) -> None:
     after = rig.recover(prepared.capture)
     prepared.check_continues(after["id"], after["matte"])
     assert not rig.names(job["matte"])
+
+
+@pytest.mark.slow
+def test_any_process_of_a_service_killed(
+    capture_archive: Path, tmp_path: Path, table: list[Row], times: int
+) -> None:
+    row = Row("SIGKILL of any process, 4 a job")
+    with serving(tmp_path / "data", "--workers", "2") as service:
+        capture = service.client.upload(capture_archive)["id"]
+        objects = Objects((tmp_path / "data" / "store").as_uri())
+
+        def recovered(kills: int) -> dict[str, str]:
+            job = service.client.recover(capture, tile=16)
+            for _ in range(kills):
+                time.sleep(random.uniform(0.5, 2))
+                with suppress(psutil.NoSuchProcess, IndexError):  # it ended, or all of them have
+                    random.choice(psutil.Process(service.process.pid).children(recursive=True)).kill()
+                    row.injected += 1
+            began = time.monotonic()
+            until(lambda: service.client.job(job["id"])["state"] not in ("queued", "running"), 120)
+            row.seconds.append(time.monotonic() - began)
+            row.lost += service.client.job(job["id"])["state"] != "succeeded"
+            return stored(objects, f"mattes/{job['matte']}")
+
+        expected = recovered(0)
+        row.seconds.clear()
+        for _ in range(times):
+            row.differing += recovered(4) != expected
+    check(table, row)

@@ -1,7 +1,6 @@
 """A tile that kills its workers fails its own job after some attempts, and no other."""
 
 import os
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,6 +12,7 @@ from distributed import Client
 from services.coordinator.job_run import LOSSES
 from tests.faults.conftest import Prepared, check
 from tests.faults.rig import Rig, Row
+from tests.parts.background import repeating
 from tests.services.cluster.clusters import listening
 
 pytestmark = pytest.mark.timeout(900)
@@ -24,25 +24,17 @@ TILE, LAST = 64, 5
 @contextmanager
 def killing_workers(rig: Rig, key: str) -> Iterator[None]:
     """Kill every worker that works on a tile until the block ends."""
-    done = threading.Event()
 
-    def watch() -> None:
-        with Client(rig.cluster, set_as_default=False) as client:
-            while not done.wait(0.1):
-                keys = [one for held in client.processing().values() for one in held if one.startswith(key)]
-                # A worker has a call stack for what it runs, and none for what is queued there.
-                for address in client.call_stack(keys=keys) if keys else ():
-                    for process in rig.workers():
-                        if urlsplit(address).port in {port for _, port in listening(process)}:
-                            process.kill()
+    def kill() -> None:
+        keys = [one for held in client.processing().values() for one in held if one.startswith(key)]
+        # A worker has a call stack for what it runs, and none for what is queued there.
+        for address in client.call_stack(keys=keys) if keys else ():
+            for process in rig.workers():
+                if urlsplit(address).port in {port for _, port in listening(process)}:
+                    process.kill()
 
-    watcher = threading.Thread(target=watch)
-    watcher.start()
-    try:
+    with Client(rig.cluster, set_as_default=False) as client, repeating(kill, 0.1):
         yield
-    finally:
-        done.set()
-        watcher.join()
 
 
 @pytest.mark.exhaustive

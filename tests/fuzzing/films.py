@@ -7,9 +7,6 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from random import Random
-from typing import Any
-
-import numpy as np
 
 from storage.errors import CaptureError
 from storage.layout import composites as stored_composites
@@ -22,12 +19,12 @@ from tests.parts.captures import nested_program, zip_bytes
 from tests.workflows.ingest.video.camera import Camera, capture, film, lights, overstated
 from tests.workflows.mattes.imports.conftest import make_matte
 from workflows.composite.video import steps as video_steps
+from workflows.ingest import films
 from workflows.ingest import steps as ingest_steps
-from workflows.ingest.video.decoder import open_clip
-from workflows.ingest.video.frame_means import TOTAL_WEIGHT, Share, mean_frames
-from workflows.ingest.video.signatures import take_signatures
+from workflows.ingest.video.frame_means import TOTAL_WEIGHT, Share
 from workflows.jobs import Task
 from workflows.simulation.glass_ball import glass_ball
+from workflows.untrusted.decoder import Decoder
 
 BOXES = b"|".join(
     (
@@ -49,18 +46,13 @@ def damaged_film(random: Random, data: bytes) -> bytes:
 
 
 def read_clip(data: bytes, folder: Path) -> None:
-    def clip() -> Any:
-        return open_clip(io.BytesIO(data), "a.mp4", LIMITS.image)
-
-    with clip() as found:
-        ticks, _ = found.ticks(2000)
-    assert (np.diff(ticks) > 0).all()
-    with clip() as found:
-        signatures, again, large = take_signatures(found, 1 << 20, 0.1)
-    assert len(signatures) == len(again) >= len(large.frames)
-    with clip() as found:
-        for picture in mean_frames(found, [[Share(tick, TOTAL_WEIGHT)] for tick in ticks[:5].tolist()]):
-            assert picture.shape == (found.height, found.width, 3)
+    file = io.BytesIO(data)
+    with Decoder(LIMITS.image) as found:
+        _, ticks, _ = films.times(found, file, "a.mp4", 2000)
+        film, signatures, again, large = films.scan(found, file, "a.mp4", 1 << 20, 0.1)
+        assert len(signatures) == len(again) >= len(large.frames)
+        plan = [[Share(tick, TOTAL_WEIGHT)] for tick in ticks[:5].tolist()]
+        for picture in films.means(found, file, "a.mp4", plan, film.width, film.height):
             assert picture.nbytes <= LIMITS.image
 
 
@@ -93,6 +85,7 @@ def capture_files() -> dict[str, Files]:
     stills = {
         ".png": seeds.pngs,
         ".jpg": seeds.jpegs,
+        ".heic": seeds.heics,
         ".tif": seeds.tiffs,
         ".exr": seeds.exrs,
         ".dng": seeds.raws,

@@ -13,8 +13,14 @@ from tests.fuzzing.seeds import Files
 from workflows.composite.backdrop import backdrop_of
 from workflows.images import camera_raw, decode, float_formats, integer_formats
 
+BOXES = b"|".join(
+    b"ftyp meta pitm iloc iinf infe iref iprp ipco ipma ispe irot imir hvcC colr pixi auxC".split()
+)
+"""Boxes of a HEIC."""
+
 
 def read_image(data: bytes, folder: Path) -> None:
+    integer_formats.orientation(data)
     pixels = integer_formats.decode(data, memory=LIMITS.image)
     assert pixels.dtype in (np.uint8, np.uint16)
     assert pixels.ndim == 3

@@ -1,6 +1,7 @@
 """Whole HTTP/1.1 requests as bytes, to a service with a matte, a video and an upload."""
 
 import asyncio
+import tempfile
 from functools import cache
 from pathlib import Path
 from random import Random
@@ -19,6 +20,7 @@ from tests.fuzzing import changes, seeds
 from tests.fuzzing.campaign import KEPT, Refused
 from tests.workflows.mattes.imports.conftest import make_matte
 from workflows.images.integer_formats import encode_png
+from workflows.kernels import use_matte
 
 SPECIAL = (
     *(
@@ -132,6 +134,13 @@ HEADERS = (
 )
 
 
+def compile_kernels() -> tuple[str]:
+    """Compile the kernels that requests call, which takes longer and more memory than a request may."""
+    with tempfile.TemporaryDirectory() as folder:
+        use_matte(Objects(Path(folder).as_uri()))
+    return ("compiled",)
+
+
 def other_text(random: Random, text: str) -> str:
     """A line of text with some words, numbers or characters replaced."""
     for _ in range(random.choice((0, 1, 1, 2, 4))):
@@ -192,6 +201,7 @@ class Served:
             self.program = programs.add(c, BODIES[JSON[2]]["program"])
             uploads.add(c, "u", 100, "", 1e6, None)
         objects.put(composites.video_path("v"), bytes(1000))
+        compile_kernels()  # loads them
         self.app = build_app(settings, engine, objects)
         self.loop = asyncio.new_event_loop()
         self._engine = engine

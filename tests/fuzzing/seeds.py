@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
 from tests.workflows.images.dngs import dng
+from tests.workflows.images.heics import heic
 from workflows.images.integer_formats import encode_png
 
 Files = tuple[bytes, ...]
@@ -87,6 +88,21 @@ def jpegs() -> tuple[bytes, ...]:
         _saved("JPEG", "CMYK"),
         _saved("JPEG", icc_profile=profile),
         _saved("JPEG", exif=_exif()),
+    )
+
+
+@cache
+def heics() -> tuple[bytes, ...]:
+    profile = _dated(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
+    pixels = np.tile(PIXELS, (3, 2, 1))
+    return (
+        heic(pixels, 6),
+        heic(np.dstack([pixels, pixels[:, :, :1]]), quality=50),
+        heic(pixels[:, :, :1], 7),
+        heic(pixels.astype(np.uint16) * 4),
+        heic(pixels, icc_profile=profile, icc_profile_type="prof"),
+        heic(pixels, 4, color_primaries=12, transfer_characteristics=13),
+        heic(np.tile(pixels, (2, 2, 1)), tile_size=64, quality=50),
     )
 
 
@@ -219,7 +235,7 @@ def raws() -> tuple[bytes, ...]:
 
 
 def backdrops() -> tuple[bytes, ...]:
-    return (*pngs(), *jpegs(), *exrs())
+    return (*pngs(), *jpegs(), *exrs(), *heics(), *raws())
 
 
 def profile() -> bytes:
@@ -257,6 +273,8 @@ CLIPS: tuple[tuple[Any, ...], ...] = (
     ("mov", "mjpeg", "yuvj422p", {}),
     ("avi", "mjpeg", "yuvj420p", {}),
     ("avi", "mpeg4", "yuv420p", {}),
+    ("mpegts", "libx264", "yuv420p", {"preset": "veryfast", "g": "4", "x264-params": "tff=1"}),
+    ("mpegts", "mpeg2video", "yuv420p", {}),
     ("webm", "libvpx", "yuv420p", {}),
     ("webm", "libvpx-vp9", "yuv420p", {}),
     ("mov", "prores_ks", "yuv422p10le", {}),

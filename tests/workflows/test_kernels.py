@@ -8,6 +8,8 @@ from typing import Any
 
 import pytest
 
+from workflows.kernels import find_kernels
+
 USE = """
 import importlib, io, json, pkgutil, sys
 from pathlib import Path
@@ -51,7 +53,7 @@ print(json.dumps({
 
 
 def ran(*command: str) -> dict[str, Any]:
-    done = subprocess.run([sys.executable, *command], capture_output=True, text=True, timeout=280)
+    done = subprocess.run([sys.executable, *command], capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, done.stderr
     found: dict[str, Any] = json.loads(done.stdout)
     return found
@@ -63,6 +65,13 @@ def test_after_warm_nothing_is_compiled(tmp_path: Path) -> None:
     assert set(warmed) == {"cache", "kernels", "compiled", "seconds"}
     used = ran("-c", USE, str(tmp_path))
     assert used == {"kernels": warmed["kernels"], "compiled": [], "lacking": []}
+
+
+def test_every_kernel_releases_the_interpreter_lock() -> None:
+    """Else a request that computes would stop the event loop, and with it all others."""
+    kernels = find_kernels()
+    assert len(kernels) > 50
+    assert not [kernel.py_func.__name__ for kernel in kernels if not kernel.targetoptions.get("nogil")]
 
 
 @pytest.mark.parametrize("named", [True, False])

@@ -89,7 +89,8 @@ def compose(
         If ``read`` raises it.
     """
     pyramid = Pyramid.over(matte.columns, matte.rows)
-    assert light.shape == (pyramid.nodes + 1, 3)  # compiled code does not check bounds
+    if light.shape != (pyramid.nodes + 1, 3):  # compiled code does not check bounds
+        raise ValueError(f"light of shape {light.shape} is not that of a pyramid of {pyramid.nodes} nodes")
     picture = np.zeros((window.height, window.width, 4), np.float32)
     crosstalk = np.array(matte.attributes["crosstalk"], np.float32)
     grids = pyramid.arrays

@@ -3,7 +3,10 @@
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextvars import copy_context
 from functools import cache
+
+from workflows.interruption import checkpoint
 
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -11,20 +14,21 @@ CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os
 def in_parts(work: Callable[[int], None], parts: Iterable[int], threads: int) -> None:
     """Call ``work`` with each of ``parts`` on several threads; with one thread, on the calling one.
 
-    An error of a part is raised once all parts under way have ended.
+    An error of a part, or of the `checkpoint` before it, is raised once all parts under way have ended.
     """
     todo = list(parts)
-    if threads == 1 or len(todo) == 1:
-        for part in todo:
-            work(part)
-        return
     following = iter(todo)  # `next` of a list's iterator is atomic
 
     def work_on() -> None:
         for part in following:
+            checkpoint()
             work(part)
 
-    futures = [_pool().submit(work_on) for _ in range(min(threads, len(todo)) - 1)]
+    if threads == 1 or len(todo) == 1:
+        work_on()
+        return
+    # With the caller's context, that `checkpoint` asks for the same work.
+    futures = [_pool().submit(copy_context().run, work_on) for _ in range(min(threads, len(todo)) - 1)]
     try:
         work_on()
     finally:

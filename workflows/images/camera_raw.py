@@ -1,8 +1,7 @@
-"""Decode camera RAW to linear light: the sensor's counts, without demosaicing, white balance or curve."""
+"""Decode camera RAW to linear light: the sensor's counts, not demosaiced, and for a picture white-balanced."""
 
 import io
-from itertools import islice
-from pathlib import PurePosixPath
+from typing import NamedTuple
 
 import numpy as np
 import rawpy
@@ -10,31 +9,47 @@ import tifffile
 from numpy.typing import NDArray
 
 from storage.errors import ImageError
-from workflows.images.integer_formats import upright
+from workflows.images.orientation import upright
+from workflows.images.raw_files import FILTERED, images
+from workflows.untrusted.limits import check_size
 
-SUFFIXES = (
-    *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef", ".mos"),
-    *(".mrw", ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
-)
-"""Extensions of RAW files. By their bytes, many of them are TIFFs that begin with a thumbnail."""
+JPEG = b"\xff\xd8\xff"
+"""First bytes of a JPEG, which no RAW known here begins with."""
 FULL = 0.99
 """Values from this share of the sensor's range on count as clipped, because photosites saturate at different values."""
 _BLOCKS = {2: 2, 6: 3}  # photosites along a pixel, by the period of the colour filter: Bayer, X-Trans
-_PHOTOSITE, _LINEAR = (
-    2 + 4,
-    8 + 12 + 4,
-)  # bytes that decoding takes for a photosite, and for a pixel of three colours
+# Bytes of the decoded image for a pixel of three colours, and for a photosite of four.
+_LINEAR, _PHOTOSITE = 12, 3
 _TURNS = {3: 3, 5: 8, 6: 6}  # EXIF orientations by LibRaw's flip
-_IMAGES = 16  # images of a DNG that are examined
+SPREAD = 100.0
+"""Colours of cameras lie no further apart: a larger number in a matrix, or its condition, is damage."""
+_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+"""CIE XYZ of sRGB's primaries (IEC 61966-2-1)."""
 
 
-def is_raw(name: str) -> bool:
-    """Whether a file is camera RAW, judging by its name."""
-    return PurePosixPath(name).suffix.lower() in SUFFIXES
+class _Read(NamedTuple):
+    """What a RAW file holds.
+
+    Attributes
+    ----------
+    light : (h, w, 3) float32
+        As `decode` returns it, before it is turned upright.
+    turn : int
+        The orientation that the file states.
+    balance : (3,) float64
+        By what the camera multiplies red, green and blue, the least of them 1.
+    to_srgb : (3, 3) float64
+        From balanced colours of the camera to linear sRGB.
+    """
+
+    light: NDArray[np.float32]
+    turn: int
+    balance: NDArray[np.float64]
+    to_srgb: NDArray[np.float64]
 
 
 def orientation(data: bytes) -> int:
-    """The orientation of a RAW file for `integer_formats.upright`; 1, which is no turn, if it can't be read."""
+    """The orientation of a RAW file for `orientation.upright`; 1, which is no turn, if it can't be read."""
     try:
         with rawpy.RawPy() as raw:
             raw.open_buffer(io.BytesIO(data))
@@ -50,9 +65,10 @@ def decode(data: bytes, *, memory: int, turn: int | None = None) -> NDArray[np.f
     ----------
     data : bytes
     memory : int
-        Bytes that decoding may take; checked before anything is unpacked.
+        Bytes that the decoded image may take; checked before anything is unpacked. Decoding takes up to three times
+        as many.
     turn : int, optional
-        Orientation, see `integer_formats.upright`; by default the file's own.
+        Orientation, see `orientation.upright`; by default the file's own.
 
     Returns
     -------
@@ -76,18 +92,48 @@ def decode(data: bytes, *, memory: int, turn: int | None = None) -> NDArray[np.f
       share a centre. Up to two rows and columns at the edges are cut off.
     - *Linear DNG* (ProRAW of phones, "linear" in Adobe's converter): the size of the file.
     """
+    read = _read(data, memory)
+    return upright(read.light, read.turn if turn is None else turn)
+
+
+def develop(data: bytes, *, memory: int) -> NDArray[np.float32]:
+    """Decode camera RAW to a picture to look at, as `decode`, with the camera's white balance and sRGB's primaries.
+
+    Parameters
+    ----------
+    data : bytes
+    memory : int
+        As in `decode`.
+
+    Returns
+    -------
+    (h, w, 3) float32
+        Linear light from 0 to 1, upright. 1 is where the sensor clips first, and what is clipped is white. Colours that
+        sRGB does not have are clipped, as with other pictures.
+
+    Raises
+    ------
+    ImageError
+        As in `decode`.
+    """
+    light, turn, balance, to_srgb = _read(data, memory)
+    light *= balance.astype(np.float32)
+    np.minimum(
+        light, 1, out=light
+    )  # also what is clipped: a highlight in which only green is left is magenta
+    for row in light:  # row by row, so that no second picture is in memory
+        row[:] = np.clip(row @ to_srgb.T.astype(np.float32), 0, 1)
+    return upright(light, turn)
+
+
+def _read(data: bytes, memory: int) -> _Read:
     try:
         linear = _is_linear(data)
         with rawpy.RawPy() as raw:
             raw.open_buffer(io.BytesIO(data))
             width, height = raw.sizes.raw_width, raw.sizes.raw_height
             each, what = (_LINEAR, "linear pixels") if linear else (_PHOTOSITE, "photosites")
-            if width * height * each > memory:
-                raise ImageError(
-                    f"decoding a RAW image of {width} x {height} {what} takes more than the {memory} bytes allowed "
-                    "for one",
-                    limit=memory,
-                )
+            check_size(width, height, each, memory, what)
             raw.unpack()
             if raw.raw_type == rawpy.RawType.Flat:
                 light = _superpixels(raw)
@@ -95,35 +141,81 @@ def decode(data: bytes, *, memory: int, turn: int | None = None) -> NDArray[np.f
                 light = _light(raw.raw_image_visible[:, :, :3], raw, [0, 1, 2])
             else:
                 raise ImageError(
-                    "this RAW image has no colour filter, and is not a linear DNG of three colours: develop these "
-                    "frames to TIFF of 16 bits with a linear curve"
+                    "this RAW image has no colour filter, and is not a linear DNG of three colours: develop it to TIFF "
+                    "of 16 bits with a linear curve"
                 )
-            return upright(light, _TURNS.get(raw.sizes.flip, 1) if turn is None else turn)
-    except rawpy.LibRawFileUnsupportedError as error:
-        raise ImageError(
-            "this camera's RAW format is not supported: convert the frames to DNG, with lossless compression other "
-            "than JPEG XL, or develop them to TIFF of 16 bits with a linear curve"
-        ) from error
+            return _Read(light, _TURNS.get(raw.sizes.flip, 1), _balance(raw), _to_srgb(raw))
     except ImageError:
         raise
     except Exception as error:  # damaged bytes raise many kinds of errors
-        raise ImageError(f"the RAW image is cut off or damaged: {error}") from error
+        raise _refusal(data, error) from error
+
+
+def _refusal(data: bytes, error: Exception) -> ImageError:
+    if data.startswith(JPEG):
+        return ImageError(
+            "this is a JPEG with the name of camera RAW: rename it to .jpg, or copy the RAW itself"
+        )
+    if isinstance(error, rawpy.LibRawFileUnsupportedError):
+        return ImageError(
+            "this camera's RAW format is not supported: convert it to DNG, with lossless compression other than JPEG "
+            "XL, or develop it to TIFF of 16 bits with a linear curve"
+        )
+    return ImageError("the RAW image is cut off or damaged: copy it again from the camera")
+
+
+def _balance(raw: rawpy.RawPy) -> NDArray[np.float64]:
+    """The white balance of the camera, or else of daylight, or else none."""
+    for stated in (raw.camera_whitebalance, raw.daylight_whitebalance):
+        balance = np.array(stated[:3], np.float64)
+        if np.isfinite(balance).all() and balance.min() > 0:
+            return np.asarray(balance / balance.min(), np.float64)
+    return np.ones(3)
+
+
+def _to_srgb(raw: rawpy.RawPy) -> NDArray[np.float64]:
+    """From balanced colours of the camera to linear sRGB; white stays white.
+
+    Notes
+    -----
+    A DNG has such a matrix. Of other files LibRaw knows the matrix M from XYZ to the camera: rows of M A, with XYZ of
+    the primaries in A, are divided by their sums, so that equal parts of all primaries give equal values, and inverted.
+    Without either, or if they are damaged, colours stay as they are.
+    """
+    stated = np.array(raw.color_matrix[:, :3], np.float64)
+    if not stated.any():
+        camera = np.array(raw.rgb_xyz_matrix[:3], np.float64) @ _XYZ
+        total = camera.sum(axis=1, keepdims=True)
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            camera /= total
+        if not np.isfinite(camera).all() or np.linalg.cond(camera) > SPREAD:
+            return np.eye(3)
+        stated = np.linalg.inv(camera)
+    whole = bool(np.isfinite(stated).all()) and float(np.abs(stated).max()) < SPREAD
+    return stated if whole else np.eye(3)
 
 
 def _is_linear(data: bytes) -> bool:
-    """Whether bytes are a DNG whose main image has all colours in each pixel."""
+    """Whether bytes are a DNG whose main image has all colours in each pixel.
+
+    Raises
+    ------
+    ImageError, EOFError
+        If it has float values, or is cut off.
+    """
     if not data.startswith((b"II*", b"MM\0*")):
         return False
     with tifffile.TiffFile(io.BytesIO(data)) as file:
-        first = file.pages[0]
-        for page in (first, *islice(first.pages or (), _IMAGES)):
+        for page in images(file.pages[0]):
             if page.subfiletype != 0:  # a preview or a mask
                 continue
             if page.sampleformat == tifffile.SAMPLEFORMAT.IEEEFP:
                 # LibRaw scales each file by its own largest value: frames would have different units.
-                raise ImageError(
-                    "DNGs of float values are not supported: develop these frames to EXR or float TIFF"
-                )
+                raise ImageError("DNGs of float values are not supported: develop them to EXR or float TIFF")
+            ends = (a + b for a, b in zip(page.dataoffsets, page.databytecounts, strict=False))
+            if page.photometric in FILTERED and max(ends, default=0) > len(data):
+                # LibRaw takes what is missing for zeros.
+                raise EOFError(f"an image ends after the {len(data)} bytes of the file")
             if page.photometric == tifffile.PHOTOMETRIC.LINEAR_RAW:
                 return True
     return False
@@ -131,11 +223,11 @@ def _is_linear(data: bytes) -> bool:
 
 def _superpixels(raw: rawpy.RawPy) -> NDArray[np.float32]:
     """The light of an unpacked RAW with a colour filter: the mean of each colour in each block."""
-    period = len(raw.raw_pattern)
+    period = _period(raw)
     if period not in _BLOCKS:
         raise ImageError(
-            "this RAW image comes from a sensor with neither a Bayer nor an X-Trans filter: develop these frames to "
-            "TIFF of 16 bits with a linear curve"
+            "this RAW image comes from a sensor with neither a Bayer nor an X-Trans filter: develop it to TIFF of "
+            "16 bits with a linear curve"
         )
     block = _BLOCKS[period]
     # `raw_pattern` itself begins in the margin, where LibRaw does not know X-Trans.
@@ -150,7 +242,8 @@ def _superpixels(raw: rawpy.RawPy) -> NDArray[np.float32]:
         numbers, colours = (np.roll(p, (-y, -x), (0, 1)) for p in (numbers, colours))
     if sorted({*colours[:block, :block].ravel()}) != ["B", "G", "R"]:
         raise ImageError(
-            f"this RAW image has the colours {raw.color_desc!r}: only red, green and blue are supported"
+            f"this RAW image has the colours {raw.color_desc!r}: only red, green and blue are supported; "
+            "develop it to TIFF of 16 bits with a linear curve"
         )
     height, width = values.shape[0] // block, values.shape[1] // block
     values = values[: block * height, : block * width]
@@ -165,13 +258,21 @@ def _superpixels(raw: rawpy.RawPy) -> NDArray[np.float32]:
     return pixels
 
 
+def _period(raw: rawpy.RawPy) -> int:
+    """After how many photosites the colour filter repeats; 0 without one, as in a monochrome sensor."""
+    return 0 if raw.raw_pattern is None else len(raw.raw_pattern)
+
+
 def _first_block(colours: NDArray[np.str_]) -> tuple[int, int]:
     """Where a block with green in its middle and corners begins in an X-Trans filter."""
     for y, x in np.ndindex(3, 3):
         block = np.roll(colours, (-y, -x), (0, 1))[:3, :3].ravel()
         if (block[::2] == "G").all():
             return y, x
-    raise ImageError("the RAW image is damaged: its colour filter is not that of an X-Trans sensor")
+    raise ImageError(
+        "the RAW image is damaged, its colour filter is not that of an X-Trans sensor: copy it again from "
+        "the camera"
+    )
 
 
 def _light(values: NDArray[np.uint16], raw: rawpy.RawPy, number: int | list[int]) -> NDArray[np.float32]:
@@ -180,7 +281,8 @@ def _light(values: NDArray[np.uint16], raw: rawpy.RawPy, number: int | list[int]
     span = np.float32(raw.white_level) - black
     if span.min() <= 0:
         raise ImageError(
-            f"the RAW image's white level {raw.white_level} is not above its black level {black.max():g}"
+            f"the RAW image's white level {raw.white_level} is not above its black level {black.max():g}: it is "
+            "damaged, copy it again from the camera"
         )
     light = values.astype(np.float32)
     light -= black

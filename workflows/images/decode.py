@@ -1,14 +1,15 @@
 """Decode a picture of any supported format, for a backdrop."""
 
 import io
-from typing import Literal
+from collections.abc import Iterator
+from typing import BinaryIO, Literal
 
 import imagecodecs
 import numpy as np
 from PIL import Image
 
 from storage.errors import ImageError
-from workflows.images import float_formats, integer_formats
+from workflows.images import camera_raw, float_formats, heif, integer_formats, raw_files
 from workflows.images.float_formats import Floats
 from workflows.images.integer_formats import Codes
 
@@ -21,9 +22,10 @@ def decode(data: bytes, transfer: Transfer, *, memory: int) -> Codes | Floats:
     Parameters
     ----------
     data : bytes
-        PNG, JPEG, TIFF or EXR.
+        PNG, JPEG, TIFF, HEIC, EXR or camera RAW.
     transfer : str
-        How integers encode light. Colours with an ICC profile are converted to sRGB, unless this is ``linear``.
+        How integers encode light. Colours with an ICC profile are converted to sRGB, unless this is ``linear``. RAW
+        and floats are linear light in any case.
     memory : int
         Bytes that the decoded picture may take.
 
@@ -36,20 +38,23 @@ def decode(data: bytes, transfer: Transfer, *, memory: int) -> Codes | Floats:
     ------
     ImageError
     """
+    if raw_files.is_raw(data):
+        return camera_raw.develop(data, memory=memory)
     if float_formats.is_float(data):
         return float_formats.decode(data, memory=memory)
     pixels = integer_formats.decode(data, memory=memory, alpha=True)
     return _to_srgb(data, pixels) if transfer == "srgb" else pixels
 
 
+def decode_file(file: BinaryIO, transfer: Transfer, memory: int) -> Iterator[Codes | Floats]:
+    """The same for `workflows.untrusted.decoder.Decoder.picture`."""
+    yield decode(file.read(), transfer, memory=memory)
+
+
 def _to_srgb(data: bytes, pixels: Codes) -> Codes:
-    """Convert RGB to sRGB by the ICC profile of the file, if it has one."""
-    with Image.open(io.BytesIO(data), formats=integer_formats.FORMATS) as picture:
-        profile = picture.info.get("icc_profile")
-        # Pixels made from a palette or from inks do not have the colours that the profile describes.
-        if not profile or picture.mode not in ("RGB", "RGBA", "I;16B", "RGB;16"):
-            return pixels
-    if pixels.shape[2] < 3:
+    """Convert RGB to sRGB by the colour profile of the file, if it has one."""
+    profile = heif.profile(data) if heif.is_heif(data) else _profile(data)
+    if not profile or pixels.shape[2] < 3:
         return pixels
     colours = np.ascontiguousarray(pixels[..., :3])
     try:
@@ -57,5 +62,14 @@ def _to_srgb(data: bytes, pixels: Codes) -> Codes:
             colours, profile, imagecodecs.cms_profile("srgb"), colorspace="rgb", outcolorspace="rgb"
         )
     except Exception as error:  # damaged bytes raise many kinds of errors
-        raise ImageError(f"the image's colour profile can't be used: {error}; save it without one") from error
+        raise ImageError(
+            "the image's colour profile can't be used: save it without one, or as sRGB"
+        ) from error
     return np.concatenate([converted, pixels[..., 3:]], axis=2)
+
+
+def _profile(data: bytes) -> bytes | None:
+    """The ICC profile of a PNG, JPEG or TIFF."""
+    with Image.open(io.BytesIO(data), formats=integer_formats.FORMATS) as picture:
+        # Pixels made from a palette or from inks do not have the colours that the profile describes.
+        return picture.info.get("icc_profile") if picture.mode in ("RGB", "RGBA", "I;16B", "RGB;16") else None

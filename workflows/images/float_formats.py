@@ -9,8 +9,10 @@ import tifffile
 from numpy.typing import NDArray
 
 from storage.errors import ImageError
-from workflows.images.integer_formats import LOSSLESS, PLAIN, check_tiles, orientation, upright
+from workflows.images.integer_formats import LOSSLESS, PLAIN, check_tiles, orientation
+from workflows.images.orientation import upright
 from workflows.untrusted import tiff_lzw
+from workflows.untrusted.limits import check_size
 
 Floats = NDArray[np.float32]
 EXR = b"v/1\x01"
@@ -39,7 +41,7 @@ def decode(data: bytes, *, memory: int, turn: int | None = None) -> Floats:
     memory : int
         Bytes that decoding may take; checked by the header, before anything is decoded.
     turn : int, optional
-        Orientation of a TIFF, see `integer_formats.upright`; by default the file's own. An EXR has none.
+        Orientation of a TIFF, see `orientation.upright`; by default the file's own. An EXR has none.
 
     Returns
     -------
@@ -57,7 +59,7 @@ def decode(data: bytes, *, memory: int, turn: int | None = None) -> Floats:
     except ImageError:
         raise
     except Exception as error:  # as above
-        raise ImageError(f"the {kind} image is cut off or damaged: {error}") from error
+        raise ImageError(f"the {kind} image is cut off or damaged: export it again") from error
     if kind == "EXR":
         return pixels
     return upright(pixels, orientation(data) if turn is None else turn)
@@ -96,9 +98,9 @@ def _exr(data: bytes, memory: int) -> Floats:
         raise ImageError("this EXR has subsampled channels: export it as RGB")
     width, height = (high - low + 1).tolist()
     # All channels are decoded, at up to 4 bytes a value, before those that are needed are copied.
-    _check_size(width, height, 4 * (len(channels) + len(names)), memory)
+    check_size(width, height, 4 * (len(channels) + len(names)), memory, "float pixels")
     if tiles is not None:  # which the library decodes whole, however little of one the image fills
-        _check_size(tiles.xSize, tiles.ySize, 4 * len(channels), memory)
+        check_size(tiles.xSize, tiles.ySize, 4 * len(channels), memory, "float pixels")
     with OpenEXR.File(io.BytesIO(data), separate_channels=True, num_threads=0) as file:
         planes = file.channels()
         pixels = np.empty((height, width, len(names)), np.float32)
@@ -120,19 +122,11 @@ def _tiff(data: bytes, memory: int) -> Floats:
         height, width = page.imagelength, page.imagewidth
         stored = -(-page.nbytes // (width * height))
         channels = 3 if page.samplesperpixel > 2 else 1
-        _check_size(width, height, stored + 4 * channels, memory)
+        check_size(width, height, stored + 4 * channels, memory, "float pixels")
         tiff_lzw.check_lzw(data, page)
         array = np.asarray(page.asarray())
         if array.size != height * width * page.samplesperpixel:
-            raise ImageError("the TIFF image is cut off or damaged: its tags contradict each other")
+            raise ImageError("the TIFF image is damaged, its tags contradict each other: export it again")
         if page.axes == "SYX":
             array = np.moveaxis(array, 0, -1)
         return np.ascontiguousarray(array.reshape(height, width, -1)[:, :, :channels], np.float32)
-
-
-def _check_size(width: int, height: int, pixel: int, memory: int) -> None:
-    if width * height * pixel > memory:
-        raise ImageError(
-            f"decoding an image of {width} x {height} float pixels takes more than the {memory} bytes allowed for one",
-            limit=memory,
-        )

@@ -1,8 +1,8 @@
-"""PNG, JPEG and TIFF of 8 and 16 bits to arrays and back. The files are not trusted."""
+"""PNG, JPEG, TIFF and HEIC of 8 to 16 bits to arrays, and PNG and JPEG back. The files are not trusted."""
 
 import io
 import warnings
-from typing import TypeVar, cast
+from typing import cast
 
 import imagecodecs
 import numpy as np
@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from storage.errors import ImageError
+from workflows.images import heif
+from workflows.images.orientation import ORIENTATION, inverse, upright
 from workflows.untrusted import tiff_lzw
+from workflows.untrusted.limits import check_size
 
-T = TypeVar("T", bound=np.generic)
 Codes = NDArray[np.unsignedinteger]
 """Values as a file stores them: uint8 or uint16."""
 FORMATS = ("PNG", "TIFF", "JPEG")
-ORIENTATION = 274
-"""The EXIF tag of the orientation."""
+"""What Pillow opens."""
 LOSSLESS = {
     tifffile.COMPRESSION.NONE,
     tifffile.COMPRESSION.LZW,
@@ -41,6 +42,8 @@ def orientation(data: bytes) -> int:
 
     It is also 1 if the image can't be read.
     """
+    if heif.is_heif(data):
+        return heif.orientation(data)
     try:
         if data.startswith((b"II", b"MM")):  # Pillow does not open them all
             with tifffile.TiffFile(io.BytesIO(data)) as file:
@@ -53,45 +56,15 @@ def orientation(data: bytes) -> int:
     return int(found) if found in range(1, 9) else 1
 
 
-def upright(pixels: NDArray[T], turn: int) -> NDArray[T]:
-    """Turn pixels upright by an orientation.
-
-    Parameters
-    ----------
-    pixels : (h, w, ...)
-    turn : int
-        EXIF orientation, tag 274 (CIPA DC-008, sect. 4.6.5). It says where row 0 and column 0 of the pixels are in the
-        upright picture. 1: top, left; 2: top, right; 3: bottom, right; 4: bottom, left; 5: left, top; 6: right, top;
-        7: right, bottom; 8: left, bottom.
-
-    Returns
-    -------
-    (h, w, ...) or (w, h, ...)
-        In C order.
-    """
-    if turn > 4:
-        pixels = pixels.swapaxes(0, 1)
-    down, across = turn in (3, 4, 7, 8), turn in (2, 3, 6, 7)
-    return np.ascontiguousarray(pixels[:: -1 if down else 1, :: -1 if across else 1])
-
-
-def decode(
-    data: bytes,
-    *,
-    memory: int,
-    formats: tuple[str, ...] = FORMATS,
-    alpha: bool = False,
-    turn: int | None = None,
-) -> Codes:
+def decode(data: bytes, *, memory: int, alpha: bool = False, turn: int | None = None) -> Codes:
     """Decode an image.
 
     Parameters
     ----------
     data : bytes
+        PNG, JPEG, TIFF or HEIC.
     memory : int
         Bytes that the decoded image may take; checked by the header, before anything is decoded.
-    formats : tuple of str
-        Accepted formats, a subset of `FORMATS`.
     alpha : bool
         Whether to keep an alpha channel.
     turn : int, optional
@@ -107,15 +80,20 @@ def decode(
     ImageError
         If it is not one of the formats, damaged, too large, or has another type or number of channels.
     """
+    if heif.is_heif(data):
+        return _kept(heif.decode(data, memory=memory, turn=turn), alpha)
     try:
         with warnings.catch_warnings():
             # Pillow's warning about large images is replaced by the limit below.
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            picture = Image.open(io.BytesIO(data), formats=formats)
+            picture = Image.open(io.BytesIO(data), formats=FORMATS)
     except Image.DecompressionBombError as error:
-        raise ImageError(f"the image is too large: {error}", limit=memory) from error
+        raise ImageError("the image is too large to be read: make it smaller", limit=memory) from error
     except Exception as error:  # damaged bytes raise many kinds of errors
-        raise ImageError(f"this is not a {' or '.join(formats)} image that can be read") from error
+        raise ImageError(
+            "this is not a PNG, TIFF, JPEG or HEIC image, or it is cut off: copy it again from the camera, or save it "
+            "as PNG"
+        ) from error
     if picture.format == "PNG" and getattr(picture, "is_animated", False):
         raise ImageError("this PNG is animated: save a single picture")
     if picture.format in ("JPEG", "MPO") and data.count(START_OF_SCAN) > SCANS:
@@ -126,14 +104,20 @@ def decode(
     except ImageError:
         raise
     except Exception as error:
-        raise ImageError(f"the {picture.format} image is cut off or damaged: {error}") from error
+        raise ImageError(
+            f"the {picture.format} image is cut off or damaged: copy it again from the camera, or save it again"
+        ) from error
     if pixels.dtype not in (np.uint8, np.uint16) or pixels.ndim != 3 or pixels.shape[2] not in (1, 2, 3, 4):
         raise ImageError(
             f"this {picture.format} image has {pixels.dtype} values in the shape {pixels.shape}: "
-            "only grey and RGB with 8 or 16 bits a channel are supported"
+            "save it as grey or RGB with 8 or 16 bits a channel"
         )
-    codes = cast("Codes", pixels if alpha else pixels[:, :, : 3 if pixels.shape[2] > 2 else 1])
-    return upright(codes, own if turn is None else turn)
+    return upright(_kept(pixels, alpha), own if turn is None else turn)
+
+
+def _kept(pixels: NDArray[np.generic], alpha: bool) -> Codes:
+    """Pixels without their alpha channel, unless it is to be kept."""
+    return cast("Codes", pixels if alpha else pixels[:, :, : 3 if pixels.shape[2] > 2 else 1])
 
 
 def _orientation_of(picture: Image.Image) -> int:
@@ -152,7 +136,7 @@ def _pixels(data: bytes, picture: Image.Image, memory: int) -> NDArray[np.generi
     if picture.format == "TIFF":
         array = _tiff(data, picture, memory)
     elif picture.format == "PNG" and data[24] == 16:  # the bit depth in IHDR (PNG, sect. 11.2.1)
-        _check_size(picture, 2 * len(picture.getbands()), memory)
+        check_size(*picture.size, 2 * len(picture.getbands()), memory)
         array = imagecodecs.png_decode(data)  # Pillow would reduce it to 8 bits
     else:
         array = _by_pillow(picture, memory)
@@ -168,9 +152,9 @@ def _tiff(data: bytes, picture: Image.Image, memory: int) -> NDArray[np.generic]
         if page.bitspersample not in (8, 16) or page.axes not in ("YX", "YXS", "SYX"):
             raise ImageError(
                 f"this TIFF has {page.bitspersample} bits and the axes {page.axes}: "
-                "only grey and RGB with 8 or 16 bits a channel are supported"
+                "save it as grey or RGB with 8 or 16 bits a channel"
             )
-        _check_size(picture, -(-page.nbytes // (picture.width * picture.height)), memory)
+        check_size(*picture.size, -(-page.nbytes // (picture.width * picture.height)), memory)
         tiff_lzw.check_lzw(data, page)
         array = np.asarray(page.asarray())
         if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
@@ -203,19 +187,10 @@ def _by_pillow(picture: Image.Image, memory: int) -> NDArray[np.uint8]:
     if picture.mode not in ("1", "P", "L", "LA", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr"):
         raise ImageError(f"{picture.format} images of mode {picture.mode!r} are not supported")
     as_it_is = picture.mode in ("L", "LA", "RGB", "RGBA")
-    _check_size(picture, len(picture.getbands()) if as_it_is else 3, memory)
+    check_size(*picture.size, len(picture.getbands()) if as_it_is else 3, memory)
     picture.info.pop("transparency", None)  # transparency of a palette is dropped
     pixels = np.asarray(picture if as_it_is else picture.convert("RGB"))
-    return upright(pixels, {6: 8, 8: 6}.get(turned, turned))  # undo Pillow's turn
-
-
-def _check_size(picture: Image.Image, pixel: int, memory: int) -> None:
-    if picture.width * picture.height * pixel > memory:
-        raise ImageError(
-            f"an image of {picture.width} x {picture.height} pixels takes more than the {memory} bytes "
-            "allowed for one",
-            limit=memory,
-        )
+    return upright(pixels, inverse(turned))
 
 
 def encode_png(pixels: Codes) -> bytes:

@@ -15,10 +15,21 @@ class Gamma(BaseModel):
     gamma: Annotated[float, Field(ge=0.2, le=5.0, description="The exponent.", examples=[2.2])]
 
 
+SAMPLES = 256
+"""Samples of a measured curve: one for each code of 8 bits."""
+
+
+class Sampled(BaseModel):
+    """A measured curve: the light at equally spaced values from 0 to 1, with straight lines between them."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    light: Annotated[tuple[float, ...], Field(min_length=SAMPLES, max_length=SAMPLES)]
+
+
 # About how many pixels curves are fitted to.
 _SAMPLE = 4096
 
-Curve = Literal["linear", "srgb"] | Gamma
+Curve = Literal["linear", "srgb"] | Gamma | Sampled
 Response = Literal["linear", "srgb", "unknown"] | Gamma
 
 
@@ -55,6 +66,8 @@ def to_light(values: NDArray[np.float32], curve: Curve) -> NDArray[np.float32]:
         low = values / np.float32(12.92)
         high = ((np.maximum(values, 0) + np.float32(0.055)) / np.float32(1.055)) ** np.float32(2.4)
         return np.where(values <= 0.04045, low, high)
+    if isinstance(curve, Sampled):
+        return np.interp(values, np.linspace(0, 1, SAMPLES), curve.light).astype(np.float32)
     return np.maximum(values, 0) ** np.float32(curve.gamma)
 
 
@@ -82,7 +95,7 @@ def estimate(
     values: NDArray[np.float32],
     usable: NDArray[np.bool_],
     monitor: Response,
-    camera: Response,
+    camera: Curve | Literal["unknown"],
 ) -> Estimate:
     """Estimate ``unknown`` curves from what the camera saw of constant levels.
 
@@ -96,8 +109,8 @@ def estimate(
         Values of n pixels for each level, 0 to 1.
     usable : (k, n) bool
         False where a value is clipped.
-    monitor, camera : Response
-        As the capture states them.
+    monitor, camera : Curve or "unknown"
+        As the capture states them, or as they were measured.
 
     Returns
     -------

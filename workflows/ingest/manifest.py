@@ -41,8 +41,8 @@ class Frame(BaseModel):
 
     model_config = ConfigDict(frozen=True)
     file: str = Field(
-        description="Name of the image in the archive: PNG, TIFF, JPEG, EXR or camera RAW. All frames have one size "
-        "and kind.",
+        description="Name of the image in the archive: PNG, TIFF, JPEG, HEIC, EXR or camera RAW. All frames have one "
+        "size and kind.",
         examples=["frames/00000.png"],
     )
     pattern: int = Field(
@@ -64,7 +64,8 @@ class Video(BaseModel):
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
     file: str = Field(
-        description="Name of the video in the archive: H.264, HEVC, MJPEG and others, in MP4, MOV, MKV, WebM or AVI.",
+        description="Name of the video in the archive: H.264, HEVC, MJPEG and others, in MP4, MOV, MTS, MKV, WebM or "
+        "AVI.",
         examples=["film.mp4"],
     )
     patterns_per_second: float = Field(

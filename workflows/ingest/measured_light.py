@@ -50,6 +50,12 @@ def look_up_of(stack: Stack) -> Floats:
     return table(camera, stack.dtype, stack.attributes["storage"]["black"])
 
 
+def even_out(light: Floats, frame: int, attributes: dict[str, Any]) -> Floats:
+    """The light of a frame as in one of usual exposure, if the camera's exposure changed by itself."""
+    exposed = attributes.get("auto_exposure")
+    return light if exposed is None else light / np.float32(exposed[frame])
+
+
 def exposures_of(attributes: dict[str, Any]) -> Floats:
     """Exposure times of a stack's frames in units of the shortest, (frames,) float32."""
     exposures = np.array(attributes["exposures"], np.float32)
@@ -76,7 +82,10 @@ def read_light(stack: Stack, span: tuple[slice, slice], program: Program) -> tup
         codes = codes[:, recovered]
 
         def at_rest(frame: int) -> tuple[Floats, Bools]:
-            return look_up[codes[frame]], (codes[frame] > 0) & (codes[frame] < top)
+            return (
+                even_out(look_up[codes[frame]], frame, attributes),
+                (codes[frame] > 0) & (codes[frame] < top),
+            )
 
         frame_of: FrameOf = at_rest
     else:
@@ -85,7 +94,7 @@ def read_light(stack: Stack, span: tuple[slice, slice], program: Program) -> tup
 
         def in_place(frame: int) -> tuple[Floats, Bools]:
             values, whole = unclipped_light(around[frame], shifts[frame], margin, look_up)
-            return values[recovered], whole[recovered]
+            return even_out(values[recovered], frame, attributes), whole[recovered]
 
         frame_of = in_place
     return light_of(frame_of, attributes, program, int(recovered.sum())), recovered

@@ -8,27 +8,25 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from storage.errors import CaptureError, ImageError
+from storage.errors import CaptureError
 from storage.layout import captures, uploads
 from storage.layout.captures import Stack, create_stack, write_slab
 from storage.objects.store import Objects
 from workflows.images import integer_formats
 from workflows.images.resample import smallest_grid
 from workflows.images.tone_curves import Response
-from workflows.ingest import stills
+from workflows.ingest import films, stills
 from workflows.ingest.archive import CaptureArchive
 from workflows.ingest.manifest import MANIFEST
 from workflows.ingest.report.calibration import measure
 from workflows.ingest.report.survey import survey
 from workflows.ingest.video.border_reader import LOOKS
-from workflows.ingest.video.decoder import open_clip
-from workflows.ingest.video.frame_means import Share, mean_frames
+from workflows.ingest.video.frame_means import Share
 from workflows.ingest.video.matching import MAX_PATTERNS, MatchedFrames, match_frames
 from workflows.ingest.video.resemblance import lay_out
-from workflows.ingest.video.signatures import take_signatures
 from workflows.jobs import Steps, Task
 from workflows.programs.program import Images
-from workflows.untrusted.decoder_guard import Guard
+from workflows.untrusted.decoder import Decoder
 from workflows.untrusted.limits import Limits
 
 
@@ -47,13 +45,15 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
     CaptureError
     """
     limits = task.limits
-    with uploads.read(objects, task.capture) as file:
+    with uploads.read(objects, task.capture) as file, Decoder(limits.image) as decoder:
         archive = CaptureArchive(file, limits)
         manifest = archive.manifest
         names = [n for part in manifest.program.parts if isinstance(part, Images) for n in part.files]
         patterns: list[NDArray[np.float32]] = []
         for name in names:
-            patterns.append(integer_formats.to_unit(smallest_grid(_decode(archive, name, limits))))
+            patterns.append(
+                integer_formats.to_unit(smallest_grid(stills.read_integers(decoder, archive, name)))
+            )
             if sum(pattern.nbytes for pattern in patterns) > limits.memory // 2:
                 raise CaptureError(
                     f"the image files of patterns, up to {name}, take more than {limits.memory // 2} bytes together: "
@@ -62,13 +62,13 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
                     limit=limits.memory // 2,
                 )
         # One orientation for all frames: a camera that looks down detects its orientation at random.
-        turn = (
-            1 if manifest.video is not None else stills.orientation(archive, manifest.frames[0].file, limits)
-        )
-        shape, storage, filmed = _examine(archive, patterns, limits)
+        turn = 1
+        if manifest.video is None:
+            turn = stills.header(decoder, archive, manifest.frames[0].file).orientation
+        shape, storage, filmed = _examine(decoder, archive, patterns, limits)
         mask = None
         if manifest.mask is not None:
-            mask = np.any(_decode(archive, manifest.mask, limits), axis=2)
+            mask = np.any(stills.read_integers(decoder, archive, manifest.mask), axis=2)
             if mask.shape != shape[1:3]:
                 raise CaptureError(
                     f"{manifest.mask} is {_size(mask)}, the frames are {shape[2]} x {shape[1]}"
@@ -117,15 +117,15 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
 
 
 def _examine(
-    archive: CaptureArchive, patterns: Sequence[NDArray[np.float32]], limits: Limits
+    decoder: Decoder, archive: CaptureArchive, patterns: Sequence[NDArray[np.float32]], limits: Limits
 ) -> tuple[tuple[int, int, int, int], stills.Storage, MatchedFrames | None]:
     """The shape of the stack and how it is stored; for a video, also its frames matched to the patterns."""
     manifest = archive.manifest
     if manifest.video is None:
-        first = stills.read(archive, manifest.frames[0].file, limits)
+        first = stills.read(decoder, archive, manifest.frames[0].file)
         height, width, channels = first.shape
         shape = len(manifest.frames), height, width, channels
-        return shape, stills.storage_of(archive, first, limits), None
+        return shape, stills.storage_of(decoder, archive, first), None
     program, entry = manifest.program, manifest.video.file
     if program.count > MAX_PATTERNS:
         raise CaptureError(
@@ -136,24 +136,15 @@ def _examine(
         )
     curve = "srgb" if program.monitor.response == "unknown" else program.monitor.response
     light = lay_out(program, curve, patterns)
-    with archive.open(entry) as file, open_clip(file, entry, limits.image) as clip:
-        border, rate = manifest.video.border, manifest.video.patterns_per_second
-        signatures, ticks, large = take_signatures(
-            clip, limits.memory // 4, math.inf if border is None else 1 / (LOOKS * rate)
+    border, rate = manifest.video.border, manifest.video.patterns_per_second
+    with archive.open(entry) as file:
+        film, signatures, ticks, large = films.scan(
+            decoder, file, entry, limits.memory // 4, None if border is None else 1 / (LOOKS * rate)
         )
-        filmed = match_frames(
-            signatures,
-            ticks,
-            clip.tick,
-            program,
-            light,
-            rate,
-            entry,
-            large,
-            border,
-        )
-        shape = len(filmed.shares), clip.height, clip.width, 3
-        return shape, stills.Storage(np.dtype(np.uint16), 0, 1.0, True), filmed
+    tick = float(film.time_base)
+    filmed = match_frames(signatures, ticks, tick, program, light, rate, entry, large, border)
+    shape = len(filmed.shares), film.height, film.width, 3
+    return shape, stills.Storage(np.dtype(np.uint16), 0, 1.0, True), filmed
 
 
 def work(objects: Objects, task: Task, tile: int) -> int:
@@ -167,9 +158,9 @@ def work(objects: Objects, task: Task, tile: int) -> int:
     stack, slab = Stack(objects, task.capture), task.plan["slab"]
     first, last = tile * slab, min((tile + 1) * slab, stack.frames)
     frames = np.empty((last - first, stack.height, stack.width, stack.channels), stack.dtype)
-    with uploads.read(objects, task.capture) as file:
+    with uploads.read(objects, task.capture) as file, Decoder(task.limits.image) as decoder:
         archive = CaptureArchive(file, task.limits)
-        for n, pixels in enumerate(_pixels(archive, stack, first, last, task.limits)):
+        for n, pixels in enumerate(_pixels(decoder, archive, stack, first, last)):
             frames[n] = pixels
     write_slab(objects, task.capture, first, frames)
     return int(frames.shape[0] * frames.shape[1] * frames.shape[2])
@@ -194,22 +185,22 @@ STEPS = Steps("ingest", "reading", prepare, work, missing, finish, scattered=Fal
 
 
 def _pixels(
-    archive: CaptureArchive, stack: Stack, first: int, last: int, limits: Limits
+    decoder: Decoder, archive: CaptureArchive, stack: Stack, first: int, last: int
 ) -> Iterator[integer_formats.Codes]:
     """The frames of a stack from ``first`` up to ``last``."""
     video = archive.manifest.video
     if video is not None:
         shares = stack.shares()
         plan = [[Share(*row) for row in shares[shares[:, 0] == n, 1:].tolist()] for n in range(first, last)]
-        with archive.open(video.file) as file, open_clip(file, video.file, limits.image) as clip:
-            yield from mean_frames(clip, plan)
+        with archive.open(video.file) as file:
+            yield from films.means(decoder, file, video.file, plan, stack.width, stack.height)
         return
     shape = (stack.height, stack.width, stack.channels)
     storage = stills.Storage(stack.dtype, **stack.attributes["storage"])
     kind = np.dtype(np.float32) if storage.black else stack.dtype
     turn = stack.attributes.get("orientation", 1)  # missing from stacks of earlier versions
     for frame in archive.manifest.frames[first:last]:
-        pixels = stills.read(archive, frame.file, limits, turn)
+        pixels = stills.read(decoder, archive, frame.file, turn)
         if pixels.shape != shape or pixels.dtype != kind:
             raise CaptureError(
                 f"{frame.file} is {_size(pixels)} with {pixels.shape[2]} channels of {pixels.dtype}, the first "
@@ -218,15 +209,6 @@ def _pixels(
                 entry=frame.file,
             )
         yield storage.encode(pixels)
-
-
-def _decode(archive: CaptureArchive, entry: str, limits: Limits) -> integer_formats.Codes:
-    data = archive.read(entry)
-    try:
-        with Guard(entry, limits.image).on():
-            return integer_formats.decode(data, memory=limits.image)
-    except ImageError as error:
-        raise CaptureError(f"{entry}: {error.detail}", entry=entry, **error.fields) from error
 
 
 def _size(pixels: NDArray[np.generic]) -> str:

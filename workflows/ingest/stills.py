@@ -1,19 +1,21 @@
 """Read one frame from its image file, and store frames of float values as integers."""
 
-from typing import NamedTuple
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Annotated, Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
 
 from storage.errors import CaptureError, ImageError
-from workflows.images import camera_raw, float_formats, integer_formats
+from workflows.images import camera_raw, float_formats, integer_formats, raw_files
 from workflows.images.float_formats import Floats
 from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import BLACK
 from workflows.ingest.archive import CaptureArchive
 from workflows.ingest.manifest import MANIFEST
-from workflows.untrusted.decoder_guard import Guard
-from workflows.untrusted.limits import Limits
+from workflows.untrusted.decoder import Decoder, blaming
 
 HEADROOM = 1.05
 """Full scale relative to the largest value of the white frame: leaves room for noise."""
@@ -59,15 +61,39 @@ class Storage(NamedTuple):
         return codes
 
 
-def orientation(archive: CaptureArchive, entry: str, limits: Limits) -> int:
-    """The orientation that a frame states, for `integer_formats.upright`."""
+class Header(BaseModel):
+    """What a frame's file says of itself.
+
+    Attributes
+    ----------
+    raw : bool
+        Whether it is camera RAW.
+    orientation : int
+        For `workflows.images.orientation.upright`.
+    """
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
+
+    raw: bool
+    orientation: Annotated[int, Field(ge=1, le=8)]
+
+
+def header(decoder: Decoder, archive: CaptureArchive, entry: str) -> Header:
+    """Read what a frame's file says of itself.
+
+    Raises
+    ------
+    CaptureError
+        If that takes too much memory.
+    """
     data = archive.read(entry)
-    with Guard(entry, limits.image).on():
-        return camera_raw.orientation(data) if camera_raw.is_raw(entry) else integer_formats.orientation(data)
+    with blaming(entry, decoder), decoder.checking():
+        (found,) = decoder.run(_header, data, entry=entry)
+        return Header.model_validate(found)
 
 
-def read(archive: CaptureArchive, entry: str, limits: Limits, turn: int | None = None) -> Codes | Floats:
-    """Decode a frame: PNG, TIFF, JPEG, EXR or camera RAW.
+def read(decoder: Decoder, archive: CaptureArchive, entry: str, turn: int | None = None) -> Codes | Floats:
+    """Decode a frame: PNG, TIFF, JPEG, HEIC, EXR or camera RAW.
 
     Parameters
     ----------
@@ -85,18 +111,24 @@ def read(archive: CaptureArchive, entry: str, limits: Limits, turn: int | None =
         Naming the entry.
     """
     data = archive.read(entry)
-    try:
-        with Guard(entry, limits.image).on():
-            if camera_raw.is_raw(entry):
-                return camera_raw.decode(data, memory=limits.image, turn=turn)
-            if float_formats.is_float(data):
-                return float_formats.decode(data, memory=limits.image, turn=turn)
-            return integer_formats.decode(data, memory=limits.image, turn=turn)
-    except ImageError as error:
-        raise CaptureError(f"{entry}: {error.detail}", entry=entry, **error.fields) from error
+    with blaming(entry, decoder):
+        return decoder.picture(_decode, data, entry=entry, memory=decoder.image, turn=turn)
 
 
-def storage_of(archive: CaptureArchive, first: NDArray[np.generic], limits: Limits) -> Storage:
+def read_integers(decoder: Decoder, archive: CaptureArchive, entry: str) -> Codes:
+    """Decode a pattern or a mask: PNG, TIFF, JPEG or HEIC.
+
+    Raises
+    ------
+    CaptureError
+        Naming the entry.
+    """
+    data = archive.read(entry)
+    with blaming(entry, decoder):
+        return decoder.picture(_decode_integers, data, entry=entry, memory=decoder.image)
+
+
+def storage_of(decoder: Decoder, archive: CaptureArchive, first: NDArray[np.generic]) -> Storage:
     """How to store the frames of an archive, given the first of them.
 
     Raises
@@ -122,9 +154,9 @@ def storage_of(archive: CaptureArchive, first: NDArray[np.generic], limits: Limi
     white = int(numbers[np.argmax(sent.sum(axis=1))])
     frames = [frame for frame in manifest.frames if frame.pattern == white]
     entry = max(frames, key=lambda frame: frame.exposure).file
-    full, bounded = 1.0, camera_raw.is_raw(entry)
+    full, bounded = 1.0, header(decoder, archive, entry).raw
     if not bounded:
-        values = read(archive, entry, limits)
+        values = read(decoder, archive, entry)
         finite = values[np.isfinite(values)]
         full = 0.0
         if finite.size:
@@ -132,3 +164,38 @@ def storage_of(archive: CaptureArchive, first: NDArray[np.generic], limits: Limi
     if full <= 0:
         raise CaptureError(f"{entry}, the brightest constant frame, holds no light", entry=entry)
     return Storage(np.dtype(np.uint16), BLACK, full, bounded)
+
+
+# What follows runs in a decoder.
+
+
+def _header(file: BinaryIO, entry: str) -> Iterator[dict[str, Any]]:
+    data = file.read()
+    raw = raw_files.is_raw(data, entry)
+    turn = camera_raw.orientation(data) if raw else integer_formats.orientation(data)
+    yield {"raw": raw, "orientation": turn}
+
+
+def _decode(file: BinaryIO, entry: str, memory: int, turn: int | None) -> Iterator[Codes | Floats]:
+    data = file.read()
+    with _naming(entry):
+        if raw_files.is_raw(data, entry):
+            yield camera_raw.decode(data, memory=memory, turn=turn)
+        elif float_formats.is_float(data):
+            yield float_formats.decode(data, memory=memory, turn=turn)
+        else:
+            yield integer_formats.decode(data, memory=memory, turn=turn)
+
+
+def _decode_integers(file: BinaryIO, entry: str, memory: int) -> Iterator[Codes]:
+    with _naming(entry):
+        yield integer_formats.decode(file.read(), memory=memory)
+
+
+@contextmanager
+def _naming(entry: str) -> Iterator[None]:
+    """Begin errors with the name of the file."""
+    try:
+        yield
+    except ImageError as error:
+        raise ImageError(f"{entry}: {error.detail}", **error.fields) from error.__cause__

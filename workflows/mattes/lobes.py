@@ -4,8 +4,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.layout.mattes import Block, Matte
+from workflows.interruption import checkpoint
 from workflows.recovery.lobe_table import FIELDS, ranked_lobes
 from workflows.recovery.transport import Transport
+
+
+def rows_of(matte: Matte, block: Block) -> Transport:
+    """The rows of T of a block's pixels."""
+    count, shared = block.count.reshape(-1, 3), block.shared.reshape(-1)
+    return Transport(matte.columns, matte.rows, count, block.cell, block.weight, shared)
 
 
 def block_lobes(matte: Matte, block: Block, most: int) -> NDArray[np.float32]:
@@ -17,12 +24,5 @@ def block_lobes(matte: Matte, block: Block, most: int) -> NDArray[np.float32]:
         See :func:`~workflows.recovery.lobe_table.ranked_lobes`.
     """
     width, height = matte.attributes["monitor"]
-    rows = Transport(
-        matte.columns,
-        matte.rows,
-        block.count.reshape(-1, 3),
-        block.cell,
-        block.weight,
-        block.shared.reshape(-1),
-    )
-    return ranked_lobes(rows, most, height / width).reshape(*block.recovered.shape, most, len(FIELDS))
+    lobes = ranked_lobes(rows_of(matte, block), most, height / width, checkpoint)
+    return lobes.reshape(*block.recovered.shape, most, len(FIELDS))

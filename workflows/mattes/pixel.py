@@ -1,14 +1,22 @@
 """One pixel of a matte: the cells of the monitor that its light comes from, and its lobes."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array, diags_array, vstack
 
 from storage.errors import InvalidInput
 from storage.layout.mattes import Matte
-from workflows.mattes.lobes import block_lobes
+from workflows.recovery.lobe_table import ranked_lobes
 from workflows.recovery.pyramid import Pyramid
+from workflows.recovery.transport import Transport
+
+SLAB = 1 << 16
+"""Cells whose bumps are in memory at once."""
+BLOCK_BYTES, PIXEL_BYTES = 24, 96
+"""What a cell of a block takes while the block is read, and one of a pixel while it is looked into."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +73,23 @@ class Pixel:
         return np.stack([u / self.columns, 1 - v / self.rows, *sides], axis=1)
 
 
+def bytes_of_pixel(matte: Matte, x: int, y: int) -> int:
+    """The memory that `look_into` takes, and drawing what it returns.
+
+    Raises
+    ------
+    InvalidInput
+        If there is no such pixel.
+    Corrupt
+        If its block is missing.
+    """
+    at, place = _find(matte, x, y)
+    counts = matte.counts(*at)
+    return BLOCK_BYTES * int(counts.sum(dtype=np.int64)) + PIXEL_BYTES * int(
+        counts[place].sum(dtype=np.int64)
+    )
+
+
 def look_into(matte: Matte, x: int, y: int, lobes: int) -> Pixel:
     """Read a pixel of a matte. One block is read.
 
@@ -75,17 +100,8 @@ def look_into(matte: Matte, x: int, y: int, lobes: int) -> Pixel:
     Corrupt
         If its block is missing.
     """
-    for name, value, size in (("x", x, matte.width), ("y", y, matte.height)):
-        if not 0 <= value < size:
-            raise InvalidInput(
-                f"{name} is {value}: the pixels of this matte have {name} from 0 to {size - 1}, counted from the "
-                f"{'left' if name == 'x' else 'top'}",
-                field=name,
-                limit=size - 1,
-            )
-    at = y // matte.block, x // matte.block
+    at, (i, j) = _find(matte, x, y)
     block = matte.read(*at)
-    i, j = y % matte.block, x % matte.block
     number = i * block.recovered.shape[1] + j
     counts = block.count.reshape(-1, 3).astype(np.int64)
     begin, size = int(counts[:number].sum()), counts[number]
@@ -97,8 +113,16 @@ def look_into(matte: Matte, x: int, y: int, lobes: int) -> Pixel:
     else:
         weight[place, np.repeat(np.arange(3), size)] = block.weight[entries]
     order = np.argsort(-weight.sum(axis=1), kind="stable")
-    ranked = block_lobes(matte, block, lobes)[i, j]
     width, height = matte.attributes["monitor"]
+    rows = Transport(
+        matte.columns,
+        matte.rows,
+        block.count[i, j, np.newaxis],
+        block.cell[entries],
+        block.weight[entries],
+        block.shared[i, j, np.newaxis],
+    )
+    ranked = ranked_lobes(rows, lobes, height / width)[0]
     return Pixel(
         x,
         y,
@@ -112,6 +136,19 @@ def look_into(matte: Matte, x: int, y: int, lobes: int) -> Pixel:
         weight[order],
         ranked[ranked[:, 2:5].any(axis=1)],
     )
+
+
+def _find(matte: Matte, x: int, y: int) -> tuple[tuple[int, int], tuple[int, int]]:
+    """The block of a pixel, and the pixel's row and column in it."""
+    for name, value, size in (("x", x, matte.width), ("y", y, matte.height)):
+        if not 0 <= value < size:
+            raise InvalidInput(
+                f"{name} is {value}: the pixels of this matte have {name} from 0 to {size - 1}, counted from the "
+                f"{'left' if name == 'x' else 'top'}",
+                field=name,
+                limit=size - 1,
+            )
+    return (y // matte.block, x // matte.block), (y % matte.block, x % matte.block)
 
 
 def contribution(
@@ -133,11 +170,16 @@ def contribution(
         Shares; over the whole monitor they sum to 1 in each channel.
     """
     pyramid = Pyramid.over(pixel.columns, pixel.rows)
-    level, row, column, _ = _places(pyramid, pixel.node)
-    columns, rows = (np.cumsum([0, *sizes]) for sizes in zip(*pyramid.grids, strict=True))
-    across = _profiles(pyramid, 0, level, column - columns[level], window[0], window[2], width)
-    down = _profiles(pyramid, 1, level, row - rows[level], window[1], window[3], height)
-    return np.stack([(down * pixel.weight[:, c, np.newaxis]).T @ across for c in range(3)], axis=-1)
+    _, row, column, _ = _places(pyramid, pixel.node)
+    across = _profiles(pyramid, 0, window[0], window[2], width)
+    down = _profiles(pyramid, 1, window[1], window[3], height)
+    shares = np.zeros((height, width, 3))
+    for first in range(0, len(row), SLAB):
+        slab = slice(first, first + SLAB)
+        u, v = across[column[slab]], down[row[slab]].T
+        for c in range(3):
+            shares[..., c] += (v @ diags_array(pixel.weight[slab, c]) @ u).toarray()
+    return shares
 
 
 def _places(
@@ -151,30 +193,19 @@ def _places(
     return level, row + first_row[level], column + first_column[level], np.ldexp(1.0, level)
 
 
-def _profiles(
-    pyramid: Pyramid,
-    axis: int,
-    level: NDArray[np.int64],
-    place: NDArray[np.int64],
-    start: float,
-    stop: float,
-    bins: int,
-) -> NDArray[np.float64]:
-    """(n, bins) the bumps of nodes along an axis, each of sum 1, in the bins of a part of it."""
+def _profiles(pyramid: Pyramid, axis: int, start: float, stop: float, bins: int) -> csr_array:
+    """(columns or rows of all grids, bins) the bumps along an axis, each of sum 1, in the bins of a part of it."""
     sizes = [grid[axis] for grid in pyramid.grids]
-    bumps = np.zeros((len(level), sizes[-1]))
-    for at in reversed(range(len(sizes))):
-        here = np.flatnonzero(level == at)
-        bumps[here, place[here]] = 1
-        if at == 0:
-            break
-        finer = np.zeros((sizes[at - 1], len(level)))
-        for offset, share in zip((-1, 0, 1, 2), (1, 3, 3, 1), strict=True):
-            taps = np.clip(2 * np.arange(sizes[at]) + offset, 0, sizes[at - 1] - 1)
-            np.add.at(finer, taps, bumps.T * share / 8)
-        bumps = finer.T
-    # What lies left of each edge of a bin, linear within a cell.
+    # A cell of the first grid is even, so edges of cells and of bins cut the part into pieces of one cell and one bin.
     edges = np.linspace(start, stop, bins + 1) * sizes[0]
-    below = np.minimum(edges.astype(np.int64), sizes[0] - 1)
-    sums = np.concatenate([np.zeros((len(level), 1)), np.cumsum(bumps, axis=1)], axis=1)
-    return np.diff(sums[:, below] + (edges - below) * bumps[:, below], axis=1)
+    cuts = np.union1d(edges, np.arange(np.ceil(edges[0]), np.floor(edges[-1]) + 1))
+    middles = (cuts[1:] + cuts[:-1]) / 2
+    cell = np.clip(middles.astype(np.int64), 0, sizes[0] - 1)
+    bin = np.clip(np.searchsorted(edges, middles, "right") - 1, 0, bins - 1)
+    profiles = [csr_array((np.diff(cuts), (cell, bin)), shape=(sizes[0], bins))]
+    for finer, size in pairwise(sizes):
+        node, offset = np.divmod(np.arange(4 * size), 4)
+        taps = np.clip(2 * node - 1 + offset, 0, finer - 1)
+        halved = csr_array((np.array([1, 3, 3, 1])[offset] / 8, (node, taps)), shape=(size, finer))
+        profiles.append(halved @ profiles[-1])
+    return csr_array(vstack(profiles))

@@ -15,7 +15,11 @@ MAX_BLOCKS = 4096
 MAX_PATTERNS = 100_000
 """Patterns of a part, and of a program."""
 
+DOT = 2
+"""Side in pixels of the dots of half-tones. Smaller ones suffer more from a page that is not shown at 100 %."""
+
 Unit = Annotated[float, Field(ge=0, le=1)]
+Quarter = Annotated[float, Field(gt=0, lt=1, multiple_of=0.25)]
 
 
 class Record(BaseModel):
@@ -187,6 +191,31 @@ class Stripes(Record):
         return ((s ^ (s >> 1)) & 1).astype(np.float32).reshape(rows, columns, 1)
 
 
+class Halftone(Record):
+    """Grey made of black and white dots, too fine for the camera: its light does not depend on the monitor's curve.
+
+    From these patterns the camera's curve is estimated; nothing else is.
+    """
+
+    kind: Literal["halftone"] = Field(description="Says that this part consists of half-tones.")
+    levels: Annotated[tuple[Quarter, ...], FailFast(), Field(min_length=1, max_length=MAX_PATTERNS)] = Field(
+        description="Share of the dots that are white, one pattern for each. A dot is 2 x 2 pixels; the one at row r "
+        "and column c is white if the entry at r % 2 and c % 2 of [[0, 2], [3, 1]] is below 4 times the level.",
+        examples=[[0.25, 0.5, 0.75]],
+    )
+
+    @property
+    def count(self) -> int:
+        return len(self.levels)
+
+    def values(self, index: int, monitor: Monitor) -> NDArray[np.float32]:
+        """Pattern ``index`` of this part, (height, width, 1) float32; 1 is lit."""
+        lit = (np.array([[0, 2], [3, 1]]) < 4 * self.levels[index]).astype(np.float32)
+        dots = np.kron(lit, np.ones((DOT, DOT), np.float32))
+        down, across = -(-monitor.height // len(dots)), -(-monitor.width // len(dots))
+        return np.tile(dots, (down, across))[: monitor.height, : monitor.width, np.newaxis]
+
+
 class Images(Record):
     """Patterns made by any tool, as image files in the archive, each stretched over the monitor."""
 
@@ -207,4 +236,4 @@ class Images(Record):
         return len(self.files)
 
 
-Part = Annotated[Constant | Bernoulli | Stripes | Images, Field(discriminator="kind")]
+Part = Annotated[Constant | Bernoulli | Stripes | Halftone | Images, Field(discriminator="kind")]

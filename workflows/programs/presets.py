@@ -3,8 +3,8 @@
 from typing import Literal, NamedTuple
 
 from storage.errors import OptionError
-from workflows.programs.parts import MAX_BLOCKS
-from workflows.programs.program import Bernoulli, Constant, Monitor, Program, Stripes
+from workflows.programs.parts import MAX_BLOCKS, Part
+from workflows.programs.program import Bernoulli, Constant, Halftone, Monitor, Program, Stripes
 
 SEED = 7
 """Seed of the first random part; each further part adds 1."""
@@ -12,14 +12,21 @@ SEED = 7
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 RED, GREEN, BLUE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
+AT_FIRST = Constant(kind="constant", colours=(WHITE, RED, GREEN, BLUE, BLACK))
+"""White is first, because a film begins after black, and black is not next, so that it is not taken for a lead-in."""
+HALFTONES = Halftone(kind="halftone", levels=(0.25, 0.5, 0.75))
+AGAIN = Constant(kind="constant", levels=(1, 0))
+"""Shown again in the middle, because exposure and the light of the room may change meanwhile."""
+AT_LAST = Constant(kind="constant", levels=(0, 1))
+"""And at the end: white is last, because black follows in a film."""
+EIGHT_LEVELS = Constant(kind="constant", levels=tuple(round(255 * i / 7) / 255 for i in range(8)))
+
 
 class Recipe(NamedTuple):
     """What a preset shows.
 
     Attributes
     ----------
-    constant : Constant
-        Its levels or colours are multiples of 1/255, so that 8 bits represent them exactly.
     grids : dict of int to int
         Number of patterns for each number of blocks along the monitor's shorter side: from few to many blocks, each
         number a whole multiple of the one before.
@@ -27,28 +34,23 @@ class Recipe(NamedTuple):
         As in `Bernoulli`.
     stripes : int
         Gray-code stripes along each axis.
+    calibrated : bool
+        Whether the patterns that calibrate the camera are shown; if not, `EIGHT_LEVELS`, as in the paper.
     """
 
-    constant: Constant
     grids: dict[int, int]
     colour: Literal["grey", "rgb"] = "grey"
     offset: bool = True
     stripes: int = 0
+    calibrated: bool = True
 
-
-EIGHT_LEVELS = Constant(kind="constant", levels=tuple(round(255 * i / 7) / 255 for i in range(8)))
-COLOURS = Constant(kind="constant", colours=(BLACK, BLACK, WHITE, WHITE, RED, GREEN, BLUE))
 
 RECIPES = {
-    "default": Recipe(
-        Constant(kind="constant", levels=(0, 0, 1, 1)),
-        {6: 10, 12: 20, 24: 26, 48: 22, 96: 14, 192: 12, 384: 8},
-        stripes=8,
-    ),
-    "quick": Recipe(COLOURS, {6: 6, 12: 10, 24: 10, 48: 9, 96: 7, 192: 5, 384: 2}, "rgb"),
-    "sketch": Recipe(COLOURS, {6: 4, 12: 6, 24: 5, 48: 4, 96: 3, 192: 3}, "rgb"),
-    "paper-250": Recipe(EIGHT_LEVELS, {12: 24, 96: 250}, offset=False),
-    "paper-400": Recipe(EIGHT_LEVELS, {12: 24, 96: 400}, offset=False),
+    "default": Recipe({6: 10, 12: 20, 24: 26, 48: 22, 96: 14, 192: 12, 384: 8}, stripes=8),
+    "quick": Recipe({6: 6, 12: 10, 24: 10, 48: 9, 96: 7, 192: 5, 384: 2}, "rgb"),
+    "sketch": Recipe({6: 4, 12: 6, 24: 5, 48: 4, 96: 3, 192: 3}, "rgb"),
+    "paper-250": Recipe({12: 24, 96: 250}, offset=False, calibrated=False),
+    "paper-400": Recipe({12: 24, 96: 400}, offset=False, calibrated=False),
 }
 
 
@@ -114,5 +116,9 @@ def preset(name: str, width: int = 1280, height: int = 960) -> Program:
         )
         for i, ((columns, rows), count) in enumerate(counts.items())
     ]
-    monitor = Monitor(width=width, height=height, response="unknown")
-    return Program(monitor=monitor, parts=(recipe.constant, *stripes, *grids))
+    patterns: tuple[Part, ...] = (*stripes, *grids)
+    middle = (len(patterns) + 1) // 2
+    parts: tuple[Part, ...] = (EIGHT_LEVELS, *patterns)
+    if recipe.calibrated:
+        parts = (AT_FIRST, HALFTONES, *patterns[:middle], AGAIN, *patterns[middle:], AT_LAST)
+    return Program(monitor=Monitor(width=width, height=height, response="unknown"), parts=parts)

@@ -15,6 +15,7 @@ from workflows.programs.parts import (
     MAX_PATTERNS,
     Bernoulli,
     Constant,
+    Halftone,
     Images,
     Monitor,
     Part,
@@ -23,7 +24,7 @@ from workflows.programs.parts import (
 )
 from workflows.recovery.sensing import Sensing
 
-__all__ = ["Bernoulli", "Constant", "Images", "Monitor", "Program", "Stripes"]
+__all__ = ["Bernoulli", "Constant", "Halftone", "Images", "Monitor", "Program", "Stripes"]
 
 Value = TypeVar("Value", bound=np.generic)
 
@@ -71,7 +72,7 @@ class Program(Record):
                 "no two different constant levels: without them neither S nor rho can be measured; "
                 'add a part like {"kind": "constant", "levels": [0, 1]}'
             )
-        if all(isinstance(part, Constant) for part in self.parts):
+        if all(isinstance(part, Constant | Halftone) for part in self.parts):
             raise ValueError("only constant parts: without other patterns T can't be measured")
         size = 4 * sum(
             p.count * p.columns * p.rows * p.channels for p in self.parts if isinstance(p, Bernoulli)
@@ -102,6 +103,17 @@ class Program(Record):
             if isinstance(part, Constant)
         ]
         return np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
+
+    @cached_property
+    def halftones(self) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+        """Numbers of the half-tones, (k,) intp, and the share of white's light that they have, (k,) float32."""
+        found = [
+            (start + i, level)
+            for start, part in zip(self.starts, self.parts, strict=False)
+            if isinstance(part, Halftone)
+            for i, level in enumerate(part.levels)
+        ]
+        return np.array([f[0] for f in found], np.intp), np.array([f[1] for f in found], np.float32)
 
     def constants_among(self, patterns: Sequence[int]) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
         """Those of the `constants` that are among ``patterns``: a video may lack some."""
@@ -183,6 +195,8 @@ class Program(Record):
                 yield from ((part.values[i].reshape(1, 1, 3), None) for i in inside)
             elif isinstance(part, Stripes):
                 yield from ((part.values(i), None) for i in inside)
+            elif isinstance(part, Halftone):
+                yield from ((part.values(i, self.monitor), None) for i in inside)
             elif inside:
                 offsets = part.offsets(self.monitor)
                 for i in inside:
@@ -249,7 +263,7 @@ class Program(Record):
         for start, part in zip(self.starts, self.parts, strict=False):
             if isinstance(part, Bernoulli) and part.offset:
                 yield from part.means(self.monitor, *finest)  # no curve changes black and white
-            elif not isinstance(part, Constant):
+            elif not isinstance(part, Constant | Halftone):
                 yield from (to_light(v, curve) for v in self._values(start, start + part.count, images))
 
     def _grids_of_others(self, images: Sequence[NDArray[np.float32]]) -> list[tuple[int, int]]:
@@ -290,5 +304,5 @@ class Program(Record):
 
     @cached_property
     def measured(self) -> NDArray[np.intp]:
-        """Numbers of the patterns that are not constant, ascending: axis 1 of the measurements."""
-        return np.setdiff1d(np.arange(self.count), self.constants[0])
+        """Numbers of the patterns that tell T, ascending: axis 1 of the measurements."""
+        return np.setdiff1d(np.arange(self.count), np.concatenate([self.constants[0], self.halftones[0]]))

@@ -1,6 +1,7 @@
 """The lobes of every pixel, heaviest first: rows of T as a few Gaussians that other tools can work with."""
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -26,9 +27,17 @@ _SPACING = 0.5
 _MOST_CLUSTERS, _MOST_WIDENING = 32, 4.0**6
 """While a pixel has more clusters than this, those in each 2 x 2 square of a grid merge, and the least variance grows
 four times, up to this factor."""
+_MOST_WORK = 96
+"""Most clusters of a pixel all the same, whatever the factor: the time of what follows grows with their cube."""
+_MOST_READ = 1 << 14
+"""Clusters of a pixel that are held while its entries are read; if there are more, squares merge already then."""
+_CHUNK = 64
+"""Pixels of one call of the kernel: some tenths of a second at worst."""
 
 
-def ranked_lobes(transport: Transport, most: int, aspect: float) -> NDArray[np.float32]:
+def ranked_lobes(
+    transport: Transport, most: int, aspect: float, between: Callable[[], None] = lambda: None
+) -> NDArray[np.float32]:
     """Find the lobes of each pixel.
 
     Parameters
@@ -39,6 +48,8 @@ def ranked_lobes(transport: Transport, most: int, aspect: float) -> NDArray[np.f
         Largest number of lobes of a pixel.
     aspect : float
         Height of the monitor divided by its width.
+    between : callable, optional
+        Is called again and again, at least every second or so; an exception ends the work.
 
     Returns
     -------
@@ -63,7 +74,8 @@ def ranked_lobes(transport: Transport, most: int, aspect: float) -> NDArray[np.f
     Each node starts as a cluster with the mean and the variance of its bump, cut off at the edges of the monitor.
     Clusters merge by their moments, at least cost first (Ward, see :func:`.clusters.gaussians.merge_clusters`). The
     first merges are limited to clusters that overlap and whose grids are at most one level apart, so that a sharp lobe
-    on a broad one stays separate. If more than `most` are left, any two may merge.
+    on a broad one stays separate. If more than `most` are left, any two may merge. The light of a pixel that comes from
+    very many places is merged in squares before, so that no pixel takes more than some milliseconds.
 
     The three channels' rows of a pixel are clustered together, so a lobe has one centre and three weights. Channels
     with different centres get separate lobes, even where these overlap.
@@ -89,17 +101,22 @@ def ranked_lobes(transport: Transport, most: int, aspect: float) -> NDArray[np.f
     begin = np.concatenate([[0], np.cumsum(sizes.sum(axis=1))])
     spacing = max(1 / transport.columns, aspect / transport.rows) * 2.0 ** np.arange(len(pyramid.grids))
     lobes = np.zeros((len(sizes), most, len(FIELDS)), np.float32)
-    _rank(
-        sizes,
-        begin,
-        transport.cell.astype(np.int64),
-        transport.weight,
-        transport.shared,
-        _bumps_of(pyramid, aspect),
-        (_SPACING * spacing) ** 2,
-        np.empty((int(np.diff(begin).max(initial=0)), CLUSTER_VALUES)),
-        lobes,
-    )
+    bumps, least_variance = _bumps_of(pyramid, aspect), (_SPACING * spacing) ** 2
+    clusters = np.empty((min(int(np.diff(begin).max(initial=0)), _MOST_READ), CLUSTER_VALUES))
+    for first in range(0, len(sizes), _CHUNK):
+        between()
+        chunk = slice(first, first + _CHUNK)
+        _rank(
+            sizes[chunk],
+            begin[chunk],
+            transport.cell,
+            transport.weight,
+            transport.shared[chunk],
+            bumps,
+            least_variance,
+            clusters,
+            lobes[chunk],
+        )
     lobes[..., 1] /= np.float32(aspect)
     return lobes
 
@@ -142,7 +159,7 @@ def _bumps_of(pyramid: Pyramid, aspect: float) -> _Bumps:
 def _rank(
     sizes: NDArray[np.int64],
     begin: NDArray[np.int64],
-    cell: NDArray[np.int64],
+    cell: NDArray[np.uint32],
     weight: NDArray[np.float32],
     shared: NDArray[np.bool_],
     bumps: _Bumps,
@@ -153,9 +170,11 @@ def _rank(
     """Write the lobes of one pixel after another, v in units of the monitor's width."""
     node, level = np.empty((len(clusters), 2), np.int64), np.empty(len(clusters), np.int64)
     for i in range(len(sizes)):
-        n = _read_clusters(sizes[i], begin[i], cell, weight, shared[i], bumps, clusters, node, level)
-        widening = 1.0
-        while n > _MOST_CLUSTERS and widening < _MOST_WIDENING:
+        n, halvings = _read_clusters(
+            sizes[i], begin[i], cell, weight, shared[i], bumps, clusters, node, level
+        )
+        widening = 4.0**halvings
+        while n > _MOST_CLUSTERS and (widening < _MOST_WIDENING or n > _MOST_WORK):
             n = merge_squares(clusters, node, level, n)
             widening *= 4
         n = merge_near(clusters, level, n, least_variance * widening, shared[i])
@@ -173,25 +192,31 @@ def _rank(
 def _read_clusters(
     sizes: NDArray[np.int64],
     entry: int,
-    cell: NDArray[np.int64],
+    cell: NDArray[np.uint32],
     weight: NDArray[np.float32],
     shared: bool,
     bumps: _Bumps,
     clusters: NDArray[np.float64],
     node: NDArray[np.int64],
     level: NDArray[np.int64],
-) -> int:
-    """Write a cluster for each entry of a pixel's rows, with its row, column and level; return their number.
+) -> tuple[int, int]:
+    """Write a cluster for each entry of a pixel's rows, with its row, column and level.
 
-    `sizes`, (3,), are the entries of each channel; the first is `entry`.
+    `sizes`, (3,), are the entries of each channel; the first is `entry`. Returns the number of clusters, and how often
+    squares were merged to make room for all.
     """
-    n = 0
+    n, halvings = 0, 0
     for channel in range(3):
         for _ in range(sizes[channel]):
-            at = np.searchsorted(bumps.starts, cell[entry], "right") - 1
-            row, column = divmod(cell[entry] - bumps.starts[at], bumps.columns[at])
+            if n == len(clusters):
+                while n > len(clusters) // 2:
+                    n = merge_squares(clusters, node, level, n)
+                    halvings += 1
+            number = np.int64(cell[entry])
+            at = np.searchsorted(bumps.starts, number, "right") - 1
+            row, column = divmod(number - bumps.starts[at], bumps.columns[at])
             x, y = bumps.across[bumps.first_column[at] + column], bumps.up[bumps.first_row[at] + row]
-            node[n, 0], node[n, 1], level[n] = row, column, at
+            node[n, 0], node[n, 1], level[n] = row >> halvings, column >> halvings, at
             w = np.float64(weight[entry])
             cluster = clusters[n]
             cluster[MOMENTS:] = w if shared else 0.0
@@ -202,7 +227,7 @@ def _read_clusters(
             cluster[0], cluster[1], cluster[2] = w, w * x[0], w * y[0]
             cluster[3], cluster[4], cluster[5] = w * x[1], w * x[0] * y[0], w * y[1]
             n, entry = n + 1, entry + 1
-    return n
+    return n, halvings
 
 
 @njit(nogil=True, cache=True)

@@ -12,6 +12,9 @@ TYPICAL_SHOT = 1 / 20_000
 TYPICAL_READ = 0.0015**2
 """Read noise of 0.15 % of full scale."""
 
+MOSTLY = 0.5
+"""Pixels that are clipped under a colour do not count for crosstalk if the others have this share of the light."""
+
 # Most pixels used to estimate the noise.
 _SAMPLE = 4096
 # A camera with a larger row sum of crosstalk is taken as one that does not separate colours.
@@ -179,20 +182,58 @@ def estimate_crosstalk(
 
     Notes
     -----
-    ``s + G b`` is fitted to each pixel's values; X_cd is the slope of G_cd over G_dd through zero.
+    ``s + G b`` is fitted to each pixel's values; X_cd is the slope of G_cd over G_dd through zero. A camera that
+    separates colours more than its filters do makes negative light, and clips it. Black, white and the channel's own
+    colour then still tell what the other two colours give together, and the solution of least norm shares it.
     """
     _check_shapes(values, levels, usable)
     design = np.concatenate([np.ones((len(levels), 1)), levels], axis=1)
-    complete = usable.all(axis=(1, 2))
-    if np.linalg.matrix_rank(design) < 4 or not complete.any():
+    if np.linalg.matrix_rank(design) < 4:
         return np.eye(3)
-    gain = np.einsum("dk,nkc->ncd", np.linalg.pinv(design)[1:], values[complete].astype(np.float64))
-    own = gain[:, [0, 1, 2], [0, 1, 2]]
-    energy = (own**2).sum(axis=0)
-    if not energy.all():
-        return np.eye(3)
-    mixed: NDArray[np.float64] = np.einsum("ncd,nd->cd", gain, own) / energy
+    gain = np.zeros((len(values), 3, 3))
+    whole, own_known = np.zeros((len(values), 3), bool), np.zeros((len(values), 3), bool)
+    for c in range(3):
+        alone = (levels[:, c] > 0) & (np.delete(levels, c, axis=1) == 0).all(axis=1)
+        needed = alone, (levels == 0).all(axis=1), (levels > 0).all(axis=1)
+        own_known[:, c] = np.all([usable[:, frames, c].any(axis=1) for frames in needed], axis=0)
+        seen = usable[:, :, c].astype(np.float64)
+        fitted, covariance = solve_least_squares(design, seen, np.where(usable[:, :, c], values[:, :, c], 0))
+        gain[:, c] = fitted[:, 1:]
+        whole[:, c] = np.linalg.matrix_rank(covariance, hermitian=True) == 4
+    known = np.asarray((whole | own_known).all(axis=1))
+    own = np.where(known[:, np.newaxis], gain[:, [0, 1, 2], [0, 1, 2]], 0)
+    mixed = np.eye(3)
+    for c in range(3):
+        complete = own * whole[:, c, np.newaxis]
+        used = complete if (complete**2).sum() > MOSTLY * (own**2).sum() else own
+        energy = (used**2).sum(axis=0)
+        if not energy.all():
+            return np.eye(3)
+        mixed[c] = (gain[:, c] * used).sum(axis=0) / energy
     return mixed if np.abs(mixed - np.eye(3)).sum(axis=1).max() < _MOST_CROSSTALK else np.eye(3)
+
+
+def solve_least_squares(
+    design: NDArray[np.float64], weight: NDArray[np.float64], values: NDArray[np.floating]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Weighted least squares of many data by one design.
+
+    Parameters
+    ----------
+    design : (k, p) float64
+    weight, values : (..., k) float
+        Values must be finite even where their weight is 0.
+
+    Returns
+    -------
+    solutions : (..., p) float64
+        Of least norm where the weights leave a parameter undetermined.
+    covariances : (..., p, p) float64
+        For values whose variance is 1 / weight; singular where a parameter is undetermined.
+    """
+    gram = np.einsum("kp,...k,kq->...pq", design, weight, design, optimize=True)
+    inverse = np.linalg.pinv(gram, rcond=1e-9, hermitian=True)
+    return (inverse @ ((weight * values) @ design)[..., np.newaxis])[..., 0], inverse
 
 
 def _check_shapes(

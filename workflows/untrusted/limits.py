@@ -1,8 +1,8 @@
-"""Limits on what an uploaded archive or video may cost to read."""
+"""Limits on what an uploaded archive, picture or video may cost to read."""
 
 from dataclasses import dataclass
 
-from storage.errors import OverLimit
+from storage.errors import ImageError, OverLimit
 
 
 @dataclass(frozen=True)
@@ -70,3 +70,28 @@ class Limits:
                 limit=self.pixels,
                 value=width * height,
             )
+
+
+def check_size(width: int, height: int, pixel: int, memory: int, what: str = "pixels") -> None:
+    """Check, before a picture is decoded, that it fits into the memory allowed for one.
+
+    Parameters
+    ----------
+    width, height : int
+    pixel : int
+        Bytes that each of them takes.
+    memory : int
+        Bytes that the picture may take.
+    what : str
+        What is counted, for the error.
+
+    Raises
+    ------
+    ImageError
+    """
+    if width * height * pixel > memory:
+        raise ImageError(
+            f"an image of {width} x {height} {what} takes more than the {memory} bytes allowed for one: make it "
+            "smaller, or ask for a higher limit",
+            limit=memory,
+        )

@@ -25,7 +25,14 @@ def check_lzw(data: bytes, page: tifffile.TiffPage) -> None:
     whole = np.frombuffer(data, np.uint8)
     for start, size in zip(page.dataoffsets, page.databytecounts, strict=False):
         if not _is_valid(whole[start : start + size]):
-            raise ImageError("the TIFF image is cut off or damaged: its LZW has undefined codes")
+            raise ImageError(
+                "the TIFF image is cut off or damaged, its LZW has undefined codes: save it again"
+            )
+
+
+def load_kernel() -> None:
+    """Compile what `check_lzw` runs, or load it from the cache: later this process may be unable to."""
+    _is_valid(np.frombuffer(b"\x80\x40\x40", np.uint8))
 
 
 @njit(nogil=True, cache=True)

@@ -1,14 +1,14 @@
 """Captures over HTTP: list, read and delete them."""
 
 from datetime import UTC, datetime
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
-from fastapi import APIRouter, Response
+from fastapi import APIRouter, Request, Response
 from pydantic import BaseModel
 from sqlalchemy import Row
 
 from services.api.context import OwnerContext
-from services.api.http.responses import bytes_response, utc_time
+from services.api.http.responses import bytes_response, json_response, utc_time
 from services.api.http.types import After, Limit
 from storage.database.engine import reading, writing
 from storage.database.rows import page
@@ -21,10 +21,12 @@ from storage.records import captures, jobs
 from workflows.images.integer_formats import encode_png
 
 router = APIRouter(tags=["captures"])
+PROGRAM_BYTES = 64 << 20
+"""What the largest program that a capture may have takes in memory."""
 
 
-class Capture(BaseModel):
-    """A capture."""
+class ListedCapture(BaseModel):
+    """A capture as lists have it."""
 
     id: str
     name: str
@@ -33,7 +35,6 @@ class Capture(BaseModel):
     width: int | None
     height: int | None
     frames: int
-    program: dict[str, Any]
     bytes: int
     report: str | None
     problem: dict[str, Any] | None
@@ -41,7 +42,7 @@ class Capture(BaseModel):
     expires_at: datetime | None
 
     @classmethod
-    def of(cls, row: Row[Any]) -> "Capture":
+    def of(cls, row: Row[Any]) -> Self:
         return cls(
             **{
                 name: getattr(row, name)
@@ -54,29 +55,45 @@ class Capture(BaseModel):
         )
 
 
+class Capture(ListedCapture):
+    """A capture. Its program may be large."""
+
+    program: dict[str, Any]
+
+
 class Captures(BaseModel):
     """A page of captures, newest first."""
 
-    captures: list[Capture]
+    captures: list[ListedCapture]
 
 
-@router.get("/captures")
-def list_captures(
+@router.get("/captures", response_model=Captures)
+async def list_captures(
     context: OwnerContext,
+    request: Request,
     limit: Limit = 100,
     after: After = None,
     state: Literal["ingesting", "ready", "failed"] | None = None,
-) -> Captures:
-    """Captures, newest first."""
-    with reading(context.engine) as c:
-        return Captures(captures=[Capture.of(row) for row in page(c, table, limit, after, state=state)])
+) -> Response:
+    """Captures, newest first, without their programs."""
+
+    def make() -> Response:
+        with reading(context.engine) as c:
+            rows = page(c, table, limit, after, without=("program",), state=state)
+            return json_response(Captures(captures=[ListedCapture.of(row) for row in rows]))
+
+    return await context.compute(request, context.lists, make)
 
 
-@router.get("/captures/{id}")
-def get_capture(context: OwnerContext, id: str) -> Capture:
+@router.get("/captures/{id}", response_model=Capture)
+async def get_capture(context: OwnerContext, id: str, request: Request) -> Response:
     """A capture."""
-    with reading(context.engine) as c:
-        return Capture.of(captures.get(c, id))
+
+    def make() -> Response:
+        with reading(context.engine) as c:
+            return json_response(Capture.of(captures.get(c, id)))
+
+    return await context.compute(request, context.lists, make)
 
 
 @router.delete("/captures/{id}", status_code=204)
@@ -93,13 +110,22 @@ def delete_capture(context: OwnerContext, id: str) -> None:
 
 
 @router.get("/captures/{id}/frames/{n}.png", response_class=Response)
-def get_frame(context: OwnerContext, id: str, n: int) -> Response:
+async def get_frame(context: OwnerContext, id: str, n: int, request: Request) -> Response:
     """A frame as it was stored."""
-    with reading(context.engine) as c:
-        row = captures.get(c, id)
-    if row.state != "ready":
-        raise Conflict(f"capture {id} is {row.state}; its frames can be read once it is ready")
-    if not 0 <= n < row.frames:
-        raise NotFound(f"capture {id} has the frames 0 to {row.frames - 1}", field="n")
-    frame = Stack(context.objects, id).read(frames=slice(n, n + 1))[0]
-    return bytes_response(encode_png(frame), "image/png")
+
+    def measure() -> tuple[Stack, int]:
+        with reading(context.engine) as c:
+            row = captures.get(c, id)
+        if row.state != "ready":
+            raise Conflict(f"capture {id} is {row.state}; its frames can be read once it is ready")
+        if not 0 <= n < row.frames:
+            raise NotFound(f"capture {id} has the frames 0 to {row.frames - 1}", field="n")
+        stack = Stack(context.objects, id)
+        return stack, int(stack.height * stack.width * stack.channels * stack.dtype.itemsize)
+
+    def encode() -> Response:
+        return bytes_response(encode_png(stack.read(frames=slice(n, n + 1))[0]), "image/png")
+
+    stack, size = await context.compute(request, context.lists, measure)
+    # The frame, and a PNG that is as large if the frame is noise.
+    return await context.compute(request, context.memory, encode, max(2 * size, PROGRAM_BYTES))

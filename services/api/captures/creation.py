@@ -12,7 +12,8 @@ from services.api.context import Context, OwnerContext
 from services.api.http.bodies import read_json, schema_of, store_as_upload, upload_limit
 from services.api.http.idempotency import IdempotencyKey, find_earlier, idempotent
 from services.api.http.media_types import JSON, ZIP, media_type_of
-from services.api.quotas import admit, admit_upload
+from services.api.limits.quotas import admit
+from services.api.limits.reservations import reserved
 from services.runtime import tracing
 from services.runtime.problems import WrongMediaType
 from services.webhooks.sender import check_webhook
@@ -21,7 +22,7 @@ from storage.database.rows import new_id
 from storage.errors import CaptureError, Conflict, NotFound
 from storage.layout import uploads as stored_uploads
 from storage.layout.uploads import Part
-from storage.records import captures, jobs, uploads
+from storage.records import bodies, captures, jobs, uploads
 from workflows.ingest.archive import CaptureArchive
 
 router = APIRouter(tags=["captures"])
@@ -69,9 +70,8 @@ async def upload(
     media_type = media_type_of(request)
     if media_type == JSON:
         given = await read_json(request, FromUpload, FROM_UPLOAD_BYTES)
-        row = await anyio.to_thread.run_sync(
-            _from_upload, context, given, idempotency_key, limiter=context.captures
-        )
+        async with context.captures.take(context.caller.owner):
+            row = await anyio.to_thread.run_sync(_from_upload, context, given, idempotency_key)
     elif media_type == ZIP:
         row = await _from_body(context, request, name, idempotency_key, webhook)
     else:
@@ -93,16 +93,19 @@ async def _from_body(
     earlier = await anyio.to_thread.run_sync(_find_earlier, context, key)
     if earlier is not None:
         return earlier
-    await anyio.to_thread.run_sync(_admit, context, length)
     capture = new_id()
-    try:
-        parts = [await store_as_upload(request, context.objects, capture, limit)]
-        args = context, capture, parts, name, key, False, webhook
-        row = await anyio.to_thread.run_sync(_register, *args, limiter=context.captures)
-    except Exception:
-        # Not when cancelled: `_register` may still be running in its thread. Then the next start removes the bytes.
-        await anyio.to_thread.run_sync(stored_uploads.remove, context.objects, capture)
-        raise
+    most = context.settings.upload_bytes
+    async with reserved(context, capture, length, most, captures=1, jobs=1) as reservation:
+        try:
+            pieces = reservation.watch(limit.stream(request))
+            parts = [await store_as_upload(pieces, context.objects, capture)]
+            args = context, capture, parts, name, key, False, webhook
+            async with context.captures.take(context.caller.owner):
+                row = await anyio.to_thread.run_sync(_register, *args)
+        except Exception:
+            # Not when cancelled: `_register` may still be running in its thread. Then a sweep removes the bytes.
+            await anyio.to_thread.run_sync(stored_uploads.remove, context.objects, capture)
+            raise
     if row.id != capture:  # a concurrent request with the same key was quicker
         await anyio.to_thread.run_sync(stored_uploads.remove, context.objects, capture)
     return row
@@ -143,11 +146,6 @@ def _find_earlier(context: Context, key: str | None) -> Row[Any] | None:
     return find_earlier(context.engine, key, CALL, captures.get)
 
 
-def _admit(context: Context, length: int) -> None:
-    with reading(context.engine) as c:
-        admit_upload(c, context.settings, context.objects, length, captures=1, jobs=1)
-
-
 def _register(
     context: Context,
     capture: str,
@@ -166,6 +164,7 @@ def _register(
     def create(c: Connection) -> str:
         if resumable and not uploads.delete(c, capture):
             raise NotFound(f"upload {capture} does not exist any more")
+        bodies.release(c, capture)
         size = sum(part.size for part in parts)
         admit(c, context.settings, captures=1, jobs=1, size=size)
         job = jobs.add(c, "ingest", capture, {}, trace=tracing.current_traceparent(), webhook=webhook)

@@ -1,9 +1,9 @@
 """Reports on captures over HTTP: how the frames turned out."""
 
-from fastapi import APIRouter, Response
+from fastapi import APIRouter, Request, Response
 
 from services.api.context import Context, OwnerContext
-from services.api.http.responses import bytes_response
+from services.api.http.responses import bytes_response, json_response
 from storage.database.engine import reading
 from storage.errors import Conflict
 from storage.layout.captures import Stack
@@ -14,17 +14,25 @@ from workflows.ingest.report.report import Report, report
 router = APIRouter(tags=["captures"])
 
 
-@router.get("/captures/{id}/report")
-def get_report(context: OwnerContext, id: str) -> Report:
+@router.get("/captures/{id}/report", response_model=Report)
+async def get_report(context: OwnerContext, id: str, request: Request) -> Response:
     """The quality of a capture, and how to improve it."""
-    stack = _stack(context, id)
-    return report(stack.attributes, stack.frames)
+
+    def make() -> Response:
+        stack = _stack(context, id)
+        return json_response(report(stack.attributes, stack.frames))
+
+    return await context.compute(request, context.lists, make)
 
 
 @router.get("/captures/{id}/contact-sheet.png", response_class=Response)
-def get_contact_sheet(context: OwnerContext, id: str) -> Response:
+async def get_contact_sheet(context: OwnerContext, id: str, request: Request) -> Response:
     """Some of a capture's frames in one picture: red where they are clipped at white, blue where clipped at black."""
-    return bytes_response(contact_sheet(_stack(context, id)), "image/png")
+
+    def draw() -> Response:
+        return bytes_response(contact_sheet(_stack(context, id)), "image/png")
+
+    return await context.compute(request, context.pictures, draw)
 
 
 def _stack(context: Context, id: str) -> Stack:

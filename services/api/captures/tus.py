@@ -111,6 +111,20 @@ def byte_count(request: Request, name: str) -> int:
     return int(text)
 
 
+def refuse_parts(request: Request) -> None:
+    """Refuse an upload that is a part of another, or made of such parts: the extension concatenation.
+
+    Raises
+    ------
+    BadHeader
+    """
+    if "upload-concat" in request.headers:
+        raise BadHeader(
+            "Upload-Concat: uploads are not joined here; send all bytes to one upload, without this header",
+            field="Upload-Concat",
+        )
+
+
 def metadata_of(request: Request) -> str:
     """Check the ``Upload-Metadata`` of a request, pairs of a key and a value in Base64; returns it unchanged.
 

@@ -1,5 +1,6 @@
 """Resumable uploads over HTTP: tus 1.0 (https://tus.io/protocols/resumable-upload)."""
 
+import time
 from datetime import UTC, datetime
 from email.utils import format_datetime
 from typing import Any
@@ -18,23 +19,29 @@ from services.api.captures.tus import (
     byte_count,
     declared,
     metadata_of,
+    refuse_parts,
     require_version,
 )
 from services.api.context import Context, OwnerContext
 from services.api.http.bodies import BodyLimit, has_body, upload_limit
 from services.api.http.idempotency import IdempotencyKey
 from services.api.http.media_types import require_media_type
-from services.api.quotas import admit_upload
+from services.api.limits.quotas import admit_bytes, admit_upload
+from services.api.limits.reservations import STEP, Reservation
 from storage.database.engine import reading, writing
 from storage.database.rows import new_id
-from storage.errors import InvalidInput, NotFound
+from storage.errors import Conflict, InvalidInput, NotFound
 from storage.layout import uploads as stored_uploads
 from storage.layout.uploads import Part
-from storage.records import captures, uploads
+from storage.records import bodies, captures, uploads
 from storage.records.uploads import MAX_PARTS
 
 PART = 64 << 20
 """Bytes after which a part is recorded: the most that a killed server loses of one PATCH."""
+LOOK = 1.0
+"""Seconds between two looks of a writer whether another request wants its upload."""
+PATIENCE = 5.0
+"""Seconds that a request waits for the writer of its upload to end."""
 
 router = APIRouter(prefix="/uploads", tags=["uploads"])
 Versioned = Depends(require_version)
@@ -59,6 +66,7 @@ async def create_upload(
     A client that knows `frames`, `width` and `height` of the capture can send them in `Upload-Metadata`: they are
     checked against the limits before any bytes are sent. The capture itself is checked in any case.
     """
+    refuse_parts(request)
     length = byte_count(request, "Upload-Length")
     upload_limit(context.settings).check(length)
     checksum = Checksum.of(request)
@@ -121,11 +129,14 @@ async def _append(context: Context, request: Request, row: Row[Any], checksum: C
         row.length,
         f"upload {row.id} has a length of {row.length} bytes, and more have come; send no more than the rest",
     )
-    limit.check_announced(request, row.offset)
+    size = min(limit.check_announced(request, row.offset), STEP)
+    writer = new_id()
+    await _claim(context, row, writer, size)
+    reservation = Reservation(context, writer, size, row.length - row.offset, LOOK)
     # A client that falls silent is disconnected, see `services.api.http.slow_clients`.
-    body = limit.stream(request, row.offset)
+    body = reservation.watch(limit.stream(request, row.offset))
     stored: list[Part] = []
-    offset, more = row.offset, True
+    offset, more, stopped = row.offset, True, None
     try:
         while more:
             name, size, more = new_id(), 0, False
@@ -140,30 +151,75 @@ async def _append(context: Context, request: Request, row: Row[Any], checksum: C
                         if size >= PART:
                             more = True
                             break
-                except ClientDisconnect:
+                except (ClientDisconnect, Conflict) as error:
                     if checksum:
                         raise
+                    stopped = error if isinstance(error, Conflict) else None
             stored[-1] = Part(name, size)
             if not size:
                 empty = stored_uploads.part_path(row.id, stored.pop().name)
                 await anyio.to_thread.run_sync(context.objects.delete, empty)
             if not checksum:
-                offset = await anyio.to_thread.run_sync(_advance, context, row.id, offset, stored)
+                args = context, row.id, offset, stored, reservation, not more
+                offset = await anyio.to_thread.run_sync(_advance, *args)
                 stored = []
+        if stopped:
+            raise stopped
         if checksum:
             checksum.check()
-            await anyio.to_thread.run_sync(_advance, context, row.id, offset, stored)
+            await anyio.to_thread.run_sync(_advance, context, row.id, offset, stored, reservation, True)
     except Exception:
         # Not when cancelled: `_advance` may still be running in its thread. Then the next start removes the parts.
         await anyio.to_thread.run_sync(_remove_unrecorded, context, row.id, stored)
         raise
+    finally:
+        await anyio.to_thread.run_sync(reservation.release)
     return await anyio.to_thread.run_sync(_get, context, row.id)
 
 
-def _advance(context: Context, upload: str, offset: int, stored: list[Part]) -> int:
+async def _claim(context: Context, row: Row[Any], writer: str, size: int) -> None:
+    """Become the only writer of an upload; a request that writes it, and to which nothing comes, is asked to end."""
+
+    def claim() -> bool:
+        with reading(context.engine) as c:  # many may wait, and should not hold up other writers
+            if bodies.has_writer(c, row.id):
+                return False
+        with writing(context.engine) as c:
+            uploads.check_offset(uploads.get(c, row.id), row.offset)
+            if not bodies.claim(c, writer, row.id, size):
+                return False
+            admit_bytes(c, context.settings, context.objects)
+            return True
+
+    def ask() -> None:
+        with writing(context.engine) as c:
+            bodies.ask_for(c, row.id)
+
+    if await anyio.to_thread.run_sync(claim):
+        return
+    await anyio.to_thread.run_sync(ask)
+    deadline = time.monotonic() + PATIENCE
+    while time.monotonic() < deadline:
+        await anyio.sleep(LOOK / 4)
+        if await anyio.to_thread.run_sync(claim):
+            return
+    raise Conflict(f"another request is writing upload {row.id}; request its offset and continue from there")
+
+
+def _advance(
+    context: Context, upload: str, offset: int, stored: list[Part], reservation: Reservation, last: bool
+) -> int:
+    """Record stored parts, which count for the upload from then on; the last of a request also end its claim."""
     context.check_key()
+    size = sum(part.size for part in stored)
     with writing(context.engine) as c:
-        return uploads.advance(c, upload, offset, stored, context.settings.upload_seconds)
+        if last:
+            bodies.release(c, reservation.id)
+        else:
+            bodies.record(c, reservation.id, size)
+        advanced = uploads.advance(c, upload, offset, stored, context.settings.upload_seconds)
+    reservation.recorded(size)
+    return advanced
 
 
 def _remove_unrecorded(context: Context, upload: str, stored: list[Part]) -> None:

@@ -3,6 +3,7 @@
 import tempfile
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from pathlib import Path
 from typing import IO, Any, TypeVar
 
 import anyio.to_thread
@@ -12,6 +13,7 @@ from pydantic import BaseModel, ValidationError
 
 from services.runtime.problems import TooLarge
 from services.settings import Settings
+from storage.disks import require_reserve
 from storage.layout.uploads import Part, part_path
 from storage.objects.store import Objects
 
@@ -107,31 +109,18 @@ def has_body(request: Request) -> bool:
     return request.headers.get("content-length", "0") != "0" or "transfer-encoding" in request.headers
 
 
-async def store_as_upload(request: Request, objects: Objects, upload: str, limit: BodyLimit) -> Part:
-    """Stream a body into the store as the only part of an upload.
-
-    Raises
-    ------
-    TooLarge
-        As soon as more bytes than the limit have come.
-    """
-    size = await store_body(request, objects, part_path(upload, ONLY_PART), limit)
-    return Part(ONLY_PART, size)
+async def store_as_upload(pieces: AsyncIterator[bytes], objects: Objects, upload: str) -> Part:
+    """Stream a body into the store as the only part of an upload."""
+    return Part(ONLY_PART, await store_body(pieces, objects, part_path(upload, ONLY_PART)))
 
 
-async def store_body(request: Request, objects: Objects, path: str, limit: BodyLimit) -> int:
-    """Stream a body into the store as one object; returns its bytes.
-
-    Raises
-    ------
-    TooLarge
-        As soon as more bytes than the limit have come.
-    """
+async def store_body(pieces: AsyncIterator[bytes], objects: Objects, path: str) -> int:
+    """Stream a body into the store as one object; returns its bytes."""
     size = 0
     async with objects.write(path) as file:
-        async for part in limit.stream(request):
-            size += len(part)
-            await file.write(part)
+        async for piece in pieces:
+            size += len(piece)
+            await file.write(piece)
     return size
 
 
@@ -143,13 +132,20 @@ async def spool_body(request: Request, limit: int) -> AsyncIterator[IO[bytes]]:
     ------
     TooLarge
         As soon as more than ``limit`` bytes have come.
+    NoRoom
+        If the disk of temporary files is nearly full.
     """
+
+    def write(part: bytes) -> None:
+        require_reserve(Path(tempfile.gettempdir()))
+        file.write(part)
+
     with tempfile.SpooledTemporaryFile(SPOOLED) as file:
         size = 0
         async for part in BodyLimit(limit).stream(request):
             size += len(part)
             if size > SPOOLED:
-                await anyio.to_thread.run_sync(file.write, part)
+                await anyio.to_thread.run_sync(write, part)
             else:
                 file.write(part)
         file.seek(0)

@@ -8,6 +8,7 @@ from typing import IO
 
 from fastapi import Response
 from fastapi.responses import StreamingResponse
+from pydantic import BaseModel
 from starlette.datastructures import Headers
 from starlette.types import Receive, Scope, Send
 
@@ -28,6 +29,11 @@ def bytes_response(data: bytes, media_type: str, headers: dict[str, str] | None 
         file.seek(0)
         stack.pop_all()  # the response closes it
     return FileStreamResponse(file, len(data), media_type, headers)
+
+
+def json_response(model: BaseModel) -> Response:
+    """A response with a model as JSON, made where it is called: for large ones, outside of the event loop."""
+    return bytes_response(model.model_dump_json().encode(), "application/json")
 
 
 class FileStreamResponse(StreamingResponse):

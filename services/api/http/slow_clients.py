@@ -15,10 +15,28 @@ logger = logging.getLogger(__name__)
 
 HEAD = 15.0
 """Seconds in which the head of a request must arrive, from the connection or from its first byte on."""
+MOST_HEAD = 16 << 10
+"""Most bytes of the head of a request."""
 CHECK_SECONDS = 30.0
 """Seconds between two checks that the client goes on to send its request's body, and to read the answer."""
-MIN_BYTES = 1000
-"""Bytes that must have been transferred between two checks: about 33 per second, less than any network gives."""
+MIN_RATE = 1000
+"""Bytes per second that must have been transferred between two checks: less than any network gives."""
+
+
+class _Unambiguous(h11.Connection):
+    """A reader of requests that refuses one with both a length and chunks.
+
+    A proxy before the service may take the other for its end, and what follows for another client's request (RFC 9112,
+    sect. 6.1 and 11.2).
+    """
+
+    def next_event(self) -> Any:
+        event = super().next_event()
+        if isinstance(event, h11.Request):
+            names = {name for name, _ in event.headers}
+            if {b"content-length", b"transfer-encoding"} <= names:
+                raise h11.RemoteProtocolError("a request has both a length and chunks")
+        return event
 
 
 class Connection(H11Protocol):
@@ -33,6 +51,10 @@ class Connection(H11Protocol):
     _check_timer: asyncio.TimerHandle | None = None
     _received = 0
     _last: "tuple[int, int, object, int]" = (0, 0, None, 0)
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.conn = _Unambiguous(h11.SERVER, MOST_HEAD)
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(_Counting(transport))  # type: ignore[arg-type]
@@ -68,10 +90,9 @@ class Connection(H11Protocol):
         sent = transport.written - unsent
         request = self.cycle if self._expects_body() else None
         last_unsent, last_sent, last_request, last_received = self._last
-        is_stuck = unsent and sent - last_sent < min(last_unsent, MIN_BYTES)
-        is_silent = (
-            request is not None and request is last_request and self._received - last_received < MIN_BYTES
-        )
+        least = MIN_RATE * CHECK_SECONDS
+        is_stuck = unsent and sent - last_sent < min(last_unsent, least)
+        is_silent = request is not None and request is last_request and self._received - last_received < least
         if is_stuck or is_silent:
             logger.info(
                 "closed a connection: %s",

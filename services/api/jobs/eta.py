@@ -5,7 +5,7 @@ from typing import Any
 
 from sqlalchemy import Connection, Row
 
-from storage.records import statistics
+from storage import statistics
 
 TYPICAL = 1.4e-7
 """Seconds per unit of `_report_work` on a 2.5 GHz core."""
@@ -25,8 +25,8 @@ def seconds_left(connection: Connection, row: Row[Any], now: float) -> float | N
     if row.done == row.total:
         elapsed = now - row.stage_at if row.stage == "finishing" else 0.0
         return max(finishing - elapsed, 0.0)
-    if row.paced_at is None or row.done <= row.paced_done:
-        return None
+    if row.paced_at is None or row.done <= row.paced_done or row.moved_at <= row.paced_at:
+        return None  # the last: the clock has gone back
     pace = (row.moved_at - row.paced_at) / (row.done - row.paced_done)
     return float(max((row.total - row.done) * pace - (now - row.moved_at), 0.0)) + finishing
 
@@ -39,7 +39,7 @@ def _finishing(connection: Connection, row: Row[Any]) -> float:
     """
     ended = [
         (plan, seconds)
-        for plan, seconds in statistics.recent_ingests(connection, limit=8)
+        for plan, seconds in statistics.recent_ingests(connection, limit=16)
         if plan.get("video") == row.plan.get("video")
     ]
     speeds = [TYPICAL, *(seconds / _report_work(plan) for plan, seconds in ended[:4])]

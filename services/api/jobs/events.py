@@ -2,10 +2,10 @@
 
 import hashlib
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
+from functools import partial
 from typing import Annotated, TypeVar
 
-import anyio
 import anyio.to_thread
 from fastapi import APIRouter, Header, Response
 from fastapi.responses import StreamingResponse
@@ -22,8 +22,6 @@ from storage.records import jobs
 router = APIRouter(tags=["jobs"])
 MEDIA_TYPE = "text/event-stream"
 T = TypeVar("T", bound=BaseModel)
-POLL = 0.5
-"""Seconds between two reads of a resource."""
 KEEP_ALIVE = 15.0
 """Seconds without an event after which a comment is sent, so that no proxy closes the connection as idle."""
 CLOCKS = {"queued_seconds", "run_seconds", "eta_seconds"}
@@ -48,11 +46,15 @@ async def follow_job(
     job = await anyio.to_thread.run_sync(_read, context, id)
     if _has_ended(job) and _event_id(job) == last_event_id:
         return Response(status_code=204)
-    return stream(lambda: _read(context, id), job, _event_id, last_event_id, _has_ended)
+
+    async def read() -> Job:
+        return await context.follow(("job", id), partial(_read, context, id))
+
+    return stream(read, job, _event_id, last_event_id, _has_ended)
 
 
 def stream(
-    read: Callable[[], T],
+    read: Callable[[], Awaitable[T]],
     current: T,
     event_id: Callable[[T], str],
     last_event_id: str | None,
@@ -63,7 +65,7 @@ def stream(
     Parameters
     ----------
     read : callable
-        Reads the resource again, in a thread.
+        Reads the resource again, in a moment.
     current : pydantic.BaseModel
         The resource as it was read just now.
     event_id : callable
@@ -81,7 +83,7 @@ def stream(
 
 
 async def _events(
-    read: Callable[[], T],
+    read: Callable[[], Awaitable[T]],
     current: T,
     event_id: Callable[[T], str],
     last_event_id: str | None,
@@ -98,9 +100,8 @@ async def _events(
             sent_at = time.monotonic()
         if has_ended(current):
             return
-        await anyio.sleep(POLL)
         try:
-            current = await anyio.to_thread.run_sync(read)
+            current = await read()
         except (NotFound, Unauthorized):  # deleted, or the caller's key was revoked
             return
         except Unavailable:  # the database may come back
@@ -112,7 +113,6 @@ def _has_ended(job: Job) -> bool:
 
 
 def _read(context: Context, id: str) -> Job:
-    context.check_key()
     with reading(context.engine) as c:
         return Job.read(c, id)
 

@@ -11,11 +11,11 @@ from sqlalchemy import Connection, Row
 from services.api.context import OwnerContext
 from services.api.http.bodies import read_json, schema_of
 from services.api.http.idempotency import IdempotencyKey, idempotent
-from services.api.http.responses import utc_time
+from services.api.http.responses import json_response, utc_time
 from services.api.http.types import After, Limit
 from services.api.jobs.eta import seconds_left
 from services.api.jobs.wait_reason import reason
-from services.api.quotas import admit
+from services.api.limits.quotas import admit
 from services.coordinator.job_kinds import JOB_KINDS
 from services.runtime import tracing
 from services.webhooks.sender import check_webhook
@@ -89,7 +89,8 @@ class Job(BaseModel):
     def of(cls, connection: Connection, row: Row[Any], sign: Heartbeat | None = None) -> "Job":
         now = time.time()
         sign = sign or leases.last_heartbeat(connection)
-        ran = ((row.finished_at or now) - row.started_at) if row.started_at else 0.0
+        # Not below zero: the clock may go back.
+        ran = max((row.finished_at or now) - row.started_at, 0.0) if row.started_at else 0.0
         running = row.state == "running"
         # The step after the last tile counts as one more tile, so only a job that has succeeded is at 1.
         progress = 1.0 if row.state == "succeeded" else row.done / (row.total + 1) if row.total else 0.0
@@ -100,7 +101,7 @@ class Job(BaseModel):
             tiles=Tiles(total=row.total, done=row.done, failed=row.failed),
             eta_seconds=seconds_left(connection, row, now) if running else None,
             waits_for=reason(connection, row, sign),
-            queued_seconds=(row.started_at or row.finished_at or now) - row.created_at,
+            queued_seconds=max((row.started_at or row.finished_at or now) - row.created_at, 0.0),
             run_seconds=ran,
             workers=len(sign.cluster["workers"]) if running and sign else 0,
             options=row.options,
@@ -194,14 +195,23 @@ def post_job(
     return job
 
 
-@router.get("/jobs")
-def list_jobs(
-    context: OwnerContext, limit: Limit = 100, after: After = None, state: State | None = None
-) -> Jobs:
+@router.get("/jobs", response_model=Jobs)
+async def list_jobs(
+    context: OwnerContext,
+    request: Request,
+    limit: Limit = 100,
+    after: After = None,
+    state: State | None = None,
+) -> Response:
     """Jobs, newest first."""
-    with reading(context.engine) as c:
-        sign = leases.last_heartbeat(c)  # once for all of them
-        return Jobs(jobs=[Job.of(c, row, sign) for row in page(c, table, limit, after, state=state)])
+
+    def make() -> Response:
+        with reading(context.engine) as c:
+            sign = leases.last_heartbeat(c)  # once for all of them
+            rows = page(c, table, limit, after, state=state)
+            return json_response(Jobs(jobs=[Job.of(c, row, sign) for row in rows]))
+
+    return await context.compute(request, context.lists, make)
 
 
 @router.get("/jobs/{id}")
@@ -250,7 +260,9 @@ def retry_job(context: OwnerContext, id: str) -> Job:
 def delete_job(context: OwnerContext, id: str) -> None:
     """Delete a job that has ended, with its log and the video of a composite. Its matte stays."""
     with writing(context.engine) as c:
-        kind = jobs.get(c, id).kind
+        row = jobs.get(c, id)
         jobs.delete(c, id)
-    if kind == "composite":
+        if row.leftovers:  # it was cancelled a moment ago
+            JOB_KINDS[row.kind].cancelled(c, row)
+    if row.kind == "composite":
         context.objects.delete(composites.path(id))

@@ -11,8 +11,9 @@ from services.api.context import Context, OwnerContext
 from services.api.http.bodies import store_as_upload, upload_limit
 from services.api.http.idempotency import IdempotencyKey, find_earlier, idempotent
 from services.api.http.media_types import ZIP, require_media_type
+from services.api.limits.quotas import admit
+from services.api.limits.reservations import reserved
 from services.api.mattes.mattes import Matte
-from services.api.quotas import admit
 from storage.database.engine import reading
 from storage.database.rows import new_id
 from storage.errors import NoRoom, NotFound
@@ -20,7 +21,7 @@ from storage.layout import mattes as stored_mattes
 from storage.layout import uploads as stored_uploads
 from storage.layout.matte_archive import Archive
 from storage.layout.uploads import Part
-from storage.records import mattes, uploads
+from storage.records import bodies, mattes
 from workflows.mattes.imports.importing import take_in
 
 router = APIRouter(tags=["mattes"])
@@ -73,14 +74,16 @@ async def _from_body(context: Context, request: Request, key: str | None) -> Row
     earlier = await anyio.to_thread.run_sync(find_earlier, context.engine, key, CALL, mattes.get)
     if earlier is not None:
         return earlier
-    await anyio.to_thread.run_sync(_admit, context, length)
     matte = new_id()
-    try:
-        part = await store_as_upload(request, context.objects, matte, limit)
-        row = await anyio.to_thread.run_sync(_import, context, matte, part, key, limiter=context.imports)
-    finally:
-        # If the server is killed, the coordinator sweeps the archive and half a matte: nothing refers to them.
-        await anyio.to_thread.run_sync(stored_uploads.remove, context.objects, matte)
+    # The disk has to hold the archive, and the matte.
+    async with reserved(context, matte, length, context.settings.upload_bytes, room=length) as reservation:
+        try:
+            part = await store_as_upload(reservation.watch(limit.stream(request)), context.objects, matte)
+            async with context.imports.take(context.caller.owner):
+                row = await anyio.to_thread.run_sync(_import, context, matte, part, key)
+        finally:
+            # If the server is killed, the coordinator sweeps the archive and half a matte: nothing refers to them.
+            await anyio.to_thread.run_sync(stored_uploads.remove, context.objects, matte)
     return row
 
 
@@ -95,6 +98,7 @@ def _import(context: Context, matte: str, part: Part, key: str | None) -> Row[An
     kept = context.settings.matte_seconds
 
     def create(c: Connection) -> str:
+        bodies.release(c, matte)
         admit(c, context.settings, size=stored)
         mattes.add_imported(c, matte, imported.attributes["options"], imported.figures, stored, kept)
         return matte
@@ -108,9 +112,3 @@ def _import(context: Context, matte: str, part: Part, key: str | None) -> Row[An
     if row.id != matte:  # a concurrent request with the same key was quicker
         objects.delete(stored_mattes.path(matte))
     return row
-
-
-def _admit(context: Context, length: int) -> None:
-    with reading(context.engine) as c:
-        admit(c, context.settings, size=length)
-        uploads.check_room(c, context.objects, 2 * length)  # the archive, and the matte

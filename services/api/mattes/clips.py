@@ -14,14 +14,15 @@ from services.api.http.bodies import store_body, upload_limit
 from services.api.http.idempotency import find_earlier, idempotent
 from services.api.http.media_types import JSON, media_type_of
 from services.api.jobs.jobs import Job
-from services.api.quotas import admit, admit_upload
+from services.api.limits.quotas import admit
+from services.api.limits.reservations import reserved
 from services.runtime import tracing
 from services.webhooks.sender import check_webhook
 from storage.database.engine import reading
 from storage.database.rows import new_id
 from storage.errors import Conflict, Corrupt
 from storage.layout import composites
-from storage.records import jobs, mattes, tiles
+from storage.records import bodies, jobs, mattes
 
 router = APIRouter(tags=["jobs"])
 CALL = "POST /v1/mattes/{id}/composite"
@@ -65,15 +66,17 @@ async def composite_clip(
     key = request.headers.get("idempotency-key", "")[:256]
     job = await anyio.to_thread.run_sync(find_earlier, context.engine, key, CALL, Job.read)
     if job is None:
-        await anyio.to_thread.run_sync(_admit, context, matte, length)
+        await anyio.to_thread.run_sync(_require_ready, context, matte)
         id = new_id()
-        try:
-            size = await store_body(request, context.objects, composites.clip_path(id), limit)
-            job = await anyio.to_thread.run_sync(_queue, context, id, matte, options, key, size, webhook)
-        except Exception:
-            # Not when cancelled: `_queue` may still be running in its thread. The coordinator sweeps clips without job.
-            await anyio.to_thread.run_sync(context.objects.delete, composites.path(id))
-            raise
+        async with reserved(context, id, length, context.settings.upload_bytes, jobs=1) as reservation:
+            try:
+                pieces = reservation.watch(limit.stream(request))
+                size = await store_body(pieces, context.objects, composites.clip_path(id))
+                job = await anyio.to_thread.run_sync(_queue, context, id, matte, options, key, size, webhook)
+            except Exception:
+                # Not when cancelled: `_queue` may still be running in its thread. A sweep removes clips without job.
+                await anyio.to_thread.run_sync(context.objects.delete, composites.path(id))
+                raise
         if job.id != id:  # a concurrent request with the same key was quicker
             await anyio.to_thread.run_sync(context.objects.delete, composites.path(id))
     headers = {"Location": f"/v1/jobs/{job.id}"}
@@ -114,11 +117,10 @@ def get_video(context: OwnerContext, id: str, request: Request) -> Response:
     return StreamingResponse(pieces, 206 if part else 200, headers, media_type="video/mp4")
 
 
-def _admit(context: Context, matte: str, length: int) -> None:
-    """Check, before a clip is sent, that its matte is ready and that the limits leave room for it."""
+def _require_ready(context: Context, matte: str) -> None:
+    """Check, before a clip is sent, that its matte is ready."""
     with reading(context.engine) as c:
         mattes.get_ready(c, matte)
-        admit_upload(c, context.settings, context.objects, length, jobs=1)
 
 
 def _queue(
@@ -135,12 +137,10 @@ def _queue(
 
     def create(c: Connection) -> str:
         row = mattes.get_ready(c, matte)
+        bodies.release(c, job)
         admit(c, context.settings, jobs=1, size=size)
         capture, trace = row.capture or "", tracing.current_traceparent()
         jobs.add(c, "composite", capture, options, matte, trace, job, size, webhook)
-        tiles.add_steps(
-            c, job
-        )  # while it has tiles it has something in the store, see `jobs.cancelled_with_leftovers`
         return job
 
     return idempotent(context.engine, key, CALL, Job.read, create)

@@ -4,6 +4,7 @@ import hashlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from typing import IO, Annotated, TypeVar
 
@@ -39,7 +40,15 @@ from workflows.mattes.tiles import cut
 
 router = APIRouter(tags=["mattes"])
 R = TypeVar("R")
-BACKDROPS = ("image/png", "image/jpeg", "image/tiff", "image/x-exr")
+BACKDROPS = (
+    "image/png",
+    "image/jpeg",
+    "image/tiff",
+    "image/heic",
+    "image/heif",
+    "image/x-exr",
+    "image/x-adobe-dng",
+)
 ANSWERS = ("image/png", "image/jpeg", "image/x-exr")
 
 
@@ -85,11 +94,10 @@ async def post_composite(
     if media_type is None:
         raise NotAcceptable(f"composites are answered as {', '.join(ANSWERS)}, not as {accept}")
     state = await anyio.to_thread.run_sync(_matte_state, context, id)
-    async with spool_body(request, context.settings.backdrop_bytes) as body, context.composites:
+    async with spool_body(request, context.settings.backdrop_bytes) as body:
+        answer = partial(_answer, context, state, body, media_type, params, request.headers)
         try:
-            return await anyio.to_thread.run_sync(
-                _answer, context, state, body, media_type, params, request.headers
-            )
+            return await context.compute(request, context.composites, answer)
         except Corrupt:
             await anyio.to_thread.run_sync(_matte_state, context, id)  # it may have been deleted meanwhile
             raise

@@ -1,6 +1,7 @@
 """Layers of mattes for other programs, and the transport of single pixels, over HTTP."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Annotated
 
@@ -9,14 +10,14 @@ from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel
 
 from services.api.context import Context, OwnerContext
-from services.api.http.responses import bytes_response, etag_matches
+from services.api.http.responses import bytes_response, etag_matches, json_response
 from services.api.http.types import Colour, Pair
 from storage.database.engine import reading
 from storage.errors import InvalidInput, NotFound
 from storage.layout import mattes as stored_mattes
 from storage.records import mattes
 from workflows.mattes import layers
-from workflows.mattes.pixel import look_into
+from workflows.mattes.pixel import Pixel, bytes_of_pixel, look_into
 from workflows.mattes.pixel_picture import picture
 
 router = APIRouter(tags=["mattes"])
@@ -37,6 +38,12 @@ Lobes = Annotated[
         description="The most lobes of a pixel; further ones are merged into these.",
     ),
 ]
+MOST_CELLS = 10_000
+"""Cells of one answer, some 2 MB."""
+LOOK_BYTES = 32 << 20
+"""What an answer about a pixel takes beside the pixel itself."""
+Cells = Annotated[int, Query(ge=0, le=MOST_CELLS, description="The most cells to list.")]
+Skip = Annotated[int, Query(ge=0, le=1 << 32, description="Cells to leave out, the heaviest first.")]
 X = Annotated[int, Query(description="The pixel's column, from 0 at the left.")]
 Y = Annotated[int, Query(description="The pixel's row, from 0 at the top.")]
 
@@ -75,6 +82,8 @@ class Transport(BaseModel):
     rho: Colour
     monitor: Pair
     cells: list[Cell]
+    cells_total: int
+    """Of the pixel; `cells` may have a part of them."""
     lobes: list[Lobe]
 
 
@@ -110,30 +119,28 @@ async def get_layer(
             )
         return bytes_response(layers.everything(matte, lobes), kind, tag)
 
-    return await anyio.to_thread.run_sync(encode, limiter=context.layers)
+    return await context.compute(request, context.layers, encode)
 
 
-@router.get("/mattes/{id}/transport")
-def get_transport(context: OwnerContext, id: str, x: X, y: Y, lobes: Lobes = layers.LOBES) -> Transport:
+@router.get("/mattes/{id}/transport", response_model=Transport)
+async def get_transport(
+    context: OwnerContext,
+    id: str,
+    x: X,
+    y: Y,
+    request: Request,
+    lobes: Lobes = layers.LOBES,
+    cells: Cells = MOST_CELLS,
+    skip: Skip = 0,
+) -> Response:
     """Where the light of a pixel comes from: cells of the monitor with their weights by channel, and lobes."""
-    pixel = look_into(_matte(context, id), x, y, lobes)
-    return Transport(
-        x=x,
-        y=y,
-        recovered=pixel.recovered,
-        S=pixel.S.tolist(),
-        rho=pixel.rho.tolist(),
-        monitor=list(pixel.monitor),
-        cells=[
-            Cell(u=u, v=v, width=width, height=height, level=level, weight=weight)
-            for (u, v, width, height), level, weight in zip(
-                pixel.cells.tolist(), pixel.levels.tolist(), pixel.weight.tolist(), strict=True
-            )
-        ],
-        lobes=[
-            Lobe(u=u, v=v, weight=[r, g, b], sigma_u=sigma_u, sigma_v=sigma_v, theta=theta)
-            for u, v, r, g, b, sigma_u, sigma_v, theta in pixel.lobes.tolist()
-        ],
+    return await _look(
+        context,
+        request,
+        id,
+        (x, y),
+        lobes,
+        lambda pixel: json_response(_describe(pixel, cells, skip)),
     )
 
 
@@ -143,15 +150,62 @@ def get_transport(context: OwnerContext, id: str, x: X, y: Y, lobes: Lobes = lay
     responses={200: {"content": {"image/png": {}}, "description": "The picture"}},
 )
 async def get_transport_picture(
-    context: OwnerContext, id: str, x: X, y: Y, lobes: Lobes = layers.LOBES
+    context: OwnerContext, id: str, x: X, y: Y, request: Request, lobes: Lobes = layers.LOBES
 ) -> Response:
     """The transport of a pixel as a picture: the monitor, a close-up with the lobes as ellipses, and each channel."""
+    return await _look(
+        context,
+        request,
+        id,
+        (x, y),
+        lobes,
+        lambda pixel: bytes_response(picture(pixel), "image/png"),
+    )
 
-    def draw() -> bytes:
-        return picture(look_into(_matte(context, id), x, y, lobes))
 
-    answer = await anyio.to_thread.run_sync(draw, limiter=context.pictures)
-    return Response(answer, media_type="image/png")
+async def _look(
+    context: Context,
+    request: Request,
+    id: str,
+    place: tuple[int, int],
+    lobes: int,
+    answer: Callable[[Pixel], Response],
+) -> Response:
+    """Look into a pixel as soon as there is memory for it, and answer with something of it."""
+
+    def measure() -> tuple[stored_mattes.Matte, int]:
+        matte = _matte(context, id)
+        return matte, LOOK_BYTES + bytes_of_pixel(matte, *place)
+
+    matte, size = await anyio.to_thread.run_sync(measure)
+    return await context.compute(
+        request, context.memory, lambda: answer(look_into(matte, *place, lobes)), size
+    )
+
+
+def _describe(pixel: Pixel, cells: int, skip: int) -> Transport:
+    """A pixel with some of its cells."""
+    part = slice(skip, skip + cells)
+    shown = replace(pixel, node=pixel.node[part], weight=pixel.weight[part])
+    return Transport(
+        x=pixel.x,
+        y=pixel.y,
+        recovered=pixel.recovered,
+        S=pixel.S.tolist(),
+        rho=pixel.rho.tolist(),
+        monitor=list(pixel.monitor),
+        cells=[
+            Cell(u=u, v=v, width=width, height=height, level=level, weight=weight)
+            for (u, v, width, height), level, weight in zip(
+                shown.cells.tolist(), shown.levels.tolist(), shown.weight.tolist(), strict=True
+            )
+        ],
+        cells_total=len(pixel.node),
+        lobes=[
+            Lobe(u=u, v=v, weight=[r, g, b], sigma_u=sigma_u, sigma_v=sigma_v, theta=theta)
+            for u, v, r, g, b, sigma_u, sigma_v, theta in pixel.lobes.tolist()
+        ],
+    )
 
 
 def _matte(context: Context, id: str) -> stored_mattes.Matte:

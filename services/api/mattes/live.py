@@ -42,7 +42,8 @@ async def get_live(context: OwnerContext, id: str, request: Request) -> Response
             except Corrupt:
                 require_ready()  # it may have been deleted meanwhile
                 raise
-            with suppress(NoRoom):  # the answer needs no room, and it can be encoded again
+            # The answer needs no room, and it can be encoded again; or the matte was deleted just now.
+            with suppress(NoRoom, FileNotFoundError):
                 stored_live.write(context.objects, id, encode.FORMAT, encoded)
         return bytes_response(encoded, "application/octet-stream", tag | {"Content-Encoding": "gzip"})
 
@@ -50,4 +51,4 @@ async def get_live(context: OwnerContext, id: str, request: Request) -> Response
     tag = {"ETag": f'"{id}-{encode.FORMAT}"'}  # a matte never changes once it is ready
     if etag_matches(request.headers, tag["ETag"]):
         return Response(status_code=304, headers=tag)
-    return await anyio.to_thread.run_sync(load, limiter=context.layers)
+    return await context.compute(request, context.layers, load)

@@ -3,12 +3,12 @@
 from datetime import UTC, datetime
 from typing import Any, Literal
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Request, Response
 from pydantic import BaseModel
 from sqlalchemy import Row
 
 from services.api.context import OwnerContext
-from services.api.http.responses import utc_time
+from services.api.http.responses import json_response, utc_time
 from services.api.http.types import After, Limit, Pair
 from storage.database.engine import reading, writing
 from storage.database.rows import page
@@ -53,16 +53,22 @@ class Mattes(BaseModel):
     mattes: list[Matte]
 
 
-@router.get("/mattes")
-def list_mattes(
+@router.get("/mattes", response_model=Mattes)
+async def list_mattes(
     context: OwnerContext,
+    request: Request,
     limit: Limit = 100,
     after: After = None,
     state: Literal["recovering", "ready", "failed"] | None = None,
-) -> Mattes:
+) -> Response:
     """Mattes, newest first."""
-    with reading(context.engine) as c:
-        return Mattes(mattes=[Matte.of(row) for row in page(c, table, limit, after, state=state)])
+
+    def make() -> Response:
+        with reading(context.engine) as c:
+            rows = page(c, table, limit, after, state=state)
+            return json_response(Mattes(mattes=[Matte.of(row) for row in rows]))
+
+    return await context.compute(request, context.lists, make)
 
 
 @router.get("/mattes/{id}")

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from typing import IO, Annotated
 
 import anyio.to_thread
-from fastapi import APIRouter, Depends, Query, Response
+from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import FileResponse, StreamingResponse
 
 from services.api.context import OwnerContext
@@ -16,6 +16,7 @@ from services.api.system.pages import HEADERS, WEB
 from storage.database.engine import reading
 from storage.errors import NotFound
 from storage.records import programs
+from workflows.interruption import checkpoint
 from workflows.programs import video
 from workflows.programs.files import pictures, png, zip_program
 from workflows.programs.program import Program
@@ -33,7 +34,7 @@ Stored = Annotated[Program, Depends(_read)]
 
 
 @router.get("/programs/{id}/patterns/{n}.png", response_class=Response)
-async def get_pattern(context: OwnerContext, program: Stored, n: int) -> Response:
+async def get_pattern(context: OwnerContext, program: Stored, n: int, request: Request) -> Response:
     """A pattern as the monitor shows it."""
     if not 0 <= n < program.count:
         raise NotFound(f"this program has the patterns 0 to {program.count - 1}", field="n")
@@ -41,7 +42,7 @@ async def get_pattern(context: OwnerContext, program: Stored, n: int) -> Respons
     def draw() -> Response:
         return bytes_response(png(next(pictures(program, n, n + 1))), "image/png")
 
-    return await anyio.to_thread.run_sync(draw, limiter=context.pictures)
+    return await context.compute(request, context.pictures, draw)
 
 
 @router.get("/programs/{id}/patterns.zip", response_class=StreamingResponse)
@@ -50,7 +51,11 @@ async def get_patterns(context: OwnerContext, program: Stored) -> StreamingRespo
     parts = zip_program(program)
 
     async def stream() -> AsyncIterator[bytes]:
-        while part := await anyio.to_thread.run_sync(next, parts, b"", limiter=context.pictures):
+        while True:
+            async with context.pictures.take(context.caller.owner):
+                part = await anyio.to_thread.run_sync(next, parts, b"")
+            if not part:
+                return
             yield part
 
     return StreamingResponse(stream(), media_type="application/zip")
@@ -60,6 +65,7 @@ async def get_patterns(context: OwnerContext, program: Stored) -> StreamingRespo
 async def get_film(
     context: OwnerContext,
     program: Stored,
+    request: Request,
     rate: Annotated[
         float, Query(ge=video.SLOWEST, le=video.FASTEST, description="Patterns per second.")
     ] = 2.0,
@@ -69,13 +75,13 @@ async def get_film(
     def encode() -> tuple[IO[bytes], int]:
         with ExitStack() as stack:
             file = stack.enter_context(tempfile.TemporaryFile())
-            video.encode_video(program, file, rate)
+            video.encode_video(program, file, rate, progress=lambda done, of: checkpoint())
             size = file.seek(0, os.SEEK_END)
             file.seek(0)
             stack.pop_all()  # the answer closes it
         return file, size
 
-    file, size = await anyio.to_thread.run_sync(encode, limiter=context.films)
+    file, size = await context.compute(request, context.films, encode)
     return FileStreamResponse(file, size, "video/mp4")
 
 

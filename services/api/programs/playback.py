@@ -1,6 +1,7 @@
 """Playback of a program over HTTP: its page reports how far it is, and a phone or a camera follows."""
 
 import hashlib
+from functools import partial
 from typing import Annotated
 
 import anyio.to_thread
@@ -40,11 +41,12 @@ async def follow_program(
 ) -> Response:
     """The program, now and each time that its page reports how far it is, as server-sent events."""
 
-    def read() -> Program:
-        context.check_key()
-        return get_program(context, id)
+    now = partial(get_program, context, id)
 
-    return stream(read, await anyio.to_thread.run_sync(read), _event_id, last_event_id)
+    async def read() -> Program:
+        return await context.follow(("program", id), now)
+
+    return stream(read, await anyio.to_thread.run_sync(now), _event_id, last_event_id)
 
 
 def _event_id(program: Program) -> str:

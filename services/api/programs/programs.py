@@ -2,7 +2,7 @@
 
 import time
 from datetime import UTC, datetime
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from fastapi import APIRouter, Depends, Request, Response
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -10,8 +10,9 @@ from sqlalchemy import Row
 
 from services.api.context import OwnerContext
 from services.api.http.bodies import read_json, schema_of
+from services.api.http.responses import json_response
 from services.api.http.types import After, Limit
-from services.api.quotas import admit
+from services.api.limits.quotas import admit
 from storage.database.engine import reading, writing
 from storage.database.rows import page
 from storage.database.tables import programs as table
@@ -94,35 +95,45 @@ class Showing(PlaybackState):
     age_seconds: float
 
 
-class Program(BaseModel):
-    """A program. `display` is the screen that its video is made for; null if there is no room for a border."""
+class ListedProgram(BaseModel):
+    """A program as lists have it. `display` is the screen that its video is made for; null if there is no room for a
+    border."""
 
     id: str
     patterns: int
     monitor: Size
     display: Size | None
-    program: dict[str, Any]
     created_at: datetime
     showing: Showing | None = Field(description="The last playback by its page.")
 
     @classmethod
-    def of(cls, row: Row[Any]) -> "Program":
+    def of(cls, row: Row[Any], **more: Any) -> Self:
         program = PatternProgram.model_validate(row.program)
         return cls(
             id=row.id,
             patterns=program.count,
             monitor=Size(width=program.monitor.width, height=program.monitor.height),
             display=_display(program.monitor),
-            program=row.program,
             created_at=datetime.fromtimestamp(row.created_at, UTC),
             showing=_showing(row.showing),
+            **more,
         )
+
+
+class Program(ListedProgram):
+    """A program, with its parts as in capture.json."""
+
+    program: dict[str, Any]
+
+    @classmethod
+    def of(cls, row: Row[Any], **more: Any) -> Self:
+        return super().of(row, program=row.program, **more)
 
 
 class Programs(BaseModel):
     """A page of programs, newest first."""
 
-    programs: list[Program]
+    programs: list[ListedProgram]
 
 
 def _display(monitor: Monitor) -> Size | None:
@@ -174,11 +185,18 @@ def post_program(
     return Program.of(row)
 
 
-@router.get("/programs")
-def list_programs(context: OwnerContext, limit: Limit = 100, after: After = None) -> Programs:
-    """Programs, newest first."""
-    with reading(context.engine) as c:
-        return Programs(programs=[Program.of(row) for row in page(c, table, limit, after)])
+@router.get("/programs", response_model=Programs)
+async def list_programs(
+    context: OwnerContext, request: Request, limit: Limit = 100, after: After = None
+) -> Response:
+    """Programs, newest first, without their parts."""
+
+    def make() -> Response:
+        with reading(context.engine) as c:
+            rows = page(c, table, limit, after)
+            return json_response(Programs(programs=[ListedProgram.of(row) for row in rows]))
+
+    return await context.compute(request, context.lists, make)
 
 
 @router.get("/programs/{id}")

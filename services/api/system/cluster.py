@@ -5,10 +5,12 @@ from pydantic import BaseModel, Field
 
 from services.api.context import AdminContext
 from services.api.jobs.wait_reason import trouble_of
+from storage import statistics
 from storage.database.engine import reading
-from storage.records import leases, statistics
+from storage.records import leases
 from storage.records.jobs import ACTIVE
 from storage.records.leases import Heartbeat
+from workflows.untrusted import confinement
 
 router = APIRouter(tags=["system"])
 
@@ -22,6 +24,10 @@ class Worker(BaseModel):
     memory_bytes: int
     memory_limit_bytes: int | None = Field(
         description="The worker is ended before it takes more; null if there is no limit."
+    )
+    unconfined_decoders: str | None = Field(
+        None,
+        description="Why the worker's machine can't confine decoders of untrusted files; null if it can.",
     )
 
 
@@ -53,6 +59,9 @@ class Cluster(BaseModel):
     memory_limit_bytes: int | None
     queue: Queue
     coordinator: Coordinator
+    unconfined_decoders: str | None = Field(
+        description="Why the service's own machine can't confine decoders of pictures; null if it can."
+    )
     problem: str | None = Field(description="Why jobs do not progress, in words; null if they do.")
 
 
@@ -82,5 +91,6 @@ def get_cluster(context: AdminContext) -> Cluster:
         coordinator=Coordinator(
             holder=sign.holder if sign else None, last_sign_seconds=sign.seconds if sign else None
         ),
+        unconfined_decoders=confinement.missing(),
         problem=trouble_of(sign),
     )

@@ -4,7 +4,7 @@ from fastapi import APIRouter
 from pydantic import BaseModel, Field
 
 from services.api.context import OwnerContext
-from services.api.quotas import Unit, limits_of
+from services.api.limits.quotas import Unit, limits_of
 from storage.database.engine import reading
 
 router = APIRouter(tags=["system"])

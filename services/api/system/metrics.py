@@ -12,8 +12,9 @@ from sqlalchemy import Connection
 
 from services.api.context import AdminContext
 from services.api.jobs.wait_reason import trouble_of
+from storage import statistics
 from storage.database.engine import reading
-from storage.records import leases, statistics
+from storage.records import leases
 from storage.records.jobs import ACTIVE
 from storage.records.leases import Heartbeat
 

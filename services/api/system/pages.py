@@ -1,6 +1,8 @@
 """Pages for browsers: the web app at `/`, the API's documentation at `/docs`, and their files below `/web`."""
 
-from collections.abc import Mapping
+import base64
+import hashlib
+import re
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -39,11 +41,19 @@ class Files(StaticFiles):
         return answer
 
 
-HEADERS: Mapping[str, str] = FRESH | {"Content-Security-Policy": POLICY}
+def _app_policy() -> str:
+    """`POLICY` with the app's one inline script, by its hash: it must run although no file of the app comes."""
+    script = re.search(r"<script>(.*?)</script>", (WEB / "app" / "index.html").read_text(), re.DOTALL)
+    assert script is not None
+    digest = base64.b64encode(hashlib.sha256(script[1].encode()).digest()).decode()
+    return POLICY.replace("script-src 'self'", f"script-src 'self' 'sha256-{digest}'")
+
+
+HEADERS = {**FRESH, "Content-Security-Policy": _app_policy()}
 SWAGGER = Path(str(files("fastapi_offline"))) / "static"
 """Swagger UI, served from here: FastAPI's own page would load it from another host."""
 # Its style sheet embeds pictures.
-DOCS = {**HEADERS, "Content-Security-Policy": POLICY.replace("img-src 'self'", "img-src 'self' data:")}
+DOCS = {**FRESH, "Content-Security-Policy": POLICY.replace("img-src 'self'", "img-src 'self' data:")}
 
 
 @page.get("/", include_in_schema=False, response_class=FileResponse)

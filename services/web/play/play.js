@@ -2,6 +2,7 @@
 import { LEAD, LEAD_SECONDS, borderOn, draw, schedule } from "./border.js";
 import { authorization } from "../app/lib/api.js";
 import { CHECKS } from "../app/film/checklist.js";
+import { countScreen, knownScreen, onZoom, rememberScreen } from "../app/film/screen.js";
 
 const COUNTDOWN = 5; // seconds
 const AHEAD = 8; // pictures decoded ahead: all of them would fill the memory
@@ -99,35 +100,32 @@ async function countDown(element, stopped) {
   return distances[Math.floor(distances.length / 2)];
 }
 
-// Gives a canvas one pixel for each pixel of the display under it.
-async function fill(canvas) {
-  const [width, height] = await new Promise((resolve) => {
+// The pixels of the display under an element, at any zoom.
+const measure = (element) =>
+  new Promise((resolve) => {
     const observer = new ResizeObserver(([entry]) => {
       observer.disconnect();
       const exact = entry.devicePixelContentBoxSize?.[0];
       const rounded = (length) => Math.round(length * devicePixelRatio);
-      resolve(
-        exact
-          ? [exact.inlineSize, exact.blockSize]
-          : [rounded(entry.contentRect.width), rounded(entry.contentRect.height)],
-      );
+      const { width, height } = entry.contentRect;
+      resolve({
+        width: exact?.inlineSize ?? rounded(width),
+        height: exact?.blockSize ?? rounded(height),
+        isMeasured: true,
+        isExact: Boolean(exact),
+      });
     });
     try {
-      observer.observe(canvas, { box: "device-pixel-content-box" });
+      observer.observe(element, { box: "device-pixel-content-box" });
     } catch {
-      observer.observe(canvas); // Safari measures in CSS pixels only
+      observer.observe(element); // Safari measures in CSS pixels only
     }
   });
-  [canvas.width, canvas.height] = [width, height];
-}
 
 const $ = (id) => document.getElementById(id);
 const setStatus = (text) => ($("status").textContent = text);
 const here = new URL(".", location.href);
-const screenSize = () => ({
-  width: Math.round(screen.width * devicePixelRatio),
-  height: Math.round(screen.height * devicePixelRatio),
-});
+const sizeOf = ({ width, height }) => `${width} x ${height}`;
 
 async function ask(path, options = {}) {
   const answer = await fetch(new URL(path, here), { ...options, headers: { ...options.headers, ...authorization() } });
@@ -142,17 +140,37 @@ const id = here.pathname.split("/").at(-2);
 const report = (progress) =>
   ask("showing", { method: "PUT", body: JSON.stringify(progress), headers: { "Content-Type": "application/json" }, keepalive: true }).catch(() => {});
 
+let surface; // what shows the patterns, as far as the page knows
+
+// The zoom in per cent of a page that counts one size where there is another; 100 if zoom does not explain it.
+function zoomBetween(counted, real) {
+  const [across, down] = [counted.width / real.width, counted.height / real.height];
+  return Math.abs(across / down - 1) < 0.05 ? Math.round(100 * across) : 100; // full screen may be lower than the screen
+}
+
+// Compares a program with a surface, and says what to do where patterns are resampled. Returns whether they fit.
+function checkFit({ display, program }, found) {
+  surface = found;
+  const { width, height, isMeasured, isWindow } = surface;
+  const near = isMeasured ? 1 : devicePixelRatio;
+  const fits = Boolean(display) && Math.abs(display.width - width) < near && Math.abs(display.height - height) < near;
+  const made = display ? `This program is made for a screen of ${sizeOf(display)} pixels` : "This program has no border";
+  const misfit = `${made}; this ${isWindow ? "window" : "screen"} has ${sizeOf(surface)}, so patterns are stretched and less sharp.`;
+  const real = isMeasured ? surface : display;
+  const zoom = real && !isWindow ? zoomBetween(countScreen(), real) : 100;
+  const zoomed = `This page ${isMeasured ? "is" : "seems to be"} zoomed to ${zoom} %. Set the zoom to 100 % (Ctrl+0 or ⌘0).`;
+  $("misfit").textContent = zoom === 100 ? misfit : `${zoomed} ${isMeasured ? "" : "If this note stays: "}${misfit}`;
+  $("refit").onclick = () => refit(program, { width, height }).catch((error) => setStatus(error.message));
+  $("fit").hidden = fits;
+  return fits;
+}
+
 async function open() {
   const program = await (await ask(`../${id}`)).json();
-  const { display, patterns, monitor } = program;
-  $("about").textContent = `${patterns} patterns of ${monitor.width} x ${monitor.height} pixels.`;
-  const size = screenSize();
-  if (display?.width !== size.width || display?.height !== size.height) {
-    const made = display ? `This program is made for a screen of ${display.width} x ${display.height} pixels` : "This program has no border";
-    $("misfit").textContent = `${made}; this screen has ${size.width} x ${size.height}, so patterns are stretched and less sharp.`;
-    $("fit").hidden = false;
-    $("refit").onclick = () => refit(program.program, size).catch((error) => setStatus(error.message));
-  }
+  const { patterns, monitor } = program;
+  $("about").textContent = `${patterns} patterns of ${sizeOf(monitor)} pixels.`;
+  checkFit(program, knownScreen());
+  onZoom(() => checkFit(program, knownScreen()));
   const pictures = new Pictures();
   setStatus("Loading the patterns.");
   await pictures.load(patterns, ask, (share) => ($("loaded").value = share));
@@ -193,9 +211,14 @@ async function play(program, pictures, rate) {
     listen(window, "popstate", () => end("Stopped."));
     listen(document, "visibilitychange", () => document.hidden && end("Stopped: the page was hidden."));
     await pictures.prepare(0);
+    const found = { ...(await measure(canvas)), isWindow: !full };
+    if (full && found.isExact) rememberScreen(found);
+    const isNew = sizeOf(found) !== sizeOf(surface);
+    if (!checkFit(program, found) && isNew) throw new Error("Not started: the patterns do not fit. See the note above the button.");
     report(progress);
     const refresh = await countDown($("countdown"), signal);
-    await fill(canvas);
+    const { width, height } = await measure(canvas);
+    [canvas.width, canvas.height] = [width, height];
     listen(window, "resize", () => end("Stopped: the window was resized."));
     const border = borderOn(canvas.width, canvas.height);
     if (!border.fits) throw new Error("The window is too small for the border: make it larger.");

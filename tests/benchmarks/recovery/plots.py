@@ -145,7 +145,7 @@ def main() -> None:
             axis.plot(list(points), list(points.values()), "o-", label=scene_name)
         axis.set(xlabel=name, xlim=(0, None), ylim=(0, None))
         axis.legend()
-    by_pixels.set_ylabel("seconds, 132 frames")
+    by_pixels.set_ylabel("seconds, 140 frames")
     by_frames.set_ylabel("seconds for 1,000 pixels")
     speed.savefig(args.folder / "speed.png", dpi=100)
     (args.folder / "plots.json").write_text(json.dumps(figures, indent=2))

@@ -11,7 +11,6 @@ import argparse
 import asyncio
 import json
 import tempfile
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -25,6 +24,7 @@ from services.cli.demo_run import service
 from services.client import Client
 from tests.benchmarks.cluster.sharing import BANDS, enlarge
 from tests.benchmarks.recovery.kits import show
+from tests.parts.background import repeating
 from tests.parts.captures import nested_program
 from workflows.simulation import glass_ball
 from workflows.simulation.scene import write_capture
@@ -69,21 +69,14 @@ def polled(url: str, path: str, pollers: int, seconds: float) -> dict[str, Any]:
 @contextmanager
 def repeated(client: Client, capture_archive: Path) -> Iterator[None]:
     """Upload and ingest a capture, and delete it, again and again."""
-    ending = threading.Event()
 
     def ingest() -> None:
-        while not ending.is_set():
-            capture = client.upload(capture_archive)
-            client.wait(capture["job"])
-            client.delete(capture)
+        capture = client.upload(capture_archive)
+        client.wait(capture["job"])
+        client.delete(capture)
 
-    thread = threading.Thread(target=ingest)
-    thread.start()
-    try:
+    with repeating(ingest, 0):
         yield
-    finally:
-        ending.set()
-        thread.join()
 
 
 def main() -> None:

@@ -99,6 +99,7 @@ def test_broken_upload_leaves_nothing(service: Service, capture_archive: Path) -
     ],
 )
 def test_frame_refused_by_the_ingest(service: Service, capture_archive: Path, change) -> None:
+    logged = len(service.log())
     answer = service.http.post("/v1/captures", content=changed_archive(capture_archive, change), headers=ZIP)
     assert answer.status_code == 201
     made = answer.json()
@@ -115,6 +116,9 @@ def test_frame_refused_by_the_ingest(service: Service, capture_archive: Path, ch
     assert job["state"] == "failed"
     assert entry in job["problem"]["detail"]
     check_problem(service.http.post("/v1/jobs", json={"capture": made["id"]}), 409, "conflict")
+    log = service.log()[logged:]
+    assert "Traceback" not in log
+    assert len([line for line in log.splitlines() if made["job"] in line and "failed" in line]) == 1, log
     # The failure is recorded before the data is deleted.
     until(lambda: not any(made["id"] in name for name in service.stored()))
 

@@ -23,9 +23,9 @@ from tests.services.api.mattes.archives import archive
 from tests.services.cluster.clusters import children, decoders, running, workers
 from tests.workflows.composite.video.test_steps import clip, even, pictures
 from tests.workflows.ingest.video.camera import capture as filmed
-from tests.workflows.ingest.video.camera import overstated, zipped
-from tests.workflows.untrusted.test_decoder_guard import fragmented
+from tests.workflows.ingest.video.camera import fragmented, overstated, zipped
 from workflows.programs.program import Program
+from workflows.untrusted import confinement
 
 pytestmark = pytest.mark.slow
 
@@ -35,9 +35,10 @@ ZIP = {"Content-Type": "application/zip"}
 @contextmanager
 def held(service: Service, matte: str) -> Iterator[tuple[psutil.Process, "Future[httpx2.Response]"]]:
     """Stop a decoder in the middle of a request; yields both. The next request gets another decoder."""
-    for one in decoders(service.process):
+    idle = decoders(service.process)
+    for one in idle:
         one.kill()
-    until(lambda: not decoders(service.process))
+    until(lambda: not running(idle))  # its memory goes first, its sockets last
     assert post_composite(service, matte).status_code == 200
     (one,) = decoders(service.process)
     one.suspend()
@@ -118,7 +119,8 @@ def test_film_that_needs_too_much_memory_fails_only_its_job(
         # This one allocates in small steps, and not every process can unpickle FFmpeg's own error.
         slowly = zipped(json.dumps(record).encode(), {"clip.mp4": fragmented(4_000_000)})
         job = service.http.post("/v1/captures", content=slowly, headers=ZIP).json()["job"]
-        with pytest.raises(ServiceError, match=r"^decoding clip\.mp4 takes more than the 384 MB"):
+        # If its last step fails, FFmpeg reports damage instead.
+        with pytest.raises(ServiceError, match=r"takes (more than the 384 MB|too much memory)"):
             service.client.wait(job)
         job = service.http.post(
             f"/v1/mattes/{matte}/composite", content=data, headers={"Content-Type": "video/mp4"}
@@ -129,3 +131,29 @@ def test_film_that_needs_too_much_memory_fails_only_its_job(
         assert workers(service.process) == [worker]
         assert peak_memory(worker) - before < 500 << 20
         service.client.wait(service.client.upload(capture_archive)["job"])
+
+
+WITHOUT_LANDLOCK = """
+import ctypes, os, struct, sys
+# All calls are allowed but landlock_create_ruleset, as by the profile of a container.
+lines = [(0x20, 0, 0, 0), (0x15, 0, 1, 444), (6, 0, 0, 0x00050001), (6, 0, 0, 0x7FFF0000)]
+code = ctypes.create_string_buffer(b"".join(struct.pack("=HBBI", *line) for line in lines))
+libc = ctypes.CDLL(None)
+assert libc.prctl(38, 1, 0, 0, 0) == 0
+assert libc.prctl(22, 2, struct.pack("@HP", len(lines), ctypes.addressof(code)), 0, 0) == 0
+os.execv(sys.executable, [sys.executable, *sys.argv[1:]])
+"""
+
+
+@pytest.mark.skipif(confinement.missing() is not None, reason=str(confinement.missing()))
+def test_machine_that_cannot_confine_decoders_is_named(capture_archive: Path, tmp_path: Path) -> None:
+    log = tmp_path / "data.log"
+    within = [sys.executable, "-c", WITHOUT_LANDLOCK]
+    with serving(tmp_path / "data", "--workers", "1", within=within) as service:
+        service.client.wait(service.client.upload(capture_archive)["job"])
+        found = service.http.get("/v1/cluster").json()
+        (worker,) = found["workers"]
+        for said in (found["unconfined_decoders"], worker["unconfined_decoders"]):
+            assert "lacks Landlock" in said
+            assert "seccomp" not in said
+    assert log.read_text().count("lacks Landlock") >= 2

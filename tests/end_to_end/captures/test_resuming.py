@@ -101,7 +101,7 @@ def test_bytes_sent_before_each_broken_connection_are_kept(
     offset = begun = 0
     with (
         Line(service.url, cuts=100, mean=size // 150, seed=2) as line,
-        httpx2.Client(base_url=line.url, timeout=60) as http,
+        httpx2.Client(base_url=line.url, timeout=300) as http,
         file.open("rb") as source,
     ):
         while offset < size:
@@ -216,7 +216,7 @@ print(first.url)
 def test_tuspy_uploads(service: Service, capture_archive: Path, checksum: bool) -> None:
     arguments = {"file": str(capture_archive), "endpoint": f"{service.url}/v1/uploads", "checksum": checksum}
     command = [sys.executable, "-c", TUSPY, json.dumps(arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     check_sent(service, done.stdout.strip(), capture_archive)
 
@@ -280,6 +280,6 @@ upload.start();
 def test_tus_js_client_uploads(service: Service, capture_archive: Path, tus_js: Path, options: dict) -> None:
     arguments = {"file": str(capture_archive), "endpoint": f"{service.url}/v1/uploads"} | options
     command = ["node", "-e", SCRIPT, "tus", json.dumps(arguments)]
-    done = subprocess.run(command, cwd=tus_js, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, cwd=tus_js, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     check_sent(service, done.stdout.strip(), capture_archive)

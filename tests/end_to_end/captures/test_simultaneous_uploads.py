@@ -1,10 +1,14 @@
-"""Simultaneous requests for one upload: one of them wins, and nothing is damaged."""
+"""Simultaneous requests for one upload: one of them writes, and nothing is damaged."""
 
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from sqlalchemy import select
 
+from storage.database.engine import open_engine, reading
+from storage.database.tables import bodies
 from tests.end_to_end.captures.tus import (
     TUS,
     begin_patch,
@@ -14,40 +18,56 @@ from tests.end_to_end.captures.tus import (
     uploads_of,
     wait_until_deleted,
 )
-from tests.end_to_end.conftest import Service, paused
+from tests.end_to_end.conftest import Service
+from tests.end_to_end.problems import check_problem
+from tests.parts.waiting import until
 
 pytestmark = pytest.mark.slow
 
 
-def test_one_of_two_patches_at_the_same_offset_wins(service: Service) -> None:
+def wait_for_writer(service: Service, where: str) -> None:
+    """Wait until a request has begun to write an upload."""
+    engine = open_engine(f"sqlite:///{service.data / 'envmatte.db'}")
+    query = select(bodies.c.id).where(bodies.c.upload == where.rsplit("/", 1)[1])
+
+    def has_writer() -> bool:
+        with reading(engine) as c:
+            return c.scalar(query) is not None
+
+    until(has_writer)
+    engine.dispose()
+
+
+def test_request_continues_an_upload_whose_writer_fell_silent(service: Service) -> None:
     before = uploads_of(service)
     where = create(service, 1000)
-    first = begin_patch(service, where, 0, 1000, b"a" * 300)
-    second = begin_patch(service, where, 0, 1000, b"b" * 300)
-    second.send(b"b" * 700)
-    assert second.getresponse().status == 204
-    first.send(b"a" * 700)
-    assert first.getresponse().status == 409
-    first.close()
-    second.close()
-    assert offset_of(service, where) == 1000
-    (part,) = uploads_of(service) - before
-    assert (service.data / "store" / part).read_bytes() == b"b" * 1000
+    silent = begin_patch(service, where, 0, 1000, b"a" * 300)
+    wait_for_writer(service, where)
+    answer = patch(service, where, 0, b"b" * 1000)
+    assert check_problem(answer, 409, "conflict")["offset"] == 300  # what has come is kept
+    assert silent.getresponse().status == 409
+    assert patch(service, where, 300, b"b" * 700).status_code == 204
+    silent.close()
+    store = service.data / "store"
+    parts = sorted((store / name).read_bytes() for name in uploads_of(service) - before)
+    assert parts == [b"a" * 300, b"b" * 700]
     service.http.delete(where, headers=TUS)
 
 
-def test_late_patch_damages_nothing(service: Service, capture_archive: Path) -> None:
-    data = capture_archive.read_bytes()
-    where = create(service, len(data))
-    late = begin_patch(service, where, 0, len(data), bytes(1000))
-    assert patch(service, where, 0, data).status_code == 204
-    with paused(service):
-        made = service.http.post("/v1/captures", json={"upload": where.rsplit("/", 1)[1]}).json()
-        late.send(bytes(len(data) - 1000))
-        # 409 if the server looked at the late request only when the other had been read.
-        assert late.getresponse().status in (404, 409)
-        late.close()
-    assert service.client.wait(made["job"])["state"] == "succeeded"
+def test_request_does_not_interrupt_the_writer_of_an_upload(service: Service) -> None:
+    where = create(service, 10_000)
+    writer = begin_patch(service, where, 0, 10_000, b"a" * 1000)
+    wait_for_writer(service, where)
+    with ThreadPoolExecutor() as pool:
+        other = pool.submit(patch, service, where, 0, b"b" * 10_000)
+        for _ in range(9):
+            time.sleep(1)
+            writer.send(b"a" * 1000)
+        assert check_problem(other.result(), 409, "conflict")
+    assert writer.getresponse().status == 204
+    writer.close()
+    assert offset_of(service, where) == 10_000
+    service.http.delete(where, headers=TUS)
 
 
 def test_two_clients_with_the_same_key_share_an_upload(

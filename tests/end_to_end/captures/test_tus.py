@@ -180,6 +180,10 @@ def test_invalid_requests_are_refused(service: Service) -> None:
     for length in ({}, {"Upload-Length": "-1"}, {"Upload-Length": "many"}, {"Upload-Defer-Length": "1"}):
         answer = service.http.post("/v1/uploads", headers=TUS | length)
         assert check_problem(answer, 400, "bad-header")["field"] == "Upload-Length"
+    for concat in ("partial", f"final;{where}"):
+        headers = TUS | {"Upload-Length": "1", "Upload-Concat": concat}
+        answer = service.http.post("/v1/uploads", headers=headers)
+        assert check_problem(answer, 400, "bad-header")["field"] == "Upload-Concat"
     for metadata in ("name ?", "a,a", ",", "a YQ==,,b", "x " + "A" * 9000):
         answer = service.http.post(
             "/v1/uploads", headers=TUS | {"Upload-Length": "1", "Upload-Metadata": metadata}

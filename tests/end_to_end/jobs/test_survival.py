@@ -44,7 +44,7 @@ def test_job_continues_after_the_server_is_killed(
             time.sleep(0.01)
         family = psutil.Process(first.process.pid).children(recursive=True)
         first.kill()
-        _, alive = psutil.wait_procs(family, timeout=60)
+        _, alive = psutil.wait_procs(family, timeout=300)
         assert alive == []
     with serving(data, "--workers", "1") as second:
         found = second.client.job(job["id"])
@@ -216,13 +216,13 @@ def test_stopped_server_leaves_no_process(
         service.process.send_signal(number)
         assert service.process.wait(120) == code
         sending.close()
-        _, alive = psutil.wait_procs(family, timeout=60)
+        _, alive = psutil.wait_procs(family, timeout=300)
         assert alive == []
 
 
 def test_second_service_on_the_same_folder_is_refused(service: Service) -> None:
     command = [sys.executable, "-m", "services", "serve", "--data", str(service.data), "--port", "0"]
-    second = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    second = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert second.returncode == 1
     assert "serves" in second.stderr
     assert "already" in second.stderr
@@ -242,7 +242,7 @@ def test_public_address_without_keys_is_refused(tmp_path: Path) -> None:
         "0.0.0.0",
     ]
     environment = {name: value for name, value in os.environ.items() if name != "ENVMATTE_KEYS"}
-    refused = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
+    refused = subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment)
     assert refused.returncode == 1
     assert "envmatte keys make" in refused.stderr
     assert "ENVMATTE_KEYS" in refused.stderr

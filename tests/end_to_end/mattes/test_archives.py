@@ -164,6 +164,7 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "matte.zip"
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_deleting_a_matte_ends_its_download(elsewhere: Service, large: Path, tmp_path: Path) -> None:
     imported_id = elsewhere.client.import_matte(large)["id"]

@@ -77,6 +77,11 @@ def test_slow_request_head_is_disconnected(service: Service) -> None:
     assert time.monotonic() - begun < 3 * slow_clients.HEAD
 
 
+POST = b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\n"
+SMUGGLED = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"
+"""A request that is part of another's body for one reader, and one of its own for another (RFC 9112, sect. 11.2)."""
+
+
 @pytest.mark.parametrize(
     "sent",
     [
@@ -85,8 +90,30 @@ def test_slow_request_head_is_disconnected(service: Service) -> None:
         b"no request at all\r\n\r\n",
         b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5\r\nContent-Length: 6\r\n\r\n{}   ",
         b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 2\r\nTransfer-Encoding: gzip\r\n\r\n{}",
+        b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n" + 20_000 * b"Many: x\r\n",
+        POST + b"Content-Length: 5\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n" + SMUGGLED,
+        POST + b"Transfer-Encoding: chunked\r\nContent-Length: 5\r\n\r\n0\r\n\r\n" + SMUGGLED,
+        POST + b"Transfer-Encoding : chunked\r\n\r\n0\r\n\r\n" + SMUGGLED,
+        POST + b"Transfer-Encoding: xchunked\r\n\r\n0\r\n\r\n" + SMUGGLED,
+        POST + b"Transfer-Encoding: chunked\r\n\r\n0x0\r\n\r\n" + SMUGGLED,
+        POST + b"Content-Length: +0\r\n\r\n" + SMUGGLED,
+        POST + b"Content-Length: 0\r\n Content-Length: 9\r\n\r\n" + SMUGGLED,
     ],
-    ids=["a long header", "a long path", "noise", "two lengths", "an unknown encoding"],
+    ids=[
+        "a long header",
+        "a long path",
+        "noise",
+        "two lengths",
+        "an unknown encoding",
+        "many headers",
+        "length, then chunks",
+        "chunks, then length",
+        "space before a colon",
+        "an encoding like chunks",
+        "chunks in hexadecimal notation",
+        "a signed length",
+        "a folded header",
+    ],
 )
 def test_malformed_request_is_refused_and_disconnected(service: Service, sent: bytes) -> None:
     with connected(service) as (connection,):

@@ -11,6 +11,7 @@ from tests.faults.rig import stored
 from tests.services.cluster.clusters import address, started
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_matte_is_the_same_in_a_bucket_and_in_a_folder(
     service: Service, matte: str, capture_archive: Path, s3: str, tmp_path: Path

@@ -16,6 +16,7 @@ from tests.end_to_end.conftest import Service, paused, serving
 from tests.parts.waiting import until
 from tests.services.runtime.collector import Collector, collecting
 from tests.workflows.composite.video.test_steps import clip, pictures
+from workflows.untrusted import confinement
 
 pytestmark = pytest.mark.slow
 
@@ -140,9 +141,10 @@ def test_cluster_status(watched: Watched) -> None:
     until(lambda: http.get("/v1/cluster").json()["queue"]["tiles_under_way"] == 0)
     found = http.get("/v1/cluster").json()
     (worker,) = found["workers"]
-    assert worker["address"].startswith("tcp://127.0.0.1:")
+    assert worker["address"].startswith("tls://127.0.0.1:")
     assert 0 < worker["memory_bytes"] < worker["memory_limit_bytes"] == found["memory_limit_bytes"]
     assert found["threads"] == 1
+    assert found["unconfined_decoders"] == worker["unconfined_decoders"] == confinement.missing()
     assert found["problem"] is None
     assert found["coordinator"]["holder"].endswith(f":{watched.service.process.pid}")
     assert found["coordinator"]["last_sign_seconds"] < 15

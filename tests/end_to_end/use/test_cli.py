@@ -128,7 +128,7 @@ def test_patterns_need_a_new_or_empty_folder(tmp_path: Path) -> None:
     done = patterns("sketch", str(tmp_path), "--monitor", "16x12")
     assert (done.returncode, done.stdout) == (0, f"{tmp_path}\n")
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    assert len(before) == 33
+    assert len(before) == 38
     again = patterns("default", str(tmp_path), "--monitor", "16x12")
     assert (again.returncode, again.stdout) == (2, "")
     assert "is not empty" in again.stderr
@@ -159,12 +159,12 @@ def test_film_of_a_preset_and_of_its_record(tmp_path: Path) -> None:
     film = tmp_path / "new" / "sketch.mp4"
     done = patterns("sketch", str(film), "--monitor", "320x240", "--rate", "10", "--json")
     assert done.returncode == 0, done.stderr
-    assert "patterns: 100% 42 of 42" in done.stderr
+    assert "patterns: 100% 47 of 47" in done.stderr
     assert json.loads(done.stdout) == {
         "video": str(film),
         "preset": "sketch",
         "monitor": [296, 216],
-        "patterns": 32,
+        "patterns": 37,
     }
     assert sorted(path.name for path in film.parent.iterdir()) == ["sketch.json", "sketch.mp4"]
     again = patterns(str(film.with_suffix(".json")), str(tmp_path / "again.mp4"), "--rate", "10")

@@ -10,10 +10,11 @@ import pytest
 from PIL import Image
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_demo_writes_its_picture_and_files(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "services", "demo", "-o", "picture.png", "--keep", "kept", "--json"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=280)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     figures = json.loads(done.stdout)
     assert figures["psnr_db"] > 26
@@ -24,6 +25,7 @@ def test_demo_writes_its_picture_and_files(tmp_path: Path) -> None:
     assert "done" in done.stderr
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends a process with its parent")
 def test_service_of_a_killed_demo_ends(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from PIL import Image
 
 from tests.end_to_end.captures.tus import wait_until_deleted
 from tests.end_to_end.conftest import HEIGHT, WIDTH, Service, digests, png
+from tests.parts.waiting import until
 from workflows.images import integer_formats
 from workflows.images.tone_curves import to_light
 from workflows.programs.program import Images, Program
@@ -151,9 +152,13 @@ def test_deleting_leaves_nothing(service: Service, capture_archive: Path) -> Non
 
 def test_running_service_is_alive_and_ready(service: Service) -> None:
     assert service.http.get("/healthz").json() == {"status": "alive"}
-    answer = service.http.get("/readyz")
-    assert answer.status_code == 200, answer.text
-    assert answer.json() == {"ready": True, "database": "ok", "store": "ok", "cluster": "ok"}
+    until(lambda: service.http.get("/readyz").status_code == 200)  # the first check may take a while
+    assert service.http.get("/readyz").json() == {
+        "ready": True,
+        "database": "ok",
+        "store": "ok",
+        "cluster": "ok",
+    }
 
 
 def test_options_are_described(service: Service) -> None:

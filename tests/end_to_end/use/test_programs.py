@@ -38,7 +38,7 @@ def program(service: Service) -> dict:
 
 def test_equal_programs_are_stored_once(service: Service, program: dict) -> None:
     assert Program.model_validate(program["program"]) == SKETCH
-    assert program["patterns"] == 32
+    assert program["patterns"] == 37
     assert program["monitor"] == {"width": 296, "height": 216}
     assert program["display"] == {"width": 320, "height": 240}
     again = service.http.post(
@@ -75,7 +75,7 @@ def test_patterns_as_png_and_as_zip(service: Service, program: dict) -> None:
     assert zipped.headers["content-type"] == "application/zip"
     every = list(pictures(SKETCH))
     with zipfile.ZipFile(io.BytesIO(zipped.content)) as archive:
-        assert len(archive.namelist()) == 33
+        assert len(archive.namelist()) == 38
         assert Program.model_validate_json(archive.read("program.json")) == SKETCH
         for n in (0, 5, 31):
             answer = service.http.get(f"{url}/patterns/{n}.png")
@@ -83,9 +83,9 @@ def test_patterns_as_png_and_as_zip(service: Service, program: dict) -> None:
             assert answer.content == archive.read(f"{n:05d}.png")
             pixels = np.asarray(Image.open(io.BytesIO(answer.content)).convert("RGB"))
             np.testing.assert_array_equal(pixels, np.broadcast_to(every[n], pixels.shape))
-    for n in (-1, 32):
+    for n in (-1, 37):
         problem = check_problem(service.http.get(f"{url}/patterns/{n}.png"), 404, "not-found")
-        assert "0 to 31" in problem["detail"]
+        assert "0 to 36" in problem["detail"]
 
 
 def test_video_equals_that_of_the_command_line(service: Service, program: dict, tmp_path: Path) -> None:

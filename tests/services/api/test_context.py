@@ -9,6 +9,7 @@ import pytest
 
 from services.api.auth import identify
 from services.api.context import KEY_CHECK, Context
+from services.api.work import Shares
 from services.decoding.pool import Decoders
 from services.runtime.problems import Unauthorized
 from services.settings import Settings
@@ -25,7 +26,8 @@ def test_download_ends_when_its_key_is_revoked(tmp_path: Path) -> None:
     settings, objects = Settings(data=tmp_path), Objects((tmp_path / "store").as_uri())
     check_key = partial(identify, settings, engine, key)
     decoders = Decoders(settings.backdrop_bytes)  # no process starts before the first picture
-    context = Context(settings, engine, objects, Cache(objects, 0), decoders, check_key=check_key)
+    memory = Shares(1, 1)
+    context = Context(settings, engine, objects, Cache(objects, 0), decoders, memory, check_key=check_key)
 
     def pieces() -> Iterator[bytes]:
         for n in range(5):

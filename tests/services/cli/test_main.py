@@ -37,7 +37,7 @@ PROCESSES = {"serve", "coordinator", "scheduler", "worker", "completion"}
 
 def envmatte(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
     command = [*COMMAND, *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, env=os.environ | environment)
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, env=os.environ | environment)
 
 
 def commands(group: click.Group = main, *above: str) -> Iterator[tuple[str, click.Command]]:
@@ -96,7 +96,7 @@ def test_exit_codes_agree_between_readme_docstring_and_help() -> None:
     table = re.findall(
         r"^\| (\d+) \| (.*) \|$", README.partition("| exit code | |")[2].partition("\n\n")[0], re.M
     )
-    assert [code for code, _ in table] == ["0", "1", "2", "3", "130"]
+    assert [code for code, _ in table] == ["0", "1", "2", "3", "4", "130"]
     import services.cli
 
     for text in (services.cli.__doc__, main.help):
@@ -246,7 +246,7 @@ def imported(*arguments: str, folder: Path) -> set[str]:
     """The top-level modules that a command imports while it runs."""
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-X", "importtime", "-m", "services", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=folder, env=environment)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=folder, env=environment)
     assert done.returncode in (0, 3), done.stderr[-2000:]
     return {line.rpartition("|")[2].strip().partition(".")[0] for line in done.stderr.splitlines()}
 
@@ -261,6 +261,32 @@ def test_listing_keys_imports_nothing_heavy(tmp_path: Path) -> None:
     imported("keys", "make", "lab", folder=tmp_path)  # makes the database, with alembic
     assert "sqlalchemy" in (found := imported("keys", "list", folder=tmp_path))
     assert not found & (HEAVY | {"pydantic"})
+
+
+@pytest.mark.parametrize(
+    ("start", "kind"),
+    [
+        (b"\0\0\0\x18ftypisom", "clip"),
+        (b"\0\0\0\x08wide\0\0\0\0", "clip"),
+        (b"\x1aE\xdf\xa3", "clip"),
+        (b"RIFF\0\0\0\0AVI LIST", "clip"),
+        (b"\x47\x40\0\x10" + bytes(184) + b"\x47", "clip"),
+        (b"\0\0\0\0\x47\x40\0\x10" + bytes(188) + b"\x47", "clip"),
+        (b"\0\0\0\x18ftypheic", "still"),
+        (b"\0\0\0\x18ftypcrx ", "still"),
+        (b"\x89PNG\r\n\x1a\n", "still"),
+        (b"GIF89a", "still"),
+        (b"RIFF\0\0\0\0WEBP", "still"),
+        (b"", "still"),
+    ],
+)
+def test_clips_and_stills_differ_by_their_first_bytes(tmp_path: Path, start: bytes, kind: str) -> None:
+    file = tmp_path / "backdrop"
+    file.write_bytes(start + bytes(300 if start else 0))
+    output = tmp_path / "out.txt"
+    answer = CliRunner().invoke(main, ["composite", "m", str(file), "-o", str(output)])
+    assert answer.exit_code == 2
+    assert ("must end in .mp4" in " ".join(answer.output.split())) == (kind == "clip")
 
 
 @pytest.mark.parametrize("name", [str(command.name) for command in remote.COMMANDS])

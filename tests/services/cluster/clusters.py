@@ -9,8 +9,6 @@ from pathlib import Path
 
 import psutil
 
-from services.decoding.process import NAME
-
 
 @contextmanager
 def started(
@@ -54,21 +52,22 @@ def children(process: subprocess.Popen[str]) -> list[psutil.Process]:
 
 
 def workers(process: subprocess.Popen[str]) -> list[psutil.Process]:
-    """The worker processes of a process: those forked by its fork server, without decoders."""
-    return [one for one, name in _forked(process) if name != NAME]
+    """The worker processes of a process: those forked by its fork server."""
+    return _forked(process, "forkserver")
 
 
 def decoders(process: subprocess.Popen[str]) -> list[psutil.Process]:
-    """The processes that decode images for the API."""
-    return [one for one, name in _forked(process) if name == NAME]
+    """The decoders of a process and of its workers."""
+    return _forked(process, "decoder_server")
 
 
-def _forked(process: subprocess.Popen[str]) -> list[tuple[psutil.Process, str]]:
+def _forked(process: subprocess.Popen[str], server: str) -> list[psutil.Process]:
     found = []
     for one in children(process):
         with suppress(psutil.NoSuchProcess):  # it has just ended
-            if any("forkserver" in argument for argument in psutil.Process(one.ppid()).cmdline()):
-                found.append((one, one.name()))
+            commands = one.cmdline(), psutil.Process(one.ppid()).cmdline()  # the same, if it was forked
+            if all(any(server in argument for argument in command) for command in commands):
+                found.append(one)
     return found
 
 

@@ -3,7 +3,6 @@
 import asyncio
 import signal
 import socket
-import ssl
 import subprocess
 import time
 from collections.abc import Iterator
@@ -15,7 +14,6 @@ from urllib.parse import urlsplit
 import psutil
 import pytest
 from distributed import Client, Scheduler, Worker
-from distributed.comm import connect as open_comm
 from distributed.scheduler import KilledWorker
 from distributed.security import Security
 
@@ -23,6 +21,7 @@ from services.cluster.connect import connect
 from services.runtime import certificates
 from storage.errors import Unavailable
 from tests.parts.waiting import until
+from tests.services.cluster.attempts import answers_without_certificate, gets_in
 from tests.services.cluster.clusters import address, children, listening, running, started, workers
 
 WORKERS = 2
@@ -97,32 +96,6 @@ def client(cluster: Cluster) -> Iterator[Client]:
     with connect(cluster.address, cluster.security) as client:
         until(lambda: len(client.nthreads()) == WORKERS)
         yield client
-
-
-async def gets_in(at: str, security: Security) -> bool:
-    """Whether a dask client gets an answer."""
-    try:
-        opening = open_comm(at, timeout=2, **security.get_connection_args("client"))
-        comm = await asyncio.wait_for(opening, 5)
-        await comm.write({"op": "identity", "reply": True})
-        reply = await asyncio.wait_for(comm.read(), 5)
-        comm.abort()
-    except (OSError, TimeoutError):
-        return False
-    return bool(reply["id"])
-
-
-async def answers_without_certificate(port: int) -> bool:
-    """Whether a TLS server answers a client without a certificate."""
-    context = ssl.create_default_context()
-    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-    try:
-        reader, writer = await asyncio.wait_for(asyncio.open_connection("127.0.0.1", port, ssl=context), 5)
-        answer = await asyncio.wait_for(reader.read(1), 5)
-        writer.close()
-    except (OSError, TimeoutError):
-        return False
-    return bool(answer)
 
 
 def test_sockets_accept_only_certificates_of_the_cluster(cluster: Cluster, client: Client) -> None:
@@ -327,7 +300,7 @@ def test_a_port_in_use_is_reported(folder: Path) -> None:
         taken.listen()
         (folder / "scheduler.log").write_text("")
         with scheduling(folder, taken.getsockname()[1], "127.0.0.1") as process:
-            assert process.wait(60) == 1
+            assert process.wait(60) == 4
     log = (folder / "scheduler.log").read_text()
-    assert "can't listen on 127.0.0.1" in log
+    assert "choose another port with --port" in log
     assert "Traceback" not in log

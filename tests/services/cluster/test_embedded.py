@@ -1,14 +1,20 @@
-"""The embedded cluster: where it listens, and how many workers it has."""
+"""The embedded cluster: where it listens, who can join it, and how many workers it has."""
 
+import os
+import subprocess
+import sys
 import time
-from pathlib import Path
+from collections.abc import Iterator
+from urllib.parse import urlsplit
 
 import psutil
 import pytest
+from distributed import LocalCluster
 
 from services.cluster.connect import connect
 from services.cluster.embedded import Scale, embedded
 from services.settings import Settings
+from tests.parts.waiting import until
 from tests.services.cluster.clusters import listening
 
 
@@ -34,11 +40,48 @@ def test_workers_scale_with_tiles_and_stop_when_idle(monkeypatch: pytest.MonkeyP
     assert targets == [1, 3, 4, 1]
 
 
-def test_the_embedded_cluster_listens_on_loopback_only(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LocalCluster]:
+    with embedded(Settings(data=tmp_path_factory.mktemp("data"), workers=1)) as cluster:
+        yield cluster
+
+
+@pytest.fixture(scope="module")
+def sockets(cluster: LocalCluster) -> set[tuple[str, int]]:
+    """Where the cluster listens: addresses and ports of the scheduler, in this process, its nanny and its worker."""
     this = psutil.Process()
-    others = set(this.children(recursive=True))
-    with embedded(Settings(data=tmp_path, workers=1)) as cluster:
-        found = {ip for one in {this, *this.children(recursive=True)} - others for ip, _ in listening(one)}
-        assert found == {"127.0.0.1"}
-        with connect(cluster.scheduler_address, None) as client:
-            assert list(client.nthreads().values()) == [1]
+    return {found for one in (this, *this.children(recursive=True)) for found in listening(one)}
+
+
+def test_the_embedded_cluster_listens_on_loopback_only(
+    cluster: LocalCluster, sockets: set[tuple[str, int]]
+) -> None:
+    assert urlsplit(cluster.scheduler_address).port in {port for _, port in sockets}
+    assert {ip for ip, _ in sockets} == {"127.0.0.1"}
+    with connect(cluster.scheduler_address, cluster.security) as client:
+        assert list(client.nthreads().values()) == [1]
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can act as another user of this machine")
+def test_another_user_of_this_machine_cannot_join(
+    cluster: LocalCluster, sockets: set[tuple[str, int]]
+) -> None:
+    ports = [str(port) for _, port in sockets]
+    attempts = [sys.executable, "-m", "tests.services.cluster.attempts", *ports]
+    done = subprocess.run(attempts, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == [f"{port} False" for port in ports]
+
+
+def test_worker_is_replaced_although_the_next_fork_server_dies_too(cluster: LocalCluster) -> None:
+    def fork_servers() -> list[psutil.Process]:
+        mine = psutil.Process().children()
+        return [one for one in mine if one.status() != "zombie" and "forkserver" in " ".join(one.cmdline())]
+
+    with connect(cluster.scheduler_address, cluster.security) as client:
+        before = {*client.run(os.getpid).values()}
+        (first,) = fork_servers()
+        first.kill()
+        until(lambda: [one for one in fork_servers() if one != first])
+        fork_servers()[0].kill()  # while it imports what workers need
+        until(lambda: {*client.run(os.getpid).values()} - before)

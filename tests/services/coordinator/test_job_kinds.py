@@ -58,7 +58,7 @@ def test_a_clip_is_kept_while_its_job_may_be_retried(
     engine: Engine, objects: Objects, job: str, error: EnvmatteError, kept: bool
 ) -> None:
     fail(engine, job, error)
-    sweep(engine, objects, seconds=0)
+    sweep(engine, objects, objects.clock() + 1)
     assert bool(objects.paths_below(composites.path(job))) == kept
     with writing(engine) as c:
         row = jobs.get(c, job)
@@ -71,9 +71,9 @@ def test_a_clip_is_kept_while_its_job_may_be_retried(
 
 def test_a_sweep_removes_only_what_no_job_refers_to(engine: Engine, objects: Objects, job: str) -> None:
     objects.put(composites.clip_path("unknown"), b"any")
-    sweep(engine, objects, seconds=0)
+    sweep(engine, objects, objects.clock() + 1)
     assert objects.names("composites") == [job]
     with writing(engine) as c:
         jobs.cancel(c, job)
-    sweep(engine, objects, seconds=0)
+    sweep(engine, objects, objects.clock() + 1)
     assert objects.names("composites") == []

@@ -8,16 +8,18 @@ import pytest
 from sqlalchemy import Engine, select, update
 
 from services.coordinator.retention import count_bytes, delete_expired, delete_old_jobs
+from storage import statistics
 from storage.database import tables
 from storage.database.engine import open_engine, reading, writing
 from storage.database.owners import for_owner
+from storage.database.rows import ROW
 from storage.layout import captures as stored_captures
 from storage.layout import composites
 from storage.layout import mattes as stored_mattes
 from storage.layout import uploads as stored_uploads
 from storage.objects.checksums import SUFFIX
 from storage.objects.store import Objects
-from storage.records import captures, idempotency, jobs, mattes, statistics, tiles, uploads
+from storage.records import captures, idempotency, jobs, mattes, tiles, uploads
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
@@ -181,8 +183,10 @@ def test_bytes_are_counted_once_complete(engine: Engine, objects: Objects) -> No
             return statistics.stored_bytes(c)
 
     each = len(objects.read_raw(f"{stored_mattes.path('a')}/z{SUFFIX}"))  # checksums count too
-    assert stored("alice") == 7 + 3 * each + 1000 + 20_000 + 300_000
-    assert stored("bob") == 0  # the size of its capture archive counts until then
+    rows = 8 * ROW + 2 * len("{}")  # two captures with their programs, two mattes, three jobs, an upload
+    assert stored("alice") == 7 + 3 * each + 1000 + 20_000 + 300_000 + rows
+    of_bob = 4 * ROW + len("{}")
+    assert stored("bob") == of_bob  # the size of its capture archive counts until then
     with writing(engine) as c:
         jobs.end(c, clip, "succeeded")
         jobs.change(c, clip, stored=None)
@@ -190,6 +194,6 @@ def test_bytes_are_counted_once_complete(engine: Engine, objects: Objects) -> No
         assert statistics.stored_bytes(c, all_owners=True) == statistics.stored_bytes(c)
     objects.delete(composites.clip_path(clip))
     objects.put(composites.video_path(clip), bytes(64))
-    assert stored("alice") == 7 + 999 + 20_000 + 64 + 5 * each
+    assert stored("alice") == 7 + 999 + 20_000 + 64 + 5 * each + rows
     with reading(for_owner(engine, "bob")) as c:
-        assert statistics.stored_bytes(c, all_owners=True) == 7 + 999 + 20_000 + 64 + 5 * each
+        assert statistics.stored_bytes(c, all_owners=True) == 7 + 999 + 20_000 + 64 + 5 * each + rows + of_bob

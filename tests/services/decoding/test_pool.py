@@ -1,11 +1,7 @@
-"""Pictures decoded in child processes: the same pixels, and children that die, hang, use memory or send garbage."""
+"""Pictures decoded in child processes: the same pixels, and children that die, hang or use memory."""
 
 import contextlib
-import errno
 import io
-import pickle
-import socket
-import struct
 from collections.abc import Callable, Iterator
 from concurrent import futures
 from concurrent.futures import ThreadPoolExecutor
@@ -17,14 +13,15 @@ import pytest
 import tifffile
 from PIL import Image
 
-from services.decoding import process
 from services.decoding.pool import Decoders
-from services.decoding.process import NAME
 from storage.errors import ImageError, Unavailable
 from tests.parts.waiting import until
 from tests.services.cluster.clusters import running
+from tests.workflows.images.dngs import dng
+from tests.workflows.images.heics import heic
 from workflows.images import decode, float_formats, integer_formats
-from workflows.untrusted import decoder_guard
+from workflows.untrusted import decoder
+from workflows.untrusted.decoder_process import NAME
 
 MEMORY = 1 << 24
 PIXELS = np.random.default_rng(0).integers(0, 256, (30, 40, 3), np.uint8)
@@ -68,6 +65,8 @@ PICTURES = {
     "PNG, alpha": integer_formats.encode_png(np.dstack([PIXELS, PIXELS[..., :1]])),
     "PNG, gray": integer_formats.encode_png(PIXELS[..., :1]),
     "JPEG": saved("JPEG"),
+    "HEIC": heic(PIXELS, 6),
+    "camera RAW": dng(PIXELS[:, :, 0].astype(np.uint16) * 16, 100, 4095),
     "JPEG, Adobe RGB": saved("JPEG", icc_profile=imagecodecs.cms_profile("adobergb")),
     **{
         f"TIFF, {name}": tiff(PIXELS, compression=name)
@@ -154,8 +153,8 @@ def test_idle_child_that_dies_is_replaced(decoders: Decoders) -> None:
 
 
 def test_child_has_a_memory_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(decoder_guard, "COPIES", 0)
-    monkeypatch.setattr(decoder_guard, "EXTRA", 32 << 20)
+    monkeypatch.setattr(decoder, "COPIES", 0)
+    monkeypatch.setattr(decoder, "EXTRA", 32 << 20)
     confined = Decoders(1 << 30)
     large = saved("PNG", np.zeros((6000, 6000, 3), np.uint8))
     with pytest.raises(ImageError, match="too much memory"):
@@ -175,55 +174,6 @@ def test_largest_allowed_picture_fits_in_memory() -> None:
     decoders.close()
 
 
-def framed(text: bytes) -> bytes:
-    return struct.pack("<I", len(text)) + text
-
-
-BAD_ANSWERS = [
-    pickle.dumps(print),
-    framed(pickle.dumps({"result": None})),
-    framed(b"{}"),
-    struct.pack("<I", 1 << 31),
-    *(
-        framed(b'{"result": {"height": %s, "width": 40, "channels": 3, "dtype": "%s"}}' % head)
-        for head in (
-            (b"100000", b"float32"),
-            (b"-1", b"uint8"),
-            (b"30.5", b"uint8"),
-            (b"1e999", b"uint8"),
-            (b"30", b"object"),
-            (b'30, "more": 1', b"uint8"),
-        )
-    ),
-    framed(b'{"result": {"height": 30, "width": 40, "channels": 3, "dtype": "uint8"}}') + b"too few",
-    framed(b'{"result": {"height": 30, "width": 40, "channels": 4, "dtype": "float32"}}'),
-    framed(b'{"result": {"detail": 3}}'),
-    framed(b'{"result": {"detail": "no", "status": 200}}'),
-    b"",
-]
-
-
-class CompromisedDecoder:
-    """Runs in a child in place of the decoder; pickled by name, so it must be a class of this module."""
-
-    def __init__(self, number: int) -> None:
-        self.number = number
-
-    def __call__(self, connection: socket.socket, memory: int) -> None:
-        with connection:
-            connection.recv(1 << 16)
-            connection.sendall(BAD_ANSWERS[self.number])
-
-
-@pytest.mark.parametrize("number", range(len(BAD_ANSWERS)))
-def test_invalid_answer_of_a_child_is_refused(
-    decoders: Decoders, monkeypatch: pytest.MonkeyPatch, number: int
-) -> None:
-    monkeypatch.setattr(process, "_serve", CompromisedDecoder(number))
-    with pytest.raises(ImageError, match="ended the process"):
-        decoders.decode(PNG, "srgb")
-
-
 def test_closed_pool_is_unavailable(decoders: Decoders) -> None:
     decoders.decode(PNG, "srgb")
     decoders.close()
@@ -232,26 +182,10 @@ def test_closed_pool_is_unavailable(decoders: Decoders) -> None:
         decoders.decode(PNG, "srgb")
 
 
-def test_kernel_that_cannot_be_cached_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on a new installation: numba adds a compiled kernel before it fails to write the cache."""
-    real, failures = decode.decode, [errno.EFBIG]
-
-    def failing_once(data: bytes, transfer: decode.Transfer, *, memory: int) -> object:
-        if failures:
-            raise ImageError("the image is damaged") from OSError(failures.pop(), "File too large")
-        return real(data, transfer, memory=memory)
-
-    monkeypatch.setattr(decode, "decode", failing_once)
-    np.testing.assert_array_equal(process._decode(PNG, "srgb", MEMORY), PIXELS)
-    failures.append(errno.EIO)
-    with pytest.raises(ImageError, match="damaged"):
-        process._decode(PNG, "srgb", MEMORY)
-
-
 def test_child_has_resource_limits(decoders: Decoders) -> None:
     decoders.decode(PNG, "srgb")
     (child,) = children()
     assert child.rlimit(psutil.RLIMIT_CORE) == (0, 0)
     assert child.rlimit(psutil.RLIMIT_FSIZE) == (0, 0)
-    room = decoder_guard.room(MEMORY)
+    room = decoder.room(MEMORY)
     assert room <= child.rlimit(psutil.RLIMIT_DATA)[1] < room + (4 << 30)

@@ -2,6 +2,7 @@
 
 import secrets
 import shutil
+import stat
 import time
 from pathlib import Path
 
@@ -25,6 +26,19 @@ def test_sqlite_settings(sqlite: str) -> None:
         assert connection.scalar(text("PRAGMA synchronous")) == 2  # FULL
         assert connection.scalar(text("PRAGMA foreign_keys")) == 1
         assert connection.scalar(text("PRAGMA busy_timeout")) == 10000
+    engine.dispose()
+
+
+def test_files_of_sqlite_are_their_owners_alone(tmp_path: Path) -> None:
+    file = tmp_path / "envmatte.db"
+    old = [Path(f"{file}{end}") for end in ("", "-wal")]
+    for path in old:
+        path.touch()
+        path.chmod(0o644)
+    engine = open_engine(f"sqlite:///{file}")
+    with reading(engine):
+        found = {path.name: stat.S_IMODE(path.stat().st_mode) for path in tmp_path.iterdir()}
+    assert found == {f"envmatte.db{end}": 0o600 for end in ("", "-wal", "-shm")}
     engine.dispose()
 
 

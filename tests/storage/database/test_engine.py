@@ -183,7 +183,7 @@ def test_frozen_writer_loses_its_transaction(postgresql: str) -> None:
         with writing(engine) as connection:
             job = jobs.add(connection, "ingest", "c", {})
         holder.send_signal(signal.SIGCONT)
-        assert "storage.errors.Unavailable: " in holder.communicate("\n", timeout=60)[1]
+        assert "storage.errors.Unavailable: " in holder.communicate("\n", timeout=300)[1]
         assert holder.returncode == 1
     with reading(engine) as connection:
         assert jobs.get(connection, job).state == "queued"

@@ -205,7 +205,7 @@ def test_concurrent_processes_upgrade_once(bare: Engine) -> None:
         assert process.stdin is not None
         process.stdin.write("\n")
         process.stdin.flush()
-    outputs = [process.communicate(timeout=60) for process in processes]
+    outputs = [process.communicate(timeout=300) for process in processes]
     assert outputs == [(f"{NEWEST}\n", "")] * 2
     with reading(bare) as connection:
         assert differences(connection) == []

@@ -1,17 +1,25 @@
 """Backing up an installation that changes meanwhile, or is damaged."""
 
-import pytest
-from sqlalchemy import Engine, delete, select
+import gc
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
+import pytest
+from sqlalchemy import Engine, delete, event, select
+
+from storage.database import dialects
 from storage.database import tables as database_tables
 from storage.database.engine import reading, writing
-from storage.errors import Corrupt
+from storage.errors import Corrupt, Unavailable
 from storage.layout import composites
 from storage.maintenance.backup import back_up
 from storage.maintenance.restore import restore
 from storage.maintenance.verify import verify
 from storage.objects.store import Objects
 from storage.records import captures, jobs, mattes
+from tests.parts.postgres import Server
 from tests.storage.installation import flip
 
 
@@ -53,6 +61,57 @@ def test_backup_while_items_are_deleted_and_finished(
                 assert composites.clip_path(row.id) in elsewhere[1].sizes(composites.path(row.id))
         if found["i"] == "ready":
             assert jobs.get(c, "ii").state == "succeeded"
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings(  # SQLAlchemy can't close the cursor of a connection that broke
+    "ignore:.*ServerCursor:pytest.PytestUnraisableExceptionWarning"
+)
+@pytest.mark.parametrize("url", ["postgresql"], indirect=True)
+def test_restarted_database_fails_or_finishes_a_backup_and_a_restore(
+    engine: Engine,
+    filled: Objects,
+    target: Objects,
+    postgresql_server: Server,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def restart_at(engine: Engine, statement: str) -> None:
+        """Restart the server after a statement, within its transaction."""
+
+        def restart(connection: Any, cursor: Any, sql: str, *more: Any) -> None:
+            if sql.startswith(statement):
+                event.remove(engine, "after_cursor_execute", restart)
+                postgresql_server.restart()
+
+        event.listen(engine, "after_cursor_execute", restart)
+
+    def restart_once(share: float, size: int) -> None:
+        if not restarts:
+            restarts.append(share)
+            postgresql_server.restart()
+
+    def refuse(act: Callable[[], object]) -> None:
+        with pytest.raises(Unavailable):
+            act()
+
+    store = Objects((tmp_path / "elsewhere").as_uri())
+    restart_at(engine, "SELECT captures")
+    caplog.set_level(logging.CRITICAL, "sqlalchemy.pool")  # what it logs would keep the cursor
+    refuse(lambda: back_up(engine, filled, target, "1"))
+    gc.collect()  # the cursor, here and not in a later test
+    assert target.names("") == []
+    restarts: list[float] = []
+    made = back_up(engine, filled, target, "1", restart_once)  # between two transactions
+    with postgresql_server.database() as url:
+        other = dialects.make_engine(url)
+        restart_at(other, "INSERT INTO jobs")
+        refuse(lambda: restore(target, other, store))
+        assert store.names("") == []
+        restarts.clear()
+        assert restore(target, other, store, restart_once) == made
+        assert verify(other, store).findings == []
+        other.dispose()
 
 
 @pytest.mark.slow

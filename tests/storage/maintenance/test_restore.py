@@ -64,6 +64,15 @@ def sealed(target: Objects, lines: list[bytes]) -> None:
     target.write_raw(MANIFEST, iter([*lines[:-1], json.dumps(last).encode()]))
 
 
+def replace_rows(target: Objects, manifest: list[bytes], rows: list[bytes]) -> None:
+    """Write other rows into a backup, and a manifest that matches them."""
+    data = b"".join(rows)
+    target.write_raw(LEDGER, iter([data]))
+    lines = list(manifest)
+    change(0, ledger={"size": len(data), "sha256": hashlib.sha256(data).hexdigest()})(lines)
+    sealed(target, lines)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("url", ["sqlite"], indirect=True)
 def test_from_sqlite_and_folder_to_postgresql_and_bucket_and_back(
@@ -204,12 +213,9 @@ def test_invalid_backup_is_refused_and_leaves_nothing(
         (b'["coordinator",{"id":1}]\n', "table 'coordinator'"),
         (b'["jobs",{"id":1}]\n', "a row of jobs with unexpected columns"),
         (b"[1]\n", "a line that is not a row"),
+        (b"[" * 100_000, "a line that is not a row"),
     ):
-        data = b"".join(rows) + row
-        target.write_raw(LEDGER, iter([data]))
-        lines = list(whole)
-        change(0, ledger={"size": len(data), "sha256": hashlib.sha256(data).hexdigest()})(lines)
-        sealed(target, lines)
+        replace_rows(target, whole, [*rows, row])
         with pytest.raises(InvalidInput, match=match):
             restore(target, *elsewhere)
         require_empty(*elsewhere)
@@ -218,6 +224,47 @@ def test_invalid_backup_is_refused_and_leaves_nothing(
     restore(target, *elsewhere)
     assert rows_of(elsewhere[0]) == rows_of(engine)
     assert contents(elsewhere[1]) == contents(filled)
+
+
+HOSTILE: tuple[tuple[str, str, Any], ...] = (
+    ("mattes", "id", "../../../victim"),
+    ("mattes", "id", ""),
+    ("mattes", "id", ".."),
+    ("mattes", "id", 7),
+    ("mattes", "capture", "a/b"),
+    ("jobs", "matte", "x" * 65),
+    ("jobs", "kind", "shell"),
+    ("jobs", "state", "done"),
+    ("jobs", "created_at", 1e300),
+    ("jobs", "finished_at", float("nan")),
+    ("captures", "created_at", "soon"),
+    ("captures", "bytes", 1 << 70),
+    ("captures", "frames", 1.5),
+    ("captures", "name", None),
+    ("tiles", "attempts", True),
+    ("tiles", "job", "../x"),
+)
+
+
+@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+@pytest.mark.parametrize(("table", "column", "value"), HOSTILE)
+def test_row_that_the_service_would_stumble_over_is_refused(
+    table: str,
+    column: str,
+    value: Any,
+    engine: Engine,
+    filled: Objects,
+    target: Objects,
+    elsewhere: tuple[Engine, Objects],
+) -> None:
+    back_up(engine, filled, target, "1")
+    rows = [json.loads(line) for line in lines_of(target, LEDGER)]
+    row = next(row for name, row in rows if name == table)
+    row[column] = value
+    replace_rows(target, lines_of(target), [json.dumps(line).encode() + b"\n" for line in rows])
+    with pytest.raises(InvalidInput, match=f"a row of {table} with an invalid {column}"):
+        restore(target, *elsewhere)
+    require_empty(*elsewhere)
 
 
 @pytest.mark.parametrize("url", ["sqlite"], indirect=True)

@@ -79,7 +79,7 @@ def test_every_call_reports_unreachable_bucket(unreachable: str) -> None:
         lambda: stream(objects, "a", bytes(PART + 1)),
         lambda: objects.names("a"),
         lambda: objects.paths_below("a"),
-        lambda: objects.stale_names("a", 1),
+        lambda: objects.written_at("a"),
         lambda: objects.delete("a"),
         lambda: gather(objects.group("a")),
         lambda: gather(objects.array("a")),

@@ -3,9 +3,11 @@
 import pytest
 from sqlalchemy import Connection, func, select
 
+from storage import statistics
 from storage.database import tables
+from storage.database.rows import ROW
 from storage.errors import Conflict, NotFound
-from storage.records import jobs, mattes, tiles
+from storage.records import jobs, tiles
 from tests.storage.records.planned import log_of, planned
 
 
@@ -133,14 +135,22 @@ def test_active_jobs_are_oldest_first(connection: Connection) -> None:
     assert [row.id for row in jobs.active(connection)] == [made[0], made[2], made[3]]
 
 
-def test_cancelled_composite_has_leftovers_until_its_tiles_are_deleted(connection: Connection) -> None:
-    recovery = jobs.add(connection, "recover", "cap", {}, matte="other")
-    mattes.add(connection, "other", "cap", recovery, {})  # which is being recovered, and is no part of it
+def test_only_cancelled_job_has_leftovers(connection: Connection) -> None:
+    other = jobs.add(connection, "recover", "cap", {}, matte="other")
     job = jobs.add(connection, "composite", "cap", {"transfer": "srgb"}, "other", job="given")
     assert job == "given"
-    tiles.add_steps(connection, job)
+    jobs.end(connection, other, "succeeded")
     assert jobs.cancelled_with_leftovers(connection) == []
     jobs.cancel(connection, job)
     assert [row.id for row in jobs.cancelled_with_leftovers(connection)] == [job]
-    tiles.delete_all(connection, job)
+    jobs.change(connection, job, leftovers=False)
+    jobs.cancel(connection, job)  # again
     assert jobs.cancelled_with_leftovers(connection) == []
+
+
+def test_each_attempt_counts_as_stored(connection: Connection) -> None:
+    job = jobs.add(connection, "recover", "c", {})
+    for attempts in (1, 2, 3):
+        assert statistics.stored_bytes(connection) == attempts * ROW
+        jobs.end(connection, job, "failed", {"detail": "", "status": 500})
+        jobs.retry(connection, job)

@@ -30,6 +30,19 @@ def test_one_process_holds_the_lease(engine: Engine) -> None:
     assert acquire(engine, "first", seize=True) == 3
 
 
+def test_lease_from_before_the_clock_went_back_is_free(engine: Engine) -> None:
+    assert acquire(engine, "first") == 1
+    hour = 3600
+    with writing(engine) as c:
+        values = {"expires_at": dialects.clock() + hour + leases.SECONDS, "beat_at": dialects.clock() + hour}
+        c.execute(update(tables.coordinator).values(values))
+    with reading(engine) as c:
+        sign = leases.last_heartbeat(c)
+    assert sign is not None
+    assert sign.seconds > hour - 5  # not negative, which would count as alive for an hour
+    assert acquire(engine, "second") == 2
+
+
 def test_released_lease_is_free(engine: Engine) -> None:
     token = acquire(engine, "first")
     assert token is not None

@@ -1,4 +1,4 @@
-"""Rows of uploads: offsets and parts, concurrent writers, expiry, Idempotency-Keys, and room in the store."""
+"""Rows of uploads: offsets and parts, concurrent writers, expiry, and Idempotency-Keys."""
 
 import threading
 import time
@@ -9,9 +9,8 @@ from sqlalchemy.exc import IntegrityError
 
 from storage.database.engine import writing
 from storage.database.tables import upload_parts
-from storage.errors import Conflict, NoRoom, NotFound
+from storage.errors import Conflict, NotFound
 from storage.layout.uploads import Part
-from storage.objects.store import Objects
 from storage.records import uploads
 
 DAY = 86400.0
@@ -111,21 +110,3 @@ def test_key_has_at_most_one_upload(engine: Engine) -> None:
     with writing(engine) as c:
         uploads.delete(c, "first")
         uploads.add(c, "second", 1, "", DAY, "key")
-
-
-def test_room_accounts_for_unfinished_uploads(engine: Engine, objects: Objects) -> None:
-    free = objects.free_bytes()
-    if free is None:  # a bucket has no end
-        with engine.connect() as c:
-            uploads.check_room(c, objects, 1 << 60)
-        return
-    with writing(engine) as c:
-        uploads.check_room(c, objects, free // 2)
-        with pytest.raises(NoRoom, match="Delete captures") as caught:
-            uploads.check_room(c, objects, 2 * free)
-        assert abs(int(caught.value.fields["missing"]) - free) < free // 10
-        uploads.add(c, "u", free, "", DAY, None)
-        with pytest.raises(NoRoom):
-            uploads.check_room(c, objects, free // 2)
-        uploads.advance(c, "u", 0, [Part("a", free)], DAY)
-        uploads.check_room(c, objects, free // 2)

@@ -10,7 +10,9 @@ import tifffile
 from numpy.typing import NDArray
 
 from storage.errors import ImageError
-from workflows.images.camera_raw import decode, is_raw
+from tests.workflows.images.test_raw_files import nef
+from workflows.images import decode as any_format
+from workflows.images.camera_raw import decode, develop
 
 MEMORY = 1 << 20
 BLACK, WHITE = 256, 4095
@@ -25,12 +27,6 @@ def expected(counts: NDArray[Any]) -> NDArray[Any]:
     light = (counts.astype(np.float32) - BLACK) / (WHITE - BLACK)
     red, blue = light[::2, ::2], light[1::2, 1::2]
     return np.stack([red, (light[::2, 1::2] + light[1::2, ::2]) / 2, blue], axis=2)
-
-
-def test_raw_is_recognised_by_the_name() -> None:
-    assert is_raw("frames/IMG_0001.CR3")
-    assert is_raw("a.dng")
-    assert not is_raw("dng/a.tif")
 
 
 def test_a_dng_is_linear_light_at_half_its_size(make_dng: Dng) -> None:
@@ -57,10 +53,10 @@ def test_a_pixel_with_a_clipped_element_is_clipped(make_dng: Dng) -> None:
 
 def test_the_limit_is_checked_before_unpacking(make_dng: Dng) -> None:
     data = make_dng(COUNTS, BLACK, WHITE)
-    decode(data, memory=40 * 60 * 6)
-    with pytest.raises(ImageError, match="60 x 40 photosites") as caught:
-        decode(data, memory=40 * 60 * 6 - 1)
-    assert caught.value.fields == {"limit": 40 * 60 * 6 - 1}
+    decode(data, memory=20 * 30 * 12)
+    with pytest.raises(ImageError, match="60 x 40 photosites takes more than the 7199 bytes") as caught:
+        decode(data, memory=20 * 30 * 12 - 1)
+    assert caught.value.fields == {"limit": 20 * 30 * 12 - 1}
 
 
 def plain_tiff() -> bytes:
@@ -73,9 +69,10 @@ def plain_tiff() -> bytes:
     ("data", "why"),
     [
         (b"", "cut off or damaged"),
-        (bytes(5000), "RAW format is not supported: convert the frames to DNG"),
+        (bytes(5000), "RAW format is not supported: convert it to DNG"),
         (b"FUJIFILMCCD-RAW " + bytes(5000), "RAW"),
         (plain_tiff(), "RAW"),
+        (b"\xff\xd8\xff\xe0" + bytes(5000), "JPEG with the name of camera RAW: rename it to .jpg"),
     ],
 )
 def test_raw_unknown_to_libraw_is_refused(data: bytes, why: str) -> None:
@@ -94,9 +91,13 @@ def test_another_colour_filter_is_refused(make_dng: Dng) -> None:
 
 
 @pytest.mark.parametrize("shape", [(40, 60), (40, 60, 3)])
-def test_a_truncated_dng_is_refused(make_dng: Dng, shape: tuple[int, ...]) -> None:
-    data = make_dng(np.ones(shape, np.uint16), BLACK, WHITE)
-    for length in np.linspace(0, len(data) * 0.9, 20).astype(int):
+@pytest.mark.parametrize(
+    "how", [{}, {"compression": "jpeg", "compressionargs": {"lossless": True}, "tile": (16, 16)}]
+)
+def test_a_truncated_dng_is_refused(make_dng: Dng, shape: tuple[int, ...], how: dict[str, Any]) -> None:
+    counts = np.random.default_rng(8).integers(200, 4000, shape, np.uint16)
+    data = make_dng(counts, BLACK, WHITE, **how)
+    for length in np.linspace(0, len(data) - 9, 20).astype(int):
         with pytest.raises(ImageError):
             decode(data[:length], memory=MEMORY)
 
@@ -163,9 +164,9 @@ def test_a_linear_dng_is_read_pixel_by_pixel(make_dng: Dng, how: dict[str, Any])
 
 def test_a_linear_dngs_margin_is_cut_off_and_its_limit_checked_first(make_dng: Dng) -> None:
     data = make_dng(PIXELS, BLACK, WHITE, active=(4, 6, 38, 56))
-    assert decode(data, memory=40 * 60 * 24).shape == (34, 50, 3)
+    assert decode(data, memory=40 * 60 * 12).shape == (34, 50, 3)
     with pytest.raises(ImageError, match="60 x 40 linear pixels"):
-        decode(data, memory=40 * 60 * 24 - 1)
+        decode(data, memory=40 * 60 * 12 - 1)
 
 
 @pytest.mark.parametrize("shape", [(40, 60), (40, 60, 3)])
@@ -178,3 +179,49 @@ def test_dng_in_a_compression_unknown_to_libraw_is_refused(make_dng: Dng) -> Non
     data = make_dng(PIXELS, BLACK, WHITE, compression=tifffile.COMPRESSION.JPEGXL_DNG)
     with pytest.raises(ImageError, match="other than JPEG XL"):
         decode(data, memory=MEMORY)
+
+
+def test_a_developed_picture_has_the_cameras_white_balance_and_white_highlights(make_dng: Dng) -> None:
+    neutral = 50, 100, 80
+    counts = np.full((40, 60), BLACK, np.uint16)
+    at = (
+        (slice(0, None, 2), slice(0, None, 2)),
+        (slice(None), slice(None)),
+        (slice(1, None, 2), slice(1, None, 2)),
+    )
+    light = 0.25
+    for share, (y, x) in zip((neutral[1], neutral[0], neutral[2]), (at[1], at[0], at[2]), strict=True):
+        counts[y, x] = BLACK + round(light * share / 100 * (WHITE - BLACK))
+    counts[:4, :4] = WHITE
+    data = make_dng(counts, BLACK, WHITE, neutral=neutral)
+    picture = develop(data, memory=MEMORY)
+    assert picture.shape == (20, 30, 3)
+    np.testing.assert_allclose(picture[:2, :2], 1, atol=1e-5)
+    np.testing.assert_allclose(picture[3:], light, atol=1e-3)
+    # A frame holds what the camera saw.
+    np.testing.assert_allclose(decode(data, memory=MEMORY)[5, 5], np.array(neutral) / 100 * light, atol=1e-3)
+
+
+def test_a_developed_picture_has_the_primaries_of_srgb(make_dng: Dng) -> None:
+    counts = np.full((40, 60), 1600, np.uint16)
+    grey = develop(make_dng(counts, BLACK, WHITE), memory=MEMORY)[4, 4]
+    counts[::2, ::2] = 1900  # more of the first colour, of a camera that sees XYZ, as its matrix says
+    red = develop(make_dng(counts, BLACK, WHITE), memory=MEMORY)[4, 4] - grey
+    # The first column of the matrix from XYZ to sRGB (IEC 61966-2-1).
+    np.testing.assert_allclose(red / red[0], [1, -0.299, 0.017], atol=0.01)
+
+
+def test_a_backdrop_is_the_raw_and_not_its_thumbnail(make_dng: Dng) -> None:
+    data = make_dng(COUNTS, BLACK, WHITE, orientation=6, thumbnail=np.zeros((8, 12, 3), np.uint8))
+    expected = develop(data, memory=MEMORY)
+    assert expected.shape == (30, 20, 3)
+    for transfer in ("srgb", "linear"):
+        np.testing.assert_array_equal(any_format.decode(data, transfer, memory=MEMORY), expected)
+    with pytest.raises(
+        ImageError, match=r"^the RAW image is cut off or damaged: copy it again from the camera$"
+    ):
+        any_format.decode(data[: len(data) // 2], "srgb", memory=MEMORY)
+
+
+def test_a_backdrop_of_nikons_is_not_its_thumbnail() -> None:
+    assert any_format.decode(nef(), "srgb", memory=MEMORY).shape == (20, 30, 3)

@@ -320,7 +320,9 @@ def test_a_mask_of_frames_before_rotation_is_refused(make_zip: Zip, ingest: Inge
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pack", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+@pytest.mark.parametrize(
+    "pack", [zipfile.ZIP_DEFLATED, pytest.param(zipfile.ZIP_STORED, marks=pytest.mark.exhaustive)]
+)
 def test_slabs_of_a_video_do_not_change_the_bytes(
     ingest_film: IngestFilm, digests: Digests, light: list[np.ndarray], pack: int
 ) -> None:
@@ -342,6 +344,7 @@ def test_film_of_too_many_patterns_is_refused(ingest_film: IngestFilm, filmed: F
     assert caught.value.fields == {"entry": "clip.mp4", "limit": 2000}
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="the resident peak is read from Linux's /proc")
 def test_long_video_is_ingested_within_its_memory(

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from storage.errors import CaptureError
 from storage.layout.captures import Stack
-from workflows.images.integer_formats import encode_png
+from tests.workflows.images.heics import heic
+from workflows.images.integer_formats import encode_jpeg, encode_png
 from workflows.images.tone_curves import BLACK, table
 
 Zip = Callable[..., bytes]
@@ -134,3 +135,26 @@ def test_raw_of_a_camera_that_is_not_known_is_refused(make_zip: Zip, ingest: Ing
     with pytest.raises(CaptureError, match=r"^0\.nef: this camera's RAW format is not supported") as caught:
         ingest("c", make_zip(record("nef"), files))
     assert caught.value.fields == {"entry": "0.nef"}
+
+
+def test_heic_frames_are_turned_as_the_first(make_zip: Zip, ingest: Ingest) -> None:
+    codes = np.random.default_rng(5).integers(0, 256, (6, 2 * HEIGHT, 2 * WIDTH, 3), np.uint8)
+    turns = [6, 6, 1, 3, 6, 6]  # a camera that looks down detects its orientation at random
+    files = {f"{n}.HEIC": heic(c, turn) for n, (c, turn) in enumerate(zip(codes, turns, strict=True))}
+    stack = ingest("c", make_zip(record("HEIC"), files))
+    np.testing.assert_array_equal(stack.read(), np.rot90(codes, -1, axes=(1, 2)))
+
+
+def test_raw_is_recognised_whatever_its_name(make_zip: Zip, ingest: Ingest, make_dng: Dng) -> None:
+    counts = np.random.default_rng(5).integers(200, 3900, (6, 2 * HEIGHT, 2 * WIDTH), np.uint16)
+    thumbnail = np.zeros((8, 12, 3), np.uint8)
+    files = {f"{n}.tif": make_dng(c, 256, 4095, thumbnail=thumbnail) for n, c in enumerate(counts)}
+    stack = ingest("c", make_zip(record("tif"), files))
+    assert stack.read().shape == (6, HEIGHT, WIDTH, 3)
+    assert stack.attributes["storage"] == {"black": BLACK, "full": 1.0, "bounded": True}
+
+
+def test_a_jpeg_with_the_name_of_raw_is_refused_with_a_remedy(make_zip: Zip, ingest: Ingest) -> None:
+    jpeg = encode_jpeg(np.ones((HEIGHT, WIDTH, 3), np.uint8), 90)
+    with pytest.raises(CaptureError, match=r"^0\.nef: this is a JPEG .* rename it to \.jpg"):
+        ingest("c", make_zip(record("nef"), {f"{n}.nef": jpeg for n in range(6)}))

@@ -1,5 +1,7 @@
 """Pixels looked into: of three rows, of one, and of none."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ from storage.errors import InvalidInput
 from storage.layout import mattes
 from storage.layout.mattes import Block, Matte
 from storage.objects.store import Objects
-from workflows.mattes.pixel import contribution, look_into
+from workflows.mattes.pixel import Pixel, contribution, look_into
 from workflows.mattes.pixel_picture import picture
 
 NODES = np.array([1, 2, 5, 6 * 40 + 1, 7], np.uint32)
@@ -60,3 +62,20 @@ def test_pixel_without_transport_is_drawn_empty(matte: Matte, x: int, recovered:
 def test_pixel_outside_the_frame_is_refused(matte: Matte, x: int, y: int) -> None:
     with pytest.raises(InvalidInput, match="from 0 to"):
         look_into(matte, x, y, 4)
+
+
+def test_drawing_many_cells_of_a_fine_grid_takes_little_memory() -> None:
+    side, n = 16384, 20_000
+    node = np.arange(n) * (side * side // n)
+    weight = np.full((n, 3), 1 / n, np.float32)
+    none = np.zeros(3, np.float32)
+    pixel = Pixel(
+        0, 0, (side, side), side, side, True, none, none, node, weight, np.zeros((0, 8), np.float32)
+    )
+    tracemalloc.start()
+    try:
+        shares = contribution(pixel, (0, 0, 1, 1), 492, 492)
+        assert tracemalloc.get_traced_memory()[1] < 100e6  # each cell and column by itself: 2.6 GB
+    finally:
+        tracemalloc.stop()
+    np.testing.assert_allclose(shares.sum(axis=(0, 1)), 1, atol=1e-5)

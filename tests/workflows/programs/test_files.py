@@ -75,7 +75,7 @@ def test_an_archive_has_the_record_and_every_picture() -> None:
     assert b"".join(zip_program(SKETCH)) == b"".join(parts)
     with zipfile.ZipFile(io.BytesIO(b"".join(parts))) as found:
         assert found.testzip() is None
-        assert found.namelist() == ["program.json", *(f"{n:05d}.png" for n in range(32))]
+        assert found.namelist() == ["program.json", *(f"{n:05d}.png" for n in range(37))]
         assert Program.model_validate_json(found.read("program.json")) == SKETCH
         for n, picture in enumerate(pictures(SKETCH)):
             data = found.read(f"{n:05d}.png")

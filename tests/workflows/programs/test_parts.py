@@ -5,9 +5,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from tests.workflows.programs.parts import grid, program, stripes
-from workflows.programs.program import Bernoulli, Monitor, Stripes
+from workflows.programs.program import Bernoulli, Halftone, Monitor, Stripes
 
 
 def test_bits_are_the_raw_words_of_pcg64() -> None:
@@ -108,3 +109,19 @@ def test_stripes_may_start_from_a_finer_one() -> None:
     some = list(program(stripes("y", 2, first=3)).pictures(2, 4))
     np.testing.assert_array_equal(some, every[3:5])
     assert Stripes.model_validate(stripes("y", 2, first=3)).values(1).shape == (32, 1, 1)
+
+
+@pytest.mark.parametrize("level", [0.25, 0.5, 0.75])
+def test_half_tones_are_dots_of_two_pixels(level: float) -> None:
+    part = Halftone(kind="halftone", levels=(level,))
+    shown = part.values(0, Monitor(width=41, height=30))
+    assert shown.shape == (30, 41, 1)
+    assert set(np.unique(shown)) == {0.0, 1.0}
+    assert shown[:28, :40].mean() == pytest.approx(level)
+    np.testing.assert_array_equal(shown[:28:2, :40], shown[1:28:2, :40])
+    np.testing.assert_array_equal(shown[:28, :40:2], shown[:28, 1:40:2])
+
+
+def test_half_tones_of_other_levels_are_refused() -> None:
+    with pytest.raises(ValidationError, match="multiple of"):
+        Halftone.model_validate({"kind": "halftone", "levels": [0.3]})

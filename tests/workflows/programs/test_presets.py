@@ -9,7 +9,7 @@ from storage.errors import OptionError
 from workflows.programs.presets import RECIPES, preset
 from workflows.programs.program import Bernoulli
 
-COUNTS = {"default": 132, "quick": 56, "sketch": 32, "paper-250": 282, "paper-400": 432}
+COUNTS = {"default": 140, "quick": 61, "sketch": 37, "paper-250": 282, "paper-400": 432}
 MONITORS = [
     (1280, 960),
     (1920, 1080),
@@ -70,15 +70,27 @@ def test_the_grids_are_those_of_the_recipes() -> None:
         assert not any(part.offset for part in parts)
 
 
-def test_the_constants_are_black_and_white_and_the_three_colours() -> None:
-    assert preset("default").constants[1].tolist() == [[0, 0, 0]] * 2 + [[1, 1, 1]] * 2
-    for name in ("quick", "sketch"):
-        sent = preset(name).constants[1].tolist()
-        assert sent == [[0, 0, 0]] * 2 + [[1, 1, 1]] * 2 + [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
-    for name in ("paper-250", "paper-400"):
-        codes = preset(name).constants[1] * 255
-        np.testing.assert_allclose(codes, np.rint(codes), atol=1e-5)  # 8 bits hold them
-        np.testing.assert_allclose(codes[:, 0], np.linspace(0, 255, 8), atol=0.5)
+@pytest.mark.parametrize("name", ["default", "quick", "sketch"])
+def test_calibration_comes_first_and_black_and_white_again_in_the_middle_and_at_the_end(name: str) -> None:
+    made = preset(name)
+    numbers, sent = made.constants
+    white, black = [1, 1, 1], [0, 0, 0]
+    first = [white, [1, 0, 0], [0, 1, 0], [0, 0, 1], black]
+    assert sent.tolist() == [*first, white, black, black, white]
+    assert numbers[:5].tolist() == [0, 1, 2, 3, 4]
+    assert 0.3 < numbers[5] / made.count < 0.8
+    assert numbers[-2:].tolist() == [made.count - 2, made.count - 1]
+    tones, shares = made.halftones
+    assert tones.tolist() == [5, 6, 7]
+    assert shares.tolist() == [0.25, 0.5, 0.75]
+    assert made.measured.size == made.count - 12
+
+
+@pytest.mark.parametrize("name", ["paper-250", "paper-400"])
+def test_the_programs_of_the_paper_begin_with_eight_levels(name: str) -> None:
+    codes = preset(name).constants[1] * 255
+    np.testing.assert_allclose(codes, np.rint(codes), atol=1e-5)  # 8 bits hold them
+    np.testing.assert_allclose(codes[:, 0], np.linspace(0, 255, 8), atol=0.5)
 
 
 @pytest.mark.parametrize(("width", "height"), [(2, 2), (0, 960), (1280, 2)])
@@ -89,7 +101,7 @@ def test_a_monitor_that_is_too_small_is_refused(width: int, height: int) -> None
 
 def test_a_band_of_pixels_is_a_monitor_too() -> None:
     for size in ((16384, 6), (6, 16384), (16384, 64)):
-        assert preset("sketch", *size).count == 32
+        assert preset("sketch", *size).count == 37
 
 
 def test_an_unknown_preset_is_refused() -> None:

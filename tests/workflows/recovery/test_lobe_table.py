@@ -1,5 +1,7 @@
 """Lobes by hand: the moments of bumps, mixtures that are known, their ranks and their merging."""
 
+import time
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -146,3 +148,34 @@ def test_pixels_do_not_depend_on_each_other() -> None:
 def test_ranked_lobes_needs_a_positive_number_and_aspect(most: int, aspect: float) -> None:
     with pytest.raises(ValueError, match="at least 1 and aspect positive"):
         ranked_lobes(transport([{0: 1.0}]), most, aspect)
+
+
+def test_pixel_that_sees_thousands_of_places_takes_milliseconds() -> None:
+    """Every colour sees cells of its own, far from those of the others, so none of them may merge as near."""
+    side = 240
+    cells = np.arange(side * side).reshape(-1, 3).T  # of a quarter of the columns and rows below
+    at = np.sort((cells // side) * 4 * 960 + cells % side * 4, axis=1).astype(np.uint32)
+    count = np.full((1, 3), at.shape[1], np.uint32)
+    pixel = Transport(
+        960, 960, count, at.ravel(), np.full(at.size, 1 / at.shape[1], np.float32), np.zeros(1, bool)
+    )
+    lobes([{0: 1.0}])  # compiles the kernel
+    start = time.perf_counter()
+    found = ranked_lobes(pixel, 4, 1.0)[0]
+    assert time.perf_counter() - start < 5  # without a bound, longer than a day
+    np.testing.assert_allclose(found[:, 2:5].sum(axis=0), 1, atol=1e-4)
+    np.testing.assert_allclose(found[:, 0] @ found[:, 2:5].mean(axis=1), 0.5, atol=0.01)
+
+
+def test_work_ends_between_pixels() -> None:
+    calls = 0
+
+    def end() -> None:
+        nonlocal calls
+        calls += 1
+        if calls == 3:
+            raise TimeoutError
+
+    with pytest.raises(TimeoutError):
+        ranked_lobes(transport(*[[{0: 1.0}]] * 1000), 4, 1.0, end)
+    assert calls == 3

@@ -124,7 +124,7 @@ def test_crosstalk_is_recovered():
     rho = rng.uniform(0.1, 0.9, (40, 1, 3))
     values = 0.02 + (rho * COLOURS) @ crosstalk.T + rng.normal(0, 0.002, (40, 5, 3))
     usable = np.ones(values.shape, bool)
-    values[3, 2], usable[3, 2, 1] = 1, False
+    values[3, 2, 1], usable[3, 2, 1] = 1, False
     found = estimate_crosstalk(values.astype(np.float32), COLOURS, usable)
     np.testing.assert_allclose(found, crosstalk, atol=3e-3)
 
@@ -138,3 +138,16 @@ def test_crosstalk_without_evidence_is_the_identity(why):
     usable = np.full(values.shape, why != "clipped")
     found = estimate_crosstalk(values.astype(np.float32), levels.astype(np.float32), usable)
     np.testing.assert_array_equal(found, np.eye(3))
+
+
+def test_crosstalk_of_a_camera_that_clips_negative_light() -> None:
+    random = np.random.default_rng(6)
+    true = np.array([[1, -0.1, -0.08], [-0.05, 1, -0.07], [-0.06, -0.1, 1]])
+    levels = np.array([[1, 1, 1], [0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+    rho, S = random.uniform(0.1, 0.8, (2000, 1, 3)), 0.02
+    values = (S + (rho * levels) @ true.T).astype(np.float32)
+    clipped = np.maximum(values, 0)
+    found = estimate_crosstalk(clipped, levels, clipped > 0)
+    np.testing.assert_allclose(found.sum(axis=1), true.sum(axis=1), atol=0.02)
+    np.testing.assert_allclose(found, true, atol=0.04)
+    np.testing.assert_allclose(estimate_crosstalk(values, levels, values > -1), true, atol=0.001)

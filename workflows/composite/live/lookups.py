@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from workflows.interruption import checkpoint
 from workflows.recovery.pyramid import Pyramid
 
 FIELDS = ("x", "y", "level", "R", "G", "B")
@@ -17,6 +18,10 @@ FIELDS = ("x", "y", "level", "R", "G", "B")
 _MOST_CLUSTERS = 24
 """Most clusters of a pixel that merge by Ward's cost. While there are more, those in each 2 x 2 square of a grid
 merge."""
+_MOST_READ = 1 << 14
+"""Clusters of a pixel that are held while its entries are read; if there are more, squares merge already then."""
+_CHUNK = 64
+"""Pixels between two checkpoints."""
 _CLUSTER = 7
 """Values of a cluster: its weight w; w times x, y and the mean second moment of the axes; the channels' weights."""
 
@@ -62,12 +67,13 @@ def fit_lookups(
     pyramid = Pyramid.over(columns, rows)
     sizes = count.astype(np.int64)
     begin = np.concatenate([[0], np.cumsum(sizes.sum(axis=1))])
-    capacity = max(int(np.diff(begin).max(initial=0)), 1)
+    capacity = min(max(int(np.diff(begin).max(initial=0)), 1), _MOST_READ)
     lookups = np.zeros((len(sizes), most, len(FIELDS)), np.float32)
-    clusters = np.empty((capacity, _CLUSTER))
-    _fit(
-        sizes, begin, wanted, shared, cell, weight, pyramid.starts, pyramid.arrays.columns, clusters, lookups
-    )
+    clusters, grid = np.empty((capacity, _CLUSTER)), (pyramid.starts, pyramid.arrays.columns)
+    for first in range(0, len(sizes), _CHUNK):
+        checkpoint()
+        at = slice(first, first + _CHUNK)
+        _fit(sizes[at], begin[at], wanted[at], shared[at], cell, weight, *grid, clusters, lookups[at])
     return lookups
 
 
@@ -89,7 +95,7 @@ def _fit(
     key, copy = np.empty(capacity, np.int64), np.empty((capacity, _CLUSTER))
     partner, cost = np.empty(capacity, np.int64), np.empty(capacity)
     for i in np.flatnonzero(wanted):
-        n = _read_clusters(sizes[i], begin[i], shared[i], cell, weight, starts, columns, clusters, key)
+        n = _read_clusters(sizes[i], begin[i], shared[i], cell, weight, starts, columns, clusters, key, copy)
         if not shared[i]:  # the channels' rows have many nodes in common
             n = _merge_equal(clusters, key, n, copy)
         n = _merge_squares(clusters, key, n, copy)
@@ -114,14 +120,19 @@ def _read_clusters(
     columns: NDArray[np.int64],
     clusters: NDArray[np.float64],
     key: NDArray[np.int64],
+    copy: NDArray[np.float64],
 ) -> int:
     """Write a cluster for each entry of a pixel's rows, and its level, row and column as a key; return their number.
 
-    `sizes`, (3,), are the entries of each channel; the first is `entry`.
+    `sizes`, (3,), are the entries of each channel; the first is `entry`. If there is no room for all, squares merge.
     """
-    n = 0
+    n, halvings = 0, 0
     for channel in range(3):
         for _ in range(sizes[channel]):
+            if n == len(clusters):
+                while n > len(clusters) // 2:
+                    n = _halve(clusters, key, n, copy)
+                    halvings += 1
             level = np.searchsorted(starts, cell[entry], "right") - 1
             row, column = divmod(np.int64(cell[entry]) - starts[level], columns[level])
             side = 2.0**level
@@ -133,7 +144,7 @@ def _read_clusters(
             w = cluster[4] + cluster[5] + cluster[6]
             cluster[0], cluster[1], cluster[2] = w, w * x, w * y
             cluster[3] = w * ((x * x + y * y) / 2 + _variance(level))
-            key[n] = (level * 2**24 + row) * 2**24 + column
+            key[n] = (level * 2**24 + (row >> halvings)) * 2**24 + (column >> halvings)
             n, entry = n + 1, entry + 1
     return n
 
@@ -144,15 +155,22 @@ def _merge_squares(
 ) -> int:
     """Merge clusters in each 2 x 2 square of a grid until there are few; return the number left, which come first."""
     while n > _MOST_CLUSTERS:
-        for a in range(n):
-            level, node = divmod(key[a], 2**48)
-            row, column = divmod(node, 2**24)
-            key[a] = (level * 2**24 + row // 2) * 2**24 + column // 2
-        left = _merge_equal(clusters, key, n, copy)
+        left = _halve(clusters, key, n, copy)
         if left == n and (key[:n] % 2**48 == 0).all():
             break  # one cluster per level
         n = left
     return n
+
+
+@njit(nogil=True, cache=True)
+def _halve(clusters: NDArray[np.float64], key: NDArray[np.int64], n: int, copy: NDArray[np.float64]) -> int:
+    """Merge clusters in each 2 x 2 square of a grid once; return the number left, which come first."""
+    for a in range(n):
+        level, node = divmod(key[a], 2**48)
+        row, column = divmod(node, 2**24)
+        key[a] = (level * 2**24 + row // 2) * 2**24 + column // 2
+    left: int = _merge_equal(clusters, key, n, copy)
+    return left
 
 
 @njit(nogil=True, cache=True)

@@ -28,10 +28,14 @@ from workflows.composite.placement import Placement
 from workflows.composite.quantise import encode
 from workflows.composite.video import segments
 from workflows.images import tone_curves
-from workflows.ingest.video.decoder import Clip, open_clip
-from workflows.ingest.video.frame_means import TOTAL_WEIGHT, Share, mean_frames
+from workflows.ingest import films
+from workflows.ingest.films import Film
+from workflows.ingest.video.frame_means import TOTAL_WEIGHT, Share
 from workflows.jobs import Steps, Task
+from workflows.untrusted.decoder import Decoder
 
+NAME = "the clip"
+"""What errors call it."""
 KEPT = 1 << 29
 """Bytes of a matte that a worker keeps from frame to frame."""
 MOST = 1_000_000
@@ -62,10 +66,14 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
         If the clip can't be read.
     """
     target = Matte(objects, task.matte)
-    with _reading(objects, task) as clip:
-        ticks, last = clip.ticks(MOST)
-        tick, width, height = clip.time_base, clip.width, clip.height
-        notes = list(_losses(clip, ticks, last))
+    with _reading(objects, task) as (decoder, file):
+        film, ticks, last = films.times(decoder, file, NAME, MOST)
+    tick, width, height = film.time_base, film.width, film.height
+    if film.interlaced:
+        raise ClipError(
+            "the clip is interlaced: each frame holds two pictures of different times, in alternate rows. Deinterlace "
+            "it with a video editor, or by `ffmpeg -i clip.mts -vf bwdif clip.mp4`, and send the result"
+        )
     gaps = np.append(np.diff(ticks), last)
     longest = int(np.argmax(gaps))
     shown = float(gaps[longest] * tick)
@@ -87,7 +95,10 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
         "tick": [tick.numerator, tick.denominator],
         "last": last,
         "rate": int(np.clip(round(len(ticks) / seconds), 1, 240)),
-        "notes": [f"the clip has {len(ticks)} frames of {width} x {height} pixels, {seconds:.3f} s", *notes],
+        "notes": [
+            f"the clip has {len(ticks)} frames of {width} x {height} pixels, {seconds:.3f} s",
+            *_losses(film, ticks, last),
+        ],
     }
 
 
@@ -112,8 +123,9 @@ def work(objects: Objects, task: Task, tile: int) -> int:
         picture = composite(put, backdrop, placement=where, read=partial(cache.strip, matte), threads=1)
         return encode(picture, transfer, np.dtype(np.uint8), 1)[..., :3].astype(np.uint8, copy=False)
 
-    with _reading(objects, task) as clip:
-        frames = mean_frames(clip, [[Share(tick, TOTAL_WEIGHT)] for tick in ticks.tolist()])
+    with _reading(objects, task) as (decoder, file):
+        plan = [[Share(tick, TOTAL_WEIGHT)] for tick in ticks.tolist()]
+        frames = films.means(decoder, file, NAME, plan, task.plan["width"], task.plan["height"])
         pictures = (shown(frame) for frame in frames)
         segment = segments.encode(pictures, task.plan["rate"], length, transfer)
     objects.put(composites.segment_path(job, tile), segment)
@@ -140,33 +152,33 @@ def finish(objects: Objects, task: Task) -> dict[str, Any]:
 STEPS = Steps("composite", "compositing", prepare, work, missing, finish, scattered=False)
 
 
-def _losses(clip: Clip, ticks: NDArray[np.int64], last: int) -> Iterator[str]:
+def _losses(film: Film, ticks: NDArray[np.int64], last: int) -> Iterator[str]:
     """What a clip lacks, as lines for the log."""
-    tick = clip.tick
-    lost = sorted({at for at in clip.lost if at >= ticks[0]} - set(ticks.tolist()))
-    if lost:
+    tick = float(film.time_base)
+    if film.lost:
+        first, final = film.lost[0] * tick, film.lost[-1] * tick
         yield (
-            f"frames between {lost[0] * tick:.3f} s and {lost[-1] * tick:.3f} s can't be decoded, because the clip is "
-            "damaged there: the frame before stays in their place"
+            f"frames between {first:.3f} s and {final:.3f} s can't be decoded, because the clip is damaged there: the "
+            "frame before stays in their place"
         )
     ends = (int(ticks[-1]) + last) * tick
-    if clip.stated_duration > ends + SHORT:
+    if film.stated_duration > ends + SHORT:
         yield (
-            f"the clip ends early: it should be {clip.stated_duration:.3f} s long, but its last frame that can be "
+            f"the clip ends early: it should be {film.stated_duration:.3f} s long, but its last frame that can be "
             f"decoded ends at {ends:.3f} s; the video ends there"
         )
 
 
 @contextmanager
-def _reading(objects: Objects, task: Task) -> Iterator[Clip]:
-    """The clip of a job, opened as an untrusted file; its faults are raised as `ClipError`."""
+def _reading(objects: Objects, task: Task) -> Iterator[tuple[Decoder, BinaryIO]]:
+    """A decoder and the clip of a job, whose faults are raised as `ClipError`."""
     try:
         file = objects.read(composites.clip_path(task.job))
     except FileNotFoundError as error:
         raise Corrupt("the clip is no longer in the store; send it again") from error
     try:
-        with file, open_clip(file, "the clip", task.limits.image) as clip:
-            yield clip
+        with file, Decoder(task.limits.image) as decoder:
+            yield decoder, file
     except CaptureError as error:
         fields = {name: value for name, value in error.fields.items() if name != "entry"}
         raise ClipError(error.detail, **fields) from error

@@ -1,8 +1,8 @@
 """Measure the camera from constant frames: its noise, its crosstalk, and unknown tone curves."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import product
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,8 @@ from pydantic import TypeAdapter
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import Curve, Response, estimate, table, to_light
 from workflows.ingest.measured_light import exposures_of
+from workflows.ingest.report.border_exposure import TRIFLE, BorderValues, relative_to_white
+from workflows.ingest.report.camera_curve import HalfTones, Shown, are_scaled, fit_camera_curve
 from workflows.programs.program import Program
 from workflows.recovery.noise import Noise, estimate_excess
 from workflows.recovery.photometry import estimate_crosstalk, estimate_noise
@@ -19,6 +21,10 @@ SAMPLES = 20_000
 """About how many pixels the noise and unknown curves are measured from."""
 FRAMES = 64
 """At most how many constant frames they are measured from."""
+TURNS = 4
+"""Turns in which the camera's curve and a film's exposures are found, one given the other."""
+MOST_APART = 1.3
+"""Ratio of the exposures of the constant frames from which on they tell no curve: the camera was not locked."""
 COMPRESSED_SAMPLES = 4096
 """At most how many pixels of all frames the noise of a video is measured from."""
 
@@ -39,39 +45,115 @@ def measure(stack: Stack, gains: Sequence[float] | None = None) -> None:
     top, black = np.iinfo(stack.dtype).max, stack.attributes["storage"]["black"]
     usable = (codes > 0) & (codes < top)
     grey = np.ptp(sent, axis=1) == 0
+    camera, exposed, scaled = _camera(stack, program)
     found = estimate(
         sent[grey, 0],
         exposures[grey],
         _by_value(table("linear", stack.dtype, black)[codes[:, grey]]),
         _by_value(usable[:, grey]),
         program.monitor.response,
-        TypeAdapter(Response).validate_python(stack.attributes["response"]),
+        camera,
     )
     # Only one exposure, so that all frames have the same noise.
     shortest = np.flatnonzero(exposures == exposures.min())
     codes, usable, sent, grey = codes[:, shortest], usable[:, shortest], sent[shortest], grey[shortest]
     look_up = table(found.camera, stack.dtype, black)
     light, shown = look_up[codes], to_light(sent, found.monitor)
+    if exposed is not None:
+        light /= exposed[[frames[at] for at in shortest], np.newaxis].astype(np.float32)
     if gains is not None:
         shown *= np.array([gains[frames[at]] for at in shortest], np.float32)[:, np.newaxis]
     # Crosstalk between channels must not count as noise, so grey levels are used if there are enough.
     some = grey if np.count_nonzero(grey) >= 4 else np.ones_like(grey)
     noise = estimate_noise(light[:, some], shown[some], usable[:, some], 1 / (top - black))
     if "video" in stack.attributes:
-        noise = _compressed(stack, look_up, frames, shown, noise)
+        noise = _compressed(stack, look_up, exposed, frames, shown, noise)
     stack.annotate(
         monitor_curve=_as_json(found.monitor),
         camera_curve=_as_json(found.camera),
         assumed_curves=found.assumed,
+        scaled=scaled,
+        auto_exposure=None if exposed is None else exposed.round(5).tolist(),
         noise={"read": noise.read, "shot": noise.shot},
         assumed_noise=bool("video" not in stack.attributes and np.count_nonzero(some) < 4),
         crosstalk=estimate_crosstalk(light, shown, usable).tolist(),
     )
 
 
+def _camera(
+    stack: Stack, program: Program
+) -> tuple[Curve | Literal["unknown"], NDArray[np.float64] | None, bool]:
+    """The camera's curve; the exposure of each frame of a film by its border, (frames,), if it varied; whether the
+    monitor showed the patterns at another size.
+
+    An unknown curve is measured if the program shows half-tones. It and the exposures are found in turn.
+    """
+    camera: Curve | Literal["unknown"]
+    camera = TypeAdapter[Response](Response).validate_python(stack.attributes["response"])
+    stated = camera != "unknown"
+    halftones = _halftones(stack, program)
+    border = BorderValues(stack, program) if stack.attributes.get("border") else None
+    exposed: NDArray[np.float64] | None = None
+    scaled = False
+    for _ in range(TURNS if border else 1):
+        look_up = table(
+            "srgb" if camera == "unknown" else camera, stack.dtype, stack.attributes["storage"]["black"]
+        )
+        if border:
+            exposed = border.exposures(look_up)
+        seen = halftones(np.ones(stack.frames) if exposed is None else exposed) if halftones else None
+        if stated:
+            scaled = seen is not None and are_scaled(seen, look_up)
+        elif seen:
+            curve, scaled = fit_camera_curve(seen)
+            camera = curve or "unknown"
+    if exposed is not None and np.log(exposed).std() < TRIFLE:
+        exposed = None
+    if exposed is not None and exposed.max() > MOST_APART * exposed.min():
+        exposed = relative_to_white(exposed, stack.attributes["patterns"], program)
+    return camera, exposed, scaled
+
+
+def _halftones(stack: Stack, program: Program) -> Callable[[NDArray[np.float64]], HalfTones | None] | None:
+    """A function from the exposures of all frames to half-tones; None if the program shows none.
+
+    It returns None if the exposure was not locked.
+    """
+    times, patterns = exposures_of(stack.attributes), np.array(stack.attributes["patterns"])
+    full = np.float32(np.iinfo(stack.dtype).max)
+
+    def frames_of(numbers: NDArray[np.intp]) -> NDArray[np.intp]:
+        return np.flatnonzero(np.isin(patterns, numbers) & (times == times.min()))[:FRAMES]
+
+    numbers, shares = program.halftones
+    constants, sent = program.constants_among(stack.attributes["patterns"])
+    of_light = [frames_of(constants[(sent == level).all(axis=1)]) for level in (0, 1)]
+    there = [(frames_of(number), float(share)) for number, share in zip(numbers, shares, strict=True)]
+    there = [(frames, share) for frames, share in there if frames.size]
+    if not there or not all(frames.size for frames in of_light):
+        return None
+    of_light += [frames for frames, _ in there]
+    codes = [
+        np.stack([_sample(stack, int(n)).ravel() for n in frames]).astype(np.float32) / full
+        for frames in of_light
+    ]
+
+    def seen(exposed: NDArray[np.float64]) -> HalfTones | None:
+        used = exposed[np.concatenate(of_light)]
+        if used.max() > MOST_APART * used.min():
+            return None
+        black, white, *tones = (
+            Shown(part, exposed[frames]) for part, frames in zip(codes, of_light, strict=True)
+        )
+        return HalfTones(black, white, tones, [share for _, share in there])
+
+    return seen
+
+
 def _compressed(
     stack: Stack,
     look_up: NDArray[np.float32],
+    exposed: NDArray[np.float64] | None,
     constants: Sequence[int],
     shown: NDArray[np.float32],
     noise: Noise,
@@ -85,6 +167,8 @@ def _compressed(
     codes = np.concatenate([values[:, mask] for values, mask in read], axis=1).transpose(1, 0, 2)
     codes = codes[:: -(-len(codes) // COMPRESSED_SAMPLES) or 1]
     light = look_up[codes]
+    if exposed is not None:
+        light /= exposed[:, np.newaxis].astype(np.float32)
     design = np.stack([np.ones(len(shown)), shown.mean(axis=1)], axis=1)
     black, slope = np.einsum("dk,nkc->dnc", np.linalg.pinv(design), light[:, constants]).astype(np.float32)
     usable = (codes > 0) & (codes < len(look_up) - 1)

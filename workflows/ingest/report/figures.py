@@ -41,13 +41,15 @@ class Drift(BaseModel):
 class Flicker(BaseModel):
     """How much the monitor's light varied between frames, in per cent: standard deviation and worst frame.
 
-    ``error`` is the standard error of a frame. ``corrected`` says whether recovery corrects it.
+    ``error`` is the standard error of a frame. ``follows`` is the correlation of the frames' light with the patterns'
+    own. ``corrected`` says whether recovery corrects it.
     """
 
     percent: float
     error: float
     worst_percent: float
     worst_frame: int
+    follows: float = 0.0
     frames: int
     corrected: bool
 

@@ -1,20 +1,25 @@
 """What the figures of a capture mean, and what to do about them, in words."""
 
-from math import floor, log2
+from math import floor, log2, log10
 from typing import Any, Literal
 
 import numpy as np
 from pydantic import BaseModel
 
+from workflows.images.tone_curves import Curve, Sampled
 from workflows.ingest.report.figures import Drift, Figures, Flicker, Quality
 from workflows.ingest.video.missing_patterns import by_reason, ranges, remedy
-from workflows.programs.program import Images, Program
+from workflows.programs.program import Bernoulli, Images, Program
 
 Level = Literal["good", "warning", "bad"]
 LEVELS: tuple[Level, ...] = ("good", "warning", "bad")
 
 SURE = 4.0
 """A drift or flicker is real from so many standard errors on."""
+LOST_COLOUR = 1e-4
+"""Mean square of lost detail of colours, of full scale, below which it costs nothing that shows (40 dB)."""
+FOLLOWS = -0.25
+"""Correlation of frames' light with their patterns' own below which the camera brightens dark pictures."""
 
 
 class Finding(BaseModel):
@@ -31,29 +36,39 @@ class Finding(BaseModel):
 
 
 def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> list[Finding]:
-    """All findings about a capture, from its figures, its program and the attributes of its stack."""
+    """All findings about a capture, from its figures, its program and the attributes of its stack.
+
+    The worst come first. Of one level, those come first that cost most when measured
+    (`tests.benchmarks.recovery.devices`): exposure, the camera's own processing, movement, scaled patterns, curves,
+    glare, colours.
+    """
     found = [
-        _frames(figures),
         *_exposure(figures, attributes["storage"]),
-        *_steadiness(attributes.get("steadiness")),
+        *_auto_exposure(attributes.get("auto_exposure")),
+        *_steadiness(attributes.get("steadiness"), attributes.get("model_error", 0.0)),
         *_drift(figures.drift),
-        *_flicker(figures.flicker),
-        *_glare(attributes.get("glare")),
-        _noise(figures, attributes["survey"]),
-        _crosstalk(figures, program),
+        *_scaling(program, scaled=attributes.get("scaled", False)),
         *_curves(figures, program),
+        *_glare(attributes.get("glare")),
+        _crosstalk(figures, program, grey=attributes["survey"].get("grey", False)),
+        *_lost_colour(attributes["survey"].get("lost_colour", 0.0)),
+        _noise(figures, attributes["survey"]),
+        *_flicker(figures.flicker),
+        _frames(figures),
     ]
     if figures.quality is not None:
-        found.append(_quality(figures.quality))
-    return found
+        found.append(_quality(figures.quality, any(isinstance(part, Bernoulli) for part in program.parts)))
+    return sorted(found, key=lambda one: -LEVELS.index(one.level))
 
 
 def _graded(value: float, warning: float, bad: float) -> Level:
     return "bad" if value >= bad else "warning" if value >= warning else "good"
 
 
-def _quality(quality: Quality) -> Finding:
-    if quality.blocks is None:
+def _quality(quality: Quality, random: bool) -> Finding:
+    if not random:
+        worst, best, why = "backdrops finer than the patterns", "coarser ones", ""
+    elif quality.blocks is None:
         worst, best, why = "frosted glass, dispersion, many edges", "clear glass", ""
     else:
         worst, best = "clear glass, many edges", "frosted glass"
@@ -61,11 +76,12 @@ def _quality(quality: Quality) -> Finding:
             f": the random grids have no offsets, so light is located no finer than a block of the finest grid, with "
             f"{quality.blocks} along the shorter side. Patterns with offsets, as in the preset `default`, do better"
         )
+    low, high = f"{quality.low:.0f}", f"{quality.high:.0f}"
+    span = f"{low} dB" if low == high else f"{low} dB ({worst}) to {high} dB ({best})"
     return Finding(
         name="quality",
         level="good",
-        message=f"expect composites of about {quality.low:.0f} dB ({worst}) to {quality.high:.0f} dB ({best}), if "
-        f"nothing else is wrong{why}",
+        message=f"expect composites of about {span}, if nothing else is wrong{why}",
     )
 
 
@@ -133,17 +149,23 @@ def _white(figures: Figures) -> Finding:
     )
 
 
-def _steadiness(found: dict[str, Any] | None) -> list[Finding]:
+def _explained(left: float) -> str:
+    """How much no T explains, in words."""
+    return f"; {100 * left:.1f} % of the light stays unexplained" if left else ""
+
+
+def _steadiness(found: dict[str, Any] | None, left: float) -> list[Finding]:
     if found is None or (found.get("drift") and found.get("flicker")):
         return []
     return [
         Finding(
             name="steadiness",
             level="warning",
-            message="the patterns of the program don't explain what the frames show: the stillness of the camera and "
-            "the evenness of the light can't be measured",
-            remedy="state the camera's curve (`response`), and check that the frames show the patterns that "
-            "capture.json names, and that neither camera nor glass moved by more than three pixels",
+            message="the frames differ from what the patterns explain in ways that are neither a movement of the "
+            "camera nor a flicker of the light, so these can't be measured" + _explained(left),
+            remedy="switch HDR, sharpening and noise reduction of the camera off, or shoot RAW; check that the frames "
+            "show the patterns that capture.json names, and that neither camera nor glass moved by more than three "
+            "pixels",
         )
     ]
 
@@ -177,6 +199,17 @@ def _flicker(flicker: Flicker | None) -> list[Finding]:
         return []
     limits = (2.0, 10.0) if flicker.corrected else (0.5, 2.0)
     level = _graded(flicker.percent if flicker.percent > SURE * flicker.error else 0.0, *limits)
+    if level != "good" and flicker.follows < FOLLOWS:
+        return [
+            Finding(
+                name="tone_mapping",
+                level=level,
+                message=f"the camera brightens dark pictures and darkens bright ones, by {flicker.percent:.1f} % "
+                "between patterns, as local tone mapping and HDR do"
+                + (": recovery corrects what all of a frame has in common" if flicker.corrected else ""),
+                remedy="switch HDR and every enhancement of the camera off, or shoot RAW",
+            )
+        ]
     return [
         Finding(
             name="flicker",
@@ -191,6 +224,44 @@ def _flicker(flicker: Flicker | None) -> list[Finding]:
                 ": so much is corrected only in part"
                 if flicker.corrected
                 else ": it is not corrected, because it is not certain, or no frame is black"
+            ),
+        )
+    ]
+
+
+def _lost_colour(square: float) -> list[Finding]:
+    if square < LOST_COLOUR:
+        return []
+    return [
+        Finding(
+            name="colour_detail",
+            level="warning",
+            message="the colours of the glass are finer than a film stores them, at half the resolution: that alone "
+            f"limits composites to about {-10 * log10(square):.0f} dB",
+            remedy="film the glass larger, or take stills",
+        )
+    ]
+
+
+def _auto_exposure(exposed: list[float] | None) -> list[Finding]:
+    if exposed is None:
+        return []
+    usual = float(np.median(exposed))
+    most = max(max(exposed) / usual - 1, 1 - min(exposed) / usual)
+    level = _graded(most, 0.03, 0.25)
+    return [
+        Finding(
+            name="auto_exposure",
+            level=level,
+            message=f"the camera's exposure changed by up to {100 * most:.0f} % from pattern to pattern, as the border "
+            "shows: recovery follows it",
+            remedy=""
+            if level == "good"
+            else "lock exposure and ISO before filming"
+            + (
+                ": so large a change is followed only in part, and hides the camera's curve"
+                if level == "bad"
+                else ""
             ),
         )
     ]
@@ -229,20 +300,41 @@ def _noise(figures: Figures, survey: dict[str, Any]) -> Finding:
     )
 
 
-def _crosstalk(figures: Figures, program: Program) -> Finding:
+def _crosstalk(figures: Figures, program: Program, *, grey: bool) -> Finding:
     between = float(np.abs(np.array(figures.crosstalk) - np.eye(3)).max())
     _, sent = program.constants
     measured = np.linalg.matrix_rank(np.concatenate([np.ones((len(sent), 1)), sent], axis=1)) == 4
     if measured:
         text = f"the camera's channels see up to {100 * between:.1f} % of the monitor's other colours: it is corrected"
         return Finding(name="crosstalk", level=_graded(between, 0.3, 0.7), message=text)
-    coloured = any(getattr(part, "colour", "grey") == "rgb" for part in program.parts)
     return Finding(
         name="crosstalk",
-        level="warning" if coloured else "good",
-        message="no crosstalk between colours is assumed: the program does not show them one at a time",
-        remedy="add constant frames of red, green and blue, as the coloured presets do" if coloured else "",
+        level="good" if grey else "warning",
+        message="a grey camera sees no colours"
+        if grey
+        else "the program does not show red, green and blue one at a time, so how much the camera's channels see of "
+        "the other colours is not measured, and not corrected",
+        remedy="" if grey else "add constant frames of red, green and blue, as the presets do",
     )
+
+
+def _scaling(program: Program, *, scaled: bool) -> list[Finding]:
+    if not program.halftones[0].size:
+        return []
+    if not scaled:
+        return [
+            Finding(name="scaling", level="good", message="the monitor showed the patterns pixel by pixel")
+        ]
+    return [
+        Finding(
+            name="scaling",
+            level="warning",
+            message="the monitor showed the patterns at another size than they were made for, as their half-tones "
+            "tell: light is located less sharply",
+            remedy="set the browser's zoom to 100 % (Ctrl+0 or ⌘0), or play the film at its own size, and make the "
+            "program for the monitor's size",
+        )
+    ]
 
 
 def _curves(figures: Figures, program: Program) -> list[Finding]:
@@ -250,13 +342,13 @@ def _curves(figures: Figures, program: Program) -> list[Finding]:
     greys = not np.isin(sent, (0, 1)).all() or any(isinstance(part, Images) for part in program.parts)
     words = {
         "given": "stated by the capture",
-        "estimated": "estimated from constant levels",
+        "estimated": "estimated from constant levels and half-tones",
         "assumed": "only assumed",
     }
     found = []
     for name, curve, matters in (("camera", figures.camera, True), ("monitor", figures.monitor, greys)):
         assumed = curve.source == "assumed" and matters
-        shape = curve.curve if isinstance(curve.curve, str) else f"a gamma of {curve.curve.gamma:g}"
+        shape = _shape(curve.curve)
         harmless = "" if matters else "; it makes no difference to black and white"
         found.append(
             Finding(
@@ -265,8 +357,17 @@ def _curves(figures: Figures, program: Program) -> list[Finding]:
                 message=f"the {name}'s curve is {shape}, {words[curve.source]}{harmless}",
                 remedy=""
                 if not assumed
-                else "state it in capture.json (`response`), show three or more grey levels, or take the constant ones "
-                "in two exposures; RAW needs no curve",
+                else "state it in capture.json (`response`), show half-tones as the presets do, or take the constant "
+                "frames in two exposures; RAW needs no curve",
             )
         )
     return found
+
+
+def _shape(curve: Curve) -> str:
+    """A tone curve in words."""
+    if isinstance(curve, str):
+        return curve
+    if isinstance(curve, Sampled):
+        return f"one that gives {100 * curve.light[len(curve.light) // 2]:.0f} % of the light at half of the range"
+    return f"a gamma of {curve.gamma:g}"

@@ -65,7 +65,13 @@ def report(attributes: dict[str, Any], frames: int) -> Report:
         ),
         crosstalk=attributes["crosstalk"],
         **curves,
-        quality=expected(program, survey, attributes.get("model_error", 0.0)),
+        quality=expected(
+            program,
+            survey,
+            attributes.get("model_error", 0.0),
+            attributes.get("pattern_error"),
+            attributes.get("auto_exposure"),
+        ),
         video=attributes.get("video"),
     )
     found = findings(figures, program, attributes)

@@ -93,7 +93,7 @@ def find_steadiness(stack: Stack) -> None:
     H. F. Walker and P. Ni, Anderson acceleration for fixed-point iterations, SIAM J. Numer. Anal. 49, 2011.
     """
     stack.annotate(
-        steadiness=None, shifts=None, gains=None, glare=None, model_error=0.0
+        steadiness=None, shifts=None, gains=None, glare=None, model_error=0.0, pattern_error=None
     )  # a retried ingest must not find old ones
     program = Program.model_validate(stack.attributes["program"])
     sample = take_sample(stack)
@@ -141,7 +141,13 @@ def find_steadiness(stack: Stack) -> None:
         found, last = _fill_gaps(first.off, shown), first
     gain = np.exp(found[:, 2] - np.median(found[shown, 2]))
     drift = _drift(found[shown, :2], last.error[shown, :2]) | {"corrected": moves}
-    flicker = _flicker(gain, last.error[:, 2], np.flatnonzero(shown)) | {"corrected": flickers}
+    mean = (
+        light.code[light.pyramid.starts[-2] :]
+        .reshape(-1, light.channels, program.measured.size)
+        .mean(axis=(0, 1))
+    )
+    bright = mean[np.searchsorted(program.measured, patterns[shown])]
+    flicker = _flicker(gain, last.error[:, 2], np.flatnonzero(shown), bright) | {"corrected": flickers}
     # A drift or flicker beyond the limits of the search is something else.
     within = _within(found, shown)
     stack.annotate(
@@ -227,13 +233,16 @@ def _drift(places: Doubles, error: Doubles) -> dict[str, Any]:
     }
 
 
-def _flicker(gain: Doubles, error: Doubles, frames: NDArray[np.intp]) -> dict[str, Any]:
+def _flicker(gain: Doubles, error: Doubles, frames: NDArray[np.intp], bright: Doubles) -> dict[str, Any]:
+    """The figures of the gains of the frames of patterns, whose mean light is ``bright``."""
     off = gain[frames] - 1
+    follows = np.corrcoef(gain[frames], bright)[0, 1] if off.any() and np.ptp(bright) else 0.0
     worst = int(np.argmax(np.abs(off)))
     return {
         "percent": float(100 * off.std()),
         "error": float(100 * _size(error[frames][np.isfinite(error[frames]), np.newaxis])),
         "worst_percent": float(100 * off[worst]),
         "worst_frame": int(frames[worst]),
+        "follows": float(follows),
         "frames": len(frames),
     }

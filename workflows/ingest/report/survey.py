@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
-from workflows.ingest.measured_light import look_up_of
+from workflows.ingest.colour_detail import ColourDetail
+from workflows.ingest.measured_light import even_out, look_up_of
 from workflows.ingest.report.calibration import constant_frames, measure
 from workflows.ingest.report.steadiness import find_steadiness
 from workflows.programs.program import Program
@@ -18,6 +19,8 @@ EDGE = 96
 """Largest side of a window in pixels. Four by four windows are spread over the frame."""
 FRAMES = 2000
 """Frames that are examined, at most, spread over the capture."""
+COLOUR_FRAMES = 16
+"""Patterns of a film, at most, from which the lost detail of colours is estimated."""
 BATCH = 32 << 20
 """About how many bytes of a window's frames are read at a time."""
 
@@ -50,13 +53,18 @@ def survey(stack: Stack) -> None:
     contrasts: list[NDArray[np.float32]] = []
     deviations: list[NDArray[np.float32]] = []
     brightest: list[NDArray[np.float32]] = []
+    detail = ColourDetail()
+    coloured = chosen[is_pattern][:: -(-np.count_nonzero(is_pattern) // COLOUR_FRAMES) or 1].tolist()
     pixels = 0
     for rows, columns in _windows(stack):
         wanted = stack.mask(rows, columns)
         if not wanted.any():
             continue
         codes_black, codes_white = (stack.read(rows, columns, slice(n, n + 1))[0] for n in (black, white))
-        B, W = look_up[codes_black].mean(axis=2), look_up[codes_white].mean(axis=2)
+        B, W = (
+            even_out(look_up[codes].mean(axis=2), frame, attributes)
+            for codes, frame in ((codes_black, black), (codes_white, white))
+        )
         top = np.iinfo(stack.dtype).max
         pixels += int(np.count_nonzero(wanted))
         ends[0] += [np.count_nonzero((c == 0).any(axis=2) & wanted) for c in (codes_black, codes_white)]
@@ -64,6 +72,9 @@ def survey(stack: Stack) -> None:
         contrasts.append((W - B)[wanted])
         deviations.append(np.sqrt(noise.variance((B + W) / 2))[wanted])
         brightest.append(look_up[codes_white].max(axis=2)[wanted])
+        if "video" in attributes and stack.channels == 3:
+            for frame, codes in zip(coloured, stack.read_frames(coloured, rows, columns), strict=True):
+                detail.add(even_out(look_up[codes], frame, attributes)[np.newaxis], wanted)
         for at, codes in _batches(stack, rows, columns, chosen):
             for end, value in enumerate((0, top)):
                 clipped[end, at] += ((codes == value).any(axis=3) & wanted).sum(axis=(1, 2))
@@ -85,6 +96,8 @@ def survey(stack: Stack) -> None:
             },
             "contrast": contrast,
             "deviation": middling,
+            "lost_colour": detail.lost(),
+            "grey": stack.channels == 1,
         }
     )
 

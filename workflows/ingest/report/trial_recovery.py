@@ -13,6 +13,7 @@ from workflows.ingest.measured_light import (
     LOBES,
     Light,
     conditions_of,
+    even_out,
     exposures_of,
     light_of,
     look_up_of,
@@ -128,6 +129,7 @@ def _see(stack: Stack, sample: Sample, shifts: Doubles) -> _Seen:
     whole = np.empty(shape, bool)
     for n, (codes, shift) in enumerate(zip(sample.codes, shifts.tolist(), strict=True)):
         picture, unclipped = unclipped_light(codes, shift, _MARGIN - _SLOPE, look_up)
+        picture = even_out(picture, n, stack.attributes)
         values[n], whole[n] = picture[square, y, x], unclipped[square, y, x]
         # The slope of the polynomial through five values.
         for slope, (dy, dx) in ((across, (0, 1)), (down, (1, 0))):

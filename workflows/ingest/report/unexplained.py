@@ -36,6 +36,8 @@ LEAST_ERROR = 0.002
 """An error of the model below this share of rho is none."""
 MOST = 0.98
 """Quantile of squared residuals beyond which they count no more."""
+MOST_GLARE = 0.7
+"""A larger share of the light is no glare: the sample sees something else, such as mostly the border of a film."""
 MIN_FLAT = 120
 """Values that the noise and the error of the model are measured from, at least."""
 CONTRAST = 3.0
@@ -50,7 +52,8 @@ def find_unexplained(
     """Estimate what T leaves unexplained in a sample of the pixels, and annotate the stack with it.
 
     ``glare`` are its shares of the light (`workflows.recovery.glare`), or None below 1 %. ``model_error`` is the
-    standard deviation of what neither T nor noise explains, as a share of rho. ``noise`` is replaced if it was only
+    standard deviation of what neither T nor noise explains, as a share of rho. ``pattern_error`` is the root mean
+    square difference of all patterns from what T predicts, in camera units. ``noise`` is replaced if it was only
     assumed, for want of constant frames.
 
     Parameters
@@ -77,7 +80,7 @@ def find_unexplained(
     curve that is not quite right, a monitor whose white depends on the picture. Errors of the model are alike in the
     three channels, and noise is not, so that the covariance of the channels tells them apart.
     """
-    stack.annotate(glare=None, model_error=0.0)
+    stack.annotate(glare=None, model_error=0.0, pattern_error=None)
     noise, assumed = Noise(**stack.attributes["noise"]), stack.attributes["assumed_noise"]
     spreads, through = spread_patterns(patterns), patterns
     shares, error = np.zeros(len(spreads)), 0.0
@@ -91,7 +94,7 @@ def find_unexplained(
         rest = _Rest(found, program, patterns, through, spreads, noise, stack.channels)
         before = shares
         shares = rest.shares(error)
-        if shares.sum() < LEAST:
+        if not LEAST <= shares.sum() <= MOST_GLARE:
             shares = np.zeros(len(spreads))
         known = noise
         noise, error = rest.noise_and_error(noise, assumed)
@@ -102,6 +105,7 @@ def find_unexplained(
                 noise={"read": noise.read, "shot": noise.shot},
                 model_error=error,
                 glare=[round(float(share), 5) for share in shares] if shares.any() else None,
+                pattern_error=rest.pattern_error(),
             )
             return found, through
         through = filter_patterns(patterns, spreads, shares.tolist()) if shares.any() else patterns
@@ -157,6 +161,10 @@ class _Rest:
             np.where(self.known, self.variance, 1) + 4 * error**2 + DETAIL * np.maximum(1 - self.plain**2, 0)
         )
         return fit_shares(parts[self.known], self.from_plain[self.known], weight[self.known])
+
+    def pattern_error(self) -> float:
+        """Root mean square of the residuals, in camera units."""
+        return float(np.sqrt(np.mean((self.rest[self.known] * self.rho[self.known] / 2) ** 2)))
 
     def noise_and_error(self, noise: Noise, assumed: bool) -> tuple[Noise, float]:
         """The noise of a frame, if it is only assumed, and the error of the model."""

@@ -1,4 +1,7 @@
-"""An untrusted video: opened with bounds on its format, memory and time, and decoded in the order of time."""
+"""An untrusted video: opened with bounds on its format and the size of its frames, and decoded in the order of time.
+
+What decoding takes is bounded by the process that does it, see `workflows.untrusted.decoder`.
+"""
 
 from collections.abc import Iterator
 from contextlib import closing
@@ -14,11 +17,16 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from storage.errors import CaptureError
-from workflows.untrusted.decoder_guard import Guard
+from workflows.untrusted.decoder_process import say_alive
 
-CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
+CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts"
 """Formats that FFmpeg may probe for. Others, such as playlists, name further files and hosts to open."""
-CODECS = frozenset({"h264", "hevc", "mjpeg", "mpeg4", "vp8", "vp9", "av1", "libdav1d", "prores", "ffv1"})
+CODECS = frozenset(
+    {"h264", "hevc", "mjpeg", "mpeg2video", "mpeg4", "vp8", "vp9", "av1", "libdav1d", "prores", "ffv1"}
+)
+BACK = (0, 2, 10, 60)
+"""Seconds before a time at which reading begins to find it. A transport stream has no index, and is entered anywhere:
+nothing can be decoded up to the next key frame."""
 
 
 class Clip:
@@ -43,6 +51,8 @@ class Clip:
         Counterclockwise quarter turns from a stored frame to an upright one.
     lost : list of int
         Times, in ticks, of the frames that could not be decoded, as far as the video has been read.
+    interlaced : bool
+        Whether any frame holds two pictures of different times, in alternate rows, as far as the video has been read.
 
     Raises
     ------
@@ -52,17 +62,17 @@ class Clip:
 
     def __init__(self, file: BinaryIO, entry: str, memory: int) -> None:
         self.entry, self._limit = entry, memory
-        self._guard = Guard(entry, memory)
         self.lost: list[int] = []
+        self.interlaced = False
         try:
-            with self._guard.on():
-                self._container: InputContainer = av.open(
-                    file, "r", container_options={"format_whitelist": CONTAINERS}, io_open=_refuse
-                )
+            self._container: InputContainer = av.open(
+                file, "r", container_options={"format_whitelist": CONTAINERS}, io_open=_refuse
+            )
         except (av.FFmpegError, OSError, ValueError) as error:
             raise CaptureError(
-                f"{entry} can't be read as a video (MP4, MOV, MKV, WebM or AVI): it is of another kind, cut off or "
-                f"damaged ({_message(error)}). Copy it again from the camera",
+                f"{entry} can't be read as a video (MP4, MOV, MTS, MKV, WebM or AVI): it is of another kind, cut off "
+                "or damaged, or has an index that takes too much memory. Copy it again from the camera, or export it "
+                "as MP4",
                 entry=entry,
             ) from error
         try:
@@ -73,11 +83,12 @@ class Clip:
             if first is None:
                 # FFmpeg silently leaves out an index that it has no memory for.
                 raise CaptureError(
-                    f"{entry}: no frame of the video can be decoded: it is damaged, or has an index that takes too "
-                    "much memory. Copy it again from the camera",
+                    f"{entry}: no frame of the video can be decoded: it is cut off or damaged, or has an index that "
+                    "takes too much memory. Copy it again from the camera",
                     entry=entry,
                 )
             self._from_start = chain([first], frames)
+            self._first = tick_of(first)
             self.quarter_turns = round(first.rotation / 90) % 4
         except BaseException:
             self._container.close()
@@ -113,12 +124,14 @@ class Clip:
 
     def frames_from(self, tick: int) -> Iterator[VideoFrame]:
         """Frames in the order of time that begin at ``tick`` or before it."""
-        try:
-            with self._guard.on():
-                self._container.seek(tick, stream=self._stream, backward=True)
-            return self._frames()
-        except av.FFmpegError:  # there is no index, or it is damaged
-            return self._from_start
+        for back in BACK:
+            if not self._seek(tick, back):  # there is no index, or it is damaged
+                break
+            frames = self._frames(entered=True)
+            first = next(frames, None)
+            if first is not None and tick_of(first) <= tick:
+                return chain([first], frames)
+        return self._frames() if self._seek(self._first, BACK[-1]) else self._from_start
 
     def ticks(self, max_frames: int) -> tuple[NDArray[np.int64], int]:
         """When each frame is shown, and for how long the last one is, in ticks. This reads all `frames`.
@@ -148,7 +161,8 @@ class Clip:
         if codec is None or codec.name not in CODECS:
             name = "an unknown codec" if codec is None else codec.name
             raise CaptureError(
-                f"{self.entry} is coded by {name}: H.264, HEVC and MJPEG are read, and {', '.join(sorted(CODECS))}",
+                f"{self.entry} is coded by {name}: export it as H.264, HEVC or MJPEG ({', '.join(sorted(CODECS))} are "
+                "read)",
                 entry=self.entry,
             )
         self._check_size(codec.width, codec.height)
@@ -158,14 +172,24 @@ class Clip:
         codec.thread_count, codec.thread_type = 2, "AUTO"
         return stream
 
-    def _frames(self) -> Iterator[VideoFrame]:
+    def _seek(self, tick: int, back: int) -> bool:
+        """Move to a key frame some seconds before ``tick``, as well as the container can; whether it could at all."""
+        try:
+            self._container.seek(tick - round(back / self.tick), stream=self._stream, backward=True)
+        except av.FFmpegError:
+            return False
+        return True
+
+    def _frames(self, entered: bool = False) -> Iterator[VideoFrame]:
         """The frames in the order of time, from the container's present position.
+
+        If the video is ``entered`` somewhere, they begin with a key frame: others may be made of frames before it.
 
         Packets that can't be decoded are skipped, and a read error ends the video: patterns that lose frames by it are
         reported later.
         """
         last: int | None = None
-        for frame in self._decoded():
+        for frame in self._decoded(entered):
             if frame.pts is None:
                 raise CaptureError(
                     f"{self.entry}: its frames have no timestamps; put it into an MP4 that has them",
@@ -181,30 +205,31 @@ class Clip:
                 last = frame.pts
                 yield frame
 
-    def _decoded(self) -> Iterator[VideoFrame]:
+    def _decoded(self, entered: bool) -> Iterator[VideoFrame]:
         """The frames that were decoded without error; the times of the others are added to `lost`."""
-        packets, intact = self._container.demux(self._stream), True
+        packets, intact = self._container.demux(self._stream), not entered
         while True:
-            with self._guard.on():
-                try:
-                    packet = next(packets)
-                except MemoryError:
-                    raise
-                except (StopIteration, av.FFmpegError, OSError):
-                    return
-                try:
-                    frames = self._stream.decode(packet)
-                except MemoryError:
-                    raise
-                except av.FFmpegError:
-                    intact = False
-                    if packet.pts is not None:
-                        self.lost.append(packet.pts)
-                    continue
+            say_alive()
+            try:
+                packet = next(packets)
+            except MemoryError:
+                raise
+            except (StopIteration, av.FFmpegError, OSError):
+                return
+            try:
+                frames = self._stream.decode(packet)
+            except MemoryError:
+                raise
+            except (av.FFmpegError, ValueError):  # ValueError: the codec changes to an unknown one
+                intact = False
+                if packet.pts is not None:
+                    self.lost.append(packet.pts)
+                continue
             for frame in frames:
                 # Damage spreads from frame to frame until a key frame.
                 intact = not frame.is_corrupt and (intact or frame.key_frame)
                 if intact:
+                    self.interlaced |= bool(frame.interlaced_frame)
                     yield frame
                 elif frame.pts is not None:
                     self.lost.append(frame.pts)
@@ -232,7 +257,3 @@ def tick_of(frame: VideoFrame) -> int:
 
 def _refuse(url: str, *_: object) -> BinaryIO:
     raise OSError(f"{url} is not in the video")
-
-
-def _message(error: Exception) -> str:
-    return str(getattr(error, "strerror", None) or error)

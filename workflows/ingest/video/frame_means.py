@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from av.video.frame import VideoFrame
-from av.video.reformatter import ColorRange, Interpolation
+from av.video.reformatter import ColorRange, Colorspace, Interpolation
 from numpy.typing import NDArray
 
 from storage.errors import CaptureError
@@ -22,6 +22,10 @@ PLANAR = {
 """Pixel formats whose planes are averaged as they are, and the same formats with 16 bits a value."""
 ACCURATE = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
 """Without these flags, swscale makes colours half a code too dark."""
+UNSTATED = 2
+"""A colour system that is not stated (ITU-T H.273, table 4)."""
+SD_ROWS = 576
+"""Pictures with more rows are by BT.709 if nothing else is stated, others by BT.601, as in players."""
 TOTAL_WEIGHT = 257
 """The sum of the weights of a pattern's frames: 257 times a code of 8 bits is the same code in 16 bits."""
 
@@ -65,7 +69,7 @@ def mean_frames(clip: Clip, plan: Sequence[Sequence[Share]]) -> Iterator[NDArray
                     "damaged there. Copy it again from the camera",
                     entry=clip.entry,
                 )
-            seen = frame if frame.format.name in PLANAR else frame.reformat(format="yuv444p16le")
+            seen = _planar(frame)
             planes = _planes(seen)
             if not sums:
                 # TOTAL_WEIGHT times a code of 8 bits just fits into 16.
@@ -74,6 +78,15 @@ def mean_frames(clip: Clip, plan: Sequence[Sequence[Share]]) -> Iterator[NDArray
             for total, plane in zip(sums, planes, strict=True):
                 total += np.multiply(plane, weight, dtype=total.dtype)
         yield np.ascontiguousarray(np.rot90(_to_rgb(sums, seen), clip.quarter_turns))
+
+
+def _planar(frame: VideoFrame) -> VideoFrame:
+    """A frame in a `PLANAR` format, and in a colour system that is stated if it is not the usual one of its size."""
+    if frame.format.name not in PLANAR:
+        return frame.reformat(format="yuv444p16le")
+    if frame.colorspace == UNSTATED and frame.height > SD_ROWS:
+        frame.colorspace = Colorspace.ITU709
+    return frame
 
 
 def _planes(frame: VideoFrame) -> list[NDArray[Any]]:
@@ -98,9 +111,8 @@ def _to_rgb(sums: Sequence[NDArray[Any]], like: VideoFrame) -> NDArray[np.uint16
     name, bits = like.format.name, like.format.components[0].bits
     full = like.color_range == ColorRange.JPEG or name.startswith(("gray", "yuvj"))
     step = 2.0 ** (bits - 8)
-    mean = VideoFrame(like.width, like.height, PLANAR[name])
-    mean.colorspace, mean.color_range = like.colorspace, ColorRange.JPEG
-    for at, (total, plane) in enumerate(zip(sums, mean.planes, strict=True)):
+    planes = []
+    for at, total in enumerate(sums):
         # The code of black, or of grey in a colour plane; the codes from black to white; the result for `zero`.
         zero, span, level = (128 * step, 224 * step, 32768) if at else (16 * step, 219 * step, 0)
         if full:
@@ -108,8 +120,23 @@ def _to_rgb(sums: Sequence[NDArray[Any]], like: VideoFrame) -> NDArray[np.uint16
         scaled = (total / np.float32(TOTAL_WEIGHT) - np.float32(zero)) * np.float32(
             65535 / span
         ) + np.float32(level)
+        planes.append(np.rint(np.clip(scaled, 0, 65535)).astype("<u2"))
+    if not like.interlaced_frame or like.height % 4:
+        return _convert(planes, like)
+    # Each field has the colours of its own rows.
+    rgb = np.empty((like.height, like.width, 3), np.uint16)
+    for field in (0, 1):
+        rgb[field::2] = _convert([plane[field::2] for plane in planes], like)
+    return rgb
+
+
+def _convert(planes: Sequence[NDArray[np.uint16]], like: VideoFrame) -> NDArray[np.uint16]:
+    """(height, width, 3) RGB of planes of 16 bits and full range, of as many rows as the first has."""
+    mean = VideoFrame(like.width, len(planes[0]), PLANAR[like.format.name])
+    mean.colorspace, mean.color_range = like.colorspace, ColorRange.JPEG
+    for pixels, plane in zip(planes, mean.planes, strict=True):
         rows = np.zeros((plane.height, plane.line_size // 2), "<u2")
-        rows[:, : plane.width] = np.rint(np.clip(scaled, 0, 65535))
+        rows[:, : plane.width] = pixels
         plane.update(rows.tobytes())
     rgb = mean.reformat(format="rgb48le", interpolation=ACCURATE)
     return np.asarray(rgb.to_ndarray(), np.uint16)

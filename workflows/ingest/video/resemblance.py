@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from workflows.images.resample import area_mean
 from workflows.images.tone_curves import Curve, to_light
-from workflows.programs.program import Bernoulli, Constant, Program
+from workflows.programs.program import Bernoulli, Constant, Halftone, Program
 
 Doubles = NDArray[np.float64]
 Light = NDArray[np.float32]
@@ -31,6 +31,8 @@ def lay_out(program: Program, curve: Curve, images: Sequence[NDArray[np.float32]
             laid[start : start + part.count] = list(part.means(program.monitor, columns, rows))
         elif isinstance(part, Constant):
             laid[start : start + part.count] = to_light(part.values, curve)[:, None, None]
+        elif isinstance(part, Halftone):
+            laid[start : start + part.count] = np.array(part.levels)[:, None, None, None]
         else:
             values = program.values(start, start + part.count, images)
             laid[start : start + part.count] = [area_mean(to_light(v, curve), columns, rows) for v in values]

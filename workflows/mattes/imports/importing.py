@@ -4,7 +4,7 @@ Only checked values reach the store. A new matte is created from the archive's a
 bounds, checked, and written like a block that was recovered here. An exported matte comes back as the same bytes.
 
 The only native code that reads untrusted bytes is zlib and zstd. Both write to a buffer of checked size, in time that
-grows only with that size, so unlike image decoders (`services.decoding.pool`) they need no process of their own.
+grows only with that size, so unlike images (`workflows.untrusted.decoder`) they need no process of their own.
 """
 
 from itertools import product

@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from workflows.recovery.lobes.footprint import PARAMETERS, PatternCodes, combine, sample, signed_codes
-from workflows.recovery.lobes.strays import add_strays
+from workflows.recovery.lobes.strays import write_strays
 
 
 class Mixture(NamedTuple):
@@ -78,7 +78,7 @@ def predict(
     node, terms, light, sums = workspace
     first = np.int64(0)  # with a literal, numba would compile another version of `signed_codes`
     groups, m = patterns.groups, patterns.m
-    add_strays(patterns.strays, mixture.stray, 0, f)
+    write_strays(patterns.strays, mixture.stray, 0, f)
     for i in range(k):
         n = sample(mixture.lobes[i], mixture.level[i], patterns.grids, node, terms)
         signed_codes(patterns.code, patterns.first, light.shape[1], node, n, light, first)

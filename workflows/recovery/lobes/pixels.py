@@ -21,7 +21,7 @@ from workflows.recovery.lobes.mixture import Mixture
 from workflows.recovery.lobes.nodes import node_responses, spread_lobes
 from workflows.recovery.lobes.options import LobesOptions
 from workflows.recovery.lobes.posterior import update
-from workflows.recovery.lobes.strays import add_strays, subtract_strays
+from workflows.recovery.lobes.strays import subtract_strays, write_strays
 from workflows.recovery.solvers import subtract
 
 # Initial capacity for the entries of a block's rows.
@@ -76,7 +76,7 @@ def finish_fit(
     offset = mixture.stray[::count].copy()
     if count > 1:
         fit_amounts(patterns, y, variance, mixture, fits.k[c])
-        add_strays(patterns.strays, mixture.stray, 1, stray)
+        write_strays(patterns.strays, mixture.stray, 1, stray)
         y, variance, offset[:] = y.copy(), variance.copy(), 0
         subtract_strays(y, variance, stray, size)
     n: int = spread_lobes(

@@ -5,7 +5,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from workflows.recovery.lobes.likelihood import estimate_kappa
-from workflows.recovery.lobes.strays import STRAY, add_strays
+from workflows.recovery.lobes.strays import STRAY, write_strays
 from workflows.recovery.solvers import inner, subtract
 
 # Prior standard deviation of the offset of a group, in units of T: an upper bound of the error of S.
@@ -237,7 +237,7 @@ def update(
     for _ in range(passes):
         mean[:], square[:] = 0, 0
         add_row_moments(A, weight, mean, square)
-        add_strays(strays, stray, 0, f)
+        write_strays(strays, stray, 0, f)
         for j in range(y.size):
             f[j] += mean[j]
         kappa, misfit = total_variance(y, f, mean, square, variance, groups, total)

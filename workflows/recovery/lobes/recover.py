@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from workflows.recovery.lobes.fits import Pixels
 from workflows.recovery.lobes.options import FINE, LobesOptions
 from workflows.recovery.lobes.pixels import Diagnostics, recover_pixels
-from workflows.recovery.lobes.strays import subtract_strays
+from workflows.recovery.lobes.strays import remove_strong_strays, subtract_strays
 from workflows.recovery.noise import Noise
 from workflows.recovery.normalise import Measurements, expected_error, normalise, refit_photometry
 from workflows.recovery.photometry import Photometry
@@ -134,8 +134,10 @@ def recover(
     if conditions.grey:
         usable = np.ones(measurements.shape, bool) if usable is None else usable.copy()
         usable[:, :, 1:] = False
-    measured = normalise(measurements, photometry, noise, options.least_contrast, usable, frames)
     strays = np.ones((1, m + 2), np.float32) if conditions.strays is None else conditions.strays
+    if len(strays) > 1:
+        measurements, photometry = remove_strong_strays(measurements, photometry, strays, usable)
+    measured = normalise(measurements, photometry, noise, options.least_contrast, usable, frames)
     counts = np.zeros((n, 3), np.int64)
     found = Diagnostics(
         np.zeros_like(measured.value),

@@ -4,12 +4,87 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-STRAY = 0.03
+from workflows.recovery.photometry import Photometry, solve_least_squares
+
+STRAY = 0.1
 """Prior standard deviation of an amount of stray light that is not constant, in units of T."""
+STRONG = 0.17
+"""Stray light that explains this share of the variance of a pixel is taken out before recovery. In chance it explains a
+tenth."""
+
+
+def remove_strong_strays(
+    measurements: NDArray[np.float32],
+    photometry: Photometry,
+    strays: NDArray[np.float32],
+    usable: NDArray[np.bool_] | None,
+) -> tuple[NDArray[np.float32], Photometry]:
+    """Take stray light out of the pixels that see more of it than of the patterns, as those that see a film's border.
+
+    Parameters
+    ----------
+    measurements : (n, m, 3) float32
+        Linear camera values under the patterns.
+    photometry : Photometry
+        From constant monitors.
+    strays : (s, m + 2) float32
+        As in :class:`~workflows.recovery.lobes.recover.Conditions`; the first is constant.
+    usable : (n, m, 3) bool or None
+        False where a value must be ignored.
+
+    Returns
+    -------
+    measurements : (n, m, 3) float32
+    photometry : Photometry
+        Of what is left: of many such pixels, S alone.
+
+    Notes
+    -----
+    ``C = S + rho / 2 + sum_s a_s B_s`` is fitted to the patterns, and ``S + sum a_s B_s`` and ``S + rho + sum a_s B_s``
+    to black and white, whose weight is the inverse of their variances. What patterns show besides is like noise here,
+    of the variance that is left.
+    """
+    m = measurements.shape[1]
+    light = np.stack([photometry.S, photometry.S + photometry.rho], axis=2)
+    values = np.concatenate([measurements.transpose(0, 2, 1), light], axis=2).astype(np.float64)
+    known = np.isfinite(values)
+    if usable is not None:
+        known[:, :, :m] &= usable.transpose(0, 2, 1)
+    values = np.where(known, values, 0)
+    half = np.concatenate([np.full(m, 0.5), [0, 1]])
+    design = np.concatenate([strays[:1], half[np.newaxis], strays[1:]]).T.astype(np.float64)
+    weight = known.astype(np.float64)
+    weight[:, :, m:] = 0
+    count = np.maximum(weight.sum(axis=2, keepdims=True), 1)
+    before = (weight * (values - (weight * values).sum(axis=2, keepdims=True) / count) ** 2).sum(axis=2)
+    alone = np.delete(design, 1, axis=1)
+    amount = solve_least_squares(alone, weight, values)[0]
+    after = (weight * (values - amount @ alone.T) ** 2).sum(axis=2)
+    strong = before - after > STRONG * before
+    left = np.maximum(after / count[..., 0], 1e-12)
+    weight /= left[..., np.newaxis]
+    weight[:, :, m:] = 1 / np.stack([photometry.black, photometry.white], axis=2)
+    found, covariance = solve_least_squares(design, weight, values)
+    stray = np.where(strong[..., np.newaxis], found[..., 2:] @ design[:m, 2:].T, 0)
+    S, rho = found[..., 0], found[..., 1]
+    white = np.array([1.0, 1.0])
+    fitted = (
+        np.where(rho > 0, S, S + rho / 2),
+        np.maximum(rho, 0),
+        covariance[..., 0, 0],
+        np.einsum("i,ncij,j->nc", white, covariance[..., :2, :2], white),
+    )
+    better = Photometry(
+        *(
+            np.where(strong, new, old).astype(np.float32)
+            for new, old in zip(fitted, vars(photometry).values(), strict=True)
+        )
+    )
+    return (measurements - stray.transpose(0, 2, 1)).astype(np.float32), better
 
 
 @njit(nogil=True, cache=True)
-def add_strays(
+def write_strays(
     strays: NDArray[np.float32], amount: NDArray[np.float64], first: int, f: NDArray[np.float32]
 ) -> None:
     """Write stray light from the given row of `strays` on, in the given amounts.

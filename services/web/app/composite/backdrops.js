@@ -70,7 +70,7 @@ export async function fromFile(file) {
   const exact = () => file;
   const name = file.name || "Pasted picture";
   const read = { premultiplyAlpha: "none" };
-  const whole = await createImageBitmap(file, read).catch(() => null); // TIFF and EXR, which only the service reads
+  const whole = await createImageBitmap(file, read).catch(() => null); // TIFF, EXR, RAW and mostly HEIC, which only the service reads
   if (!whole) return { name, exact, quick: exact };
   const longer = Math.max(whole.width, whole.height);
   let picture = whole;

@@ -11,7 +11,7 @@ export function clipJob(matte, place, signal) {
   const make = button("Make the video", problem, async () => {
     progress.replaceChildren(h("p", { class: "hint", role: "status" }, "Sending the clip."));
     try {
-      const headers = { "Content-Type": chosen.type || "video/mp4", "Idempotency-Key": crypto.randomUUID?.() ?? String(Math.random()) };
+      const headers = { "Content-Type": chosen.type.startsWith("video/") ? chosen.type : "video/mp4", "Idempotency-Key": crypto.randomUUID?.() ?? String(Math.random()) };
       const path = `v1/mattes/${matte.id}/composite?${new URLSearchParams(place())}`;
       const job = await (await ask(path, { method: "POST", headers, body: chosen, signal })).json();
       progress.replaceChildren();

@@ -9,7 +9,9 @@ import { Stage } from "./stage.js";
 import { camera, clip } from "./video_backdrops.js";
 
 const FORMATS = { PNG: "image/png", JPEG: "image/jpeg", EXR: "image/x-exr" };
-const isVideo = (file) => /^video\/|\.(mp4|mov|mkv|webm|avi)$/i.test(file.type || file.name);
+const RAW = ".dng,.nef,.cr2,.cr3,.arw,.raf,.orf,.rw2"; // the usual names of camera RAW
+// Browsers know no type of MKV, and give MTS that of something else.
+const isVideo = (file) => file.type.startsWith("video/") || /\.(mp4|mov|mkv|webm|avi|mts|m2ts)$/i.test(file.name);
 
 export function compositing(matte, signal) {
   const placed = placement(() => stage.moved());
@@ -53,7 +55,7 @@ function backdropChoices(matte, stage, use, signal) {
     for (const input of choices.querySelectorAll("input")) input.checked = false;
     use(isVideo(file) ? clip(file) : fromFile(file));
   };
-  const input = h("input", { type: "file", id: "backdrop", accept: "image/*,.exr,.tif,.tiff,video/*" });
+  const input = h("input", { type: "file", id: "backdrop", accept: `image/*,.heic,.heif,.hif,.exr,.tif,.tiff,${RAW},video/*,.mts,.m2ts` });
   input.onchange = () => {
     if (input.files.length) take(input.files);
     input.value = "";
@@ -61,5 +63,5 @@ function backdropChoices(matte, stage, use, signal) {
   onDrop(stage, take);
   addEventListener("paste", ({ clipboardData }) => clipboardData?.files.length && take(clipboardData.files), { signal });
   return [choices, h("div", { class: "drop small" }, h("label", { for: "backdrop" }, h("strong", {}, "Your own picture or clip"), " drop, paste or choose it",
-    h("span", { class: "hint" }, "PNG, JPEG, TIFF, EXR or a video")), input)];
+    h("span", { class: "hint" }, "PNG, JPEG, HEIC, TIFF, EXR, camera RAW or a video")), input)];
 }

@@ -6,6 +6,7 @@ import { badge, duration, empty, facts, h, pause, problemBox, prose, size, when 
 import { follow } from "../lib/events.js";
 import { isFilm, programName, recordOf } from "../upload/film_bundle.js";
 import { list } from "../lib/list.js";
+import { countScreen, onZoom } from "./screen.js";
 import { begin, onDrop, running } from "../upload/upload.js";
 
 const SILENT = 8; // seconds without a report after which the player page counts as gone; it reports every 2
@@ -15,8 +16,11 @@ const isPlaying = ({ showing }) => ["countdown", "showing"].includes(showing?.ph
 export async function filming(main, signal) {
   const { presets } = await getJson("v1/presets", signal);
   const problem = h("div");
-  const number = (value) => h("input", { type: "number", min: 1, max: 16384, step: 1, required: true, value: Math.round(value * devicePixelRatio) });
-  const [width, height] = [number(screen.width), number(screen.height)];
+  const number = () => h("input", { type: "number", min: 1, max: 16384, step: 1, required: true });
+  const [width, height] = [number(), number()];
+  const fill = () => ({ width: width.value, height: height.value } = countScreen());
+  fill();
+  onZoom(fill, signal);
   const choices = presets.map(({ name, description }, n) => {
     const about = h("span", { class: "hint", id: `preset-${name}` }, description);
     return h("p", {}, h("label", { class: "choice" }, h("input", { type: "radio", name: "preset", value: name, checked: n === 0, "aria-describedby": about.id }), name), " ", about);
@@ -24,7 +28,7 @@ export async function filming(main, signal) {
   const form = h("form", { class: "panel" }, h("h2", {}, "Choose a program"),
     h("fieldset", { class: "stack" }, h("legend", {}, "What the monitor shows"), choices),
     h("div", { class: "row" }, h("label", {}, "The monitor’s width", width), h("label", {}, "Height", height), "pixels"),
-    h("p", { class: "hint" }, "The size of this screen. Change it if another screen shows the program."),
+    h("p", { class: "hint" }, "The size of this screen, if the page’s zoom is 100 % (Ctrl+0 or ⌘0). Change it if another screen shows the program."),
     problem, h("p", { class: "row" }, h("button", { class: "primary" }, "Continue")));
   form.onsubmit = async (event) => {
     event.preventDefault();

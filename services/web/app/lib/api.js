@@ -1,5 +1,7 @@
 // Requests to the service, with the key of this session.
 
+import { pause } from "./dom.js";
+
 const KEY = "envmatte-key"; // the player page keeps it under the same name
 
 export class Problem extends Error {
@@ -42,13 +44,25 @@ export function unlock(problem) {
   return asking;
 }
 
+// Fetches once more where no answer came: when the network changes, browsers abort what is under way. Whatever this app
+// sends may come twice: it creates nothing, has an Idempotency-Key, or asks for a state that is then reached already.
+async function fetchTwice(path, options) {
+  try {
+    return await fetch(path, options);
+  } catch (error) {
+    if (options.signal?.aborted) throw error;
+    await pause(500, options.signal);
+    return fetch(path, options);
+  }
+}
+
 // Requests a path: resolves with the response, or throws a Problem as the API words it. Asks for a key where needed.
 export async function ask(path, options = {}) {
   for (;;) {
     const used = key();
     let answer;
     try {
-      answer = await fetch(path, { ...options, headers: { ...options.headers, ...authorization() } });
+      answer = await fetchTwice(path, { ...options, headers: { ...options.headers, ...authorization() } });
     } catch (error) {
       throw options.signal?.aborted ? options.signal.reason : new Problem(UNREACHABLE);
     }

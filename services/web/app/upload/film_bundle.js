@@ -3,7 +3,7 @@ import { getJson } from "../lib/api.js";
 import { h, size, when } from "../lib/dom.js";
 import { zip } from "./zip.js";
 
-const ENDS = /\.(mp4|m4v|mov|mkv|webm|avi|3gp)$/i;
+const ENDS = /\.(mp4|m4v|mov|mkv|webm|avi|3gp|mts|m2ts)$/i;
 export const isFilm = (file) => file.type.startsWith("video/") || ENDS.test(file.name);
 
 export const programName = (program) => `${program.patterns} patterns${program.display ? ` on a screen of ${size(program.display)}` : ""}`;
@@ -53,7 +53,7 @@ export async function askForRecord(where, signal) {
       h("label", {}, "Or the capture.json that came with the program", own), problem);
     form.onsubmit = (event) => {
       event.preventDefault();
-      resolve(recordOf(programs[which.value], Number(rate.value)));
+      getJson(`v1/programs/${programs[which.value].id}`, signal).then((program) => resolve(recordOf(program, Number(rate.value))), reject);
     };
     where.replaceChildren(form);
     (programs.length ? which : own).focus();

@@ -101,7 +101,7 @@ const startsAsZip = async (file) => /^PK[\x03\x05]/.test(await file.slice(0, 4).
 // The zone where capture archives and films are dropped or chosen.
 export function dropZone() {
   const take = (files) => [...files].forEach((file) => begin(file));
-  const input = h("input", { type: "file", accept: ".zip,application/zip,video/*,.mkv", id: "zip", multiple: true });
+  const input = h("input", { type: "file", accept: ".zip,application/zip,video/*,.mkv,.mts,.m2ts", id: "zip", multiple: true });
   input.onchange = () => {
     take(input.files);
     input.value = "";

@@ -1,7 +1,9 @@
 """Limits of bodies, announced or not."""
 
 import asyncio
+import tempfile
 from collections.abc import AsyncIterator, Sequence
+from pathlib import Path
 
 import pytest
 from fastapi.exceptions import RequestValidationError
@@ -11,6 +13,8 @@ from starlette.requests import Request
 from services.api.http.bodies import BodyLimit, has_body, read_json, schema_of, spool_body, upload_limit
 from services.runtime.problems import TooLarge
 from services.settings import Settings
+from storage.errors import NoRoom
+from tests.parts.disks import small_disk
 
 
 def request(parts: Sequence[bytes] = (), **headers: str) -> Request:
@@ -59,6 +63,17 @@ def test_spooled_body_is_read_from_its_start() -> None:
     assert asyncio.run(spooled(4)) == b"abcd"
     with pytest.raises(TooLarge):
         asyncio.run(spooled(3))
+
+
+def test_spooled_body_leaves_the_disk_its_reserve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def spooled() -> int:
+        async with spool_body(request([bytes(1 << 20)] * 32), 32 << 20) as file:
+            return file.seek(0, 2)
+
+    with small_disk(tmp_path / "disk", 16 << 20) as disk:
+        monkeypatch.setattr(tempfile, "tempdir", str(disk))
+        with pytest.raises(NoRoom, match="the disk is full, apart from a reserve"):
+            asyncio.run(spooled())
 
 
 class Inner(BaseModel):

@@ -186,6 +186,18 @@ def test_client_that_stops_sending_its_body_is_disconnected(
     until(lambda: files(served) == before)
 
 
+@pytest.mark.slow
+def test_trickling_client_is_disconnected(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(slow_clients, "CHECK_SECONDS", 4.0)
+    with served.connected(head("POST", "/v1/captures", Content_Type="application/zip")) as one:
+        until(lambda: served.count == 1)
+        with contextlib.suppress(ConnectionError):
+            while served.count:
+                one.sendall(bytes(50))  # 500 bytes a second
+                time.sleep(0.1)
+        assert rest(one) == b""
+
+
 def test_upload_keeps_the_bytes_that_came_before_the_disconnect(served: Served) -> None:
     tus = {"Tus-Resumable": "1.0.0", "Upload-Length": "1000000"}
     where = httpx2.post(f"http://127.0.0.1:{served.port}/v1/uploads", headers=tus).headers["location"]

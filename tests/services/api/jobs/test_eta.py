@@ -6,9 +6,9 @@ import pytest
 from sqlalchemy import Connection, Engine, update
 
 from services.api.jobs.eta import TYPICAL, seconds_left
-from storage.database import tables
+from storage.database import rows, tables
 from storage.database.engine import writing
-from storage.records import jobs, tiles
+from storage.records import captures, jobs, tiles
 from storage.steps import FINISH
 
 PLAN = {"tiles": 10, "slab": 4, "width": 160, "height": 120, "frames": 40, "video": False, "notes": []}
@@ -30,6 +30,8 @@ def running(connection: Connection, kind: str, done: int, plan: dict[str, Any] =
 def ended(connection: Connection, finishing: float, plan: dict[str, Any] = PLAN) -> None:
     """Add an ingest that has succeeded, with the duration of its last step."""
     job = running(connection, "ingest", 10, plan)
+    about = {"name": "", "bytes": 1, "frames": 40, "program": {}}
+    captures.add(connection, rows.new_id(), job, **about)
     tiles.mark_done(connection, job, [(FINISH, finishing, 0)])
     jobs.end(connection, job, "succeeded")
 

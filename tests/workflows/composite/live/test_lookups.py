@@ -108,3 +108,14 @@ def test_what_is_not_wanted_is_left_out() -> None:
     lookups = fit_lookups(COLUMNS, ROWS, count, *given, 4, np.array([False, True]))
     assert not lookups[0].any()
     np.testing.assert_array_equal(lookups[1], fit((row,))[0])
+
+
+def test_pixel_of_more_nodes_than_are_held_keeps_its_light() -> None:
+    side = 400
+    cell = np.sort(np.random.default_rng(2).choice(side * side, 50_000, replace=False)).astype(np.uint32)
+    count, shared = np.array([[cell.size, 0, 0]], np.uint32), np.array([True])
+    weight = np.full(cell.size, 1 / cell.size, np.float32)
+    found = fit_lookups(side, side, count, shared, cell, weight, 4, np.array([True]))[0].astype(np.float64)
+    np.testing.assert_allclose(found[:, 3:].sum(axis=0), 1, atol=1e-4)
+    np.testing.assert_allclose(found[:, 3] @ found[:, 0], (cell % side + 0.5).mean(), rtol=1e-4)
+    np.testing.assert_allclose(found[:, 3] @ found[:, 1], (cell // side + 0.5).mean(), rtol=1e-4)

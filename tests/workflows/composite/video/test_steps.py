@@ -20,6 +20,7 @@ from storage.layout import composites, mattes
 from storage.layout.mattes import Block, Matte
 from storage.objects.store import Objects
 from storage.steps import FINISH, PREPARE
+from tests.workflows.ingest.video.camera import interlaced
 from workflows.composite import composite
 from workflows.composite.video import steps as video_steps
 from workflows.composite.video.steps import STEPS
@@ -306,3 +307,9 @@ def test_deleted_clip_is_reported(make: Make, objects: Objects) -> None:
     assert objects.names(composites.path("j")) == [composites.VIDEO]
     with pytest.raises(Corrupt, match="send it again"):
         video_steps.prepare(objects, Task("j", "c", "m", {}, LIMITS))
+
+
+def test_interlaced_clip_is_refused_with_a_remedy(objects: Objects, matte: Matte) -> None:
+    one, other = pictures(2, 24, 64)
+    with pytest.raises(ClipError, match=r"the clip is interlaced: .* Deinterlace it with a video editor"):
+        plan_of(objects, interlaced(one, other))

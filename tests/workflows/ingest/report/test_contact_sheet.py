@@ -17,7 +17,9 @@ from workflows.simulation.scene import write_capture
 Ingest = Callable[..., Stack]
 
 
-@pytest.mark.parametrize(("width", "height"), [(40, 30), (30, 40), (500, 31)])
+@pytest.mark.parametrize(
+    ("width", "height"), [(40, 30), (30, 40), pytest.param(500, 31, marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("depth", [8, 16])
 def test_clipped_pixels_are_marked(ingest: Ingest, width: int, height: int, depth: int) -> None:
     target = io.BytesIO()

@@ -3,12 +3,13 @@
 from math import log10
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.parts.captures import nested_program
 from workflows.ingest.report.expected_psnr import expected
 from workflows.programs.presets import preset
-from workflows.programs.program import Program
+from workflows.programs.program import Constant, Monitor, Program, Stripes
 
 SURVEY = {"contrast": 0.81, "deviation": 0.0058}
 """Of a clear ball with usual noise."""
@@ -63,6 +64,28 @@ def test_grids_without_offsets_are_rated_by_their_finest_blocks() -> None:
     assert ends(still(384), deviation=0.05)[0] < fine[0] - 3
 
 
+def test_without_random_patterns_as_much_is_expected_as_patterns_show() -> None:
+    monitor = Monitor(width=64, height=48)
+    stripes = Stripes(kind="stripes", axis="x", count=6)
+    program = Program(monitor=monitor, parts=(Constant(kind="constant", levels=(0, 1)), stripes))
+    assert expected(program, SURVEY, 0.0) is None
+    assert expected(program, SURVEY | {"contrast": 0.0}, 0.0, 0.01) is None
+    found = expected(program, SURVEY, 0.0, 0.01)
+    assert found is not None
+    assert found.low == pytest.approx(37)
+    assert found.high == pytest.approx(45)
+    assert expected(preset("default"), SURVEY, 0.0, 0.1) == expected(preset("default"), SURVEY, 0.0)
+
+
+def test_little_is_expected_of_a_camera_whose_exposure_was_free() -> None:
+    program = preset("default")
+    locked = expected(program, SURVEY, 0.0, exposures=np.linspace(0.97, 1.03, 140).tolist())
+    assert locked == expected(program, SURVEY, 0.0)
+    free = expected(program, SURVEY, 0.0, exposures=np.linspace(0.8, 1.25, 140).tolist())
+    assert free is not None
+    assert 12 < free.low < free.high < 18
+
+
 def test_patterns_without_offsets_beside_others_are_not_counted() -> None:
     program = preset("default")
     more = Program(monitor=program.monitor, parts=(*program.parts, *still(96).parts[1:]))
@@ -87,3 +110,10 @@ def test_what_no_t_explains_is_not_promised() -> None:
     assert real is not None
     assert real.high < -20 * log10(0.02 * SURVEY["contrast"]) < ideal.high
     assert real.low < ideal.low
+
+
+def test_colours_that_a_film_has_lost_are_not_promised() -> None:
+    program = preset("default")
+    found = expected(program, SURVEY | {"lost_colour": 1e-3}, 0.0)
+    assert found is not None
+    assert 29 < found.low < found.high < 30

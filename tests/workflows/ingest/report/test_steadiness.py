@@ -114,7 +114,8 @@ def steady(ball: Ball) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return np.zeros((ball[1].count, 2)), np.ones(ball[1].count)
 
 
-@pytest.mark.parametrize("ball", [pytest.param("default", marks=pytest.mark.slow), "quick"], indirect=True)
+@pytest.mark.slow
+@pytest.mark.parametrize("ball", ["default", "quick"], indirect=True)
 def test_steady_frames_are_unchanged(ingest: Ingest, objects: Objects, digests: Digests, ball: Ball) -> None:
     stack = ingest("c", filmed(ball, *steady(ball)))
     made = report(stack.attributes, stack.frames)
@@ -179,6 +180,19 @@ def test_flicker_is_found_and_taken_out(
     assert found["flicker"].level == "warning"
     assert not stack.attributes["steadiness"]["drift"]["corrected"]
     assert with_it > without + gain
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ball", ["quick"], indirect=True)
+def test_light_that_follows_the_patterns_is_named_tone_mapping(ingest: Ingest, ball: Ball) -> None:
+    shifts, gains = steady(ball)
+    light = np.array([ball[2][n].mean() for n in ball[1].measured])
+    gains[ball[1].measured] = np.median(light) / light
+    stack = ingest("c", filmed(ball, shifts, gains))
+    found = {finding.name: finding for finding in report(stack.attributes, stack.frames).findings}
+    assert "flicker" not in found
+    assert found["tone_mapping"].level == "warning"
+    assert "brightens dark pictures" in found["tone_mapping"].message
 
 
 def test_too_small_a_frame_tells_nothing(ingest: Ingest) -> None:

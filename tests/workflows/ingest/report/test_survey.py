@@ -8,9 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
+from tests.parts.captures import nested_program
 from workflows.images.integer_formats import decode, encode_png
+from workflows.images.tone_curves import to_light
 from workflows.ingest.report.findings import Finding
 from workflows.ingest.report.report import Report, report
 from workflows.programs.presets import preset
@@ -28,7 +31,14 @@ def capture_archive() -> bytes:
     return target.getvalue()
 
 
-def filmed(capture_archive: bytes, *, gain: float = 1, less: int = 0, **more: Any) -> bytes:
+def filmed(
+    capture_archive: bytes,
+    *,
+    gain: float = 1,
+    less: int = 0,
+    curve: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
+    **more: Any,
+) -> bytes:
     """The capture as another exposure, or a camera that takes something off, would have had it."""
     target = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(capture_archive)) as archive, zipfile.ZipFile(target, "w") as out:
@@ -37,6 +47,8 @@ def filmed(capture_archive: bytes, *, gain: float = 1, less: int = 0, **more: An
         out.writestr(record["mask"], archive.read(record["mask"]))
         for frame in record["frames"]:
             values = decode(archive.read(frame["file"]), memory=1 << 24).astype(np.float64) * gain - less
+            if curve is not None:
+                values = 255 * curve(values / 255)
             out.writestr(frame["file"], encode_png(np.clip(np.rint(values), 0, 255).astype(np.uint8)))
     return target.getvalue()
 
@@ -52,7 +64,7 @@ def test_good_capture_has_no_warnings(ingest: Ingest, capture_archive: bytes) ->
     assert made.level == "good"
     assert {finding.level for finding in made.findings} == {"good"}
     assert all(finding.message and not finding.remedy for finding in made.findings)
-    assert made.frames.model_dump() == {"kept": 132, "patterns": 132, "exposures": 1, "missing": []}
+    assert made.frames.model_dump() == {"kept": 140, "patterns": 140, "exposures": 1, "missing": []}
     assert made.clipping.white == 0
     assert made.white_reaches == pytest.approx(0.86, abs=0.03)
     assert made.noise.black == pytest.approx(255 * 0.0025, rel=0.4)
@@ -103,9 +115,22 @@ def test_more_noise_and_fewer_patterns_promise_less(ingest: Ingest, capture_arch
     assert best[0] < best[1] < 60
 
 
+def test_a_curve_of_any_shape_is_measured_by_half_tones(ingest: Ingest, capture_archive: bytes) -> None:
+    made, found = reported(ingest, filmed(capture_archive, curve=lambda x: x**0.6, response="unknown"))
+    assert made.camera.source == "estimated"
+    assert found["camera_curve"].level == "good"
+    half = to_light(np.array([0.4, 0.8], np.float32) ** np.float32(0.6), made.camera.curve)
+    assert half[0] / half[1] == pytest.approx(0.5, abs=0.02)
+    assert "quality" in found
+
+
 @pytest.mark.slow
-def test_a_curve_that_is_assumed_is_a_warning(ingest: Ingest, capture_archive: bytes) -> None:
-    made, found = reported(ingest, filmed(capture_archive, response="unknown"))
+def test_a_curve_that_is_assumed_is_a_warning(ingest: Ingest) -> None:
+    target = io.BytesIO()
+    scene, bands = glass_ball(120, 90, monitor=(320, 240), rays=16), ((16, 12, 24), (32, 24, 24))
+    program = nested_program((320, 240), bands=bands, levels=2)
+    write_capture(scene, program, target, mask=True)
+    made, found = reported(ingest, filmed(target.getvalue(), response="unknown"))
     assert made.camera.source == "assumed"
     assert [f for f in made.findings if f.level == "bad"] == []
     assert made.level == found["camera_curve"].level == "warning"

@@ -14,6 +14,7 @@ from storage.layout.captures import Stack
 from tests.parts.captures import nested_program
 from workflows.images.integer_formats import encode_png
 from workflows.images.tone_curves import to_light
+from workflows.ingest.report import unexplained
 from workflows.programs.program import Program
 from workflows.recovery.glare import WIDTHS
 from workflows.simulation.glass_ball import glass_ball
@@ -84,6 +85,13 @@ def test_glare_is_measured(scene: Scene, program: Program, ingest: Ingest) -> No
     shares = ingest("c", filmed(scene, program, glare=0.1)).attributes["glare"]
     assert sum(shares) == pytest.approx(0.1, abs=0.025)
     assert shares[1] > 0.06
+
+
+def test_shares_that_no_glare_has_are_left_out(
+    scene: Scene, program: Program, ingest: Ingest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(unexplained, "fit_shares", lambda *_: np.array([0, 0, 0, 1.35]))
+    assert ingest("c", filmed(scene, program)).attributes["glare"] is None
 
 
 @pytest.mark.parametrize("noise", [0.002, 0.01])

@@ -138,6 +138,47 @@ def turned(video: bytes, matrix: Sequence[int]) -> bytes:
     return video[:at] + np.array(matrix, ">i4").tobytes() + video[at + 36 :]
 
 
+def as_transport_stream(video: bytes, packet: int = 188) -> bytes:
+    """The same pictures as a transport stream with packets of 188 bytes, or of 192 as camcorders write them."""
+    target = io.BytesIO()
+    options = {"mpegts_m2ts_mode": str(int(packet == 192))}
+    with (
+        av.open(io.BytesIO(video)) as source,
+        av.open(target, "w", format="mpegts", options=options) as box,
+    ):
+        stream = box.add_stream_from_template(source.streams.video[0])
+        for one in source.demux(source.streams.video[0]):
+            if one.dts is not None:
+                one.stream = stream
+                box.mux(one)
+    return target.getvalue()
+
+
+def interlaced(top: NDArray[np.uint8], bottom: NDArray[np.uint8], count: int = 4) -> bytes:
+    """An interlaced H.264 film: two pictures of (height, width, 3) codes in alternate rows."""
+    height, width, _ = top.shape
+    target = io.BytesIO()
+    with av.open(target, "w", format="mp4") as box:
+        options = {"preset": "veryfast", "qp": "1", "x264-params": "tff=1"}
+        stream = box.add_stream("libx264", rate=25, options=options)
+        stream.width, stream.height, stream.pix_fmt = width, 2 * height, "yuv420p"
+        fields = [
+            av.VideoFrame.from_ndarray(one, "rgb24").reformat(format="yuv420p").to_ndarray()
+            for one in (top, bottom)
+        ]
+        woven = np.stack(fields, axis=1).reshape(-1, width)
+        # The rows of a plane are woven by themselves: to_ndarray has one below the other, colours two rows in one.
+        luma = woven[: 2 * height]
+        chroma = [field[height:].reshape(2, height // 2, width // 2) for field in fields]
+        colours = np.stack(chroma, axis=2).reshape(-1, width)
+        for number in range(count):
+            frame = av.VideoFrame.from_ndarray(np.concatenate([luma, colours]), "yuv420p")
+            frame.pts = number
+            box.mux(stream.encode(frame))
+        box.mux(stream.encode(None))
+    return target.getvalue()
+
+
 def overstated(video: bytes, samples: int) -> bytes:
     """An MP4 whose index says that it has many samples, of a byte each (ISO/IEC 14496-12, sect. 8.6.1.2, 8.7)."""
     made = bytearray(video)
@@ -164,3 +205,21 @@ def boxes(video: bytes) -> Iterator[tuple[str, int, int]]:
 def zipped(record: bytes, files: dict[str, bytes]) -> bytes:
     """A capture archive of a capture.json and files."""
     return zip_bytes({"capture.json": record, **files})
+
+
+def fragmented(samples: int) -> bytes:
+    """An MP4 of ten fragments, of which all but the first say that they have many samples (sect. 8.8.8)."""
+    target = io.BytesIO()
+    flags = {"movflags": "frag_keyframe+empty_moov+default_base_moof"}
+    with av.open(target, "w", format="mp4", options=flags) as box:
+        stream = box.add_stream("mjpeg", rate=Fraction(10))
+        stream.width = stream.height = 64
+        stream.pix_fmt = "yuvj420p"
+        for n in range(10):
+            box.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((64, 64, 3), 20 * n, np.uint8))))
+        box.mux(stream.encode())
+    made = bytearray(target.getvalue())
+    at = made.index(b"trun") + 4
+    while (at := made.find(b"trun", at) + 4) > 4:
+        made[at : at + 8] = (1).to_bytes(4, "big") + samples.to_bytes(4, "big")
+    return bytes(made)

@@ -108,7 +108,12 @@ def misplaced(stack: Stack, made: Film, numbers: list[int]) -> list[tuple[int, i
             id="compressed",
             marks=pytest.mark.exhaustive,
         ),
-        pytest.param(Camera(hold=HOLD), ((20, 14), (16, 190), (203, 24), (210, 187)), id="bottom hidden"),
+        pytest.param(
+            Camera(hold=HOLD),
+            ((20, 14), (16, 190), (203, 24), (210, 187)),
+            id="bottom hidden",
+            marks=pytest.mark.exhaustive,
+        ),
         pytest.param(Camera(hold=HOLD), ASKEW[::-1], id="upside down", marks=pytest.mark.exhaustive),
     ],
 )
@@ -123,6 +128,7 @@ def test_every_number_is_read(ingest_film: Callable[..., Any], camera: Camera, c
     )
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_cut_film_lacks_only_the_patterns_cut_out(ingest_film: Callable[..., Any]) -> None:
     stack, made, numbers = ingest_film(Camera(hold=HOLD, cut=(7.0, 9.0)))
@@ -133,6 +139,7 @@ def test_cut_film_lacks_only_the_patterns_cut_out(ingest_film: Callable[..., Any
     assert set(missing) <= set(gone)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_only_patterns_behind_a_hand_are_missing(ingest_film: Callable[..., Any]) -> None:
     stack, made, numbers = ingest_film(Camera(hold=HOLD, hand=(7.0, 8.0)))
@@ -142,6 +149,7 @@ def test_only_patterns_behind_a_hand_are_missing(ingest_film: Callable[..., Any]
     assert {pattern for pattern, _ in misplaced(stack, made, numbers)} <= set(behind)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_patterns_are_found_by_their_times_without_the_sides_of_the_border(
     ingest_film: Callable[..., Any],

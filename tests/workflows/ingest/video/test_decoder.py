@@ -3,6 +3,7 @@
 import gc
 import io
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from storage.errors import CaptureError
 from tests.workflows.composite.video.test_steps import clip, even, pictures
-from tests.workflows.ingest.video.camera import Camera, Film, boxes, film, turned
+from tests.workflows.ingest.video.camera import Camera, Film, as_transport_stream, boxes, film, turned
 from tests.workflows.ingest.video.films import IngestFilm, error_of, misplaced, missing
 from workflows.ingest.video.decoder import Clip
 from workflows.ingest.video.frame_means import TOTAL_WEIGHT, Share, mean_frames
@@ -65,6 +66,40 @@ def test_frames_larger_than_the_limit_are_refused(ingest_film: IngestFilm, filme
     with pytest.raises(CaptureError, match="96 x 72 pixels") as caught:
         ingest_film(filmed.data, memory=4 * 96 * 72 * 6 - 4)
     assert caught.value.fields == {"entry": "clip.mp4", "limit": 96 * 72 * 6 - 1}
+
+
+@pytest.mark.parametrize("packet", [188, 192])
+def test_frames_of_a_transport_stream_are_found_from_any_time(packet: int) -> None:
+    """It has no index, and where it is entered nothing can be decoded up to the next key frame."""
+    mp4 = clip(pictures(90), even(90))  # a key frame each 12
+    stream = as_transport_stream(mp4, packet)
+    with closing(Clip(io.BytesIO(mp4), "clip", 1 << 24)) as plain:
+        expected, _ = plain.ticks(99)
+        first = plain.time_base
+    with closing(Clip(io.BytesIO(stream), "clip", 1 << 24)) as opened:
+        ticks, _ = opened.ticks(99)
+        steps = np.diff(ticks) * float(opened.time_base)
+    np.testing.assert_allclose(steps, np.diff(expected) * float(first), atol=1e-9)
+    shares = [[Share(tick, TOTAL_WEIGHT)] for tick in ticks.tolist()]
+    with closing(Clip(io.BytesIO(stream), "clip", 1 << 24)) as opened:
+        pixels = list(mean_frames(opened, shares))
+        for at in (89, 40, 12, 0, 77):
+            (again,) = mean_frames(opened, shares[at : at + 1])
+            np.testing.assert_array_equal(again, pixels[at])
+
+
+def test_a_film_in_a_transport_stream_is_ingested_as_in_any_container(
+    ingest_film: IngestFilm, filmed: Film
+) -> None:
+    stack = ingest_film(as_transport_stream(filmed.data, 192))
+    assert missing(stack) == []
+    assert error_of(stack, filmed) < 6
+
+
+def test_codec_that_is_not_read_is_named_with_a_remedy() -> None:
+    data = clip(pictures(3), even(3), container="avi", codec="msmpeg4")
+    with pytest.raises(CaptureError, match=r"^clip is coded by msmpeg4: export it as H\.264, HEVC or MJPEG"):
+        Clip(io.BytesIO(data), "clip", 1 << 24)
 
 
 @pytest.mark.slow

@@ -1,13 +1,16 @@
 """Means of a video's frames: the colours that were filmed, whatever system and depth they are coded in."""
 
 import io
+from contextlib import closing
 
 import av
 import numpy as np
 import pytest
+from av.video.reformatter import Colorspace
 
+from tests.workflows.ingest.video.camera import interlaced
 from workflows.ingest.video.decoder import Clip
-from workflows.ingest.video.frame_means import TOTAL_WEIGHT, Share, mean_frames
+from workflows.ingest.video.frame_means import ACCURATE, TOTAL_WEIGHT, Share, mean_frames
 from workflows.ingest.video.signatures import take_signatures
 
 
@@ -17,7 +20,11 @@ from workflows.ingest.video.signatures import take_signatures
         ("libx264", "yuv420p", "mp4", {"qp": "1"}, 2.0),
         ("libx264", "yuv444p10le", "mp4", {"qp": "1"}, 0.5),
         ("libx265", "yuv420p10le", "mp4", {"crf": "4", "x265-params": "log-level=none"}, 0.5),
+        ("libx264", "yuv420p", "mpegts", {"qp": "1"}, 2.0),
         ("mjpeg", "yuvj422p", "mov", {"qmin": "1", "qmax": "1"}, 2.5),
+        ("mjpeg", "yuvj422p", "avi", {"qmin": "1", "qmax": "1"}, 2.5),
+        ("mjpeg", "yuvj444p", "avi", {"qmin": "1", "qmax": "1"}, 2.5),
+        ("ffv1", "yuv411p", "matroska", {}, 2.0),
         ("ffv1", "bgr0", "matroska", {}, 0.2),
         ("ffv1", "gbrp10le", "matroska", {}, 0.2),
         ("prores_ks", "yuv422p10le", "mov", {}, 0.5),
@@ -46,3 +53,31 @@ def test_a_mean_has_the_colours_that_were_filmed(
     middles = mean[8::16, 8::16]
     np.testing.assert_array_equal(middles[0, :2], [[65535] * 3, [0] * 3])  # to the end of the scale: clipped
     assert np.abs(middles / 257 - codes).max() < off
+
+
+def test_fields_of_an_interlaced_film_keep_their_own_colours() -> None:
+    red, blue = (np.full((48, 64, 3), code, np.uint8) for code in ((200, 30, 40), (20, 60, 210)))
+    with closing(Clip(io.BytesIO(interlaced(red, blue)), "clip", 1 << 24)) as film:
+        ticks, _ = film.ticks(9)
+        assert film.interlaced
+        (mean,) = mean_frames(film, [[Share(int(ticks[1]), TOTAL_WEIGHT)]])
+    assert np.abs(mean[::2] / 257 - red).max() < 3
+    assert np.abs(mean[1::2] / 257 - blue).max() < 3
+
+
+@pytest.mark.parametrize(("height", "system"), [(96, Colorspace.ITU601), (640, Colorspace.ITU709)])
+def test_colour_system_that_is_not_stated_follows_from_the_size(height: int, system: Colorspace) -> None:
+    picture = np.full((height, 64, 3), (200, 60, 90), np.uint8)
+    target = io.BytesIO()
+    with av.open(target, "w", format="matroska") as box:
+        stream = box.add_stream("ffv1", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 64, height, "yuv444p"
+        coded = av.VideoFrame.from_ndarray(picture, "rgb24").reformat(
+            format="yuv444p", dst_colorspace=system, interpolation=ACCURATE
+        )
+        frame = av.VideoFrame.from_ndarray(coded.to_ndarray(), "yuv444p")
+        box.mux(stream.encode(frame))
+        box.mux(stream.encode())
+    with closing(Clip(io.BytesIO(target.getvalue()), "clip", 1 << 24)) as film:
+        (mean,) = mean_frames(film, [[Share(0, TOTAL_WEIGHT)]])
+    assert np.abs(mean / 257 - picture).max() < 2

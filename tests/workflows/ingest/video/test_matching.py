@@ -53,6 +53,7 @@ def test_every_pattern_is_found(ingest_film: IngestFilm, light: list[np.ndarray]
         assert found["first_pattern_seconds"] == pytest.approx(made.starts[0], abs=0.5 * camera.hold)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_only_patterns_behind_a_hand_are_missing(ingest_film: IngestFilm, light: list[np.ndarray]) -> None:
     for seed in range(3):

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from workflows.recovery.lobes.recover import Conditions, recover
-from workflows.recovery.lobes.strays import add_strays, subtract_strays
+from workflows.recovery.lobes.strays import remove_strong_strays, subtract_strays, write_strays
+from workflows.recovery.photometry import Photometry
 
 COLUMNS, ROWS = 64, 48
 BANDS = [(8, 6, 24), (16, 12, 24), (32, 24, 24), (COLUMNS, ROWS, 24)]
@@ -13,9 +14,9 @@ BANDS = [(8, 6, 24), (16, 12, 24), (32, 24, 24), (COLUMNS, ROWS, 24)]
 def test_amounts_of_each_group_are_added() -> None:
     strays = np.array([[1, 1, 1], [1, -1, 0.5]], np.float32)
     f = np.full(6, np.nan, np.float32)
-    add_strays(strays, np.array([0.1, 0.2, 0.3, 0.4]), 0, f)
+    write_strays(strays, np.array([0.1, 0.2, 0.3, 0.4]), 0, f)
     np.testing.assert_allclose(f, [0.3, -0.1, 0.2, 0.7, -0.1, 0.5], rtol=1e-6)
-    add_strays(strays, np.array([0.1, 0.2, 0.3, 0.4]), 1, f)
+    write_strays(strays, np.array([0.1, 0.2, 0.3, 0.4]), 1, f)
     np.testing.assert_allclose(f, [0.2, -0.2, 0.1, 0.4, -0.4, 0.2], rtol=1e-6)
 
 
@@ -65,3 +66,33 @@ def test_t_is_recovered_beside_stray_light(patterns_of, gaussian, observe, chann
 
     assert error(beside) < 2 * error(clean)
     assert error(beside) < error(ignored) / 3
+
+
+def test_a_pixel_that_sees_the_border_keeps_its_mean_light() -> None:
+    random = np.random.default_rng(4)
+    m = 128
+    bits = np.where(random.random((7, m + 6)) < 0.5, 1.0, -1.0)
+    bits -= bits.mean(axis=1, keepdims=True)
+    shown = np.concatenate([random.random(m), [0, 0, 0, 1, 1, 1]])
+    S, rho = np.array([0.2, 0.2, 0.05]), np.array([0.0, 0.02, 0.6])
+    amount = np.array([0.1, 0.08, 0.0])[:, np.newaxis] * random.standard_normal((3, 7))
+    light = S[:, np.newaxis] + rho[:, np.newaxis] * shown + amount @ bits
+    ends = bits[:, m:].reshape(7, 2, 3).mean(axis=2)  # S and rho come from three black and three white frames
+    black, white = light[:, m:].reshape(3, 2, 3).mean(axis=2).T
+    rows = np.concatenate([np.ones((1, m + 2)), np.concatenate([bits[:, :m], ends], axis=1)])
+    three = np.ones(3, np.float32)
+    given = Photometry(
+        *(
+            (values[:, np.newaxis] * three).astype(np.float32)
+            for values in (black, white - black, np.full(3, 1e-6), np.full(3, 1e-6))
+        )
+    )
+    values = (light[:, :m, np.newaxis] * three).astype(np.float32)
+    left, found = remove_strong_strays(values, given, rows.astype(np.float32), None)
+    np.testing.assert_allclose(found.S[:, 0], S, atol=0.01)
+    np.testing.assert_allclose(found.rho[:, 0], rho, atol=0.01)
+    clean = S[:, np.newaxis] + rho[:, np.newaxis] * shown[:m]
+    np.testing.assert_allclose(left[..., 0], clean, atol=0.01)
+    assert found.S[2, 0] == given.S[2, 0]  # what sees the patterns is left to the fit of its lobes
+    np.testing.assert_array_equal(left[2], values[2])
+    assert abs(given.S[0, 0] - S[0]) > 0.02

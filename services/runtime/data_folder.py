@@ -1,11 +1,25 @@
-"""The lock of a data folder."""
+"""The data folder: made for its owner alone, and locked while it is served."""
 
 import fcntl
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from storage.errors import Conflict
+
+logger = logging.getLogger(__name__)
+
+
+def make_data(data: Path) -> None:
+    """Make a data folder that no other user of the machine can enter.
+
+    The rights to one that exists are left alone, because somebody may have given them on purpose; a warning says so.
+    """
+    if not data.exists():
+        data.mkdir(mode=0o700, parents=True, exist_ok=True)
+    elif data.stat().st_mode & 0o077:
+        logger.warning("other users of this machine can enter %s; `chmod 700 %s` keeps them out", data, data)
 
 
 @contextmanager

@@ -1,14 +1,24 @@
 """Counts and sums for metrics, limits and estimates; none of them reads all tiles."""
 
+import time
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import Connection, Row, Text, cast, func, select
+from sqlalchemy import Connection, Row, Select, Text, cast, func, select
 
 from storage.database.owners import across_owners
-from storage.database.tables import captures, jobs, mattes, programs, tiles, totals, uploads
+from storage.database.rows import ROW
+from storage.database.tables import bodies, captures, jobs, mattes, programs, tiles, totals, uploads
+from storage.records.bodies import under_way
 from storage.records.jobs import ACTIVE
 from storage.steps import FINISH
+
+PROMISE = 600.0
+"""Seconds for which room is kept for the rest of an upload after bytes of it came."""
+TILE = 100
+"""Bytes that a row of a tile takes."""
+PART = 8192
+"""Bytes that a part of an upload takes besides its own, in blocks of the disk for it and its checksums."""
 
 
 def job_counts(connection: Connection) -> Sequence[Row[Any]]:
@@ -73,29 +83,61 @@ def active_jobs(connection: Connection) -> int:
 
 
 def stored_bytes(connection: Connection, *, all_owners: bool = False) -> int:
-    """Bytes stored: as counted for finished data, as announced for uploads.
+    """Bytes stored, and those that uploads and other bodies under way have reserved.
 
-    Programs count too, although they are only rows: users choose their size, and they do not expire. A capture that is
-    being ingested counts with the size of its archive; a matte that is being recovered does not count yet.
+    A capture that is being ingested counts with the size of its archive; a matte that is being recovered does not count
+    yet. Rows count too, with the documents that users choose the size of. An upload counts with its whole length while
+    bytes come, else with what has come.
     """
+    one = received_bytes(connection, all_owners=all_owners)
+    return one + promised_bytes(connection, all_owners=all_owners)
+
+
+def received_bytes(connection: Connection, *, all_owners: bool = False) -> int:
+    """The same without what is promised, see `promised_bytes`."""
     sums = [
-        func.sum(func.coalesce(captures.c.stored, captures.c.bytes)),
-        func.sum(mattes.c.stored),
-        func.sum(jobs.c.stored),
-        func.sum(uploads.c.length),
-        func.sum(func.length(cast(programs.c.program, Text))),
+        select(func.sum(func.coalesce(captures.c.stored, captures.c.bytes) + captures.c.row_bytes + ROW)),
+        select(func.sum(func.coalesce(mattes.c.stored, 0) + ROW)),
+        select(func.sum(func.coalesce(jobs.c.stored, 0) + jobs.c.row_bytes + jobs.c.total * TILE + ROW)),
+        select(func.sum(uploads.c.offset + uploads.c.parts * PART + func.length(uploads.c.metadata) + ROW)),
+        select(func.sum(func.length(cast(programs.c.program, Text)))),
+        select(func.sum(bodies.c.bytes)).where(under_way()),
     ]
-    queries = [select(one) for one in sums]
-    return sum(
-        int(connection.scalar(across_owners(query) if all_owners else query) or 0) for query in queries
-    )
+    return sum(_sum(connection, one, all_owners) for one in sums)
+
+
+def promised_bytes(connection: Connection, *, all_owners: bool = False) -> int:
+    """Bytes that are expected and not reserved yet: of bodies under way, and of uploads to which bytes came lately."""
+    lately = uploads.c.moved_at > time.time() - PROMISE
+    sums = [
+        select(func.sum(uploads.c.length - uploads.c.offset)).where(lately),
+        select(-func.sum(bodies.c.bytes)).where(under_way(), bodies.c.upload.is_not(None)),
+        select(func.sum(bodies.c.length - bodies.c.bytes)).where(under_way()),
+    ]
+    return max(sum(_sum(connection, one, all_owners) for one in sums), 0)
+
+
+def coming_bytes(connection: Connection) -> int:
+    """Bytes that are reserved for bodies of all owners and not on the disk yet."""
+    return _sum(connection, select(func.sum(bodies.c.bytes - bodies.c.stored)).where(under_way()), True)
+
+
+def _sum(connection: Connection, query: Select[Any], all_owners: bool) -> int:
+    return int(connection.scalar(across_owners(query) if all_owners else query) or 0)
 
 
 def recent_ingests(connection: Connection, limit: int) -> list[tuple[dict[str, Any], float]]:
-    """The last ingests that succeeded: the plan of each, and the seconds that its final step took."""
+    """Ingests of the newest captures that succeeded: the plan of each, and the seconds that its final step took.
+
+    Parameters
+    ----------
+    limit : int
+        How many captures are looked at.
+    """
+    newest = select(captures.c.job).order_by(captures.c.number.desc()).limit(limit)
     step = (tiles.c.job == jobs.c.id) & (tiles.c.tile == FINISH)
-    query = select(jobs.c.plan, tiles.c.seconds).join(tiles, step)
-    query = query.where(jobs.c.kind == "ingest", jobs.c.state == "succeeded", tiles.c.seconds.is_not(None))
-    return [
-        (plan, took) for plan, took in connection.execute(query.order_by(jobs.c.number.desc()).limit(limit))
-    ]
+    query = select(jobs.c.plan, jobs.c.state, tiles.c.seconds).join(tiles, step)
+    query = query.where(jobs.c.id.in_(connection.scalars(newest).all()), tiles.c.seconds.is_not(None))
+    # The state is not part of the query: SQLite would look for all jobs that succeeded first.
+    found = connection.execute(query.order_by(jobs.c.number.desc()))
+    return [(row.plan, row.seconds) for row in found if row.state == "succeeded"]

@@ -2,21 +2,25 @@
 
 import base64
 import json
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
-from sqlalchemy import Engine
+from sqlalchemy import Engine, update
 
 from services.api.app import build_app
-from services.api.quotas import UNITS
+from services.api.limits.quotas import UNITS
 from services.settings import Settings
 from storage.database.engine import open_engine, reading, writing
 from storage.database.owners import for_owner
+from storage.database.rows import ROW, json_bytes
+from storage.database.tables import uploads
 from storage.objects.store import Objects
-from storage.records import api_keys, captures, jobs, mattes
+from storage.records import api_keys, captures, jobs, mattes, tiles
+from storage.statistics import PART, PROMISE, TILE
 from tests.parts.captures import nested_program
 from workflows.simulation import glass_ball
 from workflows.simulation.scene import write_capture
@@ -86,15 +90,21 @@ def create(client: TestClient, length: int) -> Any:
     return client.post("/v1/uploads", headers=TUS | {"Upload-Length": str(length)})
 
 
+def rows_of(made: Any) -> int:
+    """Bytes of the rows of a capture and of its job."""
+    return 2 * ROW + json_bytes(made.json()["program"])
+
+
 def test_all_limits_are_listed_with_their_usage(serve: Serve, archive: bytes) -> None:
     alice, bob = (
         serve(owner_captures=7, store_bytes=1 << 30),
         serve("bob", owner_captures=7, store_bytes=1 << 30),
     )
     assert used(alice) == {"owner_captures": 0, "owner_jobs": 0, "owner_bytes": 0}
-    assert alice.post("/v1/captures", content=archive, headers=ZIP).status_code == 201
+    made = alice.post("/v1/captures", content=archive, headers=ZIP)
+    assert made.status_code == 201
     assert create(alice, 1000).status_code == 201
-    size = len(archive) + 1000
+    size = len(archive) + 1000 + rows_of(made) + ROW
     assert used(alice) == {"owner_captures": 2, "owner_jobs": 1, "owner_bytes": size}
     assert used(bob) == {"owner_captures": 0, "owner_jobs": 0, "owner_bytes": 0, "store_bytes": size}
     listed = alice.get("/v1/limits").json()
@@ -130,7 +140,7 @@ def test_captures_of_an_owner(serve: Serve, archive: bytes, tmp_path: Path) -> N
 
 
 def test_unfinished_upload_counts_as_a_capture(serve: Serve, archive: bytes) -> None:
-    client = serve(owner_captures=1, owner_bytes=len(archive))
+    client = serve(owner_captures=1, owner_bytes=len(archive) + ROW)
     where = create(client, len(archive)).headers["location"]
     chunk = TUS | {"Content-Type": "application/offset+octet-stream", "Upload-Offset": "0"}
     assert client.patch(where, content=archive, headers=chunk).status_code == 204
@@ -166,13 +176,15 @@ def test_jobs_of_an_owner(serve: Serve, archive: bytes, engine: Engine) -> None:
 @pytest.mark.parametrize(("name", "others"), [("owner_bytes", False), ("store_bytes", True)])
 def test_bytes_stored(serve: Serve, archive: bytes, tmp_path: Path, name: str, others: bool) -> None:
     size = len(archive)
-    alice, bob = serve(**{name: 2 * size}), serve("bob", **{name: 2 * size})
-    capture = alice.post("/v1/captures", content=archive, headers=ZIP).json()["id"]
+    made = serve().post("/v1/captures", content=archive, headers=ZIP)
+    capture, most = made.json()["id"], 2 * size + rows_of(made)
+    alice, bob = serve(**{name: most}), serve("bob", **{name: most})
     assert create(bob, size).status_code == 201
     before = files(tmp_path)
     problem = create(alice, size + 1).json()
-    assert (problem["status"], problem["name"], problem["limit"]) == (507, name, 2 * size)
-    assert problem["missing"] == (size + 1 if others else 1)
+    assert (problem["status"], problem["name"], problem["limit"]) == (507, name, most)
+    room = size - ROW  # of which bob was promised all, and keeps half
+    assert problem["missing"] == (size + 1 - (room - room // 2) if others else 1)
 
     def pieces() -> Iterator[bytes]:
         yield archive  # without announced length: it is refused once it has come
@@ -185,6 +197,26 @@ def test_bytes_stored(serve: Serve, archive: bytes, tmp_path: Path, name: str, o
         assert (problem["status"], problem["name"]) == (507, name)
         assert str(3 * size) not in problem["detail"]  # does not reveal what bob has
     assert alice.get(f"/v1/captures/{capture}").status_code == 200
+
+
+def test_promises_of_others_keep_at_most_half_and_decay(serve: Serve, engine: Engine) -> None:
+    limit = 1_000_000
+    alice, bob = (serve(owner, store_bytes=limit) for owner in ("alice", "bob"))
+    promised = [create(bob, 200_000).headers["location"] for _ in range(4)]
+    problem = refused(create(alice, 600_000), 507, "store_bytes", limit, 600_000)
+    assert problem["missing"] == 600_000 - (limit - 4 * ROW) // 2
+    assert "800000" not in str(problem)  # what bob was promised
+    mine = create(alice, 400_000).headers["location"]
+    chunk = TUS | {"Content-Type": "application/offset+octet-stream", "Upload-Offset": "0"}
+    assert alice.patch(mine, content=bytes(400_000), headers=chunk).status_code == 204
+    answers = [bob.patch(one, content=bytes(200_000), headers=chunk) for one in promised]
+    assert [answer.status_code for answer in answers] == [204, 204, 507, 507]  # promised twice
+    assert alice.delete(mine, headers=TUS).status_code == 204
+    most = limit - 4 * ROW - 2 * (200_000 + PART)
+    assert create(alice, most).status_code == 507
+    with writing(engine) as c:
+        c.execute(update(uploads).values(moved_at=time.time() - PROMISE))
+    assert create(alice, most).status_code == 201
 
 
 @pytest.mark.parametrize(("name", "others"), [("owner_bytes", False), ("store_bytes", True)])
@@ -220,6 +252,23 @@ def test_bytes_of_programs(serve: Serve, name: str, others: bool) -> None:
     assert alice.post("/v1/programs", json=body(1)).json() == first.json()  # a repeat takes no room
     assert alice.delete(f"/v1/programs/{first.json()['id']}").status_code == 204
     assert alice.post("/v1/programs", json=body(3)).status_code == 201
+
+
+def test_rows_count_as_stored(serve: Serve, archive: bytes, engine: Engine) -> None:
+    client = serve()
+    made = client.post("/v1/captures", content=archive, headers=ZIP)
+    plan = {"tiles": 50, "notes": ["n" * 10_000]}
+    with writing(engine) as c:
+        tiles.add_plan(c, made.json()["job"], plan)
+        jobs.end(c, made.json()["job"], "failed", {"detail": "", "status": 422})
+        captures.change(c, made.json()["id"], state="failed", stored=0)
+    of_plan = json_bytes(plan) + 50 * TILE
+    assert used(client)["owner_bytes"] == rows_of(made) + of_plan
+    assert client.delete(f"/v1/captures/{made.json()['id']}").status_code == 204
+    assert used(client)["owner_bytes"] == ROW + of_plan
+    assert create(serve(owner_bytes=10_000), 1).status_code == 507
+    assert client.delete(f"/v1/jobs/{made.json()['job']}").status_code == 204
+    assert used(client)["owner_bytes"] == 0
 
 
 def test_frames_of_a_capture(serve: Serve, archive: bytes, tmp_path: Path) -> None:

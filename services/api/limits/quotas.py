@@ -1,0 +1,216 @@
+"""Limits of owners and of the whole service, checked before anything is accepted."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from sqlalchemy import Connection
+
+from services.settings import Settings
+from storage import statistics
+from storage.database.disk_reserve import file_of
+from storage.disks import require_reserve
+from storage.errors import NEARLY_FULL, NoRoom, TooMany
+from storage.objects.store import Objects
+
+Unit = Literal["bytes", "frames", "pixels", "captures", "jobs", "seconds"]
+
+
+@dataclass(frozen=True)
+class Limit:
+    """A limit, from the setting of the same name.
+
+    Attributes
+    ----------
+    limit : int, optional
+        None if there is none.
+    used : int, optional
+        How much is in use, if the limit is for all items together.
+    """
+
+    name: str
+    unit: Unit
+    limit: int | None
+    used: int | None
+    description: str
+
+
+UNITS: dict[str, Unit] = {
+    "upload_bytes": "bytes",
+    "unpacked_bytes": "bytes",
+    "capture_frames": "frames",
+    "capture_pixels": "pixels",
+    "backdrop_bytes": "bytes",
+    "owner_captures": "captures",
+    "owner_jobs": "jobs",
+    "owner_bytes": "bytes",
+    "store_bytes": "bytes",
+    "upload_seconds": "seconds",
+    "capture_seconds": "seconds",
+    "matte_seconds": "seconds",
+    "job_seconds": "seconds",
+}
+"""The settings that are limits, with their units."""
+DELETE = "delete captures, mattes, videos, uploads, programs or ended jobs first"
+
+
+def limits_of(connection: Connection, settings: Settings, *, all_owners: bool) -> list[Limit]:
+    """All limits, with how much of each the owner of a connection uses.
+
+    Parameters
+    ----------
+    all_owners : bool
+        Whether to include how much all owners use together.
+    """
+    used = {
+        "owner_captures": statistics.captures_and_uploads(connection),
+        "owner_jobs": statistics.active_jobs(connection),
+        "owner_bytes": statistics.stored_bytes(connection),
+    }
+    if all_owners:
+        used["store_bytes"] = statistics.stored_bytes(connection, all_owners=True)
+    return [
+        Limit(
+            name, unit, getattr(settings, name), used.get(name), str(Settings.model_fields[name].description)
+        )
+        for name, unit in UNITS.items()
+    ]
+
+
+def admit(
+    connection: Connection, settings: Settings, *, captures: int = 0, jobs: int = 0, size: int = 0
+) -> None:
+    """Check that an owner may have more. Within the transaction that adds it, the result is certain.
+
+    Parameters
+    ----------
+    size : int
+        Bytes; with 0, the limits must still not be exceeded already.
+
+    Raises
+    ------
+    NoRoom
+        If something must be deleted first.
+    TooMany
+        If the owner must wait first.
+    """
+    _admit_owner(connection, settings, captures, jobs, size)
+    # What others have only promised to send is of no account here, see `admit_upload`.
+    if (room := _room_of_service(connection, settings)) is not None:
+        _check_service(settings, size, size - room)
+
+
+def admit_upload(
+    connection: Connection,
+    settings: Settings,
+    objects: Objects,
+    size: int,
+    *,
+    room: int = 0,
+    captures: int = 0,
+    jobs: int = 0,
+) -> None:
+    """Check the same before something is uploaded, and that the disk has room for its bytes.
+
+    Room that other owners were promised for uploads is kept for them, but never more than half of what there is: so
+    nobody can lock out the others by promises. What is promised twice is refused when its bytes come.
+
+    Parameters
+    ----------
+    room : int
+        Bytes that the disk must have in addition.
+
+    Raises
+    ------
+    NoRoom, TooMany
+    """
+    _admit_owner(connection, settings, captures, jobs, size)
+    own = statistics.promised_bytes(connection)
+    others = statistics.promised_bytes(connection, all_owners=True) - own
+
+    def lacking(free: int, size: int) -> int:
+        return size + own + min(others, max(free, 0) // 2) - free
+
+    if (free := _room_of_service(connection, settings)) is not None:
+        _check_service(settings, size, lacking(free, size))
+    if (free := _room_on_disk(connection, objects)) is not None and lacking(free, size + room) > 0:
+        missing = lacking(free, size + room)
+        raise NoRoom(
+            f"the store has no room for {size + room} bytes. Delete captures, mattes or uploads, or free {missing} "
+            "bytes on the disk",
+            missing=missing,
+        )
+
+
+def admit_bytes(connection: Connection, settings: Settings, objects: Objects) -> None:
+    """Check that there is room for what this transaction has reserved for a body that is coming.
+
+    Raises
+    ------
+    NoRoom
+    """
+    admit(connection, settings)
+    free = _room_on_disk(connection, objects)
+    if free is not None and free < 0:
+        raise NoRoom(NEARLY_FULL, missing=-free)
+
+
+def _admit_owner(connection: Connection, settings: Settings, captures: int, jobs: int, size: int) -> None:
+    """Check the limits of an owner, and that the database has room for rows."""
+    if captures and settings.owner_captures is not None:
+        value = statistics.captures_and_uploads(connection) + captures
+        if value > settings.owner_captures:
+            raise NoRoom(
+                f"you may have {settings.owner_captures} captures, unfinished uploads included, and this would be the "
+                f"{value}th; delete some first",
+                name="owner_captures",
+                limit=settings.owner_captures,
+                value=value,
+            )
+    if jobs and settings.owner_jobs is not None:
+        value = statistics.active_jobs(connection) + jobs
+        if value > settings.owner_jobs:
+            raise TooMany(
+                f"you may have {settings.owner_jobs} queued or running jobs, ingests included, and this would be the "
+                f"{value}th; wait for one to end, or cancel one",
+                name="owner_jobs",
+                limit=settings.owner_jobs,
+                value=value,
+            )
+    if settings.owner_bytes is not None:
+        value = statistics.stored_bytes(connection) + size
+        if value > settings.owner_bytes:
+            missing = value - settings.owner_bytes
+            raise NoRoom(
+                f"you may have {settings.owner_bytes} bytes stored, and this would be {missing} more; {DELETE}",
+                name="owner_bytes",
+                limit=settings.owner_bytes,
+                value=value,
+                missing=missing,
+            )
+    if (file := file_of(connection.engine)) is not None:
+        require_reserve(file.parent)
+
+
+def _check_service(settings: Settings, size: int, missing: int) -> None:
+    """Refuse bytes if some are missing for them; only these are named, as all that is used reveals what others have."""
+    if missing > 0:
+        raise NoRoom(
+            f"this service may have {settings.store_bytes} bytes stored, and this would be {missing} more; {DELETE}",
+            name="store_bytes",
+            limit=settings.store_bytes or 0,
+            value=size,
+            missing=missing,
+        )
+
+
+def _room_of_service(connection: Connection, settings: Settings) -> int | None:
+    """Bytes that all owners together may still send; None without a limit."""
+    if settings.store_bytes is None:
+        return None
+    return settings.store_bytes - statistics.received_bytes(connection, all_owners=True)
+
+
+def _room_on_disk(connection: Connection, objects: Objects) -> int | None:
+    """Bytes of the disk that uploads may take, without those that bodies under way have reserved."""
+    spare = objects.spare_bytes()
+    return None if spare is None else spare - statistics.coming_bytes(connection)

@@ -1,0 +1,156 @@
+"""Work that a request waits for: within its owner's share, and only as long as somebody wants its result."""
+
+import asyncio
+import threading
+import time
+from collections import Counter
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import anyio.to_thread
+from fastapi import Request
+from starlette.requests import ClientDisconnect
+
+from services.runtime.problems import TooLarge
+from storage.errors import InvalidInput
+from workflows.interruption import interruptible
+
+T = TypeVar("T")
+CHECK_SECONDS = 0.25
+"""Seconds between two looks whether the client is still there."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Turn:
+    owner: str
+    amount: int
+    came: asyncio.Event = field(default_factory=asyncio.Event)
+
+
+class Shares:
+    """Slots, or bytes, that requests take while they work; no owner can have all of them.
+
+    Requests get them in the order in which they ask, except that those of an owner who has their share wait for that
+    owner's own. All calls are from one event loop.
+
+    Parameters
+    ----------
+    total : int
+    each : int
+        The most that the requests of one owner may have together.
+    name : str, optional
+        The setting that the total comes from, for errors.
+    """
+
+    def __init__(self, total: int, each: int, name: str | None = None) -> None:
+        self._free, self._each, self._name = total, each, name
+        self._taken: Counter[str] = Counter()
+        self._waiting: list[_Turn] = []
+
+    @asynccontextmanager
+    async def take(self, owner: str, amount: int = 1) -> AsyncIterator[None]:
+        """Wait for an amount, and have it during the block.
+
+        Raises
+        ------
+        TooLarge
+            If it is more than an owner may have.
+        """
+        if amount > self._each:
+            raise TooLarge(
+                f"this request takes {amount} bytes of memory, and one may take {self._each}, half of what all may "
+                f"take together; raise ENVMATTE_{(self._name or '').upper()}",
+                **({"name": self._name} if self._name else {}),
+                limit=self._each,
+                value=amount,
+            )
+        turn = _Turn(owner, amount)
+        self._waiting.append(turn)
+        self._admit()
+        try:
+            await turn.came.wait()
+            yield
+        finally:
+            if turn.came.is_set():
+                self._free += amount
+                self._taken[owner] -= amount
+            else:
+                self._waiting.remove(turn)
+            self._admit()
+
+    def _admit(self) -> None:
+        for turn in self._waiting.copy():
+            if self._taken[turn.owner] + turn.amount > self._each:
+                continue
+            if turn.amount > self._free:
+                break  # else small ones would pass a large one for ever
+            self._waiting.remove(turn)
+            self._free -= turn.amount
+            self._taken[turn.owner] += turn.amount
+            turn.came.set()
+
+
+async def run(
+    request: Request, owner: str, seconds: float, shares: Shares, work: Callable[[], T], amount: int = 1
+) -> T:
+    """Do the work of a request in a thread, once its owner's share has room for it.
+
+    Work that calls `checkpoint` ends when the client goes away, the service stops or the time is over. What it has
+    taken of the shares it keeps until it has really ended.
+
+    Raises
+    ------
+    ClientDisconnect
+        If the client goes away.
+    InvalidInput
+        If the work takes more than ``seconds``.
+    TooLarge
+        If it needs more than an owner may have.
+    """
+    unwanted = threading.Event()
+
+    def interruptibly() -> T:
+        end = time.monotonic() + seconds
+
+        def check() -> None:
+            if unwanted.is_set():
+                raise ClientDisconnect
+            if time.monotonic() > end:
+                raise InvalidInput(
+                    f"the answer takes more than {seconds:g} s to compute; ask for less, or raise "
+                    "ENVMATTE_REQUEST_SECONDS",
+                    name="request_seconds",
+                    limit=seconds,
+                )
+
+        with interruptible(check):
+            return work()
+
+    begun = False
+
+    async def in_turn() -> T:
+        nonlocal begun
+        async with shares.take(owner, amount):
+            begun = True
+            return await anyio.to_thread.run_sync(interruptibly, limiter=anyio.CapacityLimiter(1))
+
+    answer, left = asyncio.create_task(in_turn()), asyncio.create_task(_disconnected(request))
+    answer.add_done_callback(lambda task: task.cancelled() or task.exception())  # nobody else may ask for it
+    try:
+        await asyncio.wait((answer, left), return_when=asyncio.FIRST_COMPLETED)
+        if not answer.done():
+            raise ClientDisconnect
+        return answer.result()
+    finally:
+        left.cancel()
+        unwanted.set()
+        if not begun:
+            answer.cancel()
+
+
+async def _disconnected(request: Request) -> None:
+    """Return once the client has closed the connection."""
+    while not await request.is_disconnected():
+        await asyncio.sleep(CHECK_SECONDS)

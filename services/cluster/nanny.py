@@ -1,0 +1,31 @@
+"""The process that starts a worker process, and another when it dies."""
+
+import asyncio
+import logging
+
+import distributed
+from distributed.core import Status
+
+logger = logging.getLogger(__name__)
+
+PAUSE = 0.5
+"""Seconds between two attempts to start a worker process."""
+
+
+class Nanny(distributed.Nanny):  # type: ignore[misc]
+    """A nanny that also replaces a worker whose fork server dies while it starts.
+
+    That of distributed gives up then, and lives on without a worker.
+    """
+
+    async def instantiate(self) -> Status:
+        """Start the worker process, or wait until it has started."""
+        while True:
+            try:
+                return await super().instantiate()
+            except EOFError:
+                if self.status in (Status.closing, Status.closed):
+                    raise
+                logger.warning("the fork server died while a worker started; starting both again")
+                self.process = None  # it counts as starting for ever
+                await asyncio.sleep(PAUSE)

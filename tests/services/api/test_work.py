@@ -1,0 +1,146 @@
+"""Shares of owners, and work that ends with its client, at its deadline and with the service, on a real port."""
+
+import asyncio
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+import httpx2
+import pytest
+import uvicorn
+from fastapi import FastAPI, Request
+
+from services.api import errors
+from services.api.work import Shares, run
+from services.runtime.problems import TooLarge
+from tests.parts.waiting import until
+from workflows.interruption import checkpoint
+
+SECONDS = 2.0
+
+
+@dataclass
+class Works:
+    """An API whose only route works until it is ended."""
+
+    url: str = ""
+    server: uvicorn.Server = field(init=False)
+    thread: threading.Thread = field(init=False)
+    working: set[str] = field(default_factory=set)
+
+    def start(self, owner: str, timeout: float) -> threading.Thread:
+        """Ask for work, for a time, in a thread of its own."""
+
+        def ask() -> None:
+            with suppress(httpx2.HTTPError):
+                httpx2.get(f"{self.url}/{owner}", timeout=timeout)
+
+        asking = threading.Thread(target=ask)
+        asking.start()
+        return asking
+
+
+@pytest.fixture
+def works() -> Iterator[Works]:
+    made = Works()
+    app, shares = FastAPI(), Shares(2, 1)
+    errors.register(app)
+
+    @app.get("/{owner}")
+    async def work(request: Request, owner: str) -> None:
+        def until_ended() -> None:
+            made.working.add(owner)
+            try:
+                while True:
+                    checkpoint()
+                    time.sleep(0.01)
+            finally:
+                made.working.remove(owner)
+
+        await run(request, owner, SECONDS, shares, until_ended)
+
+    config = uvicorn.Config(app, port=0, log_config=None, lifespan="off", timeout_graceful_shutdown=1)
+    with config.bind_socket() as bound:
+        made.url = f"http://127.0.0.1:{bound.getsockname()[1]}"
+        made.server = uvicorn.Server(config)
+        made.thread = threading.Thread(target=made.server.run, kwargs={"sockets": [bound]})
+        made.thread.start()
+        yield made
+        made.server.should_exit = True
+        made.thread.join()
+
+
+def test_work_ends_with_its_client_and_leaves_room_for_the_next(works: Works) -> None:
+    asking = [works.start("alice", 0.5) for _ in range(5)]
+    until(lambda: "alice" in works.working)
+    bob = works.start("bob", 0.5)  # alice cannot have both slots
+    until(lambda: works.working == {"alice", "bob"})
+    for one in (*asking, bob):
+        one.join()
+    until(lambda: not works.working, SECONDS / 2)
+
+
+def test_work_ends_at_its_deadline_with_a_remedy(works: Works) -> None:
+    answer = httpx2.get(f"{works.url}/alice", timeout=60)
+    problem = answer.json()
+    assert (answer.status_code, problem["name"], problem["limit"]) == (422, "request_seconds", SECONDS)
+    assert "ENVMATTE_REQUEST_SECONDS" in problem["detail"]
+    assert not works.working
+
+
+def test_work_ends_with_the_server(works: Works) -> None:
+    asking = works.start("alice", 60)
+    until(lambda: works.working)
+    works.server.should_exit = True
+    works.thread.join(10)
+    assert not works.thread.is_alive()
+    until(lambda: not works.working, 1)
+    asking.join()
+
+
+def test_owners_take_turns_and_small_amounts_do_not_pass_large_ones() -> None:
+    order: list[str] = []
+
+    async def take(shares: Shares, name: str, owner: str, amount: int) -> None:
+        async with shares.take(owner, amount):
+            order.append(name)
+            await asyncio.sleep(0.01)
+
+    async def all_of_them() -> None:
+        shares = Shares(4, 2)
+        asked = [
+            ("a1", "alice", 2),
+            ("a2", "alice", 1),
+            ("b1", "bob", 1),
+            ("c1", "carol", 2),
+            ("d1", "dave", 1),
+        ]
+        await asyncio.gather(*(take(shares, *one) for one in asked))
+
+    asyncio.run(all_of_them())
+    assert order == ["a1", "b1", "a2", "c1", "d1"]
+
+
+def test_more_than_an_owner_may_have_is_refused_by_the_setting() -> None:
+    async def ask() -> None:
+        async with Shares(100, 50, "request_memory").take("alice", 51):
+            pass
+
+    with pytest.raises(TooLarge, match="ENVMATTE_REQUEST_MEMORY") as caught:
+        asyncio.run(ask())
+    assert caught.value.fields == {"name": "request_memory", "limit": 50, "value": 51}
+
+
+def test_turn_that_is_given_up_takes_nothing() -> None:
+    async def give_up() -> None:
+        shares = Shares(1, 1)
+        async with shares.take("alice"):
+            with pytest.raises(TimeoutError):
+                async with asyncio.timeout(0.01), shares.take("bob"):
+                    pass
+        async with asyncio.timeout(5), shares.take("carol"):
+            pass
+
+    asyncio.run(give_up())

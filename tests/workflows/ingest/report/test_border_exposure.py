@@ -1,0 +1,68 @@
+"""The exposures of a film's frames, by the light of its border."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from workflows.images.tone_curves import table
+from workflows.ingest.report.border_exposure import BorderValues, relative_to_white
+from workflows.programs.border import border_light
+from workflows.programs.presets import preset
+
+PROGRAM = preset("sketch", 320, 240)
+LOOK_UP = table("srgb", np.dtype(np.uint16))
+
+
+class Film:
+    """What `BorderValues` needs of a stack: the border around a picture that changes at random."""
+
+    channels, height, width = 3, 60, 80
+
+    def __init__(self, exposures: NDArray[np.floating], border: bool = True, missing: int = 0) -> None:
+        random = np.random.default_rng(2)
+        self.frames = PROGRAM.count - missing
+        self.attributes: dict[str, Any] = {"patterns": list(range(missing, PROGRAM.count))}
+        light = np.repeat(random.uniform(0, 0.6, (self.frames, 60, 80, 1)), 3, axis=3)
+        if border:
+            lit = border_light(range(PROGRAM.count))[:, missing:] > 0
+            of_column = lit[np.arange(80) // 4 % len(lit)]  # a cell is four pixels wide
+            light[:, :5] = light[:, 55:] = np.where(of_column, 0.3, 0.03).T[:, np.newaxis, :, np.newaxis]
+        light *= np.asarray(exposures)[: self.frames, np.newaxis, np.newaxis, np.newaxis]
+        light += 0.002 * random.standard_normal(light.shape)
+        self.codes = np.interp(light, LOOK_UP, np.arange(65536)).round().astype(np.uint16)
+
+    def read(self, columns: slice) -> NDArray[np.uint16]:
+        return self.codes[:, :, columns]
+
+
+@pytest.mark.parametrize("missing", [0, 3])
+def test_exposures_are_followed_by_the_border(missing: int) -> None:
+    drift = np.exp(np.linspace(-0.05, 0.05, PROGRAM.count) + 0.1 * np.sin(np.arange(PROGRAM.count)))
+    found = BorderValues(Film(drift, missing=missing), PROGRAM).exposures(LOOK_UP)  # type: ignore[arg-type]
+    assert found is not None
+    true = drift[: PROGRAM.count - missing]
+    np.testing.assert_allclose(found, true / np.median(true), rtol=0.02)
+
+
+def test_frames_exposed_half_as_long_and_twice_are_followed() -> None:
+    steps = np.array([0.5, 1.0, 2.0])[np.arange(PROGRAM.count) % 3]
+    found = BorderValues(Film(steps), PROGRAM).exposures(LOOK_UP)  # type: ignore[arg-type]
+    assert found is not None
+    np.testing.assert_allclose(found / found[1], steps, rtol=0.03)
+
+
+def test_without_a_border_in_the_picture_nothing_is_said() -> None:
+    film = Film(np.ones(PROGRAM.count), border=False)
+    assert BorderValues(film, PROGRAM).exposures(LOOK_UP) is None  # type: ignore[arg-type]
+
+
+def test_white_is_the_unit_of_a_camera_that_was_not_locked() -> None:
+    """Patterns 0, 23 and 36 of the program are white."""
+    exposures = np.full(PROGRAM.count, 1.5)
+    exposures[[0, 23, 36]] = 0.6, 0.5, 0.5
+    found = relative_to_white(exposures, range(PROGRAM.count), PROGRAM)
+    np.testing.assert_allclose(found[[0, 1, 23]], [1.2, 3, 1])
+    without = relative_to_white(exposures[1:23], range(1, 23), PROGRAM)
+    np.testing.assert_array_equal(without, exposures[1:23])

@@ -1,0 +1,75 @@
+"""Films are read in a decoder: the same values, in bounded memory, and none that a taken over decoder makes up."""
+
+import io
+import sys
+from collections.abc import Iterator
+
+import av
+import numpy as np
+import pytest
+
+from storage.errors import CaptureError, Unavailable
+from tests.workflows.composite.video.test_steps import clip, even, pictures
+from tests.workflows.ingest.video.camera import fragmented, overstated
+from workflows.ingest import films
+from workflows.ingest.video.decoder import open_clip
+from workflows.ingest.video.frame_means import TOTAL_WEIGHT, Share, mean_frames
+from workflows.ingest.video.signatures import take_signatures
+from workflows.untrusted.decoder import Decoder
+
+IMAGE = 1 << 20
+FILM = clip(pictures(9), even(9))
+COUNTS_SAMPLES = av.library_versions["libavformat"] >= (63,)
+"""Whether FFmpeg knows by itself how many samples can be in a fragment at most."""
+
+
+@pytest.fixture
+def decoder() -> Iterator[Decoder]:
+    with Decoder(IMAGE) as decoder:
+        yield decoder
+
+
+def test_values_are_those_of_the_same_functions_here(decoder: Decoder) -> None:
+    file = io.BytesIO(FILM)
+    film, ticks, last = films.times(decoder, file, "film.mp4", 100)
+    with open_clip(io.BytesIO(FILM), "film.mp4", IMAGE) as here:
+        expected, expected_last = here.ticks(100)
+        np.testing.assert_array_equal(ticks, expected)
+        assert (last, film.width, film.height) == (expected_last, here.width, here.height)
+        assert (film.time_base, film.stated_duration, film.lost) == (here.time_base, here.stated_duration, [])
+    for every in (None, 0.2):
+        _, signatures, again, large = films.scan(decoder, file, "film.mp4", IMAGE, every)
+        with open_clip(io.BytesIO(FILM), "film.mp4", IMAGE) as here:
+            found = take_signatures(here, IMAGE, np.inf if every is None else every)
+        for one, other in zip((signatures, again, *large), (*found[:2], *found[2]), strict=True):
+            np.testing.assert_array_equal(one, other)
+            assert one.dtype == other.dtype
+    plan = [[Share(tick, TOTAL_WEIGHT)] for tick in ticks.tolist()]
+    means = films.means(decoder, file, "film.mp4", plan, film.width, film.height)
+    with open_clip(io.BytesIO(FILM), "film.mp4", IMAGE) as here:
+        for mean, expected_mean in zip(means, mean_frames(here, plan), strict=True):
+            np.testing.assert_array_equal(mean, expected_mean)
+
+
+def test_means_of_another_size_end_the_decoder(decoder: Decoder) -> None:
+    _, ticks, _ = films.times(decoder, io.BytesIO(FILM), "film.mp4", 100)
+    plan = [[Share(int(ticks[0]), TOTAL_WEIGHT)]]
+    with pytest.raises(Unavailable, match=r"film\.mp4 ended"):
+        list(films.means(decoder, io.BytesIO(FILM), "film.mp4", plan, 7, 7))
+    assert decoder.has_ended
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="it is Linux that limits what a process takes")
+@pytest.mark.parametrize(
+    ("film", "reason"),
+    [
+        (overstated(FILM, 40_000_000), "an index that takes too much memory"),
+        (fragmented(4_000_000), "cut off or damaged" if COUNTS_SAMPLES else "takes more than the 264 MB"),
+    ],
+    ids=["at once", "bit by bit"],
+)
+def test_film_of_a_few_kilobytes_does_not_take_gigabytes(decoder: Decoder, film: bytes, reason: str) -> None:
+    assert len(film) < 20_000
+    with pytest.raises(CaptureError, match=reason) as caught:
+        films.times(decoder, io.BytesIO(film), "film.mp4", 1000)
+    assert caught.value.fields["entry"] == "film.mp4"

@@ -1,0 +1,206 @@
+"""Read the film of a capture, or a clip, in a decoder."""
+
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
+from typing import Annotated, Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from workflows.ingest.video.decoder import Clip, open_clip
+from workflows.ingest.video.frame_means import Share, mean_frames
+from workflows.ingest.video.signatures import CELLS, LARGE_CELLS, LargeFrames, Signatures, take_signatures
+from workflows.untrusted.decoder import Decoder, blaming
+
+Positive = Annotated[int, Field(ge=1)]
+
+
+class Film(BaseModel):
+    """What is known of a film once all of it has been read; see `workflows.ingest.video.decoder.Clip`.
+
+    Attributes
+    ----------
+    width, height : int
+        Upright.
+    numerator, denominator : int
+        Length of a tick in seconds.
+    stated_duration : float
+        In seconds; 0 if none is stated.
+    interlaced : bool
+    lost : list of int
+        The first and the last time, in ticks, of the frames that could not be decoded; empty if all could be.
+    """
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
+
+    width: Positive
+    height: Positive
+    numerator: Positive
+    denominator: Positive
+    stated_duration: Annotated[float, Field(ge=0)]
+    interlaced: bool
+    lost: Annotated[list[int], Field(max_length=2)]
+
+    @property
+    def time_base(self) -> Fraction:
+        """Length of a tick in seconds, exactly."""
+        return Fraction(self.numerator, self.denominator)
+
+
+def scan(
+    decoder: Decoder, file: BinaryIO, entry: str, max_bytes: int, every: float | None
+) -> tuple[Film, Signatures, NDArray[np.int64], LargeFrames]:
+    """Read all of a film, for `workflows.ingest.video.matching`.
+
+    Parameters
+    ----------
+    max_bytes : int
+        Bytes that the signatures and large frames may take.
+    every : float, optional
+        Seconds between large frames; None for none.
+
+    Returns
+    -------
+    film : Film
+    signatures, ticks, large
+        As of `workflows.ingest.video.signatures.take_signatures`.
+
+    Raises
+    ------
+    CaptureError
+        If it can't be read, or has more frames than fit.
+    """
+    with blaming(entry, decoder):
+        arguments = {"entry": entry, "memory": decoder.image, "max_bytes": max_bytes, "every": every}
+        answers = decoder.run(_scan, file, **arguments)
+        with decoder.checking():
+            found, signatures, ticks, grey, frames = answers
+            film = Film.model_validate(found)
+            _require_grid(signatures, len(ticks), CELLS, 4)
+            _require_grid(grey, len(frames), LARGE_CELLS, 3)
+            _require_ascending(ticks)
+            if len(frames):
+                _require_ascending(frames)
+                if not 0 <= frames[0] <= frames[-1] < len(ticks):
+                    raise ValueError("a large frame is none of the film")
+            return film, signatures, ticks, LargeFrames(grey, frames.astype(np.intp))
+
+
+def times(
+    decoder: Decoder, file: BinaryIO, entry: str, max_frames: int
+) -> tuple[Film, NDArray[np.int64], int]:
+    """Read all of a film, to know when its frames are shown.
+
+    Returns
+    -------
+    film : Film
+    ticks, last
+        As of `workflows.ingest.video.decoder.Clip.ticks`.
+
+    Raises
+    ------
+    CaptureError
+        If it can't be read, or has more than ``max_frames``.
+    """
+    with blaming(entry, decoder):
+        answers = decoder.run(_times, file, entry=entry, memory=decoder.image, max_frames=max_frames)
+        with decoder.checking():
+            found, ticks, last = answers
+            _require_ascending(ticks)
+            if last.shape != (1,) or last[0] < 0 or len(ticks) > max_frames:
+                raise ValueError("the times of the frames are wrong")
+            return Film.model_validate(found), ticks, int(last[0])
+
+
+def means(
+    decoder: Decoder, file: BinaryIO, entry: str, plan: Sequence[Sequence[Share]], width: int, height: int
+) -> Iterator[NDArray[np.uint16]]:
+    """Weighted means of frames, see `workflows.ingest.video.frame_means.mean_frames`.
+
+    Parameters
+    ----------
+    width, height : int
+        Size of the frames, upright.
+
+    Raises
+    ------
+    CaptureError
+        If a frame can't be decoded again.
+    """
+    with blaming(entry, decoder):
+        answers = decoder.run(_means, file, entry=entry, memory=decoder.image, plan=plan)
+        for _ in plan:
+            with decoder.checking():
+                mean = next(answers, None)
+                if (
+                    not isinstance(mean, np.ndarray)
+                    or mean.dtype != np.uint16
+                    or mean.shape != (height, width, 3)
+                ):
+                    raise ValueError("a mean is missing, or has another size")
+            yield mean
+        with decoder.checking():
+            () = answers
+
+
+def _require_grid(values: Any, count: int, most: tuple[int, int], dimensions: int) -> None:
+    """Check small copies of frames: so many, with at most so many columns and rows."""
+    if not isinstance(values, np.ndarray) or values.dtype != np.uint8 or values.ndim != dimensions:
+        raise ValueError("small copies of frames are of the wrong kind")
+    number, rows, columns, *channels = values.shape
+    if number != count or columns > most[0] or rows > most[1] or channels not in ([], [3]):
+        raise ValueError("small copies of frames are of the wrong size")
+
+
+def _require_ascending(values: Any) -> None:
+    if not isinstance(values, np.ndarray) or values.dtype != np.int64 or values.ndim != 1:
+        raise ValueError("these are no times or indices")
+    if not len(values) or (values[1:] <= values[:-1]).any():
+        raise ValueError("times or indices do not ascend")
+
+
+# What follows runs in a decoder.
+
+
+def _scan(
+    file: BinaryIO, entry: str, memory: int, max_bytes: int, every: float | None
+) -> Iterator[dict[str, Any] | NDArray[Any]]:
+    with open_clip(file, entry, memory) as clip:
+        found = take_signatures(clip, max_bytes, np.inf if every is None else every)
+        signatures, ticks, large = found
+        yield _film(clip, ticks)
+    yield signatures
+    yield ticks
+    yield large.grey
+    yield large.frames.astype(np.int64)
+
+
+def _times(
+    file: BinaryIO, entry: str, memory: int, max_frames: int
+) -> Iterator[dict[str, Any] | NDArray[Any]]:
+    with open_clip(file, entry, memory) as clip:
+        ticks, last = clip.ticks(max_frames)
+        yield _film(clip, ticks)
+    yield ticks
+    yield np.array([last], np.int64)
+
+
+def _means(
+    file: BinaryIO, entry: str, memory: int, plan: list[list[list[int]]]
+) -> Iterator[NDArray[np.uint16]]:
+    with open_clip(file, entry, memory) as clip:
+        yield from mean_frames(clip, [[Share(*share) for share in shares] for shares in plan])
+
+
+def _film(clip: Clip, ticks: NDArray[np.int64]) -> dict[str, Any]:
+    lost = sorted({at for at in clip.lost if at >= ticks[0]} - set(ticks.tolist()))
+    return {
+        "width": clip.width,
+        "height": clip.height,
+        "numerator": clip.time_base.numerator,
+        "denominator": clip.time_base.denominator,
+        "stated_duration": max(clip.stated_duration, 0.0),
+        "interlaced": clip.interlaced,
+        "lost": [lost[0], lost[-1]] if lost else [],
+    }

@@ -1,0 +1,105 @@
+"""How the exposure of a film changed from pattern to pattern, by the border, whose light is known."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.layout.captures import Stack
+from workflows.programs.border import border_light
+from workflows.programs.program import Program
+
+STRIPS, WIDE = 8, 4
+"""Columns of the frame that are searched for the border, and how many pixels each is wide."""
+ROUNDS = 8
+"""Rounds of fitting the light of the border and the exposures, one given the other."""
+FOLLOWS = (0.5, 0.7)
+"""A value sees the border if the bits explain this share of its variance: in the first rounds, and then."""
+VARIES = 0.01
+"""It must vary by this share of what the 99th percentile of all values varies by."""
+MIN_VALUES = 40
+"""Values that see the border, at least."""
+SHOULDER = 0.93
+"""Codes from here on are left out: cameras compress what is nearly white."""
+LEAST = 0.01
+"""Light below which a value says nothing."""
+TRIFLE = 0.003
+"""A standard deviation of the exposures below this is none."""
+
+Doubles = NDArray[np.float64]
+
+
+class BorderValues:
+    """Values that may see the border of a film, in all frames.
+
+    Parameters
+    ----------
+    stack : Stack
+    program : Program
+    """
+
+    def __init__(self, stack: Stack, program: Program) -> None:
+        left = [int((n + 0.5) * stack.width / STRIPS) for n in range(STRIPS)]
+        strips = [stack.read(columns=slice(x, x + WIDE)) for x in left]
+        codes = np.concatenate([strip.reshape(stack.frames, -1, stack.channels) for strip in strips], axis=1)
+        top = np.iinfo(codes.dtype).max
+        self.codes = codes
+        self.usable = np.asarray(((codes > 0) & (codes < SHOULDER * top)).all(axis=2))
+        bits = border_light(range(program.count))[:, stack.attributes["patterns"]]
+        self.design = np.concatenate([np.ones((1, stack.frames)), bits]).T
+
+    def exposures(self, look_up: NDArray[np.float32]) -> Doubles | None:
+        """The exposure of each frame, (frames,) float64, their median 1; None if too few values see the border.
+
+        Parameters
+        ----------
+        look_up : (k,) float32
+            The light of each code.
+
+        Notes
+        -----
+        What a value sees of the border is linear in the bits of the pattern's number, times the exposure g of the
+        frame: ``v = g (a_0 + sum_b a_b B_b)``. The amounts a are fitted to v / g, and g to the light that they predict,
+        in turn. Values that are clipped, or nearly, are filled in by what is predicted.
+        """
+        light = look_up[self.codes].mean(axis=2, dtype=np.float64)
+        frames, terms = self.design.shape
+        inverse = np.linalg.pinv(self.design)
+        exposure = np.ones(frames)
+        predicted = self.design @ (inverse @ light)
+        for turn in range(ROUNDS):
+            even = np.where(self.usable, light / exposure[:, np.newaxis], predicted)
+            predicted = self.design @ (inverse @ even)
+            whole, rest = np.var(even, axis=0), np.var(even - predicted, axis=0)
+            unexplained = rest / np.maximum(whole, 1e-12) * (frames - 1) / (frames - terms)
+            varies = whole > VARIES * np.quantile(whole, 0.99)
+            follows = unexplained < 1 - (FOLLOWS[0] if turn <= ROUNDS // 3 else FOLLOWS[1])
+            border = np.flatnonzero(follows & varies & (predicted.min(axis=0) > -LEAST))
+            if border.size < MIN_VALUES:
+                return None
+            seen = predicted[:, border]
+            weight = np.where(self.usable[:, border] & (seen > LEAST), seen, 0)
+            total = (weight * seen).sum(axis=1)
+            exposure = np.where(
+                total > 0, (weight * light[:, border]).sum(axis=1) / np.maximum(total, 1e-12), 1
+            )
+            exposure = np.maximum(exposure / np.median(exposure), 1e-3)
+        return exposure
+
+
+def relative_to_white(exposures: Doubles, patterns: Sequence[int], program: Program) -> Doubles:
+    """Exposures in units of the shortest of a white monitor; unchanged if no frame shows one.
+
+    For a camera that was not locked, whose usual exposure is that of patterns, which are darker: composites with
+    bright backdrops would exceed full scale.
+
+    Parameters
+    ----------
+    exposures : (frames,) float64
+    patterns : (frames,) sequence of int
+        What each frame shows.
+    program : Program
+    """
+    numbers, sent = program.constants
+    white = np.isin(patterns, numbers[(sent == 1).all(axis=1)])
+    return exposures / exposures[white].min() if white.any() else exposures

@@ -1,0 +1,189 @@
+"""The camera's tone curve, from half-tones: frames whose light is known although the monitor's curve is not."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workflows.images.tone_curves import SAMPLES, Curve, Sampled, to_light
+
+KNOTS = 13
+"""Knots of the curve."""
+BINS = 40
+"""Groups of values of about the same brightness, each of which gives an equation for each half-tone."""
+MIN_CONTRAST = 0.05
+"""Difference of the codes of white and black from which a value counts."""
+MIN_VALUES = 400
+"""Values that are needed,"""
+REACH = 0.25
+"""and the code that the brightest must reach."""
+FURTHEST = 0.35
+"""Largest error of a half-tone, of white's light, with which a value counts at first, when sRGB is assumed,"""
+OUTLIER = 4.0
+"""and then, times the median error."""
+AGREES = 0.01
+"""Error of half-tones, as a share of white, with which a named curve is right."""
+LOST = {0.25: 0.087, 0.5: 0.159, 0.75: 0.089}
+"""Share of white's light that each half-tone loses by bilinear interpolation of codes at a gamma of 2.2; from 67 to
+300 % it differs by less than a fifth, and bicubic interpolation loses a fifth less."""
+CLEARLY = 0.75
+"""Half-tones are scaled if what is left unexplained is then below this share of what is left otherwise."""
+SMOOTH = 0.02
+"""Weight of the curvature of the slopes; it decides where no value is."""
+DARK = 0.02
+"""Light below which relative errors count no more."""
+
+Floats = NDArray[np.float32]
+
+
+class Shown(NamedTuple):
+    """Frames of one light: codes, 0 to 1, of n pixels and channels, (frames, n) float32, and the exposure of each."""
+
+    codes: Floats
+    exposures: NDArray[np.float64]
+
+
+class HalfTones(NamedTuple):
+    """What the camera saw of a black and a white monitor, and of half-tones with some shares of white's light."""
+
+    black: Shown
+    white: Shown
+    tones: Sequence[Shown]
+    shares: Sequence[float]
+
+
+class Fitted(NamedTuple):
+    """What half-tones tell: the camera's curve, and whether the monitor showed them at another size.
+
+    ``curve`` is a named curve if it explains the half-tones within 1 %, else samples. It is None if there are too few
+    values, or all are dark.
+    """
+
+    curve: Curve | None
+    scaled: bool
+
+
+def fit_camera_curve(seen: HalfTones) -> Fitted:
+    """Fit the curve from code to light to half-tones.
+
+    Notes
+    -----
+    With light F(u) of the code u, a half-tone with share t is seen as ``F(u_t) = (1 - t) F(u_black) + t F(u_white)``,
+    whatever the pixel sees of the monitor and the room. Light is that of one exposure, and the mean of several frames.
+    Since pixels differ in brightness, t = 1/2 alone determines F from white down to the darkest. F is that of sRGB with
+    its slope multiplied by a piecewise linear function, w >= 0 at the knots, so that F is monotone and the equations
+    are linear in w; ``F(1) = 1`` sets the scale. They are solved by non-negative least squares, with a small penalty on
+    the second differences of w. Each equation is a mean over values of about the same white, because noise and dots
+    that the camera partly resolves would otherwise pull towards a curve that hides them.
+
+    A page at another zoom, or a player, interpolates between the codes of black and white dots, which are less than
+    the mean light. The share that is lost, `LOST`, hardly depends on the size, and is least where dots are fewest, so
+    that it is no tone curve: the half-tones are taken as scaled if they, and a smooth curve, then agree better.
+    """
+    as_made, as_scaled = _fit(seen), _fit(seen._replace(shares=_scaled(seen.shares)))
+    if as_made is None or as_scaled is None:
+        return Fitted(as_made and as_made[0], scaled=False)
+    scaled = as_scaled[1] < CLEARLY * as_made[1]
+    return Fitted((as_scaled if scaled else as_made)[0], scaled)
+
+
+def are_scaled(seen: HalfTones, look_up: Floats) -> bool:
+    """Whether the monitor showed half-tones at another size, if the light of each code, (k,) from 0 to 1, is known."""
+    low, high, *tones = (_light_of(shown, look_up) for shown in (seen.black, seen.white, *seen.tones))
+    used = (high - low > MIN_CONTRAST) & (seen.white.codes < 1).all(axis=0)
+    if np.count_nonzero(used) < MIN_VALUES:
+        return False
+    shares = np.array([np.median((tone - low)[used] / (high - low)[used]) for tone in tones])
+    misfit = [np.linalg.norm(shares - expected) for expected in (seen.shares, _scaled(seen.shares))]
+    return bool(misfit[1] < CLEARLY * misfit[0])
+
+
+def _scaled(shares: Sequence[float]) -> list[float]:
+    return [share - LOST[share] for share in shares]
+
+
+def _fit(seen: HalfTones) -> tuple[Curve, float] | None:
+    """The curve, and how far it is from the half-tones and from smooth; None if there are too few values."""
+    black, white, tones, shares = seen
+    ends = np.concatenate([black.codes, white.codes])
+    grey = np.concatenate([shown.codes for shown in tones])
+    contrast = white.codes.mean(axis=0) - black.codes.mean(axis=0)
+    used = (
+        (grey > 0).all(axis=0) & (grey < 1).all(axis=0) & (ends < 1).all(axis=0) & (contrast > MIN_CONTRAST)
+    )
+    basis, light = _basis(), to_light(np.linspace(0, 1, SAMPLES, dtype=np.float32), "srgb").astype(np.float64)
+    for furthest in (FURTHEST, None):
+        # The border of a film, a hand, a reflection: what does not follow the half-tones is no part of the monitor.
+        low, high = _light_of(black, light), _light_of(white, light)
+        off = np.max(
+            [
+                np.abs((_light_of(shown, light) - low) / np.maximum(high - low, 1e-6) - share)
+                for shown, share in zip(tones, shares, strict=True)
+            ],
+            axis=0,
+        )
+        kept = used & (off < (furthest or OUTLIER * np.median(off[used])))
+        if np.count_nonzero(kept) < MIN_VALUES or np.quantile(white.codes[0, kept], 0.99) < REACH:
+            return None
+        equations = _equations(seen, np.flatnonzero(kept))
+        weights, left = _solve(equations @ basis, basis[-1:])
+        light = np.maximum.accumulate(basis @ weights)
+    codes = np.linspace(0, 1, SAMPLES, dtype=np.float32)
+    named: list[Curve] = ["linear", "srgb"]
+    misfit = [float(np.sqrt(np.mean((equations @ to_light(codes, curve)) ** 2))) for curve in named]
+    if min(misfit) < AGREES:
+        return named[int(np.argmin(misfit))], left
+    return Sampled(light=tuple((light / light[-1]).round(6).tolist())), left
+
+
+def _light_of(shown: Shown, light: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The mean light of frames by the samples of a curve, (n,)."""
+    found = np.interp(shown.codes, np.linspace(0, 1, len(light)), light) / shown.exposures[:, np.newaxis]
+    mean: NDArray[np.float64] = found.mean(axis=0)
+    return mean
+
+
+def _equations(seen: HalfTones, kept: NDArray[np.intp]) -> NDArray[np.float64]:
+    """The relative error of each half-tone in each group of values, by the samples of the curve: (k, SAMPLES)."""
+    black, white, tones, shares = seen
+    level = white.codes.mean(axis=0)
+    rows = []
+    for group in np.array_split(kept[np.argsort(level[kept], kind="stable")], BINS):
+        bright = to_light(level[group], "srgb").mean() + DARK
+        low, high = _mean_at(black, group), _mean_at(white, group)
+        rows += [
+            (_mean_at(shown, group) - (1 - share) * low - share * high) / bright
+            for shown, share in zip(tones, shares, strict=True)
+        ]
+    return np.array(rows)
+
+
+def _solve(rows: NDArray[np.float64], end: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """The weight of each knot, (KNOTS,), from equations and the light at the end, and the length of the residual."""
+    from scipy.optimize import nnls  # takes half a second to import
+
+    curved = SMOOTH * np.sqrt(len(rows) / KNOTS) * np.diff(np.eye(KNOTS), 2, axis=0)
+    A = np.concatenate([rows, curved, 1e3 * end])
+    weights, left = nnls(A, np.concatenate([np.zeros(len(A) - 1), [1e3]]))
+    return weights, float(left)
+
+
+def _basis() -> NDArray[np.float64]:
+    """The light at each sample of the curve for a weight of 1 at each knot, (SAMPLES, KNOTS)."""
+    codes = np.linspace(0, 1, SAMPLES, dtype=np.float32)
+    rise = np.diff(to_light(codes, "srgb").astype(np.float64))
+    middle = (codes[1:] + codes[:-1]) / 2
+    knots = np.linspace(0, 1, KNOTS)
+    hats = np.stack([np.interp(middle, knots, row) for row in np.eye(KNOTS)], axis=1)
+    return np.concatenate([np.zeros((1, KNOTS)), np.cumsum(rise[:, np.newaxis] * hats, axis=0)])
+
+
+def _mean_at(shown: Shown, values: NDArray[np.intp]) -> NDArray[np.float64]:
+    """The weight of each sample of a curve in the mean light of some values, (SAMPLES,)."""
+    place = np.clip(shown.codes[:, values], 0, 1).astype(np.float64) * (SAMPLES - 1)
+    below = np.minimum(place.astype(np.intp), SAMPLES - 2)
+    part, over = place - below, 1 / (shown.exposures[:, np.newaxis] * place.size)
+    lower = np.bincount(below.ravel(), ((1 - part) * over).ravel(), SAMPLES)
+    upper = np.bincount(below.ravel() + 1, (part * over).ravel(), SAMPLES)
+    return np.asarray(lower + upper, np.float64)
