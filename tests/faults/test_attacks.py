@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from statistics import median
 
 import httpx2
 import numpy as np
@@ -25,6 +24,7 @@ from storage.layout.captures import create_stack, write_slab
 from storage.objects.store import Objects
 from storage.records import api_keys, captures
 from tests.end_to_end.conftest import Service, serving
+from tests.faults.callers import PATIENCE
 from tests.parts.background import repeating
 from tests.parts.hostile_mattes import hostile_archive
 from tests.parts.processes import running
@@ -192,11 +192,10 @@ def measure(attacked: Attacked, *paths: str, seconds: float = SECONDS) -> Figure
 
 
 def check(figures: Figures) -> None:
-    """Bounds that hold on a machine with something else to do as well, where a single request may wait for a core."""
+    """Others are answered, if late on a machine with something else to do: without bounds they never were."""
     assert figures.peak < 1 << 30
     for name, taken in figures.seconds.items():
-        assert median(taken) < 1, name
-        assert max(taken) < 10, name
+        assert max(taken) < PATIENCE, name
     # A caller may have to wait for its turn longer than it has patience.
     assert figures.answers.keys() <= {"200", "TimeoutError"}, figures.answers
 
