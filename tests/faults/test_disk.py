@@ -131,6 +131,7 @@ def check_full(service: Service) -> None:
     assert "full" in service.http.get("/readyz").json()["database"]
 
 
+@pytest.mark.slow
 def test_full_disk_can_be_left_by_calls(tmp_path: Path, capture_archive: Path) -> None:
     with (
         small_disk(tmp_path / "disk", STORE) as disk,

@@ -65,7 +65,7 @@ class Target:
     make: Callable[[Random, Any], bytes]
     run: Callable[[bytes, Path], object]
     valid: Callable[[], Any] = tuple
-    quick: int = 300
+    quick: int = 100
     memory: int = MEMORY
 
     def input(self, seed: int, valid: Any = None) -> bytes:

@@ -50,7 +50,7 @@ def target(
     make: Callable[[Random, Any], bytes],
     read: Callable[[bytes, Path], object],
     valid: Callable[[], Any] = tuple,
-    quick: int = 300,
+    quick: int = 100,
     memory: int = MEMORY,
 ) -> Target:
     return Target(name, make, partial(refusing, read), valid, quick, memory)
@@ -63,7 +63,7 @@ ALL = (
     target("options", headers.make_options, headers.read_options),
     target("headers", headers.make_headers, headers.read_headers, quick=1000),
     target("url", headers.make_url, headers.read_url, quick=1000),
-    target("requests", requests.make, requests.read, requests.compile_kernels, quick=100),
+    target("requests", requests.make, requests.read, requests.compile_kernels, quick=60),
     target("png", of_files(rb"IHDR|PLTE|IDAT|tRNS|iCCP", changes.damaged_png), images.read_image, seeds.pngs),
     target("jpeg", of_files(rb"\xff[\xc0-\xff]"), images.read_image, seeds.jpegs),
     target("tiff", of_files(None, changes.damaged_tiff), images.read_image, seeds.tiffs),

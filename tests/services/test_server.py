@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 
 def loaded_by(*modules: str) -> set[str]:
     """Names of all modules that a new process has after it imported some."""
@@ -19,5 +21,6 @@ def test_no_route_is_imported_before_the_app() -> None:
     assert not loaded & {"fastapi", "uvicorn"}
 
 
+@pytest.mark.slow
 def test_routes_are_imported_with_the_app() -> None:
     assert {"services.api.captures.captures", "fastapi"} <= loaded_by("services.api.app")

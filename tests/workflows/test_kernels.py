@@ -74,7 +74,7 @@ def test_every_kernel_releases_the_interpreter_lock() -> None:
     assert not [kernel.py_func.__name__ for kernel in kernels if not kernel.targetoptions.get("nogil")]
 
 
-@pytest.mark.parametrize("named", [True, False])
+@pytest.mark.parametrize("named", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_the_folder_of_the_cache_is_named(
     named: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

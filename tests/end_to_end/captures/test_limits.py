@@ -76,6 +76,7 @@ def send_unfinished(service: Service, request: str, size: int, seconds: float, *
             return 0
 
 
+@pytest.mark.slow
 def test_unfinished_bodies_stay_within_the_limit(limited: list[Service]) -> None:
     requests = ["POST /v1/captures", "POST /v1/captures", "POST /v1/mattes"] * 2
     send = partial(send_unfinished, size=LIMIT // 2, seconds=2, Content_Type="application/zip")

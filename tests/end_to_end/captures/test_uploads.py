@@ -35,6 +35,7 @@ def test_full_disk_is_reported_and_loses_nothing(tmp_path: Path) -> None:
         assert patch(service, where, 4 << 20, b"a" * (16 << 20)).headers["upload-offset"] == str(20 << 20)
 
 
+@pytest.mark.slow
 def test_bytes_before_a_broken_connection_are_kept(service: Service) -> None:
     before = uploads_of(service)
     where = create(service, 4 << 20)

@@ -96,6 +96,7 @@ def test_cancelled_job_leaves_nothing(service: Service, capture: str) -> None:
     assert service.client.cancel(job["id"])["state"] == "cancelled"
 
 
+@pytest.mark.slow
 def test_job_cancelled_while_waiting_leaves_nothing(service: Service, capture_archive: Path) -> None:
     uploaded = service.client.upload(capture_archive)
     job = service.client.recover(uploaded["id"])
@@ -167,6 +168,7 @@ def test_killed_worker_changes_no_byte(service: Service, matte: str, capture: st
     assert files_of(service, ended["matte"]) == files_of(service, matte)
 
 
+@pytest.mark.slow
 def test_damaged_matte_is_reported(service: Service, capture: str) -> None:
     job = service.client.wait(service.client.recover(capture, tile=48)["id"])
     folder = service.data / "store" / "mattes" / job["matte"]
@@ -220,6 +222,7 @@ def test_stopped_server_leaves_no_process(
         assert alive == []
 
 
+@pytest.mark.slow
 def test_second_service_on_the_same_folder_is_refused(service: Service) -> None:
     command = [sys.executable, "-m", "services", "serve", "--data", str(service.data), "--port", "0"]
     second = subprocess.run(command, capture_output=True, text=True, timeout=300)

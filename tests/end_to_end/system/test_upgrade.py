@@ -49,6 +49,7 @@ def exported(client: Client, matte: str, target: Path) -> str:
     return hashlib.sha256(target.read_bytes()).hexdigest()
 
 
+@pytest.mark.slow
 def test_folder_of_0_1_0_opens_and_its_jobs_continue(facts: dict[str, Any], tmp_path: Path) -> None:
     data = tmp_path / "data"
     interrupted = data / "store" / "mattes" / facts["interrupted_matte"]

@@ -21,6 +21,7 @@ from workflows.programs.preset_names import PRESETS
 from workflows.programs.program import Program
 
 
+@pytest.mark.slow
 def test_from_a_capture_to_a_composite(service: Service, capture_archive: Path, tmp_path: Path) -> None:
     uploaded = envmatte(service, "upload", str(capture_archive), "--name", "by hand")
     assert uploaded.returncode == 0, uploaded.stderr
@@ -67,6 +68,7 @@ def test_wrong_command_line_has_exit_code_2(service: Service) -> None:
         assert envmatte(service, *arguments).returncode == 2
 
 
+@pytest.mark.slow
 def test_interrupt_stops_waiting_but_not_the_job(service: Service, capture: str) -> None:
     command = [sys.executable, "-m", "services", "recover", capture, "--url", service.url]
     newest = service.http.get("/v1/jobs?limit=1").json()["jobs"][0]["id"]
@@ -155,6 +157,7 @@ def test_invalid_patterns_are_refused(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_film_of_a_preset_and_of_its_record(tmp_path: Path) -> None:
     film = tmp_path / "new" / "sketch.mp4"
     done = patterns("sketch", str(film), "--monitor", "320x240", "--rate", "10", "--json")
@@ -176,6 +179,7 @@ def test_film_of_a_preset_and_of_its_record(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("out", "first"), [("patterns", "1 of 432"), ("patterns.mkv", "1 of 442")])
+@pytest.mark.slow
 def test_interrupted_patterns_leave_nothing(out: str, first: str, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "services", "patterns", "paper-400", str(tmp_path / out)]
     with running(command) as writing:

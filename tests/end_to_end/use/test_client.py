@@ -11,6 +11,7 @@ from workflows.images import float_formats, integer_formats
 from workflows.simulation import glass_ball
 
 
+@pytest.mark.slow
 def test_from_a_file_to_an_array(service: Service, capture_archive: Path) -> None:
     sent_so_far: list[tuple[int, int]] = []
     with Client(service.url) as client:

@@ -138,6 +138,7 @@ def test_repeated_post_with_one_key_creates_once(
     service.client.cancel(jobs.pop())
 
 
+@pytest.mark.slow
 def test_deleting_leaves_nothing(service: Service, capture_archive: Path) -> None:
     uploaded = service.client.upload(capture_archive)
     job = service.client.wait(service.client.recover(uploaded["id"], quality="fast")["id"])
@@ -169,6 +170,7 @@ def test_options_are_described(service: Service) -> None:
     assert all(option["description"] for option in options.values())
 
 
+@pytest.mark.slow
 def test_program_of_images_gives_the_same_matte(
     service: Service, matte: str, scene: Scene, program: Program, tmp_path: Path
 ) -> None:

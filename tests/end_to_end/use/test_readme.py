@@ -166,6 +166,7 @@ def test_from_a_film_to_composites(home: Home) -> None:
         assert np.std(made["film"], axis=0).mean() > 0.05
 
 
+@pytest.mark.slow
 def test_service_scales_to_three_machines(capture_archive: Path, tmp_path: Path) -> None:
     port = free_port()
     first, others = (

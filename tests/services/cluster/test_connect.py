@@ -98,6 +98,7 @@ def client(cluster: Cluster) -> Iterator[Client]:
         yield client
 
 
+@pytest.mark.slow
 def test_sockets_accept_only_certificates_of_the_cluster(cluster: Cluster, client: Client) -> None:
     own = {urlsplit(name).port for name in client.nthreads()}
     info = client.scheduler_info(n_workers=-1)["workers"].values()
@@ -162,6 +163,7 @@ def test_workers_join_a_restarted_scheduler(cluster: Cluster, client: Client) ->
     assert busy.status != "finished"
 
 
+@pytest.mark.slow
 def test_finished_tasks_leave_almost_nothing_in_memory(cluster: Cluster, client: Client) -> None:
     """Each is submitted alone, like the last tiles of a job."""
 

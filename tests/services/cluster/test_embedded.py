@@ -73,6 +73,7 @@ def test_another_user_of_this_machine_cannot_join(
     assert done.stdout.splitlines() == [f"{port} False" for port in ports]
 
 
+@pytest.mark.slow
 def test_worker_is_replaced_although_the_next_fork_server_dies_too(cluster: LocalCluster) -> None:
     def fork_servers() -> list[psutil.Process]:
         mine = psutil.Process().children()

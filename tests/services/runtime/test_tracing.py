@@ -141,6 +141,7 @@ def test_a_sampler_is_honoured() -> None:
         assert spans(collector, OTEL_SERVICE_NAME="ours") == ["ours"] * 20
 
 
+@pytest.mark.slow
 def test_an_unreachable_collector_does_not_slow_the_work() -> None:
     printed = run(
         f"""

@@ -84,6 +84,7 @@ def test_nothing_is_sent_to_an_address_that_is_not_public(engine: Engine) -> Non
         assert found.received == []
 
 
+@pytest.mark.slow
 def test_slow_receivers_do_not_delay_others(engine: Engine) -> None:
     token = lease(engine)
 

@@ -247,7 +247,10 @@ HOSTILE: tuple[tuple[str, str, Any], ...] = (
 
 
 @pytest.mark.parametrize("url", ["sqlite"], indirect=True)
-@pytest.mark.parametrize(("table", "column", "value"), HOSTILE)
+@pytest.mark.parametrize(
+    ("table", "column", "value"),
+    [HOSTILE[0], *(pytest.param(*row, marks=pytest.mark.slow) for row in HOSTILE[1:])],
+)
 def test_row_that_the_service_would_stumble_over_is_refused(
     table: str,
     column: str,
@@ -268,6 +271,7 @@ def test_row_that_the_service_would_stumble_over_is_refused(
 
 
 @pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+@pytest.mark.slow
 def test_killed_restore_can_be_repeated(
     engine: Engine, filled: Objects, target: Objects, elsewhere: tuple[Engine, Objects]
 ) -> None:

@@ -137,13 +137,14 @@ def test_visible_part_of_an_enlarged_backdrop_equals_that_of_the_whole(
     assert found.std() > 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shape", "dtype"),
     [
         ((3000, 4000, 3), "uint8"),
-        pytest.param((3000, 4000, 4), "uint8", marks=pytest.mark.slow),
-        pytest.param((2000, 3000, 3), "uint16", marks=pytest.mark.slow),
-        pytest.param((2000, 3000, 1), "float32", marks=pytest.mark.slow),
+        ((3000, 4000, 4), "uint8"),
+        ((2000, 3000, 3), "uint16"),
+        ((2000, 3000, 1), "float32"),
     ],
 )
 def test_large_backdrop_takes_little_more_than_its_own_memory(

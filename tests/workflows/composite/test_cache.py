@@ -69,6 +69,7 @@ def test_least_recently_used_strips_are_dropped(
     assert len(reads) == 5
 
 
+@pytest.mark.slow
 def test_matte_of_twice_the_memory_is_read(objects: Objects, matte: Matte) -> None:
     memory = 2 * (read_strip(matte, 0, 0).nbytes + read_strip(matte, 0, 1).nbytes)
     cache = Cache(objects, memory)

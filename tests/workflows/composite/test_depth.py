@@ -78,6 +78,7 @@ def psnr(scene: Scene, seen: np.ndarray, backdrop: np.ndarray, where: np.ndarray
     return float(-10 * np.log10(np.mean(error[where] ** 2)))
 
 
+@pytest.mark.slow
 def test_second_matte_gives_the_rays(
     made: dict[float, Matte], scenes: dict[float, Scene], backdrop: np.ndarray
 ) -> None:

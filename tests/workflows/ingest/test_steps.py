@@ -234,6 +234,7 @@ def test_measured_noise_is_that_of_the_camera(ingest: Ingest) -> None:
         assert deviation == pytest.approx(2 * (0.002 + 0.006 * value**0.5), rel=0.25)
 
 
+@pytest.mark.slow
 def test_stack_over_the_limit_is_refused(make_zip: Zip, ingest: Ingest) -> None:
     # One small file, named by a hundred thousand frames.
     flat = encode_png(np.full((100, 100, 3), 9, np.uint8))

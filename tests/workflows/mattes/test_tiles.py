@@ -216,6 +216,7 @@ def test_a_damaged_stack_is_corrupt(
     assert run(STEPS, objects, task, FINISH)[1] == {"missing": list(range(plan["tiles"]))}
 
 
+@pytest.mark.slow
 def test_frames_that_are_moved_back_are_the_same_in_any_tile(
     ingest: Callable[..., Stack], objects: Objects, digests: Digests, archives: dict[bool, bytes]
 ) -> None:
@@ -266,6 +267,7 @@ def bracketed(data: bytes, exposures: tuple[float, ...]) -> bytes:
     return target.getvalue()
 
 
+@pytest.mark.slow
 def test_exposures_are_merged_by_their_weight(objects: Objects, ingest: Ingest) -> None:
     scene = glass_ball(44, 36, monitor=(64, 48), rays=4)
     program = nested_program((64, 48), bands=((4, 3, 14), (8, 6, 10)), levels=5)

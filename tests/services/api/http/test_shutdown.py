@@ -28,7 +28,7 @@ with config.bind_socket() as bound:
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
 def test_process_ends_in_time_whatever_its_threads_are_doing(number: signal.Signals) -> None:
     with running([sys.executable, "-c", SERVER]) as process:
         assert process.stdout is not None

@@ -127,6 +127,7 @@ def test_answers_that_nobody_takes_are_held_on_disk_and_given_up(
         assert len(rest(one)) < len(whole.content) // 2
 
 
+@pytest.mark.slow
 def test_client_that_reads_single_bytes_is_disconnected(served: Served) -> None:
     with served.connected(get(f"/v1/mattes/{served.matte}/layers/S.exr")) as one:
         until(lambda: one.recv(1) and served.count == 0)
@@ -212,6 +213,7 @@ def test_upload_keeps_the_bytes_that_came_before_the_disconnect(served: Served) 
     until(lambda: offset() == "3000")
 
 
+@pytest.mark.slow
 def test_slow_client_that_keeps_sending_is_served(served: Served) -> None:
     size = 1_000_000
     sent = head("POST", f"/v1/mattes/{served.matte}/composite", Connection="close")
@@ -224,6 +226,7 @@ def test_slow_client_that_keeps_sending_is_served(served: Served) -> None:
     assert time.monotonic() - started > 2 * CHECK_SECONDS
 
 
+@pytest.mark.slow
 def test_stream_without_events_stays_open(served: Served) -> None:
     program = httpx2.post(f"http://127.0.0.1:{served.port}/v1/programs", json={"preset": "sketch"}).json()
     with served.connected(get(f"/v1/programs/{program['id']}/events")) as one:

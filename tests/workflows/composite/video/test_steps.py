@@ -192,6 +192,7 @@ def test_linear_codes_are_light(make: Make, matte: Matte) -> None:
     assert np.sqrt(np.mean((made[0][10:HEIGHT, 10:WIDTH] / 255 - expected) ** 2)) < 0.03
 
 
+@pytest.mark.slow
 def test_order_and_repetition_of_segments_do_not_change_the_video(make: Make) -> None:
     data = clip(pictures(50), even(50))
     first = make(data)
@@ -210,7 +211,9 @@ def test_video_can_be_played_while_it_loads_and_states_its_colours(make: Make) -
     assert frame.color_range == ColorRange.MPEG
 
 
-@pytest.mark.parametrize("container", ["mp4", "mov", "matroska"])
+@pytest.mark.parametrize(
+    "container", ["mp4", *(pytest.param(other, marks=pytest.mark.slow) for other in ("mov", "matroska"))]
+)
 def test_times_are_kept_however_they_vary(make: Make, container: str) -> None:
     steps = np.random.default_rng(3).integers(1, 40, 69)
     ticks = [0, *(np.cumsum(steps) * 3).tolist()]  # of 1/200 s, which Matroska's milliseconds hold

@@ -81,8 +81,9 @@ def test_a_white_that_is_clipped_asks_for_less_exposure(ingest: Ingest, capture_
 
 @pytest.mark.parametrize(
     ("gain", "level", "more"),
-    [(0.4, "warning", "a stop more"), pytest.param(0.1, "bad", "3 stops more", marks=pytest.mark.slow)],
+    [(0.4, "warning", "a stop more"), (0.1, "bad", "3 stops more")],
 )
+@pytest.mark.slow
 def test_a_dark_white_asks_for_more_exposure(
     ingest: Ingest, capture_archive: bytes, gain: float, level: str, more: str
 ) -> None:
@@ -137,6 +138,7 @@ def test_a_curve_that_is_assumed_is_a_warning(ingest: Ingest) -> None:
     assert "state it in capture.json" in found["camera_curve"].remedy
 
 
+@pytest.mark.slow
 def test_capture_without_light_is_bad(ingest: Ingest, capture_archive: bytes) -> None:
     made, found = reported(ingest, filmed(capture_archive, gain=0))
     assert made.level == "bad"

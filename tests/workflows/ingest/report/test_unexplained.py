@@ -94,7 +94,7 @@ def test_shares_that_no_glare_has_are_left_out(
     assert ingest("c", filmed(scene, program)).attributes["glare"] is None
 
 
-@pytest.mark.parametrize("noise", [0.002, 0.01])
+@pytest.mark.parametrize("noise", [0.002, pytest.param(0.01, marks=pytest.mark.slow)])
 def test_noise_is_measured_from_patterns(
     scene: Scene, program: Program, ingest: Ingest, noise: float
 ) -> None:

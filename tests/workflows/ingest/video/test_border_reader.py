@@ -162,6 +162,7 @@ def test_patterns_are_found_by_their_times_without_the_sides_of_the_border(
     assert misplaced(stack, made, numbers) == []
 
 
+@pytest.mark.slow
 def test_cut_film_without_numbers_is_refused(ingest_film: Callable[..., Any]) -> None:
     with pytest.raises(CaptureError, match=r"do not fit|does not look|are found"):
         ingest_film(Camera(hold=HOLD, cut=(7.0, 9.0)), ((-20, 14), (-18, 156), (240, 24), (235, 150)))

@@ -1,11 +1,13 @@
 """Where patterns begin: also without a visible change."""
 
 import numpy as np
+import pytest
 
 from tests.workflows.ingest.video.camera import Camera, film
 from tests.workflows.ingest.video.films import IngestFilm, misplaced, missing
 
 
+@pytest.mark.slow
 def test_first_pattern_is_found_on_a_monitor_that_showed_it_before(
     ingest_film: IngestFilm, light: list[np.ndarray]
 ) -> None:

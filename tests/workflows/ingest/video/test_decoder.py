@@ -52,6 +52,7 @@ def test_file_that_is_no_whole_video_is_refused(ingest_film: IngestFilm, filmed:
     assert caught.value.fields["entry"] == "clip.mp4"
 
 
+@pytest.mark.slow
 def test_damaged_stretch_costs_only_its_patterns(ingest_film: IngestFilm, filmed: Film) -> None:
     kind, start, size = max(boxes(filmed.data), key=lambda box: box[2])
     assert kind == "mdat"

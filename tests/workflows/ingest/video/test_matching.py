@@ -26,7 +26,7 @@ from workflows.programs.program import Program
         pytest.param(Camera(fps=60, hold=0.1, seed=3), marks=pytest.mark.slow),
         pytest.param(Camera(fps=60, hold=0.15, exposure=1.0, seed=4), marks=pytest.mark.exhaustive),
         pytest.param(Camera(fps=120, hold=0.2, readout=0.008, seed=5), marks=pytest.mark.slow),
-        Camera(fps=30000 / 1001, uneven=0.6, seed=6),
+        pytest.param(Camera(fps=30000 / 1001, uneven=0.6, seed=6), marks=pytest.mark.slow),
         pytest.param(Camera(fps=30, jitter=0.03, readout=0.033, seed=7), marks=pytest.mark.slow),
         pytest.param(Camera(codec="libx265", seed=8), marks=pytest.mark.slow),
         pytest.param(Camera(codec="mjpeg", container="mov", seed=9), marks=pytest.mark.exhaustive),
@@ -67,6 +67,7 @@ def test_only_patterns_behind_a_hand_are_missing(ingest_film: IngestFilm, light:
 
 
 @pytest.mark.parametrize(("camera", "lost"), [(Camera(tail=-1.5), "ends"), (Camera(cut=(-1, 1.8)), "begins")])
+@pytest.mark.slow
 def test_recording_of_a_part_of_the_program(
     ingest_film: IngestFilm, light: list[np.ndarray], camera: Camera, lost: str
 ) -> None:

@@ -13,10 +13,11 @@ from workflows.ingest.video.missing_patterns import REMEDIES, by_reason, ranges,
     ("camera", "what"),
     [
         (Camera(hand=(5.0, 6.0)), "keep hands"),
-        pytest.param(Camera(tail=-1.5), "go on until after", marks=pytest.mark.slow),
+        (Camera(tail=-1.5), "go on until after"),
     ],
     ids=["a hand in front", "ended too early"],
 )
+@pytest.mark.slow
 def test_patterns_without_a_frame_are_named_with_a_remedy(
     ingest_film: IngestFilm, light: list[np.ndarray], camera: Camera, what: str
 ) -> None:

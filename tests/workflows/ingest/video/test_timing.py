@@ -1,12 +1,14 @@
 """Patterns that look alike are distinguished by their times."""
 
 import numpy as np
+import pytest
 
 from tests.workflows.ingest.video.camera import film
 from tests.workflows.ingest.video.films import CAMERA, PROGRAM, IngestFilm, misplaced, missing
 from workflows.programs.program import Program
 
 
+@pytest.mark.slow
 def test_equal_patterns_are_distinguished_by_their_times(
     ingest_film: IngestFilm, light: list[np.ndarray]
 ) -> None:
