@@ -19,6 +19,9 @@ from services.settings import Settings
 from storage.objects.store import Objects
 from workflows.composite.cache import Cache
 
+BACKDROPS = 16
+"""Of the largest size, how many may be kept at once, half of them of one owner; smaller ones count by their size."""
+
 
 class App(FastAPI):
     """A FastAPI app whose OpenAPI document also has the schema of capture.json."""
@@ -46,6 +49,7 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
         Cache(objects, settings.matte_memory),
         Decoders(settings.backdrop_bytes),
         Shares(settings.request_memory, settings.request_memory // 2, "request_memory"),
+        Shares(BACKDROPS * settings.backdrop_bytes, BACKDROPS // 2 * settings.backdrop_bytes),
     )
     app.state.checks = health.checks(engine, objects)
     errors.register(app)

@@ -3,14 +3,14 @@
 import asyncio
 import time
 from collections.abc import Callable, Hashable, Iterable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated, TypeVar
 
 from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials
-from sqlalchemy import Engine
+from sqlalchemy import Connection, Engine
 
 from services.api.auth import ADMIN, Caller, bearer, check_method, identify, require_scope
 from services.api.http.browser_security import require_own_site
@@ -18,13 +18,15 @@ from services.api.together import Together
 from services.api.work import Shares, run
 from services.decoding.pool import Decoders
 from services.settings import Settings
+from storage.database.engine import reading
 from storage.database.owners import for_owner
-from storage.errors import Unavailable
+from storage.errors import Corrupt, Unavailable
 from storage.objects.store import Objects
 from workflows.composite.cache import Cache
 from workflows.composite.threads import CORES
 
 T = TypeVar("T")
+R = TypeVar("R")
 KEY_CHECK = 1.0
 """Seconds between two checks of a caller's key during a download."""
 
@@ -42,7 +44,9 @@ class Context:
     decoders: Decoders
     """Processes that decode uploaded pictures."""
     memory: Shares
-    """Bytes that frames and pixels of mattes take while they are read and encoded."""
+    """Bytes that frames, pixels, layers and composites take while they are read, computed and encoded."""
+    backdrops: Shares
+    """Bytes of backdrops on disk, from their first byte until they are composited."""
     lists: Shares = field(default_factory=lambda: Shares(4, 2))
     """Lists, captures and reports made at once: a capture's program may take 60 MB."""
     pictures: Shares = field(default_factory=lambda: Shares(4, 3))
@@ -56,16 +60,59 @@ class Context:
     imports: Shares = field(default_factory=lambda: Shares(2, 1))
     """Archives of mattes unpacked at once."""
     layers: Shares = field(default_factory=lambda: Shares(2, 1))
-    """Layers of mattes encoded at once."""
+    """Layers of mattes, and mattes for browsers, encoded at once."""
     together: Together = field(default_factory=Together)
     """Reads what streams of events follow."""
     caller: Caller = ADMIN
     check_key: Callable[[], object] = lambda: None
     """Checks again that the caller's key is valid, as `auth.identify` does: for requests that take long."""
 
-    async def compute(self, request: Request, shares: Shares, work: Callable[[], T], amount: int = 1) -> T:
-        """Do the work of a request in a thread, see `services.api.work.run`."""
-        return await run(request, self.caller.owner, self.settings.request_seconds, shares, work, amount)
+    async def compute(
+        self,
+        request: Request,
+        shares: Shares,
+        work: Callable[[], T],
+        amount: int = 1,
+        *,
+        memory: int = 0,
+        seconds: float | None = None,
+    ) -> T:
+        """Do the work of a request in a thread, see `services.api.work.run`.
+
+        Parameters
+        ----------
+        shares : Shares
+            Of what the work takes an amount.
+        memory : int
+            Bytes that it takes besides. More than an owner's share counts as all of it: it is done, one at a time.
+        seconds : float, optional
+            How long it may take; by default ENVMATTE_REQUEST_SECONDS.
+        """
+        needed = [(shares, amount)]
+        if memory:
+            needed.append((self.memory, min(memory, self.memory.each)))
+        return await run(request, self.caller.owner, seconds or self.settings.request_seconds, needed, work)
+
+    @contextmanager
+    def stored(self, get: Callable[[Connection, str], R], id: str) -> Iterator[R]:
+        """Look a row up, for a block that reads what is stored of it.
+
+        The block may find things missing because it was deleted meanwhile: it is looked up again before they count as
+        damaged.
+
+        Raises
+        ------
+        NotFound
+            If there is no such row, or it was deleted during the block.
+        """
+        with reading(self.engine) as c:
+            row = get(c, id)
+        try:
+            yield row
+        except (Corrupt, FileNotFoundError):
+            with reading(self.engine) as c:
+                get(c, id)
+            raise
 
     async def follow(self, what: Hashable, read: Callable[[], T]) -> T:
         """Read something of the owner's again, in a moment, together with what other requests follow.

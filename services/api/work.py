@@ -4,8 +4,8 @@ import asyncio
 import threading
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -45,7 +45,7 @@ class Shares:
     """
 
     def __init__(self, total: int, each: int, name: str | None = None) -> None:
-        self._free, self._each, self._name = total, each, name
+        self._free, self.each, self._name = total, each, name
         self._taken: Counter[str] = Counter()
         self._waiting: list[_Turn] = []
 
@@ -58,12 +58,12 @@ class Shares:
         TooLarge
             If it is more than an owner may have.
         """
-        if amount > self._each:
+        if amount > self.each:
             raise TooLarge(
-                f"this request takes {amount} bytes of memory, and one may take {self._each}, half of what all may "
+                f"this request takes {amount} bytes of memory, and one may take {self.each}, half of what all may "
                 f"take together; raise ENVMATTE_{(self._name or '').upper()}",
                 **({"name": self._name} if self._name else {}),
-                limit=self._each,
+                limit=self.each,
                 value=amount,
             )
         turn = _Turn(owner, amount)
@@ -82,7 +82,7 @@ class Shares:
 
     def _admit(self) -> None:
         for turn in self._waiting.copy():
-            if self._taken[turn.owner] + turn.amount > self._each:
+            if self._taken[turn.owner] + turn.amount > self.each:
                 continue
             if turn.amount > self._free:
                 break  # else small ones would pass a large one for ever
@@ -93,12 +93,21 @@ class Shares:
 
 
 async def run(
-    request: Request, owner: str, seconds: float, shares: Shares, work: Callable[[], T], amount: int = 1
+    request: Request,
+    owner: str,
+    seconds: float,
+    needed: Sequence[tuple[Shares, int]],
+    work: Callable[[], T],
 ) -> T:
-    """Do the work of a request in a thread, once its owner's share has room for it.
+    """Do the work of a request in a thread, once its owner's shares have room for it.
 
     Work that calls `checkpoint` ends when the client goes away, the service stops or the time is over. What it has
-    taken of the shares it keeps until it has really ended.
+    taken of the shares it keeps until it has really ended, and until then the request goes on too.
+
+    Parameters
+    ----------
+    needed : sequence of (Shares, int)
+        What the work takes of each, in this order. All requests that take several must take them in the same order.
 
     Raises
     ------
@@ -132,7 +141,9 @@ async def run(
 
     async def in_turn() -> T:
         nonlocal begun
-        async with shares.take(owner, amount):
+        async with AsyncExitStack() as taken:
+            for shares, amount in needed:
+                await taken.enter_async_context(shares.take(owner, amount))
             begun = True
             return await anyio.to_thread.run_sync(interruptibly, limiter=anyio.CapacityLimiter(1))
 
@@ -141,7 +152,10 @@ async def run(
     try:
         await asyncio.wait((answer, left), return_when=asyncio.FIRST_COMPLETED)
         if not answer.done():
-            raise ClientDisconnect
+            unwanted.set()
+            if not begun:
+                raise ClientDisconnect
+            await asyncio.wait((answer,))  # it may still use what its request cleans up
         return answer.result()
     finally:
         left.cancel()

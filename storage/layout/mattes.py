@@ -175,15 +175,15 @@ class Matte:
             raise self._corrupt(row, column)
         return Block(**frames, cell=cell, weight=weight)
 
-    def layer(self, name: str) -> NDArray[Any]:
-        """All of a frame-shaped array.
+    def layer(self, name: str, rows: slice = slice(None)) -> NDArray[Any]:
+        """A frame-shaped array, or some rows of it.
 
         Raises
         ------
         Corrupt
             If some of it is missing or damaged.
         """
-        return np.asarray(self._frames[name][:])
+        return np.asarray(self._frames[name][rows])
 
     def missing(self) -> set[tuple[int, int]]:
         """Rows and columns of incomplete blocks; lists the store and reads nothing."""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from storage.errors import Conflict
 from storage.layout.mattes import Matte
 from workflows.composite.threads import in_parts
+from workflows.interruption import checkpoint
 from workflows.mattes.lobes import block_lobes
 from workflows.recovery.pyramid import Grids
 
@@ -104,6 +105,7 @@ def from_two(first: Places, second: Places, distances: tuple[float, float], dept
     if np.count_nonzero(fits) < 16:
         raise Conflict("too few pixels were recovered in both mattes to find their rays")
     for _ in range(10):
+        checkpoint()
         common = frame @ np.linalg.lstsq(frame[fits], through[fits], rcond=None)[0]
         off = np.hypot(*np.moveaxis(through - common, 2, 0))
         near_enough = max(STRAY, 5 * float(np.median(off[fits])))
@@ -157,6 +159,7 @@ def _perspective(places: Places, aspect: float) -> NDArray[np.float32]:
     fits = candidates & (np.maximum(np.abs(across), np.abs(down)) > 0.9)
     least = max(MIN_DIRECT * np.count_nonzero(places[..., 3]), 16)
     for _ in range(10):
+        checkpoint()
         if np.count_nonzero(fits) < least:
             raise Conflict(
                 "too little of the monitor is seen directly beside the object to find the camera's perspective: film "

@@ -1,6 +1,6 @@
 """Composite C = S + X (rho T L), strip by strip: eq. 5 with X, the crosstalk from monitor to camera channels."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import product
 from typing import NamedTuple
 
@@ -15,7 +15,11 @@ from workflows.composite.gather import gather
 from workflows.composite.strips import LENGTH, Strip
 from workflows.composite.threads import in_parts
 from workflows.images.resample import area_mean
+from workflows.interruption import checkpoint
 from workflows.recovery.pyramid import Grids, Pyramid
+
+SHRUNK_AT_ONCE = 64
+"""Rows or columns."""
 
 
 class Window(NamedTuple):
@@ -200,11 +204,21 @@ def shrink(picture: NDArray[np.float32], size: int) -> NDArray[np.float32]:
     share = size / max(height, width)
     if share >= 1:
         return picture
-    alpha = picture[..., 3:]
-    small = area_mean(
-        np.concatenate([picture[..., :3] * alpha, alpha], axis=2),
-        max(round(width * share), 1),
-        max(round(height * share), 1),
-    )
+    columns, rows = max(round(width * share), 1), max(round(height * share), 1)
+    # Part by part, for averaging takes several times the memory of what it is given.
+    narrow = np.empty((height, columns, 4), np.float32)
+    for at in _parts(height):
+        alpha = picture[at, :, 3:]
+        weighted = np.concatenate([picture[at, :, :3] * alpha, alpha], axis=2)
+        narrow[at] = area_mean(weighted, columns, len(weighted))
+    small = np.empty((rows, columns, 4), np.float32)
+    for at in _parts(columns):
+        small[:, at] = area_mean(narrow[:, at], len(small[0, at]), rows)
     small[..., :3] /= np.maximum(small[..., 3:], np.float32(1e-6))
     return small
+
+
+def _parts(size: int) -> Iterator[slice]:
+    for first in range(0, size, SHRUNK_AT_ONCE):
+        checkpoint()
+        yield slice(first, first + SHRUNK_AT_ONCE)

@@ -1,7 +1,6 @@
 """EXR and float TIFF to arrays and back: linear light without an upper limit."""
 
 import io
-from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -9,6 +8,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from storage.errors import ImageError
+from workflows.images.exr_writer import write_exr
 from workflows.images.integer_formats import LOSSLESS, PLAIN, check_tiles, orientation
 from workflows.images.orientation import upright
 from workflows.untrusted import tiff_lzw
@@ -65,20 +65,19 @@ def decode(data: bytes, *, memory: int, turn: int | None = None) -> Floats:
     return upright(pixels, orientation(data) if turn is None else turn)
 
 
-def encode_exr(channels: dict[str, NDArray[Any]], header: dict[str, Any] | None = None) -> bytes:
-    """Encode float channels as EXR with lossless compression.
+def encode_exr(channels: str, pixels: Floats) -> bytes:
+    """Encode a picture as EXR of 32 bits with lossless compression.
 
     Parameters
     ----------
-    channels : dict of str to (height, width) or (height, width, 3 or 4) float16 or float32
-        By name, such as ``alpha`` or ``RGB``.
-    header : dict, optional
-        Further attributes.
+    channels : str
+        Their names, such as ``RGB``.
+    pixels : (height, width, channels) float32
     """
     file = io.BytesIO()
-    attributes = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | (header or {})
-    with OpenEXR.File(attributes, {name: np.ascontiguousarray(v) for name, v in channels.items()}) as image:
-        image.write(file)
+    height, width, _ = pixels.shape
+    planes = {name: pixels[..., c] for c, name in enumerate(channels)}
+    write_exr(file, width, height, dict.fromkeys(channels, np.float32), [planes])
     return file.getvalue()
 
 

@@ -1,4 +1,6 @@
-"""A matte as layers that other tools read: EXR with the official library, and 16-bit PNG.
+"""A matte as layers that other tools read, as EXR and 16-bit PNG.
+
+They are made in bands, a row of blocks high, so that a large one takes little memory and can end between two of them.
 
 Every layer has the frame's size. All values are linear light or plain numbers; a PNG's are clipped to 0 to 1.
 
@@ -40,13 +42,16 @@ Step 2 for ``lobe0`` alone, without weight, is the picture a plain STMap gives. 
 backdrop's own pixels, a variance of 1/12 of a pixel squared along each axis: a filter over its pixels leaves that out.
 """
 
-from typing import Any
+from collections.abc import Iterator
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.layout.mattes import Matte
-from workflows.images import float_formats, integer_formats
+from storage.layout.mattes import Block, Matte
+from workflows.images import integer_formats
+from workflows.images.exr_writer import Types, write_exr
+from workflows.interruption import checkpoint
 from workflows.mattes.lobes import block_lobes
 from workflows.recovery.lobe_table import FIELDS
 
@@ -62,8 +67,8 @@ _COMMENTS = (
 )
 
 
-def confidence(matte: Matte) -> NDArray[np.float32]:
-    """How far each pixel of a matte can be trusted.
+def confidence(matte: Matte, rows: slice = slice(None)) -> NDArray[np.float32]:
+    """How far each pixel of a matte, or of some of its rows, can be trusted.
 
     Returns
     -------
@@ -71,18 +76,18 @@ def confidence(matte: Matte) -> NDArray[np.float32]:
         ``1 / (1 + e / 0.01)``, e the expected error of a composite in camera units: 1/2 at 40 dB. 0 where nothing was
         recovered.
     """
-    trusted = 1 / (1 + matte.layer("error") / np.float32(0.01))
-    return np.where(matte.layer("recovered"), trusted, 0).astype(np.float32)
+    return _trust(matte.layer("error", rows), matte.layer("recovered", rows))
 
 
-def layer(matte: Matte, name: str) -> NDArray[np.float32]:
-    """A layer.
+def layer(matte: Matte, name: str, rows: slice = slice(None)) -> NDArray[np.float32]:
+    """A layer, or some rows of it.
 
     Parameters
     ----------
     matte : Matte
     name : str
         One of `NAMES`.
+    rows : slice
 
     Returns
     -------
@@ -94,40 +99,51 @@ def layer(matte: Matte, name: str) -> NDArray[np.float32]:
         If a block of the matte is missing.
     """
     if name == "confidence":
-        return confidence(matte)[..., np.newaxis]
-    values = matte.layer("recovered" if name == "alpha" else name)
-    return values.reshape(matte.height, matte.width, -1).astype(np.float32)
+        return confidence(matte, rows)[..., np.newaxis]
+    values = matte.layer("recovered" if name == "alpha" else name, rows)
+    return np.atleast_3d(values).astype(np.float32, copy=False)
 
 
-def png(matte: Matte, name: str) -> bytes:
-    """A layer as a 16-bit PNG, its values linear and clipped to 0 to 1."""
-    return integer_formats.encode_png(integer_formats.to_integers(layer(matte, name), np.dtype(np.uint16)))
+def png(matte: Matte, name: str, file: IO[bytes]) -> None:
+    """Write a layer as a 16-bit PNG, its values linear and clipped to 0 to 1."""
+    codes = np.empty((matte.height, matte.width, len(_channels(name))), np.uint16)
+    for rows in _bands(matte):
+        codes[rows] = integer_formats.to_integers(layer(matte, name, rows), np.dtype(np.uint16))
+    file.write(integer_formats.encode_png(codes))
 
 
-def exr(matte: Matte, name: str) -> bytes:
-    """A layer as an EXR of 32 bits: R, G and B, or Y."""
-    values = layer(matte, name)
-    names = "RGB" if values.shape[2] == 3 else "Y"
-    return _encode(matte, {channel: values[..., c] for c, channel in enumerate(names)})
+def exr(matte: Matte, name: str, file: IO[bytes]) -> None:
+    """Write a layer as an EXR of 32 bits: R, G and B, or Y."""
+    names = _channels(name)
+    bands = (
+        {channel: values[..., c] for c, channel in enumerate(names)}
+        for values in (layer(matte, name, rows) for rows in _bands(matte))
+    )
+    _write(file, matte, dict.fromkeys(names, np.float32), bands)
 
 
-def stmap(matte: Matte) -> bytes:
-    """Where the heaviest lobe of each pixel lies, as an EXR of 32 bits: u, v, and whether there is one."""
-    planes = {channel: np.zeros((matte.height, matte.width), np.float32) for channel in "RGB"}
-    for row, column in np.ndindex(matte.block_rows, matte.block_columns):
-        lobes = block_lobes(matte, matte.read(row, column), LOBES)[..., 0, :]
-        at = matte.span(row, column)
-        planes["R"][at], planes["G"][at] = lobes[..., 0], lobes[..., 1]
-        planes["B"][at] = lobes[..., 2:5].any(axis=-1)
-    return _encode(matte, planes)
+def stmap(matte: Matte, file: IO[bytes]) -> None:
+    """Write where the heaviest lobe of each pixel lies as an EXR of 32 bits: u, v, and whether there is one."""
+
+    def bands() -> Iterator[Planes]:
+        for row, rows in enumerate(_bands(matte)):
+            planes = {name: np.zeros((rows.stop - rows.start, matte.width), np.float32) for name in "RGB"}
+            for block, columns in _blocks(matte, row):
+                lobes = block_lobes(matte, block, LOBES)[..., 0, :]
+                planes["R"][:, columns], planes["G"][:, columns] = lobes[..., 0], lobes[..., 1]
+                planes["B"][:, columns] = lobes[..., 2:5].any(axis=-1)
+            yield planes
+
+    _write(file, matte, dict.fromkeys("RGB", np.float32), bands())
 
 
-def everything(matte: Matte, lobes: int = LOBES) -> bytes:
-    """All layers and the lobes in one EXR.
+def everything(matte: Matte, file: IO[bytes], lobes: int = LOBES) -> None:
+    """Write all layers and the lobes as one EXR.
 
     Parameters
     ----------
     matte : Matte
+    file : IO[bytes]
     lobes : int
         Of a pixel; more are merged into these.
 
@@ -136,37 +152,75 @@ def everything(matte: Matte, lobes: int = LOBES) -> bytes:
     Corrupt
         If a block of the matte is missing.
     """
-    frame = matte.height, matte.width
     half = ["R", "G", "B", "A", *(f"{name}.{c}" for name in ("S", "rho") for c in "RGB"), "confidence.Y"]
-    planes: Planes = {name: np.zeros(frame, np.float16) for name in half}
+    types: dict[str, type[np.float16] | type[np.float32]] = dict.fromkeys(half, np.float16)
     for k in range(lobes):
-        for name in FIELDS:
-            planes[f"lobe{k}.{name}"] = np.zeros(frame, np.float32 if name in ("u", "v") else np.float16)
+        types |= {f"lobe{k}.{name}": np.float32 if name in ("u", "v") else np.float16 for name in FIELDS}
     crosstalk = np.array(matte.attributes["crosstalk"], np.float32)
-    planes["confidence.Y"][:] = confidence(matte)
-    for row, column in np.ndindex(matte.block_rows, matte.block_columns):
-        block, at = matte.read(row, column), matte.span(row, column)
-        ranked = block_lobes(matte, block, lobes)
-        white = block.S + (block.rho * ranked[..., 2:5].sum(axis=-2)) @ crosstalk.T
-        for c, channel in enumerate("RGB"):
-            planes[channel][at] = white[..., c]
-            planes[f"S.{channel}"][at], planes[f"rho.{channel}"][at] = block.S[..., c], block.rho[..., c]
-        planes["A"][at] = block.recovered
-        for k in range(lobes):
-            for f, name in enumerate(FIELDS):
-                planes[f"lobe{k}.{name}"][at] = ranked[..., k, f]
-    return _encode(matte, planes)
+
+    def bands() -> Iterator[Planes]:
+        for row, rows in enumerate(_bands(matte)):
+            shape = rows.stop - rows.start, matte.width
+            planes: Planes = {name: np.zeros(shape, kind) for name, kind in types.items()}
+            for block, columns in _blocks(matte, row):
+                at = slice(None), columns
+                ranked = block_lobes(matte, block, lobes)
+                white = block.S + (block.rho * ranked[..., 2:5].sum(axis=-2)) @ crosstalk.T
+                for c, channel in enumerate("RGB"):
+                    planes[channel][at] = white[..., c]
+                    planes[f"S.{channel}"][at] = block.S[..., c]
+                    planes[f"rho.{channel}"][at] = block.rho[..., c]
+                planes["A"][at] = block.recovered
+                planes["confidence.Y"][at] = _trust(block.error, block.recovered)
+                for k in range(lobes):
+                    for f, name in enumerate(FIELDS):
+                        planes[f"lobe{k}.{name}"][at] = ranked[..., k, f]
+            yield planes
+
+    _write(file, matte, types, bands())
+
+
+def bytes_of_png(matte: Matte) -> int:
+    """Bytes that writing a PNG takes at most: three codes of 16 bits a pixel, and a file as large if they are noise."""
+    return 2 * 6 * matte.height * matte.width
+
+
+def bytes_of_band(matte: Matte, lobes: int) -> int:
+    """Bytes that writing an EXR takes at most: a band of `everything`."""
+    return bytes_of_everything(matte.width, matte.block, lobes)
 
 
 def bytes_of_everything(width: int, height: int, lobes: int) -> int:
-    """Bytes that `everything` holds of a frame's values."""
+    """Bytes of a frame's values in the EXR of `everything`, before they are compressed."""
     return width * height * (11 * 2 + lobes * (2 * 4 + 6 * 2))
 
 
-def _encode(matte: Matte, planes: Planes) -> bytes:
+def _trust(error: NDArray[np.float32], recovered: NDArray[np.bool_]) -> NDArray[np.float32]:
+    return np.where(recovered, 1 / (1 + error / np.float32(0.01)), np.float32(0))
+
+
+def _channels(name: str) -> str:
+    return "RGB" if name in ("S", "rho") else "Y"
+
+
+def _bands(matte: Matte) -> Iterator[slice]:
+    """The rows of each row of blocks, as long as somebody wants them."""
+    for row in range(matte.block_rows):
+        checkpoint()
+        yield matte.span(row, 0)[0]
+
+
+def _blocks(matte: Matte, row: int) -> Iterator[tuple[Block, slice]]:
+    """The blocks of a row, and their columns."""
+    for column in range(matte.block_columns):
+        checkpoint()
+        yield matte.read(row, column), matte.span(row, column)[1]
+
+
+def _write(file: IO[bytes], matte: Matte, types: Types, bands: Iterator[Planes]) -> None:
     header = {
         "crosstalk": np.array(matte.attributes["crosstalk"], np.float32),
         "monitor": tuple(matte.attributes["monitor"]),
         "comments": _COMMENTS,
     }
-    return float_formats.encode_exr(planes, header)
+    write_exr(file, matte.width, matte.height, types, bands, header)

@@ -114,17 +114,17 @@ async def get_frame(context: OwnerContext, id: str, n: int, request: Request) ->
     """A frame as it was stored."""
 
     def measure() -> tuple[Stack, int]:
-        with reading(context.engine) as c:
-            row = captures.get(c, id)
-        if row.state != "ready":
-            raise Conflict(f"capture {id} is {row.state}; its frames can be read once it is ready")
-        if not 0 <= n < row.frames:
-            raise NotFound(f"capture {id} has the frames 0 to {row.frames - 1}", field="n")
-        stack = Stack(context.objects, id)
-        return stack, int(stack.height * stack.width * stack.channels * stack.dtype.itemsize)
+        with context.stored(captures.get, id) as row:
+            if row.state != "ready":
+                raise Conflict(f"capture {id} is {row.state}; its frames can be read once it is ready")
+            if not 0 <= n < row.frames:
+                raise NotFound(f"capture {id} has the frames 0 to {row.frames - 1}", field="n")
+            stack = Stack(context.objects, id)
+            return stack, int(stack.height * stack.width * stack.channels * stack.dtype.itemsize)
 
     def encode() -> Response:
-        return bytes_response(encode_png(stack.read(frames=slice(n, n + 1))[0]), "image/png")
+        with context.stored(captures.get, id):
+            return bytes_response(encode_png(stack.read(frames=slice(n, n + 1))[0]), "image/png")
 
     stack, size = await context.compute(request, context.lists, measure)
     # The frame, and a PNG that is as large if the frame is noise.

@@ -1,5 +1,6 @@
 """Creating captures over HTTP: from a capture archive as the body, or from a finished upload."""
 
+from functools import partial
 from typing import Annotated, Any
 
 import anyio.to_thread
@@ -24,6 +25,7 @@ from storage.layout import uploads as stored_uploads
 from storage.layout.uploads import Part
 from storage.records import bodies, captures, jobs, uploads
 from workflows.ingest.archive import CaptureArchive
+from workflows.interruption import checkpoint
 
 router = APIRouter(tags=["captures"])
 CALL = "POST /v1/captures"
@@ -70,8 +72,8 @@ async def upload(
     media_type = media_type_of(request)
     if media_type == JSON:
         given = await read_json(request, FromUpload, FROM_UPLOAD_BYTES)
-        async with context.captures.take(context.caller.owner):
-            row = await anyio.to_thread.run_sync(_from_upload, context, given, idempotency_key)
+        create = partial(_from_upload, context, given, idempotency_key)
+        row = await context.compute(request, context.captures, create)
     elif media_type == ZIP:
         row = await _from_body(context, request, name, idempotency_key, webhook)
     else:
@@ -99,11 +101,10 @@ async def _from_body(
         try:
             pieces = reservation.watch(limit.stream(request))
             parts = [await store_as_upload(pieces, context.objects, capture)]
-            args = context, capture, parts, name, key, False, webhook
-            async with context.captures.take(context.caller.owner):
-                row = await anyio.to_thread.run_sync(_register, *args)
+            register = partial(_register, context, capture, parts, name, key, False, webhook)
+            row = await context.compute(request, context.captures, register)
         except Exception:
-            # Not when cancelled: `_register` may still be running in its thread. Then a sweep removes the bytes.
+            # Not when cancelled: `register` may still be running in its thread. Then a sweep removes the bytes.
             await anyio.to_thread.run_sync(stored_uploads.remove, context.objects, capture)
             raise
     if row.id != capture:  # a concurrent request with the same key was quicker
@@ -160,6 +161,7 @@ def _register(
     stored_uploads.seal(context.objects, capture, parts)
     with stored_uploads.read(context.objects, capture) as file:
         manifest = CaptureArchive(file, context.settings.limits).manifest
+    checkpoint()
 
     def create(c: Connection) -> str:
         if resumable and not uploads.delete(c, capture):

@@ -1,14 +1,16 @@
 """Reports on captures over HTTP: how the frames turned out."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from fastapi import APIRouter, Request, Response
 
 from services.api.context import Context, OwnerContext
 from services.api.http.responses import bytes_response, json_response
-from storage.database.engine import reading
 from storage.errors import Conflict
 from storage.layout.captures import Stack
 from storage.records import captures
-from workflows.ingest.report.contact_sheet import contact_sheet
+from workflows.ingest.report.contact_sheet import bytes_of_contact_sheet, contact_sheet
 from workflows.ingest.report.report import Report, report
 
 router = APIRouter(tags=["captures"])
@@ -19,8 +21,8 @@ async def get_report(context: OwnerContext, id: str, request: Request) -> Respon
     """The quality of a capture, and how to improve it."""
 
     def make() -> Response:
-        stack = _stack(context, id)
-        return json_response(report(stack.attributes, stack.frames))
+        with _stack(context, id) as stack:
+            return json_response(report(stack.attributes, stack.frames))
 
     return await context.compute(request, context.lists, make)
 
@@ -29,15 +31,21 @@ async def get_report(context: OwnerContext, id: str, request: Request) -> Respon
 async def get_contact_sheet(context: OwnerContext, id: str, request: Request) -> Response:
     """Some of a capture's frames in one picture: red where they are clipped at white, blue where clipped at black."""
 
+    def measure() -> int:
+        with _stack(context, id) as stack:
+            return bytes_of_contact_sheet(stack)
+
     def draw() -> Response:
-        return bytes_response(contact_sheet(_stack(context, id)), "image/png")
+        with _stack(context, id) as stack:
+            return bytes_response(contact_sheet(stack), "image/png")
 
-    return await context.compute(request, context.pictures, draw)
+    memory = await context.compute(request, context.lists, measure)
+    return await context.compute(request, context.pictures, draw, memory=memory)
 
 
-def _stack(context: Context, id: str) -> Stack:
-    with reading(context.engine) as c:
-        row = captures.get(c, id)
-    if row.state != "ready":
-        raise Conflict(f"capture {id} is {row.state}; its report is there once it is ready")
-    return Stack(context.objects, id)
+@contextmanager
+def _stack(context: Context, id: str) -> Iterator[Stack]:
+    with context.stored(captures.get, id) as row:
+        if row.state != "ready":
+            raise Conflict(f"capture {id} is {row.state}; its report is there once it is ready")
+        yield Stack(context.objects, id)

@@ -1,6 +1,8 @@
 """Responses from temporary files, entity tags and times."""
 
+import os
 import tempfile
+from collections.abc import Callable
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from functools import partial
@@ -23,12 +25,20 @@ def bytes_response(data: bytes, media_type: str, headers: dict[str, str] | None 
     """
     if len(data) <= MEMORY_BYTES:
         return Response(data, headers=headers, media_type=media_type)
+    return file_response(lambda file: file.write(data), media_type, headers)
+
+
+def file_response(
+    write: Callable[[IO[bytes]], object], media_type: str, headers: dict[str, str] | None = None
+) -> Response:
+    """A response that a function writes to a temporary file. Don't call it in the event loop."""
     with ExitStack() as stack:
         file = stack.enter_context(tempfile.TemporaryFile())
-        file.write(data)
+        write(file)
+        size = file.seek(0, os.SEEK_END)
         file.seek(0)
         stack.pop_all()  # the response closes it
-    return FileStreamResponse(file, len(data), media_type, headers)
+    return FileStreamResponse(file, size, media_type, headers)
 
 
 def json_response(model: BaseModel) -> Response:

@@ -1,5 +1,6 @@
 """Archives of mattes over HTTP: download a matte, and import it into another service."""
 
+from functools import partial
 from typing import Any
 
 import anyio.to_thread
@@ -14,7 +15,6 @@ from services.api.http.media_types import ZIP, require_media_type
 from services.api.limits.quotas import admit
 from services.api.limits.reservations import reserved
 from services.api.mattes.mattes import Matte
-from storage.database.engine import reading
 from storage.database.rows import new_id
 from storage.errors import NoRoom, NotFound
 from storage.layout import mattes as stored_mattes
@@ -26,6 +26,8 @@ from workflows.mattes.imports.importing import take_in
 
 router = APIRouter(tags=["mattes"])
 CALL = "POST /v1/mattes"
+ARCHIVE_BYTES = 1 << 30
+"""Of an archive, which may take ENVMATTE_REQUEST_SECONDS; a larger one may take as much longer."""
 
 
 @router.get(
@@ -39,9 +41,8 @@ def get_archive(context: OwnerContext, id: str) -> StreamingResponse:
     The same matte always gives the same bytes. If the matte is deleted or the key revoked during the download, the
     connection ends early.
     """
-    with reading(context.engine) as c:
-        mattes.get_ready(c, id)
-    archive = Archive(context.objects, id)
+    with context.stored(mattes.get_ready, id):
+        archive = Archive(context.objects, id)
     headers = {
         "Content-Length": str(archive.size),
         "Content-Disposition": f'attachment; filename="matte-{id}.zip"',
@@ -79,8 +80,12 @@ async def _from_body(context: Context, request: Request, key: str | None) -> Row
     async with reserved(context, matte, length, context.settings.upload_bytes, room=length) as reservation:
         try:
             part = await store_as_upload(reservation.watch(limit.stream(request)), context.objects, matte)
-            async with context.imports.take(context.caller.owner):
-                row = await anyio.to_thread.run_sync(_import, context, matte, part, key)
+            row = await context.compute(
+                request,
+                context.imports,
+                partial(_import, context, matte, part, key),
+                seconds=context.settings.request_seconds * -(-part.size // ARCHIVE_BYTES),
+            )
         finally:
             # If the server is killed, the coordinator sweeps the archive and half a matte: nothing refers to them.
             await anyio.to_thread.run_sync(stored_uploads.remove, context.objects, matte)

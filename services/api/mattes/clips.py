@@ -93,16 +93,15 @@ async def composite_clip(
 )
 def get_video(context: OwnerContext, id: str, request: Request) -> Response:
     """The video of a composite job: H.264 in MP4, with the frame times of the clip, without sound."""
-    with reading(context.engine) as c:
-        row = jobs.get(c, id)
-    if row.kind != "composite" or row.state != "succeeded":
-        raise Conflict(
-            f"job {id} is {row.state} and has no video; a composite of a clip has one once it has succeeded"
-        )
-    try:
-        file = context.objects.read(composites.video_path(id))
-    except FileNotFoundError as error:
-        raise Corrupt(f"the video of job {id} is not in the store; composite the clip again") from error
+    with context.stored(jobs.get, id) as row:
+        if row.kind != "composite" or row.state != "succeeded":
+            raise Conflict(
+                f"job {id} is {row.state} and has no video; a composite of a clip has one once it has succeeded"
+            )
+        try:
+            file = context.objects.read(composites.video_path(id))
+        except FileNotFoundError as error:
+            raise Corrupt(f"the video of job {id} is not in the store; composite the clip again") from error
     size = file.seek(0, 2)
     start, end = _span(request.headers.get("range", ""), size)
     if start >= size:

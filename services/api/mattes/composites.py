@@ -16,7 +16,7 @@ from starlette.datastructures import Headers
 
 from services.api.context import Context, OwnerContext
 from services.api.errors import answer as answer_problem
-from services.api.http.bodies import spool_body
+from services.api.http.bodies import BodyLimit, spool_body
 from services.api.http.media_types import preferred
 from services.api.http.responses import bytes_response, etag_matches
 from services.api.jobs.jobs import Job
@@ -24,7 +24,7 @@ from services.api.mattes import clips
 from services.api.mattes.composite_params import CompositeParams
 from services.runtime.problems import NotAcceptable, NotNeeded, problem_of
 from storage.database.engine import reading
-from storage.errors import Conflict, Corrupt, OptionError
+from storage.errors import Conflict, OptionError
 from storage.records import mattes
 from storage.records import tiles as tile_records
 from workflows.composite import composite
@@ -49,7 +49,17 @@ BACKDROPS = (
     "image/x-exr",
     "image/x-adobe-dng",
 )
-ANSWERS = ("image/png", "image/jpeg", "image/x-exr")
+ANSWER_BYTES = {"image/png": 16, "image/jpeg": 10, "image/x-exr": 16}
+"""The media types of answers, and what a pixel takes at most in codes and in the encoded file together."""
+ANSWERS = tuple(ANSWER_BYTES)
+PICTURE_BYTES = 16
+"""Of a pixel while it is composited: light and alpha."""
+SHRUNK_BYTES = 32
+"""Of a pixel while a picture is made smaller, and of the answer."""
+LIGHT_BYTES = 16
+"""Of a cell of the monitor: the light of three channels, with the coarser grids."""
+RAYS_BYTES = 160
+"""Of a pixel of the matte while rays to a backdrop at another depth are found."""
 
 
 @router.post(
@@ -94,13 +104,13 @@ async def post_composite(
     if media_type is None:
         raise NotAcceptable(f"composites are answered as {', '.join(ANSWERS)}, not as {accept}")
     state = await anyio.to_thread.run_sync(_matte_state, context, id)
-    async with spool_body(request, context.settings.backdrop_bytes) as body:
+    limit = context.settings.backdrop_bytes
+    announced = BodyLimit(limit).check_announced(request) or limit
+    owner = context.caller.owner
+    async with context.backdrops.take(owner, announced), spool_body(request, limit) as body:
         answer = partial(_answer, context, state, body, media_type, params, request.headers)
-        try:
-            return await context.compute(request, context.composites, answer)
-        except Corrupt:
-            await anyio.to_thread.run_sync(_matte_state, context, id)  # it may have been deleted meanwhile
-            raise
+        memory = await anyio.to_thread.run_sync(_bytes_of_composite, context, state, params, media_type)
+        return await context.compute(request, context.composites, answer, memory=memory)
 
 
 @dataclass(frozen=True)
@@ -121,20 +131,48 @@ class MatteState:
 
 
 def _matte_state(context: Context, id: str) -> MatteState:
-    with reading(context.engine) as c:
-        row = mattes.get(c, id)
+    with context.stored(mattes.get, id) as row:
         if row.state == "ready":
             return MatteState(id)
-        done = tile_records.done(c, row.job) if row.state == "recovering" else []
-    if not done:
-        raise Conflict(f"matte {id} is {row.state}, and nothing of it is there yet; see job {row.job}")
-    matte = context.cache.matte(id)
-    tiles = cut(matte, parse_options(row.options).tile or matte.block)
-    blocks = frozenset(block for tile in done for block in product(*tiles[tile]))
-    return MatteState(id, blocks, len(blocks) / (matte.block_rows * matte.block_columns))
+        with reading(context.engine) as c:
+            done = tile_records.done(c, row.job) if row.state == "recovering" else []
+        if not done:
+            raise Conflict(f"matte {id} is {row.state}, and nothing of it is there yet; see job {row.job}")
+        matte = context.cache.matte(id)
+        tiles = cut(matte, parse_options(row.options).tile or matte.block)
+        blocks = frozenset(block for tile in done for block in product(*tiles[tile]))
+        return MatteState(id, blocks, len(blocks) / (matte.block_rows * matte.block_columns))
+
+
+def _bytes_of_composite(context: Context, state: MatteState, params: CompositeParams, media_type: str) -> int:
+    """Bytes that a composite takes at most, apart from the strips of the matte."""
+    with context.stored(mattes.get, state.id):
+        matte = context.cache.matte(state.id)
+    window = Window.of(matte, params.x, params.y, params.width, params.height)
+    of_pixel = PICTURE_BYTES + (SHRUNK_BYTES if params.size is not None else ANSWER_BYTES[media_type])
+    of_rays = RAYS_BYTES * matte.width * matte.height if params.depth is not None else 0
+    # A backdrop takes as much as it may until it is decoded.
+    return (
+        context.settings.backdrop_bytes
+        + LIGHT_BYTES * matte.columns * matte.rows
+        + of_pixel * window.width * window.height
+        + of_rays
+    )
 
 
 def _answer(
+    context: Context,
+    state: MatteState,
+    body: IO[bytes],
+    media_type: str,
+    params: CompositeParams,
+    headers: Headers,
+) -> Response:
+    with context.stored(mattes.get, state.id):
+        return _composite(context, state, body, media_type, params, headers)
+
+
+def _composite(
     context: Context,
     state: MatteState,
     body: IO[bytes],
@@ -150,9 +188,9 @@ def _answer(
         times.append(f"{name};dur={(time.perf_counter() - start) * 1e3:.1f}")
         return result
 
-    data = body.read()
+    digest = hashlib.blake2b(body.read()).digest()
     inputs = f"{state.id} {sorted(state.blocks or ())} {media_type} {params.model_dump_json()} ".encode()
-    tag = f'"{hashlib.blake2b(inputs + hashlib.blake2b(data).digest(), digest_size=16).hexdigest()}"'
+    tag = f'"{hashlib.blake2b(inputs + digest, digest_size=16).hexdigest()}"'
     extra = {"ETag": tag, "Envmatte-Recovered": f"{state.share:.4f}"}
     if etag_matches(headers, tag):
         return answer_problem(
@@ -160,7 +198,8 @@ def _answer(
         )
     matte = timed("open", lambda: context.cache.matte(state.id))
     window = Window.of(matte, params.x, params.y, params.width, params.height)
-    pixels = timed("decode", lambda: context.decoders.decode(data, params.transfer))
+    body.seek(0)
+    pixels = timed("decode", lambda: context.decoders.decode(body.read(), params.transfer))
     backdrop = backdrop_of(pixels, params.transfer)
 
     def read(row: int, number: int) -> Strip:
@@ -191,9 +230,8 @@ def _rays(context: Context, state: MatteState, params: CompositeParams) -> Rays:
         return from_one(places, high / wide, params.distance, params.camera, params.depth)
     assert params.other is not None
     assert params.other_distance is not None
-    if _matte_state(context, params.other).blocks is not None:
-        raise Conflict(f"matte {params.other} is still being recovered")
-    others = context.cache.places(params.other, CORES)
+    with context.stored(mattes.get_ready, params.other):
+        others = context.cache.places(params.other, CORES)
     if others.shape != places.shape:
         raise OptionError(
             f"matte {params.other} has {others.shape[1]} x {others.shape[0]} pixels, {state.id} {places.shape[1]} x "
@@ -208,9 +246,7 @@ def _encoded(
 ) -> bytes:
     if media_type == "image/x-exr":
         opaque = bool((picture[..., 3] == 1).all())
-        return float_formats.encode_exr(
-            {"RGB" if opaque else "RGBA": picture[..., :3] if opaque else picture}
-        )
+        return float_formats.encode_exr("RGB" if opaque else "RGBA", picture)
     deep = media_type == "image/png" and backdrop.pixels.dtype != np.uint8
     codes = encode(picture, params.transfer, np.dtype(np.uint16 if deep else np.uint8), CORES)
     if media_type == "image/png":

@@ -3,16 +3,16 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Annotated
+from typing import IO, Annotated, Any
 
 import anyio.to_thread
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel
+from pydantic_core import to_json
 
 from services.api.context import Context, OwnerContext
-from services.api.http.responses import bytes_response, etag_matches, json_response
+from services.api.http.responses import bytes_response, etag_matches, file_response
 from services.api.http.types import Colour, Pair
-from storage.database.engine import reading
 from storage.errors import InvalidInput, NotFound
 from storage.layout import mattes as stored_mattes
 from storage.records import mattes
@@ -22,12 +22,12 @@ from workflows.mattes.pixel_picture import picture
 
 router = APIRouter(tags=["mattes"])
 MOST_BYTES = 1 << 30
-"""The most memory that `all.exr` may take: the values of all layers are in memory at once."""
+"""The most that `all.exr` may have before it is compressed: it waits in a temporary file until it is sent."""
 MEDIA_TYPES = {"png": "image/png", "exr": "image/x-exr"}
-FILES: dict[str, Callable[[stored_mattes.Matte], bytes]] = {
-    f"{name}.{kind}": partial(make, name=name)
+FILES: dict[str, Callable[[stored_mattes.Matte, IO[bytes]], None]] = {
+    f"{name}.{kind}": lambda matte, file, name=name, write=write: write(matte, name, file)
     for name in layers.NAMES
-    for kind, make in (("png", layers.png), ("exr", layers.exr))
+    for kind, write in (("png", layers.png), ("exr", layers.exr))
 } | {"stmap.exr": layers.stmap}
 ALL = "all.exr"
 Lobes = Annotated[
@@ -41,7 +41,7 @@ Lobes = Annotated[
 MOST_CELLS = 10_000
 """Cells of one answer, some 2 MB."""
 LOOK_BYTES = 32 << 20
-"""What an answer about a pixel takes beside the pixel itself."""
+"""What an answer takes beside a pixel, or beside a layer's values: a block of the matte, above all."""
 Cells = Annotated[int, Query(ge=0, le=MOST_CELLS, description="The most cells to list.")]
 Skip = Annotated[int, Query(ge=0, le=1 << 32, description="Cells to leave out, the heaviest first.")]
 X = Annotated[int, Query(description="The pixel's column, from 0 at the left.")]
@@ -100,26 +100,27 @@ async def get_layer(
     if file not in FILES and file != ALL:
         raise NotFound(f"there is no layer {file}; the layers are {', '.join([*FILES, ALL])}")
 
-    matte = await anyio.to_thread.run_sync(_matte, context, id)
+    matte = await anyio.to_thread.run_sync(_open, context, id)
     tag = {"ETag": f'"{id}-{file}-{lobes}"'}  # a matte never changes once it is ready
     if etag_matches(request.headers, tag["ETag"]):
         return Response(status_code=304, headers=tag)
+    size = layers.bytes_of_everything(matte.width, matte.height, lobes)
+    if file == ALL and size > MOST_BYTES:
+        raise InvalidInput(
+            f"all layers with {lobes} lobes take {size} bytes, and the limit is {MOST_BYTES}: ask for fewer "
+            "lobes, or for the layers one by one",
+            field="lobes",
+            limit=MOST_BYTES,
+        )
+    kind = file.rpartition(".")[2]
+    write = partial(layers.everything, lobes=lobes) if file == ALL else FILES[file]
 
     def encode() -> Response:
-        kind = MEDIA_TYPES[file.rpartition(".")[2]]
-        if file != ALL:
-            return bytes_response(FILES[file](matte), kind, tag)
-        size = layers.bytes_of_everything(matte.width, matte.height, lobes)
-        if size > MOST_BYTES:
-            raise InvalidInput(
-                f"all layers with {lobes} lobes take {size} bytes, and the limit is {MOST_BYTES}: ask for fewer "
-                "lobes, or for the layers one by one",
-                field="lobes",
-                limit=MOST_BYTES,
-            )
-        return bytes_response(layers.everything(matte, lobes), kind, tag)
+        with context.stored(mattes.get_ready, id):
+            return file_response(partial(write, matte), MEDIA_TYPES[kind], tag)
 
-    return await context.compute(request, context.layers, encode)
+    memory = layers.bytes_of_png(matte) if kind == "png" else layers.bytes_of_band(matte, lobes)
+    return await context.compute(request, context.layers, encode, memory=LOOK_BYTES + memory)
 
 
 @router.get("/mattes/{id}/transport", response_model=Transport)
@@ -140,7 +141,7 @@ async def get_transport(
         id,
         (x, y),
         lobes,
-        lambda pixel: json_response(_describe(pixel, cells, skip)),
+        lambda pixel: bytes_response(to_json(_describe(pixel, cells, skip)), "application/json"),
     )
 
 
@@ -174,41 +175,46 @@ async def _look(
     """Look into a pixel as soon as there is memory for it, and answer with something of it."""
 
     def measure() -> tuple[stored_mattes.Matte, int]:
-        matte = _matte(context, id)
-        return matte, LOOK_BYTES + bytes_of_pixel(matte, *place)
+        with context.stored(mattes.get_ready, id):
+            matte = context.cache.matte(id)
+            return matte, LOOK_BYTES + bytes_of_pixel(matte, *place)
+
+    def look() -> Response:
+        with context.stored(mattes.get_ready, id):
+            return answer(look_into(matte, *place, lobes))
 
     matte, size = await anyio.to_thread.run_sync(measure)
-    return await context.compute(
-        request, context.memory, lambda: answer(look_into(matte, *place, lobes)), size
-    )
+    return await context.compute(request, context.memory, look, size)
 
 
-def _describe(pixel: Pixel, cells: int, skip: int) -> Transport:
-    """A pixel with some of its cells."""
+def _describe(pixel: Pixel, cells: int, skip: int) -> dict[str, Any]:
+    """The fields of a `Transport` with some of the cells.
+
+    As plain values: 10,000 cells as models would keep the event loop waiting several times as long.
+    """
     part = slice(skip, skip + cells)
     shown = replace(pixel, node=pixel.node[part], weight=pixel.weight[part])
-    return Transport(
-        x=pixel.x,
-        y=pixel.y,
-        recovered=pixel.recovered,
-        S=pixel.S.tolist(),
-        rho=pixel.rho.tolist(),
-        monitor=list(pixel.monitor),
-        cells=[
-            Cell(u=u, v=v, width=width, height=height, level=level, weight=weight)
+    return {
+        "x": pixel.x,
+        "y": pixel.y,
+        "recovered": pixel.recovered,
+        "S": pixel.S.tolist(),
+        "rho": pixel.rho.tolist(),
+        "monitor": pixel.monitor,
+        "cells": [
+            {"u": u, "v": v, "width": width, "height": height, "level": level, "weight": weight}
             for (u, v, width, height), level, weight in zip(
                 shown.cells.tolist(), shown.levels.tolist(), shown.weight.tolist(), strict=True
             )
         ],
-        cells_total=len(pixel.node),
-        lobes=[
-            Lobe(u=u, v=v, weight=[r, g, b], sigma_u=sigma_u, sigma_v=sigma_v, theta=theta)
+        "cells_total": len(pixel.node),
+        "lobes": [
+            {"u": u, "v": v, "weight": [r, g, b], "sigma_u": sigma_u, "sigma_v": sigma_v, "theta": theta}
             for u, v, r, g, b, sigma_u, sigma_v, theta in pixel.lobes.tolist()
         ],
-    )
+    }
 
 
-def _matte(context: Context, id: str) -> stored_mattes.Matte:
-    with reading(context.engine) as c:
-        mattes.get_ready(c, id)
-    return context.cache.matte(id)
+def _open(context: Context, id: str) -> stored_mattes.Matte:
+    with context.stored(mattes.get_ready, id):
+        return context.cache.matte(id)

@@ -7,14 +7,16 @@ from fastapi import APIRouter, Request, Response
 
 from services.api.context import OwnerContext
 from services.api.http.responses import bytes_response, etag_matches
-from storage.database.engine import reading
-from storage.errors import Corrupt, NoRoom
+from storage.errors import NoRoom
 from storage.layout import live as stored_live
+from storage.layout.mattes import Matte
 from storage.records import mattes
 from workflows.composite.live import encode
 from workflows.composite.threads import CORES
 
 router = APIRouter(tags=["mattes"])
+BLOCK_BYTES = 16 << 20
+"""What a thread takes for the block that it encodes."""
 
 
 @router.get(
@@ -30,25 +32,23 @@ async def get_live(context: OwnerContext, id: str, request: Request) -> Response
     It is computed for the first request and kept in the store.
     """
 
-    def require_ready() -> None:
-        with reading(context.engine) as c:
-            mattes.get_ready(c, id)
+    def open_matte() -> Matte:
+        with context.stored(mattes.get_ready, id):
+            return context.cache.matte(id)
 
     def load() -> Response:
         encoded = stored_live.read(context.objects, id, encode.FORMAT)
         if encoded is None:
-            try:
-                encoded = encode.encode_live(context.cache.matte(id), CORES)
-            except Corrupt:
-                require_ready()  # it may have been deleted meanwhile
-                raise
+            with context.stored(mattes.get_ready, id):
+                encoded = encode.encode_live(matte, CORES)
             # The answer needs no room, and it can be encoded again; or the matte was deleted just now.
             with suppress(NoRoom, FileNotFoundError):
                 stored_live.write(context.objects, id, encode.FORMAT, encoded)
         return bytes_response(encoded, "application/octet-stream", tag | {"Content-Encoding": "gzip"})
 
-    await anyio.to_thread.run_sync(require_ready)
+    matte = await anyio.to_thread.run_sync(open_matte)
     tag = {"ETag": f'"{id}-{encode.FORMAT}"'}  # a matte never changes once it is ready
     if etag_matches(request.headers, tag["ETag"]):
         return Response(status_code=304, headers=tag)
-    return await context.compute(request, context.layers, load)
+    memory = encode.bytes_of_live(matte) + CORES * BLOCK_BYTES
+    return await context.compute(request, context.layers, load, memory=memory)

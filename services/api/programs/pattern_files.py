@@ -1,9 +1,6 @@
 """Pictures and videos of pattern programs over HTTP, drawn for each request, and the page that plays a program."""
 
-import os
-import tempfile
 from collections.abc import AsyncIterator
-from contextlib import ExitStack
 from typing import IO, Annotated
 
 import anyio.to_thread
@@ -11,7 +8,7 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import FileResponse, StreamingResponse
 
 from services.api.context import OwnerContext
-from services.api.http.responses import FileStreamResponse, bytes_response
+from services.api.http.responses import bytes_response, file_response
 from services.api.system.pages import HEADERS, WEB
 from storage.database.engine import reading
 from storage.errors import NotFound
@@ -69,20 +66,13 @@ async def get_film(
     rate: Annotated[
         float, Query(ge=video.SLOWEST, le=video.FASTEST, description="Patterns per second.")
     ] = 2.0,
-) -> StreamingResponse:
+) -> Response:
     """A video of the lead-in, the patterns in a border, and the lead-out. It is encoded before the answer begins."""
 
-    def encode() -> tuple[IO[bytes], int]:
-        with ExitStack() as stack:
-            file = stack.enter_context(tempfile.TemporaryFile())
-            video.encode_video(program, file, rate, progress=lambda done, of: checkpoint())
-            size = file.seek(0, os.SEEK_END)
-            file.seek(0)
-            stack.pop_all()  # the answer closes it
-        return file, size
+    def write(file: IO[bytes]) -> None:
+        video.encode_video(program, file, rate, progress=lambda done, of: checkpoint())
 
-    file, size = await context.compute(request, context.films, encode)
-    return FileStreamResponse(file, size, "video/mp4")
+    return await context.compute(request, context.films, lambda: file_response(write, "video/mp4"))
 
 
 @page.get("/programs/{id}/play", response_class=FileResponse)

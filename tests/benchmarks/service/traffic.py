@@ -82,7 +82,7 @@ class Traffic:
             png(light, "srgb", np.uint8),
             png(light, "srgb", np.uint16),
             encode_jpeg((np.clip(light, 0, 1) * 255).astype(np.uint8), 90),
-            float_formats.encode_exr({"RGB": light}),
+            float_formats.encode_exr("RGB", light),
         )
         self.clip = clip(pictures(6), even(6))
         self._threads = [

@@ -53,7 +53,7 @@ def test_png_jpeg_and_exr_show_the_same_picture(service: Service, matte: str) ->
 
 def test_exr_backdrop_gives_exr_composite(service: Service, matte: str) -> None:
     def seen(gain: float) -> np.ndarray:
-        sent = float_formats.encode_exr({"RGB": BACKDROP * np.float32(gain)})
+        sent = float_formats.encode_exr("RGB", BACKDROP * np.float32(gain))
         return float_formats.decode(
             post_composite(service, matte, sent, "image/x-exr").content, memory=1 << 24
         )
@@ -61,7 +61,7 @@ def test_exr_backdrop_gives_exr_composite(service: Service, matte: str) -> None:
     dark, once, four = seen(0), seen(1), seen(4)
     assert four.max() > 2
     np.testing.assert_allclose(four - dark, 4 * (once - dark), atol=1e-4)
-    deep = decoded(post_composite(service, matte, float_formats.encode_exr({"RGB": BACKDROP})))
+    deep = decoded(post_composite(service, matte, float_formats.encode_exr("RGB", BACKDROP)))
     assert deep.dtype == np.uint16
 
 

@@ -44,7 +44,7 @@ def test_from_a_file_to_an_array(service: Service, capture_archive: Path) -> Non
 def test_array_is_linear_light(service: Service, matte: str, tmp_path: Path) -> None:
     client, light = service.client, np.linspace(0, 1, 48, dtype=np.float32).reshape(4, 4, 3)
     composite = client.composite(matte, light)
-    sent = client.composite(matte, float_formats.encode_exr({"RGB": light}), kind="image/x-exr")
+    sent = client.composite(matte, float_formats.encode_exr("RGB", light), kind="image/x-exr")
     np.testing.assert_array_equal(composite, float_formats.decode(sent, memory=1 << 24))
     grey = client.composite(matte, light[..., 0], size=48)
     assert grey.shape == (36, 48, 3)

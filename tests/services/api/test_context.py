@@ -1,11 +1,14 @@
 """Requests that go on after their key was checked, against a real database."""
 
+import asyncio
+import threading
 import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
 import pytest
+from fastapi import Request
 
 from services.api.auth import identify
 from services.api.context import KEY_CHECK, Context
@@ -14,8 +17,9 @@ from services.decoding.pool import Decoders
 from services.runtime.problems import Unauthorized
 from services.settings import Settings
 from storage.database.engine import open_engine, writing
+from storage.errors import Corrupt, NotFound
 from storage.objects.store import Objects
-from storage.records import api_keys
+from storage.records import api_keys, mattes
 from workflows.composite.cache import Cache
 
 
@@ -26,8 +30,9 @@ def test_download_ends_when_its_key_is_revoked(tmp_path: Path) -> None:
     settings, objects = Settings(data=tmp_path), Objects((tmp_path / "store").as_uri())
     check_key = partial(identify, settings, engine, key)
     decoders = Decoders(settings.backdrop_bytes)  # no process starts before the first picture
-    memory = Shares(1, 1)
-    context = Context(settings, engine, objects, Cache(objects, 0), decoders, memory, check_key=check_key)
+    shares = Shares(1, 1)
+    cache = Cache(objects, 0)
+    context = Context(settings, engine, objects, cache, decoders, shares, shares, check_key=check_key)
 
     def pieces() -> Iterator[bytes]:
         for n in range(5):
@@ -42,3 +47,53 @@ def test_download_ends_when_its_key_is_revoked(tmp_path: Path) -> None:
         sent.extend(context.while_allowed(pieces()))
     engine.dispose()
     assert sent == [b"\0", b"\1", b"\2"]
+
+
+@pytest.fixture
+def context(tmp_path: Path) -> Iterator[Context]:
+    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
+    settings, objects = Settings(data=tmp_path), Objects((tmp_path / "store").as_uri())
+    cache, memory = Cache(objects, 0), Shares(8, 4, "request_memory")
+    decoders = Decoders(settings.backdrop_bytes)
+    yield Context(settings, engine, objects, cache, decoders, memory, Shares(1, 1))
+    engine.dispose()
+
+
+def test_what_was_deleted_while_it_was_read_is_not_damaged(context: Context) -> None:
+    def read(deleted: bool) -> None:
+        with context.stored(mattes.get, "m"):
+            if deleted:
+                with writing(context.engine) as c:
+                    mattes.delete(c, "m")
+            raise Corrupt("a block is missing")
+
+    with writing(context.engine) as c:
+        mattes.add_imported(c, "m", {}, {})
+    with pytest.raises(Corrupt):
+        read(deleted=False)
+    for _ in range(2):  # while it is read, and before
+        with pytest.raises(NotFound):
+            read(deleted=True)
+
+
+def test_work_larger_than_an_owners_share_of_memory_is_done_one_at_a_time(context: Context) -> None:
+    async def receive() -> dict[str, str]:
+        await asyncio.Event().wait()
+        raise AssertionError
+
+    request = Request({"type": "http"}, receive)
+    at_once: list[int] = []
+    running: set[int] = set()
+
+    def work() -> None:
+        running.add(threading.get_ident())
+        time.sleep(0.05)
+        at_once.append(len(running))
+        running.remove(threading.get_ident())
+
+    async def several() -> None:
+        slots = Shares(9, 9)
+        await asyncio.gather(*(context.compute(request, slots, work, memory=100) for _ in range(3)))
+
+    asyncio.run(several())
+    assert at_once == [1, 1, 1]

@@ -59,7 +59,7 @@ def works() -> Iterator[Works]:
             finally:
                 made.working.remove(owner)
 
-        await run(request, owner, SECONDS, shares, until_ended)
+        await run(request, owner, SECONDS, [(shares, 1)], until_ended)
 
     config = uvicorn.Config(app, port=0, log_config=None, lifespan="off", timeout_graceful_shutdown=1)
     with config.bind_socket() as bound:

@@ -74,7 +74,7 @@ PICTURES = {
     },
     "TIFF, 16 bits": tiff(PIXELS.astype(np.uint16), compression="zlib", predictor=True),
     "TIFF, floats": tiff(PIXELS.astype(np.float32), compression="zlib", predictor=True),
-    "EXR": float_formats.encode_exr({"RGB": PIXELS.astype(np.float32)}),
+    "EXR": float_formats.encode_exr("RGB", PIXELS.astype(np.float32)),
 }
 NO_PICTURES = {
     "nothing": b"",

@@ -183,7 +183,7 @@ def test_integers_are_encoded_as_asked(codes: np.ndarray) -> None:
 
 def test_float_values_are_light_and_nan_is_black() -> None:
     picture = np.array([[[0.5, 2, 4], [np.nan, np.inf, -np.inf]]], np.float32)
-    assert light_of(float_formats.encode_exr({"RGB": picture})).tolist() == [[[0.5, 2, 4], [0, 0, 0]]]
+    assert light_of(float_formats.encode_exr("RGB", picture)).tolist() == [[[0.5, 2, 4], [0, 0, 0]]]
 
 
 @pytest.mark.parametrize("depth", [np.uint8, np.uint16])

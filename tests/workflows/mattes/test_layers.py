@@ -3,6 +3,8 @@
 import io
 import tempfile
 from collections.abc import Callable
+from functools import partial
+from typing import IO
 
 import numpy as np
 import OpenImageIO as oiio
@@ -28,10 +30,10 @@ CROSSTALK = [[0.9, 0.1, 0], [0.05, 0.8, 0.15], [0.02, 0.18, 0.8]]
 Layers = dict[str, NDArray[np.float32]]
 
 
-def read(data: bytes) -> tuple[Layers, oiio.ImageSpec]:
-    """The channels of an EXR, and what its header says."""
+def read(write: Callable[[IO[bytes]], None]) -> tuple[Layers, oiio.ImageSpec]:
+    """The channels of an EXR that a function writes, and what its header says."""
     with tempfile.NamedTemporaryFile(suffix=".exr") as stored:
-        stored.write(data)
+        write(stored)
         stored.flush()
         file = oiio.ImageInput.open(stored.name)
         assert file, oiio.geterror()
@@ -76,7 +78,7 @@ def identity(objects: Objects) -> Matte:
 
 
 def test_an_identity_is_an_stmap_of_pixel_centres_from_the_bottom_left(identity: Matte) -> None:
-    channels, spec = read(layers.stmap(identity))
+    channels, spec = read(partial(layers.stmap, identity))
     assert set(channels) == {"R", "G", "B"}
     assert spec.format == oiio.FLOAT
     seen = identity.layer("count").any(axis=2)
@@ -95,10 +97,12 @@ def test_single_layers_equal_the_data_of_the_matte(identity: Matte, name: str) -
         "alpha": identity.layer("recovered")[..., np.newaxis],
         "confidence": confidence(identity)[..., np.newaxis],
     }[name]
-    pixels = integer_formats.decode(layers.png(identity, name), memory=1 << 20)
+    encoded = io.BytesIO()
+    layers.png(identity, name, encoded)
+    pixels = integer_formats.decode(encoded.getvalue(), memory=1 << 20)
     assert pixels.dtype == np.uint16
     np.testing.assert_allclose(integer_formats.to_unit(pixels), held, atol=1e-5)
-    channels, spec = read(layers.exr(identity, name))
+    channels, spec = read(partial(layers.exr, identity, name))
     assert spec.format == oiio.FLOAT
     np.testing.assert_array_equal(
         np.stack([channels[c] for c in ("RGB" if held.shape[2] == 3 else "Y")], axis=-1), held
@@ -106,7 +110,7 @@ def test_single_layers_equal_the_data_of_the_matte(identity: Matte, name: str) -
 
 
 def test_all_layers_are_read_back_from_one_exr(identity: Matte) -> None:
-    channels, spec = read(layers.everything(identity, 2))
+    channels, spec = read(partial(layers.everything, identity, lobes=2))
     of_lobe = ("u", "v", "weight.R", "weight.G", "weight.B", "sigma_u", "sigma_v", "theta")
     assert set(channels) == {
         *"RGBA",
@@ -134,7 +138,7 @@ def test_all_layers_are_read_back_from_one_exr(identity: Matte) -> None:
 
 def test_size_of_all_layers_is_known_beforehand(identity: Matte) -> None:
     for lobes in (1, 4):
-        _, spec = read(layers.everything(identity, lobes))
+        _, spec = read(partial(layers.everything, identity, lobes=lobes))
         assert spec.pixel_bytes(True) * 30 * 50 == layers.bytes_of_everything(50, 30, lobes)
 
 
@@ -185,7 +189,7 @@ def test_a_recomposite_from_the_exr_alone_is_as_close_to_the_truth(
     y, x = np.mgrid[:240, :320] / 320
     backdrop = np.stack([0.5 + 0.4 * np.sin(25 * x + 9 * y), 1 - x, 0.5 + 0.4 * np.sin(19 * y)], axis=-1)
     backdrop = backdrop.astype(np.float32)
-    channels, spec = read(layers.everything(matte))
+    channels, spec = read(partial(layers.everything, matte))
     crosstalk = np.reshape(spec.getattribute("crosstalk"), (3, 3)).astype(float)
     again, own, truth = (
         recomposite(channels, crosstalk, backdrop),

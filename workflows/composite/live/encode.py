@@ -66,7 +66,7 @@ def encode_live(matte: Matte, threads: int, lookups: int = LOOKUPS) -> bytes:
     Corrupt
         If a block of the matte is missing.
     """
-    step = max(math.ceil(math.sqrt(matte.width * matte.height / MOST_PIXELS)), 1)
+    step = _step(matte)
     ys, xs = (np.arange(step // 2, size, step) for size in (matte.height, matte.width))
     levels = Pyramid.over(matte.columns, matte.rows).grids
     coarsest = 1 << (len(levels) - 1)
@@ -97,6 +97,17 @@ def encode_live(matte: Matte, threads: int, lookups: int = LOOKUPS) -> bytes:
         "rho": max(float(encoded.rho.max()), 1e-6),
     }
     return _pack(header, encoded)
+
+
+def bytes_of_live(matte: Matte, lookups: int = LOOKUPS) -> int:
+    """Bytes that `encode_live` takes, apart from a block for each thread: codes, planes of bytes, and their copies."""
+    pixels = -(-matte.width // _step(matte)) * -(-matte.height // _step(matte))
+    return pixels * (9 * lookups + 25 + 3 * (_PLANES * lookups + 7) + 12)
+
+
+def _step(matte: Matte) -> int:
+    """Of how many rows and columns one is encoded."""
+    return max(math.ceil(math.sqrt(matte.width * matte.height / MOST_PIXELS)), 1)
 
 
 class _Encoded(NamedTuple):

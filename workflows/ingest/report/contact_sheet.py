@@ -10,6 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import from_light
 from workflows.ingest.measured_light import look_up_of
+from workflows.interruption import checkpoint
 from workflows.programs.program import Program
 
 WIDTH, HEIGHT = 240, 240
@@ -20,6 +21,8 @@ EACH = 2
 """Patterns shown of each part."""
 PARTS = 9
 """Parts shown, at most."""
+ROWS = 64
+"""Rows of the frames that are read at a time."""
 CAPTION = 18
 """Height of a caption in pixels."""
 AT_WHITE, AT_BLACK = (255, 0, 0), (0, 90, 255)
@@ -51,6 +54,14 @@ def contact_sheet(stack: Stack) -> bytes:
     target = io.BytesIO()
     sheet.save(target, "PNG")
     return target.getvalue()
+
+
+def bytes_of_contact_sheet(stack: Stack) -> int:
+    """Bytes that `contact_sheet` takes at most: some rows of all frames as they are read, and of one as light."""
+    frames = 2 + EACH * PARTS
+    value = stack.channels * stack.width * max(ROWS, _factor(stack))
+    of_thumbnails = 3 * (4 + 2) * WIDTH * HEIGHT * frames
+    return (2 * frames * stack.dtype.itemsize + 8) * value + of_thumbnails
 
 
 def _pick(stack: Stack, program: Program) -> list[tuple[int, str]]:
@@ -87,19 +98,26 @@ def _shrink(
     stack: Stack, frames: list[int]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
     """The light of frames at the size of thumbnails, and where it is clipped high and low; read in bands of rows."""
-    factor = max(1, -(-stack.width // WIDTH), -(-stack.height // HEIGHT))
+    factor = _factor(stack)
     height, width = stack.height // factor, stack.width // factor
     # Full scale is shown as white, whatever the camera's curve.
     top = np.iinfo(stack.dtype).max
     look_up = look_up_of(stack)
     light = np.zeros((len(frames), height, width, stack.channels), np.float32)
     high, low = (np.zeros((len(frames), height, width), bool) for _ in range(2))
-    band = max(1, 64 // factor)
+    band = max(1, ROWS // factor)
     for first in range(0, height, band):
         last = min(first + band, height)
         codes = stack.read_frames(frames, slice(first * factor, last * factor), slice(0, width * factor))
-        cells = codes.reshape(len(frames), last - first, factor, width, factor, stack.channels)
-        light[:, first:last] = look_up[cells].mean(axis=(2, 4))
-        high[:, first:last] = (cells == top).any(axis=(2, 4, 5))
-        low[:, first:last] = (cells == 0).any(axis=(2, 4, 5))
+        for number, of_frame in enumerate(codes):
+            checkpoint()
+            cells = of_frame.reshape(last - first, factor, width, factor, stack.channels)
+            light[number, first:last] = look_up[cells].mean(axis=(1, 3))
+            high[number, first:last] = (cells == top).any(axis=(1, 3, 4))
+            low[number, first:last] = (cells == 0).any(axis=(1, 3, 4))
     return light, high, low
+
+
+def _factor(stack: Stack) -> int:
+    """Edge of the squares of pixels that become one of a thumbnail."""
+    return max(1, -(-stack.width // WIDTH), -(-stack.height // HEIGHT))

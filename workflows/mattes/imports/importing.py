@@ -15,6 +15,7 @@ from storage.layout.matte_archive import GROUPS
 from storage.layout.mattes import Matte
 from storage.objects.checksums import unseal
 from storage.objects.store import Objects
+from workflows.interruption import checkpoint
 from workflows.mattes.imports.reader import Reader
 from workflows.untrusted.limits import Limits
 
@@ -35,6 +36,8 @@ def take_in(file: BinaryIO, objects: Objects, matte: str, limits: Limits) -> Mat
     ------
     ArchiveError
         Names the entry that is wrong, and why. The matte is deleted.
+    OverLimit
+        If its frame has more pixels than the limits allow.
     """
     archive = Reader(file, limits)
     given = archive.attributes
@@ -46,6 +49,7 @@ def take_in(file: BinaryIO, objects: Objects, matte: str, limits: Limits) -> Mat
             with objects.read(f"{mattes.path(matte)}/{name}") as ours:
                 archive.compare(name, unseal(name, ours.read())[0])
         for row, column in product(range(made.block_rows), range(made.block_columns)):
+            checkpoint()
             y, x = made.span(row, column)
             block = archive.block(row, column, y.stop - y.start, x.stop - x.start)
             made.write(row, column, block)

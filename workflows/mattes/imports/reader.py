@@ -60,6 +60,7 @@ class Reader:
         self.attributes: dict[str, Any] = self._document("zarr.json", DOCUMENT_BYTES)["attributes"]
         checked = valid(Attributes, self.attributes, "zarr.json")
         self._check_costs(checked)
+        limits.check_pixels(checked.width, checked.height, entry="zarr.json")
         self._edge = block_edge(checked.height, checked.width)
         if checked.block != self._edge:
             raise refused(

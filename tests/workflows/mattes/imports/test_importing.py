@@ -5,6 +5,7 @@ import json
 import stat
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from storage.errors import ArchiveError
+from storage.errors import ArchiveError, OverLimit
 from storage.layout.matte_archive import MANIFEST, Archive
 from storage.objects.store import Objects
 from tests.workflows.mattes.imports.conftest import (
@@ -377,3 +378,10 @@ def test_archive_that_unpacks_to_too_much_is_refused(objects: Objects, archive: 
 def test_no_archive_at_all(objects: Objects, archive: bytes) -> None:
     for data in (b"", b"PK", json.dumps({}).encode(), archive[:-10], archive[: len(archive) // 2]):
         refused(objects, data, "not a ZIP archive")
+
+
+def test_frame_with_more_pixels_than_allowed_is_refused(objects: Objects, archive: bytes) -> None:
+    with pytest.raises(OverLimit, match="a frame may have 9 pixels") as caught:
+        bring(objects, archive, replace(LIMITS, pixels=9))
+    assert caught.value.fields["entry"] == "zarr.json"
+    assert objects.paths_below("mattes/n") == set()
