@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import median
 
 import httpx2
 import numpy as np
@@ -20,15 +21,20 @@ import pytest
 
 from storage.database.engine import open_engine, writing
 from storage.database.owners import for_owner
-from storage.layout.captures import create_stack, write_slab
+from storage.layout.captures import Stack, create_stack, write_slab
 from storage.objects.store import Objects
-from storage.records import api_keys, captures
-from tests.end_to_end.conftest import Service, serving
+from storage.records import api_keys, captures, mattes
+from tests.conftest import EXHAUSTIVE
+from tests.end_to_end.conftest import BANDS, Service, serving
 from tests.faults.callers import PATIENCE
 from tests.parts.background import repeating
-from tests.parts.hostile_mattes import hostile_archive
+from tests.parts.captures import nested_program
+from tests.parts.hostile_mattes import hostile_archive, large_matte
 from tests.parts.processes import running
 from tests.parts.waiting import until
+from workflows.images.integer_formats import encode_png
+from workflows.simulation import glass_ball
+from workflows.simulation.scene import write_capture
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -37,6 +43,14 @@ SECONDS = 5.0
 """How long an attack goes on."""
 FRAME = 9000
 """Edge of a square frame: 81 megapixels."""
+LARGE = 4096
+"""Edge of a matte with a large frame."""
+SHEET = 2000
+"""Edge of the frames of a contact sheet."""
+BACKDROP = np.zeros((5000, 5000, 3), np.uint8)
+MATTE_MEMORY = 128 << 20
+"""What the service keeps of mattes. It is beside what requests take."""
+HEALTH_SECONDS = 0.1
 ZIP = {"Content-Type": "application/zip"}
 GRID = {"columns": 16384, "rows": 2048}
 MATTES: dict[str, dict[str, int | bool]] = {
@@ -52,6 +66,12 @@ ATTACKS = {
     "maps of 256 such pixels": "mattes/{blocks}/layers/stmap.exr",
     "frames of 81 megapixels": "captures/{frames}/frames/0.png",
     "lists of large programs": "captures?limit=1000",
+    "contact sheets": "captures/{sheet}/contact-sheet.png",
+    "layers of 16 megapixels": "mattes/{large}/layers/S.exr",
+    "all layers of 16 megapixels": "mattes/{large}/layers/all.exr?lobes=1",
+    "layers of 16 megapixels as PNG": "mattes/{large}/layers/rho.png",
+    "composites of 16 megapixels": "mattes/{large}/composite",
+    "16 megapixels for a browser": "mattes/{large}/live",
 }
 """Paths that the attacker asks for, by what for."""
 
@@ -65,6 +85,7 @@ class Attacked:
     ids: dict[str, str]
     own: str
     """A matte of alice's."""
+    backdrop: Path
 
     def ask(self, path: str, owner: str = "alice") -> httpx2.Response:
         return self.service.http.get(f"/{path}", headers=bearer(self.keys[owner]))
@@ -87,7 +108,8 @@ class Figures:
 def attacked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Attacked]:
     folder = tmp_path_factory.mktemp("attacked")
     data = folder / "data"
-    with serving(data, "--workers", "1", ENVMATTE_KEYS="of-the-administrator") as service:
+    settings = {"ENVMATTE_KEYS": "of-the-administrator", "ENVMATTE_MATTE_MEMORY": str(MATTE_MEMORY)}
+    with serving(data, "--workers", "1", **settings) as service:
         yield prepare(service, data, folder)
 
 
@@ -124,7 +146,34 @@ def prepare(service: Service, data: Path, folder: Path) -> Attacked:
     )
     rng = np.random.default_rng(0)  # noise, of which a PNG is as large as the frame
     write_slab(objects, ids["frames"], 0, rng.integers(0, 256, shape, np.uint8))
+    ids["sheet"], ids["large"] = "e" * 20, "d" * 20
+    write_capture(
+        glass_ball.glass_ball(32, 24, rays=4), nested_program(bands=BANDS, levels=5), folder / "ball.zip"
+    )
+    capture = service.client.upload(folder / "ball.zip")
+    service.client.wait(capture["job"])
+    attributes = Stack(objects, capture["id"]).attributes
+    frames = len(attributes["patterns"])
+    sheet = frames, SHEET, SHEET, 1
+    each = create_stack(
+        objects,
+        ids["sheet"],
+        sheet,
+        np.dtype(np.uint8),
+        memory=512 << 20,
+        attributes=attributes,
+        mask=None,
+        images=[],
+    )
+    for first in range(0, frames, each):
+        slab = np.full((min(each, frames - first), *sheet[1:]), 100, np.uint8)
+        write_slab(objects, ids["sheet"], first, slab)
+    large = large_matte(data / "store", ids["large"], LARGE)
+    (folder / "backdrop.png").write_bytes(encode_png(BACKDROP))
     with writing(for_owner(engine, "mallory")) as c:
+        mattes.add_imported(c, ids["large"], {"method": "lobes"}, large.figures)
+        captures.add(c, ids["sheet"], "0" * 20, name="sheet", bytes=1, frames=frames, program={})
+        captures.change(c, ids["sheet"], state="ready", width=SHEET, height=SHEET)
         for number in range(60):
             name = ids["frames"] if number == 0 else f"{number:020}"
             program = {"kind": "made up", "numbers": list(range(20_000))}
@@ -132,7 +181,7 @@ def prepare(service: Service, data: Path, folder: Path) -> Attacked:
             captures.add(c, name, "0" * 20, **record)
             captures.change(c, name, state="ready", width=FRAME, height=FRAME)
     engine.dispose()
-    made = Attacked(service, keys, ids, own)
+    made = Attacked(service, keys, ids, own, folder / "backdrop.png")
     for path in ("mattes/{own}/transport?x=1&y=1", "mattes/{own}/layers/stmap.exr", "mattes/{own}/live"):
         assert made.ask("v1/" + path.format(own=own)).status_code == 200  # has compiled what it needs
     until(lambda: made.ask("readyz").status_code == 200)
@@ -142,9 +191,20 @@ def prepare(service: Service, data: Path, folder: Path) -> Attacked:
 @contextmanager
 def under_attack(attacked: Attacked, *paths: str) -> Iterator[Counter[str]]:
     """Forty callers ask for these paths again and again; afterwards the counter has the statuses of the answers."""
-    netloc, key = attacked.service.url.removeprefix("http://"), attacked.keys["mallory reads"]
+    netloc = attacked.service.url.removeprefix("http://")
+    reads = not any(path.endswith("/composite") for path in paths)
+    key = attacked.keys["mallory reads" if reads else "mallory"]
     wanted = [f"/v1/{path.format(**attacked.ids)}" for path in paths]
-    command = [sys.executable, "-m", "tests.faults.callers", netloc, key, str(CALLERS), *wanted]
+    command = [
+        sys.executable,
+        "-m",
+        "tests.faults.callers",
+        netloc,
+        key,
+        str(CALLERS),
+        str(attacked.backdrop),
+    ]
+    command += wanted
     answers: Counter[str] = Counter()
     with running(command, stdin=subprocess.PIPE) as callers:
         assert callers.stdout is not None
@@ -155,14 +215,27 @@ def under_attack(attacked: Attacked, *paths: str) -> Iterator[Counter[str]]:
 
 @contextmanager
 def watched_memory(attacked: Attacked, figures: Figures) -> Iterator[None]:
+    """Watch the memory of the server and its decoders: all of its processes but those of the cluster."""
     server = psutil.Process(attacked.service.process.pid)
 
     def watch() -> None:
         with suppress(psutil.NoSuchProcess):
-            figures.peak = max(figures.peak, server.memory_info().rss)
+            figures.peak = max(
+                figures.peak, server.memory_info().rss + sum(map(own_memory, server.children()))
+            )
 
-    with repeating(watch, 0.01):
+    with repeating(watch, 0.05):
         yield
+
+
+def own_memory(process: psutil.Process) -> int:
+    """Bytes of a process and its children, where it shares them its part of them; none of the cluster's."""
+    try:
+        if any("forkserver" in argument for argument in process.cmdline()):
+            return 0
+        return int(process.memory_full_info().pss) + sum(map(own_memory, process.children()))
+    except psutil.NoSuchProcess:
+        return 0
 
 
 def measure(attacked: Attacked, *paths: str, seconds: float = SECONDS) -> Figures:
@@ -186,28 +259,35 @@ def measure(attacked: Attacked, *paths: str, seconds: float = SECONDS) -> Figure
                 assert ask().status_code == 200, path
                 name = path.rpartition("/")[2].partition("?")[0]
                 figures.seconds[name].append(time.perf_counter() - start)
-    times = ", ".join(f"{name} {1e3 * max(taken):.0f} ms" for name, taken in figures.seconds.items())
-    print(f"\n{', '.join(paths)}: {times}; {figures.peak / 1e6:.0f} MB; {dict(figures.answers)}")
+    print(f"\n{', '.join(paths)}: {figures.peak / 1e6:.0f} MB; {dict(figures.answers)}")
+    for name, taken in figures.seconds.items():
+        half, most = (1e3 * np.percentile(taken, share) for share in (50, 99))
+        print(f"  {name}: p50 {half:.0f} ms, p99 {most:.0f} ms of {len(taken)}")
     return figures
 
 
-def check(figures: Figures) -> None:
-    """Others are answered, if late on a machine with something else to do: without bounds they never were."""
+def check(figures: Figures, alone: bool) -> None:
+    """Others are answered, if late on a machine with something else to do: without bounds they never were.
+
+    On one that runs this test ``alone`` they are answered in time.
+    """
     assert figures.peak < 1 << 30
     for name, taken in figures.seconds.items():
         assert max(taken) < PATIENCE, name
+        if alone:
+            assert median(taken) < (HEALTH_SECONDS if name in ("healthz", "readyz") else 1), name
     # A caller may have to wait for its turn longer than it has patience.
     assert figures.answers.keys() <= {"200", "TimeoutError"}, figures.answers
 
 
-def test_all_attacks_at_once_leave_others_undisturbed(attacked: Attacked) -> None:
-    check(measure(attacked, *ATTACKS.values()))
+def test_all_attacks_at_once_leave_others_undisturbed(attacked: Attacked, times: int) -> None:
+    check(measure(attacked, *ATTACKS.values()), times >= EXHAUSTIVE)
 
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("attack", ATTACKS)
 def test_attack_leaves_others_undisturbed(attacked: Attacked, attack: str) -> None:
-    check(measure(attacked, ATTACKS[attack], seconds=20))
+    check(measure(attacked, ATTACKS[attack], seconds=20), alone=True)
 
 
 def test_cells_come_in_pages(attacked: Attacked) -> None:
@@ -223,14 +303,14 @@ def test_cells_come_in_pages(attacked: Attacked) -> None:
 
 def test_lists_lack_programs_that_single_captures_have(attacked: Attacked) -> None:
     listed = attacked.ask("v1/captures?limit=1000", "mallory")
-    assert len(listed.json()["captures"]) == 60
+    assert len(listed.json()["captures"]) == 61
     assert len(listed.content) < 60 * 1000
     one = listed.json()["captures"][0]
     assert "program" not in one
     assert attacked.ask(f"v1/captures/{one['id']}", "mallory").json()["program"]["kind"] == "made up"
 
 
-def test_service_under_attack_stops_in_time(attacked: Attacked) -> None:
+def test_service_under_attack_stops_in_time(attacked: Attacked, times: int) -> None:
     """The last test: it ends the service."""
     process = attacked.service.process
     children = psutil.Process(process.pid).children(recursive=True)
@@ -243,4 +323,5 @@ def test_service_under_attack_stops_in_time(attacked: Attacked) -> None:
         psutil.wait_procs(children, 60)
         everything = time.monotonic() - start
         print(f"\nended {ended:.1f} s after SIGTERM, all of its processes after {everything:.1f} s")
-        assert everything < 20  # it promises 10, on a machine that does nothing else
+        # A short run may not have the machine to itself.
+        assert everything < (10 if times >= EXHAUSTIVE else 20)

@@ -21,7 +21,7 @@ from storage.records.leases import Heartbeat
 router = APIRouter(tags=["system"])
 INTERVAL = 1.0
 """Seconds between two checks of the same thing, however often readiness is asked for."""
-PATIENCE = 0.05
+PATIENCE = 0.02
 """Seconds that an answer waits for a check; after that it has the result of the check before."""
 SILENCE = 3.0
 """Seconds after which a check without a result counts as failed."""
