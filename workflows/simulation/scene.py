@@ -51,6 +51,8 @@ class Scene:
         Identical channels share one array.
     coverage : (height, width) float32
         The share of a camera pixel that the object covers, 0 to 1.
+    reflections : (height, width, 3) float32, optional
+        The light of the room that the object reflects and refracts to the camera; none if left out.
     """
 
     width: int
@@ -58,6 +60,7 @@ class Scene:
     monitor: tuple[int, int]
     transport: Transports
     coverage: Floats
+    reflections: Floats | None = None
 
     @cached_property
     def rho(self) -> Floats:
@@ -105,9 +108,13 @@ class Scene:
         Returns
         -------
         (height, width, 3) float32
-            Linear light, ``offset + gain * composite(backdrop)``.
+            Linear light, ``offset + reflections + gain * composite(backdrop)``.
         """
-        return np.float32(offset) + np.float32(gain) * self.composite(backdrop)
+        return self._still(offset) + np.float32(gain) * self.composite(backdrop)
+
+    def _still(self, offset: float) -> Floats | np.float32:
+        """The sensor's value without light from the monitor."""
+        return np.float32(offset) + (np.float32(0) if self.reflections is None else self.reflections)
 
     def film(
         self,
@@ -128,7 +135,7 @@ class Scene:
         program : Program
             Program for a monitor of this scene's size. An ``unknown`` response of the monitor is taken as sRGB.
         offset, gain : float
-            The sensor's value without light from the monitor, and the increase for a white monitor seen directly.
+            The sensor's value without any light, and the increase for a white monitor seen directly.
         noise : float
             Factor on the noise. 1 is a read noise of 0.002 of full scale and a shot noise of 0.006 at full scale.
         depth : {8, 16}
@@ -152,8 +159,8 @@ class Scene:
 
         Notes
         -----
-        A pixel is curve(clip(v + n)), rounded, with v = offset + gain * light and normal noise n of the standard
-        deviation noise * (0.002 + 0.006 sqrt(v)).
+        A pixel is curve(clip(v + n)), rounded, with v = offset + reflections + gain * light and normal noise n of the
+        standard deviation noise * (0.002 + 0.006 sqrt(v)).
         """
         if (program.monitor.width, program.monitor.height) != self.monitor:
             raise OptionError("the program's monitor has another size than the scene's", field="program")
@@ -161,9 +168,10 @@ class Scene:
         if len(images) != needed:
             raise OptionError(f"the program needs {needed} images, not {len(images)}", field="images")
         rng = np.random.Generator(np.random.PCG64(seed))
+        still = self._still(offset)
 
         def frame(light: Floats) -> Frame:
-            value = np.float32(offset) + np.float32(gain) * light
+            value = still + np.float32(gain) * light
             spread = noise * (0.002 + 0.006 * np.sqrt(np.maximum(value, 0)))
             value = value + spread * rng.standard_normal(value.shape, dtype=np.float32)
             stored = from_light(np.clip(value, 0, 1), response)
@@ -181,8 +189,9 @@ def write_capture(
     program: Program,
     target: Path | BinaryIO,
     *,
-    mask: bool = False,
+    mask: bool | NDArray[np.bool_] = False,
     name: str = "",
+    jpeg: int | None = None,
     **film: Unpack[FilmOptions],
 ) -> int:
     """Simulate the frames of a program and write a capture archive, a ZIP in the format envmatte-capture/1.
@@ -195,10 +204,12 @@ def write_capture(
     program : Program
         Files of its `Images` parts are written under their names, as PNG of 16 bits.
     target : Path or binary file
-    mask : bool
-        Whether to include the object's mask.
+    mask : bool or (height, width) bool
+        Whether to include the object's mask; or another mask to include.
     name : str
         Name of the capture; omitted if empty.
+    jpeg : int, optional
+        Quality of JPEG frames, 1 to 100; they are PNG if left out.
     **film
         Options of `Scene.film`.
 
@@ -213,14 +224,16 @@ def write_capture(
         As from `Scene.film`; nothing is written.
     """
     filmed = scene.film(program, **film)
-    frames = [{"file": f"frames/{n:05d}.png", "pattern": n} for n in range(program.count)]
+    kind = "jpg" if jpeg else "png"
+    frames = [{"file": f"frames/{n:05d}.{kind}", "pattern": n} for n in range(program.count)]
+    masked = scene.object_mask if mask is True else mask
     record = {
         "format": "envmatte-capture/1",
         **({"name": name} if name else {}),
         "program": program.model_dump(mode="json", exclude_defaults=True),
         "response": film.get("response", "linear"),
         "frames": frames,
-        **({"mask": "mask.png"} if mask else {}),
+        **({} if masked is False else {"mask": "mask.png"}),
     }
     files = [file for part in program.parts if part.kind == "images" for file in part.files]
     with zipfile.ZipFile(target, "w", zipfile.ZIP_STORED) as archive:
@@ -234,8 +247,9 @@ def write_capture(
         for file, image in zip(files, film.get("images", ()), strict=True):
             pixels = image[:, :, 0] if image.shape[2] == 1 else image
             add(file, np.round(pixels * 65535).astype(np.uint16))
-        if mask:
-            add("mask.png", scene.object_mask.astype(np.uint8) * np.uint8(255))
+        if masked is not False:
+            add("mask.png", masked.astype(np.uint8) * np.uint8(255))
         for entry, frame in zip(frames, filmed, strict=True):
-            add(str(entry["file"]), frame)
+            encoded = bytes(imagecodecs.jpeg_encode(frame, jpeg, subsampling="444")) if jpeg else frame
+            add(str(entry["file"]), encoded)
     return program.count

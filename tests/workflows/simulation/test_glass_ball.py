@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from workflows.simulation.glass_ball import CAMERA, MONITOR, backdrop, fresnel, glass_ball
+from workflows.simulation.camera import CAMERA, MONITOR
+from workflows.simulation.glass_ball import backdrop, glass_ball
+from workflows.simulation.optics import fresnel
 from workflows.simulation.scene import Scene
 
 

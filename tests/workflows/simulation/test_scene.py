@@ -159,3 +159,18 @@ def test_what_does_not_fit_is_refused_and_nothing_written(
     assert not path.exists()
     with pytest.raises(OptionError, match="must be a square number"):
         glass_ball(rays=50)
+
+
+def test_frames_may_be_jpeg_and_the_mask_another(ball: Scene, program: Program) -> None:
+    mask = ball.coverage > 0
+    film = {"noise": 0.0, "response": "srgb"}
+    write_capture(ball, program, file := io.BytesIO(), mask=mask, jpeg=95, **film)  # type: ignore[arg-type]
+    with zipfile.ZipFile(file) as archive:
+        record = json.loads(archive.read("capture.json"))
+        np.testing.assert_array_equal(imagecodecs.imread(archive.read("mask.png")) > 0, mask)
+        expected = list(ball.film(program, **film))  # type: ignore[arg-type]
+        assert record["response"] == "srgb"
+        for frame, exact in zip(record["frames"], expected, strict=True):
+            content = archive.read(frame["file"])
+            assert content.startswith(b"\xff\xd8")
+            assert np.mean((imagecodecs.jpeg_decode(content) - exact.astype(float)) ** 2) < 25
