@@ -203,14 +203,21 @@ def _is_clip(file: Path) -> bool:
     )
 
 
-@click.command(epilog=example("envmatte export MATTE -o matte.zip"))
+@click.command(
+    epilog=example("envmatte export MATTE -o matte.zip", "envmatte export MATTE --html -o glass.html")
+)
 @click.argument("matte")
-@click.option("-o", "--output", type=OutputFile, required=True, help="ZIP to write.")
+@click.option("-o", "--output", type=OutputFile, required=True, help="File to write.")
+@click.option("--html", is_flag=True, help="Write a web page that draws the glass without a service.")
 @_remote
-def export(matte: str, output: Path, url: str, key: str | None, as_json: bool) -> None:
-    """Write a matte to a file, for `envmatte import` elsewhere or any zarr reader."""
-    with _client(url, key) as client, Progress("export") as bar:
-        client.export(matte, output, progress=lambda done, size: bar.show(done / size))
+def export(matte: str, output: Path, html: bool, url: str, key: str | None, as_json: bool) -> None:
+    """Write a matte to a file, a ZIP for `envmatte import` elsewhere or any zarr reader."""
+    with _client(url, key) as client:
+        if html:
+            write(output, client.live_page(matte))
+        else:
+            with Progress("export") as bar:
+                client.export(matte, output, progress=lambda done, size: bar.show(done / size))
     print_result({"output": str(output)}, as_json, "output")
 
 

@@ -243,6 +243,10 @@ class Client:
         """Get a layer of a matte as a file, such as ``confidence.png``; ``Matte.layers`` has them as arrays."""
         return self._http.send("GET", f"{_path(Matte, matte)}/layers/{name}", computing=True).content
 
+    def live_page(self, matte: Matte | str) -> bytes:
+        """Get a matte as a web page in one file, which draws the glass without a service."""
+        return self._http.send("GET", f"{_path(Matte, matte)}/live.html", computing=True).content
+
     def export(
         self, matte: Matte | str, file: Path, *, progress: Callable[[int, int], None] | None = None
     ) -> None:

@@ -1,16 +1,20 @@
-"""Mattes for graphics hardware over HTTP: the web app draws them while the user moves the backdrop."""
+"""Mattes for graphics hardware over HTTP: for the web app, and as a page that draws the glass without a service."""
 
 from contextlib import suppress
+from typing import Any
 
 import anyio.to_thread
 from fastapi import APIRouter, Request, Response
+from sqlalchemy import Row
 
-from services.api.context import OwnerContext
+from services.api.context import Context, OwnerContext
 from services.api.http.responses import bytes_response, etag_matches
-from storage.errors import NoRoom
+from services.api.mattes.live_page import make_page
+from storage.database.engine import reading
+from storage.errors import NoRoom, NotFound
 from storage.layout import live as stored_live
 from storage.layout.mattes import Matte
-from storage.records import mattes
+from storage.records import captures, mattes
 from workflows.composite.live import encode
 from workflows.composite.threads import CORES
 
@@ -32,23 +36,65 @@ async def get_live(context: OwnerContext, id: str, request: Request) -> Response
     It is computed for the first request and kept in the store.
     """
 
-    def open_matte() -> Matte:
-        with context.stored(mattes.get_ready, id):
-            return context.cache.matte(id)
-
     def load() -> Response:
-        encoded = stored_live.read(context.objects, id, encode.FORMAT)
-        if encoded is None:
-            with context.stored(mattes.get_ready, id):
-                encoded = encode.encode_live(matte, CORES)
-            # The answer needs no room, and it can be encoded again; or the matte was deleted just now.
-            with suppress(NoRoom, FileNotFoundError):
-                stored_live.write(context.objects, id, encode.FORMAT, encoded)
+        encoded = _encoded(context, matte)
         return bytes_response(encoded, "application/octet-stream", tag | {"Content-Encoding": "gzip"})
 
-    matte = await anyio.to_thread.run_sync(open_matte)
+    _, matte = await anyio.to_thread.run_sync(_open, context, id)
     tag = {"ETag": f'"{id}-{encode.FORMAT}"'}  # a matte never changes once it is ready
     if etag_matches(request.headers, tag["ETag"]):
         return Response(status_code=304, headers=tag)
-    memory = encode.bytes_of_live(matte) + CORES * BLOCK_BYTES
-    return await context.compute(request, context.layers, load, memory=memory)
+    return await context.compute(request, context.layers, load, memory=_bytes_of(matte))
+
+
+@router.get(
+    "/mattes/{id}/live.html",
+    response_class=Response,
+    responses={200: {"content": {"text/html": {}}, "description": "The page"}},
+)
+async def get_live_page(context: OwnerContext, id: str, request: Request) -> Response:
+    """The matte as a web page in one file: it draws the glass by itself, from a disk or any web server, offline too.
+
+    The page loads nothing, and another page can show it in an `iframe`. Anyone with the file has the matte as
+    `GET /v1/mattes/{id}/live` sends it.
+    """
+
+    def load() -> Response:
+        page = make_page(_title(context, row), row.figures["monitor"], _encoded(context, matte))
+        # Saved and not shown: here it would be a page of the service.
+        headers = {"Content-Disposition": f'attachment; filename="matte-{id}.html"'}
+        return bytes_response(page, "text/html", headers)
+
+    row, matte = await anyio.to_thread.run_sync(_open, context, id)
+    return await context.compute(request, context.layers, load, memory=_bytes_of(matte))
+
+
+def _open(context: Context, id: str) -> tuple[Row[Any], Matte]:
+    """A matte that is ready, and its row."""
+    with context.stored(mattes.get_ready, id) as row:
+        return row, context.cache.matte(id)
+
+
+def _bytes_of(matte: Matte) -> int:
+    """Bytes that encoding a matte takes at most."""
+    return encode.bytes_of_live(matte) + CORES * BLOCK_BYTES
+
+
+def _title(context: Context, row: Row[Any]) -> str:
+    """What people call a matte: the name of its capture, as long as that exists."""
+    with suppress(NotFound), reading(context.engine) as c:
+        if name := captures.get(c, row.capture or "").name:
+            return str(name)
+    return f"Matte {row.id[:8]}"
+
+
+def _encoded(context: Context, matte: Matte) -> bytes:
+    """A matte as `workflows.composite.live.encode` encodes it."""
+    encoded = stored_live.read(context.objects, matte.id, encode.FORMAT)
+    if encoded is None:
+        with context.stored(mattes.get_ready, matte.id):
+            encoded = encode.encode_live(matte, CORES)
+        # The answer needs no room, and it can be encoded again; or the matte was deleted just now.
+        with suppress(NoRoom, FileNotFoundError):
+            stored_live.write(context.objects, matte.id, encode.FORMAT, encoded)
+    return encoded

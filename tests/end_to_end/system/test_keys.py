@@ -96,6 +96,7 @@ CALLS = {
     "GET /v1/mattes/{id}/archive": Call("matte"),
     "GET /v1/mattes/{id}/layers/{file}": Call("matte"),
     "GET /v1/mattes/{id}/live": Call("matte"),
+    "GET /v1/mattes/{id}/live.html": Call("matte"),
     "GET /v1/mattes/{id}/transport": Call("matte"),
     "GET /v1/mattes/{id}/transport.png": Call("matte"),
     "POST /v1/mattes/{id}/composite": Call(

@@ -2,36 +2,12 @@
 // composites a small picture; after the last movement the service's composite at full size is shown.
 import { ask } from "../lib/api.js";
 import { h, newest, problemBox, show } from "../lib/dom.js";
+import { Coarseness } from "./coarseness.js";
 import { fetchLive } from "./live.js";
 import { createPainter, webglContext } from "./webgl.js";
 
 const STILL = 300; // ms without a change after which the exact composite is requested
 const QUICK = 480; // pixels of the longer side of a preview
-const SLOW = 45; // ms between pictures above which fewer pixels are drawn
-const COARSEST = 2;
-
-// How many fewer pixels to draw so that the picture keeps up with the hand.
-class Coarseness {
-  level = 0; // one pixel of 4 ** level is drawn
-  #intervals = []; // ms between the last pictures of a movement
-  #paintedAt;
-  #rested = true; // whether the movement before has ended
-
-  // Notes that a picture is painted at a time; returns the level to paint it with.
-  next(now) {
-    if (!this.#rested) this.#intervals = [...this.#intervals.slice(-3), now - this.#paintedAt];
-    else if (this.level) [this.level, this.#intervals] = [this.level - 1, []]; // the device may have been busy only then
-    [this.#paintedAt, this.#rested] = [now, false];
-    if (this.#intervals.length === 4 && Math.min(...this.#intervals) > SLOW && this.level < COARSEST) {
-      this.level += 1;
-      this.#intervals = [];
-    }
-    return this.level;
-  }
-  rest() {
-    this.#rested = true;
-  }
-}
 
 export class Stage {
   #matte;

@@ -60,10 +60,11 @@ export async function matte(main, signal, id) {
     location.replace("#/mattes");
   }, "quiet");
   const archive = button("Download the matte", problem, () => save(`v1/mattes/${id}/archive`, `matte-${id}.zip`));
-  archive.hidden = found.state !== "ready";
+  const page = button("Save as a web page", problem, () => save(`v1/mattes/${id}/live.html`, `matte-${id}.html`));
+  archive.hidden = page.hidden = found.state !== "ready";
   main.append(
     h("p", { class: "crumb" }, h("a", { href: "#/mattes" }, "Mattes")),
-    h("div", { class: "row spread" }, h("h1", {}, `Matte ${id.slice(0, 8)}`), h("span", { class: "row" }, badge(found.state), archive, deletion)),
+    h("div", { class: "row spread" }, h("h1", {}, `Matte ${id.slice(0, 8)}`), h("span", { class: "row" }, badge(found.state), page, archive, deletion)),
     problem,
     facts({
       Frame: found.width && `${size(found)} pixels`, Monitor: found.monitor && `${found.monitor.join(" × ")} pixels`,

@@ -1,0 +1,26 @@
+// How many fewer pixels to draw so that the picture keeps up with the hand.
+
+const SLOW = 45; // ms between pictures above which fewer pixels are drawn
+const COARSEST = 2;
+
+export class Coarseness {
+  level = 0; // one pixel of 4 ** level is drawn
+  #intervals = []; // ms between the last pictures of a movement
+  #paintedAt;
+  #rested = true; // whether the movement before has ended
+
+  // Notes that a picture is painted at a time; returns the level to paint it with.
+  next(now) {
+    if (!this.#rested) this.#intervals = [...this.#intervals.slice(-3), now - this.#paintedAt];
+    else if (this.level) [this.level, this.#intervals] = [this.level - 1, []]; // the device may have been busy only then
+    [this.#paintedAt, this.#rested] = [now, false];
+    if (this.#intervals.length === 4 && Math.min(...this.#intervals) > SLOW && this.level < COARSEST) {
+      this.level += 1;
+      this.#intervals = [];
+    }
+    return this.level;
+  }
+  rest() {
+    this.#rested = true;
+  }
+}
