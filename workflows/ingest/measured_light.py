@@ -13,7 +13,7 @@ from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import Curve, table
 from workflows.programs.border import border_light
 from workflows.programs.program import Program
-from workflows.recovery.lobes.recover import Conditions
+from workflows.recovery.normalise import Conditions
 
 LOBES = 3
 """Lobes on either side of the Lanczos kernel that frames are shifted with."""

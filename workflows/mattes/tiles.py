@@ -17,13 +17,16 @@ from workflows.mattes.options import RecoveryOptions
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out, pyramid_of
 from workflows.recovery.dgsr import recover as dgsr
+from workflows.recovery.dgsr.glare import filter_sensing
 from workflows.recovery.dgsr.options import DgsrOptions
 from workflows.recovery.glare import add_glare, filter_patterns, spread_patterns
 from workflows.recovery.lobes import recover as lobes
+from workflows.recovery.lobes.options import FAST
 from workflows.recovery.noise import Noise
 from workflows.recovery.normalise import normalise
 from workflows.recovery.photometry import fit_photometry
 from workflows.recovery.sensing import Patterns, Sensing
+from workflows.recovery.transport import LEAST_WEIGHT
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
@@ -92,24 +95,24 @@ def _recover_block(
     shown = program.measured
     measurements = np.ascontiguousarray(light[:, shown])
     given = (noise, usable[:, shown], worth[:, shown])
-    method = options.of_method
+    method, conditions = options.of_method, conditions_of(stack, program)
+    patterns = patterns_of(objects, capture)
     if isinstance(method, DgsrOptions):
-        sensing = sensing_of(objects, capture)
-        transport = dgsr.recover(measurements, photometry, sensing, *given, method)
-        measured = normalise(measurements, photometry, noise, method.constants.least_contrast, *given[1:])
-        error = dgsr.error_of(transport, photometry, measured, sensing)
+        # Lobes find the light of a film's border, and fit S and rho to all frames.
+        found = lobes.recover(measurements, photometry, patterns, *given, FAST, conditions)
+        photometry = found.photometry
+        if found.stray is not None:
+            measurements -= found.stray
+        sensing, constants = sensing_of(objects, capture), method.constants
+        transport = dgsr.recover(measurements, photometry, sensing, *given, method, conditions)
+        measured = normalise(measurements, photometry, noise, constants.least_contrast, *given[1:])
+        error, least_weight = dgsr.error_of(transport, photometry, measured, sensing), LEAST_WEIGHT
     else:
-        patterns = patterns_of(objects, capture)
-        transport, photometry, error = lobes.recover(
-            measurements,
-            photometry,
-            patterns,
-            *given,
-            method,
-            conditions_of(stack, program),
-        )
-        if attributes.get("glare"):
-            transport = add_glare(transport, attributes["glare"], method.least_weight)
+        found = lobes.recover(measurements, photometry, patterns, *given, method, conditions)
+        transport, photometry, error = found.transport, found.photometry, found.error
+        least_weight = method.least_weight
+    if attributes.get("glare"):
+        transport = add_glare(transport, attributes["glare"], least_weight)
 
     def spread(values: NDArray[Scalar], *channels: int) -> NDArray[Scalar]:
         """Values of the recovered pixels, and zeros for the others."""
@@ -148,9 +151,14 @@ def program_of(objects: Objects, capture: str) -> tuple[Program, Curve]:
 
 @lru_cache(maxsize=1)
 def sensing_of(objects: Objects, capture: str) -> Sensing:
-    """A capture's sensing matrices."""
+    """A capture's sensing matrices, as the patterns arrive through its glare."""
     program, monitor = program_of(objects, capture)
-    return program.sensing(monitor, _images_of(objects, capture))
+    images, glare = _images_of(objects, capture), Stack(objects, capture).attributes.get("glare")
+    sensing = program.sensing(monitor, images)
+    if not glare:
+        return sensing
+    patterns = lay_out(program, monitor, images)
+    return filter_sensing(sensing, spread_patterns(patterns), glare, *patterns.pyramid.grids[0])
 
 
 @lru_cache(maxsize=1)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from workflows.recovery.pyramid import Grids, Pyramid, halve_codes
 from workflows.recovery.sensing import Patterns
-from workflows.recovery.transport import Transport
+from workflows.recovery.transport import LEAST_WEIGHT, Transport
 
 WIDTHS = (1 / 96, 1 / 32, 1 / 10)
 """Standard deviations of the Gaussians, as shares of the monitor's width. One more part is the whole monitor."""
@@ -191,7 +191,7 @@ def centres(pyramid: Pyramid) -> tuple[NDArray[np.float64], NDArray[np.float64]]
     return np.concatenate(x), np.concatenate(y)
 
 
-def add_glare(transport: Transport, shares: Sequence[float], least_weight: float = 1e-4) -> Transport:
+def add_glare(transport: Transport, shares: Sequence[float], least_weight: float = LEAST_WEIGHT) -> Transport:
     """Add the glare to a T that was recovered from filtered patterns.
 
     Parameters

@@ -12,6 +12,30 @@ from workflows.recovery.photometry import Photometry
 _MOST_CHANGE = 2.0
 
 
+class Conditions(NamedTuple):
+    """What else than T the frames of a capture show.
+
+    Attributes
+    ----------
+    grey : bool
+        Whether the three channels are one, repeated, which must not count three times.
+    strays : (s, m + 2) float32 or None
+        Light that does not come from the patterns, as in :class:`~workflows.recovery.lobes.footprint.PatternCodes`. Its
+        last two values are those under a black and a white monitor. None is constant light alone.
+    model_error : float
+        Standard deviation of what no T explains, as a share of rho: of light that bounces, and of a camera or a monitor
+        that is not quite linear.
+    """
+
+    grey: bool = False
+    strays: NDArray[np.float32] | None = None
+    model_error: float = 0.0
+
+
+PLAIN = Conditions()
+"""Frames that show nothing else."""
+
+
 class Measurements(NamedTuple):
     """Measurements in the +-1 form of eq. 8, free of S and rho: T times the patterns, plus noise.
 
@@ -95,6 +119,17 @@ def normalise(
         np.concatenate([value, constants], axis=2).astype(np.float32),
         np.concatenate([variance, constant_variance], axis=2).astype(np.float32),
     )
+
+
+def less_certain(measured: Measurements, model_error: float) -> Measurements:
+    """Add the error of the model to the variances of patterns, but not to those of the black and white monitor.
+
+    The contrast of patterns is twice that of the unit of `model_error`.
+    """
+    variance = measured.variance.copy()
+    size = measured.value.shape[-1]
+    variance[..., : size - 2] += np.float32(4 * model_error**2)
+    return Measurements(measured.value, variance)
 
 
 def refit_photometry(

@@ -7,6 +7,9 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+LEAST_WEIGHT = 1e-4
+"""Entries below this share of their row's sum are dropped."""
+
 
 @dataclass(frozen=True)
 class Transport:
@@ -43,7 +46,7 @@ class Transport:
         cell: NDArray[np.integer],
         weight: NDArray[np.floating],
         shared: NDArray[np.bool_] | None = None,
-        least_weight: float = 1e-4,
+        least_weight: float = LEAST_WEIGHT,
     ) -> Self:
         """Make a transport from a solver's rows: drop small entries and normalise each row to a sum of 1.
 
@@ -104,7 +107,7 @@ class Transport:
         cell: NDArray[np.integer],
         weight: NDArray[np.floating],
         shared: NDArray[np.bool_],
-        least_weight: float = 1e-4,
+        least_weight: float = LEAST_WEIGHT,
     ) -> Self:
         """As `from_rows`, of entries whose cells need not ascend within a row and may repeat: weights are added."""
         row = np.repeat(np.arange(count.size), count.ravel())

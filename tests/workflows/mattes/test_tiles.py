@@ -23,6 +23,7 @@ from workflows.images.integer_formats import decode, encode_png
 from workflows.jobs import Task, run
 from workflows.mattes.steps import STEPS
 from workflows.mattes.tiles import cut
+from workflows.programs.border import border_light
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import Scene, write_capture
 from workflows.untrusted.limits import Limits
@@ -308,3 +309,63 @@ def test_patterns_that_a_video_lacks_are_done_without(
     backdrop = np.stack([x, 1 - x, y], axis=2).astype(np.float32)
     error = composite(matte, backdrop)[..., :3] - scene.truth(backdrop)
     assert -10 * np.log10(np.mean(error[scene.object_mask] ** 2)) > 24
+
+
+BANDS = ((10, 10, 12), (20, 20, 12), (40, 40, 12), (80, 40, 24))
+MONITOR = 160, 120
+
+
+@pytest.fixture
+def error_of(objects: Objects) -> Callable[..., float]:
+    """Recovers a capture, and measures how far a composite is from a picture, root mean square over a mask."""
+
+    def of(capture: str, method: str, backdrop: np.ndarray, picture: np.ndarray, mask: np.ndarray) -> float:
+        task = Task("j", capture, f"m-{capture}", {"method": method}, Limits(1 << 30, 1 << 26))
+        task = replace(task, plan=run(STEPS, objects, task, PREPARE)[1])
+        for tile in range(task.plan["tiles"]):
+            run(STEPS, objects, task, tile)
+        found = composite(mattes.Matte(objects, task.matte), backdrop)[..., :3]
+        return float(np.sqrt(np.mean((found - picture)[mask] ** 2)))
+
+    return of
+
+
+@pytest.mark.parametrize("method", ["lobes", "nn-dgsr"])
+@pytest.mark.parametrize("what", ["border", "glare"])
+def test_composites_have_glare_but_no_border(
+    ingest: Callable[..., Stack], error_of: Callable[..., float], make_zip: Zip, method: str, what: str
+) -> None:
+    ball, program = (
+        glass_ball(24, 18, monitor=MONITOR, rays=9),
+        nested_program(MONITOR, bands=BANDS, levels=2),
+    )
+    share = 0.15 if what == "glare" else 0.0
+
+    def seen(light: np.ndarray) -> np.ndarray:
+        through = (1 - share) * light + share * light.mean(axis=(0, 1))
+        return 0.1 + ball.truth(through.astype(np.float32), gain=0.7)
+
+    border, rng = border_light(range(program.count)), np.random.default_rng(3)
+    amount = (0.0 if share else 0.03) * rng.standard_normal((18, 24, len(border)))
+    frames = [{"file": f"{n}.png", "pattern": n} for n in range(program.count)]
+    files = {}
+    for n, picture in enumerate(program.pictures(0, program.count)):
+        value = seen((picture > 0).astype(np.float32)) + (amount @ border[:, n])[..., np.newaxis]
+        value += 0.003 * rng.standard_normal(value.shape)
+        files[f"{n}.png"] = encode_png(np.rint(np.clip(value, 0, 1) * 65535).astype(np.uint16))
+    record = {
+        "format": "envmatte-capture/1",
+        "program": program.model_dump(mode="json"),
+        "frames": frames,
+        "response": "linear",
+    }
+    y, x = np.mgrid[:120, :160]
+    bump = np.exp(-((x - 40) ** 2 + (y - 40) ** 2) / (2 * 25**2))[..., np.newaxis]
+    backdrop = (bump * [1, 0.8, 0.5]).astype(np.float32)
+    off = []
+    for name, known in (("with", True), ("without", False)):
+        stack = ingest(name, make_zip(record, files))
+        stack.annotate(border=known and not share, glare=[0.0, 0.0, 0.0, share] if known and share else None)
+        stack.save()
+        off.append(error_of(name, method, backdrop, seen(backdrop), ball.object_mask))
+    assert off[0] < 0.85 * off[1]

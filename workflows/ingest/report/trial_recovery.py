@@ -150,7 +150,7 @@ class RecoveredSample(NamedTuple):
     transport : Transport
         Without glare.
     strays : (s, m + 2) float32
-        As in :class:`~workflows.recovery.lobes.recover.Conditions`.
+        As in :class:`~workflows.recovery.normalise.Conditions`.
     alive : (n, 3) bool
         Where there is enough contrast.
     seen : _Seen
@@ -180,7 +180,7 @@ def recover_sample(
     if np.count_nonzero(alive.any(axis=1)) < MIN_PIXELS:
         return None
     shown, conditions = program.measured, conditions_of(stack, program)
-    transport, photometry, _ = recover(
+    transport, photometry, _, _ = recover(
         np.ascontiguousarray(light[:, shown]),
         photometry,
         patterns,

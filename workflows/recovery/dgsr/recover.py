@@ -8,7 +8,14 @@ from workflows.recovery.dgsr.groups import Rows
 from workflows.recovery.dgsr.options import DEFAULT, DgsrOptions
 from workflows.recovery.dgsr.pursuit import System, grow_rows
 from workflows.recovery.noise import Noise
-from workflows.recovery.normalise import Measurements, expected_error, normalise
+from workflows.recovery.normalise import (
+    PLAIN,
+    Conditions,
+    Measurements,
+    expected_error,
+    less_certain,
+    normalise,
+)
 from workflows.recovery.photometry import Photometry
 from workflows.recovery.sensing import Sensing
 from workflows.recovery.transport import Transport
@@ -29,6 +36,7 @@ def recover(
     usable: NDArray[np.bool_] | None = None,
     frames: NDArray[np.number] | None = None,
     options: DgsrOptions = DEFAULT,
+    conditions: Conditions = PLAIN,
 ) -> Transport:
     """Recover T by NN-DGSR (Duan, Cai and Zheng, "Compressive environment matting", 2015, Sect. 4.2 and 5.1).
 
@@ -47,6 +55,8 @@ def recover(
     frames : (m,) or (n, m, 3) number, optional
         Frames averaged into each measurement, above 0. Default: 1.
     options : DgsrOptions
+    conditions : Conditions
+        Without stray light, which must have been subtracted.
 
     Returns
     -------
@@ -92,21 +102,29 @@ def recover(
     """
     constants = options.constants
     measured = normalise(measurements, photometry, noise, constants.least_contrast, usable, frames)
+    measured = less_certain(measured, conditions.model_error)
     value, weight = _weight_measurements(measured.value[..., :-2], measured.variance[..., :-2])
     parts = []
     for first in range(0, max(len(value), 1), _BLOCK):
         block = slice(first, first + _BLOCK)
-        parts.append(_recover_block(value[block], weight[block], sensing, options))
+        parts.append(_recover_block(value[block], weight[block], sensing, options, grey=conditions.grey))
     return Transport.concatenate(parts)
 
 
 def _recover_block(
-    value: NDArray[np.float32], weight: NDArray[np.float32], sensing: Sensing, options: DgsrOptions
+    value: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    sensing: Sensing,
+    options: DgsrOptions,
+    *,
+    grey: bool,
 ) -> Transport:
-    """Recover some pixels from their measurements and weights, (n, 3, m)."""
+    """Recover some pixels from their measurements and weights, (n, 3, m); all channels as the first if grey."""
     levels = sensing.levels if options.levels == "hierarchical" else sensing.levels[-1:]
-    joint, constants = options.channels == "joint", options.constants
+    joint, constants = grey or options.channels == "joint", options.constants
     alive = weight.max(axis=2, initial=0) > 0
+    if grey:
+        weight = weight * np.array([1, 0, 0], np.float32)[:, np.newaxis]
     index = np.full(alive.shape, -1)
     if joint:
         pixel = np.flatnonzero(alive.any(axis=1))
@@ -121,14 +139,14 @@ def _recover_block(
             rows = rows.split(levels[i - 1], level, constants.least_group, reach=0)
         finest = level is levels[-1]
         light = np.ascontiguousarray(level.light)
-        grey = len(light) == 1
-        source = np.zeros_like(channel) if grey else channel
+        grey_patterns = len(light) == 1
+        source = np.zeros_like(channel) if grey_patterns else channel
         target, scale, variance = _scale_rows(
             value[..., level.patterns],
             weight[..., level.patterns],
             pixel,
             None if joint else channel,
-            grey=grey,
+            grey=grey_patterns,
         )
         system = System(light, level.columns, level.rows, source, scale, target, variance)
         grow_rows(system, rows, finest, constants)

@@ -8,9 +8,17 @@ from numpy.typing import NDArray
 from workflows.recovery.lobes.fits import Pixels
 from workflows.recovery.lobes.options import FINE, LobesOptions
 from workflows.recovery.lobes.pixels import Diagnostics, recover_pixels
-from workflows.recovery.lobes.strays import remove_strong_strays, subtract_strays
+from workflows.recovery.lobes.strays import find_strong_strays, subtract_strays
 from workflows.recovery.noise import Noise
-from workflows.recovery.normalise import Measurements, expected_error, normalise, refit_photometry
+from workflows.recovery.normalise import (
+    PLAIN,
+    Conditions,
+    Measurements,
+    expected_error,
+    less_certain,
+    normalise,
+    refit_photometry,
+)
 from workflows.recovery.photometry import Photometry
 from workflows.recovery.sensing import Patterns
 from workflows.recovery.transport import Transport
@@ -19,26 +27,6 @@ from workflows.recovery.transport import Transport
 _BLOCK = 256
 # Least difference of white and black without stray light, of 2 with it, for which S and rho are corrected.
 _LEAST_CONTRAST = 0.5
-
-
-class Conditions(NamedTuple):
-    """What else than T the frames of a capture show.
-
-    Attributes
-    ----------
-    grey : bool
-        Whether the three channels are one, repeated, which must not count three times.
-    strays : (s, m + 2) float32 or None
-        Light that does not come from the patterns, as in :class:`~workflows.recovery.lobes.footprint.PatternCodes`. Its
-        last two values are those under a black and a white monitor. None is constant light alone.
-    model_error : float
-        Standard deviation of what no T explains, as a share of rho: of light that bounces, and of a camera or a monitor
-        that is not quite linear.
-    """
-
-    grey: bool = False
-    strays: NDArray[np.float32] | None = None
-    model_error: float = 0.0
 
 
 class Recovery(NamedTuple):
@@ -52,14 +40,15 @@ class Recovery(NamedTuple):
     error : (n,) float32
         Expected root mean square error of a composite over the channels, in camera units; infinite where nothing could
         be recovered.
+    stray : (n, m, 3) float32 or None
+        Light of the measurements that does not come from the patterns, in camera units, beside the constant light that
+        is part of S. None if the conditions name none.
     """
 
     transport: Transport
     photometry: Photometry
     error: NDArray[np.float32]
-
-
-_PLAIN = Conditions()
+    stray: NDArray[np.float32] | None
 
 
 def recover(
@@ -70,7 +59,7 @@ def recover(
     usable: NDArray[np.bool_] | None = None,
     frames: NDArray[np.number] | None = None,
     options: LobesOptions = FINE,
-    conditions: Conditions = _PLAIN,
+    conditions: Conditions = PLAIN,
 ) -> Recovery:
     """Recover T: a few oriented Gaussian lobes, refined to the posterior mean given the measurements.
 
@@ -135,8 +124,10 @@ def recover(
         usable = np.ones(measurements.shape, bool) if usable is None else usable.copy()
         usable[:, :, 1:] = False
     strays = np.ones((1, m + 2), np.float32) if conditions.strays is None else conditions.strays
+    stray: NDArray[np.float32] | None = None
     if len(strays) > 1:
-        measurements, photometry = remove_strong_strays(measurements, photometry, strays, usable)
+        stray, photometry = find_strong_strays(measurements, photometry, strays, usable)
+        measurements = measurements - stray
     measured = normalise(measurements, photometry, noise, options.least_contrast, usable, frames)
     counts = np.zeros((n, 3), np.int64)
     found = Diagnostics(
@@ -153,14 +144,18 @@ def recover(
         parts.append(
             _recover_block(patterns, of_block, options, conditions.model_error, strays, found.at(block))
         )
-    if found.stray.any():
-        photometry, measured = _without_strays(photometry, measured, found.stray)
+    if stray is not None:
+        known = _are_known(measured, found.stray)
+        weak = photometry.rho[..., np.newaxis] / 2 * found.stray[:, :, :-2]
+        stray += np.where(known[..., np.newaxis], weak, 0).transpose(0, 2, 1)
+        photometry, measured = _without_strays(photometry, measured, found.stray, known)
     better = refit_photometry(
-        photometry, _less_certain(measured, conditions.model_error), found.response, found.kappa
+        photometry, less_certain(measured, conditions.model_error), found.response, found.kappa
     )
     if conditions.grey:
         better = Photometry(*(np.repeat(values[:, :1], 3, axis=1) for values in vars(better).values()))
-    return Recovery(Transport.concatenate(parts), better, expected_error(better, measured, found.misfit))
+    error = expected_error(better, measured, found.misfit)
+    return Recovery(Transport.concatenate(parts), better, error, stray)
 
 
 def _recover_block(
@@ -179,10 +174,10 @@ def _recover_block(
         joint = _average_channels(own)
         separate = _channels_disagree(own, joint.value, options.disagreement)
         # The channels' errors of the model are alike, so their mean has the same.
-        joint, own = (_less_certain(part, model_error) for part in (joint, own))
+        joint, own = (less_certain(part, model_error) for part in (joint, own))
     else:
         n, channels, m = own.value.shape
-        own = _less_certain(own, model_error)
+        own = less_certain(own, model_error)
         joint = Measurements(own.value.reshape(n, channels * m), own.variance.reshape(n, channels * m))
         separate = np.zeros(n, bool)
     of_alive = found.at(alive)
@@ -210,14 +205,20 @@ def _average_channels(own: Measurements) -> Measurements:
     return Measurements(joint, joint_variance)
 
 
+def _are_known(measured: Measurements, stray: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Where enough contrast is left without stray light to take it out, (n, 3) bool."""
+    black, white = (measured.value[:, :, at] - stray[:, :, at] for at in (-2, -1))
+    known: NDArray[np.bool_] = np.isfinite(measured.variance[:, :, -1]) & (white - black > _LEAST_CONTRAST)
+    return known
+
+
 def _without_strays(
-    photometry: Photometry, measured: Measurements, stray: NDArray[np.float32]
+    photometry: Photometry, measured: Measurements, stray: NDArray[np.float32], known: NDArray[np.bool_]
 ) -> tuple[Photometry, Measurements]:
     """S and rho without stray light, and the measurements that are normalised with these."""
     black, white = (measured.value[:, :, at] - stray[:, :, at] for at in (-2, -1))
     value, variance = measured.value.copy(), measured.variance.copy()
     subtract_strays(value.reshape(-1), variance.reshape(-1), stray.reshape(-1), value.shape[2])
-    known = np.isfinite(measured.variance[:, :, -1]) & (white - black > _LEAST_CONTRAST)
     S = photometry.S + photometry.rho * (black + 1) / 2
     rho = photometry.rho * (white - black) / 2
     return (
@@ -232,17 +233,6 @@ def _without_strays(
             np.where(known[..., np.newaxis], variance, measured.variance),
         ),
     )
-
-
-def _less_certain(measured: Measurements, model_error: float) -> Measurements:
-    """Add the error of the model to the variances of patterns, but not to those of the black and white monitor.
-
-    The contrast of patterns is twice that of the unit of `model_error`.
-    """
-    variance = measured.variance.copy()
-    size = measured.value.shape[-1]
-    variance[..., : size - 2] += np.float32(4 * model_error**2)
-    return Measurements(measured.value, variance)
 
 
 def _channels_disagree(

@@ -13,13 +13,13 @@ STRONG = 0.17
 tenth."""
 
 
-def remove_strong_strays(
+def find_strong_strays(
     measurements: NDArray[np.float32],
     photometry: Photometry,
     strays: NDArray[np.float32],
     usable: NDArray[np.bool_] | None,
 ) -> tuple[NDArray[np.float32], Photometry]:
-    """Take stray light out of the pixels that see more of it than of the patterns, as those that see a film's border.
+    """Find the stray light of pixels that see more of it than of the patterns, as those that see a film's border.
 
     Parameters
     ----------
@@ -28,13 +28,14 @@ def remove_strong_strays(
     photometry : Photometry
         From constant monitors.
     strays : (s, m + 2) float32
-        As in :class:`~workflows.recovery.lobes.recover.Conditions`; the first is constant.
+        As in :class:`~workflows.recovery.normalise.Conditions`; the first is constant.
     usable : (n, m, 3) bool or None
         False where a value must be ignored.
 
     Returns
     -------
-    measurements : (n, m, 3) float32
+    stray : (n, m, 3) float32
+        In camera units; 0 at other pixels.
     photometry : Photometry
         Of what is left: of many such pixels, S alone.
 
@@ -80,7 +81,7 @@ def remove_strong_strays(
             for new, old in zip(fitted, vars(photometry).values(), strict=True)
         )
     )
-    return (measurements - stray.transpose(0, 2, 1)).astype(np.float32), better
+    return stray.transpose(0, 2, 1).astype(np.float32), better
 
 
 @njit(nogil=True, cache=True)

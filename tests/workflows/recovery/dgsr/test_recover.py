@@ -7,6 +7,7 @@ import pytest
 
 from workflows.recovery.dgsr import recover as dgsr
 from workflows.recovery.dgsr.options import DgsrOptions
+from workflows.recovery.normalise import Conditions
 from workflows.recovery.photometry import Photometry
 from workflows.recovery.sensing import Sensing
 
@@ -130,6 +131,36 @@ def test_dark_channels_get_empty_rows(recover, sensing_of, observe):
     assert (found.count[0] > 0).tolist() == [True, False, False]
     assert (found.count[1] == 0).all()
     assert np.abs(dense(found)[0, 0] - truth[0, 0]).sum() < 0.05
+
+
+@pytest.mark.parametrize("colours", [1, 3])
+def test_grey_camera_counts_once(recover, sensing_of, observe, colours):
+    sensing = sensing_of(BANDS, 12, channels=colours)
+    measurements, photometry, noise = observe(sensing, mixture(6))
+    grey = np.repeat(measurements[..., :1], 3, axis=2)
+    found = recover(grey, photometry, sensing, noise, conditions=Conditions(grey=True))
+    usable = np.zeros(grey.shape, bool)
+    usable[..., 0] = True
+    alone = dense(dgsr.recover(grey, photometry, sensing, noise, usable))
+    for c in range(3):
+        np.testing.assert_array_equal(dense(found)[:, c], dense(found)[:, 0])
+    assert np.abs(dense(found)[:, 0] - mixture(6)[:, 0]).sum(1).mean() < 0.3
+    assert (alone[:, 1:] == 0).all()
+    if recover is dgsr.recover:
+        np.testing.assert_allclose(dense(found)[:, 0], alone[:, 0], atol=1e-4)
+
+
+def test_error_of_the_model_is_left_unexplained(sensing_of, observe):
+    truth = np.concatenate([lobe(x + 0.5, 12.4, 2.5, 1.2, 0.3) for x in range(6, 26)])
+    sensing = sensing_of(BANDS, 13)
+    measurements, photometry, noise = observe(sensing, truth)
+    wrong = 0.06 * np.random.default_rng(0).standard_normal(measurements.shape[1])[:, np.newaxis]
+    seen = (measurements + wrong * photometry.rho[:, np.newaxis]).astype(np.float32)
+    off = [
+        np.abs(dense(dgsr.recover(seen, photometry, sensing, noise, conditions=c)) - truth).sum()
+        for c in (Conditions(model_error=0.06), Conditions())
+    ]
+    assert off[0] < 0.9 * off[1]
 
 
 def test_rows_are_clean(recover, sensing_of, observe):

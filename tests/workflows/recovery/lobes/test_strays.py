@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from workflows.recovery.lobes.recover import Conditions, recover
-from workflows.recovery.lobes.strays import remove_strong_strays, subtract_strays, write_strays
+from workflows.recovery.lobes.recover import recover
+from workflows.recovery.lobes.strays import find_strong_strays, subtract_strays, write_strays
+from workflows.recovery.normalise import Conditions
 from workflows.recovery.photometry import Photometry
 
 COLUMNS, ROWS = 64, 48
@@ -56,6 +57,9 @@ def test_t_is_recovered_beside_stray_light(patterns_of, gaussian, observe, chann
     ignored = recover(seen, from_constants, shown, noise)
     np.testing.assert_allclose(beside.photometry.S, clean.photometry.S, atol=2e-3)
     np.testing.assert_allclose(beside.photometry.rho, clean.photometry.rho, atol=4e-3)
+    assert beside.stray is not None
+    np.testing.assert_allclose(beside.stray, light[..., :-2].transpose(0, 2, 1), atol=6e-3)
+    assert clean.stray is None
     backdrop = np.sin(np.arange(COLUMNS) / 5)[np.newaxis, :, np.newaxis] * np.ones((ROWS, 1, 3)) / 2 + 0.5
     nodes = shown.pyramid.light(backdrop.astype(np.float32))
 
@@ -88,7 +92,8 @@ def test_a_pixel_that_sees_the_border_keeps_its_mean_light() -> None:
         )
     )
     values = (light[:, :m, np.newaxis] * three).astype(np.float32)
-    left, found = remove_strong_strays(values, given, rows.astype(np.float32), None)
+    stray, found = find_strong_strays(values, given, rows.astype(np.float32), None)
+    left = values - stray
     np.testing.assert_allclose(found.S[:, 0], S, atol=0.01)
     np.testing.assert_allclose(found.rho[:, 0], rho, atol=0.01)
     clean = S[:, np.newaxis] + rho[:, np.newaxis] * shown[:m]
