@@ -37,7 +37,7 @@ async def get_live(context: OwnerContext, id: str, request: Request) -> Response
     """
 
     def load() -> Response:
-        encoded = _encoded(context, matte)
+        encoded = _encoded(context, id, matte)
         return bytes_response(encoded, "application/octet-stream", tag | {"Content-Encoding": "gzip"})
 
     _, matte = await anyio.to_thread.run_sync(_open, context, id)
@@ -60,7 +60,7 @@ async def get_live_page(context: OwnerContext, id: str, request: Request) -> Res
     """
 
     def load() -> Response:
-        page = make_page(_title(context, row), row.figures["monitor"], _encoded(context, matte))
+        page = make_page(_title(context, row), row.figures["monitor"], _encoded(context, id, matte))
         # Saved and not shown: here it would be a page of the service.
         headers = {"Content-Disposition": f'attachment; filename="matte-{id}.html"'}
         return bytes_response(page, "text/html", headers)
@@ -88,13 +88,13 @@ def _title(context: Context, row: Row[Any]) -> str:
     return f"Matte {row.id[:8]}"
 
 
-def _encoded(context: Context, matte: Matte) -> bytes:
+def _encoded(context: Context, id: str, matte: Matte) -> bytes:
     """A matte as `workflows.composite.live.encode` encodes it."""
-    encoded = stored_live.read(context.objects, matte.id, encode.FORMAT)
+    encoded = stored_live.read(context.objects, id, encode.FORMAT)
     if encoded is None:
-        with context.stored(mattes.get_ready, matte.id):
+        with context.stored(mattes.get_ready, id):
             encoded = encode.encode_live(matte, CORES)
         # The answer needs no room, and it can be encoded again; or the matte was deleted just now.
         with suppress(NoRoom, FileNotFoundError):
-            stored_live.write(context.objects, matte.id, encode.FORMAT, encoded)
+            stored_live.write(context.objects, id, encode.FORMAT, encoded)
     return encoded
