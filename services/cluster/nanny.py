@@ -10,6 +10,9 @@ logger = logging.getLogger(__name__)
 
 PAUSE = 0.5
 """Seconds between two attempts to start a worker process."""
+SERVER_DIED = (EOFError, AttributeError)
+"""What distributed raises if the fork server dies after it has taken a request, or before: an `AttributeError` then
+hides the `OSError`, since distributed wants to end a process that was never started."""
 
 
 class Nanny(distributed.Nanny):  # type: ignore[misc]
@@ -23,7 +26,7 @@ class Nanny(distributed.Nanny):  # type: ignore[misc]
         while True:
             try:
                 return await super().instantiate()
-            except EOFError:
+            except SERVER_DIED:
                 if self.status in (Status.closing, Status.closed):
                     raise
                 logger.warning("the fork server died while a worker started; starting both again")

@@ -124,6 +124,7 @@ def main(modules: list[str]) -> None:
     for module in modules:
         import_module(module)
     load_kernel()  # here it may still be compiled and cached
+    os.environ.clear()  # nothing needs it any more
     gc.freeze()  # a collection would touch, and so copy, all memory that decoders share
     control = socket.socket(fileno=0)
     # By the socket that says whether it is wanted: its process, and a pipe that is closed when it ends.

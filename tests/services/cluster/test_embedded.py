@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from multiprocessing import forkserver
 from urllib.parse import urlsplit
 
 import psutil
@@ -86,3 +87,28 @@ def test_worker_is_replaced_although_the_next_fork_server_dies_too(cluster: Loca
         until(lambda: [one for one in fork_servers() if one != first])
         fork_servers()[0].kill()  # while it imports what workers need
         until(lambda: {*client.run(os.getpid).values()} - before)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", [ConnectionRefusedError, FileNotFoundError, BrokenPipeError])
+def test_worker_is_replaced_although_no_fork_server_answers(
+    cluster: LocalCluster, monkeypatch: pytest.MonkeyPatch, fault: type[OSError]
+) -> None:
+    """The server dies in the moment between two steps of a request, which no test can hit from outside."""
+    failed: list[str] = []
+    take = forkserver.connect_to_new_process
+
+    def connect_to_new_process(files: list[int]) -> tuple[int, int]:
+        if not failed:
+            failed.append(fault.__name__)
+            raise fault
+        return take(files)
+
+    with connect(cluster.scheduler_address, cluster.security) as client:
+        until(client.nthreads)
+        (before,) = client.nthreads()
+        monkeypatch.setattr(forkserver, "connect_to_new_process", connect_to_new_process)
+        (nanny,) = cluster.workers.values()
+        psutil.Process(nanny.pid).kill()
+        until(lambda: set(client.nthreads()) - {before}, 60)
+    assert failed == [fault.__name__]
