@@ -43,7 +43,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_film_with_its_record_becomes_a_capture(desk: Page, service: Service, clip: Path) -> None:
-    desk.goto(service.url)
+    desk.goto(f"{service.url}/#/captures")
     desk.get_by_label(ZIP).set_input_files(clip)
     field = desk.get_by_label("Or the capture.json that came with the program")
     field.set_input_files({"name": "holiday.json", "mimeType": "application/json", "buffer": b"{}"})
@@ -66,7 +66,7 @@ def test_film_without_record_asks_for_its_program(desk: Page, service: Service, 
         "border": {"width": 801, "height": 451},
     }
     assert service.http.put(f"/v1/programs/{made['id']}/showing", json=showing).status_code == 204
-    desk.goto(service.url)
+    desk.goto(f"{service.url}/#/captures")
     desk.get_by_label(ZIP).set_input_files(clip)
     expect(desk.get_by_text("Which program does this film show?")).to_be_visible()
     desk.get_by_label("Program", exact=True).select_option("0")
@@ -78,7 +78,7 @@ def test_film_without_record_asks_for_its_program(desk: Page, service: Service, 
 
 
 def test_film_and_record_are_zipped(desk: Page, service: Service) -> None:
-    desk.goto(service.url)
+    desk.goto(f"{service.url}/#/captures")
     text = desk.evaluate(
         """async () => {
             const { filmArchive, recordOf } = await import("/web/app/upload/film_bundle.js");
@@ -116,7 +116,7 @@ def test_film_of_gigabytes_is_zipped(desk: Page, service: Service, tmp_path: Pat
         {"name": "film.mp4", "size": size, "crc": 0},
         {"name": "capture.json", "size": len(record), "crc": zlib.crc32(record)},
     ]
-    desk.goto(service.url)
+    desk.goto(f"{service.url}/#/captures")
     parts = desk.evaluate(
         """async (files) => {
             const { framed } = await import("/web/app/upload/zip.js");
@@ -158,7 +158,7 @@ def test_number_and_size_of_frames_are_sent_before_the_archive(
     (tmp_path / "none.zip").write_bytes(b"PK and nothing more")
     of_ball = {"frames": len(json.loads(zipfile.ZipFile(ball).read("capture.json"))["frames"])}
     of_ball |= {"width": 96, "height": 72}
-    desk.goto(service.url)
+    desk.goto(f"{service.url}/#/captures")
     for path, expected in (
         (ball, of_ball),
         (packed, of_ball),

@@ -60,7 +60,7 @@ def envmatte_keys(data: Path, *arguments: str) -> str:
 def test_wrong_file_is_refused_with_reason(
     desk: Page, service: Service, name: str, data: bytes, reason: str
 ) -> None:
-    desk.goto(service.url)
+    desk.goto(f"{service.url}/#/captures")
     file = {"name": name, "mimeType": "application/octet-stream", "buffer": data}
     desk.get_by_label(ZIP).set_input_files(file)  # type: ignore[arg-type]
     expect(desk.get_by_role("alert")).to_contain_text(reason)
@@ -69,7 +69,7 @@ def test_wrong_file_is_refused_with_reason(
 
 
 def test_file_dropped_beside_the_zone_does_not_replace_the_page(desk: Page, service: Service) -> None:
-    desk.goto(service.url)
+    desk.goto(f"{service.url}/#/captures")
     files = desk.evaluate_handle(
         """() => {
             const files = new DataTransfer();
@@ -98,7 +98,7 @@ def test_interrupted_upload_continues(desk: Page, service: Service, ball: Path) 
             route.continue_()
 
     desk.route("**/v1/uploads/**", cut)
-    desk.goto(service.url)
+    desk.goto(f"{service.url}/#/captures")
     with desk.expect_console_message(lambda message: "ERR_CONNECTION_RESET" in message.text):
         desk.get_by_label(ZIP).set_input_files(ball)
     expect(desk.get_by_text("trying again")).to_be_visible()
@@ -112,7 +112,7 @@ def test_upload_survives_other_views_and_the_back_button(desk: Page, service: Se
         "**/v1/uploads/*",
         lambda route: held.append(route) if route.request.method == "PATCH" else route.continue_(),
     )
-    desk.goto(service.url)
+    desk.goto(f"{service.url}/#/captures")
     desk.get_by_label(ZIP).set_input_files(ball)
     row = desk.get_by_role("region", name="ball.zip")
     expect(row).to_be_visible()
@@ -133,9 +133,9 @@ def test_upload_survives_other_views_and_the_back_button(desk: Page, service: Se
 
 def test_same_file_uploaded_in_two_tabs_is_one_capture(desk: Page, service: Service, ball: Path) -> None:
     before = {one["id"] for one in service.http.get("/v1/captures").json()["captures"]}
-    desk.goto(service.url)
+    desk.goto(f"{service.url}/#/captures")
     second = desk.context.new_page()
-    second.goto(service.url)
+    second.goto(f"{service.url}/#/captures")
     held: list[Route] = []
     second.route(
         "**/v1/uploads/*",
@@ -163,7 +163,7 @@ def test_same_file_uploaded_in_two_tabs_is_one_capture(desk: Page, service: Serv
 
 def test_reload_and_back_button_keep_the_view(desk: Page, service: Service, ready: tuple[str, str]) -> None:
     _, matte = ready
-    desk.goto(service.url)
+    desk.goto(f"{service.url}/#/captures")
     desk.get_by_role("link", name="a ball").first.click()
     expect(desk.get_by_role("heading", name="a ball")).to_be_visible()
     desk.get_by_role("navigation").get_by_role("link", name="Mattes").click()
@@ -225,7 +225,7 @@ def test_file_removed_during_upload_is_named(desk: Page, service: Service, tmp_p
     film = tmp_path / "card.zip"
     film.write_bytes(b"PK\x03\x04" + bytes(9 << 20))  # more than one part
     held = hold(desk)
-    desk.goto(service.url)
+    desk.goto(f"{service.url}/#/captures")
     desk.get_by_label(ZIP).set_input_files(film)
     while not held:
         desk.wait_for_timeout(50)

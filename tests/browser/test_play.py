@@ -191,7 +191,7 @@ def test_escape_stops_and_program_can_be_played_again(tab: Page, service: Servic
 
 def test_back_button_stops_and_keeps_loaded_patterns(tab: Page, service: Service) -> None:
     program = posted(service)
-    tab.goto(service.url)
+    tab.goto(f"{service.url}/#/captures")
     url = go(tab, service, program)
     start = tab.get_by_role("button", name="full screen")
     for _ in range(2):
@@ -211,7 +211,7 @@ def test_leaving_the_page_stops_the_program(tab: Page, service: Service) -> None
     go(tab, service, program)
     tab.get_by_role("button", name="full screen").click()
     expect(tab.locator("#stage")).to_be_visible()
-    tab.goto(service.url)
+    tab.goto(f"{service.url}/#/captures")
     while service.http.get(f"/v1/programs/{program['id']}").json()["showing"]["phase"] != "stopped":
         tab.wait_for_timeout(100)
 

@@ -1,13 +1,14 @@
 // Shows the view that the part of the URL after `#` names, so that a reload and the back button keep it.
 import { h, problemBox } from "./lib/dom.js";
 import { recordings } from "./lib/recordings.js";
+import { home } from "./home/home.js";
 import { captures } from "./views/captures.js";
 import { capture } from "./views/capture.js";
 import { filming, program } from "./film/program.js";
 import { job, jobs } from "./views/jobs.js";
 import { matte, mattes } from "./views/mattes.js";
 
-const VIEWS = { film: [filming, program], captures: [captures, capture], jobs: [jobs, job], mattes: [mattes, matte] };
+const VIEWS = { home: [home], film: [filming, program], captures: [captures, capture], jobs: [jobs, job], mattes: [mattes, matte] };
 const main = document.getElementById("main");
 const note = document.getElementById("recording");
 const views = new Map(); // by their part of the URL: the one that is shown, and those that record a film
@@ -35,8 +36,8 @@ function open(hash) {
 }
 
 async function route(navigated) {
-  const [hash, name, id] = /^#\/(\w+)(?:\/([\w-]+))?$/.exec(location.hash) ?? [];
-  if (!VIEWS[name]) return location.replace("#/captures");
+  const [hash, name = "home", id] = /^#\/(?:(\w+)(?:\/([\w-]+))?)?$/.exec(location.hash) ?? [];
+  if (hash === undefined || !VIEWS[name]?.[id ? 1 : 0]) return location.replace("#/");
   const before = views.get(hash);
   const view = (shown = recordings.has(before?.signal) ? before : open(hash));
   tidy();

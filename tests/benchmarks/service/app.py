@@ -1,29 +1,40 @@
-"""The web app's size, and how long its views take in a browser from the click to the first paint.
+"""The web app's size, how long its views take in a browser from the click to the first paint, and how long a newcomer
+waits from `envmatte serve` for glass that moves.
 
     python -m tests.benchmarks.service.app [--times 10]
 
-Starts a service on loopback and opens its views in a fresh Chromium, each time with an empty cache. Run it from the
+Starts services on loopback and opens their views in a fresh Chromium, each time with an empty cache. Run it from the
 root of the repository.
 """
 
 import argparse
 import statistics
 import tempfile
+import time
 from pathlib import Path
 
 from playwright.sync_api import Browser, sync_playwright
 
 from services.cli.demo_run import service
-from tests.browser.conftest import CHROMIUM
+from tests.browser.conftest import ARGUMENTS, CHROMIUM
 
 WEB = Path(__file__).parents[3] / "services" / "web"
-VIEWS = ("captures", "jobs", "mattes", "film")
+VIEWS = ("", "captures", "jobs", "mattes", "film")
 PAINT = """() => [
     performance.getEntriesByName("first-contentful-paint")[0].startTime,
     performance.getEntriesByType("navigation")[0].loadEventEnd,
     performance.getEntriesByType("resource").concat(performance.getEntriesByType("navigation"))
         .reduce((sum, one) => sum + one.transferSize, 0),
 ]"""
+
+MOVES = """() => {
+    const canvas = document.querySelector("canvas.glass");
+    if (!canvas?.width || !canvas.isConnected) return false;
+    const picture = canvas.toDataURL();
+    const first = (window.first ??= picture);
+    return picture !== first && document.querySelector("main").ariaBusy === "false";
+}"""
+"""Whether a second picture of the glass was drawn: by itself at first, as it greets who opens the app."""
 
 
 def main() -> None:
@@ -33,7 +44,13 @@ def main() -> None:
     parser.add_argument("--times", type=int, default=10)
     times = parser.parse_args().times
     files = [path for path in WEB.rglob("*") if path.is_file()]
-    print(f"{len(files)} files, {sum(path.stat().st_size for path in files) / 1000:.0f} kB")
+    samples = [path for path in files if "samples" in path.parts]
+    for name, some in (("the app", set(files) - set(samples)), ("its samples", samples)):
+        print(f"{name}: {len(some)} files, {sum(path.stat().st_size for path in some) / 1000:.0f} kB")
+    starts = [_start() for _ in range(3)]
+    print(
+        f"from `envmatte serve` to glass that moves: {statistics.median(starts):.1f} s, {max(starts):.1f} s at most"
+    )
     with (
         tempfile.TemporaryDirectory() as folder,
         service(Path(folder, "data"), 1) as url,
@@ -45,10 +62,25 @@ def main() -> None:
             found = [_open(browser, f"{url}/#/{view}") for _ in range(times)]
             paints, loads, sizes = zip(*found, strict=True)
             print(
-                f"{view:10} {statistics.median(paints):24.0f} {max(paints):5.0f} {statistics.median(loads):20.0f}"
-                f" {max(sizes) / 1000:15.0f}"
+                f"{view or 'home':10} {statistics.median(paints):24.0f} {max(paints):5.0f}"
+                f" {statistics.median(loads):20.0f} {max(sizes) / 1000:15.0f}"
             )
         browser.close()
+
+
+def _start() -> float:
+    """Seconds from the start of a service with an empty data folder until the glass of the first view has moved."""
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        page = browser.new_page()
+        start = time.perf_counter()
+        with service(Path(folder, "data"), None) as url:
+            page.goto(url)
+            while not page.evaluate(MOVES):
+                page.wait_for_timeout(20)
+            seconds = time.perf_counter() - start
+        browser.close()
+    return seconds
 
 
 def _open(browser: Browser, url: str) -> tuple[float, float, float]:

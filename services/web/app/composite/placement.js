@@ -53,8 +53,8 @@ export function placement(changed) {
   };
 }
 
-// Lets keys, the wheel, the mouse and fingers on an element set a placement.
-export function handleGestures(element, placed) {
+// Lets keys, the wheel, the mouse and fingers on an element set a placement. `monitor` is an element of the monitor's size.
+export function handleGestures(element, placed, monitor = element) {
   element.onkeydown = (event) => {
     const [name, steps] = KEYS[event.key] ?? [];
     if (!name || event.ctrlKey || event.metaKey || event.altKey) return;
@@ -66,11 +66,11 @@ export function handleGestures(element, placed) {
     event.preventDefault();
     placed.set({ scale: placed.values.scale * Math.exp(-event.deltaY * (event.deltaMode ? 0.03 : 0.001)) });
   }, { passive: false });
-  handlePointers(element, placed);
+  handlePointers(element, placed, monitor);
 }
 
 // One finger or the mouse moves; two fingers scale and turn as well.
-function handlePointers(element, placed) {
+function handlePointers(element, placed, monitor) {
   const fingers = new Map();
   const state = () => {
     const [a, b = a] = [...fingers.values()];
@@ -87,7 +87,7 @@ function handlePointers(element, placed) {
     const before = state();
     fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
     const now = state();
-    const { width, height } = element.getBoundingClientRect();
+    const { width, height } = monitor.getBoundingClientRect();
     const { right, down, scale, angle } = placed.values;
     const wanted = { right: right + (now.x - before.x) / width, down: down + (now.y - before.y) / height };
     if (fingers.size === 2 && before.apart > 10) {

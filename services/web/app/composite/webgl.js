@@ -14,7 +14,7 @@ void main() {
   light = vec4(seen.a * seen.rgb, 1);
 }`;
 
-// Resamples the backdrop to the cells of the first level; beyond its edges is black.
+// Resamples the backdrop to the cells of the first level; beyond its edges is black, or its mirror image without end.
 const PLACE = `#version 300 es
 precision highp float;
 uniform sampler2D backdrop;
@@ -22,10 +22,12 @@ uniform mat3 placing; // from cells to shares of the picture
 uniform vec2 most; // the last column and row
 uniform vec2 cells; // that are as wide, and as high, as the picture
 uniform float blur; // level of the picture that is as coarse as the cells
+uniform bool endless;
 out vec4 light;
 void main() {
   vec2 at = (placing * vec3(min(floor(gl_FragCoord.xy), most) + 0.5, 1)).xy;
-  vec2 covered = clamp(cells * min(at, 1.0 - at) + 0.5, 0.0, 1.0);
+  if (endless) at = 1.0 - abs(mod(at, 2.0) - 1.0);
+  vec2 covered = endless ? vec2(1) : clamp(cells * min(at, 1.0 - at) + 0.5, 0.0, 1.0);
   light = vec4(covered.x * covered.y * textureLod(backdrop, at, blur).rgb, 1);
 }`;
 
@@ -70,7 +72,7 @@ void main() {
   vec3 rho = texelFetch(absorption, pixel, 0).rgb;
   vec3 seen = tops.x * root.rgb * root.rgb + crosstalk * (tops.y * rho * rho * sum);
   seen = clamp(root.a * seen, 0.0, 1.0);
-  colour = vec4(mix(12.92 * seen, 1.055 * pow(seen, vec3(1.0 / 2.4)) - 0.055, greaterThan(seen, vec3(0.0031308))), 1);
+  colour = vec4(mix(12.92 * seen, 1.055 * pow(seen, vec3(1.0 / 2.4)) - 0.055, greaterThan(seen, vec3(0.0031308))), root.a);
 }`;
 
 // The matrix of a placement, as `Placement.matrix` computes it: from cells to shares of the picture.
@@ -85,9 +87,10 @@ function placing({ right, down, scale, angle }, [columns, rows], [wide, high]) {
   ];
 }
 
-// A WebGL2 context; null where the browser has none, or cannot render to floating-point textures.
-export function webglContext(canvas) {
-  const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true });
+// A WebGL2 context; null where the browser has none, or cannot render to floating-point textures. What a mask left out is
+// black, or transparent with `alpha`.
+export function webglContext(canvas, alpha = false) {
+  const gl = canvas.getContext("webgl2", { alpha, antialias: false, depth: false, preserveDrawingBuffer: true });
   return gl?.getExtension("EXT_color_buffer_float") || gl?.getExtension("EXT_color_buffer_half_float") ? gl : null;
 }
 
@@ -179,8 +182,9 @@ export function createPainter(gl, matte, monitor) {
       gl.drawArrays(gl.TRIANGLES, 0, 3);
       gl.generateMipmap(gl.TEXTURE_2D);
     },
-    // Draws the glass with the backdrop at a placement. One of 4 ** coarser pixels is drawn, from light that is as much coarser.
-    draw(at, coarser = 0) {
+    // Draws the glass with the backdrop at a placement. One of 4 ** coarser pixels is drawn, from light that is as much
+    // coarser. An `endless` backdrop goes on beyond its edges.
+    draw(at, coarser = 0, endless = false) {
       if (!shown[0]) return;
       const first = Math.min(finest + coarser, levels.length - 1);
       const every = 2 ** coarser;
@@ -199,6 +203,7 @@ export function createPainter(gl, matte, monitor) {
       gl.uniform2f(place.at("cells"), 1 / Math.hypot(matrix[0], matrix[3]), 1 / Math.hypot(matrix[1], matrix[4]));
       const blur = Math.log2(pixels * (moved ? 1.125 : 1));
       gl.uniform1f(place.at("blur"), blur > 0.25 ? blur : 0); // sampling between two levels takes twice as long
+      gl.uniform1i(place.at("endless"), endless);
       for (let level = first; level < levels.length; level++) {
         gl.bindFramebuffer(gl.FRAMEBUFFER, targets[level]);
         gl.viewport(0, 0, texture[0] >> level, texture[1] >> level);

@@ -98,19 +98,29 @@ const unreadable = ({ name }) => ({
 
 const startsAsZip = async (file) => /^PK[\x03\x05]/.test(await file.slice(0, 4).text());
 
-// The zone where capture archives and films are dropped or chosen.
-export function dropZone() {
-  const take = (files) => [...files].forEach((file) => begin(file));
-  const input = h("input", { type: "file", accept: ".zip,application/zip,video/*,.mkv,.mts,.m2ts", id: "zip", multiple: true });
+// Uploads capture archives and films, and shows them in the list of captures.
+export function upload(files) {
+  [...files].forEach((file) => begin(file));
+  location.hash = "#/captures";
+}
+
+// A field for capture archives and films.
+export function fileInput(id) {
+  const input = h("input", { type: "file", accept: ".zip,application/zip,video/*,.mkv,.mts,.m2ts", id, multiple: true });
   input.onchange = () => {
-    take(input.files);
+    upload(input.files);
     input.value = "";
   };
+  return input;
+}
+
+// The zone where they are dropped or chosen.
+export function dropZone() {
   const zone = h("div", { class: "drop" },
     h("label", { for: "zip" }, h("strong", {}, "Choose a capture archive or a film"), " or drop it here",
       h("span", { class: "hint" }, "A ZIP with capture.json and its frames, or the film of a program. An interrupted upload continues where it stopped.")),
-    input);
-  onDrop(zone, take);
+    fileInput("zip"));
+  onDrop(zone, upload);
   return h("div", {}, zone, running);
 }
 

@@ -1,14 +1,22 @@
 // The list of captures, and the zone to upload another one.
 import { getJson } from "../lib/api.js";
-import { badge, bytes, empty, h, size, when } from "../lib/dom.js";
+import { badge, button, bytes, empty, h, size, when } from "../lib/dom.js";
+import { areRemoved, fetchCapture, restoreSamples } from "../home/samples.js";
 import { list } from "../lib/list.js";
-import { dropZone } from "../upload/upload.js";
+import { dropZone, upload } from "../upload/upload.js";
 
 export async function captures(main, signal) {
+  const problem = h("div");
+  const restore = button("Show the samples again", problem, () => {
+    restoreSamples();
+    location.hash = "#/";
+  });
   main.append(
     h("h1", {}, "Captures"),
     h("p", { class: "lead" }, "Films of a glass before a monitor that shows patterns. Upload one to see its report."),
     dropZone(),
+    h("p", { class: "row" }, button("Try it with a sample capture", problem, async () => upload([await fetchCapture(signal)])), areRemoved() && restore),
+    problem,
   );
   await list(main, signal, {
     page: (after) => getJson(`v1/captures?limit=50${after}`, signal).then((answer) => answer.captures),

@@ -1,0 +1,178 @@
+"""The first view: a sample that is played with, without a capture, a matte or a key."""
+
+import base64
+import io
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from numpy.typing import NDArray
+from PIL import Image
+from playwright.sync_api import Browser, Page, expect
+
+from tests.browser.pages import MINUTE, PHONE, is_fitting, opened
+from tests.browser.test_compositing import WITHOUT
+from tests.end_to_end.conftest import Service
+from tests.parts.waiting import until
+
+SAMPLES = Path(__file__).parents[2] / "services" / "web" / "samples"
+NAMES = [one["title"] for one in json.loads((SAMPLES / "samples.json").read_text())]
+LIGHT = "(canvas) => canvas.toDataURL('image/png')"
+
+
+def drawn(page: Page) -> NDArray[np.float64]:
+    """The glass as it is drawn, (rows, columns, 4); transparent where the mask left pixels out."""
+    url = page.locator("canvas.glass").evaluate(LIGHT)
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))).convert("RGBA"), float)
+
+
+def settled(page: Page) -> NDArray[np.float64]:
+    """The glass once all of its pixels are drawn, and nothing moves any more."""
+    last = np.zeros(0)
+
+    def is_still() -> bool:
+        nonlocal last
+        before, last = last, drawn(page)
+        return (
+            last.shape == before.shape
+            and min(last.shape[:2]) >= 240
+            and bool(last.any())
+            and bool(np.all(last == before))
+        )
+
+    until(is_still)
+    return last
+
+
+def test_first_view_is_a_glass_that_moves_under_the_hand(desk: Page, service: Service) -> None:
+    asked: list[str] = []
+    desk.on("request", lambda request: asked.append(request.url))
+    desk.emulate_media(reduced_motion="reduce")
+    desk.goto(service.url)
+    expect(desk).to_have_url(re.compile("/#/$"))
+    expect(desk.get_by_role("heading", name=NAMES[0])).to_be_visible()
+    expect(desk.get_by_text("Sample: traced, not filmed")).to_be_visible()
+    before = settled(desk)
+    assert 0.1 < np.mean(before[..., 3] > 0) < 0.9
+    glass = desk.get_by_role("group", name="Glass.")
+    box = glass.bounding_box()
+    assert box
+    desk.mouse.move(box["x"] + 600, box["y"] + 200)
+    desk.mouse.down()
+    desk.mouse.move(box["x"] + 500, box["y"] + 260, steps=4)
+    desk.mouse.up()
+    moved = settled(desk)
+    assert np.mean(np.abs(moved - before)[before[..., 3] > 0]) > 3
+    glass.press("]")
+    turned = settled(desk)
+    assert np.any(turned != moved)
+    for name in ("Lights", "Tiles"):
+        desk.get_by_role("radio", name=name).check(force=True)
+        other = settled(desk)
+        assert np.mean(np.abs(other - turned)[before[..., 3] > 0]) > 3
+        turned = other
+    for name in NAMES[1:]:
+        desk.get_by_role("radio", name=name).check(force=True)
+        expect(desk.get_by_role("heading", name=name)).to_be_visible()
+        other = settled(desk)
+        assert not np.array_equal(other, turned)
+        turned = other
+    assert not any("/v1/" in url for url in asked)  # it takes neither a matte nor a key
+
+
+def test_backdrop_around_the_glass_joins_what_is_seen_through_it(desk: Page, service: Service) -> None:
+    # At its edge the object covers pixels in part: what they show is nearly what is beside it.
+    desk.emulate_media(reduced_motion="reduce")
+    desk.goto(service.url)
+    glass = settled(desk)
+    shot = np.asarray(Image.open(io.BytesIO(desk.screenshot())).convert("RGB"), float)
+    box = desk.locator("canvas.glass").bounding_box()
+    assert box
+    rows, columns = glass.shape[:2]
+    covered = glass[..., 3] > 0
+    edge = covered & ~(
+        np.roll(covered, 1, 0) & np.roll(covered, -1, 0) & np.roll(covered, 1, 1) & np.roll(covered, -1, 1)
+    )
+    y, x = np.nonzero(edge)
+    out = np.array([x - x.mean(), y - y.mean()]) / np.hypot(x - x.mean(), y - y.mean())
+    beside_x = np.rint(box["x"] + (x + 0.5 + 2 * out[0]) * box["width"] / columns).astype(int)
+    beside_y = np.rint(box["y"] + (y + 0.5 + 2 * out[1]) * box["height"] / rows).astype(int)
+    inside = (beside_x > 0) & (beside_x < shot.shape[1]) & (beside_y > 0) & (beside_y < 600)
+    difference = glass[y, x, :3][inside] - shot[beside_y[inside], beside_x[inside]]
+    assert np.median(np.abs(difference)) < 25
+
+
+def test_camera_is_a_backdrop(desk: Page, service: Service) -> None:
+    desk.goto(service.url)
+    settled(desk)
+    desk.get_by_role("radio", name="Use my camera").check(force=True)
+    one = drawn(desk)
+    until(lambda: not np.array_equal(drawn(desk), one))
+    two = drawn(desk)
+    until(lambda: not np.array_equal(drawn(desk), two))
+
+
+def test_samples_are_removed_and_restored(desk: Page, service: Service) -> None:
+    desk.goto(service.url)
+    desk.get_by_role("button", name="Remove the samples").click()
+    expect(desk.get_by_role("heading", name="Captures")).to_be_visible()
+    desk.goto("about:blank")
+    desk.goto(service.url)
+    expect(desk).to_have_url(re.compile("/#/captures$"))
+    desk.get_by_role("link", name="envmatte").click()
+    expect(desk.get_by_role("heading", name="Captures")).to_be_visible()
+    desk.get_by_role("button", name="Show the samples again").click()
+    expect(desk.get_by_role("heading", name=NAMES[0])).to_be_visible()
+    desk.get_by_role("link", name="Film your own").click()
+    expect(desk.get_by_role("heading", name="Choose a program")).to_be_visible()
+    desk.get_by_role("link", name="envmatte").click()
+    expect(desk.get_by_role("heading", name=NAMES[0])).to_be_visible()
+
+
+def test_without_webgl_a_still_is_shown(browser: Browser, service: Service) -> None:
+    with opened(browser) as page:
+        page.add_init_script(WITHOUT)
+        page.goto(service.url)
+        expect(page.get_by_text("This browser has no WebGL2")).to_be_visible()
+        image = page.get_by_alt_text(f"{NAMES[0]} before a checkerboard")
+        expect(image).to_be_visible()
+        until(lambda: bool(image.evaluate("(image) => image.complete && image.naturalWidth >= 240")))
+        page.get_by_role("radio", name=NAMES[-1]).check(force=True)
+        expect(page.get_by_alt_text(f"{NAMES[-1]} before a checkerboard")).to_be_visible()
+
+
+@pytest.mark.slow
+def test_sample_capture_is_uploaded_and_read(desk: Page, service: Service) -> None:
+    desk.goto(f"{service.url}/#/captures")
+    desk.get_by_role("button", name="Try it with a sample capture").click()
+    expect(desk).to_have_url(re.compile(r"#/captures/\w+"), timeout=MINUTE)
+    capture = desk.url.rpartition("/")[2]
+    service.client.wait(service.client.capture(capture)["job"])
+    expect(desk.get_by_role("heading", name="Report")).to_be_visible(timeout=MINUTE)
+    report = service.http.get(f"/v1/captures/{capture}/report").json()
+    assert report["level"] != "bad", report
+    matte = service.client.wait(service.client.recover(capture, quality="fast")["id"])["matte"]
+    assert service.client.matte(matte)["state"] == "ready"
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("device", ["desk", "phone"])
+def test_first_view_is_accessible_and_fits(
+    browser: Browser, service: Service, device: str, scheme: str
+) -> None:
+    size = {"viewport": PHONE, "has_touch": True, "is_mobile": True} if device == "phone" else {}
+    with opened(browser, color_scheme=scheme, reduced_motion="reduce", **size) as page:
+        page.goto(service.url)
+        settled(page)
+        assert is_fitting(page)
+        assert page.evaluate("document.documentElement.scrollHeight <= innerHeight")
+        assert [one["id"] for one in Axe().run(page).response["violations"]] == []
+
+
+def test_shipped_samples_are_small() -> None:
+    files = list(SAMPLES.iterdir())
+    assert {file.suffix for file in files} == {".json", ".live", ".webp", ".zip"}
+    assert max(file.stat().st_size for file in files) <= 1 << 20
