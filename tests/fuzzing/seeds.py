@@ -92,6 +92,18 @@ def jpegs() -> tuple[bytes, ...]:
 
 
 @cache
+def webs() -> tuple[bytes, ...]:
+    """WebP, AVIF and GIF."""
+    alpha = Image.fromarray(np.dstack([PIXELS, PIXELS[:, :, 0]]))
+    files = [_saved(kind, mode) for kind in ("WEBP", "AVIF", "GIF") for mode in ("RGB", "P", "L")]
+    for kind in ("WEBP", "AVIF", "GIF"):
+        target = io.BytesIO()
+        alpha.save(target, kind, save_all=True, append_images=[alpha.rotate(180)])
+        files.append(target.getvalue())
+    return (*files, _saved("WEBP", lossless=True, exif=_exif()))
+
+
+@cache
 def heics() -> tuple[bytes, ...]:
     profile = _dated(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
     pixels = np.tile(PIXELS, (3, 2, 1))
@@ -235,7 +247,7 @@ def raws() -> tuple[bytes, ...]:
 
 
 def backdrops() -> tuple[bytes, ...]:
-    return (*pngs(), *jpegs(), *exrs(), *heics(), *raws())
+    return (*pngs(), *jpegs(), *exrs(), *heics(), *webs(), *raws())
 
 
 def profile() -> bytes:

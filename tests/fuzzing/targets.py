@@ -69,6 +69,12 @@ ALL = (
     target("tiff", of_files(None, changes.damaged_tiff), images.read_image, seeds.tiffs),
     target("heic", of_files(images.BOXES), images.read_image, seeds.heics),
     target(
+        "web-picture",
+        of_files(rb"VP8[ LX]|ANIM|ANMF|ALPH|ipco|ispe|av1C|iloc|GIF89a|\x2c"),
+        images.read_any_backdrop,
+        seeds.webs,
+    ),
+    target(
         "backdrop",
         of_files(rb"IHDR|iCCP|ICC_PROFILE|colr", images.profiled),
         images.read_any_backdrop,

@@ -9,11 +9,13 @@ import numpy as np
 from PIL import Image
 
 from storage.errors import ImageError
-from workflows.images import camera_raw, float_formats, heif, integer_formats, raw_files
+from workflows.images import camera_raw, float_formats, heif, integer_formats, raw_files, web_formats
 from workflows.images.float_formats import Floats
 from workflows.images.integer_formats import Codes
 
 Transfer = Literal["srgb", "linear"]
+FORMATS = (*integer_formats.FORMATS, *web_formats.FORMATS)
+"""What Pillow opens of a backdrop: what browsers show, too."""
 
 
 def decode(data: bytes, transfer: Transfer, *, memory: int) -> Codes | Floats:
@@ -22,7 +24,7 @@ def decode(data: bytes, transfer: Transfer, *, memory: int) -> Codes | Floats:
     Parameters
     ----------
     data : bytes
-        PNG, JPEG, TIFF, HEIC, EXR or camera RAW.
+        PNG, JPEG, WebP, AVIF, GIF, TIFF, HEIC, EXR or camera RAW. Of a moving picture the first frame is decoded.
     transfer : str
         How integers encode light. Colours with an ICC profile are converted to sRGB, unless this is ``linear``. RAW
         and floats are linear light in any case.
@@ -42,7 +44,7 @@ def decode(data: bytes, transfer: Transfer, *, memory: int) -> Codes | Floats:
         return camera_raw.develop(data, memory=memory)
     if float_formats.is_float(data):
         return float_formats.decode(data, memory=memory)
-    pixels = integer_formats.decode(data, memory=memory, alpha=True)
+    pixels = integer_formats.decode(data, memory=memory, alpha=True, formats=FORMATS)
     return _to_srgb(data, pixels) if transfer == "srgb" else pixels
 
 
@@ -69,7 +71,7 @@ def _to_srgb(data: bytes, pixels: Codes) -> Codes:
 
 
 def _profile(data: bytes) -> bytes | None:
-    """The ICC profile of a PNG, JPEG or TIFF."""
-    with Image.open(io.BytesIO(data), formats=integer_formats.FORMATS) as picture:
+    """The ICC profile of what Pillow opens."""
+    with Image.open(io.BytesIO(data), formats=FORMATS) as picture:
         # Pixels made from a palette or from inks do not have the colours that the profile describes.
         return picture.info.get("icc_profile") if picture.mode in ("RGB", "RGBA", "I;16B", "RGB;16") else None

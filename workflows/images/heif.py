@@ -31,8 +31,9 @@ pillow_heif.options.AUX_IMAGES = False
 
 
 def is_heif(data: bytes) -> bool:
-    """Whether bytes are HEIF, judging by their first box."""
-    return data[4:8] == b"ftyp" and data[8:12] in BRANDS
+    """Whether bytes are HEIF and not AVIF, judging by their first box."""
+    also = data[16 : int.from_bytes(data[:4], "big")]  # its other brands
+    return data[4:8] == b"ftyp" and data[8:12] in BRANDS and b"avif" not in also
 
 
 def decode(data: bytes, *, memory: int, turn: int | None = None) -> NDArray[np.unsignedinteger]:

@@ -1,7 +1,6 @@
-"""PNG, JPEG, TIFF and HEIC of 8 to 16 bits to arrays, and PNG and JPEG back. The files are not trusted."""
+"""PNG, JPEG, TIFF, HEIC and web formats of 8 to 16 bits to arrays, and PNG and JPEG back. Files are not trusted."""
 
 import io
-import warnings
 from typing import cast
 
 import imagecodecs
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from storage.errors import ImageError
-from workflows.images import heif
+from workflows.images import heif, web_formats
 from workflows.images.orientation import ORIENTATION, inverse, upright
 from workflows.untrusted import tiff_lzw
 from workflows.untrusted.limits import check_size
@@ -19,7 +18,8 @@ from workflows.untrusted.limits import check_size
 Codes = NDArray[np.unsignedinteger]
 """Values as a file stores them: uint8 or uint16."""
 FORMATS = ("PNG", "TIFF", "JPEG")
-"""What Pillow opens."""
+"""What Pillow opens of a capture."""
+Image.MAX_IMAGE_PIXELS = None  # `check_size` has the limit
 LOSSLESS = {
     tifffile.COMPRESSION.NONE,
     tifffile.COMPRESSION.LZW,
@@ -56,19 +56,28 @@ def orientation(data: bytes) -> int:
     return int(found) if found in range(1, 9) else 1
 
 
-def decode(data: bytes, *, memory: int, alpha: bool = False, turn: int | None = None) -> Codes:
+def decode(
+    data: bytes,
+    *,
+    memory: int,
+    alpha: bool = False,
+    turn: int | None = None,
+    formats: tuple[str, ...] = FORMATS,
+) -> Codes:
     """Decode an image.
 
     Parameters
     ----------
     data : bytes
-        PNG, JPEG, TIFF or HEIC.
+        HEIC, or one of ``formats``. Of a moving picture the first frame is decoded.
     memory : int
         Bytes that the decoded image may take; checked by the header, before anything is decoded.
     alpha : bool
         Whether to keep an alpha channel.
     turn : int, optional
         Orientation, see `upright`; by default the file's own.
+    formats : tuple of str
+        What Pillow may open.
 
     Returns
     -------
@@ -82,17 +91,14 @@ def decode(data: bytes, *, memory: int, alpha: bool = False, turn: int | None = 
     """
     if heif.is_heif(data):
         return _kept(heif.decode(data, memory=memory, turn=turn), alpha)
+    if "WEBP" in formats:
+        web_formats.check_webp(data, memory)
     try:
-        with warnings.catch_warnings():
-            # Pillow's warning about large images is replaced by the limit below.
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            picture = Image.open(io.BytesIO(data), formats=FORMATS)
-    except Image.DecompressionBombError as error:
-        raise ImageError("the image is too large to be read: make it smaller", limit=memory) from error
+        picture = Image.open(io.BytesIO(data), formats=formats)
     except Exception as error:  # damaged bytes raise many kinds of errors
         raise ImageError(
-            "this is not a PNG, TIFF, JPEG or HEIC image, or it is cut off: copy it again from the camera, or save it "
-            "as PNG"
+            f"this is not a {', '.join(formats)} or HEIC image, or it is cut off: copy it again from the camera, or "
+            "save it as PNG"
         ) from error
     if picture.format == "PNG" and getattr(picture, "is_animated", False):
         raise ImageError("this PNG is animated: save a single picture")
@@ -187,9 +193,11 @@ def _by_pillow(picture: Image.Image, memory: int) -> NDArray[np.uint8]:
     if picture.mode not in ("1", "P", "L", "LA", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr"):
         raise ImageError(f"{picture.format} images of mode {picture.mode!r} are not supported")
     as_it_is = picture.mode in ("L", "LA", "RGB", "RGBA")
-    check_size(*picture.size, len(picture.getbands()) if as_it_is else 3, memory)
-    picture.info.pop("transparency", None)  # transparency of a palette is dropped
-    pixels = np.asarray(picture if as_it_is else picture.convert("RGB"))
+    seen_through = picture.format == "GIF" and "transparency" in picture.info
+    check_size(*picture.size, len(picture.getbands()) if as_it_is else 4 if seen_through else 3, memory)
+    if not seen_through:
+        picture.info.pop("transparency", None)  # transparency of a palette is dropped
+    pixels = np.asarray(picture if as_it_is else picture.convert("RGBA" if seen_through else "RGB"))
     return upright(pixels, inverse(turned))
 
 

@@ -91,7 +91,9 @@ class CaptureArchive:
                             file.write(packed.read(min(PIECE, info.file_size - done)))
                         file.seek(0)
             except zip_files.UNREADABLE as error:
-                raise CaptureError(f"{entry} is damaged in the archive: {error}", entry=entry) from error
+                raise CaptureError(
+                    f"{entry} is damaged in the archive: make the archive again", entry=entry
+                ) from error
             yield file
 
     def _read_manifest(self) -> Manifest:

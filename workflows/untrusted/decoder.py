@@ -6,6 +6,7 @@ files, but not the service.
 """
 
 import json
+import logging
 import os
 import signal
 import socket
@@ -22,6 +23,7 @@ from storage.errors import CaptureError, ImageError, Unavailable
 from workflows.untrusted.decoder_process import ADVICE, HEAD, PIECE, Function
 from workflows.untrusted.decoder_server import EXIT, server
 
+logger = logging.getLogger(__name__)
 SECONDS = 180.0
 """More than the largest frame takes on a busy machine, or with a slow store."""
 COPIES, EXTRA = 8, 256 << 20
@@ -76,6 +78,12 @@ class _Refused(_Strict):
     limit: int | None
 
 
+class _Failed(_Strict):
+    """The file can't be decoded, by an error of a library, in its words."""
+
+    failed: Annotated[str, Field(max_length=1000)]
+
+
 class _OutOfMemory(_Strict):
     """The file takes too much memory."""
 
@@ -88,7 +96,7 @@ class _Done(_Strict):
     done: Literal[True]
 
 
-_Answer = _Read | _Alive | _Array | _Value | _Refused | _OutOfMemory | _Done
+_Answer = _Read | _Alive | _Array | _Value | _Refused | _Failed | _OutOfMemory | _Done
 _ANSWERS: TypeAdapter[_Answer] = TypeAdapter(_Answer)
 
 
@@ -172,7 +180,7 @@ class Decoder:
                 self._send(HEAD.pack(len(text)) + text, deadline)
                 if isinstance(file, bytes):
                     self._send(file, deadline)
-            while not isinstance(answer, _Done | _Refused | _OutOfMemory):
+            while not isinstance(answer, _Done | _Refused | _Failed | _OutOfMemory):
                 with self.checking():
                     answer = self._receive(deadline)
                     values = self._array(answer, deadline) if isinstance(answer, _Array) else None
@@ -194,6 +202,9 @@ class Decoder:
             raise
         if isinstance(answer, _OutOfMemory):
             raise MemoryError
+        if isinstance(answer, _Failed):
+            logger.warning("a file can't be decoded: %s", answer.failed)
+            raise ImageError(f"the file can't be decoded: it is damaged, or of an unusual kind; {ADVICE}")
         if isinstance(answer, _Refused):
             raise ImageError(answer.refused, **({} if answer.limit is None else {"limit": answer.limit}))
 

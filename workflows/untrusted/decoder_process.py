@@ -149,13 +149,13 @@ def _remote(connection: io.FileIO, length: int) -> BinaryIO:
 
 
 def _refusal(error: Exception) -> dict[str, Any]:
-    """The answer for an error; only errors of ours are passed on as they are."""
+    """The answer for an error; only errors of ours are passed on as they are, others are for the log."""
     if isinstance(error, MemoryError) or isinstance(error.__cause__, MemoryError):
         return {"out_of_memory": True}
     if isinstance(error, EnvmatteError):
         limit = error.fields.get("limit")
         return {"refused": error.detail[:10_000], "limit": limit if isinstance(limit, int) else None}
-    return {"refused": f"the file can't be decoded: {error!r:.1000}; {ADVICE}", "limit": None}
+    return {"failed": f"{error!r:.1000}"}
 
 
 def in_use() -> int:

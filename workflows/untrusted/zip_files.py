@@ -118,7 +118,7 @@ def read(
         with archive.open(info) as file:
             return file.read(info.file_size)
     except UNREADABLE as error:
-        raise refusal(f"{name} is damaged in the archive: {error}", entry=name) from error
+        raise refusal(f"{name} is damaged in the archive: make the archive again", entry=name) from error
 
 
 class _Bounded:

@@ -43,6 +43,9 @@ R = TypeVar("R")
 BACKDROPS = (
     "image/png",
     "image/jpeg",
+    "image/webp",
+    "image/avif",
+    "image/gif",
     "image/tiff",
     "image/heic",
     "image/heif",

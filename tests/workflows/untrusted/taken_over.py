@@ -65,6 +65,12 @@ def attacks(victim: int, secret: str) -> dict[str, Callable[[], object]]:
     }
 
 
+def stumble(file: BinaryIO) -> Iterator[dict[str, Any]]:
+    """Fail as a library does."""
+    yield {}
+    raise RuntimeError("libglass: bad huffman code")
+
+
 def attack(file: BinaryIO, victim: int, secret: str) -> Iterator[dict[str, Any]]:
     """Try everything; yields what was not refused, and what is open."""
     done = []

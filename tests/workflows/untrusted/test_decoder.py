@@ -11,7 +11,7 @@ import numpy as np
 import psutil
 import pytest
 
-from storage.errors import CaptureError, Unavailable
+from storage.errors import CaptureError, ImageError, Unavailable
 from tests.parts.waiting import until
 from tests.workflows.untrusted import taken_over
 from workflows.untrusted import confinement, decoder, decoder_server
@@ -140,6 +140,13 @@ def test_crash_is_told_as_a_reason_to_try_again() -> None:
     ended = pytest.raises(Unavailable, match=r"film\.mp4 ended .* \(SIGSEGV\)")
     with Decoder(IMAGE) as found, ended, blaming("film.mp4", found):
         list(found.run(taken_over.crash, b""))
+
+
+def test_words_of_a_library_stay_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    with Decoder(IMAGE) as found, pytest.raises(ImageError, match="save it again") as refused:
+        list(found.run(taken_over.stumble, b""))
+    assert "libglass" not in refused.value.detail
+    assert "libglass: bad huffman code" in caplog.text
 
 
 def test_decoder_that_hangs_is_ended() -> None:
