@@ -33,7 +33,7 @@ def on_postgresql(
         yield prepare(rig, capture_archive)
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_restarted_database(
     on_postgresql: Prepared, postgresql_server: Server, table: list[Row], times: int
 ) -> None:
