@@ -65,7 +65,8 @@ export async function builtIn(name, [wide, high]) {
   return { name, exact: () => blob, quick: () => blob, picture };
 }
 
-// A picture from a file. Of a large one a small copy is sent while the user moves it.
+// A picture from a file. A small copy is sent while the user moves it. `copy` makes what the service takes if it refuses
+// the file: as large as this browser draws it.
 export async function fromFile(file) {
   const exact = () => file;
   const name = file.name || "Pasted picture";
@@ -80,8 +81,9 @@ export async function fromFile(file) {
     whole.close();
   }
   let small;
-  const quick = async () => (small ??= longer > PREVIEW ? await still(picture, picture.width, picture.height, PREVIEW, "image/jpeg") : file);
-  return { name, exact, quick, picture, close: () => picture.close() };
+  const shot = (longest, type) => still(picture, picture.width, picture.height, longest, type);
+  const quick = async () => (small ??= await shot(PREVIEW, "image/jpeg"));
+  return { name, exact, quick, picture, copy: () => shot(DRAWABLE, "image/png"), close: () => picture.close() };
 }
 
 // The picture, or the current frame of a video, no larger than `longest`; transparent parts become black, as in the service.

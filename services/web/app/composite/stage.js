@@ -18,6 +18,8 @@ export class Stage {
   #timer;
   #frame = 0;
   #changes = 0;
+  #isExact = false; // whether the picture shows the last change at full size
+  #preview = new AbortController();
   #choices = 0;
   #coarseness = new Coarseness();
   #image;
@@ -29,7 +31,7 @@ export class Stage {
   constructor(matte, place, signal) {
     [this.#matte, this.#place, this.#signal] = [matte, place, signal];
     const { width, height } = matte;
-    this.#image = h("img", { alt: "The glass before the backdrop", width, height, draggable: "false" });
+    this.#image = h("img", { alt: "The glass before the backdrop", width, height, draggable: "false", hidden: true });
     this.#canvas = h("canvas", { role: "img", "aria-label": "The glass before the backdrop", width, height, hidden: true });
     this.element = h("div", {
       class: "picture stage", tabindex: 0, role: "group",
@@ -78,38 +80,59 @@ export class Stage {
     if (!this.#backdrop) return;
     clearTimeout(this.#timer);
     this.#changes += 1;
+    this.#isExact = false;
     this.#describe(this.#isLive ? "live" : "preview");
     if (!this.playing) this.#timer = setTimeout(() => this.#stopped(), STILL);
     if (this.#isLive) this.#requestPaint();
     else this.#composite(false);
   }
 
-  // The service's composite of the whole frame, as a file of a media type.
-  async download(type) {
+  // The service's composite of the whole frame, as a file of a media type: of a backdrop, or of the one that is chosen.
+  // If the service refuses its file, this browser sends a copy.
+  async composite(type, backdrop = this.#backdrop) {
     const wanted = type === "image/jpeg" ? { quality: 95 } : {};
-    return this.#request(await this.#backdrop.exact(), wanted, type);
+    try {
+      return await this.#request(await backdrop.exact(), wanted, type);
+    } catch (error) {
+      if (![413, 422].includes(error.status) || !backdrop.copy) throw error;
+      const copy = await backdrop.copy();
+      const answer = await this.#request(copy, wanted, type);
+      const why = error.status === 413 || error.limit != null ? "does not take pictures this large" : "cannot read this file";
+      const { width, height } = backdrop.picture;
+      backdrop.note = `. The service ${why}, so this browser sends a copy of ${width} × ${height} pixels.`;
+      backdrop.exact = () => copy;
+      return answer;
+    }
   }
 
-  async #request(body, wanted, type) {
+  async #request(body, wanted, type, signal = this.#signal) {
     const query = new URLSearchParams({ ...this.#place, ...wanted });
     const path = `v1/mattes/${this.#matte.id}/composite?${query}`;
-    return (await ask(path, { method: "POST", headers: { Accept: type }, body, signal: this.#signal })).blob();
+    return (await ask(path, { method: "POST", headers: { Accept: type }, body, signal })).blob();
+  }
+
+  async #quick(backdrop) {
+    this.#preview = new AbortController();
+    const size = Math.min(QUICK, Math.max(this.#matte.width, this.#matte.height));
+    const signal = AbortSignal.any([this.#signal, this.#preview.signal]);
+    return this.#request(await backdrop.quick(), { quality: 80, size }, "image/jpeg", signal);
   }
 
   // Shows the service's composite, exact or as a preview.
   #composite = newest(async (exact) => {
     const [backdrop, changes] = [this.#backdrop, this.#changes];
     try {
-      const longer = Math.max(this.#matte.width, this.#matte.height);
-      const wanted = exact ? { quality: 95 } : { quality: 80, size: Math.min(QUICK, longer) };
-      const picture = await this.#request(await (exact ? backdrop.exact() : backdrop.quick()), wanted, "image/jpeg");
+      const picture = await (exact ? this.composite("image/jpeg", backdrop) : this.#quick(backdrop));
       if (backdrop !== this.#backdrop || (this.#isLive && changes !== this.#changes)) return; // the live picture is newer
       await show(this.#image, picture);
       this.#bringToFront(this.#image);
-      if (exact && changes === this.#changes) this.#describe(`exact, ${this.#matte.width} × ${this.#matte.height} pixels`);
+      if (exact && changes === this.#changes) {
+        this.#isExact = true;
+        this.#describe(`exact, ${this.#matte.width} × ${this.#matte.height} pixels${backdrop.note ?? ""}`);
+      }
       this.problem.replaceChildren();
     } catch (error) {
-      this.fail(error);
+      if (error.name !== "AbortError") this.fail(error);
     }
     if (!exact && this.playing && !this.#isLive && !this.#signal.aborted) this.#composite(false); // the next frame
   });
@@ -135,6 +158,7 @@ export class Stage {
 
   #stopped() {
     this.#coarseness.rest();
+    this.#preview.abort(); // a service that is busy may take long for it
     this.#composite(true);
   }
 
@@ -164,7 +188,11 @@ export class Stage {
       if (this.#backdrop?.picture) this.#painter.setBackdrop(this.#backdrop.picture);
       const some = found.step > 1 ? `, one pixel in ${found.step ** 2} of it` : "";
       this.renderer.textContent = `This browser draws the glass while you move${some}; when you stop, the service does.`;
-      if (this.#backdrop && this.playing) this.moved();
+      if (!this.#backdrop || this.#isExact) return;
+      if (this.playing) return this.moved();
+      // Something was moved meanwhile: the exact picture is on its way.
+      this.#describe(this.#isLive ? "live" : "preview");
+      this.#requestPaint();
     } catch (error) {
       this.fail(error);
     }

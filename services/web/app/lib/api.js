@@ -5,9 +5,9 @@ import { pause } from "./dom.js";
 const KEY = "envmatte-key"; // the player page keeps it under the same name
 
 export class Problem extends Error {
-  constructor({ title, detail, status, field }) {
+  constructor({ title, detail, status, field, entry, limit }) {
     super(detail);
-    Object.assign(this, { title, detail, status, field });
+    Object.assign(this, { title, detail, status, field, entry, limit });
   }
 }
 
