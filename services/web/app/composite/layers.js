@@ -12,7 +12,7 @@ const LAYERS = {
 };
 
 export function layers(matte, signal) {
-  const image = h("img", { alt: FIRST, width: matte.width, height: matte.height, draggable: "false" });
+  const image = h("img", { alt: FIRST, width: matte.width, height: matte.height, draggable: "false", hidden: true });
   const mark = h("span", { class: "mark", hidden: true });
   const stage = h("div", {
     class: "picture layer", tabindex: 0, role: "group",

@@ -17,6 +17,8 @@ const UNREACHABLE = {
   detail: "Check that it runs and that this device is connected to it, then try again. Nothing stored is lost.",
 };
 
+const GONE = "It was deleted, it has expired, or it belongs to another key.";
+
 export const key = () => sessionStorage.getItem(KEY);
 
 // Characters that no header can hold are replaced: the key is unknown to the service either way.
@@ -75,6 +77,7 @@ export async function ask(path, options = {}) {
 
 async function describe(answer) {
   const about = answer.headers.get("content-type")?.includes("json") ? await answer.json().catch(() => ({})) : {};
+  if (answer.status === 404) about.detail = GONE; // the service says it for those who call it
   return { title: answer.statusText || "Refused", detail: `The service answered with ${answer.status}.`, ...about, status: answer.status };
 }
 

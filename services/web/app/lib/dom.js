@@ -13,10 +13,14 @@ export function h(tag, attributes = {}, ...children) {
 // A text as elements: what stands between `backticks` is code.
 export const prose = (text) => text.split(/`([^`]*)`/).map((part, i) => (i % 2 ? h("code", {}, part) : part));
 
+// A text of the API with a capital letter, unless it begins with a name: of a file, a field or an option.
+export const sentence = (text, name) =>
+  name && text.startsWith(name) ? text : text.replace(/^[a-z]+(?=[ ,])/, (word) => word[0].toUpperCase() + word.slice(1));
+
 // A box with an error as the API words it, or as the browser does.
 export const problemBox = (error) =>
   h("div", { class: "problem", role: "alert" }, h("strong", {}, error.title ?? "Something went wrong in this page"),
-    h("p", {}, prose(error.detail ?? error.message)));
+    h("p", {}, prose(sentence(error.detail ?? error.message, error.entry))));
 
 export const empty = (title, text) => h("div", { class: "empty" }, h("strong", {}, title), h("p", {}, text));
 
@@ -77,13 +81,13 @@ export function newest(work) {
   };
 }
 
-// Puts a picture into an `img`, and frees the one before.
+// Puts a picture into an `img`, which appears with its first one, and frees the one before.
 export async function show(image, blob) {
   const url = URL.createObjectURL(blob);
   const before = image.dataset.url;
   image.dataset.url = image.src = url;
-  image.hidden = false;
   await image.decode().catch(() => {});
+  image.hidden = false;
   if (before) URL.revokeObjectURL(before);
 }
 

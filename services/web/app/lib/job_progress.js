@@ -58,8 +58,11 @@ export async function followJob(panel, id, signal, changed = () => {}, known = n
 function describe(job) {
   const percent = `${Math.floor(100 * job.progress)} %`;
   if (job.state === "running") {
-    const left = job.eta_seconds == null ? "" : `, about ${duration(job.eta_seconds)} left`;
-    return `${job.stage}, ${percent}${left}`;
+    // The last step has no tiles to count, and may take longer than it was expected to.
+    const last = job.stage === "finishing";
+    const doing = !last ? `${job.stage}, ${percent}` : job.kind === "ingest" ? "measuring and writing the report" : "finishing";
+    const left = job.eta_seconds == null || (last && job.eta_seconds < 1) ? "" : `, about ${duration(job.eta_seconds)} left`;
+    return doing + left;
   }
   if (job.state === "succeeded") return `in ${duration(job.run_seconds)}`;
   return job.state === "queued" ? "" : `at ${percent}`;

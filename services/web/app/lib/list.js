@@ -15,11 +15,19 @@ export async function list(main, signal, { page, busy, none, item }) {
     more.hidden = found.length < 50;
     pages += 1;
   };
-  const first = await page("");
-  if (!first.length) main.append(none());
+  const start = async () => {
+    const first = await page("");
+    if (!first.length) items.before(none());
+    add(first);
+    watch(first).catch(() => {}); // the user left the view
+  };
+  const again = async (error) => {
+    signal.throwIfAborted();
+    problem.replaceChildren(problemBox(error), button("Try again", problem, () => start().catch(again)));
+  };
+  more.hidden = true;
   main.append(items, problem, more);
-  add(first);
-  watch(first).catch(() => {}); // the user left the view
+  await start().catch(again);
 
   // Refreshes the first page only, and only while no further page is shown.
   async function watch(found) {

@@ -79,8 +79,11 @@ export async function send(file, remembered, { signal, progress, waiting }) {
       }
       if (error.status === 401 && isPart) continue; // `ask` asks for a key when it requests the offset
       if (!TEMPORARY.includes(error.status)) throw error;
-      waiting(true, wait);
-      await pause(wait, signal);
+      const end = performance.now() + wait;
+      for (let left = wait; left > 0; left = end - performance.now()) {
+        waiting(true, left);
+        await pause(Math.min(left, 1000), signal);
+      }
       wait = Math.min(2 * wait, LONGEST);
     }
   }

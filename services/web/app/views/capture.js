@@ -1,6 +1,6 @@
 // One capture: its report, its frames, and the form that starts a recovery.
 import { getBlob, getJson, remove } from "../lib/api.js";
-import { badge, button, bytes, confirmed, facts, h, newest, problemBox, prose, show, size, when } from "../lib/dom.js";
+import { badge, button, bytes, confirmed, facts, h, newest, problemBox, prose, sentence, show, size, when } from "../lib/dom.js";
 import { recoveryForm } from "./recovery_form.js";
 import { followJob } from "../lib/job_progress.js";
 
@@ -37,13 +37,15 @@ async function reportPanels(found, signal) {
   const report = await getJson(found.report.slice(1), signal);
   const findings = h("section", { class: "panel" }, h("div", { class: "row" }, h("h2", {}, "Report"), badge(report.level)),
     h("ul", { class: "findings" }, report.findings.map((one) =>
-      h("li", {}, badge(one.level), h("div", {}, h("p", {}, prose(one.message)), one.remedy && h("p", { class: "remedy" }, prose(one.remedy)))))));
+      h("li", {}, badge(one.level), h("div", {}, h("p", {}, prose(sentence(one.message))), one.remedy && h("p", { class: "remedy" }, prose(sentence(one.remedy))))))));
   return [findings, h("div", { class: "columns" }, frames(found, signal), sheet(found, signal))];
 }
 
 function frames(found, signal) {
   const middle = found.frames >> 1; // the first ones are black and white
-  const image = h("img", { alt: `Frame ${middle + 1}`, width: found.width, height: found.height });
+  const image = h("img", { alt: `Frame ${middle + 1}`, width: found.width, height: found.height, hidden: true });
+  const frame = h("div", { class: "picture" }, image);
+  frame.style.aspectRatio = `${found.width} / ${found.height}`; // keeps its place until the picture is there
   const number = h("input", { type: "range", id: "frame", min: 0, max: found.frames - 1, value: middle });
   const position = h("output", { for: "frame" }, `${middle + 1} of ${found.frames}`);
   const problem = h("div");
@@ -61,7 +63,7 @@ function frames(found, signal) {
     look();
   };
   look();
-  return h("section", { class: "panel" }, h("h2", {}, "Frames"), h("div", { class: "picture" }, image),
+  return h("section", { class: "panel" }, h("h2", {}, "Frames"), frame,
     h("div", { class: "row" }, h("label", { for: "frame" }, "Frame"), number, position), problem);
 }
 
@@ -69,7 +71,8 @@ function sheet(found, signal) {
   const image = h("img", { alt: "Some of the frames side by side", hidden: true });
   const frame = h("div", { class: "picture whole" }, image);
   frame.style.aspectRatio = `${2 * found.width} / ${1.1 * found.height}`; // most sheets are four by two frames: this keeps the page from moving when it loads
-  getBlob(`v1/captures/${found.id}/contact-sheet.png`, signal).then((blob) => show(image, blob), (error) => {
+  const fit = (blob) => show(image, blob).then(() => (frame.style.aspectRatio = `${image.naturalWidth} / ${image.naturalHeight}`));
+  getBlob(`v1/captures/${found.id}/contact-sheet.png`, signal).then(fit, (error) => {
     if (!signal.aborted) image.replaceWith(problemBox(error));
   });
   return h("section", { class: "panel" }, h("h2", {}, "Contact sheet"), frame,
