@@ -47,8 +47,8 @@ def send(
     mark = f"{file.resolve()} {size} {state.st_mtime_ns}"
     key = hashlib.sha256(mark.encode(errors="surrogateescape")).hexdigest()
     create = TUS | {"Upload-Length": str(size), "Idempotency-Key": key}
-    if known := declared(file):
-        create["Upload-Metadata"] = ",".join(f"{name} {_base64(str(one))}" for name, one in known.items())
+    known = declared(file) | {"filename": file.name.encode(errors="replace").decode()}
+    create["Upload-Metadata"] = ",".join(f"{name} {_base64(str(one))}" for name, one in known.items())
     where, offset, step, pause = "", -1, LARGEST, _transport.FIRST_PAUSE
     give_up = time.monotonic() + _transport.PATIENCE
 

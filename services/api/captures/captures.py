@@ -3,11 +3,13 @@
 from datetime import UTC, datetime
 from typing import Any, Literal, Self
 
+import anyio.to_thread
 from fastapi import APIRouter, Request, Response
-from pydantic import BaseModel
+from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Row
 
 from services.api.context import OwnerContext
+from services.api.http.bodies import read_json, schema_of
 from services.api.http.responses import bytes_response, json_response, utc_time
 from services.api.http.types import After, Limit
 from storage.database.engine import reading, writing
@@ -21,6 +23,7 @@ from storage.records import captures, jobs
 from workflows.images.integer_formats import encode_png
 
 router = APIRouter(tags=["captures"])
+CHANGE_BYTES = 1 << 12
 PROGRAM_BYTES = 64 << 20
 """What the largest program that a capture may have takes in memory."""
 
@@ -61,6 +64,13 @@ class Capture(ListedCapture):
     program: dict[str, Any]
 
 
+class CaptureChange(BaseModel):
+    """What of a capture to change."""
+
+    model_config = ConfigDict(extra="forbid", str_strip_whitespace=True)
+    name: str = Field(max_length=200, pattern=r"\S", description="A name for people.")
+
+
 class Captures(BaseModel):
     """A page of captures, newest first."""
 
@@ -93,6 +103,29 @@ async def get_capture(context: OwnerContext, id: str, request: Request) -> Respo
         with reading(context.engine) as c:
             return json_response(Capture.of(captures.get(c, id)))
 
+    return await context.compute(request, context.lists, make)
+
+
+@router.patch(
+    "/captures/{id}",
+    response_model=Capture,
+    openapi_extra={"requestBody": {"content": {"application/json": {"schema": schema_of(CaptureChange)}}}},
+)
+async def change_capture(context: OwnerContext, id: str, request: Request) -> Response:
+    """Rename a capture."""
+
+    def require() -> None:
+        with reading(context.engine) as c:
+            captures.get(c, id)
+
+    def make() -> Response:
+        with writing(context.engine) as c:
+            captures.get(c, id)  # it may have been deleted meanwhile
+            captures.change(c, id, name=change.name)
+            return json_response(Capture.of(captures.get(c, id)))
+
+    await anyio.to_thread.run_sync(require)
+    change = await read_json(request, CaptureChange, CHANGE_BYTES)
     return await context.compute(request, context.lists, make)
 
 

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection, Row
 
 from services.api.captures.captures import Capture
+from services.api.captures.tus import file_name
 from services.api.context import Context, OwnerContext
 from services.api.http.bodies import read_json, schema_of, store_as_upload, upload_limit
 from services.api.http.idempotency import IdempotencyKey, find_earlier, idempotent
@@ -130,7 +131,9 @@ def _from_upload(context: Context, given: FromUpload, key: str | None) -> Row[An
             offset=row.offset,
         )
     try:
-        return _register(context, upload, parts, given.name, key, True, given.webhook)
+        return _register(
+            context, upload, parts, given.name, key, True, given.webhook, otherwise=file_name(row.metadata)
+        )
     except (CaptureError, NotFound, FileNotFoundError) as error:
         with writing(context.engine) as c:
             if captures.exists(c, upload):  # a concurrent request was quicker
@@ -155,8 +158,12 @@ def _register(
     key: str | None,
     resumable: bool,
     webhook: str | None,
+    otherwise: str = "",
 ) -> Row[Any]:
-    """Check a complete archive, and add the rows of its capture and of the ingest job."""
+    """Check a complete archive, and add the rows of its capture and of the ingest job.
+
+    The capture has the first name that there is: one that was asked for, its own, or what it is called otherwise.
+    """
     context.check_key()
     stored_uploads.seal(context.objects, capture, parts)
     with stored_uploads.read(context.objects, capture) as file:
@@ -174,7 +181,7 @@ def _register(
             c,
             capture,
             job,
-            name=name or manifest.name,
+            name=name or manifest.name or otherwise,
             seconds=context.settings.capture_seconds,
             bytes=size,
             frames=len(manifest.frames) or manifest.program.count,

@@ -3,6 +3,7 @@
 import base64
 import binascii
 import hashlib
+from pathlib import PurePath
 from typing import TYPE_CHECKING, Annotated
 
 from fastapi import Header, Request
@@ -18,6 +19,8 @@ EXTENSIONS = "creation,creation-with-upload,checksum,expiration,termination"
 ALGORITHMS = ("sha1", "sha256")
 CHUNK = "application/offset+octet-stream"
 METADATA_BYTES = 8192
+NAME_LENGTH = 200
+"""Most characters of a capture's name."""
 DECLARED = ("frames", "width", "height")
 """Names in Upload-Metadata for the number of frames of a capture, and for their size in pixels."""
 
@@ -166,6 +169,13 @@ def declared(metadata: str) -> dict[str, int]:
                 field="Upload-Metadata",
             )
     return {name: int(text) for name, text in texts.items()}
+
+
+def file_name(metadata: str) -> str:
+    """The ``filename`` in an ``Upload-Metadata`` that `metadata_of` has checked, without its extension, or nothing."""
+    pairs = dict(pair.strip().partition(" ")[::2] for pair in metadata.split(","))
+    name = base64.b64decode(pairs.get("filename", "")).decode(errors="replace")
+    return PurePath(name.replace("\0", "")).stem[:NAME_LENGTH]
 
 
 def _base64(text: str, name: str) -> bytes:

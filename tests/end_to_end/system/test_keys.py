@@ -77,6 +77,7 @@ CALLS = {
     "GET /v1/captures": Call(),
     "POST /v1/captures": Call(needs="write", json={"upload": "{upload}"}, named=True),
     "GET /v1/captures/{id}": Call("capture"),
+    "PATCH /v1/captures/{id}": Call("capture", needs="write", json={"name": "a name"}),
     "GET /v1/captures/{id}/frames/{n}.png": Call("capture"),
     "GET /v1/captures/{id}/report": Call("capture"),
     "GET /v1/captures/{id}/contact-sheet.png": Call("capture"),

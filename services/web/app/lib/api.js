@@ -91,6 +91,9 @@ export async function post(path, body, once = crypto.randomUUID?.() ?? String(Ma
   return (await ask(path, { method: "POST", headers, body: JSON.stringify(body) })).json();
 }
 
+export const patchJson = async (path, body) =>
+  (await ask(path, { method: "PATCH", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) })).json();
+
 export const call = (method, path) => ask(path, { method });
 
 // Deletes; something that another tab has deleted already counts as deleted.

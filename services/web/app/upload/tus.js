@@ -41,8 +41,12 @@ async function offsetOf(id, signal) {
 
 const isCapture = (id, signal) => ask(`v1/captures/${id}`, { signal }).then(() => true, () => false);
 
-// Sends a file, continuing an upload of it where it was interrupted; returns the id of the upload.
-export async function send(file, remembered, { signal, progress, waiting }) {
+// Values of tus are bytes in Base64.
+const encoded = (value) => btoa(String.fromCharCode(...new TextEncoder().encode(value)));
+
+// Sends a file, continuing an upload of it where it was interrupted; returns the id of the upload. `filename` is that of
+// the film, if the file is an archive made of one.
+export async function send(file, remembered, { filename, signal, progress, waiting }) {
   let id = localStorage.getItem(remembered);
   let offset = 0;
   let wait = 1000;
@@ -51,8 +55,8 @@ export async function send(file, remembered, { signal, progress, waiting }) {
     try {
       if (lost) offset = await offsetOf(id, signal);
       if (!id) {
-        const metadata = Object.entries(await readArchiveInfo(file)).map(([name, value]) => `${name} ${btoa(value)}`);
-        const headers = { ...TUS, "Upload-Length": file.size, ...(metadata.length && { "Upload-Metadata": metadata.join(",") }) };
+        const metadata = Object.entries({ ...(await readArchiveInfo(file)), filename }).map(([name, value]) => `${name} ${encoded(value)}`);
+        const headers = { ...TUS, "Upload-Length": file.size, "Upload-Metadata": metadata.join(",") };
         const answer = await ask("v1/uploads", { method: "POST", headers, signal });
         id = answer.headers.get("Location").split("/").at(-1);
         localStorage.setItem(remembered, id);

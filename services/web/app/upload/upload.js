@@ -58,6 +58,7 @@ export function begin(file, record, { unsaved = false, warning = "" } = {}) {
       // A film with another capture.json is another archive.
       remembered ??= `envmatte-upload ${file.name} ${archive.size} ${file.lastModified} ${record ? await crc32(archive.slice(0, HEAD)) : ""}`;
       const upload = await send(archive, remembered, {
+        filename: file.name,
         signal: stop.signal,
         progress(done) {
           first ??= done;

@@ -1,12 +1,14 @@
 // One capture: its report, its frames, and the form that starts a recovery.
-import { getBlob, getJson, remove } from "../lib/api.js";
+import { getBlob, getJson, patchJson, remove } from "../lib/api.js";
 import { badge, button, bytes, confirmed, facts, h, newest, problemBox, prose, sentence, show, size, when } from "../lib/dom.js";
 import { recoveryForm } from "./recovery_form.js";
 import { followJob } from "../lib/job_progress.js";
+import { renamable } from "../lib/rename.js";
 
 export async function capture(main, signal, id) {
   const found = await getJson(`v1/captures/${id}`, signal);
   const problem = h("div");
+  const rename = async (name) => (await patchJson(`v1/captures/${id}`, { name })).name;
   const deletion = button("Delete", problem, async () => {
     if (!(await confirmed("Delete this capture?", "Its frames will be deleted. Mattes recovered from it stay.", "Delete capture"))) return;
     await remove(`v1/captures/${id}`);
@@ -14,7 +16,7 @@ export async function capture(main, signal, id) {
   }, "quiet");
   main.append(
     h("p", { class: "crumb" }, h("a", { href: "#/captures" }, "Captures")),
-    h("div", { class: "row spread" }, h("h1", {}, found.name || `Capture ${id.slice(0, 8)}`), h("span", { class: "row" }, badge(found.state), deletion)),
+    h("div", { class: "row spread" }, renamable(found.name || `Capture ${id.slice(0, 8)}`, "Name of the capture", rename), h("span", { class: "row" }, badge(found.state), deletion)),
     problem,
     facts({
       Frame: found.width && `${size(found)} pixels`, Frames: found.frames, Monitor: `${size(found.program.monitor)} pixels`,
