@@ -4,17 +4,22 @@ the byte.
 
 import random
 import time
+from collections import Counter
 from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import psutil
 import pytest
 
 from storage.objects.store import Objects
+from tests.conftest import EXHAUSTIVE
 from tests.end_to_end.conftest import serving
 from tests.faults.conftest import Prepared, check
 from tests.faults.rig import Row, freeze, stored, thaw
+from tests.parts.background import repeating
 from tests.parts.waiting import until
+from tests.services.cluster.clusters import running
 
 pytestmark = pytest.mark.timeout(7200)
 
@@ -87,12 +92,65 @@ def test_cancelled_job_frees_workers_and_disk(prepared: Prepared) -> None:
     assert not rig.names(job["matte"])
 
 
+PROMISED = 10.0
+"""Seconds until a worker or the fork server that was killed is there again; the rest starts when it is next needed."""
+
+
+@dataclass
+class Watch:
+    """Kills processes below a service at random, and sees when there is another in their role."""
+
+    service: psutil.Process
+    usual: Counter[str] = field(default_factory=Counter)
+    """How many there are in each role."""
+    seen: set[psutil.Process] = field(default_factory=set)
+    killed: list[tuple[psutil.Process, str, float]] = field(default_factory=list)
+    """Those that nothing has replaced yet, their roles, and when they were killed."""
+    seconds: dict[str, list[float]] = field(default_factory=dict)
+
+    def look(self) -> Counter[str]:
+        """Count the processes in each role."""
+        alive = {}
+        for process in self.service.children(recursive=True):
+            with suppress(psutil.NoSuchProcess):
+                if process.status() != psutil.STATUS_ZOMBIE:
+                    alive[process] = role_of(process)
+        self.seen |= alive.keys()
+        found = Counter(alive.values())
+        for process, role, at in self.killed.copy():
+            if process not in alive and found[role] >= self.usual[role]:
+                self.killed.remove((process, role, at))
+                self.seconds.setdefault(role, []).append(time.monotonic() - at)
+        return found
+
+    def kill_one(self) -> None:
+        process = random.choice(self.service.children(recursive=True))
+        role = role_of(process)
+        process.kill()
+        self.killed.append((process, role, time.monotonic()))
+
+
+def role_of(process: psutil.Process) -> str:
+    """What a process of a service is for, by its command; those that are forked have that of their server."""
+    command = " ".join(process.cmdline())
+    forked = " ".join(psutil.Process(process.ppid()).cmdline()) == command
+    for module, server, child in (
+        ("multiprocessing.forkserver", "fork server", "worker"),
+        ("decoder_server", "server of decoders", "decoder"),
+    ):
+        if module in command:
+            return child if forked else server
+    return "resource tracker"
+
+
 @pytest.mark.slow
 def test_any_process_of_a_service_killed(
     capture_archive: Path, tmp_path: Path, table: list[Row], times: int
 ) -> None:
     row = Row("SIGKILL of any process, 4 a job")
+    replaced_soon = {"worker", "fork server"}
     with serving(tmp_path / "data", "--workers", "2") as service:
+        watch = Watch(psutil.Process(service.process.pid))
         capture = service.client.upload(capture_archive)["id"]
         objects = Objects((tmp_path / "data" / "store").as_uri())
 
@@ -101,7 +159,7 @@ def test_any_process_of_a_service_killed(
             for _ in range(kills):
                 time.sleep(random.uniform(0.5, 2))
                 with suppress(psutil.NoSuchProcess, IndexError):  # it ended, or all of them have
-                    random.choice(psutil.Process(service.process.pid).children(recursive=True)).kill()
+                    watch.kill_one()
                     row.injected += 1
             began = time.monotonic()
             until(lambda: service.client.job(job["id"])["state"] not in ("queued", "running"), 120)
@@ -111,6 +169,17 @@ def test_any_process_of_a_service_killed(
 
         expected = recovered(0)
         row.seconds.clear()
-        for _ in range(times):
-            row.differing += recovered(4) != expected
+        watch.usual = watch.look()
+        with repeating(watch.look, 0.1):
+            for _ in range(times):
+                row.differing += recovered(4) != expected
+            until(lambda: not replaced_soon & {role for _, role, _ in watch.killed}, 60)
+    for role, seconds in watch.seconds.items():
+        print(f"\n{role}: {len(seconds)} killed, another after {max(seconds):.1f} s at most")
+    print(f"\nnot needed since: {Counter(role for _, role, _ in watch.killed)}")
+    if times >= EXHAUSTIVE:  # a short run may not have the machine to itself
+        assert max(max(watch.seconds.get(role, [0])) for role in replaced_soon) < PROMISED
+    until(lambda: not running(list(watch.seen)), 30)
+    assert not list((tmp_path / "data" / "scratch").glob("**/worker-*/"))
+    assert objects.names("uploads") == []
     check(table, row)
