@@ -92,9 +92,15 @@ def find_steadiness(stack: Stack) -> None:
     ----------
     H. F. Walker and P. Ni, Anderson acceleration for fixed-point iterations, SIAM J. Numer. Anal. 49, 2011.
     """
-    stack.annotate(
-        steadiness=None, shifts=None, gains=None, glare=None, model_error=0.0, pattern_error=None
-    )  # a retried ingest must not find old ones
+    stack.annotate(  # a retried ingest must not find old ones
+        steadiness=None,
+        shifts=None,
+        gains=None,
+        glare=None,
+        model_error=0.0,
+        pattern_error=None,
+        noise_of_patterns=False,
+    )
     program = Program.model_validate(stack.attributes["program"])
     sample = take_sample(stack)
     if sample is None:

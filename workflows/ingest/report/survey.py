@@ -34,7 +34,7 @@ def survey(stack: Stack) -> None:
     if stack.attributes["gains"] is not None:
         noise = stack.attributes["noise"]
         measure(stack, stack.attributes["gains"])
-        if stack.attributes["assumed_noise"]:
+        if stack.attributes["noise_of_patterns"]:
             stack.annotate(noise=noise)
     attributes = stack.attributes
     program = Program.model_validate(attributes["program"])

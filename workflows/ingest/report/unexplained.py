@@ -38,6 +38,8 @@ MOST = 0.98
 """Quantile of squared residuals beyond which they count no more."""
 MOST_GLARE = 0.7
 """A larger share of the light is no glare: the sample sees something else, such as mostly the border of a film."""
+HIDDEN = 1.5
+"""Ratio of the variance of patterns to that of constant frames from which these hide noise."""
 MIN_FLAT = 120
 """Values that the noise and the error of the model are measured from, at least."""
 CONTRAST = 3.0
@@ -54,7 +56,7 @@ def find_unexplained(
     ``glare`` are its shares of the light (`workflows.recovery.glare`), or None below 1 %. ``model_error`` is the
     standard deviation of what neither T nor noise explains, as a share of rho. ``pattern_error`` is the root mean
     square difference of all patterns from what T predicts, in camera units. ``noise`` is replaced if it was only
-    assumed, for want of constant frames.
+    assumed, for want of constant frames, or if that of patterns is larger: ``noise_of_patterns`` says whether.
 
     Parameters
     ----------
@@ -81,7 +83,8 @@ def find_unexplained(
     three channels, and noise is not, so that the covariance of the channels tells them apart.
     """
     stack.annotate(glare=None, model_error=0.0, pattern_error=None)
-    noise, assumed = Noise(**stack.attributes["noise"]), stack.attributes["assumed_noise"]
+    before, assumed = Noise(**stack.attributes["noise"]), stack.attributes["assumed_noise"]
+    noise, of_patterns = before, stack.attributes["noise_of_patterns"]
     spreads, through = spread_patterns(patterns), patterns
     shares, error = np.zeros(len(spreads)), 0.0
     rounds = 0
@@ -92,13 +95,13 @@ def find_unexplained(
         if found is None:
             return None
         rest = _Rest(found, program, patterns, through, spreads, noise, stack.channels)
-        before = shares
+        last = shares
         shares = rest.shares(error)
         if not LEAST <= shares.sum() <= MOST_GLARE:
             shares = np.zeros(len(spreads))
         known = noise
         noise, error = rest.noise_and_error(noise, assumed)
-        settled = bool(np.abs(shares - before).max() < SETTLED)
+        settled = bool(np.abs(shares - last).max() < SETTLED)
         settled &= bool(abs(noise.variance(_GREY)[0] / known.variance(_GREY)[0] - 1) < NOISE_SETTLED)
         if settled or rounds == ROUNDS:
             stack.annotate(
@@ -106,6 +109,7 @@ def find_unexplained(
                 model_error=error,
                 glare=[round(float(share), 5) for share in shares] if shares.any() else None,
                 pattern_error=rest.pattern_error(),
+                noise_of_patterns=of_patterns or noise != before,
             )
             return found, through
         through = filter_patterns(patterns, spreads, shares.tolist()) if shares.any() else patterns
@@ -167,7 +171,11 @@ class _Rest:
         return float(np.sqrt(np.mean((self.rest[self.known] * self.rho[self.known] / 2) ** 2)))
 
     def noise_and_error(self, noise: Noise, assumed: bool) -> tuple[Noise, float]:
-        """The noise of a frame, if it is only assumed, and the error of the model."""
+        """The noise of a frame and the error of the model.
+
+        The noise of constant frames, unless it is only assumed, is kept if that of patterns is about the same. JPEG and
+        noise reduction hide noise where a picture is flat.
+        """
         if np.count_nonzero(self.flat) < MIN_FLAT:
             return noise, 0.0
         if self.rest.shape[1] == 3:
@@ -184,12 +192,14 @@ class _Rest:
             square = (self.rest[flat] / 2 * self.rho[flat]) ** 2
             common = 0.0 if assumed else _mean_without_outliers(self.rest[flat] ** 2)
             common -= 0.0 if assumed else float(self.variance[flat].mean())
-        if assumed:
+        if assumed or self.rest.shape[1] == 3:
             level, square = (
                 self.level[flat].astype(np.float64),
                 (square * self.worth[flat]).astype(np.float64),
             )
-            noise = fit_noise(level, square, noise.read / 100) or noise
+            found = fit_noise(level, square, noise.read / 100) or noise
+            if assumed or found.variance(_GREY)[0] > HIDDEN * noise.variance(_GREY)[0]:
+                noise = found
         error = float(np.sqrt(max(common, 0.0)) / 2)
         return noise, error if error >= LEAST_ERROR else 0.0
 

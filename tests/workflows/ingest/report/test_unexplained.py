@@ -15,7 +15,7 @@ from tests.parts.captures import nested_program
 from workflows.images.integer_formats import encode_png
 from workflows.images.tone_curves import to_light
 from workflows.ingest.report import unexplained
-from workflows.programs.program import Program
+from workflows.programs.program import Constant, Program
 from workflows.recovery.glare import WIDTHS
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import Scene
@@ -44,8 +44,12 @@ def filmed(
     error: float = 0.0,
     channels: int = 3,
     noise: float = NOISE,
+    shown: float = 1.0,
 ) -> bytes:
-    """A capture: a share of the light comes through a broad Gaussian, and frames differ by a share of themselves."""
+    """A capture: a share of the light comes through a broad Gaussian, and frames differ by a share of themselves.
+
+    Constant frames show a share of the noise.
+    """
     rng, target, sigma = np.random.default_rng(7), io.BytesIO(), WIDTHS[1] * MONITOR[0]
     with zipfile.ZipFile(target, "w") as archive:
         frames = [{"file": f"{n}.png", "pattern": n} for n in range(program.count)]
@@ -63,7 +67,8 @@ def filmed(
             if n in program.measured:
                 seen = seen * (1 + error * rng.standard_normal((HEIGHT, WIDTH, 1)))
             value = (0.02 + 0.7 * seen)[..., :channels]
-            value = value + noise * rng.standard_normal(value.shape)
+            seen_noise = noise if n in program.measured else shown * noise
+            value = value + seen_noise * rng.standard_normal(value.shape)
             archive.writestr(f"{n}.png", encode_png(np.rint(np.clip(value, 0, 1) * 65535).astype(np.uint16)))
     return target.getvalue()
 
@@ -101,6 +106,18 @@ def test_noise_is_measured_from_patterns(
     stack = ingest("c", filmed(scene, program, channels=1, noise=noise))
     assert stack.attributes["assumed_noise"]
     np.testing.assert_allclose(deviation(stack), noise, rtol=0.3)
+
+
+@pytest.mark.parametrize("shown", [1.0, 0.3])
+def test_noise_that_constant_frames_hide_is_measured(
+    scene: Scene, program: Program, ingest: Ingest, shown: float
+) -> None:
+    constant = Constant(kind="constant", levels=(0, 1, 0, 1, 0, 1))
+    several = Program(monitor=program.monitor, parts=(constant, *program.parts[1:]))
+    stack = ingest("c", filmed(scene, several, shown=shown))
+    assert not stack.attributes["assumed_noise"]
+    assert stack.attributes["noise_of_patterns"] == (shown < 1)
+    np.testing.assert_allclose(deviation(stack), NOISE, rtol=0.3)
 
 
 def test_error_of_the_model_is_what_channels_have_in_common(
