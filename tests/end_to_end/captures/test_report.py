@@ -16,13 +16,13 @@ def test_capture_links_to_its_report(service: Service, capture: str) -> None:
     report = service.http.get(link).json()
     assert report["level"] in ("good", "warning", "bad")
     names = [finding["name"] for finding in report["findings"]]
-    assert {"frames", "exposure", "black", "noise", "camera_curve", "quality"} <= set(names)
+    assert {"frames", "exposure", "black", "noise", "unmeasured", "quality"} <= set(names)
     assert len(names) == len(set(names))
     for finding in report["findings"]:
         assert finding["message"]
         assert bool(finding["remedy"]) == (finding["level"] != "good")
     assert report["frames"]["kept"] == service.http.get(f"/v1/captures/{capture}").json()["frames"]
-    assert report["camera"] == {"curve": "linear", "source": "given"}
+    assert report["camera"] == {"curve": "linear", "source": "given", "apart": None}
     assert report["quality"]["low"] < report["quality"]["high"]
 
 

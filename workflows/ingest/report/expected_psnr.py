@@ -68,10 +68,8 @@ def expected(
     warnings in their report, may be below.
     """
     rho, s2 = survey["contrast"], survey["deviation"] ** 2
-    unexplained = (model_error * rho) ** 2 + survey.get("lost_colour", 0.0)
-    spread = float(np.diff(np.log(np.quantile(exposures, (0.05, 0.95))))[0]) / 2 if exposures else 0.0
-    if spread > UNLOCKED:
-        unexplained += (spread * rho) ** 2
+    costs = costs_of(program, survey, model_error, exposures)
+    unexplained = costs["model_error"] + costs["lost_colour"] + costs["auto_exposure"]
     shown = [part for part in program.parts if not isinstance(part, Constant | Halftone)]
     random = [part for part in shown if isinstance(part, Bernoulli)]
     if rho > 0 and not random and pattern_error:
@@ -88,3 +86,23 @@ def expected(
         error = k * s2 / patterns + c * rho**2 / patterns**1.2 + unexplained
         ends.append(-10 * log10(error if blocks is None else error + a * rho**2 / blocks**b))
     return Quality(low=ends[0], high=ends[1], blocks=blocks)
+
+
+def costs_of(
+    program: Program, survey: dict[str, Any], model_error: float, exposures: Sequence[float] | None = None
+) -> dict[str, float]:
+    """The mean square errors of composites by their causes, as far as these are known; see :func:`expected`.
+
+    Returns
+    -------
+    dict
+        ``noise``, at the low end; ``model_error``, ``lost_colour``, ``auto_exposure``.
+    """
+    rho = survey["contrast"]
+    spread = float(np.diff(np.log(np.quantile(exposures, (0.05, 0.95))))[0]) / 2 if exposures else 0.0
+    return {
+        "noise": _NOISE[0][0] * survey["deviation"] ** 2 / max(program.measured.size, 1),
+        "model_error": (model_error * rho) ** 2,
+        "lost_colour": survey.get("lost_colour", 0.0),
+        "auto_exposure": (spread * rho) ** 2 if spread > UNLOCKED else 0.0,
+    }

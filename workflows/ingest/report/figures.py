@@ -1,10 +1,33 @@
-"""The figures in the report on a capture."""
+"""The figures in the report on a capture, and what is found by them."""
 
 from typing import Any, Literal
 
 from pydantic import BaseModel
 
 from workflows.images.tone_curves import Curve
+
+Level = Literal["good", "warning", "bad"]
+LEVELS: tuple[Level, ...] = ("good", "warning", "bad")
+
+
+class Finding(BaseModel):
+    """One aspect of a capture.
+
+    ``name`` is stable, for programs. ``message`` says what was found, and ``remedy`` what to do about it; it is empty
+    if the level is good. ``cost`` is the mean square error that composites have by it, of full scale, or None if that
+    is not known.
+    """
+
+    name: str
+    level: Level
+    message: str
+    remedy: str = ""
+    cost: float | None = None
+
+
+def graded(value: float, warning: float, bad: float) -> Level:
+    """The level of a value that is the worse the larger it is."""
+    return "bad" if value >= bad else "warning" if value >= warning else "good"
 
 
 class Frames(BaseModel):
@@ -67,10 +90,15 @@ class Noise(BaseModel):
 
 
 class ToneCurve(BaseModel):
-    """A tone curve, and whether the capture states it, or it was estimated from constant levels, or is assumed."""
+    """A tone curve, and whether the capture states it, or it was estimated from constant levels, or is assumed.
+
+    ``apart`` is the largest difference between the light of half-tones by this curve and what they should have, as a
+    share of white's; None if there are none.
+    """
 
     curve: Curve
     source: Literal["given", "estimated", "assumed"]
+    apart: float | None = None
 
 
 class Quality(BaseModel):

@@ -1,88 +1,56 @@
 """What the figures of a capture mean, and what to do about them, in words."""
 
-from math import floor, log2, log10
-from typing import Any, Literal
+from math import floor, log2
+from typing import Any
 
 import numpy as np
-from pydantic import BaseModel
 
-from workflows.images.tone_curves import Curve, Sampled
-from workflows.ingest.report.figures import Drift, Figures, Flicker, Quality
+from workflows.ingest.report.expected_psnr import costs_of
+from workflows.ingest.report.figures import LEVELS, Drift, Figures, Finding, Flicker, graded
+from workflows.ingest.report.limits import (
+    curves,
+    is_assumed,
+    lost_colour,
+    quality,
+    unexplained,
+    unmeasured,
+)
 from workflows.ingest.video.missing_patterns import by_reason, ranges, remedy
-from workflows.programs.program import Bernoulli, Images, Program
-
-Level = Literal["good", "warning", "bad"]
-LEVELS: tuple[Level, ...] = ("good", "warning", "bad")
+from workflows.programs.program import Bernoulli, Program
 
 SURE = 4.0
 """A drift or flicker is real from so many standard errors on."""
-LOST_COLOUR = 1e-4
-"""Mean square of lost detail of colours, of full scale, below which it costs nothing that shows (40 dB)."""
 FOLLOWS = -0.25
 """Correlation of frames' light with their patterns' own below which the camera brightens dark pictures."""
-
-
-class Finding(BaseModel):
-    """One aspect of a capture.
-
-    ``name`` is stable, for programs. ``message`` says what was found, and ``remedy`` what to do about it; it is empty
-    if the level is good.
-    """
-
-    name: str
-    level: Level
-    message: str
-    remedy: str = ""
 
 
 def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> list[Finding]:
     """All findings about a capture, from its figures, its program and the attributes of its stack.
 
-    The worst come first. Of one level, those come first that cost most when measured
-    (`tests.benchmarks.recovery.devices`): exposure, the camera's own processing, movement, scaled patterns, curves,
-    glare, colours.
+    The worst come first. Of one level, those come first that cost most, then, where the cost is not known, those that
+    cost most when measured (`tests.benchmarks.recovery.devices`): exposure, the camera's own processing, movement,
+    scaled patterns, curves, glare, colours.
     """
+    survey = attributes["survey"]
+    costs = costs_of(program, survey, attributes.get("model_error", 0.0), attributes.get("auto_exposure"))
     found = [
         *_exposure(figures, attributes["storage"]),
-        *_auto_exposure(attributes.get("auto_exposure")),
-        *_steadiness(attributes.get("steadiness"), attributes.get("model_error", 0.0)),
+        *_auto_exposure(attributes.get("auto_exposure"), costs["auto_exposure"]),
+        *_steadiness(attributes.get("steadiness")),
         *_drift(figures.drift),
         *_scaling(program, scaled=attributes.get("scaled", False)),
-        *_curves(figures, program),
+        *curves(figures, program, linear=attributes["storage"]["black"] > 0),
         *_glare(attributes.get("glare")),
-        _crosstalk(figures, program, grey=attributes["survey"].get("grey", False)),
-        *_lost_colour(attributes["survey"].get("lost_colour", 0.0)),
-        _noise(figures, attributes["survey"]),
+        _crosstalk(figures, program, grey=survey.get("grey", False)),
+        *unexplained(costs["model_error"], attributes.get("model_error", 0.0)),
+        *lost_colour(costs["lost_colour"]),
+        *_noise(figures, attributes, costs["noise"]),
         *_flicker(figures.flicker),
         _frames(figures),
+        *quality(figures.quality, any(isinstance(part, Bernoulli) for part in program.parts)),
+        *unmeasured(figures, program, attributes),
     ]
-    if figures.quality is not None:
-        found.append(_quality(figures.quality, any(isinstance(part, Bernoulli) for part in program.parts)))
-    return sorted(found, key=lambda one: -LEVELS.index(one.level))
-
-
-def _graded(value: float, warning: float, bad: float) -> Level:
-    return "bad" if value >= bad else "warning" if value >= warning else "good"
-
-
-def _quality(quality: Quality, random: bool) -> Finding:
-    if not random:
-        worst, best, why = "backdrops finer than the patterns", "coarser ones", ""
-    elif quality.blocks is None:
-        worst, best, why = "frosted glass, dispersion, many edges", "clear glass", ""
-    else:
-        worst, best = "clear glass, many edges", "frosted glass"
-        why = (
-            f": the random grids have no offsets, so light is located no finer than a block of the finest grid, with "
-            f"{quality.blocks} along the shorter side. Patterns with offsets, as in the preset `default`, do better"
-        )
-    low, high = f"{quality.low:.0f}", f"{quality.high:.0f}"
-    span = f"{low} dB" if low == high else f"{low} dB ({worst}) to {high} dB ({best})"
-    return Finding(
-        name="quality",
-        level="good",
-        message=f"expect composites of about {span}, if nothing else is wrong{why}",
-    )
+    return sorted(found, key=lambda one: (-LEVELS.index(one.level), -(one.cost or 0.0)))
 
 
 def _frames(figures: Figures) -> Finding:
@@ -92,7 +60,7 @@ def _frames(figures: Figures) -> Finding:
         which = "; ".join(f"{ranges(numbers)} ({why})" for numbers, why in by_reason(missing))
         return Finding(
             name="frames",
-            level=_graded(len(missing) / figures.frames.patterns, 0, 0.1),
+            level=graded(len(missing) / figures.frames.patterns, 0, 0.1),
             message=f"{len(missing)} of {figures.frames.patterns} patterns have no frame that can be used: {which}",
             remedy=remedy(missing.values()),
         )
@@ -109,7 +77,7 @@ def _exposure(figures: Figures, storage: dict[str, Any]) -> list[Finding]:
     if storage["bounded"]:
         found.append(_white(figures))
     black = figures.clipping.black
-    level = _graded(black, 0.05, 0.3) if storage["black"] == 0 else "good"
+    level = graded(black, 0.05, 0.3) if storage["black"] == 0 else "good"
     found.append(
         Finding(
             name="black",
@@ -126,7 +94,7 @@ def _exposure(figures: Figures, storage: dict[str, Any]) -> list[Finding]:
 
 def _white(figures: Figures) -> Finding:
     clipped, reach = figures.clipping.white, figures.white_reaches
-    level = _graded(clipped, 0.002, 0.05)
+    level = graded(clipped, 0.002, 0.05)
     if level != "good":
         less = "a third of a stop" if clipped < 0.01 else "half a stop" if clipped < 0.05 else "a stop"
         return Finding(
@@ -135,7 +103,7 @@ def _white(figures: Figures) -> Finding:
             message=f"the white frame is clipped in {100 * clipped:.1f} % of the pixels",
             remedy=f"expose {less} less, or add frames of a shorter exposure",
         )
-    level = _graded(-reach, -0.5, -0.15)
+    level = graded(-reach, -0.5, -0.15)
     message = f"white reaches {100 * reach:.0f} % of the range"
     if level == "good":
         return Finding(name="exposure", level=level, message=message)
@@ -149,12 +117,7 @@ def _white(figures: Figures) -> Finding:
     )
 
 
-def _explained(left: float) -> str:
-    """How much no T explains, in words."""
-    return f"; {100 * left:.1f} % of the light stays unexplained" if left else ""
-
-
-def _steadiness(found: dict[str, Any] | None, left: float) -> list[Finding]:
+def _steadiness(found: dict[str, Any] | None) -> list[Finding]:
     if found is None or (found.get("drift") and found.get("flicker")):
         return []
     return [
@@ -162,7 +125,7 @@ def _steadiness(found: dict[str, Any] | None, left: float) -> list[Finding]:
             name="steadiness",
             level="warning",
             message="the frames differ from what the patterns explain in ways that are neither a movement of the "
-            "camera nor a flicker of the light, so these can't be measured" + _explained(left),
+            "camera nor a flicker of the light, so these can't be measured",
             remedy="switch HDR, sharpening and noise reduction of the camera off, or shoot RAW; check that the frames "
             "show the patterns that capture.json names, and that neither camera nor glass moved by more than three "
             "pixels",
@@ -175,7 +138,7 @@ def _drift(drift: Drift | None) -> list[Finding]:
         return []
     # A corrected drift leaves a small rest; a drift within its own error is none.
     limits = (0.5, 2.0) if drift.corrected else (0.1, 0.5)
-    level = _graded(drift.pixels if drift.corrected or drift.pixels > SURE * drift.error else 0.0, *limits)
+    level = graded(drift.pixels if drift.corrected or drift.pixels > SURE * drift.error else 0.0, *limits)
     found = f"the camera moved by {drift.pixels:.2f} pixels (a frame is located to {drift.error:.3f})"
     return [
         Finding(
@@ -198,7 +161,7 @@ def _flicker(flicker: Flicker | None) -> list[Finding]:
     if flicker is None:
         return []
     limits = (2.0, 10.0) if flicker.corrected else (0.5, 2.0)
-    level = _graded(flicker.percent if flicker.percent > SURE * flicker.error else 0.0, *limits)
+    level = graded(flicker.percent if flicker.percent > SURE * flicker.error else 0.0, *limits)
     if level != "good" and flicker.follows < FOLLOWS:
         return [
             Finding(
@@ -229,32 +192,19 @@ def _flicker(flicker: Flicker | None) -> list[Finding]:
     ]
 
 
-def _lost_colour(square: float) -> list[Finding]:
-    if square < LOST_COLOUR:
-        return []
-    return [
-        Finding(
-            name="colour_detail",
-            level="warning",
-            message="the colours of the glass are finer than a film stores them, at half the resolution: that alone "
-            f"limits composites to about {-10 * log10(square):.0f} dB",
-            remedy="film the glass larger, or take stills",
-        )
-    ]
-
-
-def _auto_exposure(exposed: list[float] | None) -> list[Finding]:
+def _auto_exposure(exposed: list[float] | None, cost: float) -> list[Finding]:
     if exposed is None:
         return []
     usual = float(np.median(exposed))
     most = max(max(exposed) / usual - 1, 1 - min(exposed) / usual)
-    level = _graded(most, 0.03, 0.25)
+    level = graded(most, 0.03, 0.25)
     return [
         Finding(
             name="auto_exposure",
             level=level,
             message=f"the camera's exposure changed by up to {100 * most:.0f} % from pattern to pattern, as the border "
             "shows: recovery follows it",
+            cost=cost or None,
             remedy=""
             if level == "good"
             else "lock exposure and ISO before filming"
@@ -271,7 +221,7 @@ def _glare(shares: list[float] | None) -> list[Finding]:
     """Glare below 1 % is not reported: it is left out of recovery too."""
     if not shares:
         return []
-    level = _graded(sum(shares), 0.03, 0.3)
+    level = graded(sum(shares), 0.03, 0.3)
     return [
         Finding(
             name="glare",
@@ -285,12 +235,16 @@ def _glare(shares: list[float] | None) -> list[Finding]:
     ]
 
 
-def _noise(figures: Figures, survey: dict[str, Any]) -> Finding:
+def _noise(figures: Figures, attributes: dict[str, Any], cost: float) -> list[Finding]:
+    survey = attributes["survey"]
     ratio = survey["contrast"] / survey["deviation"] if survey["deviation"] else 0.0
-    level = _graded(-ratio, -25, -8)
-    return Finding(
+    level = graded(-ratio, -25, -8)
+    if level == "good" and is_assumed(attributes):
+        return []
+    found = Finding(
         name="noise",
         level=level,
+        cost=cost or None,
         message=f"noise of {figures.noise.black:.1f} grey levels of 8 bits at black, {figures.noise.full:.1f} at full "
         f"scale; white minus black is {ratio:.0f} times that of a pixel between them",
         remedy=""
@@ -298,6 +252,7 @@ def _noise(figures: Figures, survey: dict[str, Any]) -> Finding:
         else "expose longer at a lower ISO, take several frames of each pattern, make the monitor brighter or the room "
         "darker; or leave pixels that see no monitor out of the mask",
     )
+    return [found]
 
 
 def _crosstalk(figures: Figures, program: Program, *, grey: bool) -> Finding:
@@ -306,7 +261,7 @@ def _crosstalk(figures: Figures, program: Program, *, grey: bool) -> Finding:
     measured = np.linalg.matrix_rank(np.concatenate([np.ones((len(sent), 1)), sent], axis=1)) == 4
     if measured:
         text = f"the camera's channels see up to {100 * between:.1f} % of the monitor's other colours: it is corrected"
-        return Finding(name="crosstalk", level=_graded(between, 0.3, 0.7), message=text)
+        return Finding(name="crosstalk", level=graded(between, 0.3, 0.7), message=text)
     return Finding(
         name="crosstalk",
         level="good" if grey else "warning",
@@ -335,39 +290,3 @@ def _scaling(program: Program, *, scaled: bool) -> list[Finding]:
             "program for the monitor's size",
         )
     ]
-
-
-def _curves(figures: Figures, program: Program) -> list[Finding]:
-    _, sent = program.constants
-    greys = not np.isin(sent, (0, 1)).all() or any(isinstance(part, Images) for part in program.parts)
-    words = {
-        "given": "stated by the capture",
-        "estimated": "estimated from constant levels and half-tones",
-        "assumed": "only assumed",
-    }
-    found = []
-    for name, curve, matters in (("camera", figures.camera, True), ("monitor", figures.monitor, greys)):
-        assumed = curve.source == "assumed" and matters
-        shape = _shape(curve.curve)
-        harmless = "" if matters else "; it makes no difference to black and white"
-        found.append(
-            Finding(
-                name=f"{name}_curve",
-                level="warning" if assumed else "good",
-                message=f"the {name}'s curve is {shape}, {words[curve.source]}{harmless}",
-                remedy=""
-                if not assumed
-                else "state it in capture.json (`response`), show half-tones as the presets do, or take the constant "
-                "frames in two exposures; RAW needs no curve",
-            )
-        )
-    return found
-
-
-def _shape(curve: Curve) -> str:
-    """A tone curve in words."""
-    if isinstance(curve, str):
-        return curve
-    if isinstance(curve, Sampled):
-        return f"one that gives {100 * curve.light[len(curve.light) // 2]:.0f} % of the light at half of the range"
-    return f"a gamma of {curve.gamma:g}"

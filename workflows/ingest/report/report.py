@@ -5,8 +5,17 @@ from typing import Any
 import numpy as np
 
 from workflows.ingest.report.expected_psnr import expected
-from workflows.ingest.report.figures import Clipping, Figures, Frames, Noise, ToneCurve
-from workflows.ingest.report.findings import LEVELS, Finding, Level, findings
+from workflows.ingest.report.figures import (
+    LEVELS,
+    Clipping,
+    Figures,
+    Finding,
+    Frames,
+    Level,
+    Noise,
+    ToneCurve,
+)
+from workflows.ingest.report.findings import findings
 from workflows.programs.program import Program
 
 
@@ -38,6 +47,7 @@ def report(attributes: dict[str, Any], frames: int) -> Report:
             else "estimated"
             if response == "unknown"
             else "given",
+            apart=survey.get("halftones_apart") if name == "camera" else None,
         )
         for name, response in stated.items()
     }

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
 from workflows.ingest.colour_detail import ColourDetail
-from workflows.ingest.measured_light import even_out, look_up_of
+from workflows.ingest.measured_light import even_out, exposures_of, look_up_of
 from workflows.ingest.report.calibration import constant_frames, measure
 from workflows.ingest.report.steadiness import find_steadiness
 from workflows.programs.program import Program
@@ -53,6 +53,8 @@ def survey(stack: Stack) -> None:
     contrasts: list[NDArray[np.float32]] = []
     deviations: list[NDArray[np.float32]] = []
     brightest: list[NDArray[np.float32]] = []
+    tones = [] if attributes["scaled"] else _halftone_frames(stack, program)
+    lit = np.zeros((2, len(tones)))  # of half-tones times white, of white squared
     detail = ColourDetail()
     coloured = chosen[is_pattern][:: -(-np.count_nonzero(is_pattern) // COLOUR_FRAMES) or 1].tolist()
     pixels = 0
@@ -70,6 +72,11 @@ def survey(stack: Stack) -> None:
         ends[0] += [np.count_nonzero((c == 0).any(axis=2) & wanted) for c in (codes_black, codes_white)]
         ends[1] += [np.count_nonzero((c == top).any(axis=2) & wanted) for c in (codes_black, codes_white)]
         contrasts.append((W - B)[wanted])
+        whole = wanted & ((codes_black > 0) & (codes_white < top)).all(axis=2)
+        for of_tone, (frame, _) in zip(lit.T, tones, strict=True):
+            tone = look_up[stack.read(rows, columns, slice(frame, frame + 1))[0]].mean(axis=2)
+            tone = even_out(tone, frame, attributes)
+            of_tone += [((light - B) * (W - B))[whole].sum(dtype=np.float64) for light in (tone, W)]
         deviations.append(np.sqrt(noise.variance((B + W) / 2))[wanted])
         brightest.append(look_up[codes_white].max(axis=2)[wanted])
         if "video" in attributes and stack.channels == 3:
@@ -82,6 +89,7 @@ def survey(stack: Stack) -> None:
         _percentile(c, q) for c, q in ((contrasts, 50), (deviations, 50), (brightest, 99))
     )
     share = clipped / max(pixels, 1)
+    apart = lit[0] / np.maximum(lit[1], 1e-12) - [level for _, level in tones]
     stack.annotate(
         survey={
             "pixels": pixels,
@@ -98,8 +106,20 @@ def survey(stack: Stack) -> None:
             "deviation": middling,
             "lost_colour": detail.lost(),
             "grey": stack.channels == 1,
+            "halftones_apart": float(apart[np.argmax(np.abs(apart))]) if lit.any() else None,
         }
     )
+
+
+def _halftone_frames(stack: Stack, program: Program) -> list[tuple[int, float]]:
+    """A frame of each half-tone in the shortest exposure, and the share of white's light that it should have."""
+    patterns, times = np.array(stack.attributes["patterns"]), exposures_of(stack.attributes)
+    frames = [np.flatnonzero((patterns == n) & (times == times.min())) for n in program.halftones[0]]
+    return [
+        (int(found[0]), float(level))
+        for found, level in zip(frames, program.halftones[1], strict=True)
+        if found.size
+    ]
 
 
 def _percentile(values: list[NDArray[np.float32]], q: float) -> float:

@@ -126,6 +126,18 @@ def test_a_curve_of_any_shape_is_measured_by_half_tones(ingest: Ingest, capture_
 
 
 @pytest.mark.slow
+def test_half_tones_disagree_with_a_curve_that_is_stated_wrongly(
+    ingest: Ingest, capture_archive: bytes
+) -> None:
+    _, right = reported(ingest, capture_archive)
+    assert "half-tones agree" in right["camera_curve"].message
+    made, found = reported(ingest, filmed(capture_archive, curve=lambda x: x**0.7))
+    assert made.camera.apart is not None
+    assert made.camera.apart > 0.06
+    assert found["camera_curve"].level == "warning"
+
+
+@pytest.mark.slow
 def test_a_curve_that_is_assumed_is_a_warning(ingest: Ingest) -> None:
     target = io.BytesIO()
     scene, bands = glass_ball(120, 90, monitor=(320, 240), rays=16), ((16, 12, 24), (32, 24, 24))

@@ -1,0 +1,93 @@
+"""What limits composites is graded by what it costs, and what was not measured is never good."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from storage.layout.captures import Stack
+from tests.parts.captures import nested_program
+from tests.workflows.ingest.report.test_unexplained import filmed
+from workflows.ingest.report.figures import Finding, Quality, ToneCurve
+from workflows.ingest.report.limits import lost_colour, quality, unexplained
+from workflows.ingest.report.report import Report, report
+from workflows.programs.program import Program
+from workflows.simulation.glass_ball import glass_ball
+
+Ingest = Callable[..., Stack]
+MONITOR = 160, 120
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "level"), [(41, 50, "good"), (26, 33, "warning"), (18, 25, "bad"), (24, 40, "good")]
+)
+def test_expected_quality_is_graded(low: float, high: float, level: str) -> None:
+    (found,) = quality(Quality(low=low, high=high, blocks=None), random=True)
+    assert found.level == level
+    assert bool(found.remedy) == (level != "good")
+    assert f"{low} dB" in found.message
+
+
+def test_nothing_is_said_of_an_unknown_quality() -> None:
+    assert quality(None, random=True) == []
+
+
+@pytest.mark.parametrize(("cost", "level"), [(1e-3, "warning"), (1e-2, "bad")])
+def test_errors_are_graded_by_their_cost(cost: float, level: str) -> None:
+    (found,) = unexplained(cost, 0.03)
+    assert (found.level, found.cost) == (level, cost)
+    assert f"about {-10 * np.log10(cost):.0f} dB" in found.message
+    assert unexplained(1e-5, 0.003) == lost_colour(1e-5) == []
+    assert lost_colour(cost)[0].cost == cost
+
+
+@pytest.fixture(scope="module")
+def program() -> Program:
+    return nested_program(MONITOR, bands=((8, 6, 12), (16, 12, 12), (32, 24, 12)), levels=2)
+
+
+@pytest.fixture
+def stack(ingest: Ingest, program: Program) -> Stack:
+    return ingest("c", filmed(glass_ball(80, 60, monitor=MONITOR, rays=4), program))
+
+
+def findings(stack: Stack, **other: Any) -> tuple[Report, dict[str, Finding]]:
+    made = report(stack.attributes | other, stack.frames)
+    return made, {finding.name: finding for finding in made.findings}
+
+
+def test_what_is_not_measured_is_listed_and_nowhere_good(stack: Stack) -> None:
+    made, found = findings(stack)
+    assert made.camera == ToneCurve(curve="linear", source="given")
+    assert found["unmeasured"].level == "warning"
+    assert found["unmeasured"].message == (
+        "not measured: whether the monitor scaled the patterns; the camera's curve, which the capture states"
+    )
+    assert not {"camera_curve", "scaling"} & set(found)
+    assert found["drift"].level == found["noise"].level == "good"
+    made, found = findings(stack, steadiness=None, pattern_error=None, noise_of_patterns=False)
+    for what in ("drift", "flicker", "glare", "noise"):
+        assert what in found["unmeasured"].message
+        assert what not in found
+    assert "constant frames" in found["unmeasured"].remedy
+
+
+def test_stated_curve_is_checked_by_half_tones(stack: Stack) -> None:
+    survey = stack.attributes["survey"]
+    _, found = findings(stack, survey=survey | {"halftones_apart": 0.01})
+    assert found["camera_curve"].level == "good"
+    assert "half-tones agree" in found["camera_curve"].message
+    _, found = findings(stack, survey=survey | {"halftones_apart": -0.11})
+    assert found["camera_curve"].level == "warning"
+    assert "-11 % of white" in found["camera_curve"].message
+    assert "unknown" in found["camera_curve"].remedy
+
+
+def test_of_one_level_the_costliest_comes_first(stack: Stack) -> None:
+    survey = stack.attributes["survey"]
+    for lost, error, first in ((1e-3, 0.02, "colour_detail"), (2e-4, 0.04, "unexplained")):
+        made, _ = findings(stack, model_error=error, survey=survey | {"lost_colour": lost})
+        assert made.findings[0].name == first
+        costs = [finding.cost for finding in made.findings if finding.level == "warning"]
+        assert costs[:2] == sorted(costs[:2], reverse=True)

@@ -1,0 +1,221 @@
+"""Findings on what limits composites, and on what could not be measured."""
+
+from math import log10
+from typing import Any
+
+import numpy as np
+
+from workflows.images.tone_curves import Curve, Sampled
+from workflows.ingest.report.figures import Figures, Finding, Quality, graded
+from workflows.programs.program import Images, Program
+
+SHOWS, SPOILS = 1e-4, 6e-3
+"""Mean squares of errors, of full scale, from which on they show (40 dB), and spoil composites (22 dB)."""
+FEW, TOO_FEW = 30.0, 22.0
+"""PSNR in dB below which composites differ visibly from a photograph, and are of no use."""
+APART = 0.03
+"""Difference of half-tones from their light by the camera's curve, as a share of white's, that is more than local tone
+mapping and flicker make."""
+
+
+def quality(expected: Quality | None, random: bool) -> list[Finding]:
+    """The PSNR to expect, graded by the middle of its range."""
+    if expected is None:
+        return []
+    if not random:
+        worst, best, why = "backdrops finer than the patterns", "coarser ones", ""
+    elif expected.blocks is None:
+        worst, best, why = "frosted glass, dispersion, many edges", "clear glass", ""
+    else:
+        worst, best = "clear glass, many edges", "frosted glass"
+        why = (
+            f": the random grids have no offsets, so light is located no finer than a block of the finest grid, with "
+            f"{expected.blocks} along the shorter side. Patterns with offsets, as in the preset `default`, do better"
+        )
+    low, high = f"{expected.low:.0f}", f"{expected.high:.0f}"
+    span = f"{low} dB" if low == high else f"{low} dB ({worst}) to {high} dB ({best})"
+    level = graded(-(expected.low + expected.high) / 2, -FEW, -TOO_FEW)
+    return [
+        Finding(
+            name="quality",
+            level=level,
+            message=f"expect composites of about {span}, if nothing else is wrong{why}",
+            remedy=""
+            if level == "good"
+            else "follow the other findings, first the one that costs most; show more patterns, as the preset "
+            "`default` does",
+        )
+    ]
+
+
+def unexplained(cost: float, share: float) -> list[Finding]:
+    """What neither T nor noise explains."""
+    if cost < SHOWS:
+        return []
+    return [
+        Finding(
+            name="unexplained",
+            level=graded(cost, SHOWS, SPOILS),
+            message=f"{100 * share:.1f} % of the light is explained neither by the patterns nor by noise, as with "
+            f"sharpening, compression or scattered light: that alone limits composites to about {_dB(cost)} dB",
+            remedy="switch HDR, sharpening and noise reduction of the camera off, shoot RAW, or film at a higher bit "
+            "rate",
+            cost=cost,
+        )
+    ]
+
+
+def lost_colour(cost: float) -> list[Finding]:
+    """Detail of colours that a film has lost."""
+    if cost < SHOWS:
+        return []
+    return [
+        Finding(
+            name="colour_detail",
+            level="warning",
+            message="the colours of the glass are finer than a film stores them, at half the resolution: that alone "
+            f"limits composites to about {_dB(cost)} dB",
+            remedy="film the glass larger, or take stills",
+            cost=cost,
+        )
+    ]
+
+
+def curves(figures: Figures, program: Program, *, linear: bool) -> list[Finding]:
+    """The tone curves that were measured or don't matter, and those that are assumed.
+
+    Parameters
+    ----------
+    linear : bool
+        Whether the frames' format holds linear light.
+    """
+    found = []
+    camera, monitor = figures.camera, figures.monitor
+    off = camera.apart is not None and abs(camera.apart) > APART
+    if camera.source == "assumed":
+        found.append(_assumed("camera", camera.curve))
+    elif off and camera.source == "given":
+        assert camera.apart is not None
+        found.append(
+            Finding(
+                name="camera_curve",
+                level="warning",
+                message=f"the camera's curve is {_shape(camera.curve)}, stated by the capture, but by this curve "
+                f"half-tones are off by {100 * camera.apart:+.0f} % of white",
+                remedy='set `"response": "unknown"` in capture.json: the curve is then measured from the half-tones',
+            )
+        )
+    elif linear or camera.source == "estimated" or camera.apart is not None:
+        how = (
+            "as the format of the frames says"
+            if linear
+            else "estimated from constant levels and half-tones"
+            if camera.source == "estimated"
+            else "stated by the capture, and half-tones agree"
+        )
+        found.append(
+            Finding(
+                name="camera_curve",
+                level="good",
+                message=f"the camera's curve is {_shape(camera.curve)}, {how}",
+            )
+        )
+    if monitor.source == "assumed" and _shows_greys(program):
+        found.append(_assumed("monitor", monitor.curve))
+    elif monitor.source == "estimated" or not _shows_greys(program):
+        harmless = "" if _shows_greys(program) else "; it makes no difference to black and white"
+        how = {"given": "stated by the capture", "estimated": "estimated from constant levels"}.get(
+            monitor.source, "only assumed"
+        )
+        found.append(
+            Finding(
+                name="monitor_curve",
+                level="good",
+                message=f"the monitor's curve is {_shape(monitor.curve)}, {how}{harmless}",
+            )
+        )
+    return found
+
+
+def unmeasured(figures: Figures, program: Program, attributes: dict[str, Any]) -> list[Finding]:
+    """What could not be measured, all in one."""
+    lacking: list[str] = []
+    remedies: dict[str, None] = {}
+
+    def lacks(what: str, remedy: str) -> None:
+        lacking.append(what)
+        remedies[remedy] = None
+
+    larger = "show the object larger and brighter in the picture"
+    steady = larger if attributes.get("steadiness") is None else "shoot RAW, with nothing that moves"
+    if figures.drift is None:
+        lacks("the drift of the camera", steady)
+    if figures.flicker is None:
+        lacks("the flicker of the light", steady)
+    if attributes.get("pattern_error") is None:
+        lacks("glare and what else the patterns don't explain", larger)
+    if is_assumed(attributes):
+        lacks("the noise, which is only assumed", "add constant frames of four levels, or several of each")
+    halftones = "show half-tones, as the presets do"
+    if not program.halftones[0].size:
+        lacks("whether the monitor scaled the patterns", halftones)
+    if (
+        figures.camera.source == "given"
+        and figures.camera.apart is None
+        and not attributes["storage"]["black"]
+    ):
+        lacks("the camera's curve, which the capture states", halftones)
+    if figures.monitor.source == "given" and _shows_greys(program):
+        lacks(
+            "the monitor's curve, which the capture states",
+            'set the monitor\'s `"response": "unknown"` and show three grey levels',
+        )
+    if figures.video is not None and not attributes.get("border"):
+        lacks(
+            "the camera's exposure from frame to frame, as the film shows no border",
+            "film the program with its border",
+        )
+    if not lacking:
+        return []
+    return [
+        Finding(
+            name="unmeasured",
+            level="warning",
+            message=f"not measured: {'; '.join(lacking)}",
+            remedy="; ".join(remedies),
+        )
+    ]
+
+
+def is_assumed(attributes: dict[str, Any]) -> bool:
+    """Whether the noise is only assumed."""
+    return bool(attributes.get("assumed_noise") and not attributes.get("noise_of_patterns"))
+
+
+def _assumed(name: str, curve: Curve) -> Finding:
+    return Finding(
+        name=f"{name}_curve",
+        level="warning",
+        message=f"the {name}'s curve is {_shape(curve)}, only assumed",
+        remedy="state it in capture.json (`response`), show half-tones as the presets do, or take the constant frames "
+        "in two exposures; RAW needs no curve",
+    )
+
+
+def _shows_greys(program: Program) -> bool:
+    """Whether the monitor's curve makes a difference."""
+    _, sent = program.constants
+    return bool(not np.isin(sent, (0, 1)).all() or any(isinstance(part, Images) for part in program.parts))
+
+
+def _dB(square: float) -> str:
+    return f"{-10 * log10(square):.0f}"
+
+
+def _shape(curve: Curve) -> str:
+    """A tone curve in words."""
+    if isinstance(curve, str):
+        return curve
+    if isinstance(curve, Sampled):
+        return f"one that gives {100 * curve.light[len(curve.light) // 2]:.0f} % of the light at half of the range"
+    return f"a gamma of {curve.gamma:g}"
