@@ -68,7 +68,7 @@ def test_seconds_until_the_next_attempt_are_counted_down(desk: Page, service: Se
             route.abort("connectionreset") if route.request.method == "PATCH" else route.continue_()
         ),
     )
-    desk.goto(service.url)
+    desk.goto(f"{service.url}/#/captures")
     desk.get_by_label(ZIP).set_input_files(ball)
     for seconds in (3, 2):  # of four: the pauses are of 1, 2, 4 and 8 s
         expect(desk.get_by_text(re.compile(rf"trying again in {seconds}\.\d s"))).to_be_visible()
