@@ -1,7 +1,7 @@
 // How many fewer pixels to draw so that the picture keeps up with the hand.
 
 const SLOW = 45; // ms between pictures above which fewer pixels are drawn
-const COARSEST = 2; // unless told otherwise
+const COARSEST = 2; // by default
 
 export class Coarseness {
   level = 0; // one pixel of 4 ** level is drawn
