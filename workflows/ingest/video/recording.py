@@ -21,6 +21,11 @@ _LEAST_CHANGE = 0.6  # of so many codes,
 _LEAST_SHARE = 0.015  # and of this share of the large changes: codecs refine a picture after it appears
 _CLEAN = 3.0  # a frame is not torn if it is off by at most so many times the plateau's own spread,
 _LEAST_CLEAN = 0.3  # and the spread is taken for at least so many codes
+_DRIFTS = (
+    0.05  # a plateau whose brightness, in codes, runs one way by this share is one whose exposure settles:
+)
+_SETTLED = 0.02  # only frames within this share of its end are used
+_ONE_WAY = 1.5  # brightness runs one way if its changes add up to no more than so many times the whole change
 
 
 class Event(NamedTuple):
@@ -80,12 +85,26 @@ class Recording:
 
     def clean(self, frames: range) -> tuple[Integers, Doubles]:
         """The frames of a plateau that resemble its median in every row, and their weights."""
+        frames = self._settled(frames)
         chosen = np.array(frames)[:: -(-len(frames) // MAX_FRAMES)]
         middle = self.look(chosen)
         off = np.array([difference(self.signatures[t], middle).max() for t in chosen])
         spread = max(float(np.median(off)), _LEAST_CLEAN)
         kept = off <= _CLEAN * spread
         return chosen[kept], 1 / (1 + (off[kept] / spread) ** 2)
+
+    def _settled(self, frames: range) -> range:
+        """The frames of a plateau without those in which the camera's exposure was still settling."""
+        # The first and the last frame may be torn.
+        inner = frames[1:-1]
+        if len(inner) < 3:
+            return frames
+        bright = self.signatures[inner.start : inner.stop].mean(axis=(1, 2, 3))
+        whole, end = abs(bright[-1] - bright[0]), bright[-1]
+        if whole <= _DRIFTS * end or np.abs(np.diff(bright)).sum() > _ONE_WAY * whole:
+            return frames
+        before = np.flatnonzero(np.abs(bright - end) > _SETTLED * end)
+        return range(inner.start + min(int(before[-1]) + 1, len(inner) - 2), frames.stop)
 
 
 def difference(one: NDArray[np.generic], other: NDArray[np.generic]) -> Doubles:
