@@ -44,6 +44,11 @@ class Light(NamedTuple):
     worth: Floats
 
 
+def clipped_from(stack: Stack) -> int:
+    """The value from which on one counts as clipped: full scale, or less in a film that clips."""
+    return int(stack.attributes.get("clipped_from", np.iinfo(stack.dtype).max))
+
+
 def look_up_of(stack: Stack) -> Floats:
     """A look-up table from the values of a stack to light, (k,) float32."""
     camera = TypeAdapter[Curve](Curve).validate_python(stack.attributes["camera_curve"])
@@ -76,7 +81,7 @@ def read_light(stack: Stack, span: tuple[slice, slice], program: Program) -> tup
     attributes = stack.attributes
     shifts = attributes.get("shifts")
     look_up = look_up_of(stack)
-    top = np.iinfo(stack.dtype).max
+    top = clipped_from(stack)
     if shifts is None:
         codes, recovered = stack.read_masked(*span)
         codes = codes[:, recovered]
@@ -93,7 +98,7 @@ def read_light(stack: Stack, span: tuple[slice, slice], program: Program) -> tup
         around, recovered = _around(stack, span, margin), stack.mask(*span)
 
         def in_place(frame: int) -> tuple[Floats, Bools]:
-            values, whole = unclipped_light(around[frame], shifts[frame], margin, look_up)
+            values, whole = unclipped_light(around[frame], shifts[frame], margin, look_up, top)
             return even_out(values[recovered], frame, attributes), whole[recovered]
 
         frame_of = in_place
@@ -222,7 +227,7 @@ def margin_of(shifts: Sequence[Sequence[float]]) -> int:
 
 
 def unclipped_light(
-    codes: Codes, shift: Sequence[float], margin: int, look_up: Floats
+    codes: Codes, shift: Sequence[float], margin: int, look_up: Floats, top: int
 ) -> tuple[Floats, Bools]:
     """The light of a frame, shifted back to where its picture should be, and whether it is not clipped.
 
@@ -235,6 +240,8 @@ def unclipped_light(
         Extra pixels of `codes` on each side, at least `margin_of` the shift.
     look_up : (k,) float32
         See `look_up_of`.
+    top : int
+        See `clipped_from`.
 
     Returns
     -------
@@ -247,7 +254,7 @@ def unclipped_light(
     rectangle that it is in.
     """
     values = look_up[codes]
-    clipped = (codes == 0) | (codes == len(look_up) - 1)
+    clipped = (codes == 0) | (codes >= top)
     share = clipped.astype(np.float32) if clipped.any() else None
     for axis, distance in ((-2, shift[0]), (-3, shift[1])):
         whole = math.floor(distance)

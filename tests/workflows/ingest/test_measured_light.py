@@ -6,8 +6,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tests.workflows.ingest.video.camera import film
+from tests.workflows.ingest.video.films import CAMERA, IngestFilm
 from workflows.images.tone_curves import table
-from workflows.ingest.measured_light import Light, margin_of, merge, stray_light, unclipped_light
+from workflows.ingest.measured_light import (
+    Light,
+    clipped_from,
+    margin_of,
+    merge,
+    stray_light,
+    unclipped_light,
+)
 from workflows.programs.border import border_light
 from workflows.programs.presets import preset
 
@@ -57,25 +66,35 @@ def test_a_picture_that_moved_is_moved_back(shift: tuple[float, float]) -> None:
         return np.rint(np.stack([value, value / 2, value], axis=2)).astype(np.uint8)
 
     margin = margin_of([shift])
-    moved, whole = unclipped_light(picture(*shift), shift, margin, LOOK_UP)
+    moved, whole = unclipped_light(picture(*shift), shift, margin, LOOK_UP, 255)
     inside = slice(margin, -margin)
     assert whole.all()
     np.testing.assert_allclose(255 * moved, picture(0, 0)[inside, inside], atol=1.5)
     # the same in whatever rectangle
-    part, _ = unclipped_light(picture(*shift)[5:30, 7:44], shift, margin, LOOK_UP)
+    part, _ = unclipped_light(picture(*shift)[5:30, 7:44], shift, margin, LOOK_UP, 255)
     np.testing.assert_array_equal(part, moved[5 : 30 - 2 * margin, 7 : 44 - 2 * margin])
 
 
 def test_value_merged_from_clipped_ones_is_clipped() -> None:
     codes = np.full((20, 20, 3), 100, np.uint8)
     codes[10, 10, 1] = 255
-    _, whole = unclipped_light(codes, (0.4, 0.0), 4, LOOK_UP)
+    _, whole = unclipped_light(codes, (0.4, 0.0), 4, LOOK_UP, 255)
     assert whole[..., [0, 2]].all()
     # two neighbours are made of it, those further on hardly
     assert not whole[6, 5:7, 1].any()
     assert 2 <= np.count_nonzero(~whole) <= 4
-    _, still = unclipped_light(codes, (0.0, 0.0), 4, LOOK_UP)
+    _, still = unclipped_light(codes, (0.0, 0.0), 4, LOOK_UP, 255)
     assert np.count_nonzero(~still) == 1
+    _, none = unclipped_light(codes, (0.0, 0.0), 4, LOOK_UP, 100)
+    assert not none.any()
+
+
+@pytest.mark.parametrize(("gain", "least"), [(1.0, 65535), (2.5, int(0.97 * 65535))])
+def test_values_of_a_film_that_clips_count_as_clipped_a_little_below_full_scale(
+    ingest_film: IngestFilm, light: list[np.ndarray], gain: float, least: int
+) -> None:
+    stack = ingest_film(film([np.float32(gain) * one for one in light], CAMERA).data)
+    assert clipped_from(stack) == least
 
 
 def test_stray_light_of_constant_frames_is_what_s_and_rho_are_fitted_to() -> None:

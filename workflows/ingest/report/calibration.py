@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from storage.layout.captures import Stack
+from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import Curve, Response, estimate, table, to_light
-from workflows.ingest.measured_light import exposures_of
+from workflows.ingest.measured_light import clipped_from, exposures_of
 from workflows.ingest.report.border_exposure import TRIFLE, BorderValues, relative_to_white
 from workflows.ingest.report.camera_curve import HalfTones, Shown, are_scaled, fit_camera_curve
 from workflows.programs.program import Program
@@ -21,6 +22,10 @@ SAMPLES = 20_000
 """About how many pixels the noise and unknown curves are measured from."""
 FRAMES = 64
 """At most how many constant frames they are measured from."""
+CLIPS = 0.002
+"""Share of the values of a film at full scale from which on it clips,"""
+CLIPPED = 0.97
+"""and the share of full scale from which on its values then count as clipped."""
 TURNS = 4
 """Turns in which the camera's curve and a film's exposures are found, one given the other."""
 MOST_APART = 1.3
@@ -40,10 +45,12 @@ def measure(stack: Stack, gains: Sequence[float] | None = None) -> None:
         Gain of the monitor's light in each frame; 1 by default.
     """
     program = Program.model_validate(stack.attributes["program"])
+    filmed = _take_squares(stack) if "video" in stack.attributes else None
+    stack.annotate(clipped_from=_clipped_from(stack, filmed))
     frames, sent, exposures = constant_frames(stack, program)
     codes = np.stack([_sample(stack, frame) for frame in frames], axis=1)
     top, black = np.iinfo(stack.dtype).max, stack.attributes["storage"]["black"]
-    usable = (codes > 0) & (codes < top)
+    usable = (codes > 0) & (codes < clipped_from(stack))
     grey = np.ptp(sent, axis=1) == 0
     camera, exposed, scaled = _camera(stack, program)
     found = estimate(
@@ -66,8 +73,8 @@ def measure(stack: Stack, gains: Sequence[float] | None = None) -> None:
     # Crosstalk between channels must not count as noise, so grey levels are used if there are enough.
     some = grey if np.count_nonzero(grey) >= 4 else np.ones_like(grey)
     noise = estimate_noise(light[:, some], shown[some], usable[:, some], 1 / (top - black))
-    if "video" in stack.attributes:
-        noise = _compressed(stack, look_up, exposed, frames, shown, noise)
+    if filmed is not None and not _is_free(exposed):
+        noise = _compressed(stack, filmed, look_up, exposed, frames, shown, noise)
     stack.annotate(
         monitor_curve=_as_json(found.monitor),
         camera_curve=_as_json(found.camera),
@@ -75,7 +82,7 @@ def measure(stack: Stack, gains: Sequence[float] | None = None) -> None:
         scaled=scaled,
         auto_exposure=None if exposed is None else exposed.round(5).tolist(),
         noise={"read": noise.read, "shot": noise.shot},
-        assumed_noise=bool("video" not in stack.attributes and np.count_nonzero(some) < 4),
+        assumed_noise=bool((filmed is None and np.count_nonzero(some) < 4) or _is_free(exposed)),
         crosstalk=estimate_crosstalk(light, shown, usable).tolist(),
     )
 
@@ -109,9 +116,17 @@ def _camera(
             camera = curve or "unknown"
     if exposed is not None and np.log(exposed).std() < TRIFLE:
         exposed = None
-    if exposed is not None and exposed.max() > MOST_APART * exposed.min():
+    if exposed is not None and _is_free(exposed):
         exposed = relative_to_white(exposed, stack.attributes["patterns"], program)
     return camera, exposed, scaled
+
+
+def _is_free(exposed: NDArray[np.float64] | None) -> bool:
+    """Whether the exposure of a film was not locked.
+
+    Then errors of the exposures make more values brighter than white than noise does.
+    """
+    return exposed is not None and bool(exposed.max() > MOST_APART * exposed.min())
 
 
 def _halftones(stack: Stack, program: Program) -> Callable[[NDArray[np.float64]], HalfTones | None] | None:
@@ -150,8 +165,27 @@ def _halftones(stack: Stack, program: Program) -> Callable[[NDArray[np.float64]]
     return seen
 
 
+def _take_squares(stack: Stack) -> Codes:
+    """Values of some of the pixels to recover in all frames, (n, frames, channels)."""
+    squares = product(_spread(stack.height), _spread(stack.width))
+    read = [stack.read_masked(y, x) for y, x in squares]
+    codes = np.concatenate([values[:, mask] for values, mask in read], axis=1).transpose(1, 0, 2)
+    return codes[:: -(-len(codes) // COMPRESSED_SAMPLES) or 1]
+
+
+def _clipped_from(stack: Stack, filmed: Codes | None) -> int:
+    """The value from which on one counts as clipped.
+
+    Compression, and averaging, make values of a little less than full scale of what was clipped.
+    """
+    top = int(np.iinfo(stack.dtype).max)
+    clips = filmed is not None and filmed.size and np.mean(filmed == top) > CLIPS
+    return int(CLIPPED * top) if clips else top
+
+
 def _compressed(
     stack: Stack,
+    filmed: Codes,
     look_up: NDArray[np.float32],
     exposed: NDArray[np.float64] | None,
     constants: Sequence[int],
@@ -162,16 +196,12 @@ def _compressed(
 
     Each mean frame counts as one frame, because averaging does not remove compression noise.
     """
-    squares = product(_spread(stack.height), _spread(stack.width))
-    read = [stack.read_masked(y, x) for y, x in squares]
-    codes = np.concatenate([values[:, mask] for values, mask in read], axis=1).transpose(1, 0, 2)
-    codes = codes[:: -(-len(codes) // COMPRESSED_SAMPLES) or 1]
-    light = look_up[codes]
+    light = look_up[filmed]
     if exposed is not None:
         light /= exposed[:, np.newaxis].astype(np.float32)
     design = np.stack([np.ones(len(shown)), shown.mean(axis=1)], axis=1)
     black, slope = np.einsum("dk,nkc->dnc", np.linalg.pinv(design), light[:, constants]).astype(np.float32)
-    usable = (codes > 0) & (codes < len(look_up) - 1)
+    usable = (filmed > 0) & (filmed < clipped_from(stack))
     excess = estimate_excess(light, black, black + np.maximum(slope, 0), usable)
     grey = np.array([0.5], np.float32)
     return noise if excess is None or excess.variance(grey) < noise.variance(grey) else excess

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
 from workflows.ingest.colour_detail import ColourDetail
-from workflows.ingest.measured_light import even_out, exposures_of, look_up_of
+from workflows.ingest.measured_light import clipped_from, even_out, exposures_of, look_up_of
 from workflows.ingest.report.calibration import constant_frames, measure
 from workflows.ingest.report.steadiness import find_steadiness
 from workflows.programs.program import Program
@@ -67,10 +67,10 @@ def survey(stack: Stack) -> None:
             even_out(look_up[codes].mean(axis=2), frame, attributes)
             for codes, frame in ((codes_black, black), (codes_white, white))
         )
-        top = np.iinfo(stack.dtype).max
+        top = clipped_from(stack)
         pixels += int(np.count_nonzero(wanted))
         ends[0] += [np.count_nonzero((c == 0).any(axis=2) & wanted) for c in (codes_black, codes_white)]
-        ends[1] += [np.count_nonzero((c == top).any(axis=2) & wanted) for c in (codes_black, codes_white)]
+        ends[1] += [np.count_nonzero((c >= top).any(axis=2) & wanted) for c in (codes_black, codes_white)]
         contrasts.append((W - B)[wanted])
         whole = wanted & ((codes_black > 0) & (codes_white < top)).all(axis=2)
         for of_tone, (frame, _) in zip(lit.T, tones, strict=True):
@@ -83,8 +83,8 @@ def survey(stack: Stack) -> None:
             for frame, codes in zip(coloured, stack.read_frames(coloured, rows, columns), strict=True):
                 detail.add(even_out(look_up[codes], frame, attributes)[np.newaxis], wanted)
         for at, codes in _batches(stack, rows, columns, chosen):
-            for end, value in enumerate((0, top)):
-                clipped[end, at] += ((codes == value).any(axis=3) & wanted).sum(axis=(1, 2))
+            for end, there in enumerate((codes == 0, codes >= top)):
+                clipped[end, at] += (there.any(axis=3) & wanted).sum(axis=(1, 2))
     contrast, middling, bright = (
         _percentile(c, q) for c, q in ((contrasts, 50), (deviations, 50), (brightest, 99))
     )

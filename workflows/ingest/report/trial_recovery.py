@@ -12,6 +12,7 @@ from workflows.images.tone_curves import Curve, to_light
 from workflows.ingest.measured_light import (
     LOBES,
     Light,
+    clipped_from,
     conditions_of,
     even_out,
     exposures_of,
@@ -128,7 +129,7 @@ def _see(stack: Stack, sample: Sample, shifts: Doubles) -> _Seen:
     values, across, down = np.empty((3, *shape), np.float32)
     whole = np.empty(shape, bool)
     for n, (codes, shift) in enumerate(zip(sample.codes, shifts.tolist(), strict=True)):
-        picture, unclipped = unclipped_light(codes, shift, _MARGIN - _SLOPE, look_up)
+        picture, unclipped = unclipped_light(codes, shift, _MARGIN - _SLOPE, look_up, clipped_from(stack))
         picture = even_out(picture, n, stack.attributes)
         values[n], whole[n] = picture[square, y, x], unclipped[square, y, x]
         # The slope of the polynomial through five values.
