@@ -9,8 +9,8 @@ import numpy as np
 from workflows.ingest.report.figures import Quality
 from workflows.programs.program import Bernoulli, Constant, Halftone, Program
 
-UNLOCKED = 0.1
-"""Exposures that spread by more than this share about their mean are not those of a locked camera."""
+UNLOCKED = 0.06
+"""Exposures whose standard deviation is a larger share of their mean are not those of a locked camera."""
 
 _NOISE = (19.0, 0.040), (5.5, 0.0044)  # k and c at the low and the high end
 _OTHER = 3.0, -5.0  # dB by which composites are worse than patterns at the low end, and at the high end
@@ -53,8 +53,8 @@ def expected(
     for n blocks along the monitor's shorter side in the finest grid: it is not known where in a block the light comes
     from, which costs clear glass most and frosted glass least.
 
-    If the exposure was not locked, nobody knows at which one the scene is to be shown: half of the middle 90 % of the
-    exposures, as a share of rho, is added from a tenth on.
+    If the exposure was not locked, nobody knows at which one the scene is to be shown: the standard deviation of the
+    exposures, as a share of rho, is added.
 
     Without random patterns, as of stripes alone, composites are about as far from the truth as patterns from what T
     predicts: of five captures by a real camera, none was more than 3.4 dB worse, where backdrops are finer than
@@ -99,7 +99,7 @@ def costs_of(
         ``noise``, at the low end; ``model_error``, ``lost_colour``, ``auto_exposure``.
     """
     rho = survey["contrast"]
-    spread = float(np.diff(np.log(np.quantile(exposures, (0.05, 0.95))))[0]) / 2 if exposures else 0.0
+    spread = float(np.log(exposures).std()) if exposures else 0.0
     return {
         "noise": _NOISE[0][0] * survey["deviation"] ** 2 / max(program.measured.size, 1),
         "model_error": (model_error * rho) ** 2,
