@@ -47,10 +47,9 @@ def main() -> None:
     samples = [path for path in files if "samples" in path.parts]
     for name, some in (("the app", set(files) - set(samples)), ("its samples", samples)):
         print(f"{name}: {len(some)} files, {sum(path.stat().st_size for path in some) / 1000:.0f} kB")
-    starts = [_start() for _ in range(3)]
-    print(
-        f"from `envmatte serve` to glass that moves: {statistics.median(starts):.1f} s, {max(starts):.1f} s at most"
-    )
+    print("`envmatte serve` listens after, s    glass moves after, s")
+    for listens, moves in sorted(_start() for _ in range(3)):
+        print(f"{listens:32.1f} {moves:23.1f}")
     with (
         tempfile.TemporaryDirectory() as folder,
         service(Path(folder, "data"), 1) as url,
@@ -68,19 +67,20 @@ def main() -> None:
         browser.close()
 
 
-def _start() -> float:
-    """Seconds from the start of a service with an empty data folder until the glass of the first view has moved."""
+def _start() -> tuple[float, float]:
+    """Seconds from the start of a service with an empty data folder until it listens, and until glass has moved."""
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
         page = browser.new_page()
         start = time.perf_counter()
         with service(Path(folder, "data"), None) as url:
+            listens = time.perf_counter() - start
             page.goto(url)
             while not page.evaluate(MOVES):
                 page.wait_for_timeout(20)
-            seconds = time.perf_counter() - start
+            moves = time.perf_counter() - start
         browser.close()
-    return seconds
+    return listens, moves
 
 
 def _open(browser: Browser, url: str) -> tuple[float, float, float]:

@@ -14,6 +14,7 @@ const SWAY = 0.16; // how far, in widths of the monitor
 export async function home(main, signal) {
   if (areRemoved()) return location.replace("#/captures");
   const samples = await fetchSamples(signal);
+  await new Promise((next) => requestAnimationFrame(() => setTimeout(next))); // the header shows while WebGL2 starts
   const placed = placement(() => glass.moved());
   const glass = new GlassWindow(placed.values, signal);
   handleGestures(glass.element, placed, glass.monitor);
