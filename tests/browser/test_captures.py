@@ -179,7 +179,9 @@ def test_number_and_size_of_frames_are_sent_before_the_archive(
     ) as sent:
         desk.get_by_label(ZIP).set_input_files(packed)
     metadata = dict(pair.split(" ") for pair in (sent.value.header_value("upload-metadata") or "").split(","))
-    assert {name: int(base64.b64decode(value)) for name, value in metadata.items()} == of_ball
+    values = {name: base64.b64decode(value).decode() for name, value in metadata.items()}
+    assert values.pop("filename") == "packed.zip"
+    assert {name: int(value) for name, value in values.items()} == of_ball
 
 
 def test_frames_are_browsed_by_keys(desk: Page, service: Service, ready: tuple[str, str]) -> None:

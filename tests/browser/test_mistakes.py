@@ -54,7 +54,7 @@ def envmatte_keys(data: Path, *arguments: str) -> str:
     [
         ("holiday.zip", b"twelve bytes", "neither a ZIP nor a film"),
         ("holiday.jpg", b"\xff\xd8\xff\xe0 and so on", "neither a ZIP nor a film"),
-        ("holiday.docx", empty_zip(), "there is no capture.json"),
+        ("holiday.docx", empty_zip(), "There is no capture.json"),
     ],
 )
 def test_wrong_file_is_refused_with_reason(
@@ -246,7 +246,7 @@ def test_wrong_key_then_key_revoked_during_upload(browser: Browser, ball: Path, 
     data = tmp_path / "data"
     with serving(data, "--workers", "1", ENVMATTE_KEYS="first") as locked, opened(browser) as page:
         lab = envmatte_keys(data, "make", "lab").split()[-1]
-        page.goto(locked.url)
+        page.goto(f"{locked.url}/#/captures")
         key = page.get_by_label("Key of the service")
         unknown = page.get_by_text("The service does not know this key")
         key.fill("ключ")  # no header can hold it
@@ -280,7 +280,7 @@ def test_full_disk_is_reported_and_upload_continues_with_room(
         with ballast.open("wb") as file:
             os.posix_fallocate(file.fileno(), 0, shutil.disk_usage(disk).free - (1 << 18))
         with opened(browser) as page:
-            page.goto(small.url)
+            page.goto(f"{small.url}/#/captures")
             page.get_by_label(ZIP).set_input_files(ball)
             expect(page.get_by_role("alert")).to_contain_text("There is no room for it")
             expect(page.get_by_role("alert")).to_contain_text(re.compile("delete|room|free"))
@@ -300,7 +300,7 @@ def test_service_restarts_with_another_key_during_upload(
     settings = ("--workers", "1", "--host", "0.0.0.0", "--port", port)
     with opened(browser) as page:
         with serving(folder, *settings, ENVMATTE_KEYS="first") as locked:
-            page.goto(f"http://127.0.0.1:{port}")
+            page.goto(f"http://127.0.0.1:{port}/#/captures")
             for key in ("wrong", "first"):
                 page.get_by_label("Key of the service").fill(key)
                 page.keyboard.press("Enter")
