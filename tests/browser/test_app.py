@@ -76,7 +76,7 @@ def test_upload_report_recovery_and_composite(tab: Page, service: Service, ball:
     expect(findings).to_have_count(len(report["findings"]))
     for number, finding in enumerate(report["findings"]):
         expect(findings.nth(number)).to_contain_text(finding["level"])
-        expect(findings.nth(number)).to_contain_text(finding["message"].replace("`", ""))
+        expect(findings.nth(number)).to_contain_text(finding["message"].replace("`", ""), ignore_case=True)
     expect(tab.get_by_alt_text("Some of the frames")).to_be_visible()
     tab.get_by_role("slider", name="Frame").fill("3")
     expect(tab.get_by_text(f"4 of {capture['frames']}")).to_be_visible()
