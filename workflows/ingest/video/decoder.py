@@ -17,6 +17,7 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from storage.errors import CaptureError
+from workflows.images.heif import is_heif
 from workflows.untrusted.decoder_process import say_alive
 
 CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts"
@@ -27,6 +28,7 @@ CODECS = frozenset(
 BACK = (0, 2, 10, 60)
 """Seconds before a time at which reading begins to find it. A transport stream has no index, and is entered anywhere:
 nothing can be decoded up to the next key frame."""
+_HEAD = 12  # bytes that tell HEIC
 
 
 class Clip:
@@ -64,6 +66,13 @@ class Clip:
         self.entry, self._limit = entry, memory
         self.lost: list[int] = []
         self.interlaced = False
+        head = file.read(_HEAD)
+        file.seek(0)
+        if is_heif(head):  # FFmpeg reads a tile of the picture as a film of one frame
+            raise CaptureError(
+                f"{entry} is a picture in HEIC, not a film: give it as a frame, or film the patterns",
+                entry=entry,
+            )
         try:
             self._container: InputContainer = av.open(
                 file, "r", container_options={"format_whitelist": CONTAINERS}, io_open=_refuse

@@ -11,6 +11,7 @@ import pytest
 
 from storage.errors import CaptureError
 from tests.workflows.composite.video.test_steps import clip, even, pictures
+from tests.workflows.images.heics import heic
 from tests.workflows.ingest.video.camera import Camera, Film, as_transport_stream, boxes, film, turned
 from tests.workflows.ingest.video.films import IngestFilm, error_of, misplaced, missing
 from workflows.ingest.video.decoder import Clip
@@ -101,6 +102,12 @@ def test_codec_that_is_not_read_is_named_with_a_remedy() -> None:
     data = clip(pictures(3), even(3), container="avi", codec="msmpeg4")
     with pytest.raises(CaptureError, match=r"^clip is coded by msmpeg4: export it as H\.264, HEVC or MJPEG"):
         Clip(io.BytesIO(data), "clip", 1 << 24)
+
+
+def test_picture_is_no_film_of_one_frame() -> None:
+    picture = heic(np.zeros((64, 64, 3), np.uint8))
+    with pytest.raises(CaptureError, match=r"IMG_1\.HEIC is a picture in HEIC, not a film"):
+        Clip(io.BytesIO(picture), "IMG_1.HEIC", 1 << 20)
 
 
 @pytest.mark.slow
