@@ -148,19 +148,17 @@ def _matte_state(context: Context, id: str) -> MatteState:
 
 
 def _bytes_of_composite(context: Context, state: MatteState, params: CompositeParams, media_type: str) -> int:
-    """Bytes that a composite takes at most, apart from the strips of the matte."""
+    """Bytes that a composite takes at most, apart from the strips of the matte and from backdrops.
+
+    The bound of these is ENVMATTE_BACKDROP_BYTES times the composites at once: if they counted at their most here,
+    composites of one owner would wait for one another.
+    """
     with context.stored(mattes.get, state.id):
         matte = context.cache.matte(state.id)
     window = Window.of(matte, params.x, params.y, params.width, params.height)
     of_pixel = PICTURE_BYTES + (SHRUNK_BYTES if params.size is not None else ANSWER_BYTES[media_type])
     of_rays = RAYS_BYTES * matte.width * matte.height if params.depth is not None else 0
-    # A backdrop takes as much as it may until it is decoded.
-    return (
-        context.settings.backdrop_bytes
-        + LIGHT_BYTES * matte.columns * matte.rows
-        + of_pixel * window.width * window.height
-        + of_rays
-    )
+    return LIGHT_BYTES * matte.columns * matte.rows + of_pixel * window.width * window.height + of_rays
 
 
 def _answer(

@@ -22,7 +22,7 @@ router = APIRouter(tags=["system"])
 INTERVAL = 1.0
 """Seconds between two checks of the same thing, however often readiness is asked for."""
 PATIENCE = 0.02
-"""Seconds that an answer waits for a check; after that it has the result of the check before."""
+"""Seconds that an answer waits for a check; after that it has the result of the check before. The first has none."""
 SILENCE = 3.0
 """Seconds after which a check without a result counts as failed."""
 
@@ -58,7 +58,7 @@ class Check:
             self._task = asyncio.create_task(
                 anyio.to_thread.run_sync(self._try, limiter=anyio.CapacityLimiter(1))
             )
-        await asyncio.wait((self._task,), timeout=PATIENCE)
+        await asyncio.wait((self._task,), timeout=SILENCE if self._last is None else PATIENCE)
         if self._task.done():
             self._last = self._task.result()
         silence = time.monotonic() - self._began
@@ -106,7 +106,7 @@ async def health() -> Health:
     return Health()
 
 
-@router.get("/readyz")
+@router.get("/readyz", responses={503: {"model": Readiness, "description": "Something can't be reached"}})
 async def readiness(request: Request, response: Response) -> Readiness:
     """Whether the database, the store and the cluster can be reached; 503 if not."""
     checks: dict[str, Check] = request.app.state.checks
