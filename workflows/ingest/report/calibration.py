@@ -22,7 +22,7 @@ SAMPLES = 20_000
 """About how many pixels the noise and unknown curves are measured from."""
 FRAMES = 64
 """At most how many constant frames they are measured from."""
-CLIPS = 0.002
+CLIPS = 0.01
 """Share of the values of a film at full scale from which on it clips,"""
 CLIPPED = 0.97
 """and the share of full scale from which on its values then count as clipped."""
