@@ -4,7 +4,6 @@ import hashlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from itertools import product
 from typing import IO, Annotated, TypeVar
 
@@ -111,7 +110,11 @@ async def post_composite(
     announced = BodyLimit(limit).check_announced(request) or limit
     owner = context.caller.owner
     async with context.backdrops.take(owner, announced), spool_body(request, limit) as body:
-        answer = partial(_answer, context, state, body, media_type, params, request.headers)
+
+        def answer() -> Response:
+            with context.stored(mattes.get, id):
+                return _answer(context, state, body, media_type, params, request.headers)
+
         memory = await anyio.to_thread.run_sync(_bytes_of_composite, context, state, params, media_type)
         return await context.compute(request, context.composites, answer, memory=memory)
 
@@ -162,18 +165,6 @@ def _bytes_of_composite(context: Context, state: MatteState, params: CompositePa
 
 
 def _answer(
-    context: Context,
-    state: MatteState,
-    body: IO[bytes],
-    media_type: str,
-    params: CompositeParams,
-    headers: Headers,
-) -> Response:
-    with context.stored(mattes.get, state.id):
-        return _composite(context, state, body, media_type, params, headers)
-
-
-def _composite(
     context: Context,
     state: MatteState,
     body: IO[bytes],
