@@ -6,11 +6,6 @@ from workflows.simulation.optics import Doubles
 from workflows.simulation.solids import Convex, Solid, turned
 
 
-def ball() -> Solid:
-    """A ball of radius 1."""
-    return Solid(Convex(centres=np.zeros((1, 3)), axes=np.ones((1, 3))))
-
-
 def lens(thickness: float = 0.3, turn: Doubles | None = None) -> Solid:
     """A lens of diameter 2 that is as thick in its middle, between two spheres; its axis is z."""
     radius = (1 + thickness**2 / 4) / thickness

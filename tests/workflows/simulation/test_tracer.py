@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 from tests.workflows.simulation.test_glass_ball import centroids
 from workflows.simulation.camera import CAMERA, MONITOR, Camera
 from workflows.simulation.glass_ball import backdrop, glass_ball
-from workflows.simulation.objects import ball, lens, stone, tumbler, window
+from workflows.simulation.objects import lens, stone, tumbler, window
 from workflows.simulation.optics import fresnel
 from workflows.simulation.solids import Convex, Solid, turned
 from workflows.simulation.tracer import through, trace
 
 SOLIDS = {"lens": lens(), "tumbler": tumbler(), "stone": stone()}
+BALL = Solid(Convex(centres=np.zeros((1, 3)), axes=np.ones((1, 3))))
 SMALL = Camera(48, 36, (96, 72), 16)
 AHEAD = np.array([[0.0], [0.0], [1.0]])
 
@@ -40,7 +41,7 @@ def test_no_light_is_made_and_little_is_lost(name: str) -> None:
 
 @pytest.mark.parametrize("name", SOLIDS)
 def test_solid_of_no_refraction_is_not_seen(name: str) -> None:
-    clear, bare = trace(SOLIDS[name], SMALL, index=1.0), trace(ball(), SMALL, index=1.0)
+    clear, bare = trace(SOLIDS[name], SMALL, index=1.0), trace(BALL, SMALL, index=1.0)
     assert 0.1 < clear.coverage.mean() < bare.coverage.mean()
     np.testing.assert_allclose(clear.rho, 1, atol=1e-6)
     np.testing.assert_allclose(centroids(clear), centroids(bare), atol=1e-6)
@@ -48,7 +49,7 @@ def test_solid_of_no_refraction_is_not_seen(name: str) -> None:
 
 def test_ball_agrees_with_the_glass_ball() -> None:
     glass = {"index": (1.49, 1.5, 1.52), "absorption": (0.1, 0.0, 0.3)}
-    traced = trace(ball(), SMALL, surfaces=6, **glass)  # type: ignore[arg-type]
+    traced = trace(BALL, SMALL, surfaces=6, **glass)  # type: ignore[arg-type]
     known = glass_ball(48, 36, monitor=(96, 72), rays=16, bounces=4, **glass)  # type: ignore[arg-type]
     np.testing.assert_array_equal(traced.coverage, known.coverage)
     y, x = np.mgrid[:36, :48]
@@ -63,7 +64,7 @@ def test_ball_agrees_with_the_glass_ball() -> None:
 def test_near_the_axis_a_lens_follows_paraxial_optics() -> None:
     size = {"width": 161, "height": 121, "monitor": (6400, 4800), "rays": 16}
     camera, thickness = Camera(**size), 0.3  # type: ignore[arg-type]
-    direct = centroids(trace(ball(), camera, index=1.0))[60, 83, 0]
+    direct = centroids(trace(BALL, camera, index=1.0))[60, 83, 0]
     index = (1.45, 1.5, 1.6)
     scene = trace(lens(thickness), camera, index=index, surfaces=2)
     radius = (1 + thickness**2 / 4) / thickness
@@ -121,7 +122,7 @@ def test_tint_follows_the_way_through_the_walls() -> None:
 
 
 def test_room_is_mirrored_and_the_window_is_in_it() -> None:
-    scene = trace(ball(), SMALL, room=window)
+    scene = trace(BALL, SMALL, room=window)
     assert scene.reflections is not None
     assert scene.reflections[scene.coverage == 0].max() < 1e-6
     # The outside mirrors it where the normal halves the angle between it and the camera: above and to the left.
