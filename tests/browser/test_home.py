@@ -105,6 +105,7 @@ def test_backdrop_around_the_glass_joins_what_is_seen_through_it(desk: Page, ser
     assert np.median(np.abs(difference)) < 25
 
 
+@pytest.mark.slow
 def test_camera_is_a_backdrop(desk: Page, service: Service) -> None:
     desk.goto(service.url)
     settled(desk)
@@ -115,6 +116,7 @@ def test_camera_is_a_backdrop(desk: Page, service: Service) -> None:
     until(lambda: not np.array_equal(drawn(desk), two))
 
 
+@pytest.mark.slow
 def test_samples_are_removed_and_restored(desk: Page, service: Service) -> None:
     desk.goto(service.url)
     desk.get_by_role("button", name="Remove the samples").click()
@@ -158,8 +160,14 @@ def test_sample_capture_is_uploaded_and_read(desk: Page, service: Service) -> No
     assert service.client.matte(matte)["state"] == "ready"
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("device", ["desk", "phone"])
+@pytest.mark.parametrize(
+    ("device", "scheme"),
+    [("phone", "dark")]
+    + [
+        pytest.param(*one, marks=pytest.mark.slow)
+        for one in (("phone", "light"), ("desk", "dark"), ("desk", "light"))
+    ],
+)
 def test_first_view_is_accessible_and_fits(
     browser: Browser, service: Service, device: str, scheme: str
 ) -> None:

@@ -330,7 +330,7 @@ def error_of(objects: Objects) -> Callable[..., float]:
     return of
 
 
-@pytest.mark.parametrize("method", ["lobes", "nn-dgsr"])
+@pytest.mark.parametrize("method", ["lobes", pytest.param("nn-dgsr", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("what", ["border", "glare"])
 def test_composites_have_glare_but_no_border(
     ingest: Callable[..., Stack], error_of: Callable[..., float], make_zip: Zip, method: str, what: str
