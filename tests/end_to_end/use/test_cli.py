@@ -88,7 +88,10 @@ def patterns(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=120)
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize(
+    "preset",
+    [pytest.param(name, marks=pytest.mark.slow if name.startswith("paper") else ()) for name in PRESETS],
+)
 def test_patterns_of_a_preset_are_written(preset: str, tmp_path: Path) -> None:
     folder = tmp_path / "new" / "patterns"
     done = patterns(preset, str(folder), "--monitor", "160x120", "--json")

@@ -61,6 +61,7 @@ def test_a_recovery_goes_from_queued_to_succeeded(service: Service, capture: str
     assert log == ["queued", "preparing", "recovering", "finishing", "succeeded"]
 
 
+@pytest.mark.slow
 def test_job_posted_during_the_ingest_of_its_capture_succeeds(
     service: Service, capture_archive: Path
 ) -> None:
@@ -93,6 +94,7 @@ def test_composite_reports_how_long_each_step_took(service: Service, matte: str)
     assert names == ["open", "decode", "composite", "encode"]
 
 
+@pytest.mark.slow
 def test_masked_pixels_are_transparent(service: Service, scene: Scene, program, tmp_path: Path) -> None:
     masked = tmp_path / "masked.zip"
     write_capture(scene, program, masked, mask=True)

@@ -89,7 +89,9 @@ def test_value_merged_from_clipped_ones_is_clipped() -> None:
     assert not none.any()
 
 
-@pytest.mark.parametrize(("gain", "least"), [(1.0, 65535), (2.5, int(0.97 * 65535))])
+@pytest.mark.parametrize(
+    ("gain", "least"), [pytest.param(1.0, 65535, marks=pytest.mark.slow), (2.5, int(0.97 * 65535))]
+)
 def test_values_of_a_film_that_clips_count_as_clipped_a_little_below_full_scale(
     ingest_film: IngestFilm, light: list[np.ndarray], gain: float, least: int
 ) -> None:

@@ -87,7 +87,11 @@ def test_codes_are_all_different_and_neighbours_differ_in_one_bit_and_the_parity
     assert certain.all()
 
 
-@pytest.mark.parametrize("border", DISPLAYS, ids=lambda b: f"{b.width}x{b.height}")
+@pytest.mark.parametrize(
+    "border",
+    [pytest.param(b, marks=pytest.mark.slow if b.width > 3000 else ()) for b in DISPLAYS],
+    ids=lambda b: f"{b.width}x{b.height}",
+)
 def test_picture_is_unchanged_and_light_of_the_border_constant(border: Border) -> None:
     x, y, w, h = border.inner
     picture = np.random.default_rng(0).integers(0, 256, (h, w, 3), np.uint8)

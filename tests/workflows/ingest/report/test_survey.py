@@ -116,6 +116,7 @@ def test_more_noise_and_fewer_patterns_promise_less(ingest: Ingest, capture_arch
     assert best[0] < best[1] < 60
 
 
+@pytest.mark.slow
 def test_a_curve_of_any_shape_is_measured_by_half_tones(ingest: Ingest, capture_archive: bytes) -> None:
     made, found = reported(ingest, filmed(capture_archive, curve=lambda x: x**0.6, response="unknown"))
     assert made.camera.source == "estimated"

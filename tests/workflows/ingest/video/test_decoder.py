@@ -90,6 +90,7 @@ def test_frames_of_a_transport_stream_are_found_from_any_time(packet: int) -> No
             np.testing.assert_array_equal(again, pixels[at])
 
 
+@pytest.mark.slow
 def test_a_film_in_a_transport_stream_is_ingested_as_in_any_container(
     ingest_film: IngestFilm, filmed: Film
 ) -> None:
