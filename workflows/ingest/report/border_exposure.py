@@ -1,6 +1,6 @@
 """How the exposure of a film changed from pattern to pattern, by the border, whose light is known."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +23,6 @@ SHOULDER = 0.93
 """Codes from here on are left out: cameras compress what is nearly white."""
 LEAST = 0.01
 """Light below which a value says nothing."""
-BRIGHT = 0.98
-"""The white monitor itself is as bright as this quantile of a frame that shows it."""
-WHITE = 0.9
-"""What a camera that is locked well makes of the white monitor, of full scale."""
 TRIFLE = 0.003
 """A standard deviation of the exposures below this is none."""
 
@@ -91,32 +87,19 @@ class BorderValues:
         return exposure
 
 
-def as_exposed_for_white(
-    exposures: Doubles,
-    patterns: Sequence[int],
-    program: Program,
-    light_of: Callable[[int], NDArray[np.floating]],
-) -> Doubles:
-    """Exposures in units of the one by which a white monitor is just not clipped; unchanged if no frame shows white.
+def relative_to_white(exposures: Doubles, patterns: Sequence[int], program: Program) -> Doubles:
+    """Exposures in units of the shortest of a white monitor; unchanged if no frame shows one.
 
-    For a camera that was not locked. It has no exposure of its own that composites could be shown at: its usual one is
-    that of patterns, which are darker than most backdrops. So they are shown as by a locked camera that uses its range.
+    For a camera that was not locked, whose usual exposure is that of patterns, which are darker: composites with
+    bright backdrops would exceed full scale.
 
     Parameters
     ----------
     exposures : (frames,) float64
-        In any unit.
     patterns : (frames,) sequence of int
         What each frame shows.
     program : Program
-    light_of : function
-        Returns the light of pixels of a frame, (n, channels), 1 being full scale, by the frame's index.
     """
     numbers, sent = program.constants
-    white = np.flatnonzero(np.isin(patterns, numbers[(sent == 1).all(axis=1)]))
-    if not white.size:
-        return exposures
-    shortest = white[np.argmin(exposures[white])]
-    brightest = np.quantile(light_of(int(shortest)).mean(axis=1), BRIGHT)
-    unit = exposures[shortest] * WHITE / max(float(brightest), LEAST)
-    return np.asarray(exposures / unit)
+    white = np.isin(patterns, numbers[(sent == 1).all(axis=1)])
+    return exposures / exposures[white].min() if white.any() else exposures

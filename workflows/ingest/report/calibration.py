@@ -12,7 +12,7 @@ from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import Curve, Response, estimate, table, to_light
 from workflows.ingest.measured_light import clipped_from, exposures_of
-from workflows.ingest.report.border_exposure import TRIFLE, BorderValues, as_exposed_for_white
+from workflows.ingest.report.border_exposure import TRIFLE, BorderValues, relative_to_white
 from workflows.ingest.report.camera_curve import HalfTones, Shown, are_scaled, fit_camera_curve
 from workflows.programs.program import Program
 from workflows.recovery.noise import Noise, estimate_excess
@@ -103,7 +103,9 @@ def _camera(
     exposed: NDArray[np.float64] | None = None
     scaled = False
     for _ in range(TURNS if border else 1):
-        look_up = _look_up(stack, camera)
+        look_up = table(
+            "srgb" if camera == "unknown" else camera, stack.dtype, stack.attributes["storage"]["black"]
+        )
         if border:
             exposed = border.exposures(look_up)
         seen = halftones(np.ones(stack.frames) if exposed is None else exposed) if halftones else None
@@ -115,17 +117,8 @@ def _camera(
     if exposed is not None and np.log(exposed).std() < TRIFLE:
         exposed = None
     if exposed is not None and _is_free(exposed):
-        look_up = _look_up(stack, camera)
-        exposed = as_exposed_for_white(
-            exposed, stack.attributes["patterns"], program, lambda frame: look_up[_sample(stack, frame)]
-        )
+        exposed = relative_to_white(exposed, stack.attributes["patterns"], program)
     return camera, exposed, scaled
-
-
-def _look_up(stack: Stack, camera: Curve | Literal["unknown"]) -> NDArray[np.float32]:
-    """The light of each value by the camera's curve, or by that of sRGB as long as it is not known, (k,)."""
-    known: Curve = "srgb" if camera == "unknown" else camera
-    return table(known, stack.dtype, stack.attributes["storage"]["black"])
 
 
 def _is_free(exposed: NDArray[np.float64] | None) -> bool:

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from workflows.images.tone_curves import table
-from workflows.ingest.report.border_exposure import BorderValues, as_exposed_for_white
+from workflows.ingest.report.border_exposure import BorderValues, relative_to_white
 from workflows.programs.border import border_light
 from workflows.programs.presets import preset
 
@@ -58,14 +58,11 @@ def test_without_a_border_in_the_picture_nothing_is_said() -> None:
     assert BorderValues(film, PROGRAM).exposures(LOOK_UP) is None  # type: ignore[arg-type]
 
 
-def test_white_is_just_not_clipped_of_a_camera_that_was_not_locked() -> None:
+def test_white_is_the_unit_of_a_camera_that_was_not_locked() -> None:
     """Patterns 0, 23 and 36 of the program are white."""
     exposures = np.full(PROGRAM.count, 1.5)
     exposures[[0, 23, 36]] = 0.6, 0.5, 0.5
-    seen = {23: np.linspace(0, 0.6, 1000)[:, np.newaxis].repeat(3, 1)}
-    found = as_exposed_for_white(exposures, range(PROGRAM.count), PROGRAM, seen.__getitem__)
-    monitor = 0.98 * 0.6
-    assert monitor / found[23] == pytest.approx(0.9)
-    np.testing.assert_allclose(found / found[23], exposures / 0.5)
-    without = as_exposed_for_white(exposures[1:23], range(1, 23), PROGRAM, seen.__getitem__)
+    found = relative_to_white(exposures, range(PROGRAM.count), PROGRAM)
+    np.testing.assert_allclose(found[[0, 1, 23]], [1.2, 3, 1])
+    without = relative_to_white(exposures[1:23], range(1, 23), PROGRAM)
     np.testing.assert_array_equal(without, exposures[1:23])
