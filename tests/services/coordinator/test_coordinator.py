@@ -93,8 +93,8 @@ def test_files_that_cannot_be_removed_are_removed_later(
     with writing(engine) as c:
         jobs.cancel(c, job)
     with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, Idle()):  # type: ignore[arg-type]
+        until(lambda: not failures)  # a sweep may have removed them before
         until(lambda: not objects.paths_below("uploads"))
-    assert failures == []
 
 
 @pytest.mark.exhaustive

@@ -12,6 +12,10 @@ from workflows.recovery.solvers import inner, subtract
 _OFFSET = 0.03
 # Conjugate gradients end when this fraction of the initial squared residual is left.
 _PRECISION = 1e-5
+# Where more than this fraction is left after the usual number of steps, they go on, up to this many times as many: so
+# far from the solution, all weights may come out negative.
+_UNSOLVED = 1e-2
+_MOST_STEPS = 4
 _LEAST_KAPPA = 1e-5
 
 
@@ -155,9 +159,9 @@ def solve_covariance(
         x[j], z[j] = 0.0, r[j] / diagonal[j]
         p[j] = z[j]
     left = inner(r, z)
-    goal = left * np.float32(_PRECISION)
-    for _ in range(steps):
-        if left <= goal:
+    goal, far = left * np.float32(_PRECISION), left * np.float32(_UNSOLVED)
+    for step in range(_MOST_STEPS * steps):
+        if left <= (goal if step < steps else far):
             break
         apply_covariance(A, weight, kappa, total, strays, measured, p, Kp)
         length = left / inner(p, Kp)
@@ -175,14 +179,17 @@ def solve_covariance(
 def reweight(
     A: NDArray[np.float32], kappa: float, x: NDArray[np.float32], weight: NDArray[np.float32]
 ) -> None:
-    """Multiply the weights by ``1 + kappa A x``, clipped at 0, and normalise their sum to 1."""
-    total = 0.0
+    """Multiply the weights by ``1 + kappa A x``, clipped at 0, and normalise their sum to 1.
+
+    They stay as they are if all would be 0.
+    """
+    factor, total = np.empty_like(weight), 0.0
     for i in range(weight.size):
-        weight[i] *= max(1 + np.float32(kappa) * inner(A[i], x), np.float32(0))
-        total += weight[i]
+        factor[i] = max(1 + np.float32(kappa) * inner(A[i], x), np.float32(0))
+        total += weight[i] * factor[i]
     if total > 0:
         for i in range(weight.size):
-            weight[i] /= np.float32(total)
+            weight[i] *= factor[i] / np.float32(total)
 
 
 @njit(nogil=True, cache=True)

@@ -112,3 +112,23 @@ def test_total_variance_finds_the_variance_about_a_first_estimate():
     assert misfit == pytest.approx(np.mean((y - f)[:m] ** 2 - variance[:m]), rel=1e-4)
     # black and white nodes leave nothing to what is finer than them
     np.testing.assert_allclose(total, variance, atol=1e-7)
+
+
+def test_few_steps_suffice_where_patterns_differ_little():
+    """Neighbouring nodes of sharp glass: their patterns are alike, and dark values are known very well."""
+    far = 0
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        code = np.where(rng.random(M) < 0.5, 0, 255) ^ np.where(rng.random((16, M)) < 0.15, 255, 0)
+        A = np.empty((16, M + 2), np.float32)
+        node_responses(PatternCodes(GRIDS, code.astype(np.uint8), 0, 1, M, CONSTANT), np.arange(16), 16, A)
+        start, truth = rng.dirichlet(np.full(16, 0.5), 2)
+        y = truth @ A
+        variance = np.where(y < 0, 1e-5, 2e-4)
+        variance[-2:] = 1e-6
+        y = (y + np.sqrt(variance) * rng.standard_normal(y.size)).astype(np.float32)
+        few, many = start.astype(np.float32), start.astype(np.float32)
+        for weight, steps in ((few, 9), (many, 500)):
+            update(A, weight, y, variance.astype(np.float32), CONSTANT, np.zeros(1), 2, steps)
+        far += np.abs(few - many).sum() > 0.6
+    assert far <= 3
