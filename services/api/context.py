@@ -180,6 +180,9 @@ def authorized(request: Request, given: Key) -> Context:
 OwnerContext = Annotated[Context, Depends(authorized)]
 """For routes that take any key: sees what belongs to the key's owner."""
 
+PublicContext = Annotated[Context, Depends(_service_context)]
+"""For routes without a key, which must check otherwise what a request may see: sees what belongs to any owner."""
+
 
 def _for_admins(request: Request, context: OwnerContext) -> Context:
     require_scope(context.caller, "admin")

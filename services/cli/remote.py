@@ -221,6 +221,16 @@ def export(matte: str, output: Path, html: bool, url: str, key: str | None, as_j
     print_result({"output": str(output)}, as_json, "output")
 
 
+@click.command(epilog=example("envmatte share MATTE", "envmatte share MATTE --days 365"))
+@click.argument("matte")
+@click.option("--days", type=click.FloatRange(0, 3650, min_open=True), default=30, show_default=True)
+@_remote
+def share(matte: str, days: float, url: str, key: str | None, as_json: bool) -> None:
+    """Make a link by which anyone can see a matte, live, without a key. Prints its URL."""
+    with _client(url, key) as client:
+        print_result({"url": client.share(matte, days)}, as_json, "url")
+
+
 @click.command("import", epilog=example("envmatte import matte.zip"))
 @click.argument("file", type=InputFile)
 @_remote
@@ -264,4 +274,4 @@ def _parse_option(option: str) -> tuple[str, Any]:
         return name, value
 
 
-COMMANDS = (upload, recover, status, wait, cancel, composite, export, import_, layers)
+COMMANDS = (upload, recover, status, wait, cancel, composite, export, share, import_, layers)

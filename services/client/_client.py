@@ -247,6 +247,19 @@ class Client:
         """Get a matte as a web page in one file, which draws the glass without a service."""
         return self._http.send("GET", f"{_path(Matte, matte)}/live.html", computing=True).content
 
+    def share(self, matte: Matte | str, days: float = 30) -> str:
+        """Make a link by which anyone can see a matte, live, without a key; returns its URL.
+
+        `GET /v1/mattes/{id}/links` lists links, and DELETE deletes one.
+
+        Parameters
+        ----------
+        days : float
+            Until the link expires, 3650 at most.
+        """
+        made = self._http.json("POST", f"{_path(Matte, matte)}/links", json={"days": days})
+        return self._http.url_of(made["path"])
+
     def export(
         self, matte: Matte | str, file: Path, *, progress: Callable[[int, int], None] | None = None
     ) -> None:

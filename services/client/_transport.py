@@ -53,6 +53,10 @@ class Transport:
         self._http = httpx2.Client(base_url=base, headers=headers, timeout=SILENCE)
         self._answered = False
 
+    def url_of(self, path: str) -> str:
+        """The whole URL of a path of the service."""
+        return f"{str(self._http.base_url).rstrip('/')}{path}"
+
     def close(self) -> None:
         """Close the connection."""
         self._http.close()

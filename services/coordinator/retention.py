@@ -14,7 +14,7 @@ from storage.layout import captures, composites, mattes
 from storage.layout import uploads as stored_uploads
 from storage.maintenance import inventory
 from storage.objects.store import Objects
-from storage.records import bodies, jobs, uploads
+from storage.records import bodies, jobs, links, uploads
 
 logger = logging.getLogger(__name__)
 
@@ -25,9 +25,11 @@ MOST = 1000
 def delete_expired(connection: Connection) -> list[str]:
     """Delete the rows of expired uploads, captures and mattes; returns their folders in the store.
 
-    What an active job works on is kept until the job has ended. Rows of dead processes' requests are deleted too.
+    What an active job works on is kept until the job has ended. Rows of dead processes' requests, and links that have
+    expired, are deleted too.
     """
     bodies.delete_lapsed(connection)
+    links.delete_expired(connection)
     gone = [stored_uploads.path(upload) for upload in uploads.delete_expired(connection)]
     for table, making, where in (
         (tables.captures, "ingesting", (captures.path, stored_uploads.path)),

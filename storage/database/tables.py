@@ -250,3 +250,15 @@ keys = Table(
     Column("revoked_at", Float),
 )
 """API keys. See `storage.records.api_keys`."""
+
+links = Table(
+    "links",
+    metadata,
+    Column("id", String(32), primary_key=True),
+    Column("hash", String(64), nullable=False, unique=True),
+    Column("matte", ForeignKey("mattes.id", ondelete="CASCADE"), nullable=False, index=True),
+    Column("created_at", Float, nullable=False),
+    Column("expires_at", Float, nullable=False, index=True),
+    _owner(),
+)
+"""Links that let anyone see one matte. See `storage.records.links`."""

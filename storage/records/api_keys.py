@@ -42,14 +42,14 @@ def create(connection: Connection, name: str, owner: str, scope: str) -> str:
     if _active(connection, name) is not None:
         raise Conflict(f"there is already a key {name!r}; revoke it first, or use another name")
     key = PREFIX + secrets.token_urlsafe(32)
-    row = {"name": name, "hash": _hash(key), "owner": owner, "scope": scope, "created_at": time.time()}
+    row = {"name": name, "hash": hash_of(key), "owner": owner, "scope": scope, "created_at": time.time()}
     connection.execute(insert(keys).values(row))
     return key
 
 
 def find(connection: Connection, key: str) -> Row[Any] | None:
     """The row of an active key, if there is one."""
-    query = select(keys).where(keys.c.hash == _hash(key), keys.c.revoked_at.is_(None))
+    query = select(keys).where(keys.c.hash == hash_of(key), keys.c.revoked_at.is_(None))
     return connection.execute(query).one_or_none()
 
 
@@ -82,5 +82,6 @@ def _active(connection: Connection, name: str) -> Row[Any] | None:
     return connection.execute(query).one_or_none()
 
 
-def _hash(key: str) -> str:
+def hash_of(key: str) -> str:
+    """What the database keeps of a secret."""
     return hashlib.sha256(key.encode(errors="surrogateescape")).hexdigest()

@@ -85,7 +85,7 @@ def test_jobs_and_upload_go_on_when_the_clock_jumps(tmp_path: Path, faketime: Pa
         began = time.monotonic()
         for job in (answer.json()["job"], *jobs):
             while (found := service.client.job(job))["state"] in ("queued", "running"):
-                assert time.monotonic() - began < 120
+                assert time.monotonic() - began < 400
                 assert min(found["queued_seconds"], found["run_seconds"], found["eta_seconds"] or 0) >= 0
                 time.sleep(0.1)
             row.lost += found["state"] != "succeeded"

@@ -59,10 +59,17 @@ async def get_live_page(context: OwnerContext, id: str, request: Request) -> Res
     `GET /v1/mattes/{id}/live` sends it.
     """
 
+    # Saved and not shown: here it would be a page of the service.
+    return await live_page(
+        context, id, request, {"Content-Disposition": f'attachment; filename="matte-{id}.html"'}
+    )
+
+
+async def live_page(context: Context, id: str, request: Request, headers: dict[str, str]) -> Response:
+    """The answer with the page of a matte."""
+
     def load() -> Response:
         page = make_page(_title(context, row), row.figures["monitor"], _encoded(context, id, matte))
-        # Saved and not shown: here it would be a page of the service.
-        headers = {"Content-Disposition": f'attachment; filename="matte-{id}.html"'}
         return bytes_response(page, "text/html", headers)
 
     row, matte = await anyio.to_thread.run_sync(_open, context, id)

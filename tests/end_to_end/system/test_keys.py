@@ -100,6 +100,11 @@ CALLS = {
     "GET /v1/mattes/{id}/live.html": Call("matte"),
     "GET /v1/mattes/{id}/transport": Call("matte"),
     "GET /v1/mattes/{id}/transport.png": Call("matte"),
+    "GET /v1/mattes/{id}/links": Call("matte"),
+    "POST /v1/mattes/{id}/links": Call("matte", needs="write", json={"days": 1}),
+    "DELETE /v1/mattes/{id}/links/{link}": Call("matte", needs="write", last=1),
+    "GET /share/{token}": Call(needs=""),
+    "GET /embed/{token}": Call(needs=""),
     "POST /v1/mattes/{id}/composite": Call(
         "matte", needs="write", content=png(np.full((9, 12, 3), 0.5), "srgb", np.uint8)
     ),
@@ -132,7 +137,13 @@ class Locked:
     def call(self, route: str, key: str | None) -> httpx2.Response:
         method, path = route.split(" ")
         call = CALLS[route]
-        for name, value in (("id", self.ids.get(call.id or "")), ("n", "0"), ("file", "S.png")):
+        for name, value in (
+            ("id", self.ids.get(call.id or "")),
+            ("n", "0"),
+            ("file", "S.png"),
+            ("link", self.ids["link"]),
+            ("token", self.ids["token"]),
+        ):
             path = path.replace(f"{{{name}}}", value or "")
         body = json.dumps(call.json or {})
         for name, value in self.ids.items():
@@ -179,7 +190,10 @@ def locked(capture_archive: Path, tmp_path_factory: pytest.TempPathFactory) -> I
         program = service.http.post("/v1/programs", json=body, headers=bearer(made["write"])).json()["id"]
         create = TUS | {"Upload-Length": "9"} | bearer(made["write"])
         upload = service.http.post("/v1/uploads", headers=create).headers["location"].rsplit("/", 1)[1]
-        ids = {"capture": capture["id"], "job": job["id"], "matte": job["matte"], "program": program}
+        made_link = alice.share(job["matte"])
+        listed = service.http.get(f"/v1/mattes/{job['matte']}/links", headers=bearer(made["write"])).json()
+        link = {"link": listed["links"][0]["id"], "token": made_link.rpartition("/")[2]}
+        ids = link | {"capture": capture["id"], "job": job["id"], "matte": job["matte"], "program": program}
         yield Locked(service, made, ids | {"upload": upload})
 
 

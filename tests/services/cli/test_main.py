@@ -60,6 +60,7 @@ REMOTE = {
     "cancel": ["j"],
     "composite": ["m", "backdrop.png", "-o", "composite.png"],
     "export": ["m", "-o", "matte.zip"],
+    "share": ["m"],
     "import": ["matte.zip"],
     "layers": ["m", "layers"],
 }

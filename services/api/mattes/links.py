@@ -1,0 +1,113 @@
+"""Links to a matte for people without a key: made, listed and deleted by its owner, and the pages that they lead to."""
+
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Annotated, Any
+
+import anyio.to_thread
+from fastapi import APIRouter, Body, Request, Response
+from pydantic import BaseModel, Field
+from sqlalchemy import Row
+
+from services.api.auth import Caller
+from services.api.context import OwnerContext, PublicContext
+from services.api.mattes.live import live_page
+from storage.database.engine import reading, writing
+from storage.database.owners import for_owner
+from storage.records import links, mattes
+
+router = APIRouter(tags=["mattes"])
+page = APIRouter(tags=["mattes"])
+DAY = 86_400
+"""Seconds."""
+SANDBOX = "sandbox allow-scripts; frame-ancestors"
+"""The page runs its own script, and nothing of it can reach the service: for the browser it is another site."""
+
+
+class Link(BaseModel):
+    """A link to a matte."""
+
+    id: str
+    created_at: datetime
+    expires_at: datetime
+
+    @classmethod
+    def fields(cls, row: Row[Any]) -> dict[str, Any]:
+        """The fields that a row has."""
+        times = {
+            name: datetime.fromtimestamp(getattr(row, name), UTC) for name in ("created_at", "expires_at")
+        }
+        return {"id": row.id, **times}
+
+
+class NewLink(Link):
+    """A link that was just made: only now is it known where it leads."""
+
+    path: str = Field(
+        description="The page, below the address of the service; anyone who has it sees the matte."
+    )
+    embed: str = Field(description="The same for an `iframe` in a page of any website.")
+
+
+class Links(BaseModel):
+    """The links to a matte, newest first."""
+
+    links: list[Link]
+
+
+Days = Annotated[
+    float, Body(gt=0, le=3650, embed=True, description="Days until the link expires, a fraction too.")
+]
+
+
+@router.post("/mattes/{id}/links", status_code=201)
+def create_link(context: OwnerContext, id: str, days: Days = 30) -> NewLink:
+    """Make a link by which anyone can see the matte, live before pictures of their own, but nothing else.
+
+    Its path is in this answer only. The page has the matte as `GET /v1/mattes/{id}/live` sends it.
+    """
+    with writing(context.engine) as c:
+        mattes.get_ready(c, id)
+        token, row = links.create(c, id, days * DAY)
+    return NewLink(**Link.fields(row), path=f"/share/{token}", embed=f"/embed/{token}")
+
+
+@router.get("/mattes/{id}/links")
+def list_links(context: OwnerContext, id: str) -> Links:
+    """The links to the matte that have not expired, newest first."""
+    with reading(context.engine) as c:
+        mattes.get(c, id)
+        return Links(links=[Link(**Link.fields(row)) for row in links.list_all(c, id)])
+
+
+@router.delete("/mattes/{id}/links/{link}", status_code=204)
+def delete_link(context: OwnerContext, id: str, link: str) -> None:
+    """Delete a link: it leads nowhere from now on."""
+    with writing(context.engine) as c:
+        mattes.get(c, id)
+        links.remove(c, id, link)
+
+
+@page.get("/share/{token}", response_class=Response, responses={200: {"content": {"text/html": {}}}})
+async def get_shared(context: PublicContext, token: str, request: Request) -> Response:
+    """The page that a link leads to."""
+    return await _shown(context, token, request, {"Content-Security-Policy": f"{SANDBOX} 'none'"})
+
+
+@page.get("/embed/{token}", response_class=Response, responses={200: {"content": {"text/html": {}}}})
+async def get_embedded(context: PublicContext, token: str, request: Request) -> Response:
+    """The same page, which pages of other websites may show in an `iframe`."""
+    anywhere = {"Content-Security-Policy": f"{SANDBOX} *", "Cross-Origin-Resource-Policy": "cross-origin"}
+    return await _shown(context, token, request, anywhere)
+
+
+async def _shown(context: PublicContext, token: str, request: Request, headers: dict[str, str]) -> Response:
+    def find() -> Row[Any]:
+        with reading(context.engine) as c:
+            return links.find(c, token)
+
+    row = await anyio.to_thread.run_sync(find)
+    # What it costs counts as its owner's.
+    bound = replace(context, engine=for_owner(context.engine, row.owner), caller=Caller(row.owner, "read"))
+    # Asked for again each time, so that a deleted link shows nothing.
+    return await live_page(bound, row.matte, request, headers | {"Cache-Control": "private, no-store"})
