@@ -2,14 +2,19 @@
 
 import asyncio
 import logging
+from multiprocessing import forkserver
+from typing import Any
 
 import distributed
 from distributed.core import Status
+from tornado.ioloop import PeriodicCallback
 
 logger = logging.getLogger(__name__)
 
 PAUSE = 0.5
 """Seconds between two attempts to start a worker process."""
+LOOK = 2.0
+"""Seconds between two looks at what worker processes need."""
 SERVER_DIED = (EOFError, AttributeError)
 """What distributed raises if the fork server dies after it has taken a request, or before: an `AttributeError` then
 hides the `OSError`, since distributed wants to end a process that was never started."""
@@ -18,8 +23,13 @@ hides the `OSError`, since distributed wants to end a process that was never sta
 class Nanny(distributed.Nanny):  # type: ignore[misc]
     """A nanny that also replaces a worker whose fork server dies while it starts.
 
-    That of distributed gives up then, and lives on without a worker.
+    That of distributed gives up then, and lives on without a worker. This one also starts the fork server and the
+    resource tracker again if they die: multiprocessing itself does so only when it next needs them.
     """
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.periodic_callbacks["servers"] = PeriodicCallback(forkserver.ensure_running, LOOK * 1e3)
 
     async def instantiate(self) -> Status:
         """Start the worker process, or wait until it has started."""

@@ -93,7 +93,7 @@ def test_cancelled_job_frees_workers_and_disk(prepared: Prepared) -> None:
 
 
 PROMISED = 10.0
-"""Seconds until a worker or the fork server that was killed is there again; the rest starts when it is next needed."""
+"""Seconds until a process that was killed is there again; decoders and their servers start when next needed."""
 
 
 @dataclass
@@ -148,7 +148,7 @@ def test_any_process_of_a_service_killed(
     capture_archive: Path, tmp_path: Path, table: list[Row], times: int
 ) -> None:
     row = Row("SIGKILL of any process, 4 a job")
-    replaced_soon = {"worker", "fork server"}
+    replaced_soon = {"worker", "fork server", "resource tracker"}
     with serving(tmp_path / "data", "--workers", "2") as service:
         watch = Watch(psutil.Process(service.process.pid))
         capture = service.client.upload(capture_archive)["id"]

@@ -74,18 +74,26 @@ def test_another_user_of_this_machine_cannot_join(
     assert done.stdout.splitlines() == [f"{port} False" for port in ports]
 
 
+def processes_of(module: str) -> list[psutil.Process]:
+    """The children of this process that run a module of multiprocessing."""
+    mine = psutil.Process().children()
+    return [one for one in mine if one.status() != psutil.STATUS_ZOMBIE and module in " ".join(one.cmdline())]
+
+
+def test_resource_tracker_is_replaced_although_nothing_needs_it(cluster: LocalCluster) -> None:
+    (first,) = processes_of("resource_tracker")
+    first.kill()
+    until(lambda: set(processes_of("resource_tracker")) - {first}, 10)
+
+
 @pytest.mark.slow
 def test_worker_is_replaced_although_the_next_fork_server_dies_too(cluster: LocalCluster) -> None:
-    def fork_servers() -> list[psutil.Process]:
-        mine = psutil.Process().children()
-        return [one for one in mine if one.status() != "zombie" and "forkserver" in " ".join(one.cmdline())]
-
     with connect(cluster.scheduler_address, cluster.security) as client:
         before = {*client.run(os.getpid).values()}
-        (first,) = fork_servers()
+        (first,) = processes_of("forkserver")
         first.kill()
-        until(lambda: [one for one in fork_servers() if one != first])
-        fork_servers()[0].kill()  # while it imports what workers need
+        until(lambda: [one for one in processes_of("forkserver") if one != first])
+        processes_of("forkserver")[0].kill()  # while it imports what workers need
         until(lambda: {*client.run(os.getpid).values()} - before)
 
 
