@@ -297,7 +297,8 @@ class Settings(CoordinatorSettings):
     )
     request_seconds: int = _setting(
         300,
-        "How long a request may compute a composite, a layer or a picture, or import a GiB of a matte, in seconds.",
+        "How long a request may wait for its turn, and then compute a composite, a layer or a picture, or import a GiB "
+        "of a matte, in seconds.",
         ge=1,
     )
 

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
+from itertools import count
 from typing import TypeVar
 
 import anyio.to_thread
@@ -14,7 +15,7 @@ from fastapi import Request
 from starlette.requests import ClientDisconnect
 
 from services.runtime.problems import TooLarge
-from storage.errors import InvalidInput
+from storage.errors import InvalidInput, TooMany
 from workflows.interruption import interruptible
 
 T = TypeVar("T")
@@ -32,8 +33,9 @@ class _Turn:
 class Shares:
     """Slots, or bytes, that requests take while they work; no owner can have all of them.
 
-    Requests get them in the order in which they ask, except that those of an owner who has their share wait for that
-    owner's own. All calls are from one event loop.
+    Owners take turns: what is free goes to the one who has waited longest since their last turn, however many requests
+    others have waiting. The requests of an owner who has their share wait for that owner's own. All calls are from one
+    event loop.
 
     Parameters
     ----------
@@ -48,15 +50,20 @@ class Shares:
         self._free, self.each, self._name = total, each, name
         self._taken: Counter[str] = Counter()
         self._waiting: list[_Turn] = []
+        self._turns: dict[str, int] = {}
+        """The number of the last turn of each owner who has something, or waits."""
+        self._numbers = count(1)
 
     @asynccontextmanager
-    async def take(self, owner: str, amount: int = 1) -> AsyncIterator[None]:
+    async def take(self, owner: str, seconds: float, amount: int = 1) -> AsyncIterator[None]:
         """Wait for an amount, and have it during the block.
 
         Raises
         ------
         TooLarge
             If it is more than an owner may have.
+        TooMany
+            If its turn does not come within ``seconds``.
         """
         if amount > self.each:
             raise TooLarge(
@@ -70,7 +77,11 @@ class Shares:
         self._waiting.append(turn)
         self._admit()
         try:
-            await turn.came.wait()
+            try:
+                async with asyncio.timeout(seconds):
+                    await turn.came.wait()
+            except TimeoutError as error:
+                raise TooMany("other requests are served first; send this one again later") from error
             yield
         finally:
             if turn.came.is_set():
@@ -81,14 +92,18 @@ class Shares:
             self._admit()
 
     def _admit(self) -> None:
-        for turn in self._waiting.copy():
-            if self._taken[turn.owner] + turn.amount > self.each:
-                continue
+        waiting = {turn.owner for turn in self._waiting}
+        self._turns = {one: turn for one, turn in self._turns.items() if one in waiting or self._taken[one]}
+        while eligible := [
+            turn for turn in self._waiting if self._taken[turn.owner] + turn.amount <= self.each
+        ]:
+            turn = min(eligible, key=lambda turn: self._turns.get(turn.owner, 0))
             if turn.amount > self._free:
                 break  # else small ones would pass a large one for ever
             self._waiting.remove(turn)
             self._free -= turn.amount
             self._taken[turn.owner] += turn.amount
+            self._turns[turn.owner] = next(self._numbers)
             turn.came.set()
 
 
@@ -106,6 +121,8 @@ async def run(
 
     Parameters
     ----------
+    seconds : float
+        How long it may wait for its turn, and how long the work may take.
     needed : sequence of (Shares, int)
         What the work takes of each, in this order. All requests that take several must take them in the same order.
 
@@ -117,6 +134,8 @@ async def run(
         If the work takes more than ``seconds``.
     TooLarge
         If it needs more than an owner may have.
+    TooMany
+        If its turn does not come within ``seconds``.
     """
     unwanted = threading.Event()
 
@@ -138,12 +157,13 @@ async def run(
             return work()
 
     begun = False
+    last = time.monotonic() + seconds
 
     async def in_turn() -> T:
         nonlocal begun
         async with AsyncExitStack() as taken:
             for shares, amount in needed:
-                await taken.enter_async_context(shares.take(owner, amount))
+                await taken.enter_async_context(shares.take(owner, last - time.monotonic(), amount))
             begun = True
             return await anyio.to_thread.run_sync(interruptibly, limiter=anyio.CapacityLimiter(1))
 

@@ -108,8 +108,8 @@ async def post_composite(
     state = await anyio.to_thread.run_sync(_matte_state, context, id)
     limit = context.settings.backdrop_bytes
     announced = BodyLimit(limit).check_announced(request) or limit
-    owner = context.caller.owner
-    async with context.backdrops.take(owner, announced), spool_body(request, limit) as body:
+    turn = context.backdrops.take(context.caller.owner, context.settings.request_seconds, announced)
+    async with turn, spool_body(request, limit) as body:
 
         def answer() -> Response:
             with context.stored(mattes.get, id):

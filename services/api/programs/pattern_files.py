@@ -49,7 +49,7 @@ async def get_patterns(context: OwnerContext, program: Stored) -> StreamingRespo
 
     async def stream() -> AsyncIterator[bytes]:
         while True:
-            async with context.pictures.take(context.caller.owner):
+            async with context.pictures.take(context.caller.owner, context.settings.request_seconds):
                 part = await anyio.to_thread.run_sync(next, parts, b"")
             if not part:
                 return

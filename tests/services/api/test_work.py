@@ -49,7 +49,7 @@ def works() -> Iterator[Works]:
     errors.register(app)
 
     @app.get("/{owner}")
-    async def work(request: Request, owner: str) -> None:
+    async def work(request: Request, owner: str, seconds: float = SECONDS) -> None:
         def until_ended() -> None:
             made.working.add(owner)
             try:
@@ -59,7 +59,7 @@ def works() -> Iterator[Works]:
             finally:
                 made.working.remove(owner)
 
-        await run(request, owner, SECONDS, [(shares, 1)], until_ended)
+        await run(request, owner, seconds, [(shares, 1)], until_ended)
 
     config = uvicorn.Config(app, port=0, log_config=None, lifespan="off", timeout_graceful_shutdown=1)
     with config.bind_socket() as bound:
@@ -73,7 +73,7 @@ def works() -> Iterator[Works]:
 
 
 def test_work_ends_with_its_client_and_leaves_room_for_the_next(works: Works) -> None:
-    asking = [works.start("alice", 0.5) for _ in range(5)]
+    asking = [works.start("alice", 1.5) for _ in range(5)]
     until(lambda: "alice" in works.working)
     bob = works.start("bob", 0.5)  # alice cannot have both slots
     until(lambda: works.working == {"alice", "bob"})
@@ -104,7 +104,7 @@ def test_owners_take_turns_and_small_amounts_do_not_pass_large_ones() -> None:
     order: list[str] = []
 
     async def take(shares: Shares, name: str, owner: str, amount: int) -> None:
-        async with shares.take(owner, amount):
+        async with shares.take(owner, SECONDS, amount):
             order.append(name)
             await asyncio.sleep(0.01)
 
@@ -120,12 +120,36 @@ def test_owners_take_turns_and_small_amounts_do_not_pass_large_ones() -> None:
         await asyncio.gather(*(take(shares, *one) for one in asked))
 
     asyncio.run(all_of_them())
-    assert order == ["a1", "b1", "a2", "c1", "d1"]
+    assert order == ["a1", "b1", "c1", "d1", "a2"]
+
+
+def test_two_owners_with_many_requests_keep_a_third_waiting_for_one_turn() -> None:
+    order: list[str] = []
+
+    async def take(shares: Shares, owner: str) -> None:
+        async with shares.take(owner, SECONDS):
+            order.append(owner)
+            await asyncio.sleep(0.01)
+
+    async def all_of_them() -> None:
+        shares = Shares(2, 1)
+        await asyncio.gather(*(take(shares, owner) for owner in ["alice", "bob"] * 20 + ["carol"]))
+
+    asyncio.run(all_of_them())
+    assert order.index("carol") == 2
+
+
+def test_turn_that_does_not_come_is_refused_with_when_to_try_again(works: Works) -> None:
+    asking = works.start("alice?seconds=60", 2)
+    until(lambda: "alice" in works.working)
+    answer = httpx2.get(f"{works.url}/alice?seconds=0.1", timeout=60)
+    assert (answer.status_code, int(answer.headers["retry-after"]) > 0) == (429, True)
+    asking.join()
 
 
 def test_more_than_an_owner_may_have_is_refused_by_the_setting() -> None:
     async def ask() -> None:
-        async with Shares(100, 50, "request_memory").take("alice", 51):
+        async with Shares(100, 50, "request_memory").take("alice", SECONDS, 51):
             pass
 
     with pytest.raises(TooLarge, match="ENVMATTE_REQUEST_MEMORY") as caught:
@@ -136,11 +160,11 @@ def test_more_than_an_owner_may_have_is_refused_by_the_setting() -> None:
 def test_turn_that_is_given_up_takes_nothing() -> None:
     async def give_up() -> None:
         shares = Shares(1, 1)
-        async with shares.take("alice"):
+        async with shares.take("alice", SECONDS):
             with pytest.raises(TimeoutError):
-                async with asyncio.timeout(0.01), shares.take("bob"):
+                async with asyncio.timeout(0.01), shares.take("bob", SECONDS):
                     pass
-        async with asyncio.timeout(5), shares.take("carol"):
+        async with shares.take("carol", SECONDS):
             pass
 
     asyncio.run(give_up())
