@@ -1,18 +1,55 @@
-"""How a process ends when it is asked to."""
+"""How a process ends when it is asked to: in order, but within a time that all it has to close shares."""
 
 import asyncio
+import logging
+import os
 import signal
 import sys
-from contextlib import AbstractAsyncContextManager
+import threading
+import time
+from contextlib import AbstractAsyncContextManager, suppress
+
+import psutil
+
+logger = logging.getLogger(__name__)
+
+LIMIT = 6.0
+"""Seconds from the first signal until the process and its children are killed. All that is stored survives a sudden end
+at any moment, as after a crash."""
+
+
+def end_in_time() -> None:
+    """Kill this process and its children in `LIMIT` seconds, unless it ends before."""
+    threading.Thread(target=_end, args=(time.monotonic() + LIMIT,), daemon=True).start()
+
+
+def _end(last: float) -> None:
+    # Listed now: those whose parent ends meanwhile are no longer below this process.
+    children = psutil.Process().children(recursive=True)
+    time.sleep(max(last - time.monotonic(), 0))
+    text = "not everything has ended %g s after the signal; the process ends all the same"
+    said = threading.Thread(target=logger.warning, args=(text, LIMIT), daemon=True)
+    said.start()
+    # Workers and decoders would notice it only some seconds later.
+    for child in {*children, *psutil.Process().children(recursive=True)}:
+        with suppress(psutil.NoSuchProcess):
+            child.kill()
+    said.join(0.2)  # what hangs may hold a lock of the log
+    os._exit(0)
 
 
 def exit_on_sigterm() -> None:
-    """Raise SystemExit in the main thread at SIGTERM, so that everything open is closed."""
-    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))
+    """Raise SystemExit in the main thread at SIGTERM, so that everything open is closed, in time."""
+
+    def end(number: int, frame: object) -> None:
+        end_in_time()
+        sys.exit(0)
+
+    signal.signal(signal.SIGTERM, end)
 
 
 def run_until_signal(service: AbstractAsyncContextManager[object]) -> None:
-    """Keep a service open, in an event loop of this thread, until SIGTERM or SIGINT.
+    """Keep a service open, in an event loop of this thread, until SIGTERM or SIGINT; then close it, in time.
 
     Raises
     ------
@@ -26,7 +63,9 @@ def run_until_signal(service: AbstractAsyncContextManager[object]) -> None:
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, received.put_nowait, number)
         async with service:
-            return await received.get()
+            last = await received.get()
+            end_in_time()
+            return last
 
     if asyncio.run(run()) == signal.SIGINT:
         raise KeyboardInterrupt

@@ -14,7 +14,8 @@ import time
 import uvicorn
 from fastapi import FastAPI
 from services.api.http import shutdown
-shutdown.LIMIT = 1.5
+from services.runtime import signals
+signals.LIMIT = 1.5
 app = FastAPI()
 @app.get("/")
 def hang():
