@@ -1,0 +1,97 @@
+"""Backdrops that wait on disk, on a real port: an owner has a share of them, and broken uploads leave nothing."""
+
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import httpx2
+import numpy as np
+import pytest
+import uvicorn
+from sqlalchemy import Engine
+
+from services.api.app import BACKDROPS, build_app
+from services.settings import Settings
+from storage.database.engine import writing
+from storage.database.owners import for_owner
+from storage.objects.store import Objects
+from storage.records import api_keys, mattes
+from tests.parts.hostile_mattes import large_matte
+from tests.parts.waiting import until
+from workflows.images.integer_formats import encode_png
+
+LIMIT = 2 << 20
+"""Bytes of a backdrop."""
+SENT = 3 << 19
+"""Bytes of each that come: more than are kept in memory."""
+BACKDROP = encode_png(np.zeros((8, 8, 3), np.uint8))
+
+
+@dataclass
+class Api:
+    url: str
+    keys: dict[str, str]
+
+    def composite(self, owner: str, seconds: float = 120) -> httpx2.Response:
+        headers = {"Authorization": f"Bearer {self.keys[owner]}"}
+        url = f"{self.url}/v1/mattes/{owner}/composite"
+        return httpx2.post(url, content=BACKDROP, headers=headers, timeout=seconds)
+
+    def begin(self, owner: str) -> socket.socket:
+        """Begin a composite with a backdrop of unknown length that does not end."""
+        where = urlsplit(self.url)
+        connection = socket.create_connection((where.hostname or "", where.port or 0))
+        head = (
+            f"POST /v1/mattes/{owner}/composite HTTP/1.1\r\nHost: {where.netloc}\r\n"
+            f"Authorization: Bearer {self.keys[owner]}\r\nTransfer-Encoding: chunked\r\n\r\n{LIMIT:x}\r\n"
+        )
+        connection.sendall(head.encode() + bytes(SENT))
+        return connection
+
+
+@pytest.fixture
+def api(tmp_path: Path, engine: Engine, objects: Objects) -> Iterator[Api]:
+    with writing(engine) as c:
+        keys = {owner: api_keys.create(c, owner, owner, "write") for owner in ("alice", "bob")}
+    for owner in keys:
+        made = large_matte(tmp_path / "store", owner, 64)
+        with writing(for_owner(engine, owner)) as c:
+            mattes.add_imported(c, owner, {"method": "lobes"}, made.figures)
+    app = build_app(Settings(data=tmp_path, backdrop_bytes=LIMIT), engine, objects)
+    config = uvicorn.Config(app, port=0, log_config=None, lifespan="off", timeout_graceful_shutdown=1)
+    server = uvicorn.Server(config)
+    with config.bind_socket() as bound:
+        bound.listen()
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [bound]})
+        thread.start()
+        yield Api(f"http://127.0.0.1:{bound.getsockname()[1]}", keys)
+        server.should_exit = True
+        thread.join()
+    app.state.context.decoders.close()
+
+
+def spooled() -> int:
+    """Bytes of the temporary files without a name that this process has open."""
+    size = 0
+    for file in Path("/proc/self/fd").iterdir():
+        with suppress(FileNotFoundError):  # it has been closed
+            if str(file.readlink()).endswith("(deleted)"):
+                size += file.stat().st_size
+    return size
+
+
+def test_backdrops_of_one_owner_keep_no_other_waiting_and_leave_nothing(api: Api) -> None:
+    before, share = spooled(), BACKDROPS // 2
+    sending = [api.begin("alice") for _ in range(share)]
+    until(lambda: spooled() - before >= share * SENT)
+    assert api.composite("bob").status_code == 200
+    with pytest.raises(httpx2.ReadTimeout):
+        api.composite("alice", seconds=1)
+    for one in sending:
+        one.close()
+    assert api.composite("alice").status_code == 200
+    until(lambda: spooled() == before)
