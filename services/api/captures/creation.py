@@ -21,7 +21,7 @@ from services.runtime.problems import WrongMediaType
 from services.webhooks.sender import check_webhook
 from storage.database.engine import reading, writing
 from storage.database.rows import new_id
-from storage.errors import CaptureError, Conflict, NotFound
+from storage.errors import CaptureError, Conflict, NotFound, Unavailable
 from storage.layout import uploads as stored_uploads
 from storage.layout.uploads import Part
 from storage.records import bodies, captures, jobs, uploads
@@ -104,8 +104,9 @@ async def _from_body(
             parts = [await store_as_upload(pieces, context.objects, capture)]
             register = partial(_register, context, capture, parts, name, key, False, webhook)
             row = await context.compute(request, context.captures, register)
-        except Exception:
-            # Not when cancelled: `register` may still be running in its thread. Then a sweep removes the bytes.
+        except Unavailable:  # there may be a capture; a sweep removes bytes without one
+            raise
+        except Exception:  # not when cancelled: `register` may still be running in its thread
             await anyio.to_thread.run_sync(stored_uploads.remove, context.objects, capture)
             raise
     if row.id != capture:  # a concurrent request with the same key was quicker
@@ -189,4 +190,4 @@ def _register(
         )
         return capture
 
-    return idempotent(context.engine, key, CALL, captures.get, create)
+    return idempotent(context.engine, key, CALL, captures.get, create, capture)

@@ -1,5 +1,6 @@
 """Idempotency-Key: a repeated POST is answered with what the first one created."""
 
+import time
 from collections.abc import Callable
 from typing import Annotated, TypeVar
 
@@ -8,11 +9,15 @@ from sqlalchemy import Connection, Engine
 from sqlalchemy.exc import IntegrityError
 
 from storage.database.engine import reading, writing
+from storage.errors import NotFound, Unavailable
 from storage.records.idempotency import add, find
 
 T = TypeVar("T")
 Read = Callable[[Connection, str], T]
 """Reads what an id stands for; raises `NotFound` if it has been deleted."""
+PATIENCE = 10.0
+"""Seconds within which a database that is restarted should be back."""
+PAUSE = 0.2
 IdempotencyKey = Annotated[str | None, Header(alias="Idempotency-Key", max_length=256)]
 
 
@@ -32,7 +37,12 @@ def find_earlier(engine: Engine, key: str | None, call: str, read: Read[T]) -> T
 
 
 def idempotent(
-    engine: Engine, key: str | None, call: str, read: Read[T], create: Callable[[Connection], str]
+    engine: Engine,
+    key: str | None,
+    call: str,
+    read: Read[T],
+    create: Callable[[Connection], str],
+    new: str | None = None,
 ) -> T:
     """Create something and remember its key in one transaction, unless an earlier request with the key did.
 
@@ -44,15 +54,39 @@ def idempotent(
         Method and path of the route: a key may be used once for each.
     create : callable
         Creates it within the transaction, and returns its id.
+    new : str, optional
+        The id of what ``create`` creates. With it, a transaction that a restart of the database ends is repeated.
 
     Raises
     ------
     NotFound
         If an earlier request created it and it has been deleted since.
+    Unavailable
+        If the database stays away. The transaction may have been committed or not.
     """
+    give_up = time.monotonic() + (PATIENCE if new else 0)
+    while True:
+        try:
+            return _once(engine, key, call, read, create, new)
+        except Unavailable:
+            if time.monotonic() > give_up:
+                raise
+        time.sleep(PAUSE)
+
+
+def _once(
+    engine: Engine,
+    key: str | None,
+    call: str,
+    read: Read[T],
+    create: Callable[[Connection], str],
+    new: str | None,
+) -> T:
     try:
         with writing(engine) as c:
             created = find(c, key, call) if key else None
+            if created is None and new and _exists(c, new, read):  # committed, before the connection broke
+                created = new
             if created is None:
                 created = create(c)
                 if key:
@@ -63,3 +97,11 @@ def idempotent(
         if earlier is None:
             raise
         return earlier
+
+
+def _exists(connection: Connection, id: str, read: Read[T]) -> bool:
+    try:
+        read(connection, id)
+    except NotFound:
+        return False
+    return True

@@ -109,7 +109,7 @@ def _import(context: Context, matte: str, part: Part, key: str | None) -> Row[An
         return matte
 
     try:
-        row = idempotent(context.engine, key, CALL, mattes.get, create)
+        row = idempotent(context.engine, key, CALL, mattes.get, create, matte)
     except (NoRoom, NotFound):
         # After any other error the row may have been written; if it was not, the coordinator sweeps the matte.
         objects.delete(stored_mattes.path(matte))

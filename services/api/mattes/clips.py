@@ -20,7 +20,7 @@ from services.runtime import tracing
 from services.webhooks.sender import check_webhook
 from storage.database.engine import reading
 from storage.database.rows import new_id
-from storage.errors import Conflict, Corrupt
+from storage.errors import Conflict, Corrupt, Unavailable
 from storage.layout import composites
 from storage.records import bodies, jobs, mattes
 
@@ -73,8 +73,9 @@ async def composite_clip(
                 pieces = reservation.watch(limit.stream(request))
                 size = await store_body(pieces, context.objects, composites.clip_path(id))
                 job = await anyio.to_thread.run_sync(_queue, context, id, matte, options, key, size, webhook)
-            except Exception:
-                # Not when cancelled: `_queue` may still be running in its thread. A sweep removes clips without job.
+            except Unavailable:  # there may be a job; a sweep removes clips without one
+                raise
+            except Exception:  # not when cancelled: `_queue` may still be running in its thread
                 await anyio.to_thread.run_sync(context.objects.delete, composites.path(id))
                 raise
         if job.id != id:  # a concurrent request with the same key was quicker
@@ -142,7 +143,7 @@ def _queue(
         jobs.add(c, "composite", capture, options, matte, trace, job, size, webhook)
         return job
 
-    return idempotent(context.engine, key, CALL, Job.read, create)
+    return idempotent(context.engine, key, CALL, Job.read, create, job)
 
 
 def _span(text: str, size: int) -> tuple[int, int]:

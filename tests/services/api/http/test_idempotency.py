@@ -1,12 +1,14 @@
 """Repeated requests with one Idempotency-Key: one thing is created, and every answer is about it."""
 
+import sqlite3
+
 import pytest
-from sqlalchemy import Connection, Engine
+from sqlalchemy import Connection, Engine, PoolProxiedConnection
 
 from services.api.http import idempotency
 from services.api.http.idempotency import find_earlier, idempotent
 from storage.database.engine import reading, writing
-from storage.errors import NotFound
+from storage.errors import NotFound, Unavailable
 from storage.records import jobs
 
 CALL = "POST /v1/jobs"
@@ -69,3 +71,37 @@ def test_concurrent_repeat_answers_with_quicker_one(engine: Engine, monkeypatch:
     assert idempotent(engine, "a", CALL, jobs.get, create).id == first.id
     assert len(keys) == 2
     assert count(engine) == 1
+
+
+@pytest.mark.parametrize("committed", [False, True])
+def test_transaction_whose_connection_breaks_creates_once(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch, committed: bool
+) -> None:
+    """As by a restart of PostgreSQL, before the commit or before its answer."""
+    broken = sqlite3.OperationalError()
+    broken.sqlite_errorcode = sqlite3.SQLITE_IOERR
+    commit, breaks = engine.dialect.do_commit, [broken]
+
+    def do_commit(connection: PoolProxiedConnection) -> None:
+        if committed or not breaks:
+            commit(connection)
+        if breaks:
+            raise breaks.pop()
+
+    monkeypatch.setattr(engine.dialect, "do_commit", do_commit)
+    monkeypatch.setattr(idempotency, "PAUSE", 0)
+
+    def create(connection: Connection) -> str:
+        return jobs.add(connection, "recover", "cap", {}, "mat", None, "job")
+
+    assert idempotent(engine, None, CALL, jobs.get, create, "job").id == "job"
+    assert (breaks, count(engine)) == ([], 1)
+
+
+def test_database_that_stays_away_is_given_up(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    def create(connection: Connection) -> str:
+        raise Unavailable("it is away")
+
+    monkeypatch.setattr(idempotency, "PATIENCE", 0.1)
+    with pytest.raises(Unavailable):
+        idempotent(engine, None, CALL, jobs.get, create, "job")

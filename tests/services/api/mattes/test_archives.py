@@ -1,0 +1,55 @@
+"""PostgreSQL is restarted while a matte is imported: the import goes on, and leaves one matte."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy import event
+
+from services.api.app import build_app
+from services.settings import Settings
+from storage.database.engine import open_engine
+from storage.layout.mattes import Matte
+from storage.objects.store import Objects
+from tests.parts.postgres import Server
+from tests.services.api.mattes.archives import archive
+
+ZIP = {"Content-Type": "application/zip"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moment", ["unpacking", "writing its row"])
+def test_import_goes_on_although_the_database_restarts(
+    postgresql: str, postgresql_server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: str
+) -> None:
+    engine, objects = open_engine(postgresql), Objects((tmp_path / "store").as_uri())
+    restarts: list[str] = []
+
+    def restart() -> None:
+        if not restarts:
+            restarts.append(moment)
+            postgresql_server.restart()
+
+    if moment == "unpacking":
+        write = Matte.write
+        monkeypatch.setattr(Matte, "write", lambda *block: (restart(), write(*block)))
+    else:
+
+        @event.listens_for(engine, "after_cursor_execute")
+        def executed(connection: Any, cursor: Any, sql: str, *more: Any) -> None:
+            if sql.startswith("INSERT INTO mattes"):
+                restart()
+
+    sent = archive(tmp_path / "made", 300, 200)
+    app = build_app(Settings(data=tmp_path), engine, objects)
+    with TestClient(app, "http://127.0.0.1") as client:
+        answer = client.post("/v1/mattes", content=sent, headers=ZIP)
+        assert (answer.status_code, restarts) == (201, [moment]), answer.text
+        made = answer.json()["id"]
+        assert [one["id"] for one in client.get("/v1/mattes").json()["mattes"]] == [made]
+        assert client.get(f"/v1/mattes/{made}/archive").content == sent
+    assert set(objects.names("mattes")) - {"zarr.json"} == {made}
+    assert objects.names("uploads") == []
+    app.state.context.decoders.close()
+    engine.dispose()
