@@ -17,6 +17,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import httpx2
 import psutil
 from sqlalchemy import Engine, Table, insert, select
 
@@ -34,6 +35,29 @@ IDLE = 20.0
 """Seconds of watching the service without a request."""
 STATES = ("succeeded",) * 7 + ("failed", "cancelled", "cancelled")
 """Of ten composites."""
+PATHS = (
+    "/v1/captures",
+    "/v1/captures?limit=1000",
+    "/v1/captures/{capture}",
+    "/v1/mattes",
+    "/v1/mattes?limit=1000",
+    "/v1/mattes/{matte}",
+    "/v1/mattes?capture={capture}",
+    "/v1/jobs",
+    "/v1/jobs?limit=1000",
+    "/v1/jobs?limit=1000&after={last}",
+    "/v1/jobs?state=running",
+    "/v1/jobs?state=failed",
+    "/v1/jobs?capture={capture}",
+    "/v1/jobs?matte={matte}",
+    "/v1/jobs/{job}",
+    "/v1/programs",
+    "/v1/limits",
+    "/v1/cluster",
+    "/metrics",
+    "/readyz",
+)
+"""What is asked for."""
 
 
 def main() -> None:
@@ -125,45 +149,30 @@ def fill(engine: Engine, count: int) -> None:
                 c.execute(insert(table), [row for group in some for row in group[table]])
 
 
-def timed(service: Service, archive: Path) -> Iterator[tuple[str, float]]:
-    """The longest of three answers to each call."""
-    http = service.http
+def calls(http: httpx2.Client) -> Iterator[tuple[str, list[float]]]:
+    """Each call that reads rows, and the seconds until each of three answers."""
     captures = http.get("/v1/captures").json()
     jobs = http.get("/v1/jobs?limit=1000").json()
-    last = jobs["jobs"][-1]["id"]
-    matte = http.get("/v1/mattes").json()["mattes"][0]["id"]
-    job = jobs["jobs"][0]["id"]
-    capture = captures["captures"][0]["id"]
-    for path in (
-        "/v1/captures",
-        "/v1/captures?limit=1000",
-        f"/v1/captures/{capture}",
-        "/v1/mattes",
-        "/v1/mattes?limit=1000",
-        f"/v1/mattes/{matte}",
-        f"/v1/mattes?capture={capture}",
-        "/v1/jobs",
-        "/v1/jobs?limit=1000",
-        f"/v1/jobs?limit=1000&after={last}",
-        "/v1/jobs?state=running",
-        "/v1/jobs?state=failed",
-        f"/v1/jobs?capture={capture}",
-        f"/v1/jobs?matte={matte}",
-        f"/v1/jobs/{job}",
-        "/v1/programs",
-        "/v1/uploads",
-        "/v1/limits",
-        "/v1/cluster",
-        "/metrics",
-        "/readyz",
-    ):
+    ids = {
+        "capture": captures["captures"][0]["id"],
+        "matte": http.get("/v1/mattes").json()["mattes"][0]["id"],
+        "job": jobs["jobs"][0]["id"],
+        "last": jobs["jobs"][-1]["id"],
+    }
+    for path in PATHS:
         took = []
         for _ in range(3):
             began = time.monotonic()
-            answer = http.get(path)
+            answer = http.get(path.format(**ids))
             took.append(time.monotonic() - began)
-        shown = path.replace(capture, "ID").replace(matte, "ID").replace(job, "ID").replace(last, "ID")
-        yield f"GET {shown}{'' if answer.is_success else f' ({answer.status_code})'}", max(took)
+            assert answer.is_success, answer.text
+        yield f"GET {path}", took
+
+
+def timed(service: Service, archive: Path) -> Iterator[tuple[str, float]]:
+    """The longest of three answers to each call, and how long jobs take."""
+    http = service.http
+    yield from ((call, max(took)) for call, took in calls(http))
     began = time.monotonic()
     uploaded = service.client.upload(archive)
     yield "an upload", time.monotonic() - began
