@@ -25,12 +25,13 @@ def faults(block: Block, nodes: int) -> Iterator[tuple[str, str]]:
         yield "count", "a pixel whose channels share a row has cells in the others"
     if block.cell.max(initial=0) >= nodes:
         yield "cell", f"a cell is beyond the {nodes} of its grids"
-    sizes = block.count.ravel().astype(np.int64)
-    row = np.repeat(np.arange(sizes.size), sizes)
-    if not ((np.diff(block.cell.astype(np.int64)) > 0) | (np.diff(row) > 0)).all():
+    # Cells may be millions: what is computed for each takes little memory.
+    sizes = block.count[block.count > 0].astype(np.int64)
+    row = np.repeat(np.arange(sizes.size, dtype=np.uint32), sizes)
+    if not ((block.cell[1:] > block.cell[:-1]) | (row[1:] > row[:-1])).all():
         yield "cell", "the cells of a row do not ascend"
     if not (np.isfinite(block.weight) & (block.weight > 0)).all():
         yield "weight", "a weight is not positive"
-    total = np.bincount(row, block.weight, sizes.size)
-    if (np.abs(total - 1)[sizes > 0] > TOLERANCE).any():
+    total = np.add.reduceat(block.weight, np.cumsum(sizes) - sizes, dtype=np.float64)
+    if (np.abs(total - 1) > TOLERANCE).any():
         yield "weight", "the weights of a row do not add up to 1"

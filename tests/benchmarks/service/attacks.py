@@ -1,0 +1,144 @@
+"""How long others wait while one owner asks forty times at once for what costs most, before a version and now.
+
+    python -m tests.benchmarks.service.attacks --before PATH [--seconds 10]
+
+PATH is a checkout of an earlier version with a virtual environment ``.venv`` of its own, such as
+
+    git worktree add PATH COMMIT && cd PATH && python3 -m venv .venv && .venv/bin/pip install -c requirements.lock -e .
+
+Each attack is made on the earlier version and on this one in turn, each time on a service that has just been started.
+Meanwhile another owner asks for ``/healthz`` and for a composite, one after the other, and gives each up after ten
+seconds. Printed are the median and the 99th percentile of both, and how many were answered. Run it from the root of the
+repository.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx2
+import numpy as np
+import psutil
+
+from tests.end_to_end.conftest import Service, serving
+from tests.faults.test_attacks import ATTACKS, MATTES, ZIP, Attacked, bearer, under_attack
+from tests.parts.hostile_mattes import hostile_archive
+from workflows.images.integer_formats import encode_png
+
+PATIENCE = 10.0
+"""Seconds after which the other owner gives a request up."""
+MADE = tuple(name for name, path in ATTACKS.items() if any(f"{{{one}}}" in path for one in MATTES))
+"""The attacks that need nothing but imported mattes, which an earlier version takes too."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--before", type=Path, required=True)
+    parser.add_argument("--seconds", type=float, default=10)
+    args = parser.parse_args()
+    before = args.before.resolve()
+    versions = {
+        "before": ("env", "-C", str(before), str(before / ".venv/bin/python")),
+        "now": (sys.executable,),
+    }
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        archives = {
+            name: hostile_archive(folder / name, **costs)  # type: ignore[arg-type]
+            for name, costs in MATTES.items()
+        }
+        archives["own"] = hostile_archive(folder / "own", cells=20, columns=64, rows=48, edge=16)
+        (folder / "backdrop.png").write_bytes(encode_png(np.zeros((48, 64, 3), np.uint8)))
+        prepared = {
+            version: prepare(folder, version, command, archives) for version, command in versions.items()
+        }
+        print("| forty callers of | | `/healthz` | a composite | answered |\n|---|---|---|---|---|")
+        for attack in MADE:
+            for version, command in versions.items():
+                with started(folder / version, command) as service:
+                    keys, ids = prepared[version]
+                    attacked = Attacked(service, keys, ids, ids["own"], folder / "backdrop.png")
+                    print(f"| {attack} | {version} | {measure(attacked, attack, args.seconds)} |", flush=True)
+
+
+def prepare(
+    folder: Path, version: str, command: Sequence[str], archives: dict[str, bytes]
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Make keys, and import mattes; returns the keys by owner, and the ids by what they cost."""
+    keys = {owner: make_key(command, folder / version, owner) for owner in ("alice", "mallory")}
+    with started(folder / version, command) as service:
+        ids = {}
+        for name, archive in archives.items():
+            headers = ZIP | bearer(keys["alice" if name == "own" else "mallory"])
+            sent = httpx2.post(f"{service.url}/v1/mattes", content=archive, headers=headers, timeout=300)
+            ids[name] = str(sent.raise_for_status().json()["id"])
+    return keys | {"mallory reads": keys["mallory"]}, ids
+
+
+def make_key(command: Sequence[str], data: Path, owner: str) -> str:
+    make = [*command, "-m", "services", "keys", "make", owner, "--owner", owner, "--data", str(data)]
+    return subprocess.run(make, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
+
+
+@contextmanager
+def started(data: Path, command: Sequence[str]) -> Iterator[Service]:
+    """A service that is killed at the end: an earlier version may not end when it is asked to."""
+    with serving(data, "--workers", "1", within=command) as service:
+        try:
+            yield service
+        finally:
+            for process in psutil.Process(service.process.pid).children(recursive=True):
+                process.kill()
+            service.kill()
+
+
+def measure(attacked: Attacked, attack: str, seconds: float) -> str:
+    """The cells of a row: the seconds of both calls, and how many were answered."""
+    took: dict[str, list[float]] = {"healthz": [], "composite": []}
+    composite(attacked, 600)  # compiles and reads what it needs
+    with under_attack(attacked, ATTACKS[attack]):
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            for name, seconds_of in took.items():
+                began = time.monotonic()
+                try:
+                    composite(attacked) if name == "composite" else healthz(attacked)
+                except httpx2.TimeoutException:
+                    seconds_of.append(np.inf)
+                else:
+                    seconds_of.append(time.monotonic() - began)
+    cells = [f"{percentile(one, 50)}, {percentile(one, 99)}" for one in took.values()]
+    every = [one for of_call in took.values() for one in of_call]
+    return " | ".join([*cells, f"{sum(np.isfinite(every))} of {len(every)}"])
+
+
+def percentile(seconds: Sequence[float], share: float) -> str:
+    found = float(np.percentile(seconds, share, method="higher"))
+    return f"{found:.2f} s" if np.isfinite(found) else "none"
+
+
+def healthz(attacked: Attacked) -> None:
+    httpx2.get(f"{attacked.service.url}/healthz", timeout=PATIENCE).raise_for_status()
+
+
+def composite(attacked: Attacked, patience: float = PATIENCE) -> None:
+    """Ask for a composite as the owner who does not attack."""
+    httpx2.post(
+        f"{attacked.service.url}/v1/mattes/{attacked.own}/composite",
+        content=attacked.backdrop.read_bytes(),
+        headers=bearer(attacked.keys["alice"]),
+        timeout=patience,
+    ).raise_for_status()
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("ENVMATTE_MATTE_MEMORY", str(128 << 20))
+    main()
