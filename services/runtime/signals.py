@@ -13,7 +13,7 @@ import psutil
 
 logger = logging.getLogger(__name__)
 
-LIMIT = 6.0
+LIMIT = 5.0
 """Seconds from the first signal until the process and its children are killed. All that is stored survives a sudden end
 at any moment, as after a crash."""
 
