@@ -87,6 +87,7 @@ class Ingest(JobKind):
 
     def succeeded(self, connection: Connection, task: Task, figures: dict[str, Any]) -> None:
         captures.change(connection, task.capture, state="ready")
+        jobs.change(connection, task.job, plan=task.plan | figures)
 
     def failed(self, connection: Connection, task: Task, problem: Problem) -> None:
         captures.change(

@@ -19,6 +19,7 @@ from workflows.ingest import films, stills
 from workflows.ingest.archive import CaptureArchive
 from workflows.ingest.manifest import MANIFEST
 from workflows.ingest.report.calibration import measure
+from workflows.ingest.report.recovery_time import core_seconds
 from workflows.ingest.report.survey import survey
 from workflows.ingest.video.border_reader import LOOKS
 from workflows.ingest.video.frame_means import Share
@@ -172,13 +173,19 @@ def missing(objects: Objects, task: Task) -> list[int]:
 
 
 def finish(objects: Objects, task: Task) -> dict[str, Any]:
-    """Remove what interrupted workers left beside the stack, and measure the capture."""
+    """Remove what interrupted workers left beside the stack, and measure the capture.
+
+    Returns
+    -------
+    dict
+        ``core_seconds`` that its recovery will take, by quality.
+    """
     objects.sweep(captures.path(task.capture))
     stack = Stack(objects, task.capture)
     measure(stack)
     survey(stack)
     stack.save()
-    return {}
+    return {"core_seconds": core_seconds(stack)}
 
 
 STEPS = Steps("ingest", "reading", prepare, work, missing, finish, scattered=False)

@@ -6,12 +6,13 @@ from typing import Any, Literal, Self
 import anyio.to_thread
 from fastapi import APIRouter, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
-from sqlalchemy import Row
+from sqlalchemy import Connection, Row
 
 from services.api.context import OwnerContext
 from services.api.http.bodies import read_json, schema_of
 from services.api.http.responses import bytes_response, json_response, utc_time
 from services.api.http.types import After, Limit
+from services.api.jobs.eta import seconds_to_recover
 from storage.database.engine import reading, writing
 from storage.database.rows import page
 from storage.database.tables import captures as table
@@ -62,6 +63,21 @@ class Capture(ListedCapture):
     """A capture. Its program may be large."""
 
     program: dict[str, Any]
+    recovery_seconds: dict[str, float] | None = Field(
+        description="How long a recovery will take on the workers that there are now, by `quality`, from a trial on "
+        "some pixels; null until it is measured, without workers, and once the ingest job is deleted."
+    )
+
+    @classmethod
+    def of(cls, row: Row[Any], recovery_seconds: dict[str, float] | None = None) -> Self:
+        listed = ListedCapture.of(row).model_dump()
+        return cls(**listed, program=row.program, recovery_seconds=recovery_seconds)
+
+    @classmethod
+    def read(cls, connection: Connection, id: str) -> "Capture":
+        """A capture by its id; `NotFound` if there is none."""
+        row = captures.get(connection, id)
+        return cls.of(row, seconds_to_recover(connection, row))
 
 
 class CaptureChange(BaseModel):
@@ -101,7 +117,7 @@ async def get_capture(context: OwnerContext, id: str, request: Request) -> Respo
 
     def make() -> Response:
         with reading(context.engine) as c:
-            return json_response(Capture.of(captures.get(c, id)))
+            return json_response(Capture.read(c, id))
 
     return await context.compute(request, context.lists, make)
 
@@ -122,7 +138,7 @@ async def change_capture(context: OwnerContext, id: str, request: Request) -> Re
         with writing(context.engine) as c:
             captures.get(c, id)  # it may have been deleted meanwhile
             captures.change(c, id, name=change.name)
-            return json_response(Capture.of(captures.get(c, id)))
+            return json_response(Capture.read(c, id))
 
     await anyio.to_thread.run_sync(require)
     change = await read_json(request, CaptureChange, CHANGE_BYTES)

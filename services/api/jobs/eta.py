@@ -1,11 +1,14 @@
-"""Time until a job succeeds, by the pace of its tiles and by how long the last step took in earlier jobs."""
+"""Time until a job succeeds: by the pace of its tiles and by earlier jobs, or, before it starts, by a trial."""
 
 from statistics import median_low
 from typing import Any
 
-from sqlalchemy import Connection, Row
+from sqlalchemy import Connection, Row, select
 
 from storage import statistics
+from storage.database.tables import jobs
+from storage.layout.blocks import block_edge
+from storage.records import leases
 
 TYPICAL = 1.4e-7
 """Seconds per unit of `_report_work` on a 2.5 GHz core."""
@@ -29,6 +32,18 @@ def seconds_left(connection: Connection, row: Row[Any], now: float) -> float | N
         return None  # the last: the clock has gone back
     pace = (row.moved_at - row.paced_at) / (row.done - row.paced_done)
     return float(max((row.total - row.done) * pace - (now - row.moved_at), 0.0)) + finishing
+
+
+def seconds_to_recover(connection: Connection, capture: Row[Any]) -> dict[str, float] | None:
+    """Seconds that a recovery of a capture will take by quality, by the trial of its ingest and the workers of now."""
+    plan = connection.scalar(select(jobs.c.plan).where(jobs.c.id == capture.job)) or {}
+    sign = leases.last_heartbeat(connection)
+    workers = len(sign.cluster["workers"]) if sign else 0
+    if not plan.get("core_seconds") or not workers:
+        return None
+    edge = block_edge(plan["height"], plan["width"])
+    blocks = -(-plan["height"] // edge) * -(-plan["width"] // edge)
+    return {name: seconds / min(workers, blocks) for name, seconds in plan["core_seconds"].items()}
 
 
 def _finishing(connection: Connection, row: Row[Any]) -> float:

@@ -21,6 +21,7 @@ from workflows.ingest.measured_light import (
     unclipped_light,
 )
 from workflows.programs.program import Program
+from workflows.recovery.lobes.options import FINE, LobesOptions
 from workflows.recovery.lobes.recover import recover
 from workflows.recovery.noise import Noise
 from workflows.recovery.photometry import Photometry, fit_photometry
@@ -166,7 +167,13 @@ class RecoveredSample(NamedTuple):
 
 
 def recover_sample(
-    stack: Stack, program: Program, monitor: Curve, patterns: Patterns, sample: Sample, state: Doubles
+    stack: Stack,
+    program: Program,
+    monitor: Curve,
+    patterns: Patterns,
+    sample: Sample,
+    state: Doubles,
+    options: LobesOptions = FINE,
 ) -> RecoveredSample | None:
     """Recover the sample from frames corrected by ``state``, (frames, 3); None if it has too little contrast."""
     seen, gains = _see(stack, sample, state[:, :2]), np.exp(state[:, 2])
@@ -188,7 +195,8 @@ def recover_sample(
         noise,
         usable[:, shown],
         worth[:, shown],
-        conditions=conditions,
+        options,
+        conditions,
     )
     assert conditions.strays is not None
     return RecoveredSample(found, photometry, transport, conditions.strays, alive, seen)

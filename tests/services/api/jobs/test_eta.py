@@ -5,10 +5,10 @@ from typing import Any
 import pytest
 from sqlalchemy import Connection, Engine, update
 
-from services.api.jobs.eta import TYPICAL, seconds_left
+from services.api.jobs.eta import TYPICAL, seconds_left, seconds_to_recover
 from storage.database import rows, tables
 from storage.database.engine import writing
-from storage.records import captures, jobs, tiles
+from storage.records import captures, jobs, leases, tiles
 from storage.steps import FINISH
 
 PLAN = {"tiles": 10, "slab": 4, "width": 160, "height": 120, "frames": 40, "video": False, "notes": []}
@@ -71,3 +71,17 @@ def test_last_step_takes_as_long_as_in_earlier_ingests(engine: Engine) -> None:
         for _ in range(3):
             ended(c, 20.0, PLAN | {"video": True})
         assert left(c, job, 11.0) == pytest.approx(4.0)
+
+
+def test_recovery_is_estimated_by_trial_and_workers(engine: Engine) -> None:
+    with writing(engine) as c:
+        ended(c, 1.0, PLAN | {"core_seconds": {"fine": 120.0, "fast": 60.0}})
+        (row,) = c.execute(tables.captures.select()).all()
+        assert seconds_to_recover(c, row) is None  # there is no worker
+        token = leases.acquire(c, "here")
+        assert token is not None
+        for workers, shared in ((3, 3), (1000, 20)):  # a frame of 160 x 120 pixels has 20 blocks
+            leases.renew(c, token, {"workers": [{}] * workers, "problem": None})
+            assert seconds_to_recover(c, row) == {"fine": 120 / shared, "fast": 60 / shared}
+        jobs.delete(c, row.job)
+        assert seconds_to_recover(c, row) is None

@@ -1,0 +1,41 @@
+"""How long recoveries will take, from trials of an ingest."""
+
+import io
+from collections.abc import Callable
+from itertools import count
+
+import numpy as np
+import pytest
+
+from storage.layout.captures import Stack
+from tests.parts.captures import nested_program
+from workflows.ingest.report import recovery_time
+from workflows.ingest.report.recovery_time import core_seconds
+from workflows.ingest.report.trial_recovery import take_sample
+from workflows.simulation.glass_ball import glass_ball
+from workflows.simulation.scene import write_capture
+
+
+def stack_of(ingest: Callable[..., Stack], width: int, height: int) -> Stack:
+    target = io.BytesIO()
+    program = nested_program((64, 48), bands=((4, 3, 14), (8, 6, 10)), levels=5)
+    write_capture(glass_ball(width, height, monitor=(64, 48), rays=4), program, target, noise=0.5)
+    return ingest("c", target.getvalue())
+
+
+@pytest.mark.slow
+def test_seconds_of_a_trial_count_for_all_pixels(
+    ingest: Callable[..., Stack], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stack = stack_of(ingest, 80, 60)
+    sample = take_sample(stack)
+    assert sample is not None
+    share = np.count_nonzero(stack.mask()) / len(sample.chosen[0])
+    assert share > 1
+    clock = count()  # each trial lasts a second
+    monkeypatch.setattr(recovery_time.time, "perf_counter", lambda: float(next(clock)))
+    assert core_seconds(stack) == {"fine": round(share, 2), "fast": round(share, 2)}
+
+
+def test_frame_too_small_for_a_trial_has_none(ingest: Callable[..., Stack]) -> None:
+    assert core_seconds(stack_of(ingest, 36, 28)) is None

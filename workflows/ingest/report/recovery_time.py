@@ -1,0 +1,54 @@
+"""How long a recovery of a capture will take, from a trial of each quality on some of its pixels."""
+
+import time
+
+import numpy as np
+from pydantic import TypeAdapter
+
+from storage.layout.captures import Stack
+from workflows.images.tone_curves import Curve
+from workflows.ingest.report.trial_recovery import recover_sample, take_sample
+from workflows.programs.program import Program
+from workflows.programs.pyramid_light import lay_out
+from workflows.recovery.glare import filter_patterns, spread_patterns
+from workflows.recovery.lobes.options import FAST, FINE
+
+QUALITIES = {"fine": FINE, "fast": FAST}
+
+
+def core_seconds(stack: Stack) -> dict[str, float] | None:
+    """Seconds that one core takes to recover all pixels of a stack, by quality; None if too few pixels can be tried.
+
+    Parameters
+    ----------
+    stack : Stack
+        With its attributes after `survey`.
+
+    Notes
+    -----
+    The time of a pixel depends on its glass: more lobes take longer. So the pixels of `take_sample`, which are spread
+    over the frame, are tried, with the shifts and gains that were found. Kernels are compiled by then: steadiness was
+    measured with them. Reading the frames and writing the matte are left out.
+    """
+    sample = take_sample(stack)
+    if sample is None:
+        return None
+    attributes = stack.attributes
+    program = Program.model_validate(attributes["program"])
+    monitor: Curve = TypeAdapter[Curve](Curve).validate_python(attributes["monitor_curve"])
+    patterns = lay_out(program, monitor, stack.images())
+    if attributes["glare"]:
+        patterns = filter_patterns(patterns, spread_patterns(patterns), attributes["glare"])
+    state = np.zeros((stack.frames, 3))
+    if attributes["shifts"] is not None:
+        state[:, :2] = attributes["shifts"]
+    if attributes["gains"] is not None:
+        state[:, 2] = np.log(attributes["gains"])
+    share = float(np.count_nonzero(stack.mask()) / len(sample.chosen[0]))
+    seconds = {}
+    for name, options in QUALITIES.items():
+        start = time.perf_counter()
+        if recover_sample(stack, program, monitor, patterns, sample, state, options) is None:
+            return None
+        seconds[name] = round(share * (time.perf_counter() - start), 2)
+    return seconds
