@@ -1,6 +1,6 @@
 """Reports on captures over HTTP: how the frames turned out."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from fastapi import APIRouter, Request, Response
@@ -10,7 +10,7 @@ from services.api.http.responses import bytes_response, json_response
 from storage.errors import Conflict
 from storage.layout.captures import Stack
 from storage.records import captures
-from workflows.ingest.report.contact_sheet import bytes_of_contact_sheet, contact_sheet
+from workflows.ingest.report.contact_sheet import bytes_of_contact_sheet, contact_sheet, thumbnail
 from workflows.ingest.report.report import Report, report
 
 router = APIRouter(tags=["captures"])
@@ -30,17 +30,26 @@ async def get_report(context: OwnerContext, id: str, request: Request) -> Respon
 @router.get("/captures/{id}/contact-sheet.png", response_class=Response)
 async def get_contact_sheet(context: OwnerContext, id: str, request: Request) -> Response:
     """Some of a capture's frames in one picture: red where they are clipped at white, blue where clipped at black."""
+    return await _drawn(context, id, request, contact_sheet)
 
+
+@router.get("/captures/{id}/thumbnail.png", response_class=Response)
+async def get_thumbnail(context: OwnerContext, id: str, request: Request) -> Response:
+    """The brightest constant frame of a capture, at most 240 pixels wide and high."""
+    return await _drawn(context, id, request, thumbnail)
+
+
+async def _drawn(context: Context, id: str, request: Request, draw: Callable[[Stack], bytes]) -> Response:
     def measure() -> int:
         with _stack(context, id) as stack:
             return bytes_of_contact_sheet(stack)
 
-    def draw() -> Response:
+    def answer() -> Response:
         with _stack(context, id) as stack:
-            return bytes_response(contact_sheet(stack), "image/png")
+            return bytes_response(draw(stack), "image/png")
 
     memory = await context.compute(request, context.lists, measure)
-    return await context.compute(request, context.pictures, draw, memory=memory)
+    return await context.compute(request, context.pictures, answer, memory=memory)
 
 
 @contextmanager

@@ -60,12 +60,13 @@ async def list_mattes(
     limit: Limit = 100,
     after: After = None,
     state: Literal["recovering", "ready", "failed"] | None = None,
+    capture: str | None = None,
 ) -> Response:
-    """Mattes, newest first."""
+    """Mattes, newest first: all, or those of a capture."""
 
     def make() -> Response:
         with reading(context.engine) as c:
-            rows = page(c, table, limit, after, state=state)
+            rows = page(c, table, limit, after, state=state, capture=capture)
             return json_response(Mattes(mattes=[Matte.of(row) for row in rows]))
 
     return await context.compute(request, context.lists, make)

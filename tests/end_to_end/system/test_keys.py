@@ -80,6 +80,7 @@ CALLS = {
     "PATCH /v1/captures/{id}": Call("capture", needs="write", json={"name": "a name"}),
     "GET /v1/captures/{id}/frames/{n}.png": Call("capture"),
     "GET /v1/captures/{id}/report": Call("capture"),
+    "GET /v1/captures/{id}/thumbnail.png": Call("capture"),
     "GET /v1/captures/{id}/contact-sheet.png": Call("capture"),
     "DELETE /v1/captures/{id}": Call("capture", needs="write", last=5),
     "GET /v1/jobs": Call(),

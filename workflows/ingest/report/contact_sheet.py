@@ -46,13 +46,29 @@ def contact_sheet(stack: Stack) -> bytes:
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(12)
     for at, (_, caption) in enumerate(picked):
         x, y = 8 + at % ACROSS * (width + 8), 8 + at // ACROSS * (height + CAPTION + 8)
-        values = np.rint(from_light(np.clip(light[at], 0, 1), "srgb") * 255).astype(np.uint8)
-        values = np.repeat(values, 3 // values.shape[2], axis=2)
+        values = _codes(light[at])
         values[low[at]], values[high[at]] = AT_BLACK, AT_WHITE
         sheet.paste(Image.fromarray(values), (x, y))
         draw.text((x, y + height + 2), caption, (220, 220, 220), font)
+    return _png(sheet)
+
+
+def thumbnail(stack: Stack) -> bytes:
+    """Draw the brightest constant frame, which shows the object best; returns a PNG."""
+    picked = _pick(stack, Program.model_validate(stack.attributes["program"]))
+    frame = next((frame for frame, caption in picked if caption.endswith("brightest")), 0)
+    light, _, _ = _shrink(stack, [frame])
+    return _png(Image.fromarray(_codes(light[0])))
+
+
+def _codes(light: NDArray[np.float32]) -> NDArray[np.uint8]:
+    values = np.rint(from_light(np.clip(light, 0, 1), "srgb") * 255).astype(np.uint8)
+    return np.repeat(values, 3 // values.shape[2], axis=2)
+
+
+def _png(picture: Image.Image) -> bytes:
     target = io.BytesIO()
-    sheet.save(target, "PNG")
+    picture.save(target, "PNG")
     return target.getvalue()
 
 

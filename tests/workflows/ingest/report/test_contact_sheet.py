@@ -10,7 +10,7 @@ from PIL import Image
 from storage.layout.captures import Stack
 from tests.parts.captures import nested_program
 from workflows.images.integer_formats import encode_png
-from workflows.ingest.report.contact_sheet import AT_BLACK, AT_WHITE, HEIGHT, WIDTH, contact_sheet
+from workflows.ingest.report.contact_sheet import AT_BLACK, AT_WHITE, HEIGHT, WIDTH, contact_sheet, thumbnail
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import write_capture
 
@@ -53,3 +53,5 @@ def test_grey_frames_have_one_too(ingest: Ingest, make_zip: Callable[..., bytes]
     files = {f"{n}.png": encode_png(np.full((12, 16, 1), 60 * n + 9, np.uint8)) for n in range(4)}
     with Image.open(io.BytesIO(contact_sheet(ingest("c", make_zip(record, files))))) as sheet:
         assert sheet.size == (4 * 24 + 8, 12 + 18 + 16)
+    with Image.open(io.BytesIO(thumbnail(ingest("d", make_zip(record, files))))) as small:
+        assert (small.size, small.getcolors()) == ((16, 12), [(192, (69, 69, 69))])  # the white frame
