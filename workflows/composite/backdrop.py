@@ -113,6 +113,23 @@ def node_light(
     return light
 
 
+def frame_light(
+    backdrop: Backdrop,
+    width: int,
+    height: int,
+    threads: int,
+    placement: Placement | None = None,
+    monitor: tuple[int, int] = (1, 1),
+) -> NDArray[np.float32]:
+    """The light of a backdrop at the pixels of a frame that sees the whole monitor, (height, width, 3) float32."""
+    light = np.empty((height, width, 3), np.float32)
+    if placement is None:
+        _resample(backdrop, light, threads, (height, width))
+    else:
+        _place(backdrop, placement, monitor, light, threads)
+    return light
+
+
 def _resample(
     backdrop: Backdrop,
     cells: NDArray[np.float32],

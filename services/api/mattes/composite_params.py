@@ -33,6 +33,11 @@ class CompositeParams(BaseModel):
     scale: float = Field(1, ge=0.01, le=100, description="Enlarges the backdrop by this factor.")
     angle: float = Field(0, ge=-360, le=360, description="Turns the backdrop, in degrees clockwise.")
 
+    around: Literal["nothing", "backdrop"] = Field(
+        "nothing",
+        description="What is shown where the mask left pixels out: nothing, so that a PNG is transparent and a JPEG "
+        "black there, or the backdrop, as if the frame saw the whole monitor.",
+    )
     depth: Distance | None = Field(
         None, description="Distance of the backdrop from the object, if it is not where the monitor was."
     )
@@ -64,6 +69,8 @@ class CompositeParams(BaseModel):
                 "a backdrop at another depth takes depth, distance and camera, or depth, distance, other and "
                 "other_distance"
             )
+        if self.around == "backdrop" and self.depth is not None:
+            raise ValueError("a backdrop at another depth is not shown around the glass: omit around")
         if self.other_distance is not None and self.other_distance == self.distance:
             raise ValueError("the two distances must differ")
         return self

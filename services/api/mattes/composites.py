@@ -27,6 +27,7 @@ from storage.errors import Conflict, OptionError
 from storage.records import mattes
 from storage.records import tiles as tile_records
 from workflows.composite import composite
+from workflows.composite.around import put_around
 from workflows.composite.backdrop import Backdrop, backdrop_of
 from workflows.composite.depth import Rays, from_one, from_two
 from workflows.composite.engine import Window, shrink
@@ -60,6 +61,8 @@ SHRUNK_BYTES = 32
 """Of a pixel while a picture is made smaller, and of the answer."""
 LIGHT_BYTES = 16
 """Of a cell of the monitor: the light of three channels, with the coarser grids."""
+AROUND_BYTES = 48
+"""Of a pixel of the matte while the backdrop is put around the glass: its light, what it adds, and blurred alpha."""
 RAYS_BYTES = 160
 """Of a pixel of the matte while rays to a backdrop at another depth are found."""
 
@@ -161,7 +164,9 @@ def _bytes_of_composite(context: Context, state: MatteState, params: CompositePa
     window = Window.of(matte, params.x, params.y, params.width, params.height)
     of_pixel = PICTURE_BYTES + (SHRUNK_BYTES if params.size is not None else ANSWER_BYTES[media_type])
     of_rays = RAYS_BYTES * matte.width * matte.height if params.depth is not None else 0
-    return LIGHT_BYTES * matte.columns * matte.rows + of_pixel * window.width * window.height + of_rays
+    of_frame = AROUND_BYTES * matte.width * matte.height if params.around == "backdrop" else 0
+    of_window = of_pixel * window.width * window.height
+    return LIGHT_BYTES * matte.columns * matte.rows + of_window + of_rays + of_frame
 
 
 def _answer(
@@ -202,6 +207,13 @@ def _answer(
         "composite",
         lambda: composite(matte, backdrop, placement=params.placement, rays=rays, window=window, read=read),
     )
+    if params.around == "backdrop":
+        wide, high = matte.attributes["monitor"]
+        frame = matte.width, matte.height
+        picture = timed(
+            "around",
+            lambda: put_around(picture, backdrop, window, frame, (wide, high), params.placement, CORES),
+        )
     if params.size is not None:
         picture = shrink(picture, params.size)
     answer = timed("encode", lambda: _encoded(picture, backdrop, media_type, params))
