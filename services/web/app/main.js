@@ -16,65 +16,65 @@ let shown;
 
 // Ends the views that are not shown, except those that record a film: these go on, and are shown again when opened.
 function tidy() {
-  for (const [hash, view] of views) {
-    if (view === shown || recordings.has(view.signal)) continue;
-    view.stop.abort();
-    views.delete(hash);
-  }
-  const [away] = [...views].find(([, view]) => view !== shown) ?? [];
-  note.hidden = !away;
-  if (away) note.hash = away;
+	for (const [hash, view] of views) {
+		if (view === shown || recordings.has(view.signal)) continue;
+		view.stop.abort();
+		views.delete(hash);
+	}
+	const [away] = [...views].find(([, view]) => view !== shown) ?? [];
+	note.hidden = !away;
+	if (away) note.hash = away;
 }
 addEventListener("recording", tidy);
 
 function open(hash) {
-  const stop = new AbortController();
-  const view = { stop, signal: stop.signal, element: h("div", { class: "view" }) };
-  views.get(hash)?.stop.abort();
-  views.set(hash, view);
-  return view;
+	const stop = new AbortController();
+	const view = { stop, signal: stop.signal, element: h("div", { class: "view" }) };
+	views.get(hash)?.stop.abort();
+	views.set(hash, view);
+	return view;
 }
 
 async function route(navigated) {
-  const [hash, name = "home", id] = /^#\/(?:(\w+)(?:\/([\w-]+))?)?$/.exec(location.hash) ?? [];
-  if (hash === undefined || !VIEWS[name]?.[id ? 1 : 0]) return location.replace("#/");
-  const before = views.get(hash);
-  const view = (shown = recordings.has(before?.signal) ? before : open(hash));
-  tidy();
-  for (const link of document.querySelectorAll("nav a")) {
-    if (link.hash === `#/${name}`) link.setAttribute("aria-current", "page");
-    else link.removeAttribute("aria-current");
-  }
-  main.replaceChildren(view.element);
-  main.ariaBusy = "true";
-  try {
-    if (view === before) view.resume();
-    else view.resume = await VIEWS[name][id ? 1 : 0](view.element, view.signal, id);
-  } catch (error) {
-    if (!view.signal.aborted) view.element.append(problemBox(error));
-  }
-  if (view !== shown) return;
-  main.ariaBusy = "false";
-  const title = main.querySelector("h1");
-  document.title = `${title?.textContent ?? "envmatte"} · envmatte`;
-  if (navigated) {
-    scrollTo(0, 0);
-    main.focus({ preventScroll: true });
-  }
+	const [hash, name = "home", id] = /^#\/(?:(\w+)(?:\/([\w-]+))?)?$/.exec(location.hash) ?? [];
+	if (hash === undefined || !VIEWS[name]?.[id ? 1 : 0]) return location.replace("#/");
+	const before = views.get(hash);
+	const view = (shown = recordings.has(before?.signal) ? before : open(hash));
+	tidy();
+	for (const link of document.querySelectorAll("nav a")) {
+		if (link.hash === `#/${name}`) link.setAttribute("aria-current", "page");
+		else link.removeAttribute("aria-current");
+	}
+	main.replaceChildren(view.element);
+	main.ariaBusy = "true";
+	try {
+		if (view === before) view.resume();
+		else view.resume = await VIEWS[name][id ? 1 : 0](view.element, view.signal, id);
+	} catch (error) {
+		if (!view.signal.aborted) view.element.append(problemBox(error));
+	}
+	if (view !== shown) return;
+	main.ariaBusy = "false";
+	const title = main.querySelector("h1");
+	document.title = `${title?.textContent ?? "envmatte"} · envmatte`;
+	if (navigated) {
+		scrollTo(0, 0);
+		main.focus({ preventScroll: true });
+	}
 }
 
 // Moves the focus without following the link, which would replace the view in the URL.
 document.querySelector(".skip").onclick = (event) => {
-  event.preventDefault();
-  main.focus();
+	event.preventDefault();
+	main.focus();
 };
 // Ignores files dropped beside a drop zone: the browser would leave the page to show them.
 for (const type of ["dragover", "drop"]) {
-  addEventListener(type, (event) => {
-    if (event.defaultPrevented || !event.dataTransfer.types.includes("Files")) return;
-    event.preventDefault();
-    event.dataTransfer.dropEffect = "none";
-  });
+	addEventListener(type, (event) => {
+		if (event.defaultPrevented || !event.dataTransfer.types.includes("Files")) return;
+		event.preventDefault();
+		event.dataTransfer.dropEffect = "none";
+	});
 }
 addEventListener("hashchange", () => route(true));
 route(false);

@@ -11,116 +11,116 @@ const REPORT = 2000; // ms between two reports of progress
 
 // The pictures of a program: all are fetched before it starts, the next few are decoded.
 class Pictures {
-  #blobs = [];
-  #decoded = new Map();
+	#blobs = [];
+	#decoded = new Map();
 
-  async load(count, fetched, progress) {
-    let next = 0;
-    let done = 0;
-    const work = async () => {
-      while (next < count) {
-        const n = next++;
-        this.#blobs[n] = await (await fetched(`patterns/${n}.png`)).blob();
-        progress(++done / count);
-      }
-    };
-    await Promise.all(Array.from({ length: AT_ONCE }, work));
-  }
+	async load(count, fetched, progress) {
+		let next = 0;
+		let done = 0;
+		const work = async () => {
+			while (next < count) {
+				const n = next++;
+				this.#blobs[n] = await (await fetched(`patterns/${n}.png`)).blob();
+				progress(++done / count);
+			}
+		};
+		await Promise.all(Array.from({ length: AT_ONCE }, work));
+	}
 
-  // Decodes the pictures from a number on, and frees those before it.
-  async prepare(first) {
-    for (const [n, entry] of this.#decoded) {
-      if (n < first) {
-        this.#decoded.delete(n);
-        entry.then((picture) => picture.close(), () => {});
-      }
-    }
-    for (let n = first; n < Math.min(first + AHEAD, this.#blobs.length); n++) {
-      if (!this.#decoded.has(n)) {
-        const entry = createImageBitmap(this.#blobs[n], { colorSpaceConversion: "none" });
-        entry.then((picture) => (entry.picture = picture), () => {});
-        this.#decoded.set(n, entry);
-      }
-    }
-    await Promise.all(this.#decoded.values());
-  }
+	// Decodes the pictures from a number on, and frees those before it.
+	async prepare(first) {
+		for (const [n, entry] of this.#decoded) {
+			if (n < first) {
+				this.#decoded.delete(n);
+				entry.then((picture) => picture.close(), () => {});
+			}
+		}
+		for (let n = first; n < Math.min(first + AHEAD, this.#blobs.length); n++) {
+			if (!this.#decoded.has(n)) {
+				const entry = createImageBitmap(this.#blobs[n], { colorSpaceConversion: "none" });
+				entry.then((picture) => (entry.picture = picture), () => {});
+				this.#decoded.set(n, entry);
+			}
+		}
+		await Promise.all(this.#decoded.values());
+	}
 
-  // The picture of a number if it is decoded.
-  at(n) {
-    return this.#decoded.get(n)?.picture;
-  }
+	// The picture of a number if it is decoded.
+	at(n) {
+		return this.#decoded.get(n)?.picture;
+	}
 }
 
 // The next animation frame. A hidden page has none, so stopping rejects.
 const nextFrame = (stopped) =>
-  new Promise((resolve, reject) => {
-    if (stopped.aborted) return reject(stopped.reason);
-    requestAnimationFrame(resolve);
-    stopped.onabort = () => reject(stopped.reason);
-  });
+	new Promise((resolve, reject) => {
+		if (stopped.aborted) return reject(stopped.reason);
+		requestAnimationFrame(resolve);
+		stopped.onabort = () => reject(stopped.reason);
+	});
 
 // Shows the steps, each for a whole number of the display's refreshes, and none before its picture is decoded. If one
 // refresh is missed, the next step is shorter by it; if more are, the next step has its full length and the beat starts
 // again from there. No step is left out. Returns when each step was first shown.
 async function show(context, border, steps, pictures, refresh, stopped, passed) {
-  const shown = [];
-  let due = -Infinity;
-  for (const [i, step] of steps.entries()) {
-    let now;
-    let picture;
-    do {
-      now = await nextFrame(stopped);
-      picture = pictures.at(step.number);
-    } while (now < due - refresh / 2 || (step.number !== LEAD && !picture));
-    draw(context, border, step, picture);
-    shown.push({ number: step.number, white: step.white, at: now });
-    passed(step.number);
-    // On time, the next step follows the beat; too late, a new beat starts.
-    const start = now < due + 1.5 * refresh ? due : now;
-    due = start + Math.max(1, Math.round((step.seconds * 1000) / refresh)) * refresh;
-    if (i + 1 < steps.length && steps[i + 1].number !== LEAD) {
-      pictures.prepare(steps[i + 1].number).catch(() => {}); // the program waits for a picture that fails, until Escape
-    }
-  }
-  while ((await nextFrame(stopped)) < due - refresh / 2);
-  return shown;
+	const shown = [];
+	let due = -Infinity;
+	for (const [i, step] of steps.entries()) {
+		let now;
+		let picture;
+		do {
+			now = await nextFrame(stopped);
+			picture = pictures.at(step.number);
+		} while (now < due - refresh / 2 || (step.number !== LEAD && !picture));
+		draw(context, border, step, picture);
+		shown.push({ number: step.number, white: step.white, at: now });
+		passed(step.number);
+		// On time, the next step follows the beat; too late, a new beat starts.
+		const start = now < due + 1.5 * refresh ? due : now;
+		due = start + Math.max(1, Math.round((step.seconds * 1000) / refresh)) * refresh;
+		if (i + 1 < steps.length && steps[i + 1].number !== LEAD) {
+			pictures.prepare(steps[i + 1].number).catch(() => {}); // the program waits for a picture that fails, until Escape
+		}
+	}
+	while ((await nextFrame(stopped)) < due - refresh / 2);
+	return shown;
 }
 
 // Counts down, and meanwhile measures the refresh interval of the display: the median between frames, in milliseconds.
 async function countDown(element, stopped) {
-  const begin = await nextFrame(stopped);
-  const times = [begin];
-  while (times.at(-1) < begin + COUNTDOWN * 1000) {
-    const left = String(Math.ceil(COUNTDOWN - (times.at(-1) - begin) / 1000));
-    if (element.textContent !== left) element.textContent = left;
-    times.push(await nextFrame(stopped));
-  }
-  element.textContent = "";
-  const distances = times.slice(1).map((time, i) => time - times[i]).sort((a, b) => a - b);
-  return distances[Math.floor(distances.length / 2)];
+	const begin = await nextFrame(stopped);
+	const times = [begin];
+	while (times.at(-1) < begin + COUNTDOWN * 1000) {
+		const left = String(Math.ceil(COUNTDOWN - (times.at(-1) - begin) / 1000));
+		if (element.textContent !== left) element.textContent = left;
+		times.push(await nextFrame(stopped));
+	}
+	element.textContent = "";
+	const distances = times.slice(1).map((time, i) => time - times[i]).sort((a, b) => a - b);
+	return distances[Math.floor(distances.length / 2)];
 }
 
 // The pixels of the display under an element, at any zoom.
 const measure = (element) =>
-  new Promise((resolve) => {
-    const observer = new ResizeObserver(([entry]) => {
-      observer.disconnect();
-      const exact = entry.devicePixelContentBoxSize?.[0];
-      const rounded = (length) => Math.round(length * devicePixelRatio);
-      const { width, height } = entry.contentRect;
-      resolve({
-        width: exact?.inlineSize ?? rounded(width),
-        height: exact?.blockSize ?? rounded(height),
-        isMeasured: true,
-        isExact: Boolean(exact),
-      });
-    });
-    try {
-      observer.observe(element, { box: "device-pixel-content-box" });
-    } catch {
-      observer.observe(element); // Safari measures in CSS pixels only
-    }
-  });
+	new Promise((resolve) => {
+		const observer = new ResizeObserver(([entry]) => {
+			observer.disconnect();
+			const exact = entry.devicePixelContentBoxSize?.[0];
+			const rounded = (length) => Math.round(length * devicePixelRatio);
+			const { width, height } = entry.contentRect;
+			resolve({
+				width: exact?.inlineSize ?? rounded(width),
+				height: exact?.blockSize ?? rounded(height),
+				isMeasured: true,
+				isExact: Boolean(exact),
+			});
+		});
+		try {
+			observer.observe(element, { box: "device-pixel-content-box" });
+		} catch {
+			observer.observe(element); // Safari measures in CSS pixels only
+		}
+	});
 
 const $ = (id) => document.getElementById(id);
 const setStatus = (text) => ($("status").textContent = text);
@@ -128,145 +128,145 @@ const here = new URL(".", location.href);
 const sizeOf = ({ width, height }) => `${width} x ${height}`;
 
 async function ask(path, options = {}) {
-  const answer = await fetch(new URL(path, here), { ...options, headers: { ...options.headers, ...authorization() } });
-  if (answer.status === 401) $("unlock").hidden = false;
-  if (!answer.ok) throw new Error((await answer.json()).detail);
-  return answer;
+	const answer = await fetch(new URL(path, here), { ...options, headers: { ...options.headers, ...authorization() } });
+	if (answer.status === 401) $("unlock").hidden = false;
+	if (!answer.ok) throw new Error((await answer.json()).detail);
+	return answer;
 }
 
 const id = here.pathname.split("/").at(-2);
 
 // Reports progress to the service. The program continues if that fails; `keepalive` sends it when the page is closed, too.
 const report = (progress) =>
-  ask("showing", { method: "PUT", body: JSON.stringify(progress), headers: { "Content-Type": "application/json" }, keepalive: true }).catch(() => {});
+	ask("showing", { method: "PUT", body: JSON.stringify(progress), headers: { "Content-Type": "application/json" }, keepalive: true }).catch(() => {});
 
 let surface; // what shows the patterns, as far as the page knows
 
 // The zoom in per cent of a page that counts one size where there is another; 100 if zoom does not explain it.
 function zoomBetween(counted, real) {
-  const [across, down] = [counted.width / real.width, counted.height / real.height];
-  return Math.abs(across / down - 1) < 0.05 ? Math.round(100 * across) : 100; // full screen may be lower than the screen
+	const [across, down] = [counted.width / real.width, counted.height / real.height];
+	return Math.abs(across / down - 1) < 0.05 ? Math.round(100 * across) : 100; // full screen may be lower than the screen
 }
 
 // Compares a program with a surface, and says what to do where patterns are resampled. Returns whether they fit.
 function checkFit({ display, program }, found) {
-  surface = found;
-  const { width, height, isMeasured, isWindow } = surface;
-  const near = isMeasured ? 1 : devicePixelRatio;
-  const fits = Boolean(display) && Math.abs(display.width - width) < near && Math.abs(display.height - height) < near;
-  const made = display ? `This program is made for a screen of ${sizeOf(display)} pixels` : "This program has no border";
-  const misfit = `${made}; this ${isWindow ? "window" : "screen"} has ${sizeOf(surface)}, so patterns are stretched and less sharp.`;
-  const real = isMeasured ? surface : display;
-  const zoom = real && !isWindow ? zoomBetween(countScreen(), real) : 100;
-  const zoomed = `This page ${isMeasured ? "is" : "seems to be"} zoomed to ${zoom} %. Set the zoom to 100 % (Ctrl+0 or ⌘0).`;
-  $("misfit").textContent = zoom === 100 ? misfit : `${zoomed} ${isMeasured ? "" : "If this note stays: "}${misfit}`;
-  $("refit").onclick = () => refit(program, { width, height }).catch((error) => setStatus(error.message));
-  $("fit").hidden = fits;
-  return fits;
+	surface = found;
+	const { width, height, isMeasured, isWindow } = surface;
+	const near = isMeasured ? 1 : devicePixelRatio;
+	const fits = Boolean(display) && Math.abs(display.width - width) < near && Math.abs(display.height - height) < near;
+	const made = display ? `This program is made for a screen of ${sizeOf(display)} pixels` : "This program has no border";
+	const misfit = `${made}; this ${isWindow ? "window" : "screen"} has ${sizeOf(surface)}, so patterns are stretched and less sharp.`;
+	const real = isMeasured ? surface : display;
+	const zoom = real && !isWindow ? zoomBetween(countScreen(), real) : 100;
+	const zoomed = `This page ${isMeasured ? "is" : "seems to be"} zoomed to ${zoom} %. Set the zoom to 100 % (Ctrl+0 or ⌘0).`;
+	$("misfit").textContent = zoom === 100 ? misfit : `${zoomed} ${isMeasured ? "" : "If this note stays: "}${misfit}`;
+	$("refit").onclick = () => refit(program, { width, height }).catch((error) => setStatus(error.message));
+	$("fit").hidden = fits;
+	return fits;
 }
 
 async function open() {
-  const program = await (await ask(`../${id}`)).json();
-  const { patterns, monitor } = program;
-  $("about").textContent = `${patterns} patterns of ${sizeOf(monitor)} pixels.`;
-  checkFit(program, knownScreen());
-  onZoom(() => checkFit(program, knownScreen()));
-  const pictures = new Pictures();
-  setStatus("Loading the patterns.");
-  await pictures.load(patterns, ask, (share) => ($("loaded").value = share));
-  setStatus("Ready.");
-  $("start").disabled = false;
-  $("settings").onsubmit = (event) => {
-    event.preventDefault();
-    play(program, pictures, Number($("rate").value));
-  };
+	const program = await (await ask(`../${id}`)).json();
+	const { patterns, monitor } = program;
+	$("about").textContent = `${patterns} patterns of ${sizeOf(monitor)} pixels.`;
+	checkFit(program, knownScreen());
+	onZoom(() => checkFit(program, knownScreen()));
+	const pictures = new Pictures();
+	setStatus("Loading the patterns.");
+	await pictures.load(patterns, ask, (share) => ($("loaded").value = share));
+	setStatus("Ready.");
+	$("start").disabled = false;
+	$("settings").onsubmit = (event) => {
+		event.preventDefault();
+		play(program, pictures, Number($("rate").value));
+	};
 }
 
 async function refit(program, monitor) {
-  const body = JSON.stringify({ program, monitor, border: true });
-  const answer = await ask("../../programs", { method: "POST", body, headers: { "Content-Type": "application/json" } });
-  location.assign(new URL(`../${(await answer.json()).id}/play`, here));
+	const body = JSON.stringify({ program, monitor, border: true });
+	const answer = await ask("../../programs", { method: "POST", body, headers: { "Content-Type": "application/json" } });
+	location.assign(new URL(`../${(await answer.json()).id}/play`, here));
 }
 
 async function play(program, pictures, rate) {
-  const [stage, canvas] = [$("stage"), $("canvas")];
-  const stop = new AbortController();
-  const { signal } = stop;
-  const listen = (target, event, listener) => target.addEventListener(event, listener, { signal });
-  const end = (why) => stop.abort(new Error(why));
-  const progress = { phase: "countdown", patterns_per_second: rate, seconds: COUNTDOWN + LEAD_SECONDS.reduce((sum, one) => sum + one) };
-  let lock;
-  let reportedAt = -REPORT;
-  $("record").hidden = true;
-  $("start").disabled = true;
-  try {
-    stage.hidden = false;
-    // Without full screen for elements, the stage fills the window.
-    const full = await stage.requestFullscreen?.({ navigationUI: "hide" }).then(() => true, () => false);
-    lock = await navigator.wakeLock?.request("screen").catch(() => undefined);
-    listen(document, "keydown", (event) => event.key === "Escape" && end("Stopped."));
-    listen(document, "fullscreenchange", () => full && !document.fullscreenElement && end("Stopped."));
-    // The back button stops the program without leaving the page and what it has loaded.
-    if (!history.state?.showing) history.pushState({ showing: true }, "");
-    listen(window, "popstate", () => end("Stopped."));
-    listen(document, "visibilitychange", () => document.hidden && end("Stopped: the page was hidden."));
-    await pictures.prepare(0);
-    const found = { ...(await measure(canvas)), isWindow: !full };
-    if (full && found.isExact) rememberScreen(found);
-    const isNew = sizeOf(found) !== sizeOf(surface);
-    if (!checkFit(program, found) && isNew) throw new Error("Not started: the patterns do not fit. See the note above the button.");
-    report(progress);
-    const refresh = await countDown($("countdown"), signal);
-    const { width, height } = await measure(canvas);
-    [canvas.width, canvas.height] = [width, height];
-    listen(window, "resize", () => end("Stopped: the window was resized."));
-    const border = borderOn(canvas.width, canvas.height);
-    if (!border.fits) throw new Error("The window is too small for the border: make it larger.");
-    const context = canvas.getContext("2d", { alpha: false });
-    Object.assign(progress, { phase: "showing", seconds: 0, border: { width: border.width, height: border.height } });
-    const passed = (number) => {
-      if (number === LEAD || performance.now() < reportedAt + REPORT) return;
-      reportedAt = performance.now();
-      report({ ...progress, shown: number + 1 });
-    };
-    const shown = await show(context, border, schedule(program.patterns, rate), pictures, refresh, signal, passed);
-    progress.patterns_per_second = finish(program, border, shown, refresh);
-    report({ ...progress, phase: "shown", shown: program.patterns });
-  } catch (error) {
-    report({ ...progress, phase: "stopped", seconds: 0 });
-    setStatus(error.message);
-  } finally {
-    stop.abort();
-    if (history.state?.showing && !document.hidden) history.back();
-    lock?.release();
-    if (document.fullscreenElement) await document.exitFullscreen();
-    canvas.width = canvas.height = 0;
-    $("countdown").textContent = "";
-    stage.hidden = true;
-    $("start").disabled = false;
-    $("start").focus();
-  }
+	const [stage, canvas] = [$("stage"), $("canvas")];
+	const stop = new AbortController();
+	const { signal } = stop;
+	const listen = (target, event, listener) => target.addEventListener(event, listener, { signal });
+	const end = (why) => stop.abort(new Error(why));
+	const progress = { phase: "countdown", patterns_per_second: rate, seconds: COUNTDOWN + LEAD_SECONDS.reduce((sum, one) => sum + one) };
+	let lock;
+	let reportedAt = -REPORT;
+	$("record").hidden = true;
+	$("start").disabled = true;
+	try {
+		stage.hidden = false;
+		// Without full screen for elements, the stage fills the window.
+		const full = await stage.requestFullscreen?.({ navigationUI: "hide" }).then(() => true, () => false);
+		lock = await navigator.wakeLock?.request("screen").catch(() => undefined);
+		listen(document, "keydown", (event) => event.key === "Escape" && end("Stopped."));
+		listen(document, "fullscreenchange", () => full && !document.fullscreenElement && end("Stopped."));
+		// The back button stops the program without leaving the page and what it has loaded.
+		if (!history.state?.showing) history.pushState({ showing: true }, "");
+		listen(window, "popstate", () => end("Stopped."));
+		listen(document, "visibilitychange", () => document.hidden && end("Stopped: the page was hidden."));
+		await pictures.prepare(0);
+		const found = { ...(await measure(canvas)), isWindow: !full };
+		if (full && found.isExact) rememberScreen(found);
+		const isNew = sizeOf(found) !== sizeOf(surface);
+		if (!checkFit(program, found) && isNew) throw new Error("Not started: the patterns do not fit. See the note above the button.");
+		report(progress);
+		const refresh = await countDown($("countdown"), signal);
+		const { width, height } = await measure(canvas);
+		[canvas.width, canvas.height] = [width, height];
+		listen(window, "resize", () => end("Stopped: the window was resized."));
+		const border = borderOn(canvas.width, canvas.height);
+		if (!border.fits) throw new Error("The window is too small for the border: make it larger.");
+		const context = canvas.getContext("2d", { alpha: false });
+		Object.assign(progress, { phase: "showing", seconds: 0, border: { width: border.width, height: border.height } });
+		const passed = (number) => {
+			if (number === LEAD || performance.now() < reportedAt + REPORT) return;
+			reportedAt = performance.now();
+			report({ ...progress, shown: number + 1 });
+		};
+		const shown = await show(context, border, schedule(program.patterns, rate), pictures, refresh, signal, passed);
+		progress.patterns_per_second = finish(program, border, shown, refresh);
+		report({ ...progress, phase: "shown", shown: program.patterns });
+	} catch (error) {
+		report({ ...progress, phase: "stopped", seconds: 0 });
+		setStatus(error.message);
+	} finally {
+		stop.abort();
+		if (history.state?.showing && !document.hidden) history.back();
+		lock?.release();
+		if (document.fullscreenElement) await document.exitFullscreen();
+		canvas.width = canvas.height = 0;
+		$("countdown").textContent = "";
+		stage.hidden = true;
+		$("start").disabled = false;
+		$("start").focus();
+	}
 }
 
 function finish(program, { width, height }, shown, refresh) {
-  const patterns = shown.filter((step) => step.number !== LEAD);
-  const seconds = (patterns.at(-1).at - patterns[0].at) / 1000;
-  const rate = Number(((patterns.length - 1) / seconds).toFixed(4));
-  const video = { file: "film.mp4", patterns_per_second: rate, border: { width, height } };
-  const record = { format: "envmatte-capture/1", program: program.program, video };
-  URL.revokeObjectURL($("capture").href);
-  $("capture").href = URL.createObjectURL(new Blob([JSON.stringify(record, null, 1)], { type: "application/json" }));
-  $("record").hidden = false;
-  setStatus(`All ${patterns.length} patterns were shown, ${rate} a second. Stop recording.`);
-  document.dispatchEvent(new CustomEvent("played", { detail: { shown, refresh, record } }));
-  return rate;
+	const patterns = shown.filter((step) => step.number !== LEAD);
+	const seconds = (patterns.at(-1).at - patterns[0].at) / 1000;
+	const rate = Number(((patterns.length - 1) / seconds).toFixed(4));
+	const video = { file: "film.mp4", patterns_per_second: rate, border: { width, height } };
+	const record = { format: "envmatte-capture/1", program: program.program, video };
+	URL.revokeObjectURL($("capture").href);
+	$("capture").href = URL.createObjectURL(new Blob([JSON.stringify(record, null, 1)], { type: "application/json" }));
+	$("record").hidden = false;
+	setStatus(`All ${patterns.length} patterns were shown, ${rate} a second. Stop recording.`);
+	document.dispatchEvent(new CustomEvent("played", { detail: { shown, refresh, record } }));
+	return rate;
 }
 
 $("unlock").onsubmit = (event) => {
-  event.preventDefault();
-  sessionStorage.setItem("envmatte-key", $("key").value.trim());
-  $("unlock").hidden = true;
-  start();
+	event.preventDefault();
+	sessionStorage.setItem("envmatte-key", $("key").value.trim());
+	$("unlock").hidden = true;
+	start();
 };
 
 $("checks").append(...CHECKS.map((text) => Object.assign(document.createElement("li"), { textContent: text })));

@@ -5,40 +5,40 @@ import { followJob } from "../lib/job_progress.js";
 
 // The controls for the clip that is chosen; `place` returns where it stands.
 export function clipJob(matte, place, signal) {
-  const problem = h("div");
-  const progress = h("div", { class: "stack" });
-  let chosen;
-  const make = button("Make the video", problem, async () => {
-    progress.replaceChildren(h("p", { class: "hint", role: "status" }, "Sending the clip."));
-    try {
-      const headers = { "Content-Type": chosen.type.startsWith("video/") ? chosen.type : "video/mp4", "Idempotency-Key": crypto.randomUUID?.() ?? String(Math.random()) };
-      const path = `v1/mattes/${matte.id}/composite?${new URLSearchParams(place())}`;
-      const job = await (await ask(path, { method: "POST", headers, body: chosen, signal })).json();
-      progress.replaceChildren();
-      watch(job);
-    } catch (error) {
-      progress.replaceChildren();
-      throw error;
-    }
-  });
-  async function watch(job) {
-    const panel = h("div", { class: "stack" });
-    const way = h("p", { class: "row" }, h("a", { href: `#/jobs/${job.id}` }, "Show the job"));
-    progress.replaceChildren(panel, way);
-    try {
-      const ended = await followJob(panel, job.id, signal, () => {}, job);
-      if (ended.video) way.prepend(button("Download the video", problem, () => save(ended.video.slice(1), "composite.mp4"), "primary"));
-    } catch (error) {
-      if (!signal.aborted) panel.append(problemBox(error));
-    }
-  }
-  const element = h("div", { class: "stack", hidden: true }, h("p", { class: "row" }, make), problem, progress);
-  return {
-    element,
-    choose(file) {
-      chosen = file;
-      element.hidden = !file;
-      progress.replaceChildren();
-    },
-  };
+	const problem = h("div");
+	const progress = h("div", { class: "stack" });
+	let chosen;
+	const make = button("Make the video", problem, async () => {
+		progress.replaceChildren(h("p", { class: "hint", role: "status" }, "Sending the clip."));
+		try {
+			const headers = { "Content-Type": chosen.type.startsWith("video/") ? chosen.type : "video/mp4", "Idempotency-Key": crypto.randomUUID?.() ?? String(Math.random()) };
+			const path = `v1/mattes/${matte.id}/composite?${new URLSearchParams(place())}`;
+			const job = await (await ask(path, { method: "POST", headers, body: chosen, signal })).json();
+			progress.replaceChildren();
+			watch(job);
+		} catch (error) {
+			progress.replaceChildren();
+			throw error;
+		}
+	});
+	async function watch(job) {
+		const panel = h("div", { class: "stack" });
+		const way = h("p", { class: "row" }, h("a", { href: `#/jobs/${job.id}` }, "Show the job"));
+		progress.replaceChildren(panel, way);
+		try {
+			const ended = await followJob(panel, job.id, signal, () => {}, job);
+			if (ended.video) way.prepend(button("Download the video", problem, () => save(ended.video.slice(1), "composite.mp4"), "primary"));
+		} catch (error) {
+			if (!signal.aborted) panel.append(problemBox(error));
+		}
+	}
+	const element = h("div", { class: "stack", hidden: true }, h("p", { class: "row" }, make), problem, progress);
+	return {
+		element,
+		choose(file) {
+			chosen = file;
+			element.hidden = !file;
+			progress.replaceChildren();
+		},
+	};
 }

@@ -4,28 +4,28 @@ const SLOW = 45; // ms between pictures above which fewer pixels are drawn
 const COARSEST = 2; // by default
 
 export class Coarseness {
-  level = 0; // one pixel of 4 ** level is drawn
-  #intervals = []; // ms between the last pictures of a movement
-  #paintedAt;
-  #rested = true; // whether the movement before has ended
-  #coarsest;
+	level = 0; // one pixel of 4 ** level is drawn
+	#intervals = []; // ms between the last pictures of a movement
+	#paintedAt;
+	#rested = true; // whether the movement before has ended
+	#coarsest;
 
-  constructor(coarsest = COARSEST) {
-    this.#coarsest = coarsest;
-  }
+	constructor(coarsest = COARSEST) {
+		this.#coarsest = coarsest;
+	}
 
-  // Notes that a picture is painted at a time; returns the level to paint it with.
-  next(now) {
-    if (!this.#rested) this.#intervals = [...this.#intervals.slice(-3), now - this.#paintedAt];
-    else if (this.level) [this.level, this.#intervals] = [this.level - 1, []]; // the device may have been busy only then
-    [this.#paintedAt, this.#rested] = [now, false];
-    if (this.#intervals.length === 4 && Math.min(...this.#intervals) > SLOW && this.level < this.#coarsest) {
-      this.level += 1;
-      this.#intervals = [];
-    }
-    return this.level;
-  }
-  rest() {
-    this.#rested = true;
-  }
+	// Notes that a picture is painted at a time; returns the level to paint it with.
+	next(now) {
+		if (!this.#rested) this.#intervals = [...this.#intervals.slice(-3), now - this.#paintedAt];
+		else if (this.level) [this.level, this.#intervals] = [this.level - 1, []]; // the device may have been busy only then
+		[this.#paintedAt, this.#rested] = [now, false];
+		if (this.#intervals.length === 4 && Math.min(...this.#intervals) > SLOW && this.level < this.#coarsest) {
+			this.level += 1;
+			this.#intervals = [];
+		}
+		return this.level;
+	}
+	rest() {
+		this.#rested = true;
+	}
 }

@@ -9,66 +9,66 @@ const TIMES = 2;
 
 // `element`, and `all`, which composites several files.
 export function downloads(stage, signal) {
-  const status = h("p", { class: "hint", role: "status" });
-  const problem = h("div");
-  const larger = h("input", { type: "checkbox" });
-  const buttons = Object.entries(FORMATS).map(([name, type]) =>
-    button(name, stage.problem, async () => saveBlob(await picture(stage, type, larger.checked), `composite.${name.toLowerCase()}`)));
-  // A browser cannot write EXR, and scales what is in 8 bits.
-  larger.onchange = () => (buttons.at(-1).hidden = larger.checked);
+	const status = h("p", { class: "hint", role: "status" });
+	const problem = h("div");
+	const larger = h("input", { type: "checkbox" });
+	const buttons = Object.entries(FORMATS).map(([name, type]) =>
+		button(name, stage.problem, async () => saveBlob(await picture(stage, type, larger.checked), `composite.${name.toLowerCase()}`)));
+	// A browser cannot write EXR, and scales what is in 8 bits.
+	larger.onchange = () => (buttons.at(-1).hidden = larger.checked);
 
-  async function all(files) {
-    const made = [];
-    const refused = [];
-    problem.replaceChildren();
-    for (const [n, file] of files.entries()) {
-      status.textContent = `Composite ${n + 1} of ${files.length}`;
-      try {
-        const backdrop = await fromFile(file);
-        made.push([entryName(file.name, n), await stage.composite(FORMATS.PNG, backdrop)]);
-        backdrop.close?.();
-      } catch (error) {
-        signal.throwIfAborted();
-        refused.push(`${file.name}: ${error.detail ?? error.message}`);
-      }
-    }
-    if (made.length) saveBlob(await zip(made, signal), "composites.zip");
-    status.textContent = `${made.length} of ${files.length} composites are in composites.zip.`;
-    if (refused.length) problem.replaceChildren(problemBox({ title: "Some files cannot be backdrops", detail: refused.join("; "), entry: refused[0] }));
-  }
+	async function all(files) {
+		const made = [];
+		const refused = [];
+		problem.replaceChildren();
+		for (const [n, file] of files.entries()) {
+			status.textContent = `Composite ${n + 1} of ${files.length}`;
+			try {
+				const backdrop = await fromFile(file);
+				made.push([entryName(file.name, n), await stage.composite(FORMATS.PNG, backdrop)]);
+				backdrop.close?.();
+			} catch (error) {
+				signal.throwIfAborted();
+				refused.push(`${file.name}: ${error.detail ?? error.message}`);
+			}
+		}
+		if (made.length) saveBlob(await zip(made, signal), "composites.zip");
+		status.textContent = `${made.length} of ${files.length} composites are in composites.zip.`;
+		if (refused.length) problem.replaceChildren(problemBox({ title: "Some files cannot be backdrops", detail: refused.join("; "), entry: refused[0] }));
+	}
 
-  const copy = button("Copy picture", stage.problem, async () => {
-    await copyPicture(stage);
-    status.textContent = "The picture is in the clipboard.";
-  });
-  const element = h("div", { class: "stack" }, h("div", { class: "row" }, copy, h("span", {}, "Download as"), buttons,
-    h("label", {}, larger, " Twice the size")), status, problem);
-  return { element, all: (files) => all(files).catch((error) => signal.aborted || problem.replaceChildren(problemBox(error))) };
+	const copy = button("Copy picture", stage.problem, async () => {
+		await copyPicture(stage);
+		status.textContent = "The picture is in the clipboard.";
+	});
+	const element = h("div", { class: "stack" }, h("div", { class: "row" }, copy, h("span", {}, "Download as"), buttons,
+		h("label", {}, larger, " Twice the size")), status, problem);
+	return { element, all: (files) => all(files).catch((error) => signal.aborted || problem.replaceChildren(problemBox(error))) };
 }
 
 // The composite as a file; twice as large it is smoother, and shows no more detail.
 async function picture(stage, type, isLarger) {
-  if (!isLarger) return stage.composite(type);
-  const bitmap = await createImageBitmap(await stage.composite(FORMATS.PNG));
-  const canvas = Object.assign(document.createElement("canvas"), { width: TIMES * bitmap.width, height: TIMES * bitmap.height });
-  const context = canvas.getContext("2d");
-  context.imageSmoothingQuality = "high";
-  context.drawImage(bitmap, 0, 0, canvas.width, canvas.height);
-  return new Promise((resolve) => canvas.toBlob(resolve, type, 0.95));
+	if (!isLarger) return stage.composite(type);
+	const bitmap = await createImageBitmap(await stage.composite(FORMATS.PNG));
+	const canvas = Object.assign(document.createElement("canvas"), { width: TIMES * bitmap.width, height: TIMES * bitmap.height });
+	const context = canvas.getContext("2d");
+	context.imageSmoothingQuality = "high";
+	context.drawImage(bitmap, 0, 0, canvas.width, canvas.height);
+	return new Promise((resolve) => canvas.toBlob(resolve, type, 0.95));
 }
 
 async function copyPicture(stage) {
-  const title = "Cannot copy the picture";
-  if (!navigator.clipboard?.write) {
-    throw new Problem({ title, detail: "Browsers copy pictures only on pages from https or from this device. Download it instead." });
-  }
-  const made = stage.composite(FORMATS.PNG);
-  try {
-    await navigator.clipboard.write([new ClipboardItem({ [FORMATS.PNG]: made })]);
-  } catch {
-    await made; // says what the service refused
-    throw new Problem({ title, detail: "The browser did not allow it. Click into the page and try again, or download the picture." });
-  }
+	const title = "Cannot copy the picture";
+	if (!navigator.clipboard?.write) {
+		throw new Problem({ title, detail: "Browsers copy pictures only on pages from https or from this device. Download it instead." });
+	}
+	const made = stage.composite(FORMATS.PNG);
+	try {
+		await navigator.clipboard.write([new ClipboardItem({ [FORMATS.PNG]: made })]);
+	} catch {
+		await made; // says what the service refused
+		throw new Problem({ title, detail: "The browser did not allow it. Click into the page and try again, or download the picture." });
+	}
 }
 
 // ASCII, and of its own for each file.

@@ -3,5 +3,5 @@ import { ask } from "../lib/api.js";
 import { decodeLive } from "./live_form.js";
 
 export async function fetchLive(id, signal) {
-  return decodeLive(await (await ask(`v1/mattes/${id}/live`, { signal })).arrayBuffer());
+	return decodeLive(await (await ask(`v1/mattes/${id}/live`, { signal })).arrayBuffer());
 }

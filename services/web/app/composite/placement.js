@@ -2,99 +2,99 @@
 import { h } from "../lib/dom.js";
 
 const CONTROLS = [
-  // name, label, default, minimum, maximum, step of the slider and of the keys
-  ["right", "Move right", 0, -2, 2, 0.01],
-  ["down", "Move down", 0, -2, 2, 0.01],
-  ["scale", "Size", 1, 0.1, 10, 0.01],
-  ["angle", "Turn", 0, -180, 180, 1],
+	// name, label, default, minimum, maximum, step of the slider and of the keys
+	["right", "Move right", 0, -2, 2, 0.01],
+	["down", "Move down", 0, -2, 2, 0.01],
+	["scale", "Size", 1, 0.1, 10, 0.01],
+	["angle", "Turn", 0, -180, 180, 1],
 ];
 const DEFAULTS = Object.fromEntries(CONTROLS.map(([name, , value]) => [name, value]));
 const KEYS = {
-  ArrowLeft: ["right", -2], ArrowRight: ["right", 2], ArrowUp: ["down", -2], ArrowDown: ["down", 2],
-  "+": ["scale", 5], "-": ["scale", -5], "[": ["angle", -2], "]": ["angle", 2],
+	ArrowLeft: ["right", -2], ArrowRight: ["right", 2], ArrowUp: ["down", -2], ArrowDown: ["down", 2],
+	"+": ["scale", 5], "-": ["scale", -5], "[": ["angle", -2], "]": ["angle", 2],
 };
 
 // The four numbers in `values`, and the elements that set them. `changed` is called after each change.
 export function placement(changed) {
-  const values = { ...DEFAULTS };
-  const sliders = Object.fromEntries(CONTROLS.map(([name, , , min, max, step]) => {
-    const logarithmic = name === "scale"; // as far from 1 to 10 as from 1 to a tenth
-    const [low, high, fine] = logarithmic ? [Math.log10(min), Math.log10(max), 0.01] : [min, max, step];
-    const input = h("input", { type: "range", id: `place-${name}`, min: low, max: high, step: fine });
-    input.oninput = () => set({ [name]: logarithmic ? 10 ** input.value : Number(input.value) });
-    return [name, { input, output: h("output", { for: `place-${name}` }) }];
-  }));
+	const values = { ...DEFAULTS };
+	const sliders = Object.fromEntries(CONTROLS.map(([name, , , min, max, step]) => {
+		const logarithmic = name === "scale"; // as far from 1 to 10 as from 1 to a tenth
+		const [low, high, fine] = logarithmic ? [Math.log10(min), Math.log10(max), 0.01] : [min, max, step];
+		const input = h("input", { type: "range", id: `place-${name}`, min: low, max: high, step: fine });
+		input.oninput = () => set({ [name]: logarithmic ? 10 ** input.value : Number(input.value) });
+		return [name, { input, output: h("output", { for: `place-${name}` }) }];
+	}));
 
-  function update(wanted) {
-    for (const [name, , , min, max] of CONTROLS) {
-      let value = wanted[name] ?? values[name];
-      if (name === "angle") value = ((((value + 180) % 360) + 360) % 360) - 180;
-      values[name] = Number(Math.min(max, Math.max(min, value)).toFixed(4));
-      const { input, output } = sliders[name];
-      input.value = name === "scale" ? Math.log10(values.scale) : values[name];
-      input.ariaValueText = output.textContent = name === "angle" ? `${Math.round(values.angle)}°` : `${Math.round(100 * values[name])} %`;
-    }
-  }
-  function set(wanted) {
-    update(wanted);
-    changed();
-  }
-  function step(name, steps) {
-    const [, , , , , fine] = CONTROLS.find(([control]) => control === name);
-    set({ [name]: name === "scale" ? values.scale * 1.02 ** steps : values[name] + steps * fine });
-  }
+	function update(wanted) {
+		for (const [name, , , min, max] of CONTROLS) {
+			let value = wanted[name] ?? values[name];
+			if (name === "angle") value = ((((value + 180) % 360) + 360) % 360) - 180;
+			values[name] = Number(Math.min(max, Math.max(min, value)).toFixed(4));
+			const { input, output } = sliders[name];
+			input.value = name === "scale" ? Math.log10(values.scale) : values[name];
+			input.ariaValueText = output.textContent = name === "angle" ? `${Math.round(values.angle)}°` : `${Math.round(100 * values[name])} %`;
+		}
+	}
+	function set(wanted) {
+		update(wanted);
+		changed();
+	}
+	function step(name, steps) {
+		const [, , , , , fine] = CONTROLS.find(([control]) => control === name);
+		set({ [name]: name === "scale" ? values.scale * 1.02 ** steps : values[name] + steps * fine });
+	}
 
-  update({});
-  return {
-    values, set, step,
-    sliders: h("div", { class: "sliders" }, CONTROLS.map(([name, label]) =>
-      [h("label", { for: `place-${name}` }, label), sliders[name].input, sliders[name].output])),
-    reset: h("button", { type: "button", onclick: () => set(DEFAULTS) }, "Reset"),
-  };
+	update({});
+	return {
+		values, set, step,
+		sliders: h("div", { class: "sliders" }, CONTROLS.map(([name, label]) =>
+			[h("label", { for: `place-${name}` }, label), sliders[name].input, sliders[name].output])),
+		reset: h("button", { type: "button", onclick: () => set(DEFAULTS) }, "Reset"),
+	};
 }
 
 // Lets keys, the wheel, the mouse and fingers on an element set a placement. `monitor` is an element of the monitor's size.
 export function handleGestures(element, placed, monitor = element) {
-  element.onkeydown = (event) => {
-    const [name, steps] = KEYS[event.key] ?? [];
-    if (!name || event.ctrlKey || event.metaKey || event.altKey) return;
-    event.preventDefault();
-    placed.step(name, event.shiftKey && event.key.startsWith("Arrow") ? 5 * steps : steps);
-  };
-  element.addEventListener("wheel", (event) => {
-    if (document.activeElement !== element && !event.ctrlKey) return; // without focus the wheel scrolls the page
-    event.preventDefault();
-    placed.set({ scale: placed.values.scale * Math.exp(-event.deltaY * (event.deltaMode ? 0.03 : 0.001)) });
-  }, { passive: false });
-  handlePointers(element, placed, monitor);
+	element.onkeydown = (event) => {
+		const [name, steps] = KEYS[event.key] ?? [];
+		if (!name || event.ctrlKey || event.metaKey || event.altKey) return;
+		event.preventDefault();
+		placed.step(name, event.shiftKey && event.key.startsWith("Arrow") ? 5 * steps : steps);
+	};
+	element.addEventListener("wheel", (event) => {
+		if (document.activeElement !== element && !event.ctrlKey) return; // without focus the wheel scrolls the page
+		event.preventDefault();
+		placed.set({ scale: placed.values.scale * Math.exp(-event.deltaY * (event.deltaMode ? 0.03 : 0.001)) });
+	}, { passive: false });
+	handlePointers(element, placed, monitor);
 }
 
 // One finger or the mouse moves; two fingers scale and turn as well.
 function handlePointers(element, placed, monitor) {
-  const fingers = new Map();
-  const state = () => {
-    const [a, b = a] = [...fingers.values()];
-    const [dx, dy] = [b.x - a.x, b.y - a.y];
-    return { x: (a.x + b.x) / 2, y: (a.y + b.y) / 2, apart: Math.hypot(dx, dy), angle: (Math.atan2(dy, dx) * 180) / Math.PI };
-  };
-  element.onpointerdown = (event) => {
-    if (event.button) return;
-    element.setPointerCapture(event.pointerId);
-    fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
-  };
-  element.onpointermove = (event) => {
-    if (!fingers.has(event.pointerId)) return;
-    const before = state();
-    fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
-    const now = state();
-    const { width, height } = monitor.getBoundingClientRect();
-    const { right, down, scale, angle } = placed.values;
-    const wanted = { right: right + (now.x - before.x) / width, down: down + (now.y - before.y) / height };
-    if (fingers.size === 2 && before.apart > 10) {
-      wanted.scale = (scale * now.apart) / before.apart;
-      wanted.angle = angle + now.angle - before.angle;
-    }
-    placed.set(wanted);
-  };
-  element.onpointerup = element.onpointercancel = (event) => fingers.delete(event.pointerId);
+	const fingers = new Map();
+	const state = () => {
+		const [a, b = a] = [...fingers.values()];
+		const [dx, dy] = [b.x - a.x, b.y - a.y];
+		return { x: (a.x + b.x) / 2, y: (a.y + b.y) / 2, apart: Math.hypot(dx, dy), angle: (Math.atan2(dy, dx) * 180) / Math.PI };
+	};
+	element.onpointerdown = (event) => {
+		if (event.button) return;
+		element.setPointerCapture(event.pointerId);
+		fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+	};
+	element.onpointermove = (event) => {
+		if (!fingers.has(event.pointerId)) return;
+		const before = state();
+		fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+		const now = state();
+		const { width, height } = monitor.getBoundingClientRect();
+		const { right, down, scale, angle } = placed.values;
+		const wanted = { right: right + (now.x - before.x) / width, down: down + (now.y - before.y) / height };
+		if (fingers.size === 2 && before.apart > 10) {
+			wanted.scale = (scale * now.apart) / before.apart;
+			wanted.angle = angle + now.angle - before.angle;
+		}
+		placed.set(wanted);
+	};
+	element.onpointerup = element.onpointercancel = (event) => fingers.delete(event.pointerId);
 }

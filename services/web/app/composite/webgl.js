@@ -10,8 +10,8 @@ precision highp float;
 uniform sampler2D picture; // which decodes sRGB
 out vec4 light;
 void main() {
-  vec4 seen = texelFetch(picture, ivec2(gl_FragCoord.xy), 0);
-  light = vec4(seen.a * seen.rgb, 1);
+	vec4 seen = texelFetch(picture, ivec2(gl_FragCoord.xy), 0);
+	light = vec4(seen.a * seen.rgb, 1);
 }`;
 
 // Resamples the backdrop to the cells of the first level; beyond its edges is black, or its mirror image without end.
@@ -25,10 +25,10 @@ uniform float blur; // level of the picture that is as coarse as the cells
 uniform bool endless;
 out vec4 light;
 void main() {
-  vec2 at = (placing * vec3(min(floor(gl_FragCoord.xy), most) + 0.5, 1)).xy;
-  if (endless) at = 1.0 - abs(mod(at, 2.0) - 1.0);
-  vec2 covered = endless ? vec2(1) : clamp(cells * min(at, 1.0 - at) + 0.5, 0.0, 1.0);
-  light = vec4(covered.x * covered.y * textureLod(backdrop, at, blur).rgb, 1);
+	vec2 at = (placing * vec3(min(floor(gl_FragCoord.xy), most) + 0.5, 1)).xy;
+	if (endless) at = 1.0 - abs(mod(at, 2.0) - 1.0);
+	vec2 covered = endless ? vec2(1) : clamp(cells * min(at, 1.0 - at) + 0.5, 0.0, 1.0);
+	light = vec4(covered.x * covered.y * textureLod(backdrop, at, blur).rgb, 1);
 }`;
 
 // Halves a level: every second node, with the weights [1, 3, 3, 1] / 8 along each axis, sampling between pairs of nodes.
@@ -39,9 +39,9 @@ uniform vec2 size; // of the finer level, in nodes, with those beyond its edge
 uniform vec2 most; // the last column and row of this one
 out vec4 light;
 void main() {
-  vec2 first = 2.0 * min(floor(gl_FragCoord.xy), most) + 0.25;
-  light = vec4(0);
-  for (int k = 0; k < 4; k++) light += textureLod(fine, (first + 1.5 * vec2(k & 1, k >> 1)) / size, 0.0) / 4.0;
+	vec2 first = 2.0 * min(floor(gl_FragCoord.xy), most) + 0.25;
+	light = vec4(0);
+	for (int k = 0; k < 4; k++) light += textureLod(fine, (first + 1.5 * vec2(k & 1, k >> 1)) / size, 0.0) / 4.0;
 }`;
 
 const GLASS = `#version 300 es
@@ -59,177 +59,177 @@ uniform int height;
 uniform int every; // pixel that is drawn, along each axis
 out vec4 colour;
 void main() {
-  ivec2 pixel = min(every * ivec2(gl_FragCoord.x, float(height) - gl_FragCoord.y) + every / 2, textureSize(offset, 0) - 1);
-  int count = textureSize(lookups, 0).z;
-  vec3 sum = vec3(0);
-  for (int k = 0; k < count; k++) {
-    uvec4 lookup = texelFetch(lookups, ivec3(pixel, k), 0);
-    vec3 share = vec3(lookup.z & 255u, lookup.w >> 8, lookup.w & 255u) / 255.0;
-    if (share == vec3(0)) break;
-    sum += share * textureLod(light, vec2(lookup.xy) / 65536.0, max(float(lookup.z >> 8) / 16.0 - finest, 0.0)).rgb;
-  }
-  vec4 root = texelFetch(offset, pixel, 0);
-  vec3 rho = texelFetch(absorption, pixel, 0).rgb;
-  vec3 seen = tops.x * root.rgb * root.rgb + crosstalk * (tops.y * rho * rho * sum);
-  seen = clamp(root.a * seen, 0.0, 1.0);
-  colour = vec4(mix(12.92 * seen, 1.055 * pow(seen, vec3(1.0 / 2.4)) - 0.055, greaterThan(seen, vec3(0.0031308))), root.a);
+	ivec2 pixel = min(every * ivec2(gl_FragCoord.x, float(height) - gl_FragCoord.y) + every / 2, textureSize(offset, 0) - 1);
+	int count = textureSize(lookups, 0).z;
+	vec3 sum = vec3(0);
+	for (int k = 0; k < count; k++) {
+		uvec4 lookup = texelFetch(lookups, ivec3(pixel, k), 0);
+		vec3 share = vec3(lookup.z & 255u, lookup.w >> 8, lookup.w & 255u) / 255.0;
+		if (share == vec3(0)) break;
+		sum += share * textureLod(light, vec2(lookup.xy) / 65536.0, max(float(lookup.z >> 8) / 16.0 - finest, 0.0)).rgb;
+	}
+	vec4 root = texelFetch(offset, pixel, 0);
+	vec3 rho = texelFetch(absorption, pixel, 0).rgb;
+	vec3 seen = tops.x * root.rgb * root.rgb + crosstalk * (tops.y * rho * rho * sum);
+	seen = clamp(root.a * seen, 0.0, 1.0);
+	colour = vec4(mix(12.92 * seen, 1.055 * pow(seen, vec3(1.0 / 2.4)) - 0.055, greaterThan(seen, vec3(0.0031308))), root.a);
 }`;
 
 // The matrix of a placement, as `Placement.matrix` computes it: from cells to shares of the picture.
 function placing({ right, down, scale, angle }, [columns, rows], [wide, high]) {
-  const turn = (angle * Math.PI) / 180;
-  const [cosine, sine] = [Math.cos(turn) / scale, Math.sin(turn) / scale];
-  const [x, y] = [-wide / 2 - right * wide, -high / 2 - down * high];
-  return [
-    (cosine * wide) / columns / wide, (-sine * wide) / columns / high, 0,
-    (sine * high) / rows / wide, (cosine * high) / rows / high, 0,
-    (cosine * x + sine * y) / wide + 0.5, (-sine * x + cosine * y) / high + 0.5, 1,
-  ];
+	const turn = (angle * Math.PI) / 180;
+	const [cosine, sine] = [Math.cos(turn) / scale, Math.sin(turn) / scale];
+	const [x, y] = [-wide / 2 - right * wide, -high / 2 - down * high];
+	return [
+		(cosine * wide) / columns / wide, (-sine * wide) / columns / high, 0,
+		(sine * high) / rows / wide, (cosine * high) / rows / high, 0,
+		(cosine * x + sine * y) / wide + 0.5, (-sine * x + cosine * y) / high + 0.5, 1,
+	];
 }
 
 // A WebGL2 context; null where the browser has none, or cannot render to floating-point textures. What a mask left out is
 // black, or transparent with `alpha`.
 export function webglContext(canvas, alpha = false) {
-  const gl = canvas.getContext("webgl2", { alpha, antialias: false, depth: false, preserveDrawingBuffer: true });
-  return gl?.getExtension("EXT_color_buffer_float") || gl?.getExtension("EXT_color_buffer_half_float") ? gl : null;
+	const gl = canvas.getContext("webgl2", { alpha, antialias: false, depth: false, preserveDrawingBuffer: true });
+	return gl?.getExtension("EXT_color_buffer_float") || gl?.getExtension("EXT_color_buffer_half_float") ? gl : null;
 }
 
 // A painter of a matte that `fetchLive` has decoded.
 export function createPainter(gl, matte, monitor) {
-  const { width, height, levels, texture, finest } = matte;
-  const made = [];
-  const keep = (kind, thing) => (made.push([kind, thing]), thing);
+	const { width, height, levels, texture, finest } = matte;
+	const made = [];
+	const keep = (kind, thing) => (made.push([kind, thing]), thing);
 
-  function program(text) {
-    const one = keep("Program", gl.createProgram());
-    for (const [kind, source] of [[gl.VERTEX_SHADER, TRIANGLE], [gl.FRAGMENT_SHADER, text]]) {
-      const shader = gl.createShader(kind);
-      gl.shaderSource(shader, source);
-      gl.compileShader(shader);
-      gl.attachShader(one, shader);
-      gl.deleteShader(shader); // as soon as the program goes
-    }
-    gl.linkProgram(one);
-    if (!gl.getProgramParameter(one, gl.LINK_STATUS) && !gl.isContextLost()) throw new Error(gl.getProgramInfoLog(one));
-    const places = new Map();
-    const at = (name) => places.get(name) ?? places.set(name, gl.getUniformLocation(one, name)).get(name);
-    return { use: () => gl.useProgram(one), at };
-  }
-  function textureOf(target, unit, filter, min = filter) {
-    const one = keep("Texture", gl.createTexture());
-    gl.activeTexture(gl.TEXTURE0 + unit);
-    gl.bindTexture(target, one);
-    gl.texParameteri(target, gl.TEXTURE_MAG_FILTER, filter);
-    gl.texParameteri(target, gl.TEXTURE_MIN_FILTER, min);
-    gl.texParameteri(target, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
-    gl.texParameteri(target, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
-    return one;
-  }
-  // Each texture stays on a unit of its own.
-  const [LIGHT, LOOKUPS, OFFSET, ABSORPTION, PICTURE, BACKDROP] = [0, 1, 2, 3, 4, 5];
-  const [decode, place, halve, seen] = [program(DECODE), program(PLACE), program(HALVE), program(GLASS)];
-  gl.bindVertexArray(keep("VertexArray", gl.createVertexArray()));
-  gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+	function program(text) {
+		const one = keep("Program", gl.createProgram());
+		for (const [kind, source] of [[gl.VERTEX_SHADER, TRIANGLE], [gl.FRAGMENT_SHADER, text]]) {
+			const shader = gl.createShader(kind);
+			gl.shaderSource(shader, source);
+			gl.compileShader(shader);
+			gl.attachShader(one, shader);
+			gl.deleteShader(shader); // as soon as the program goes
+		}
+		gl.linkProgram(one);
+		if (!gl.getProgramParameter(one, gl.LINK_STATUS) && !gl.isContextLost()) throw new Error(gl.getProgramInfoLog(one));
+		const places = new Map();
+		const at = (name) => places.get(name) ?? places.set(name, gl.getUniformLocation(one, name)).get(name);
+		return { use: () => gl.useProgram(one), at };
+	}
+	function textureOf(target, unit, filter, min = filter) {
+		const one = keep("Texture", gl.createTexture());
+		gl.activeTexture(gl.TEXTURE0 + unit);
+		gl.bindTexture(target, one);
+		gl.texParameteri(target, gl.TEXTURE_MAG_FILTER, filter);
+		gl.texParameteri(target, gl.TEXTURE_MIN_FILTER, min);
+		gl.texParameteri(target, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
+		gl.texParameteri(target, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
+		return one;
+	}
+	// Each texture stays on a unit of its own.
+	const [LIGHT, LOOKUPS, OFFSET, ABSORPTION, PICTURE, BACKDROP] = [0, 1, 2, 3, 4, 5];
+	const [decode, place, halve, seen] = [program(DECODE), program(PLACE), program(HALVE), program(GLASS)];
+	gl.bindVertexArray(keep("VertexArray", gl.createVertexArray()));
+	gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
 
-  const light = textureOf(gl.TEXTURE_2D, LIGHT, gl.LINEAR, gl.LINEAR_MIPMAP_LINEAR);
-  gl.texStorage2D(gl.TEXTURE_2D, levels.length, gl.RGBA16F, ...texture);
-  const targetOn = (texture, level) => {
-    const target = keep("Framebuffer", gl.createFramebuffer());
-    gl.bindFramebuffer(gl.FRAMEBUFFER, target);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, level);
-    return target;
-  };
-  const targets = levels.map((_, level) => targetOn(light, level));
-  textureOf(gl.TEXTURE_2D_ARRAY, LOOKUPS, gl.NEAREST);
-  gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.RGBA16UI, width, height, matte.lookups.length);
-  matte.lookups.forEach((layer, k) =>
-    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, k, width, height, 1, gl.RGBA_INTEGER, gl.UNSIGNED_SHORT, layer));
-  for (const [unit, frame] of [[OFFSET, matte.offset], [ABSORPTION, matte.absorption]]) {
-    textureOf(gl.TEXTURE_2D, unit, gl.NEAREST);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, width, height, 0, gl.RGBA, gl.UNSIGNED_BYTE, frame);
-  }
-  textureOf(gl.TEXTURE_2D, PICTURE, gl.NEAREST);
-  const target = targetOn(textureOf(gl.TEXTURE_2D, BACKDROP, gl.LINEAR, gl.LINEAR_MIPMAP_LINEAR), 0);
-  let shown = [0, 0];
+	const light = textureOf(gl.TEXTURE_2D, LIGHT, gl.LINEAR, gl.LINEAR_MIPMAP_LINEAR);
+	gl.texStorage2D(gl.TEXTURE_2D, levels.length, gl.RGBA16F, ...texture);
+	const targetOn = (texture, level) => {
+		const target = keep("Framebuffer", gl.createFramebuffer());
+		gl.bindFramebuffer(gl.FRAMEBUFFER, target);
+		gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, level);
+		return target;
+	};
+	const targets = levels.map((_, level) => targetOn(light, level));
+	textureOf(gl.TEXTURE_2D_ARRAY, LOOKUPS, gl.NEAREST);
+	gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.RGBA16UI, width, height, matte.lookups.length);
+	matte.lookups.forEach((layer, k) =>
+		gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, k, width, height, 1, gl.RGBA_INTEGER, gl.UNSIGNED_SHORT, layer));
+	for (const [unit, frame] of [[OFFSET, matte.offset], [ABSORPTION, matte.absorption]]) {
+		textureOf(gl.TEXTURE_2D, unit, gl.NEAREST);
+		gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, width, height, 0, gl.RGBA, gl.UNSIGNED_BYTE, frame);
+	}
+	textureOf(gl.TEXTURE_2D, PICTURE, gl.NEAREST);
+	const target = targetOn(textureOf(gl.TEXTURE_2D, BACKDROP, gl.LINEAR, gl.LINEAR_MIPMAP_LINEAR), 0);
+	let shown = [0, 0];
 
-  seen.use();
-  gl.uniform1i(seen.at("light"), LIGHT);
-  gl.uniform1i(seen.at("lookups"), LOOKUPS);
-  gl.uniform1i(seen.at("offset"), OFFSET);
-  gl.uniform1i(seen.at("absorption"), ABSORPTION);
-  gl.uniform2f(seen.at("tops"), matte.S, matte.rho);
-  gl.uniformMatrix3fv(seen.at("crosstalk"), true, matte.crosstalk.flat());
-  halve.use();
-  gl.uniform1i(halve.at("fine"), LIGHT);
-  decode.use();
-  gl.uniform1i(decode.at("picture"), PICTURE);
-  place.use();
-  gl.uniform1i(place.at("backdrop"), BACKDROP);
-  return {
-    // Sets the backdrop: a picture, or the current frame of a video.
-    setBackdrop(picture) {
-      gl.activeTexture(gl.TEXTURE0 + PICTURE);
-      gl.texImage2D(gl.TEXTURE_2D, 0, gl.SRGB8_ALPHA8, gl.RGBA, gl.UNSIGNED_BYTE, picture);
-      const size = [picture.videoWidth ?? picture.width, picture.videoHeight ?? picture.height];
-      gl.activeTexture(gl.TEXTURE0 + BACKDROP);
-      if (size.some((one, i) => one !== shown[i])) {
-        gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA16F, ...size, 0, gl.RGBA, gl.HALF_FLOAT, null);
-        shown = size;
-      }
-      gl.bindFramebuffer(gl.FRAMEBUFFER, target);
-      gl.viewport(0, 0, ...size);
-      decode.use();
-      gl.drawArrays(gl.TRIANGLES, 0, 3);
-      gl.generateMipmap(gl.TEXTURE_2D);
-    },
-    // Draws the glass with the backdrop at a placement. One of 4 ** coarser pixels is drawn, from light that is as much
-    // coarser. An `endless` backdrop goes on beyond its edges.
-    draw(at, coarser = 0, endless = false) {
-      if (!shown[0]) return;
-      const first = Math.min(finest + coarser, levels.length - 1);
-      const every = 2 ** coarser;
-      const size = { width: Math.ceil(width / every), height: Math.ceil(height / every) };
-      if (gl.canvas.width !== size.width || gl.canvas.height !== size.height) Object.assign(gl.canvas, size);
-      const cells = levels[0].map((one) => one / 2 ** first);
-      const matrix = placing(at, cells, monitor);
-      const pixels = Math.sqrt(Math.abs(matrix[0] * matrix[4] - matrix[1] * matrix[3]) * shown[0] * shown[1]);
-      // The service takes the mean of a picture over each cell. One that is moved it samples at four places in each cell,
-      // which blurs it by as much as a pixel an eighth larger does.
-      const moved = at.right || at.down || at.angle || at.scale !== 1;
-      gl.activeTexture(gl.TEXTURE0 + LIGHT);
-      place.use();
-      gl.uniformMatrix3fv(place.at("placing"), false, matrix);
-      gl.uniform2f(place.at("most"), levels[first][0] - 1, levels[first][1] - 1);
-      gl.uniform2f(place.at("cells"), 1 / Math.hypot(matrix[0], matrix[3]), 1 / Math.hypot(matrix[1], matrix[4]));
-      const blur = Math.log2(pixels * (moved ? 1.125 : 1));
-      gl.uniform1f(place.at("blur"), blur > 0.25 ? blur : 0); // sampling between two levels takes twice as long
-      gl.uniform1i(place.at("endless"), endless);
-      for (let level = first; level < levels.length; level++) {
-        gl.bindFramebuffer(gl.FRAMEBUFFER, targets[level]);
-        gl.viewport(0, 0, texture[0] >> level, texture[1] >> level);
-        if (level > first) {
-          if (level === first + 1) halve.use();
-          // WebGL forbids reading the level that is being written.
-          gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_BASE_LEVEL, level - 1);
-          gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAX_LEVEL, level - 1);
-          gl.uniform2f(halve.at("size"), texture[0] >> (level - 1), texture[1] >> (level - 1));
-          gl.uniform2f(halve.at("most"), levels[level][0] - 1, levels[level][1] - 1);
-        }
-        gl.drawArrays(gl.TRIANGLES, 0, 3);
-      }
-      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_BASE_LEVEL, first);
-      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAX_LEVEL, levels.length - 1);
-      gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-      gl.viewport(0, 0, size.width, size.height);
-      seen.use();
-      gl.uniform1f(seen.at("finest"), first);
-      gl.uniform1i(seen.at("height"), size.height);
-      gl.uniform1i(seen.at("every"), every);
-      gl.drawArrays(gl.TRIANGLES, 0, 3);
-    },
-    // Frees everything on the graphics card.
-    close() {
-      for (const [kind, thing] of made.splice(0)) gl[`delete${kind}`](thing);
-    },
-  };
+	seen.use();
+	gl.uniform1i(seen.at("light"), LIGHT);
+	gl.uniform1i(seen.at("lookups"), LOOKUPS);
+	gl.uniform1i(seen.at("offset"), OFFSET);
+	gl.uniform1i(seen.at("absorption"), ABSORPTION);
+	gl.uniform2f(seen.at("tops"), matte.S, matte.rho);
+	gl.uniformMatrix3fv(seen.at("crosstalk"), true, matte.crosstalk.flat());
+	halve.use();
+	gl.uniform1i(halve.at("fine"), LIGHT);
+	decode.use();
+	gl.uniform1i(decode.at("picture"), PICTURE);
+	place.use();
+	gl.uniform1i(place.at("backdrop"), BACKDROP);
+	return {
+		// Sets the backdrop: a picture, or the current frame of a video.
+		setBackdrop(picture) {
+			gl.activeTexture(gl.TEXTURE0 + PICTURE);
+			gl.texImage2D(gl.TEXTURE_2D, 0, gl.SRGB8_ALPHA8, gl.RGBA, gl.UNSIGNED_BYTE, picture);
+			const size = [picture.videoWidth ?? picture.width, picture.videoHeight ?? picture.height];
+			gl.activeTexture(gl.TEXTURE0 + BACKDROP);
+			if (size.some((one, i) => one !== shown[i])) {
+				gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA16F, ...size, 0, gl.RGBA, gl.HALF_FLOAT, null);
+				shown = size;
+			}
+			gl.bindFramebuffer(gl.FRAMEBUFFER, target);
+			gl.viewport(0, 0, ...size);
+			decode.use();
+			gl.drawArrays(gl.TRIANGLES, 0, 3);
+			gl.generateMipmap(gl.TEXTURE_2D);
+		},
+		// Draws the glass with the backdrop at a placement. One of 4 ** coarser pixels is drawn, from light that is as much
+		// coarser. An `endless` backdrop goes on beyond its edges.
+		draw(at, coarser = 0, endless = false) {
+			if (!shown[0]) return;
+			const first = Math.min(finest + coarser, levels.length - 1);
+			const every = 2 ** coarser;
+			const size = { width: Math.ceil(width / every), height: Math.ceil(height / every) };
+			if (gl.canvas.width !== size.width || gl.canvas.height !== size.height) Object.assign(gl.canvas, size);
+			const cells = levels[0].map((one) => one / 2 ** first);
+			const matrix = placing(at, cells, monitor);
+			const pixels = Math.sqrt(Math.abs(matrix[0] * matrix[4] - matrix[1] * matrix[3]) * shown[0] * shown[1]);
+			// The service takes the mean of a picture over each cell. One that is moved it samples at four places in each cell,
+			// which blurs it by as much as a pixel an eighth larger does.
+			const moved = at.right || at.down || at.angle || at.scale !== 1;
+			gl.activeTexture(gl.TEXTURE0 + LIGHT);
+			place.use();
+			gl.uniformMatrix3fv(place.at("placing"), false, matrix);
+			gl.uniform2f(place.at("most"), levels[first][0] - 1, levels[first][1] - 1);
+			gl.uniform2f(place.at("cells"), 1 / Math.hypot(matrix[0], matrix[3]), 1 / Math.hypot(matrix[1], matrix[4]));
+			const blur = Math.log2(pixels * (moved ? 1.125 : 1));
+			gl.uniform1f(place.at("blur"), blur > 0.25 ? blur : 0); // sampling between two levels takes twice as long
+			gl.uniform1i(place.at("endless"), endless);
+			for (let level = first; level < levels.length; level++) {
+				gl.bindFramebuffer(gl.FRAMEBUFFER, targets[level]);
+				gl.viewport(0, 0, texture[0] >> level, texture[1] >> level);
+				if (level > first) {
+					if (level === first + 1) halve.use();
+					// WebGL forbids reading the level that is being written.
+					gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_BASE_LEVEL, level - 1);
+					gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAX_LEVEL, level - 1);
+					gl.uniform2f(halve.at("size"), texture[0] >> (level - 1), texture[1] >> (level - 1));
+					gl.uniform2f(halve.at("most"), levels[level][0] - 1, levels[level][1] - 1);
+				}
+				gl.drawArrays(gl.TRIANGLES, 0, 3);
+			}
+			gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_BASE_LEVEL, first);
+			gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAX_LEVEL, levels.length - 1);
+			gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+			gl.viewport(0, 0, size.width, size.height);
+			seen.use();
+			gl.uniform1f(seen.at("finest"), first);
+			gl.uniform1i(seen.at("height"), size.height);
+			gl.uniform1i(seen.at("every"), every);
+			gl.drawArrays(gl.TRIANGLES, 0, 3);
+		},
+		// Frees everything on the graphics card.
+		close() {
+			for (const [kind, thing] of made.splice(0)) gl[`delete${kind}`](thing);
+		},
+	};
 }

@@ -9,100 +9,100 @@ const AFTER = 1000; // ms that recording continues after the program
 
 // Why this browser cannot record, in words; null if it can.
 export function noCamera() {
-  if (!isSecureContext) return "Browsers allow the camera only on pages from https or from this device. Record with the camera’s own app, and choose the film here.";
-  if (!navigator.mediaDevices?.getUserMedia || !window.MediaRecorder) return "This browser cannot record films. Use the camera’s own app, and choose the film here.";
-  return null;
+	if (!isSecureContext) return "Browsers allow the camera only on pages from https or from this device. Record with the camera’s own app, and choose the film here.";
+	if (!navigator.mediaDevices?.getUserMedia || !window.MediaRecorder) return "This browser cannot record films. Use the camera’s own app, and choose the film here.";
+	return null;
 }
 
 // A panel to record with. `filmed(file, whole)` is called with every film; call `resume` when the panel is shown again.
 export function camera(signal, filmed) {
-  const picture = h("video", { muted: true, playsinline: true, "aria-label": "What the camera sees" });
-  const frame = h("div", { class: "picture", hidden: true }, picture);
-  const status = h("p", { class: "hint", role: "status" });
-  const problem = h("div");
-  const which = h("select", { "aria-label": "Camera", hidden: true });
-  const open = h("button", { type: "button", onclick: () => use() }, "Use a camera of this device");
-  const shoot = h("button", { type: "button", class: "primary", hidden: true, onclick: () => (recorder ? stop() : start()) }, "Start recording");
-  let stream;
-  let recorder;
-  let whole; // whether the program was shown to its end
+	const picture = h("video", { muted: true, playsinline: true, "aria-label": "What the camera sees" });
+	const frame = h("div", { class: "picture", hidden: true }, picture);
+	const status = h("p", { class: "hint", role: "status" });
+	const problem = h("div");
+	const which = h("select", { "aria-label": "Camera", hidden: true });
+	const open = h("button", { type: "button", onclick: () => use() }, "Use a camera of this device");
+	const shoot = h("button", { type: "button", class: "primary", hidden: true, onclick: () => (recorder ? stop() : start()) }, "Start recording");
+	let stream;
+	let recorder;
+	let whole; // whether the program was shown to its end
 
-  async function use(deviceId) {
-    problem.replaceChildren();
-    open.disabled = true;
-    try {
-      close();
-      const wanted = { width: { ideal: 1920 }, height: { ideal: 1080 }, frameRate: { ideal: 30 } };
-      stream = await navigator.mediaDevices.getUserMedia({ audio: false, video: deviceId ? { ...wanted, deviceId: { exact: deviceId } } : { ...wanted, facingMode: "environment" } });
-      if (signal.aborted) return close();
-      picture.srcObject = stream;
-      frame.hidden = which.hidden = shoot.hidden = false;
-      open.hidden = true;
-      const { width, height, deviceId: used } = stream.getVideoTracks()[0].getSettings();
-      picture.style.aspectRatio = `${width} / ${height}`;
-      const cameras = (await navigator.mediaDevices.enumerateDevices()).filter(({ kind }) => kind === "videoinput");
-      which.replaceChildren(...cameras.map(({ deviceId: id, label }, n) => h("option", { value: id, selected: id === used }, label || `Camera ${n + 1}`)));
-      status.textContent = `${width} × ${height} pixels. Recording starts and stops with the program.`;
-      await picture.play();
-    } catch (error) {
-      const detail = error.name === "NotAllowedError" ? "Allow it in the browser’s address bar, and try again." : error.message;
-      if (!signal.aborted) problem.replaceChildren(problemBox({ title: "Cannot use the camera", detail }));
-    } finally {
-      open.disabled = false;
-    }
-  }
-  which.onchange = () => use(which.value);
+	async function use(deviceId) {
+		problem.replaceChildren();
+		open.disabled = true;
+		try {
+			close();
+			const wanted = { width: { ideal: 1920 }, height: { ideal: 1080 }, frameRate: { ideal: 30 } };
+			stream = await navigator.mediaDevices.getUserMedia({ audio: false, video: deviceId ? { ...wanted, deviceId: { exact: deviceId } } : { ...wanted, facingMode: "environment" } });
+			if (signal.aborted) return close();
+			picture.srcObject = stream;
+			frame.hidden = which.hidden = shoot.hidden = false;
+			open.hidden = true;
+			const { width, height, deviceId: used } = stream.getVideoTracks()[0].getSettings();
+			picture.style.aspectRatio = `${width} / ${height}`;
+			const cameras = (await navigator.mediaDevices.enumerateDevices()).filter(({ kind }) => kind === "videoinput");
+			which.replaceChildren(...cameras.map(({ deviceId: id, label }, n) => h("option", { value: id, selected: id === used }, label || `Camera ${n + 1}`)));
+			status.textContent = `${width} × ${height} pixels. Recording starts and stops with the program.`;
+			await picture.play();
+		} catch (error) {
+			const detail = error.name === "NotAllowedError" ? "Allow it in the browser’s address bar, and try again." : error.message;
+			if (!signal.aborted) problem.replaceChildren(problemBox({ title: "Cannot use the camera", detail }));
+		} finally {
+			open.disabled = false;
+		}
+	}
+	which.onchange = () => use(which.value);
 
-  // Keeps the settings that the camera has found: a change during the film would look like a change of light. Returns the
-  // names of those that cannot be locked.
-  async function lock(track) {
-    const can = track.getCapabilities?.() ?? {};
-    const free = [];
-    for (const [mode, name] of Object.entries(LOCKED)) {
-      if (!can[mode]?.includes("manual")) free.push(name);
-      else await track.applyConstraints({ advanced: [{ [mode]: "manual" }] }).catch(() => free.push(name));
-    }
-    return free;
-  }
+	// Keeps the settings that the camera has found: a change during the film would look like a change of light. Returns the
+	// names of those that cannot be locked.
+	async function lock(track) {
+		const can = track.getCapabilities?.() ?? {};
+		const free = [];
+		for (const [mode, name] of Object.entries(LOCKED)) {
+			if (!can[mode]?.includes("manual")) free.push(name);
+			else await track.applyConstraints({ advanced: [{ [mode]: "manual" }] }).catch(() => free.push(name));
+		}
+		return free;
+	}
 
-  async function start() {
-    if (!stream || recorder) return;
-    const type = TYPES.find((one) => MediaRecorder.isTypeSupported(one));
-    const parts = [];
-    const mine = (recorder = new MediaRecorder(stream, { mimeType: type, videoBitsPerSecond: BITS }));
-    mine.ondataavailable = ({ data }) => parts.push(data);
-    mine.onstop = () => {
-      recorder = undefined;
-      shoot.textContent = "Start recording";
-      which.disabled = false;
-      status.textContent = "Recorded.";
-      const [kind] = mine.mimeType.split(";");
-      filmed(new File(parts, `film.${kind.endsWith("mp4") ? "mp4" : "webm"}`, { type: kind }), whole);
-      setRecording(signal, false);
-    };
-    whole = false;
-    mine.start(1000);
-    setRecording(signal, true);
-    shoot.textContent = "Stop recording";
-    which.disabled = true;
-    const free = await lock(stream.getVideoTracks()[0]);
-    status.textContent = free.length ? `Recording. The browser cannot lock ${free.join(", ")} of this camera: make sure that nothing changes.` : "Recording.";
-  }
+	async function start() {
+		if (!stream || recorder) return;
+		const type = TYPES.find((one) => MediaRecorder.isTypeSupported(one));
+		const parts = [];
+		const mine = (recorder = new MediaRecorder(stream, { mimeType: type, videoBitsPerSecond: BITS }));
+		mine.ondataavailable = ({ data }) => parts.push(data);
+		mine.onstop = () => {
+			recorder = undefined;
+			shoot.textContent = "Start recording";
+			which.disabled = false;
+			status.textContent = "Recorded.";
+			const [kind] = mine.mimeType.split(";");
+			filmed(new File(parts, `film.${kind.endsWith("mp4") ? "mp4" : "webm"}`, { type: kind }), whole);
+			setRecording(signal, false);
+		};
+		whole = false;
+		mine.start(1000);
+		setRecording(signal, true);
+		shoot.textContent = "Stop recording";
+		which.disabled = true;
+		const free = await lock(stream.getVideoTracks()[0]);
+		status.textContent = free.length ? `Recording. The browser cannot lock ${free.join(", ")} of this camera: make sure that nothing changes.` : "Recording.";
+	}
 
-  async function stop(ended = true) {
-    if (recorder?.state !== "recording") return;
-    await pause(AFTER, signal).catch(() => {});
-    if (recorder?.state !== "recording") return;
-    whole = ended;
-    recorder.stop();
-  }
+	async function stop(ended = true) {
+		if (recorder?.state !== "recording") return;
+		await pause(AFTER, signal).catch(() => {});
+		if (recorder?.state !== "recording") return;
+		whole = ended;
+		recorder.stop();
+	}
 
-  function close() {
-    stream?.getTracks().forEach((track) => track.stop());
-    stream = undefined;
-  }
-  signal.addEventListener("abort", close, { once: true });
-  const panel = h("div", { class: "stack" }, h("div", { class: "row" }, open, which, shoot), frame, status, problem);
-  const resume = () => picture.play().catch(() => {}); // the preview stops outside of the page, the recording does not
-  return { panel, start, stop, resume };
+	function close() {
+		stream?.getTracks().forEach((track) => track.stop());
+		stream = undefined;
+	}
+	signal.addEventListener("abort", close, { once: true });
+	const panel = h("div", { class: "stack" }, h("div", { class: "row" }, open, which, shoot), frame, status, problem);
+	const resume = () => picture.play().catch(() => {}); // the preview stops outside of the page, the recording does not
+	return { panel, start, stop, resume };
 }

@@ -4,8 +4,8 @@ const key = () => `envmatte-screen-${screen.width}x${screen.height}`;
 
 // As the page counts: right at a zoom of 100 %, to within the rounding of CSS pixels.
 export const countScreen = () => ({
-  width: Math.round(screen.width * devicePixelRatio),
-  height: Math.round(screen.height * devicePixelRatio),
+	width: Math.round(screen.width * devicePixelRatio),
+	height: Math.round(screen.height * devicePixelRatio),
 });
 
 // As it was measured in full screen, or else as the page counts.
@@ -15,11 +15,11 @@ export const rememberScreen = (size) => sessionStorage.setItem(key(), JSON.strin
 
 // Calls back when the zoom changes, or the window moves to a screen of another scale.
 export function onZoom(changed, signal) {
-  let ratio = devicePixelRatio;
-  const resized = () => {
-    if (ratio === devicePixelRatio) return;
-    ratio = devicePixelRatio;
-    changed();
-  };
-  addEventListener("resize", resized, { signal });
+	let ratio = devicePixelRatio;
+	const resized = () => {
+		if (ratio === devicePixelRatio) return;
+		ratio = devicePixelRatio;
+		changed();
+	};
+	addEventListener("resize", resized, { signal });
 }

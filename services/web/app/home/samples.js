@@ -13,19 +13,19 @@ export const still = ({ name }) => `${FOLDER}${name}.webp`;
 
 // Fetches a file of the app itself, which needs no key.
 async function fetchFile(name, signal) {
-  const answer = await fetch(FOLDER + name, { signal });
-  if (!answer.ok) throw new Problem({ title: "A sample is missing", detail: `This service has no file ${name}.`, status: answer.status });
-  return answer;
+	const answer = await fetch(FOLDER + name, { signal });
+	if (!answer.ok) throw new Problem({ title: "A sample is missing", detail: `This service has no file ${name}.`, status: answer.status });
+	return answer;
 }
 
 export const fetchSamples = async (signal) => (await fetchFile("samples.json", signal)).json();
 
 export async function fetchSample({ name }, signal) {
-  const { body } = await fetchFile(`${name}.live`, signal);
-  return decodeLive(await new Response(body.pipeThrough(new DecompressionStream("gzip"))).arrayBuffer());
+	const { body } = await fetchFile(`${name}.live`, signal);
+	return decodeLive(await new Response(body.pipeThrough(new DecompressionStream("gzip"))).arrayBuffer());
 }
 
 // A small capture archive, to run a recovery on.
 export async function fetchCapture(signal) {
-  return new File([await (await fetchFile("capture.zip", signal)).blob()], "sample-tumbler.zip", { type: "application/zip" });
+	return new File([await (await fetchFile("capture.zip", signal)).blob()], "sample-tumbler.zip", { type: "application/zip" });
 }

@@ -5,16 +5,16 @@ import { pause } from "./dom.js";
 const KEY = "envmatte-key"; // the player page keeps it under the same name
 
 export class Problem extends Error {
-  constructor({ title, detail, status, field, entry, limit }) {
-    super(detail);
-    Object.assign(this, { title, detail, status, field, entry, limit });
-  }
+	constructor({ title, detail, status, field, entry, limit }) {
+		super(detail);
+		Object.assign(this, { title, detail, status, field, entry, limit });
+	}
 }
 
 const UNREACHABLE = {
-  status: 0,
-  title: "The service does not answer",
-  detail: "Check that it runs and that this device is connected to it, then try again. Nothing stored is lost.",
+	status: 0,
+	title: "The service does not answer",
+	detail: "Check that it runs and that this device is connected to it, then try again. Nothing stored is lost.",
 };
 
 const GONE = "It was deleted, it has expired, or it belongs to another key.";
@@ -28,57 +28,57 @@ let asking;
 
 // Asks the user for a key; all requests that are refused meanwhile wait for the same dialog.
 export function unlock(problem) {
-  asking ??= new Promise((resolve, reject) => {
-    const dialog = document.getElementById("unlock");
-    const field = document.getElementById("key");
-    document.getElementById("unlock-why").textContent = key() ? "The service does not know this key." : "";
-    field.value = "";
-    dialog.onsubmit = () => {
-      sessionStorage.setItem(KEY, field.value.trim());
-      resolve();
-    };
-    dialog.onclose = () => {
-      asking = undefined;
-      reject(problem); // has no effect once a key was given
-    };
-    dialog.showModal();
-  });
-  return asking;
+	asking ??= new Promise((resolve, reject) => {
+		const dialog = document.getElementById("unlock");
+		const field = document.getElementById("key");
+		document.getElementById("unlock-why").textContent = key() ? "The service does not know this key." : "";
+		field.value = "";
+		dialog.onsubmit = () => {
+			sessionStorage.setItem(KEY, field.value.trim());
+			resolve();
+		};
+		dialog.onclose = () => {
+			asking = undefined;
+			reject(problem); // has no effect once a key was given
+		};
+		dialog.showModal();
+	});
+	return asking;
 }
 
 // Fetches once more where no answer came: when the network changes, browsers abort what is under way. Whatever this app
 // sends may come twice: it creates nothing, has an Idempotency-Key, or asks for a state that is then reached already.
 async function fetchTwice(path, options) {
-  try {
-    return await fetch(path, options);
-  } catch (error) {
-    if (options.signal?.aborted) throw error;
-    await pause(500, options.signal);
-    return fetch(path, options);
-  }
+	try {
+		return await fetch(path, options);
+	} catch (error) {
+		if (options.signal?.aborted) throw error;
+		await pause(500, options.signal);
+		return fetch(path, options);
+	}
 }
 
 // Requests a path: resolves with the response, or throws a Problem as the API words it. Asks for a key where needed.
 export async function ask(path, options = {}) {
-  for (;;) {
-    const used = key();
-    let answer;
-    try {
-      answer = await fetchTwice(path, { ...options, headers: { ...options.headers, ...authorization() } });
-    } catch (error) {
-      throw options.signal?.aborted ? options.signal.reason : new Problem(UNREACHABLE);
-    }
-    if (answer.ok) return answer;
-    const problem = new Problem(await describe(answer));
-    if (answer.status !== 401) throw problem;
-    if (used === key()) await unlock(problem);
-  }
+	for (;;) {
+		const used = key();
+		let answer;
+		try {
+			answer = await fetchTwice(path, { ...options, headers: { ...options.headers, ...authorization() } });
+		} catch (error) {
+			throw options.signal?.aborted ? options.signal.reason : new Problem(UNREACHABLE);
+		}
+		if (answer.ok) return answer;
+		const problem = new Problem(await describe(answer));
+		if (answer.status !== 401) throw problem;
+		if (used === key()) await unlock(problem);
+	}
 }
 
 async function describe(answer) {
-  const about = answer.headers.get("content-type")?.includes("json") ? await answer.json().catch(() => ({})) : {};
-  if (answer.status === 404) about.detail = GONE; // the service says it for those who call it
-  return { title: answer.statusText || "Refused", detail: `The service answered with ${answer.status}.`, ...about, status: answer.status };
+	const about = answer.headers.get("content-type")?.includes("json") ? await answer.json().catch(() => ({})) : {};
+	if (answer.status === 404) about.detail = GONE; // the service says it for those who call it
+	return { title: answer.statusText || "Refused", detail: `The service answered with ${answer.status}.`, ...about, status: answer.status };
 }
 
 export const getJson = async (path, signal) => (await ask(path, { signal })).json();
@@ -87,33 +87,33 @@ export const getBlob = async (path, signal) => (await ask(path, { signal })).blo
 
 // Posts JSON with an Idempotency-Key: a double click or a retry creates one thing.
 export async function post(path, body, once = crypto.randomUUID?.() ?? String(Math.random())) {
-  const headers = { "Content-Type": "application/json", "Idempotency-Key": once };
-  return (await ask(path, { method: "POST", headers, body: JSON.stringify(body) })).json();
+	const headers = { "Content-Type": "application/json", "Idempotency-Key": once };
+	return (await ask(path, { method: "POST", headers, body: JSON.stringify(body) })).json();
 }
 
 export const patchJson = async (path, body) =>
-  (await ask(path, { method: "PATCH", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) })).json();
+	(await ask(path, { method: "PATCH", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) })).json();
 
 export const call = (method, path) => ask(path, { method });
 
 // Deletes; something that another tab has deleted already counts as deleted.
 export const remove = (path) => call("DELETE", path).catch((error) => {
-  if (error.status !== 404) throw error;
+	if (error.status !== 404) throw error;
 });
 
 // Saves a response as a file. Without a key the browser streams it to the disk itself.
 export async function save(path, name) {
-  if (!key()) return saveAs(path, name);
-  saveBlob(await getBlob(path), name);
+	if (!key()) return saveAs(path, name);
+	saveBlob(await getBlob(path), name);
 }
 
 export function saveBlob(blob, name) {
-  const url = URL.createObjectURL(blob);
-  saveAs(url, name);
-  setTimeout(() => URL.revokeObjectURL(url), 60_000);
+	const url = URL.createObjectURL(blob);
+	saveAs(url, name);
+	setTimeout(() => URL.revokeObjectURL(url), 60_000);
 }
 
 function saveAs(href, download) {
-  const link = Object.assign(document.createElement("a"), { href, download });
-  link.click();
+	const link = Object.assign(document.createElement("a"), { href, download });
+	link.click();
 }

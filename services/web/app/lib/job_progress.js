@@ -8,62 +8,62 @@ const LOG_EVERY = 2000; // ms
 // Fills `panel` and follows a job until it has ended; resolves with its last state. `changed` is called with every state,
 // first with the `known` one if given.
 export async function followJob(panel, id, signal, changed = () => {}, known = null) {
-  const bar = h("progress", { max: 1, value: 0, "aria-label": "Progress" });
-  const stage = h("p", { class: "stage", role: "status" }, " ");
-  const waits = h("p", { class: "waits", hidden: true });
-  const about = h("div");
-  const problem = h("div");
-  const lines = h("ol", { class: "log", tabindex: 0, "aria-label": "Log" });
-  const log = h("details", { open: panel.dataset.log != null }, h("summary", {}, "Log"), lines);
-  panel.append(stage, bar, waits, about, problem, log);
+	const bar = h("progress", { max: 1, value: 0, "aria-label": "Progress" });
+	const stage = h("p", { class: "stage", role: "status" }, " ");
+	const waits = h("p", { class: "waits", hidden: true });
+	const about = h("div");
+	const problem = h("div");
+	const lines = h("ol", { class: "log", tabindex: 0, "aria-label": "Log" });
+	const log = h("details", { open: panel.dataset.log != null }, h("summary", {}, "Log"), lines);
+	panel.append(stage, bar, waits, about, problem, log);
 
-  let last = 0;
-  const read = newest(async (ended) => {
-    try {
-      const found = (await getJson(`v1/jobs/${id}/log?after=${last}`, signal)).lines;
-      const atEnd = lines.scrollTop + lines.clientHeight >= lines.scrollHeight - 8;
-      lines.append(...found.map(({ at, text }) => h("li", {}, h("time", { datetime: at }, new Date(at).toLocaleTimeString("en-GB")), " ", text)));
-      last = found.at(-1)?.line ?? last;
-      if (atEnd) lines.scrollTop = lines.scrollHeight;
-      if (!ended) await pause(LOG_EVERY, signal);
-    } catch {} // the next event reads it again
-  });
+	let last = 0;
+	const read = newest(async (ended) => {
+		try {
+			const found = (await getJson(`v1/jobs/${id}/log?after=${last}`, signal)).lines;
+			const atEnd = lines.scrollTop + lines.clientHeight >= lines.scrollHeight - 8;
+			lines.append(...found.map(({ at, text }) => h("li", {}, h("time", { datetime: at }, new Date(at).toLocaleTimeString("en-GB")), " ", text)));
+			last = found.at(-1)?.line ?? last;
+			if (atEnd) lines.scrollTop = lines.scrollHeight;
+			if (!ended) await pause(LOG_EVERY, signal);
+		} catch {} // the next event reads it again
+	});
 
-  const update = (job) => {
-    const active = ACTIVE.includes(job.state);
-    bar.value = job.progress;
-    bar.hidden = !active && job.state !== "failed";
-    stage.replaceChildren(badge(job.state), ` ${describe(job)}`);
-    waits.hidden = !job.waits_for;
-    waits.textContent = job.waits_for ? `Waiting: ${job.waits_for}` : "";
-    about.replaceChildren(facts({
-      Tiles: job.tiles.total ? `${job.tiles.done} of ${job.tiles.total}` : null,
-      Failed: job.tiles.failed || null,
-      Workers: job.state === "running" ? job.workers : null,
-      Ran: job.run_seconds ? duration(job.run_seconds) : null,
-      Waited: job.queued_seconds >= 1 ? duration(job.queued_seconds) : null,
-    }));
-    problem.replaceChildren(...(job.problem ? [problemBox(job.problem)] : []));
-    read(!active);
-    changed(job);
-  };
-  if (known) update(known);
-  const lost = (away) => {
-    panel.classList.toggle("lost", away);
-    if (away) stage.textContent = "The service does not answer; trying again. Jobs continue where they were.";
-  };
-  return follow(`v1/jobs/${id}/events`, signal, update, { lost, over: (job) => !ACTIVE.includes(job.state) });
+	const update = (job) => {
+		const active = ACTIVE.includes(job.state);
+		bar.value = job.progress;
+		bar.hidden = !active && job.state !== "failed";
+		stage.replaceChildren(badge(job.state), ` ${describe(job)}`);
+		waits.hidden = !job.waits_for;
+		waits.textContent = job.waits_for ? `Waiting: ${job.waits_for}` : "";
+		about.replaceChildren(facts({
+			Tiles: job.tiles.total ? `${job.tiles.done} of ${job.tiles.total}` : null,
+			Failed: job.tiles.failed || null,
+			Workers: job.state === "running" ? job.workers : null,
+			Ran: job.run_seconds ? duration(job.run_seconds) : null,
+			Waited: job.queued_seconds >= 1 ? duration(job.queued_seconds) : null,
+		}));
+		problem.replaceChildren(...(job.problem ? [problemBox(job.problem)] : []));
+		read(!active);
+		changed(job);
+	};
+	if (known) update(known);
+	const lost = (away) => {
+		panel.classList.toggle("lost", away);
+		if (away) stage.textContent = "The service does not answer; trying again. Jobs continue where they were.";
+	};
+	return follow(`v1/jobs/${id}/events`, signal, update, { lost, over: (job) => !ACTIVE.includes(job.state) });
 }
 
 function describe(job) {
-  const percent = `${Math.floor(100 * job.progress)} %`;
-  if (job.state === "running") {
-    // The last step has no tiles to count, and may take longer than it was expected to.
-    const last = job.stage === "finishing";
-    const doing = !last ? `${job.stage}, ${percent}` : job.kind === "ingest" ? "measuring and writing the report" : "finishing";
-    const left = job.eta_seconds == null || (last && job.eta_seconds < 1) ? "" : `, about ${duration(job.eta_seconds)} left`;
-    return doing + left;
-  }
-  if (job.state === "succeeded") return `in ${duration(job.run_seconds)}`;
-  return job.state === "queued" ? "" : `at ${percent}`;
+	const percent = `${Math.floor(100 * job.progress)} %`;
+	if (job.state === "running") {
+		// The last step has no tiles to count, and may take longer than it was expected to.
+		const last = job.stage === "finishing";
+		const doing = !last ? `${job.stage}, ${percent}` : job.kind === "ingest" ? "measuring and writing the report" : "finishing";
+		const left = job.eta_seconds == null || (last && job.eta_seconds < 1) ? "" : `, about ${duration(job.eta_seconds)} left`;
+		return doing + left;
+	}
+	if (job.state === "succeeded") return `in ${duration(job.run_seconds)}`;
+	return job.state === "queued" ? "" : `at ${percent}`;
 }

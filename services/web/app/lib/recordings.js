@@ -4,7 +4,7 @@ export const recordings = new Set();
 addEventListener("beforeunload", (event) => recordings.size && event.preventDefault());
 
 export function setRecording(signal, isRecording) {
-  if (isRecording) recordings.add(signal);
-  else recordings.delete(signal);
-  dispatchEvent(new Event("recording"));
+	if (isRecording) recordings.add(signal);
+	else recordings.delete(signal);
+	dispatchEvent(new Event("recording"));
 }

@@ -3,31 +3,31 @@ import { button, h, problemBox } from "./dom.js";
 
 // `save` stores a new text, and resolves with the text as it is stored.
 export function renamable(text, label, save) {
-  const problem = h("div");
-  const title = h("h1", {}, text);
-  const input = h("input", { type: "text", maxlength: 200, required: true, "aria-label": label });
-  const form = h("form", { class: "row", hidden: true }, input, h("button", { class: "primary" }, "Save"), h("button", { type: "button", onclick: () => edit(false) }, "Cancel"));
-  const rename = button("Rename", problem, () => edit(true));
-  function edit(editing) {
-    form.hidden = !editing;
-    title.hidden = rename.hidden = editing;
-    problem.replaceChildren();
-    if (!editing) return rename.focus();
-    input.value = title.textContent;
-    input.focus();
-    input.select();
-  }
-  form.onkeydown = ({ key }) => {
-    if (key === "Escape") edit(false);
-  };
-  form.onsubmit = async (event) => {
-    event.preventDefault();
-    try {
-      title.textContent = await save(input.value.trim());
-      edit(false);
-    } catch (error) {
-      problem.replaceChildren(problemBox(error));
-    }
-  };
-  return h("div", { class: "stack" }, h("div", { class: "row" }, title, rename, form), problem);
+	const problem = h("div");
+	const title = h("h1", {}, text);
+	const input = h("input", { type: "text", maxlength: 200, required: true, "aria-label": label });
+	const form = h("form", { class: "row", hidden: true }, input, h("button", { class: "primary" }, "Save"), h("button", { type: "button", onclick: () => edit(false) }, "Cancel"));
+	const rename = button("Rename", problem, () => edit(true));
+	function edit(editing) {
+		form.hidden = !editing;
+		title.hidden = rename.hidden = editing;
+		problem.replaceChildren();
+		if (!editing) return rename.focus();
+		input.value = title.textContent;
+		input.focus();
+		input.select();
+	}
+	form.onkeydown = ({ key }) => {
+		if (key === "Escape") edit(false);
+	};
+	form.onsubmit = async (event) => {
+		event.preventDefault();
+		try {
+			title.textContent = await save(input.value.trim());
+			edit(false);
+		} catch (error) {
+			problem.replaceChildren(problemBox(error));
+		}
+	};
+	return h("div", { class: "stack" }, h("div", { class: "row" }, title, rename, form), problem);
 }

@@ -14,53 +14,53 @@ const view = async (blob) => new DataView(await blob.arrayBuffer());
 
 // The entries of a ZIP by name; none of a ZIP64 archive.
 async function entries(file) {
-  const tail = await view(file.slice(-TAIL));
-  let at = tail.byteLength - 22;
-  while (tail.getUint32(at, true) !== END) at -= 1;
-  const start = tail.getUint32(at + 16, true);
-  if (start === FULL) return {};
-  const directory = await view(file.slice(start, start + tail.getUint32(at + 12, true)));
-  const found = {};
-  for (let n = 0; n < directory.byteLength && directory.getUint32(n, true) === ENTRY; ) {
-    const [name, extra, comment] = [28, 30, 32].map((field) => directory.getUint16(n + field, true));
-    const text = new TextDecoder().decode(new Uint8Array(directory.buffer, n + 46, name));
-    found[text] = { method: directory.getUint16(n + 10, true), size: directory.getUint32(n + 20, true), at: directory.getUint32(n + 42, true) };
-    n += 46 + name + extra + comment;
-  }
-  return found;
+	const tail = await view(file.slice(-TAIL));
+	let at = tail.byteLength - 22;
+	while (tail.getUint32(at, true) !== END) at -= 1;
+	const start = tail.getUint32(at + 16, true);
+	if (start === FULL) return {};
+	const directory = await view(file.slice(start, start + tail.getUint32(at + 12, true)));
+	const found = {};
+	for (let n = 0; n < directory.byteLength && directory.getUint32(n, true) === ENTRY; ) {
+		const [name, extra, comment] = [28, 30, 32].map((field) => directory.getUint16(n + field, true));
+		const text = new TextDecoder().decode(new Uint8Array(directory.buffer, n + 46, name));
+		found[text] = { method: directory.getUint16(n + 10, true), size: directory.getUint32(n + 20, true), at: directory.getUint32(n + 42, true) };
+		n += 46 + name + extra + comment;
+	}
+	return found;
 }
 
 async function read(file, { method, size, at }) {
-  const head = await view(file.slice(at, at + 30));
-  const start = at + 30 + head.getUint16(26, true) + head.getUint16(28, true);
-  const packed = file.slice(start, start + size);
-  return method ? new Response(packed.stream().pipeThrough(new DecompressionStream("deflate-raw"))).blob() : packed;
+	const head = await view(file.slice(at, at + 30));
+	const start = at + 30 + head.getUint16(26, true) + head.getUint16(28, true);
+	const packed = file.slice(start, start + size);
+	return method ? new Response(packed.stream().pipeThrough(new DecompressionStream("deflate-raw"))).blob() : packed;
 }
 
 const patterns = ({ levels, colours, files, count }) => (levels ?? colours ?? files)?.length ?? count;
 
 // The size of a PNG or JPEG (ITU-T T.81, table B.1) from its first bytes.
 function sizeOf(head) {
-  if (head.getUint32(0) === PNG) return { width: head.getUint32(16), height: head.getUint32(20) };
-  if (head.getUint16(0) !== JPEG) return {};
-  let at = 2;
-  while ((head.getUint8(at + 1) & 0xf0) !== 0xc0 || [0xc4, 0xc8, 0xcc].includes(head.getUint8(at + 1))) at += 2 + head.getUint16(at + 2);
-  return { width: head.getUint16(at + 7), height: head.getUint16(at + 5) };
+	if (head.getUint32(0) === PNG) return { width: head.getUint32(16), height: head.getUint32(20) };
+	if (head.getUint16(0) !== JPEG) return {};
+	let at = 2;
+	while ((head.getUint8(at + 1) & 0xf0) !== 0xc0 || [0xc4, 0xc8, 0xcc].includes(head.getUint8(at + 1))) at += 2 + head.getUint16(at + 2);
+	return { width: head.getUint16(at + 7), height: head.getUint16(at + 5) };
 }
 
 // `frames`, and `width` and `height` of the first one if it is PNG or JPEG. What cannot be read is left out; the service
 // reports what is wrong with a file.
 export async function readArchiveInfo(file) {
-  const info = {};
-  try {
-    const found = await entries(file);
-    if (found[RECORD].size > MOST) return info;
-    const record = JSON.parse(await (await read(file, found[RECORD])).text());
-    info.frames = record.frames?.length || record.program.parts.reduce((sum, part) => sum + patterns(part), 0);
-    if (record.frames?.length) {
-      const image = await read(file, found[record.frames[0].file]);
-      Object.assign(info, sizeOf(await view(image.slice(0, HEAD))));
-    }
-  } catch {}
-  return info;
+	const info = {};
+	try {
+		const found = await entries(file);
+		if (found[RECORD].size > MOST) return info;
+		const record = JSON.parse(await (await read(file, found[RECORD])).text());
+		info.frames = record.frames?.length || record.program.parts.reduce((sum, part) => sum + patterns(part), 0);
+		if (record.frames?.length) {
+			const image = await read(file, found[record.frames[0].file]);
+			Object.assign(info, sizeOf(await view(image.slice(0, HEAD))));
+		}
+	} catch {}
+	return info;
 }

@@ -10,52 +10,52 @@ export const programName = (program) => `${program.patterns} patterns${program.d
 
 // The capture.json of a film of a program, shown by the player page or as a video.
 export function recordOf(program, rate) {
-  const border = program.showing?.border ?? program.display;
-  const video = { patterns_per_second: rate, ...(border && { border }) };
-  return { format: "envmatte-capture/1", program: program.program, video };
+	const border = program.showing?.border ?? program.display;
+	const video = { patterns_per_second: rate, ...(border && { border }) };
+	return { format: "envmatte-capture/1", program: program.program, video };
 }
 
 // The capture archive of a film and its capture.json.
 export async function filmArchive(film, record, signal) {
-  const file = `film${ENDS.exec(film.name)?.[0].toLowerCase() ?? ".mp4"}`;
-  const name = record.name || film.name.replace(/\.\w+$/, "").slice(0, 200);
-  const text = JSON.stringify({ ...record, name, video: { ...record.video, file } });
-  return zip([["capture.json", new Blob([text])], [file, film]], signal);
+	const file = `film${ENDS.exec(film.name)?.[0].toLowerCase() ?? ".mp4"}`;
+	const name = record.name || film.name.replace(/\.\w+$/, "").slice(0, 200);
+	const text = JSON.stringify({ ...record, name, video: { ...record.video, file } });
+	return zip([["capture.json", new Blob([text])], [file, film]], signal);
 }
 
 // Asks in `where` which program a film shows; resolves with its capture.json.
 export async function askForRecord(where, signal) {
-  const { programs } = await getJson("v1/programs?limit=100", signal);
-  return new Promise((resolve, reject) => {
-    signal.addEventListener("abort", () => reject(signal.reason), { once: true });
-    const problem = h("p", { class: "hint", role: "status" });
-    const which = h("select", { "aria-label": "Program" }, programs.map((one, n) => h("option", { value: n }, `${programName(one)}, ${when(one.created_at).textContent}`)));
-    const rate = h("input", { type: "number", min: 0.01, max: 120, step: "any", required: true });
-    const suggest = () => (rate.value = programs[which.value]?.showing?.patterns_per_second ?? 2);
-    which.onchange = suggest;
-    suggest();
-    const own = h("input", { type: "file", accept: ".json,application/json" });
-    own.onchange = async () => {
-      try {
-        const found = JSON.parse(await own.files[0].text());
-        if (!found.video?.patterns_per_second) throw new Error("it describes no video");
-        resolve(found);
-      } catch (error) {
-        problem.textContent = `Not the capture.json of a film: ${error.message}. Choose the one that came with the program.`;
-        own.value = "";
-      }
-    };
-    const form = h("form", { class: "stack" },
-      h("p", {}, h("strong", {}, "Which program does this film show?")),
-      programs.length
-        ? [h("label", {}, "Program", which), h("label", {}, "Patterns a second", rate), h("p", { class: "row" }, h("button", { class: "primary" }, "Upload"))]
-        : h("p", {}, "There are no programs yet. ", h("a", { href: "#/film" }, "Play one and film it"), "."),
-      h("label", {}, "Or the capture.json that came with the program", own), problem);
-    form.onsubmit = (event) => {
-      event.preventDefault();
-      getJson(`v1/programs/${programs[which.value].id}`, signal).then((program) => resolve(recordOf(program, Number(rate.value))), reject);
-    };
-    where.replaceChildren(form);
-    (programs.length ? which : own).focus();
-  }).finally(() => where.replaceChildren());
+	const { programs } = await getJson("v1/programs?limit=100", signal);
+	return new Promise((resolve, reject) => {
+		signal.addEventListener("abort", () => reject(signal.reason), { once: true });
+		const problem = h("p", { class: "hint", role: "status" });
+		const which = h("select", { "aria-label": "Program" }, programs.map((one, n) => h("option", { value: n }, `${programName(one)}, ${when(one.created_at).textContent}`)));
+		const rate = h("input", { type: "number", min: 0.01, max: 120, step: "any", required: true });
+		const suggest = () => (rate.value = programs[which.value]?.showing?.patterns_per_second ?? 2);
+		which.onchange = suggest;
+		suggest();
+		const own = h("input", { type: "file", accept: ".json,application/json" });
+		own.onchange = async () => {
+			try {
+				const found = JSON.parse(await own.files[0].text());
+				if (!found.video?.patterns_per_second) throw new Error("it describes no video");
+				resolve(found);
+			} catch (error) {
+				problem.textContent = `Not the capture.json of a film: ${error.message}. Choose the one that came with the program.`;
+				own.value = "";
+			}
+		};
+		const form = h("form", { class: "stack" },
+			h("p", {}, h("strong", {}, "Which program does this film show?")),
+			programs.length
+				? [h("label", {}, "Program", which), h("label", {}, "Patterns a second", rate), h("p", { class: "row" }, h("button", { class: "primary" }, "Upload"))]
+				: h("p", {}, "There are no programs yet. ", h("a", { href: "#/film" }, "Play one and film it"), "."),
+			h("label", {}, "Or the capture.json that came with the program", own), problem);
+		form.onsubmit = (event) => {
+			event.preventDefault();
+			getJson(`v1/programs/${programs[which.value].id}`, signal).then((program) => resolve(recordOf(program, Number(rate.value))), reject);
+		};
+		where.replaceChildren(form);
+		(programs.length ? which : own).focus();
+	}).finally(() => where.replaceChildren());
 }

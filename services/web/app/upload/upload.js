@@ -17,124 +17,124 @@ addEventListener("beforeunload", (event) => [...rows].some(({ busy, unsaved }) =
 // `unsaved` was recorded here: it can be saved, and is deleted only after a question. One with a `warning` waits for
 // "Continue".
 export function begin(file, record, { unsaved = false, warning = "" } = {}) {
-  const state = { busy: false, unsaved };
-  const stop = new AbortController();
-  const bar = h("progress", { max: 1, value: 0, "aria-label": `Upload of ${file.name}` });
-  const status = h("span", { role: "status" }, "Starting");
-  const problem = h("div");
-  const asked = h("div");
-  const again = h("button", { type: "button", hidden: true, onclick: () => work() }, "Continue");
-  const save = h("button", { type: "button", hidden: !unsaved, onclick: () => (saveBlob(file, file.name), (state.unsaved = false)) }, "Save the film");
-  const end = () => (rows.delete(state), row.remove());
-  const drop = async () => {
-    if (state.unsaved && !(await confirmed("Delete this film?", "It is only in this page. Upload or save it first to keep it.", "Delete film"))) return;
-    stop.abort();
-    end();
-  };
-  const cancel = h("button", { type: "button", onclick: drop }, unsaved ? "Delete the film" : "Cancel");
-  const row = h("section", { class: "panel", "aria-label": file.name },
-    h("p", { class: "row spread" }, h("strong", { class: "name" }, file.name), h("span", { class: "row" }, again, save, cancel)), bar, status, asked, problem);
-  running.append(row);
-  rows.add(state);
-  let archive = isFilm(file) ? null : file;
-  let remembered;
+	const state = { busy: false, unsaved };
+	const stop = new AbortController();
+	const bar = h("progress", { max: 1, value: 0, "aria-label": `Upload of ${file.name}` });
+	const status = h("span", { role: "status" }, "Starting");
+	const problem = h("div");
+	const asked = h("div");
+	const again = h("button", { type: "button", hidden: true, onclick: () => work() }, "Continue");
+	const save = h("button", { type: "button", hidden: !unsaved, onclick: () => (saveBlob(file, file.name), (state.unsaved = false)) }, "Save the film");
+	const end = () => (rows.delete(state), row.remove());
+	const drop = async () => {
+		if (state.unsaved && !(await confirmed("Delete this film?", "It is only in this page. Upload or save it first to keep it.", "Delete film"))) return;
+		stop.abort();
+		end();
+	};
+	const cancel = h("button", { type: "button", onclick: drop }, unsaved ? "Delete the film" : "Cancel");
+	const row = h("section", { class: "panel", "aria-label": file.name },
+		h("p", { class: "row spread" }, h("strong", { class: "name" }, file.name), h("span", { class: "row" }, again, save, cancel)), bar, status, asked, problem);
+	running.append(row);
+	rows.add(state);
+	let archive = isFilm(file) ? null : file;
+	let remembered;
 
-  async function work() {
-    const start = performance.now();
-    let first;
-    again.hidden = true;
-    problem.replaceChildren();
-    state.busy = true;
-    try {
-      if (!archive) {
-        status.textContent = "Film";
-        record ??= await askForRecord(asked, stop.signal);
-        status.textContent = "Making the capture archive";
-        archive = await filmArchive(file, record, stop.signal);
-      } else if (!(await startsAsZip(archive))) {
-        const detail = `${file.name} is neither a ZIP nor a film. Drop the ZIP with capture.json and the frames, or the video that the camera recorded.`;
-        throw new Problem({ status: 422, title: "Not a capture", detail });
-      }
-      // A film with another capture.json is another archive.
-      remembered ??= `envmatte-upload ${file.name} ${archive.size} ${file.lastModified} ${record ? await crc32(archive.slice(0, HEAD)) : ""}`;
-      const upload = await send(archive, remembered, {
-        filename: file.name,
-        signal: stop.signal,
-        progress(done) {
-          first ??= done;
-          const left = (archive.size - done) / ((done - first) / (performance.now() - start) || Infinity) / 1000;
-          bar.value = archive.size ? done / archive.size : 1;
-          status.textContent = `${bytes(done)} of ${bytes(archive.size)}${left > 2 ? `, ${duration(left)} left` : ""}`;
-        },
-        waiting: (away, ms) => away && (status.textContent = `The service does not answer; trying again in ${duration(ms / 1000)}`),
-      });
-      status.textContent = "Checking the archive";
-      const made = await post("v1/captures", { upload }, `capture-of-${upload}`);
-      localStorage.removeItem(remembered);
-      end();
-      if (running.isConnected && !recordings.size) location.hash = `#/captures/${made.id}`;
-    } catch (error) {
-      if (stop.signal.aborted) return;
-      const refused = error.status >= 400 && error.status < 500 && error.status !== 401; // another key may be typed
-      if (refused) localStorage.removeItem(remembered);
-      status.textContent = refused ? "Refused" : "Stopped; the bytes sent so far are kept";
-      if (!unsaved) cancel.textContent = refused ? "Dismiss" : "Cancel";
-      again.textContent = "Continue";
-      again.hidden = refused;
-      problem.replaceChildren(problemBox(/^Not(Found|Readable)Error$/.test(error.name) ? unreadable(file) : error));
-    } finally {
-      state.busy = false;
-    }
-  }
-  if (!warning) return work();
-  status.textContent = warning;
-  again.textContent = "Upload anyway";
-  again.hidden = false;
+	async function work() {
+		const start = performance.now();
+		let first;
+		again.hidden = true;
+		problem.replaceChildren();
+		state.busy = true;
+		try {
+			if (!archive) {
+				status.textContent = "Film";
+				record ??= await askForRecord(asked, stop.signal);
+				status.textContent = "Making the capture archive";
+				archive = await filmArchive(file, record, stop.signal);
+			} else if (!(await startsAsZip(archive))) {
+				const detail = `${file.name} is neither a ZIP nor a film. Drop the ZIP with capture.json and the frames, or the video that the camera recorded.`;
+				throw new Problem({ status: 422, title: "Not a capture", detail });
+			}
+			// A film with another capture.json is another archive.
+			remembered ??= `envmatte-upload ${file.name} ${archive.size} ${file.lastModified} ${record ? await crc32(archive.slice(0, HEAD)) : ""}`;
+			const upload = await send(archive, remembered, {
+				filename: file.name,
+				signal: stop.signal,
+				progress(done) {
+					first ??= done;
+					const left = (archive.size - done) / ((done - first) / (performance.now() - start) || Infinity) / 1000;
+					bar.value = archive.size ? done / archive.size : 1;
+					status.textContent = `${bytes(done)} of ${bytes(archive.size)}${left > 2 ? `, ${duration(left)} left` : ""}`;
+				},
+				waiting: (away, ms) => away && (status.textContent = `The service does not answer; trying again in ${duration(ms / 1000)}`),
+			});
+			status.textContent = "Checking the archive";
+			const made = await post("v1/captures", { upload }, `capture-of-${upload}`);
+			localStorage.removeItem(remembered);
+			end();
+			if (running.isConnected && !recordings.size) location.hash = `#/captures/${made.id}`;
+		} catch (error) {
+			if (stop.signal.aborted) return;
+			const refused = error.status >= 400 && error.status < 500 && error.status !== 401; // another key may be typed
+			if (refused) localStorage.removeItem(remembered);
+			status.textContent = refused ? "Refused" : "Stopped; the bytes sent so far are kept";
+			if (!unsaved) cancel.textContent = refused ? "Dismiss" : "Cancel";
+			again.textContent = "Continue";
+			again.hidden = refused;
+			problem.replaceChildren(problemBox(/^Not(Found|Readable)Error$/.test(error.name) ? unreadable(file) : error));
+		} finally {
+			state.busy = false;
+		}
+	}
+	if (!warning) return work();
+	status.textContent = warning;
+	again.textContent = "Upload anyway";
+	again.hidden = false;
 }
 
 const unreadable = ({ name }) => ({
-  title: "Cannot read the file",
-  detail: `${name} was changed, moved or removed after it was chosen, or it is a folder. Put it back and continue, or choose it again.`,
+	title: "Cannot read the file",
+	detail: `${name} was changed, moved or removed after it was chosen, or it is a folder. Put it back and continue, or choose it again.`,
 });
 
 const startsAsZip = async (file) => /^PK[\x03\x05]/.test(await file.slice(0, 4).text());
 
 // Uploads capture archives and films, and shows them in the list of captures.
 export function upload(files) {
-  [...files].forEach((file) => begin(file));
-  location.hash = "#/captures";
+	[...files].forEach((file) => begin(file));
+	location.hash = "#/captures";
 }
 
 // A field for capture archives and films.
 export function fileInput(id) {
-  const input = h("input", { type: "file", accept: ".zip,application/zip,video/*,.mkv,.mts,.m2ts", id, multiple: true });
-  input.onchange = () => {
-    upload(input.files);
-    input.value = "";
-  };
-  return input;
+	const input = h("input", { type: "file", accept: ".zip,application/zip,video/*,.mkv,.mts,.m2ts", id, multiple: true });
+	input.onchange = () => {
+		upload(input.files);
+		input.value = "";
+	};
+	return input;
 }
 
 // The zone where they are dropped or chosen.
 export function dropZone() {
-  const zone = h("div", { class: "drop" },
-    h("label", { for: "zip" }, h("strong", {}, "Choose a capture archive or a film"), " or drop it here",
-      h("span", { class: "hint" }, "A ZIP with capture.json and its frames, or the film of a program. An interrupted upload continues where it stopped.")),
-    fileInput("zip"));
-  onDrop(zone, upload);
-  return h("div", {}, zone, running);
+	const zone = h("div", { class: "drop" },
+		h("label", { for: "zip" }, h("strong", {}, "Choose a capture archive or a film"), " or drop it here",
+			h("span", { class: "hint" }, "A ZIP with capture.json and its frames, or the film of a program. An interrupted upload continues where it stopped.")),
+		fileInput("zip"));
+	onDrop(zone, upload);
+	return h("div", {}, zone, running);
 }
 
 export function onDrop(zone, take) {
-  let depth = 0;
-  const over = (by) => zone.classList.toggle("over", (depth = Math.max(0, depth + by)) > 0);
-  zone.addEventListener("dragenter", (event) => (event.preventDefault(), over(1)));
-  zone.addEventListener("dragleave", () => over(-1));
-  zone.addEventListener("dragover", (event) => event.preventDefault());
-  zone.addEventListener("drop", (event) => {
-    event.preventDefault();
-    depth = 0;
-    over(0);
-    if (event.dataTransfer.files.length) take(event.dataTransfer.files);
-  });
+	let depth = 0;
+	const over = (by) => zone.classList.toggle("over", (depth = Math.max(0, depth + by)) > 0);
+	zone.addEventListener("dragenter", (event) => (event.preventDefault(), over(1)));
+	zone.addEventListener("dragleave", () => over(-1));
+	zone.addEventListener("dragover", (event) => event.preventDefault());
+	zone.addEventListener("drop", (event) => {
+		event.preventDefault();
+		depth = 0;
+		over(0);
+		if (event.dataTransfer.files.length) take(event.dataTransfer.files);
+	});
 }

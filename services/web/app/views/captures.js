@@ -6,26 +6,26 @@ import { list } from "../lib/list.js";
 import { dropZone, upload } from "../upload/upload.js";
 
 export async function captures(main, signal) {
-  const problem = h("div");
-  const restore = button("Show the samples again", problem, () => {
-    restoreSamples();
-    location.hash = "#/";
-  });
-  main.append(
-    h("h1", {}, "Captures"),
-    h("p", { class: "lead" }, "Films of a glass before a monitor that shows patterns. Upload one to see its report."),
-    dropZone(),
-    h("p", { class: "row" }, button("Try it with a sample capture", problem, async () => upload([await fetchCapture(signal)])), areRemoved() && restore),
-    problem,
-  );
-  await list(main, signal, {
-    page: (after) => getJson(`v1/captures?limit=50${after}`, signal).then((answer) => answer.captures),
-    busy: (one) => one.state === "ingesting",
-    none: () => empty("No captures yet", "The first one appears here as soon as it is uploaded."),
-    item: (one) =>
-      h("a", { class: "card", href: `#/captures/${one.id}` },
-        h("span", { class: "name" }, one.name || `Capture ${one.id.slice(0, 8)}`), badge(one.state),
-        h("span", { class: "about" }, [size(one), `${one.frames} frames`, bytes(one.bytes)].filter(Boolean).join(" · ")),
-        when(one.created_at)),
-  });
+	const problem = h("div");
+	const restore = button("Show the samples again", problem, () => {
+		restoreSamples();
+		location.hash = "#/";
+	});
+	main.append(
+		h("h1", {}, "Captures"),
+		h("p", { class: "lead" }, "Films of a glass before a monitor that shows patterns. Upload one to see its report."),
+		dropZone(),
+		h("p", { class: "row" }, button("Try it with a sample capture", problem, async () => upload([await fetchCapture(signal)])), areRemoved() && restore),
+		problem,
+	);
+	await list(main, signal, {
+		page: (after) => getJson(`v1/captures?limit=50${after}`, signal).then((answer) => answer.captures),
+		busy: (one) => one.state === "ingesting",
+		none: () => empty("No captures yet", "The first one appears here as soon as it is uploaded."),
+		item: (one) =>
+			h("a", { class: "card", href: `#/captures/${one.id}` },
+				h("span", { class: "name" }, one.name || `Capture ${one.id.slice(0, 8)}`), badge(one.state),
+				h("span", { class: "about" }, [size(one), `${one.frames} frames`, bytes(one.bytes)].filter(Boolean).join(" · ")),
+				when(one.created_at)),
+	});
 }

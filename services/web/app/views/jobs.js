@@ -11,91 +11,91 @@ const LONGER = 640; // pixels of their longer side, at most
 const KINDS = { ingest: "Ingest of a capture", recover: "Recovery of a matte", composite: "Composite of a clip" };
 
 export async function jobs(main, signal) {
-  main.append(h("h1", {}, "Jobs"));
-  await list(main, signal, {
-    page: (after) => getJson(`v1/jobs?limit=50${after}`, signal).then((answer) => answer.jobs),
-    busy: (one) => ACTIVE.includes(one.state),
-    none: () => empty("No jobs yet", "Each capture and each matte starts one."),
-    item: (one) =>
-      h("a", { class: "card", href: `#/jobs/${one.id}` }, h("span", { class: "name" }, KINDS[one.kind]), badge(one.state),
-        h("span", { class: "about" }, one.problem?.detail ?? (one.state === "running" ? `${one.stage}, ${Math.floor(100 * one.progress)} %` : one.id)),
-        when(one.created_at)),
-  });
+	main.append(h("h1", {}, "Jobs"));
+	await list(main, signal, {
+		page: (after) => getJson(`v1/jobs?limit=50${after}`, signal).then((answer) => answer.jobs),
+		busy: (one) => ACTIVE.includes(one.state),
+		none: () => empty("No jobs yet", "Each capture and each matte starts one."),
+		item: (one) =>
+			h("a", { class: "card", href: `#/jobs/${one.id}` }, h("span", { class: "name" }, KINDS[one.kind]), badge(one.state),
+				h("span", { class: "about" }, one.problem?.detail ?? (one.state === "running" ? `${one.stage}, ${Math.floor(100 * one.progress)} %` : one.id)),
+				when(one.created_at)),
+	});
 }
 
 export async function job(main, signal, id) {
-  const found = await getJson(`v1/jobs/${id}`, signal);
-  const problem = h("div");
-  const cancel = button("Cancel", problem, () => call("POST", `v1/jobs/${id}/cancel`));
-  const retry = button("Try again", problem, async () => {
-    await post(`v1/jobs/${id}/retry`);
-    watch();
-  }, "primary");
-  const deletion = button("Delete", problem, async () => {
-    const lost = found.kind === "composite" ? "Its log and its video will be deleted." : "Its log will be deleted; its capture or matte stays.";
-    if (!(await confirmed("Delete this job?", lost, "Delete job"))) return;
-    await remove(`v1/jobs/${id}`);
-    location.replace("#/jobs");
-  }, "quiet");
-  const asked = h("details", { class: "panel", hidden: found.kind !== "recover" }, h("summary", {}, "Options"), facts(found.options));
-  const links = h("p", { class: "row" });
-  const panel = h("section", { class: "panel", "aria-label": "Progress", "data-log": "" });
-  const preview = found.kind === "recover" ? await progressPicture(found, signal) : null;
-  main.append(
-    h("p", { class: "crumb" }, h("a", { href: "#/jobs" }, "Jobs")),
-    h("div", { class: "row spread" }, h("h1", {}, KINDS[found.kind]), h("span", { class: "row" }, cancel, retry, deletion)),
-    problem,
-    facts({ Asked: when(found.created_at), Capture: found.capture && h("a", { href: `#/captures/${found.capture}` }, found.capture.slice(0, 8)), Method: found.options.method, Quality: found.options.quality }),
-    links, h("div", { class: preview ? "columns" : "stack" }, preview?.panel, h("div", { class: "stack" }, panel, asked)),
-  );
-  watch(found);
+	const found = await getJson(`v1/jobs/${id}`, signal);
+	const problem = h("div");
+	const cancel = button("Cancel", problem, () => call("POST", `v1/jobs/${id}/cancel`));
+	const retry = button("Try again", problem, async () => {
+		await post(`v1/jobs/${id}/retry`);
+		watch();
+	}, "primary");
+	const deletion = button("Delete", problem, async () => {
+		const lost = found.kind === "composite" ? "Its log and its video will be deleted." : "Its log will be deleted; its capture or matte stays.";
+		if (!(await confirmed("Delete this job?", lost, "Delete job"))) return;
+		await remove(`v1/jobs/${id}`);
+		location.replace("#/jobs");
+	}, "quiet");
+	const asked = h("details", { class: "panel", hidden: found.kind !== "recover" }, h("summary", {}, "Options"), facts(found.options));
+	const links = h("p", { class: "row" });
+	const panel = h("section", { class: "panel", "aria-label": "Progress", "data-log": "" });
+	const preview = found.kind === "recover" ? await progressPicture(found, signal) : null;
+	main.append(
+		h("p", { class: "crumb" }, h("a", { href: "#/jobs" }, "Jobs")),
+		h("div", { class: "row spread" }, h("h1", {}, KINDS[found.kind]), h("span", { class: "row" }, cancel, retry, deletion)),
+		problem,
+		facts({ Asked: when(found.created_at), Capture: found.capture && h("a", { href: `#/captures/${found.capture}` }, found.capture.slice(0, 8)), Method: found.options.method, Quality: found.options.quality }),
+		links, h("div", { class: preview ? "columns" : "stack" }, preview?.panel, h("div", { class: "stack" }, panel, asked)),
+	);
+	watch(found);
 
-  function update(now) {
-    cancel.hidden = !ACTIVE.includes(now.state);
-    deletion.hidden = ACTIVE.includes(now.state);
-    retry.hidden = now.state !== "failed";
-    const made = now.state === "succeeded";
-    links.replaceChildren(...[
-      made && now.kind === "recover" && h("a", { class: "primary", href: `#/mattes/${now.matte}` }, "Open the matte"),
-      made && now.kind === "ingest" && h("a", { class: "primary", href: `#/captures/${now.capture}` }, "Open the capture"),
-      made && now.video && button("Download the video", problem, () => save(now.video.slice(1), "composite.mp4"), "primary"),
-    ].filter(Boolean));
-    preview?.update(now);
-  }
+	function update(now) {
+		cancel.hidden = !ACTIVE.includes(now.state);
+		deletion.hidden = ACTIVE.includes(now.state);
+		retry.hidden = now.state !== "failed";
+		const made = now.state === "succeeded";
+		links.replaceChildren(...[
+			made && now.kind === "recover" && h("a", { class: "primary", href: `#/mattes/${now.matte}` }, "Open the matte"),
+			made && now.kind === "ingest" && h("a", { class: "primary", href: `#/captures/${now.capture}` }, "Open the capture"),
+			made && now.video && button("Download the video", problem, () => save(now.video.slice(1), "composite.mp4"), "primary"),
+		].filter(Boolean));
+		preview?.update(now);
+	}
 
-  function watch(known) {
-    panel.replaceChildren();
-    return followJob(panel, id, signal, update, known).catch((error) => {
-      if (signal.aborted) return;
-      if (error.status === 404) dispatchEvent(new HashChangeEvent("hashchange")); // deleted meanwhile: show that it is not found
-      else panel.append(problemBox(error));
-    });
-  }
+	function watch(known) {
+		panel.replaceChildren();
+		return followJob(panel, id, signal, update, known).catch((error) => {
+			if (signal.aborted) return;
+			if (error.status === 404) dispatchEvent(new HashChangeEvent("hashchange")); // deleted meanwhile: show that it is not found
+			else panel.append(problemBox(error));
+		});
+	}
 }
 
 // The composite of what is recovered so far; the rest is transparent.
 async function progressPicture(found, signal) {
-  const { width, height } = await getJson(`v1/captures/${found.capture}`, signal).catch(() => ({}));
-  const image = h("img", { alt: "The composite of what is recovered so far", hidden: true });
-  const frame = h("div", { class: "picture filling" }, image);
-  if (width) frame.style.aspectRatio = `${width} / ${height}`;
-  const before = backdrop("Checker", 640, 480);
-  let done = 0;
-  const look = newest(async (now) => {
-    if (now.tiles.done === done) return;
-    const size = Math.min(LONGER, Math.max(width ?? LONGER, height ?? LONGER));
-    try {
-      const headers = { Accept: "image/png" };
-      const answer = await ask(`v1/mattes/${now.matte}/composite?size=${size}`, { method: "POST", headers, body: await before, signal });
-      await show(image, await answer.blob());
-      done = now.tiles.done;
-      if (now.state === "running") await pause(REFRESH, signal);
-    } catch {
-      await pause(REFRESH, signal).catch(() => {}); // nothing recovered yet, or the service is away, which the progress panel shows
-    }
-  });
-  return {
-    panel: h("section", { class: "panel" }, h("h2", {}, "The frame"), frame),
-    update: (now) => now.tiles.done > 0 && ["running", "succeeded"].includes(now.state) && look(now),
-  };
+	const { width, height } = await getJson(`v1/captures/${found.capture}`, signal).catch(() => ({}));
+	const image = h("img", { alt: "The composite of what is recovered so far", hidden: true });
+	const frame = h("div", { class: "picture filling" }, image);
+	if (width) frame.style.aspectRatio = `${width} / ${height}`;
+	const before = backdrop("Checker", 640, 480);
+	let done = 0;
+	const look = newest(async (now) => {
+		if (now.tiles.done === done) return;
+		const size = Math.min(LONGER, Math.max(width ?? LONGER, height ?? LONGER));
+		try {
+			const headers = { Accept: "image/png" };
+			const answer = await ask(`v1/mattes/${now.matte}/composite?size=${size}`, { method: "POST", headers, body: await before, signal });
+			await show(image, await answer.blob());
+			done = now.tiles.done;
+			if (now.state === "running") await pause(REFRESH, signal);
+		} catch {
+			await pause(REFRESH, signal).catch(() => {}); // nothing recovered yet, or the service is away, which the progress panel shows
+		}
+	});
+	return {
+		panel: h("section", { class: "panel" }, h("h2", {}, "The frame"), frame),
+		update: (now) => now.tiles.done > 0 && ["running", "succeeded"].includes(now.state) && look(now),
+	};
 }
