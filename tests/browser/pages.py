@@ -13,6 +13,8 @@ MINUTE = 60_000
 """Milliseconds."""
 SIZE = 96, 72
 """Width and height of the capture that tests share."""
+BY_HAND = "localStorage.setItem('envmatte-recover-by-hand', '1')"
+"""Recoveries do not start by themselves."""
 PHONE = {"width": 390, "height": 844}
 EXPECTED = (
     "the server responded with a status of",
@@ -49,6 +51,12 @@ def asks_before_closing(page: Page) -> bool:
         page.close(run_before_unload=True)
     dialog.value.dismiss()
     return dialog.value.type == "beforeunload"
+
+
+def unfold(page: Page) -> None:
+    """Open everything in a view that is folded, once there is something."""
+    page.locator("main details").first.wait_for()
+    page.evaluate("document.querySelectorAll('main details').forEach((one) => (one.open = true))")
 
 
 def is_fitting(page: Page) -> bool:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
-from tests.browser.pages import MINUTE, SIZE, opened
+from tests.browser.pages import BY_HAND, MINUTE, SIZE, opened, unfold
 from tests.end_to_end.conftest import Service, serving
 from workflows.images import integer_formats
 
@@ -63,16 +63,19 @@ def picture(seed: int, width: int, height: int) -> bytes:
 
 
 def test_upload_report_recovery_and_composite(tab: Page, service: Service, ball: Path) -> None:
+    tab.add_init_script(BY_HAND)
     tab.goto(f"{service.url}/#/captures")
     tab.get_by_label("Choose a capture archive or a film").set_input_files(ball)
     expect(tab).to_have_url(re.compile(r"#/captures/\w+"), timeout=MINUTE)
     expect(tab.get_by_role("heading", name="a ball")).to_be_visible()
-    expect(tab.get_by_role("heading", name="Report")).to_be_visible(
+    expect(tab.get_by_role("region", name="Report")).to_be_visible(
         timeout=3 * MINUTE
     )  # kernels compile first
     capture = service.client.capture(tab.url.rpartition("/")[2])
     report = service.http.get(capture["report"]).json()
-    findings = tab.locator(".findings li")
+    expect(tab.get_by_role("heading", name=re.compile("expect( at best)? .* clear glass"))).to_be_visible()
+    assert set(capture["recovery_seconds"]) == {"fine", "fast"}
+    findings = tab.locator(".findings li")  # what is fine is folded
     expect(findings).to_have_count(len(report["findings"]))
     for number, finding in enumerate(report["findings"]):
         expect(findings.nth(number)).to_contain_text(finding["level"])
@@ -82,8 +85,10 @@ def test_upload_report_recovery_and_composite(tab: Page, service: Service, ball:
     expect(tab.get_by_text(f"4 of {capture['frames']}")).to_be_visible()
     expect(tab.get_by_alt_text("Frame 4", exact=True)).to_be_visible()
 
-    tab.get_by_label("Quality").select_option("fast")
-    tab.get_by_role("button", name="Start").click()
+    draft = tab.get_by_role("radio", name="Draft")
+    expect(draft.locator("..")).to_contain_text(re.compile(r"about .+ (s|min)"))
+    draft.check()
+    tab.get_by_role("button", name="Recover", exact=True).click()
     expect(tab).to_have_url(re.compile(r"#/jobs/\w+"))
     expect(tab.get_by_role("progressbar")).to_be_visible()
     expect(tab.get_by_alt_text("The composite of what is recovered so far")).to_be_visible(timeout=MINUTE)
@@ -99,7 +104,7 @@ def test_upload_report_recovery_and_composite(tab: Page, service: Service, ball:
     drop(tab, beach, "beach.png")
     expect(tab.get_by_text(exact)).to_be_visible(timeout=MINUTE)
     answer = service.http.post(
-        f"/v1/mattes/{matte}/composite", content=beach, headers={"Accept": "image/png"}
+        f"/v1/mattes/{matte}/composite?around=backdrop", content=beach, headers={"Accept": "image/png"}
     )
     error = np.mean((shown(tab, ".picture.stage img") - pixels(answer.content).astype(float)) ** 2)
     assert 10 * np.log10(255**2 / error) > 28
@@ -110,6 +115,7 @@ def test_backdrop_moves_by_mouse_and_keys(tab: Page, service: Service, ready: tu
     tab.goto(f"{service.url}/#/mattes/{ready[1]}")
     status = tab.get_by_text("exact")
     expect(status).to_be_visible(timeout=MINUTE)
+    unfold(tab)
     stage = tab.get_by_role("group", name="Composite.")
     before = shown(tab, ".picture.stage img")
     box = stage.bounding_box()
@@ -149,27 +155,44 @@ def test_backdrop_moves_by_mouse_and_keys(tab: Page, service: Service, ready: tu
 @pytest.mark.slow
 def test_layers_and_lobes_of_a_pixel(tab: Page, service: Service, ready: tuple[str, str]) -> None:
     tab.goto(f"{service.url}/#/mattes/{ready[1]}")
+    unfold(tab)
     for name in ("S", "alpha", "confidence", "rho"):
         tab.get_by_role("radio", name=name, exact=True).check()
         expect(tab.get_by_alt_text(f"The layer {name}")).to_be_visible()
         assert shown(tab, ".layer img").shape == (SIZE[1], SIZE[0], 3)
-    layer = tab.get_by_role("group", name="Layer.")
-    layer.focus()
-    layer.press("ArrowRight")
-    expect(tab.get_by_alt_text("pixel (49, 36)")).to_be_visible(timeout=MINUTE)
-    figures = tab.get_by_role("group", name="Lobes of this pixel")
+    tab.get_by_role("button", name="Explain a pixel").click()
+    stage = tab.get_by_role("group", name="Composite.")
+    stage.press("ArrowRight")
+    words = tab.get_by_text("Pixel (49, 36)")
+    expect(words).to_contain_text(
+        re.compile(r"\d+ % of the monitor’s light comes through, \d+ % of it from the \w+")
+    )
+    figures = tab.locator(".composite .facts > div")
     pixel = service.http.get(f"/v1/mattes/{ready[1]}/transport?x=49&y=36").json()
-    expect(figures.get_by_role("row")).to_have_count(3 + len(pixel["lobes"]))
-    expect(figures.get_by_role("row", name="Transparency")).to_contain_text(f"{100 * pixel['rho'][0]:.0f} %")
+    expect(figures).to_have_count(2 + len(pixel["lobes"]))
+    expect(figures.first).to_contain_text(f"{100 * pixel['rho'][0]:.0f} %, {100 * pixel['rho'][1]:.0f} %")
     place = f"{pixel['lobes'][0]['u'] * 1280:.0f}, {(1 - pixel['lobes'][0]['v']) * 960:.0f}"
-    expect(figures.get_by_role("row", name="Lobe 1")).to_contain_text(place)
-    layer.hover(position={"x": 5, "y": 5})
-    expect(tab.get_by_alt_text("pixel (0, 0)")).to_be_visible()
+    expect(figures.filter(has_text="Lobe 1")).to_contain_text(f"at {place}")
+    lobes = tab.locator(".lobes ellipse")
+    expect(lobes).to_have_count(len(pixel["lobes"]))
+    box, mark = tab.locator("canvas.inset").bounding_box(), lobes.first.bounding_box()
+    assert box is not None
+    assert mark is not None
+    # The first lobe is drawn where it is on the backdrop.
+    at = (mark["x"] + mark["width"] / 2 - box["x"]) / box["width"]
+    assert at == pytest.approx(pixel["lobes"][0]["u"], abs=0.02)
+    stage.hover(position={"x": 5, "y": 5})
+    expect(tab.get_by_text("Pixel (0, 0)")).to_be_visible()
+    tab.get_by_role("button", name="Explain a pixel").click()
+    expect(lobes).to_have_count(0)
+    stage.press("ArrowRight")  # moves the backdrop again
+    expect(tab.locator("output[for=place-right]")).to_have_text("2 %")
 
 
 @pytest.mark.slow
 def test_layers_for_other_tools_are_downloaded(tab: Page, service: Service, ready: tuple[str, str]) -> None:
     tab.goto(f"{service.url}/#/mattes/{ready[1]}")
+    unfold(tab)
     for name in ("all.exr", "stmap.exr"):
         with tab.expect_download() as download:
             tab.get_by_role("button", name=name).click()

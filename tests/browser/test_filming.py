@@ -134,8 +134,8 @@ def test_recording_continues_while_another_view_is_shown(desk: Page, service: Se
     expect(desk.get_by_label("Choose the film")).to_be_attached()
     expect(note).to_be_hidden()
     assert not desk.get_by_label("What the camera sees").evaluate("(video) => video.paused")
-    desk.get_by_role("navigation").get_by_role("link", name="Jobs").click()
-    expect(desk.get_by_role("heading", name="Jobs")).to_be_visible()
+    desk.get_by_role("navigation").get_by_role("link", name="Mattes").click()
+    expect(desk.get_by_role("heading", name="Mattes")).to_be_visible()
     expect(note).to_be_visible()
     before = {one["id"] for one in service.http.get("/v1/captures").json()["captures"]}
     shown(service, program, "shown")
@@ -147,7 +147,7 @@ def test_recording_continues_while_another_view_is_shown(desk: Page, service: Se
     ):
         desk.wait_for_timeout(100)
     assert [one["name"] for one in made] == ["film"]
-    expect(desk.get_by_role("heading", name="Jobs")).to_be_visible()
+    expect(desk.get_by_role("heading", name="Mattes")).to_be_visible()
     desk.go_back()
     expect(desk.get_by_role("button", name="Use a camera of this device")).to_be_visible()
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
-from tests.browser.pages import MINUTE, PHONE, is_fitting, opened
+from tests.browser.pages import BY_HAND, MINUTE, PHONE, is_fitting, opened
 from tests.browser.test_compositing import WITHOUT
 from tests.end_to_end.conftest import Service
 from tests.parts.waiting import until
@@ -148,12 +148,13 @@ def test_without_webgl_a_still_is_shown(browser: Browser, service: Service) -> N
 
 @pytest.mark.slow
 def test_sample_capture_is_uploaded_and_read(desk: Page, service: Service) -> None:
+    desk.add_init_script(BY_HAND)
     desk.goto(f"{service.url}/#/captures")
     desk.get_by_role("button", name="Try it with a sample capture").click()
     expect(desk).to_have_url(re.compile(r"#/captures/\w+"), timeout=MINUTE)
     capture = desk.url.rpartition("/")[2]
     service.client.wait(service.client.capture(capture)["job"])
-    expect(desk.get_by_role("heading", name="Report")).to_be_visible(timeout=MINUTE)
+    expect(desk.get_by_role("region", name="Report")).to_be_visible(timeout=MINUTE)
     report = service.http.get(f"/v1/captures/{capture}/report").json()
     assert report["level"] != "bad", report
     matte = service.client.wait(service.client.recover(capture, quality="fast")["id"])["matte"]

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from tests.browser.pages import MINUTE
+from tests.browser.pages import MINUTE, ZIP
 from tests.end_to_end.conftest import Service, paused, serving
 
 pytestmark = pytest.mark.slow
@@ -16,14 +16,14 @@ pytestmark = pytest.mark.slow
 def test_invalid_option_is_explained(desk: Page, service: Service, ready: tuple[str, str]) -> None:
     desk.goto(f"{service.url}/#/captures/{ready[0]}")
     known = {option["name"] for option in service.http.get("/v1/options").json()["options"]}
-    desk.get_by_text("All options").click()
+    desk.get_by_text("Expert").click()
     fields = desk.locator("#recovery [name]")
     names = {fields.nth(n).get_attribute("name") for n in range(fields.count())}
     assert names == known
     # Bypass the browser's own check, as if another version of the service had other ranges.
     desk.locator("#recovery").evaluate("(form) => (form.noValidate = true)")
     desk.get_by_label("most lobes").fill("99")
-    desk.get_by_role("button", name="Start").click()
+    desk.get_by_role("button", name="Recover", exact=True).click()
     expect(desk.get_by_role("alert")).to_contain_text("'most_lobes': must be a whole number between 1 and 16")
     expect(desk.get_by_label("most lobes")).to_be_focused()
 
@@ -144,3 +144,47 @@ def test_restarted_service_with_keys(
         expect(page.get_by_text("exact")).to_be_visible(timeout=MINUTE)
     assert page.evaluate("Object.keys(localStorage)") == []
     page.close()
+
+
+def test_recovery_follows_the_ingest_by_itself(desk: Page, service: Service, ball: Path) -> None:
+    with paused(service):
+        desk.goto(f"{service.url}/#/captures")
+        desk.get_by_label(ZIP).set_input_files(ball)
+        expect(desk.get_by_label("Recover automatically when ready")).to_be_checked()
+        expect(desk.get_by_role("list", name="Steps").locator("[aria-current=step]")).to_have_text("Check")
+        desk.get_by_role("radio", name="Draft").check()
+    expect(desk).to_have_url(re.compile("#/mattes/"), timeout=3 * MINUTE)
+    matte = service.client.matte(desk.url.rpartition("/")[2])
+    assert matte["options"]["quality"] == "fast"
+    desk.get_by_role("list", name="Steps").get_by_role("link", name="Check").click()
+    expect(desk.get_by_role("region", name="Mattes").get_by_role("link")).to_have_attribute(
+        "href", f"#/mattes/{matte['id']}"
+    )
+
+
+def test_activity_lists_the_last_jobs(desk: Page, service: Service, ready: tuple[str, str]) -> None:
+    with paused(service):
+        job = service.client.recover(ready[0])["id"]
+        desk.goto(f"{service.url}/#/captures")
+        activity = desk.get_by_role("button", name=re.compile("Activity.*1"))
+        activity.press("Enter")
+        menu = desk.get_by_role("region", name="Activity")
+        expect(menu.get_by_role("link").first).to_have_attribute("href", f"#/jobs/{job}")
+        service.http.post(f"/v1/jobs/{job}/cancel")
+        expect(menu.get_by_role("link").first).to_contain_text("cancelled")
+    menu.get_by_role("link", name="All jobs").click()
+    expect(desk.get_by_role("heading", name="Jobs")).to_be_visible()
+    expect(menu).to_be_hidden()
+
+
+def test_view_that_failed_to_load_can_be_tried_again(
+    desk: Page, service: Service, ready: tuple[str, str]
+) -> None:
+    desk.route("**/v1/mattes/*", lambda route: route.abort("connectionreset"))
+    desk.goto(f"{service.url}/#/mattes/{ready[1]}")
+    again = desk.get_by_role("button", name="Try again")
+    expect(again).to_be_visible()
+    desk.unroute("**/v1/mattes/*")
+    again.click()
+    expect(desk.get_by_role("heading", name=f"Matte {ready[1][:8]}")).to_be_visible()
+    expect(desk.get_by_role("alert")).to_have_count(0)

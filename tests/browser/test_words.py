@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Page, Route, expect
 
-from tests.browser.pages import ZIP
+from tests.browser.pages import ZIP, unfold
 from tests.end_to_end.conftest import Service
 
 pytestmark = pytest.mark.slow
@@ -87,7 +87,7 @@ def test_no_picture_is_shown_until_there_is_one(desk: Page, service: Service, re
     held: list[Route] = []
     desk.route("**/layers/rho.png", lambda route: held.append(route))
     desk.goto(f"{service.url}/#/mattes/{ready[1]}")
-    expect(desk.get_by_role("heading", name="Layers")).to_be_visible()
+    unfold(desk)
     image = desk.locator(".layer img")
     expect(image).to_be_hidden()
     while not held:

@@ -8,6 +8,7 @@ from pathlib import Path
 from string import Template
 
 PAGE = Path(__file__).parents[2] / "web" / "standalone"
+APP_STYLE = PAGE.parent / "app" / "style.css"
 _IMPORT = re.compile(r'^import \{ (.+) \} from "(.+)";$', re.MULTILINE)
 _EXPORT = re.compile(r"^export ((?:async )?(?:function|class|const) (\w+))", re.MULTILINE)
 
@@ -29,7 +30,7 @@ def make_page(title: str, monitor: tuple[int, int], live: bytes) -> bytes:
     bytes
         HTML in UTF-8. Its policy lets it run its own script, and load nothing.
     """
-    style, script = (PAGE / "page.css").read_text(), bundle(PAGE / "page.js")
+    style, script = _colours() + (PAGE / "page.css").read_text(), bundle(PAGE / "page.js")
     allowed = f"script-src {_hash(script)}; style-src {_hash(style)}"
     policy = f"default-src 'none'; {allowed}; base-uri 'none'; form-action 'none'"
     wide, high = monitor
@@ -71,6 +72,17 @@ def bundle(module: Path) -> str:
 
     add(module.resolve())
     return "".join(parts)
+
+
+def _colours() -> str:
+    """The rules of the app's style sheet that name its colours, light and dark."""
+    found = re.match(
+        r":root \{.*?^\}\n@media \(prefers-color-scheme: dark\) \{.*?^\}\n",
+        APP_STYLE.read_text(),
+        re.M | re.S,
+    )
+    assert found is not None
+    return found[0]
 
 
 def _hash(text: str) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from fastapi import APIRouter
-from fastapi.responses import FileResponse, Response
+from fastapi.responses import FileResponse, HTMLResponse, Response
 from starlette.staticfiles import StaticFiles
 
 page = APIRouter()
@@ -41,14 +41,24 @@ class Files(StaticFiles):
         return answer
 
 
+def _app() -> str:
+    """The app's page, with a link for each module: browsers then load all of them at once, not one after another."""
+    modules = sorted(path.relative_to(WEB).as_posix() for path in (WEB / "app").rglob("*.js"))
+    links = "\n".join(
+        f'<link rel="modulepreload" href="web/{module}">' for module in modules if module != "app/main.js"
+    )
+    return (WEB / "app" / "index.html").read_text().replace("<!-- preload -->", links)
+
+
 def _app_policy() -> str:
     """`POLICY` with the app's one inline script, by its hash: it must run although no file of the app comes."""
-    script = re.search(r"<script>(.*?)</script>", (WEB / "app" / "index.html").read_text(), re.DOTALL)
+    script = re.search(r"<script>(.*?)</script>", APP, re.DOTALL)
     assert script is not None
     digest = base64.b64encode(hashlib.sha256(script[1].encode()).digest()).decode()
     return POLICY.replace("script-src 'self'", f"script-src 'self' 'sha256-{digest}'")
 
 
+APP = _app()
 HEADERS = {**FRESH, "Content-Security-Policy": _app_policy()}
 SWAGGER = Path(str(files("fastapi_offline"))) / "static"
 """Swagger UI, served from here: FastAPI's own page would load it from another host."""
@@ -56,10 +66,10 @@ SWAGGER = Path(str(files("fastapi_offline"))) / "static"
 DOCS = {**FRESH, "Content-Security-Policy": POLICY.replace("img-src 'self'", "img-src 'self' data:")}
 
 
-@page.get("/", include_in_schema=False, response_class=FileResponse)
-def get_app() -> FileResponse:
+@page.get("/", include_in_schema=False, response_class=HTMLResponse)
+def get_app() -> HTMLResponse:
     """The web app. The page itself needs no key: it asks the user for one if the API needs it."""
-    return FileResponse(WEB / "app" / "index.html", media_type="text/html", headers=HEADERS)
+    return HTMLResponse(APP, headers=HEADERS)
 
 
 @page.get("/docs", include_in_schema=False, response_class=FileResponse)

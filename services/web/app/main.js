@@ -1,5 +1,6 @@
 // Shows the view that the part of the URL after `#` names, so that a reload and the back button keep it.
 import { h, problemBox } from "./lib/dom.js";
+import { refreshActivity } from "./lib/activity.js";
 import { recordings } from "./lib/recordings.js";
 import { home } from "./home/home.js";
 import { captures } from "./views/captures.js";
@@ -14,7 +15,7 @@ const note = document.getElementById("recording");
 const views = new Map(); // by their part of the URL: the one that is shown, and those that record a film
 let shown;
 
-// Ends the views that are not shown, except those that record a film: these go on, and are shown again when opened.
+// Ends the views that are not shown, except those that record a film: these are shown again when opened.
 function tidy() {
 	for (const [hash, view] of views) {
 		if (view === shown || recordings.has(view.signal)) continue;
@@ -29,18 +30,20 @@ addEventListener("recording", tidy);
 
 function open(hash) {
 	const stop = new AbortController();
-	const view = { stop, signal: stop.signal, element: h("div", { class: "view" }) };
+	const view = { stop, signal: stop.signal, element: h("div.view") };
 	views.get(hash)?.stop.abort();
 	views.set(hash, view);
 	return view;
 }
 
 async function route(navigated) {
-	const [hash, name = "home", id] = /^#\/(?:(\w+)(?:\/([\w-]+))?)?$/.exec(location.hash) ?? [];
+	// What follows a question mark is the view's own.
+	const [, hash, name = "home", id] = /^(#\/(?:(\w+)(?:\/([\w-]+))?)?)(?:\?.*)?$/.exec(location.hash) ?? [];
 	if (hash === undefined || !VIEWS[name]?.[id ? 1 : 0]) return location.replace("#/");
 	const before = views.get(hash);
 	const view = (shown = recordings.has(before?.signal) ? before : open(hash));
 	tidy();
+	if (name !== "home") refreshActivity(); // the first view needs no key
 	for (const link of document.querySelectorAll("nav a")) {
 		if (link.hash === `#/${name}`) link.setAttribute("aria-current", "page");
 		else link.removeAttribute("aria-current");
@@ -51,7 +54,9 @@ async function route(navigated) {
 		if (view === before) view.resume();
 		else view.resume = await VIEWS[name][id ? 1 : 0](view.element, view.signal, id);
 	} catch (error) {
-		if (!view.signal.aborted) view.element.append(problemBox(error));
+		const final = error.status >= 400 && error.status < 500;
+		const again = !final && h("p", h("button", { type: "button", onclick: () => route(true) }, "Try again"));
+		if (!view.signal.aborted) view.element.append(problemBox(error), again || "");
 	}
 	if (view !== shown) return;
 	main.ariaBusy = "false";

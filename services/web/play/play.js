@@ -59,9 +59,8 @@ const nextFrame = (stopped) =>
 		stopped.onabort = () => reject(stopped.reason);
 	});
 
-// Shows the steps, each for a whole number of the display's refreshes, and none before its picture is decoded. If one
-// refresh is missed, the next step is shorter by it; if more are, the next step has its full length and the beat starts
-// again from there. No step is left out. Returns when each step was first shown.
+// Shows each step for a whole number of the display's refreshes, once its picture is decoded. If one refresh is missed, the
+// next step is shorter by it; if more are, the beat starts again. Returns when each step was first shown.
 async function show(context, border, steps, pictures, refresh, stopped, passed) {
 	const shown = [];
 	let due = -Infinity;
@@ -86,7 +85,7 @@ async function show(context, border, steps, pictures, refresh, stopped, passed) 
 	return shown;
 }
 
-// Counts down, and meanwhile measures the refresh interval of the display: the median between frames, in milliseconds.
+// Counts down, and measures the refresh interval of the display meanwhile: the median between frames, in ms.
 async function countDown(element, stopped) {
 	const begin = await nextFrame(stopped);
 	const times = [begin];
@@ -136,7 +135,7 @@ async function ask(path, options = {}) {
 
 const id = here.pathname.split("/").at(-2);
 
-// Reports progress to the service. The program continues if that fails; `keepalive` sends it when the page is closed, too.
+// Reports progress. The program continues if that fails; `keepalive` sends it when the page is closed, too.
 const report = (progress) =>
 	ask("showing", { method: "PUT", body: JSON.stringify(progress), headers: { "Content-Type": "application/json" }, keepalive: true }).catch(() => {});
 

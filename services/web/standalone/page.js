@@ -1,24 +1,17 @@
 // The glass without a service: the page holds the matte, and the browser draws it. `services/api/mattes/live_page.py` makes
 // one file of this module, of those that it imports, and of a matte.
-import { NAMES, builtIn, fromFile } from "../app/composite/backdrops.js";
-import { Coarseness } from "../app/composite/coarseness.js";
+import { builtIn, fromFile } from "../app/composite/backdrops.js";
+import { LiveGlass } from "../app/composite/live_glass.js";
 import { decodeLive } from "../app/composite/live_form.js";
 import { handleGestures, placement } from "../app/composite/placement.js";
-import { createPainter, webglContext } from "../app/composite/webgl.js";
+import { NAMES } from "../app/composite/scenery.js";
 import { h } from "../app/lib/dom.js";
 
-const STILL = 300; // ms without a change after which all pixels are drawn
 const stage = document.getElementById("stage");
-const canvas = stage.querySelector("canvas");
 const choices = document.getElementById("choices");
 const monitor = document.body.dataset.monitor.split(" ").map(Number);
-const coarseness = new Coarseness();
-const placed = placement(moved);
-let painter;
-let backdrop;
-let wanted = 0;
-let frame = 0;
-let timer;
+const placed = placement(() => glass.moved());
+const glass = new LiveGlass(stage.querySelector("canvas"), placed.values, new AbortController().signal);
 
 const say = (text) => (document.getElementById("status").textContent = text);
 
@@ -30,30 +23,12 @@ async function matte() {
 	return decodeLive(await new Response(unpacked).arrayBuffer());
 }
 
-function moved() {
-	clearTimeout(timer);
-	frame ||= requestAnimationFrame((now) => {
-		frame = 0;
-		painter?.draw(placed.values, coarseness.next(now));
-	});
-	timer = setTimeout(() => {
-		coarseness.rest();
-		painter?.draw(placed.values);
-	}, STILL);
-}
+const readable = (found) => {
+	if (!found.picture) throw new Error(`This browser cannot read ${found.name}. Use PNG, JPEG or WebP.`);
+	return found;
+};
 
-// Shows the backdrop that a promise brings; of several, the one that was chosen last.
-async function use(promise) {
-	const choice = (wanted += 1);
-	const found = await promise;
-	if (choice !== wanted) return found.close?.();
-	if (!found.picture) return say(`This browser cannot read ${found.name}. Use PNG, JPEG or WebP.`);
-	backdrop?.close?.();
-	backdrop = found;
-	painter?.setBackdrop(found.picture);
-	say("");
-	moved();
-}
+const use = (promise) => glass.use(promise.then(readable)).then((found) => found && say(""), (error) => say(error.message));
 
 function take([file]) {
 	if (!file) return;
@@ -62,22 +37,15 @@ function take([file]) {
 }
 
 async function start() {
-	const gl = webglContext(canvas);
-	if (!gl) return say("This browser has no WebGL2, which draws the glass. Open the page in another one.");
-	canvas.addEventListener("webglcontextlost", () => {
-		painter = undefined;
-		say("The browser lost the graphics card. Reload the page to draw the glass again.");
-	});
+	if (!glass.gl) return say("This browser has no WebGL2, which draws the glass. Open the page in another one.");
+	glass.lost = () => say("The browser lost the graphics card. Reload the page to draw the glass again.");
 	const found = await matte();
-	if (Math.max(found.width, found.height, ...found.texture) > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
-		return say("This matte is too large for the graphics card of this device.");
-	}
+	if (!glass.load(found, monitor)) return glass.gl && say("This matte is too large for the graphics card of this device.");
 	stage.style.setProperty("--aspect", found.width / found.height);
-	painter = createPainter(gl, found, monitor);
 	handleGestures(stage, placed);
 	const choice = (name, i) =>
-		h("label", {}, h("input", { type: "radio", name: "backdrop", checked: i === 0, onchange: () => use(builtIn(name, monitor)) }), name);
-	choices.prepend(h("fieldset", {}, h("legend", {}, "Backdrop"), NAMES.map(choice)));
+		h("label", h("input", { type: "radio", name: "backdrop", checked: i === 0, onchange: () => use(builtIn(name, monitor)) }), name);
+	choices.prepend(h("fieldset", h("legend", "Backdrop"), NAMES.map(choice)));
 	document.getElementById("reset").append(placed.reset);
 	const own = document.querySelector("#own input");
 	own.onchange = () => {

@@ -50,13 +50,13 @@ PLACES = [
     {"right": -0.1, "down": 0, "scale": 0.5, "angle": -70},
 ]
 COARSEST = 2
-"""Resolution the app falls back to while a backdrop moves, see `services/web/app/composite/webgl.js`."""
+"""Resolution the app falls back to while a backdrop moves, see `services/web/app/composite/coarseness.js`."""
 SOFTWARE = ("swiftshader", "llvmpipe", "software", "basic render")
 BROWSER = "--no-sandbox", "--enable-unsafe-swiftshader"
 OPEN = """async ([id, monitor]) => {
     const { webglContext, createPainter } = await import("/web/app/composite/webgl.js");
-    const { fetchLive } = await import("/web/app/composite/live.js");
-    const found = await fetchLive(id);
+    const { decodeLive } = await import("/web/app/composite/live_form.js");
+    const found = decodeLive(await (await fetch(`/v1/mattes/${id}/live`)).arrayBuffer());
     const gl = webglContext(document.createElement("canvas"));
     const info = gl.getExtension("WEBGL_debug_renderer_info");
     window.bench = { gl, painter: createPainter(gl, found, monitor) };

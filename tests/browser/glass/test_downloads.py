@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
-from tests.browser.pages import SIZE, opened
+from tests.browser.pages import SIZE, opened, unfold
 from tests.end_to_end.conftest import Service, png
 from workflows.simulation import glass_ball
 
@@ -46,6 +46,7 @@ def stage(browser: Browser, service: Service, ready: tuple[str, str]) -> Iterato
     ) as page:
         page.goto(f"{service.url}/#/mattes/{ready[1]}")
         expect(page.get_by_text(EXACT)).to_be_visible()
+        unfold(page)
         yield page
 
 
@@ -74,7 +75,9 @@ def test_picture_that_only_the_browser_reads_is_sent_as_a_copy(
     expect(stage.get_by_role("alert")).to_have_count(0)
     with stage.expect_download() as download:
         stage.get_by_role("button", name="PNG", exact=True).click()
-    exact = service.http.post(f"/v1/mattes/{ready[1]}/composite", content=saved("PNG")).content
+    exact = service.http.post(
+        f"/v1/mattes/{ready[1]}/composite?around=backdrop", content=saved("PNG")
+    ).content
     np.testing.assert_array_equal(pixels_of(download.value.path().read_bytes()), pixels_of(exact))
 
 
@@ -96,7 +99,7 @@ def test_picture_is_copied(stage: Page, service: Service, ready: tuple[str, str]
     expect(stage.get_by_text(f"beach.png: {EXACT}")).to_be_visible()
     stage.get_by_role("button", name="Copy picture").click()
     expect(stage.get_by_text("The picture is in the clipboard.")).to_be_visible()
-    exact = service.http.post(f"/v1/mattes/{ready[1]}/composite", content=body).content
+    exact = service.http.post(f"/v1/mattes/{ready[1]}/composite?around=backdrop", content=body).content
     copied = base64.b64decode(stage.evaluate(COPIED))
     np.testing.assert_array_equal(pixels_of(copied), pixels_of(exact))
 
@@ -119,7 +122,9 @@ def test_several_pictures_come_back_as_a_zip(stage: Page, service: Service, read
     with zipfile.ZipFile(download.value.path()) as archive:
         assert archive.namelist() == ["001-beach.png", "003-night.png"]
         for entry, body in zip(archive.namelist(), bodies.values(), strict=True):
-            exact = service.http.post(f"/v1/mattes/{ready[1]}/composite", content=body).content
+            exact = service.http.post(
+                f"/v1/mattes/{ready[1]}/composite?around=backdrop", content=body
+            ).content
             assert archive.read(entry) == exact
     expect(stage.get_by_text("2 of 3 composites are in composites.zip.")).to_be_visible()
     expect(stage.get_by_role("alert")).to_contain_text("notes.txt: this is not a PNG")

@@ -1,17 +1,17 @@
 // Composites of clips: the service composites every frame, as a job that ends with a video.
-import { ask, save } from "../lib/api.js";
+import { ask, newKey, save } from "../lib/api.js";
 import { button, h, problemBox } from "../lib/dom.js";
 import { followJob } from "../lib/job_progress.js";
 
 // The controls for the clip that is chosen; `place` returns where it stands.
 export function clipJob(matte, place, signal) {
 	const problem = h("div");
-	const progress = h("div", { class: "stack" });
+	const progress = h("div.stack");
 	let chosen;
 	const make = button("Make the video", problem, async () => {
-		progress.replaceChildren(h("p", { class: "hint", role: "status" }, "Sending the clip."));
+		progress.replaceChildren(h("p.hint", { role: "status" }, "Sending the clip."));
 		try {
-			const headers = { "Content-Type": chosen.type.startsWith("video/") ? chosen.type : "video/mp4", "Idempotency-Key": crypto.randomUUID?.() ?? String(Math.random()) };
+			const headers = { "Content-Type": chosen.type.startsWith("video/") ? chosen.type : "video/mp4", "Idempotency-Key": newKey() };
 			const path = `v1/mattes/${matte.id}/composite?${new URLSearchParams(place())}`;
 			const job = await (await ask(path, { method: "POST", headers, body: chosen, signal })).json();
 			progress.replaceChildren();
@@ -22,8 +22,8 @@ export function clipJob(matte, place, signal) {
 		}
 	});
 	async function watch(job) {
-		const panel = h("div", { class: "stack" });
-		const way = h("p", { class: "row" }, h("a", { href: `#/jobs/${job.id}` }, "Show the job"));
+		const panel = h("div.stack");
+		const way = h("p.row", h("a", { href: `#/jobs/${job.id}` }, "Show the job"));
 		progress.replaceChildren(panel, way);
 		try {
 			const ended = await followJob(panel, job.id, signal, () => {}, job);
@@ -32,7 +32,7 @@ export function clipJob(matte, place, signal) {
 			if (!signal.aborted) panel.append(problemBox(error));
 		}
 	}
-	const element = h("div", { class: "stack", hidden: true }, h("p", { class: "row" }, make), problem, progress);
+	const element = h("div.stack", { hidden: true }, h("p.row", make), problem, progress);
 	return {
 		element,
 		choose(file) {

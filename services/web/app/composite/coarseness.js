@@ -1,7 +1,7 @@
 // How many fewer pixels to draw so that the picture keeps up with the hand.
 
 const SLOW = 45; // ms between pictures above which fewer pixels are drawn
-const COARSEST = 2; // by default
+const SHORTEST = 240; // pixels of the shorter side that are drawn at least
 
 export class Coarseness {
 	level = 0; // one pixel of 4 ** level is drawn
@@ -10,8 +10,9 @@ export class Coarseness {
 	#rested = true; // whether the movement before has ended
 	#coarsest;
 
-	constructor(coarsest = COARSEST) {
-		this.#coarsest = coarsest;
+	// `shorter` is the shorter side of the picture, in pixels.
+	constructor(shorter) {
+		this.#coarsest = Math.max(0, Math.floor(Math.log2(shorter / SHORTEST)));
 	}
 
 	// Notes that a picture is painted at a time; returns the level to paint it with.

@@ -1,20 +1,27 @@
-// The panel that puts the glass before a backdrop: the stage, the choice of backdrops, placement and downloads.
-import { h } from "../lib/dom.js";
+// The stage of a matte, and its controls.
+import { fileField, h } from "../lib/dom.js";
 import { onDrop } from "../upload/upload.js";
-import { NAMES, builtIn, fromFile } from "./backdrops.js";
+import { builtIn, fromFile } from "./backdrops.js";
 import { clipJob } from "./clip_job.js";
+import { comparison } from "./compare.js";
 import { downloads } from "./downloads.js";
+import { explanation } from "./explain.js";
 import { handleGestures, placement } from "./placement.js";
+import { NAMES, scenery } from "./scenery.js";
 import { Stage } from "./stage.js";
+import { cameraSymbol, choice, thumbs } from "./thumb_choices.js";
 import { camera, clip } from "./video_backdrops.js";
 
 const RAW = ".dng,.nef,.cr2,.cr3,.arw,.raf,.orf,.rw2"; // the usual names of camera RAW
 // Browsers know no type of MKV, and give MTS that of something else.
 const isVideo = (file) => file.type.startsWith("video/") || /\.(mp4|mov|mkv|webm|avi|mts|m2ts)$/i.test(file.name);
 
-export function compositing(matte, signal) {
-	const placed = placement(() => stage.moved());
+// `others` are mattes to compare with, by a name.
+export function compositing(matte, others, signal) {
+	const given = Object.fromEntries(new URLSearchParams(location.hash.split("?")[1]));
+	const placed = placement(() => stage.moved(), given);
 	const stage = new Stage(matte, placed.values, signal);
+	const explained = explanation(stage, matte, signal);
 	const video = clipJob(matte, () => placed.values, signal);
 	handleGestures(stage.element, placed);
 
@@ -32,37 +39,58 @@ export function compositing(matte, signal) {
 		play.hidden = !backdrop.moving;
 		play.textContent = "Pause";
 	}
-	const taken = downloads(stage, signal);
-	const choices = backdropChoices(matte, stage.element, use, taken.all, signal);
-	use(builtIn(NAMES[0], matte.monitor));
+	const transparent = h("input", { type: "checkbox", checked: given.around === "nothing" });
+	transparent.onchange = () => stage.putAround(!transparent.checked);
+	stage.around = !transparent.checked;
+	const first = NAMES.includes(given.backdrop) ? given.backdrop : NAMES[0];
 
-	return h("section", { class: "panel composite", "aria-label": "Compositing" },
-		h("div", {}, stage.element, h("p", { class: "hint" }, "Drag the picture to move the backdrop; then scroll, or pinch, to scale it."),
-			stage.status, stage.renderer, stage.problem),
-		h("div", { class: "stack" }, choices, placed.sliders, h("p", { class: "row" }, placed.reset, play),
-			taken.element, video.element));
+	// A reload and a link show the same, as far as the backdrop is a built-in one.
+	stage.element.addEventListener("exact", () => {
+		if (signal.aborted) return;
+		const state = new URLSearchParams(placed.moved);
+		const { name } = stage.backdrop;
+		if (NAMES.includes(name) && name !== NAMES[0]) state.set("backdrop", name);
+		if (!stage.around) state.set("around", "nothing");
+		history.replaceState(history.state, "", `#/mattes/${matte.id}${state.size ? `?${state}` : ""}`);
+	});
+	const taken = downloads(stage, signal);
+	const choices = backdropChoices(matte, stage.element, use, taken.all, first, signal);
+	use(builtIn(first, matte.monitor));
+
+	const filled = (is) => ((sheet.open = !is), full.textContent = section.classList.toggle("full", Boolean(is)) ? "Leave full screen" : "Full screen");
+	const full = h("button", {
+		type: "button",
+		onclick() {
+			if (document.fullscreenElement) document.exitFullscreen();
+			else if (section.requestFullscreen) section.requestFullscreen();
+			else filled(!section.classList.contains("full")); // the window: browsers of phones let only videos fill the screen
+		},
+	}, "Full screen");
+	const folded = (title, ...about) => h("details", h("summary", title), about);
+	const sheet = h("details.panel.sheet", { open: true }, h("summary", "Controls"),
+		h("div.row", full, play, explained.button, placed.reset, h("label", transparent, " Transparent around the glass")),
+		stage.status, explained.panel, choices,
+		folded("Placement", h("p.hint", "Drag the picture to move the backdrop; then scroll, or pinch, to scale it."), placed.sliders),
+		folded("Comparison", comparison(stage, matte, others)), folded("Copy and download", taken.element), video.element, stage.renderer);
+	const section = h("section.composite", { "aria-label": "Compositing" }, stage.element, sheet);
+	section.addEventListener("fullscreenchange", () => filled(document.fullscreenElement));
+	return section;
 }
 
-// What can be a backdrop: the built-in ones, the camera, and a file that is dropped on the stage, pasted or chosen. Of
-// several files `all` makes composites.
-function backdropChoices(matte, stage, use, all, signal) {
-	const choice = (name, make, checked = false) =>
-		h("label", { class: "choice" }, h("input", { type: "radio", name: "backdrop", checked, onchange: () => use(make()) }), name);
-	const builtIns = NAMES.map((name, i) => choice(name, () => builtIn(name, matte.monitor), i === 0));
-	const choices = h("fieldset", { class: "row" }, h("legend", {}, "Backdrop"), builtIns, choice("Camera", camera));
+// What can be a backdrop: a built-in one, the camera, or a file that is dropped, pasted or chosen. Of several files `all`
+// makes composites.
+function backdropChoices(matte, stage, use, all, first, signal) {
+	const builtIns = NAMES.map((name) => choice("backdrop", name, scenery(name, 96, 72).picture, name === first, () => use(builtIn(name, matte.monitor))));
+	const choices = thumbs("Backdrop", [...builtIns, choice("backdrop", "Camera", cameraSymbol(), false, () => use(camera()))]);
 	const take = (files) => {
 		if (files.length > 1) return all([...files]);
 		const [file] = files;
 		for (const input of choices.querySelectorAll("input")) input.checked = false;
 		use(isVideo(file) ? clip(file) : fromFile(file));
 	};
-	const input = h("input", { type: "file", id: "backdrop", multiple: true, accept: `image/*,.heic,.heif,.hif,.exr,.tif,.tiff,${RAW},video/*,.mts,.m2ts` });
-	input.onchange = () => {
-		if (input.files.length) take(input.files);
-		input.value = "";
-	};
+	const input = fileField({ id: "backdrop", multiple: true, accept: `image/*,.heic,.heif,.hif,.exr,.tif,.tiff,${RAW},video/*,.mts,.m2ts` }, take);
 	onDrop(stage, take);
 	addEventListener("paste", ({ clipboardData }) => clipboardData?.files.length && take(clipboardData.files), { signal });
-	return [choices, h("div", { class: "drop small" }, h("label", { for: "backdrop" }, h("strong", {}, "Your own picture or clip"), " drop, paste or choose it",
-		h("span", { class: "hint" }, "PNG, JPEG, WebP, AVIF, GIF, HEIC, TIFF, EXR, camera RAW or a video; several pictures come back as a ZIP")), input)];
+	return [choices, h("div.drop.small", h("label", { for: "backdrop" }, h("strong", "Your own picture or clip"), " drop, paste or choose it",
+		h("span.hint", "PNG, JPEG, WebP, AVIF, GIF, HEIC, TIFF, EXR, camera RAW or a video; several pictures come back as a ZIP")), input)];
 }

@@ -9,7 +9,7 @@ const TIMES = 2;
 
 // `element`, and `all`, which composites several files.
 export function downloads(stage, signal) {
-	const status = h("p", { class: "hint", role: "status" });
+	const status = h("p.hint", { role: "status" });
 	const problem = h("div");
 	const larger = h("input", { type: "checkbox" });
 	const buttons = Object.entries(FORMATS).map(([name, type]) =>
@@ -41,8 +41,8 @@ export function downloads(stage, signal) {
 		await copyPicture(stage);
 		status.textContent = "The picture is in the clipboard.";
 	});
-	const element = h("div", { class: "stack" }, h("div", { class: "row" }, copy, h("span", {}, "Download as"), buttons,
-		h("label", {}, larger, " Twice the size")), status, problem);
+	const element = h("div.stack", h("div.row", copy, h("span", "Download as"), buttons,
+		h("label", larger, " Twice the size")), status, problem);
 	return { element, all: (files) => all(files).catch((error) => signal.aborted || problem.replaceChildren(problemBox(error))) };
 }
 

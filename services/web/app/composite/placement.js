@@ -14,8 +14,8 @@ const KEYS = {
 	"+": ["scale", 5], "-": ["scale", -5], "[": ["angle", -2], "]": ["angle", 2],
 };
 
-// The four numbers in `values`, and the elements that set them. `changed` is called after each change.
-export function placement(changed) {
+// The four numbers in `values`, at first those `given` as texts, and the elements that set them.
+export function placement(changed, given = {}) {
 	const values = { ...DEFAULTS };
 	const sliders = Object.fromEntries(CONTROLS.map(([name, , , min, max, step]) => {
 		const logarithmic = name === "scale"; // as far from 1 to 10 as from 1 to a tenth
@@ -44,23 +44,26 @@ export function placement(changed) {
 		set({ [name]: name === "scale" ? values.scale * 1.02 ** steps : values[name] + steps * fine });
 	}
 
-	update({});
+	update(Object.fromEntries(CONTROLS.map(([name]) => [name, parseFloat(given[name])]).filter(([, value]) => Number.isFinite(value))));
 	return {
 		values, set, step,
-		sliders: h("div", { class: "sliders" }, CONTROLS.map(([name, label]) =>
+		get moved() {
+			return Object.entries(values).filter(([name, value]) => value !== DEFAULTS[name]);
+		},
+		sliders: h("div.sliders", CONTROLS.map(([name, label]) =>
 			[h("label", { for: `place-${name}` }, label), sliders[name].input, sliders[name].output])),
 		reset: h("button", { type: "button", onclick: () => set(DEFAULTS) }, "Reset"),
 	};
 }
 
-// Lets keys, the wheel, the mouse and fingers on an element set a placement. `monitor` is an element of the monitor's size.
+// Lets keys, the wheel, the mouse and fingers set a placement. `monitor` is an element of the monitor's size.
 export function handleGestures(element, placed, monitor = element) {
-	element.onkeydown = (event) => {
+	element.addEventListener("keydown", (event) => {
 		const [name, steps] = KEYS[event.key] ?? [];
-		if (!name || event.ctrlKey || event.metaKey || event.altKey) return;
+		if (!name || event.target !== element || event.ctrlKey || event.metaKey || event.altKey) return;
 		event.preventDefault();
 		placed.step(name, event.shiftKey && event.key.startsWith("Arrow") ? 5 * steps : steps);
-	};
+	});
 	element.addEventListener("wheel", (event) => {
 		if (document.activeElement !== element && !event.ctrlKey) return; // without focus the wheel scrolls the page
 		event.preventDefault();

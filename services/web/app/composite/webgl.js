@@ -1,10 +1,10 @@
-// Draws the glass by WebGL2: the light of the backdrop as a pyramid of textures, then a few look-ups in it for each pixel.
+// Draws the glass by WebGL2: the backdrop's light as a pyramid of textures, then a few look-ups in it for each pixel.
 // `workflows/composite/live/encode.py` describes the model; light is linear until the last line of the last shader.
 
 const TRIANGLE = `#version 300 es
 void main() { gl_Position = vec4(vec2(gl_VertexID == 1, gl_VertexID == 2) * 4.0 - 1.0, 0, 1); }`;
 
-// Decodes the backdrop to linear light once for each picture: decoding at each sample is slow in software renderers.
+// Decodes the backdrop once: at each sample that is slow in software.
 const DECODE = `#version 300 es
 precision highp float;
 uniform sampler2D picture; // which decodes sRGB
@@ -14,7 +14,7 @@ void main() {
 	light = vec4(seen.a * seen.rgb, 1);
 }`;
 
-// Resamples the backdrop to the cells of the first level; beyond its edges is black, or its mirror image without end.
+// Resamples the backdrop to the cells of the first level; beyond its edges is black, or its mirror image.
 const PLACE = `#version 300 es
 precision highp float;
 uniform sampler2D backdrop;
@@ -31,7 +31,7 @@ void main() {
 	light = vec4(covered.x * covered.y * textureLod(backdrop, at, blur).rgb, 1);
 }`;
 
-// Halves a level: every second node, with the weights [1, 3, 3, 1] / 8 along each axis, sampling between pairs of nodes.
+// Halves a level, with the weights [1, 3, 3, 1] / 8 along each axis, by sampling between pairs of nodes.
 const HALVE = `#version 300 es
 precision highp float;
 uniform sampler2D fine;
@@ -57,6 +57,9 @@ uniform mat3 crosstalk;
 uniform float finest; // level of the light that is there
 uniform int height;
 uniform int every; // pixel that is drawn, along each axis
+uniform bool around; // whether what a mask left out shows the light behind it
+uniform vec2 whole; // share of the texture of the light that the monitor takes
+uniform float coarse; // level of the light that is as coarse as the pixels
 out vec4 colour;
 void main() {
 	ivec2 pixel = min(every * ivec2(gl_FragCoord.x, float(height) - gl_FragCoord.y) + every / 2, textureSize(offset, 0) - 1);
@@ -71,8 +74,17 @@ void main() {
 	vec4 root = texelFetch(offset, pixel, 0);
 	vec3 rho = texelFetch(absorption, pixel, 0).rgb;
 	vec3 seen = tops.x * root.rgb * root.rgb + crosstalk * (tops.y * rho * rho * sum);
-	seen = clamp(root.a * seen, 0.0, 1.0);
-	colour = vec4(mix(12.92 * seen, 1.055 * pow(seen, vec3(1.0 / 2.4)) - 0.055, greaterThan(seen, vec3(0.0031308))), root.a);
+	float alpha = root.a;
+	if (around) {
+		ivec2 size = textureSize(offset, 0);
+		float near = 0.0; // the mean of the pixel and its neighbours: no steps at the edge
+		for (int k = 0; k < 9; k++) near += texelFetch(offset, clamp(pixel + ivec2(k % 3, k / 3) - 1, ivec2(0), size - 1), 0).a / 9.0;
+		vec3 behind = textureLod(light, whole * (vec2(pixel) + 0.5) / vec2(size), max(coarse - finest, 0.0)).rgb;
+		seen = mix(behind, seen, alpha * near);
+		alpha = 1.0;
+	}
+	seen = clamp(alpha * seen, 0.0, 1.0);
+	colour = vec4(mix(12.92 * seen, 1.055 * pow(seen, vec3(1.0 / 2.4)) - 0.055, greaterThan(seen, vec3(0.0031308))), alpha);
 }`;
 
 // The matrix of a placement, as `Placement.matrix` computes it: from cells to shares of the picture.
@@ -87,14 +99,13 @@ function placing({ right, down, scale, angle }, [columns, rows], [wide, high]) {
 	];
 }
 
-// A WebGL2 context; null where the browser has none, or cannot render to floating-point textures. What a mask left out is
-// black, or transparent with `alpha`.
-export function webglContext(canvas, alpha = false) {
-	const gl = canvas.getContext("webgl2", { alpha, antialias: false, depth: false, preserveDrawingBuffer: true });
+// A WebGL2 context; null where the browser has none, or cannot render to floating-point textures.
+export function webglContext(canvas) {
+	const gl = canvas.getContext("webgl2", { antialias: false, depth: false, preserveDrawingBuffer: true });
 	return gl?.getExtension("EXT_color_buffer_float") || gl?.getExtension("EXT_color_buffer_half_float") ? gl : null;
 }
 
-// A painter of a matte that `fetchLive` has decoded.
+// A painter of a matte that `decodeLive` has decoded.
 export function createPainter(gl, matte, monitor) {
 	const { width, height, levels, texture, finest } = matte;
 	const made = [];
@@ -125,7 +136,6 @@ export function createPainter(gl, matte, monitor) {
 		gl.texParameteri(target, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
 		return one;
 	}
-	// Each texture stays on a unit of its own.
 	const [LIGHT, LOOKUPS, OFFSET, ABSORPTION, PICTURE, BACKDROP] = [0, 1, 2, 3, 4, 5];
 	const [decode, place, halve, seen] = [program(DECODE), program(PLACE), program(HALVE), program(GLASS)];
 	gl.bindVertexArray(keep("VertexArray", gl.createVertexArray()));
@@ -158,6 +168,8 @@ export function createPainter(gl, matte, monitor) {
 	gl.uniform1i(seen.at("offset"), OFFSET);
 	gl.uniform1i(seen.at("absorption"), ABSORPTION);
 	gl.uniform2f(seen.at("tops"), matte.S, matte.rho);
+	gl.uniform2f(seen.at("whole"), levels[0][0] / texture[0], levels[0][1] / texture[1]);
+	gl.uniform1f(seen.at("coarse"), Math.log2(levels[0][0] / width));
 	gl.uniformMatrix3fv(seen.at("crosstalk"), true, matte.crosstalk.flat());
 	halve.use();
 	gl.uniform1i(halve.at("fine"), LIGHT);
@@ -182,9 +194,9 @@ export function createPainter(gl, matte, monitor) {
 			gl.drawArrays(gl.TRIANGLES, 0, 3);
 			gl.generateMipmap(gl.TEXTURE_2D);
 		},
-		// Draws the glass with the backdrop at a placement. One of 4 ** coarser pixels is drawn, from light that is as much
-		// coarser. An `endless` backdrop goes on beyond its edges.
-		draw(at, coarser = 0, endless = false) {
+		// Draws one of 4 ** coarser pixels, from light that is as much coarser. An `endless` backdrop goes on beyond its edges;
+		// what a mask left out shows it, or is transparent.
+		draw(at, coarser = 0, { endless = false, around = false } = {}) {
 			if (!shown[0]) return;
 			const first = Math.min(finest + coarser, levels.length - 1);
 			const every = 2 ** coarser;
@@ -193,8 +205,7 @@ export function createPainter(gl, matte, monitor) {
 			const cells = levels[0].map((one) => one / 2 ** first);
 			const matrix = placing(at, cells, monitor);
 			const pixels = Math.sqrt(Math.abs(matrix[0] * matrix[4] - matrix[1] * matrix[3]) * shown[0] * shown[1]);
-			// The service takes the mean of a picture over each cell. One that is moved it samples at four places in each cell,
-			// which blurs it by as much as a pixel an eighth larger does.
+			// The service samples a picture that is moved at four places in each cell: that blurs as a pixel an eighth larger.
 			const moved = at.right || at.down || at.angle || at.scale !== 1;
 			gl.activeTexture(gl.TEXTURE0 + LIGHT);
 			place.use();
@@ -225,6 +236,7 @@ export function createPainter(gl, matte, monitor) {
 			gl.uniform1f(seen.at("finest"), first);
 			gl.uniform1i(seen.at("height"), size.height);
 			gl.uniform1i(seen.at("every"), every);
+			gl.uniform1i(seen.at("around"), around);
 			gl.drawArrays(gl.TRIANGLES, 0, 3);
 		},
 		// Frees everything on the graphics card.

@@ -2,10 +2,11 @@
 import { getJson, post } from "../lib/api.js";
 import { camera, noCamera } from "./recorder.js";
 import { CHECKS } from "./checklist.js";
-import { badge, duration, empty, facts, h, pause, problemBox, prose, size, when } from "../lib/dom.js";
+import { badge, duration, empty, facts, fileField, h, pause, problemBox, prose, size, when } from "../lib/dom.js";
 import { follow } from "../lib/events.js";
 import { isFilm, programName, recordOf } from "../upload/film_bundle.js";
 import { list } from "../lib/list.js";
+import { FILM, steps } from "../lib/view.js";
 import { countScreen, onZoom } from "./screen.js";
 import { begin, onDrop, running } from "../upload/upload.js";
 
@@ -22,14 +23,14 @@ export async function filming(main, signal) {
 	fill();
 	onZoom(fill, signal);
 	const choices = presets.map(({ name, description }, n) => {
-		const about = h("span", { class: "hint", id: `preset-${name}` }, description);
-		return h("p", {}, h("label", { class: "choice" }, h("input", { type: "radio", name: "preset", value: name, checked: n === 0, "aria-describedby": about.id }), name), " ", about);
+		const about = h("span.hint", { id: `preset-${name}` }, description);
+		return h("p", h("label.choice", h("input", { type: "radio", name: "preset", value: name, checked: n === 0, "aria-describedby": about.id }), name), " ", about);
 	});
-	const form = h("form", { class: "panel" }, h("h2", {}, "Choose a program"),
-		h("fieldset", { class: "stack" }, h("legend", {}, "What the monitor shows"), choices),
-		h("div", { class: "row" }, h("label", {}, "The monitor’s width", width), h("label", {}, "Height", height), "pixels"),
-		h("p", { class: "hint" }, "The size of this screen, if the page’s zoom is 100 % (Ctrl+0 or ⌘0). Change it if another screen shows the program."),
-		problem, h("p", { class: "row" }, h("button", { class: "primary" }, "Continue")));
+	const form = h("form.panel", h("h2", "Choose a program"),
+		h("fieldset.stack", h("legend", "What the monitor shows"), choices),
+		h("div.row", h("label", "The monitor’s width", width), h("label", "Height", height), "pixels"),
+		h("p.hint", "The size of this screen, if the page’s zoom is 100 % (Ctrl+0 or ⌘0). Change it if another screen shows the program."),
+		problem, h("p.row", h("button.primary", "Continue")));
 	form.onsubmit = async (event) => {
 		event.preventDefault();
 		problem.replaceChildren();
@@ -41,15 +42,15 @@ export async function filming(main, signal) {
 			problem.replaceChildren(problemBox(error));
 		}
 	};
-	main.append(h("h1", {}, "Filming"),
-		h("p", { class: "lead" }, "A monitor behind the glass shows patterns, one after another, and a camera films them."),
-		form, running, await nearby(signal), h("h2", {}, "Programs"));
+	main.append(steps(FILM), h("h1", "Filming"),
+		h("p.lead", "A monitor behind the glass shows patterns, one after another, and a camera films them."),
+		form, running, await nearby(signal), h("h2", "Programs"));
 	await list(main, signal, {
 		page: (after) => getJson(`v1/programs?limit=50${after}`, signal).then((answer) => answer.programs),
 		busy: isPlaying,
 		none: () => empty("No programs yet", "Choose one above."),
-		item: (one) => h("a", { class: "card", href: `#/film/${one.id}` }, h("span", { class: "name" }, programName(one)), isPlaying(one) ? badge("running") : h("span"),
-			h("span", { class: "about" }, one.id), when(one.created_at)),
+		item: (one) => h("a.card", { href: `#/film/${one.id}` }, h("span.name", programName(one)), isPlaying(one) ? badge("running") : h("span"),
+			h("span.about", one.id), when(one.created_at)),
 	});
 }
 
@@ -57,44 +58,41 @@ export async function filming(main, signal) {
 async function nearby(signal) {
 	const isOwn = /^(localhost|127\.|\[::1\]$)/.test(location.hostname);
 	const { url, problem } = isOwn ? await getJson("v1/network", signal) : { url: location.origin };
-	return h("section", { class: "panel" }, h("h2", {}, "On a phone"),
-		url ? [h("p", {}, "A phone in the same network can follow the program and upload its film at"), h("p", { class: "address" }, `${url}/#/film`),
-				h("p", { class: "hint" }, "Choose the program there; the newest is first.")]
-			: h("p", {}, prose(problem), "."));
+	return h("section.panel", h("h2", "On a phone"),
+		url ? [h("p", "A phone in the same network can follow the program and upload its film at"), h("p.address", `${url}/#/film`),
+				h("p.hint", "Choose the program there; the newest is first.")]
+			: h("p", prose(problem), "."));
 }
 
 export async function program(main, signal, id) {
 	let found = await getJson(`v1/programs/${id}`, signal);
-	const phase = h("p", { class: "phase", role: "timer", "aria-label": "On the monitor" });
+	const phase = h("p.phase", { role: "timer", "aria-label": "On the monitor" });
 	const bar = h("progress", { max: found.patterns, value: 0, "aria-label": "Patterns shown" });
-	const about = h("p", { class: "hint" });
+	const about = h("p.hint");
 	const problem = h("div");
-	const live = h("section", { class: "panel" }, h("h2", {}, "On the monitor"), phase, bar, about,
-		h("p", { class: "row" }, h("a", { class: "primary", href: `v1/programs/${id}/play`, target: "_blank", rel: "opener" }, "Play it on this screen")));
+	const live = h("section.panel", h("h2", "On the monitor"), phase, bar, about,
+		h("p.row", h("a.primary", { href: `v1/programs/${id}/play`, target: "_blank", rel: "opener" }, "Play it on this screen")));
 	const film = (file, about) => begin(file, recordOf(found, found.showing?.patterns_per_second ?? 2), about);
 	const why = noCamera();
 	const recorder = why ? null : camera(signal, (file, whole) => film(file, { unsaved: true, warning: whole ? "" : CUT }));
-	const choose = h("input", { type: "file", accept: "video/*", id: "film" });
 	const take = ([file]) => {
 		problem.replaceChildren();
-		if (file && isFilm(file)) film(file);
-		else if (file) problem.replaceChildren(problemBox({ title: "Not a film", detail: `${file.name} has the type ${file.type || "unknown"}. Choose the video that the camera recorded.` }));
+		if (isFilm(file)) film(file);
+		else problem.replaceChildren(problemBox({ title: "Not a film", detail: `${file.name} has the type ${file.type || "unknown"}. Choose the video that the camera recorded.` }));
 	};
-	choose.onchange = () => {
-		take(choose.files);
-		choose.value = "";
-	};
-	const zone = h("div", { class: "drop small" }, h("label", { for: "film" }, h("strong", {}, "Choose the film"), " that the camera recorded of this program, or drop it here"), choose);
+	const choose = fileField({ accept: "video/*", id: "film" }, take);
+	const zone = h("div.drop.small", h("label", { for: "film" }, h("strong", "Choose the film"), " that the camera recorded of this program, or drop it here"), choose);
 	onDrop(zone, take);
-	const filmed = h("section", { class: "panel" }, h("h2", {}, "The film"), recorder ? recorder.panel : h("p", {}, why), zone, problem, running);
+	const filmed = h("section.panel", h("h2", "The film"), recorder ? recorder.panel : h("p", why), zone, problem, running);
 	main.append(
-		h("p", { class: "crumb" }, h("a", { href: "#/film" }, "Filming")),
-		h("h1", {}, programName(found)),
+		steps(FILM),
+		h("p.crumb", h("a", { href: "#/film" }, "Filming")),
+		h("h1", programName(found)),
 		facts({ Patterns: `${size(found.monitor)} pixels`, "At 2 a second": duration(found.patterns / 2), Made: when(found.created_at) }),
-		h("div", { class: "columns" },
-			h("section", { class: "panel" }, h("h2", {}, "Before you start"),
-				h("ul", { class: "checks" }, CHECKS.map((text) => h("li", {}, h("label", {}, h("input", { type: "checkbox" }), h("span", {}, text)))))),
-			h("div", { class: "stack" }, live, filmed)),
+		h("div.columns",
+			h("section.panel", h("h2", "Before you start"),
+				h("ul.checks", CHECKS.map((text) => h("li", h("label", h("input", { type: "checkbox" }), h("span", text)))))),
+			h("div.stack", live, filmed)),
 		await nearby(signal),
 	);
 	let since = performance.now();

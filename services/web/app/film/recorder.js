@@ -1,4 +1,4 @@
-// Records a film with a camera of this device.
+// Records a film.
 import { h, pause, problemBox } from "../lib/dom.js";
 import { setRecording } from "../lib/recordings.js";
 
@@ -17,12 +17,12 @@ export function noCamera() {
 // A panel to record with. `filmed(file, whole)` is called with every film; call `resume` when the panel is shown again.
 export function camera(signal, filmed) {
 	const picture = h("video", { muted: true, playsinline: true, "aria-label": "What the camera sees" });
-	const frame = h("div", { class: "picture", hidden: true }, picture);
-	const status = h("p", { class: "hint", role: "status" });
+	const frame = h("div.picture", { hidden: true }, picture);
+	const status = h("p.hint", { role: "status" });
 	const problem = h("div");
 	const which = h("select", { "aria-label": "Camera", hidden: true });
 	const open = h("button", { type: "button", onclick: () => use() }, "Use a camera of this device");
-	const shoot = h("button", { type: "button", class: "primary", hidden: true, onclick: () => (recorder ? stop() : start()) }, "Start recording");
+	const shoot = h("button.primary", { type: "button", hidden: true, onclick: () => (recorder ? stop() : start()) }, "Start recording");
 	let stream;
 	let recorder;
 	let whole; // whether the program was shown to its end
@@ -53,8 +53,7 @@ export function camera(signal, filmed) {
 	}
 	which.onchange = () => use(which.value);
 
-	// Keeps the settings that the camera has found: a change during the film would look like a change of light. Returns the
-	// names of those that cannot be locked.
+	// Keeps the settings that the camera has found, as a change would look like one of light. Returns those it cannot lock.
 	async function lock(track) {
 		const can = track.getCapabilities?.() ?? {};
 		const free = [];
@@ -102,7 +101,7 @@ export function camera(signal, filmed) {
 		stream = undefined;
 	}
 	signal.addEventListener("abort", close, { once: true });
-	const panel = h("div", { class: "stack" }, h("div", { class: "row" }, open, which, shoot), frame, status, problem);
+	const panel = h("div.stack", h("div.row", open, which, shoot), frame, status, problem);
 	const resume = () => picture.play().catch(() => {}); // the preview stops outside of the page, the recording does not
 	return { panel, start, stop, resume };
 }

@@ -25,7 +25,6 @@ export async function fetchSample({ name }, signal) {
 	return decodeLive(await new Response(body.pipeThrough(new DecompressionStream("gzip"))).arrayBuffer());
 }
 
-// A small capture archive, to run a recovery on.
 export async function fetchCapture(signal) {
 	return new File([await (await fetchFile("capture.zip", signal)).blob()], "sample-tumbler.zip", { type: "application/zip" });
 }

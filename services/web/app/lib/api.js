@@ -46,8 +46,8 @@ export function unlock(problem) {
 	return asking;
 }
 
-// Fetches once more where no answer came: when the network changes, browsers abort what is under way. Whatever this app
-// sends may come twice: it creates nothing, has an Idempotency-Key, or asks for a state that is then reached already.
+// Fetches once more where no answer came: when the network changes, browsers abort what is under way. What this app sends
+// may come twice: it creates nothing, has an Idempotency-Key, or asks for a state that is reached already.
 async function fetchTwice(path, options) {
 	try {
 		return await fetch(path, options);
@@ -85,8 +85,13 @@ export const getJson = async (path, signal) => (await ask(path, { signal })).jso
 
 export const getBlob = async (path, signal) => (await ask(path, { signal })).blob();
 
+export const getComposite = async (id, query, type, body, signal) =>
+	(await ask(`v1/mattes/${id}/composite?${new URLSearchParams(query)}`, { method: "POST", headers: { Accept: type }, body, signal })).blob();
+
+export const newKey = () => crypto.randomUUID?.() ?? String(Math.random());
+
 // Posts JSON with an Idempotency-Key: a double click or a retry creates one thing.
-export async function post(path, body, once = crypto.randomUUID?.() ?? String(Math.random())) {
+export async function post(path, body, once = newKey()) {
 	const headers = { "Content-Type": "application/json", "Idempotency-Key": once };
 	return (await ask(path, { method: "POST", headers, body: JSON.stringify(body) })).json();
 }
@@ -94,10 +99,8 @@ export async function post(path, body, once = crypto.randomUUID?.() ?? String(Ma
 export const patchJson = async (path, body) =>
 	(await ask(path, { method: "PATCH", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) })).json();
 
-export const call = (method, path) => ask(path, { method });
-
 // Deletes; something that another tab has deleted already counts as deleted.
-export const remove = (path) => call("DELETE", path).catch((error) => {
+export const remove = (path) => ask(path, { method: "DELETE" }).catch((error) => {
 	if (error.status !== 404) throw error;
 });
 

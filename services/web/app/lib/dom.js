@@ -1,8 +1,11 @@
 // Elements of pages, and text for numbers and times.
 
-export function h(tag, attributes = {}, ...children) {
+// `h("p.hint", { id: "why" }, "Text")`: an element with its classes, its attributes if it has any, and its children.
+export function h(name, ...children) {
+	const [tag, ...classes] = name.split(".");
 	const element = document.createElement(tag);
-	for (const [name, value] of Object.entries(attributes)) {
+	element.classList.add(...classes);
+	for (const [name, value] of Object.entries(children[0]?.constructor === Object ? children.shift() : {})) {
 		if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
 		else if (value !== false && value != null) element.setAttribute(name, value === true ? "" : value);
 	}
@@ -10,8 +13,15 @@ export function h(tag, attributes = {}, ...children) {
 	return element;
 }
 
+export function svg(tag, attributes, ...children) {
+	const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
+	for (const pair of Object.entries(attributes)) element.setAttribute(...pair);
+	element.append(...children);
+	return element;
+}
+
 // A text as elements: what stands between `backticks` is code.
-export const prose = (text) => text.split(/`([^`]*)`/).map((part, i) => (i % 2 ? h("code", {}, part) : part));
+export const prose = (text) => text.split(/`([^`]*)`/).map((part, i) => (i % 2 ? h("code", part) : part));
 
 // A text of the API with a capital letter, unless it begins with a name: of a file, a field or an option.
 export const sentence = (text, name) =>
@@ -19,10 +29,10 @@ export const sentence = (text, name) =>
 
 // A box with an error as the API words it, or as the browser does.
 export const problemBox = (error) =>
-	h("div", { class: "problem", role: "alert" }, h("strong", {}, error.title ?? "Something went wrong in this page"),
-		h("p", {}, prose(sentence(error.detail ?? error.message, error.entry))));
+	h("div.problem", { role: "alert" }, h("strong", error.title ?? "Something went wrong in this page"),
+		h("p", prose(sentence(error.detail ?? error.message, error.entry))));
 
-export const empty = (title, text) => h("div", { class: "empty" }, h("strong", {}, title), h("p", {}, text));
+export const empty = (title, text) => h("div.empty", h("strong", title), h("p", text));
 
 const LEVEL = {
 	good: "good", ready: "good", succeeded: "good",
@@ -32,8 +42,8 @@ const LEVEL = {
 export const badge = (word) => h("span", { class: `badge ${LEVEL[word] ?? "off"}` }, word);
 
 export const facts = (pairs) =>
-	h("dl", { class: "facts" }, Object.entries(pairs).filter(([, value]) => value != null && value !== "")
-		.map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, value))));
+	h("dl.facts", Object.entries(pairs).filter(([, value]) => value != null && value !== "")
+		.map(([name, value]) => h("div", h("dt", name), h("dd", value))));
 
 export const bytes = (count) => {
 	const units = ["bytes", "kB", "MB", "GB", "TB"];
@@ -100,6 +110,16 @@ export function confirmed(title, text, yes) {
 	dialog.returnValue = "no";
 	dialog.showModal();
 	return new Promise((resolve) => dialog.addEventListener("close", () => resolve(dialog.returnValue === "yes"), { once: true }));
+}
+
+// A field for files, which `take` gets; the same file can be chosen again.
+export function fileField(attributes, take) {
+	const input = h("input", { type: "file", ...attributes });
+	input.onchange = () => {
+		if (input.files.length) take(input.files);
+		input.value = "";
+	};
+	return input;
 }
 
 // A button that is disabled while its work runs; an error is shown in `where`.

@@ -38,8 +38,8 @@ export async function* parse(stream, onbytes = () => {}) {
 	}
 }
 
-// Calls `changed(found)` with the first state of what `path` streams and with every later one. Returns the state for
-// which `over` is true. When the connection is lost it calls `lost(true)` and connects again, ever less often.
+// Calls `changed` with every state that `path` streams, up to that for which `over` is true, which it returns. When the
+// connection is lost it calls `lost(true)` and connects again, ever less often.
 export async function follow(path, signal, changed, { lost = () => {}, over = () => false } = {}) {
 	let seen;
 	let wait = 1000;

@@ -5,16 +5,15 @@ import { badge, duration, facts, h, newest, pause, problemBox } from "./dom.js";
 
 const LOG_EVERY = 2000; // ms
 
-// Fills `panel` and follows a job until it has ended; resolves with its last state. `changed` is called with every state,
-// first with the `known` one if given.
+// Fills `panel` and follows a job to its end; resolves with its last state. `changed` gets every state, the `known` first.
 export async function followJob(panel, id, signal, changed = () => {}, known = null) {
 	const bar = h("progress", { max: 1, value: 0, "aria-label": "Progress" });
-	const stage = h("p", { class: "stage", role: "status" }, " ");
-	const waits = h("p", { class: "waits", hidden: true });
+	const stage = h("p.stage", { role: "status" }, " ");
+	const waits = h("p.waits", { hidden: true });
 	const about = h("div");
 	const problem = h("div");
-	const lines = h("ol", { class: "log", tabindex: 0, "aria-label": "Log" });
-	const log = h("details", { open: panel.dataset.log != null }, h("summary", {}, "Log"), lines);
+	const lines = h("ol.log", { tabindex: 0, "aria-label": "Log" });
+	const log = h("details", { open: panel.dataset.log != null }, h("summary", "Log"), lines);
 	panel.append(stage, bar, waits, about, problem, log);
 
 	let last = 0;
@@ -22,7 +21,7 @@ export async function followJob(panel, id, signal, changed = () => {}, known = n
 		try {
 			const found = (await getJson(`v1/jobs/${id}/log?after=${last}`, signal)).lines;
 			const atEnd = lines.scrollTop + lines.clientHeight >= lines.scrollHeight - 8;
-			lines.append(...found.map(({ at, text }) => h("li", {}, h("time", { datetime: at }, new Date(at).toLocaleTimeString("en-GB")), " ", text)));
+			lines.append(...found.map(({ at, text }) => h("li", h("time", { datetime: at }, new Date(at).toLocaleTimeString("en-GB")), " ", text)));
 			last = found.at(-1)?.line ?? last;
 			if (atEnd) lines.scrollTop = lines.scrollHeight;
 			if (!ended) await pause(LOG_EVERY, signal);

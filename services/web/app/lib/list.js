@@ -4,13 +4,13 @@ import { button, h, pause, problemBox } from "./dom.js";
 const REFRESH = 5000; // ms
 
 export async function list(main, signal, { page, busy, none, item }) {
-	const items = h("ul", { class: "list" });
+	const items = h("ul.list");
 	const problem = h("div");
 	const more = button("Show older", problem, async () => add(await page(`&after=${last.id}`)), "more");
 	let last;
 	let pages = 0;
 	const add = (found) => {
-		items.append(...found.map((one) => h("li", {}, item(one))));
+		items.append(...found.map((one) => h("li", item(one))));
 		last = found.at(-1);
 		more.hidden = found.length < 50;
 		pages += 1;
@@ -43,7 +43,7 @@ export async function list(main, signal, { page, busy, none, item }) {
 				continue;
 			}
 			const focused = items.contains(document.activeElement) ? document.activeElement.getAttribute("href") : undefined;
-			items.replaceChildren(...found.map((one) => h("li", {}, item(one))));
+			items.replaceChildren(...found.map((one) => h("li", item(one))));
 			if (focused) items.querySelector(`[href="${focused}"]`)?.focus();
 		}
 	}

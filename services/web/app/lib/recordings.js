@@ -1,5 +1,4 @@
-// The views in which a film is being recorded, by their signals. A change is announced as a `recording` event of the
-// window, and leaving the page asks first.
+// The views that record a film, by their signals. A change is a `recording` event of the window; leaving asks first.
 export const recordings = new Set();
 addEventListener("beforeunload", (event) => recordings.size && event.preventDefault());
 

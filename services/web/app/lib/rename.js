@@ -4,9 +4,9 @@ import { button, h, problemBox } from "./dom.js";
 // `save` stores a new text, and resolves with the text as it is stored.
 export function renamable(text, label, save) {
 	const problem = h("div");
-	const title = h("h1", {}, text);
+	const title = h("h1", text);
 	const input = h("input", { type: "text", maxlength: 200, required: true, "aria-label": label });
-	const form = h("form", { class: "row", hidden: true }, input, h("button", { class: "primary" }, "Save"), h("button", { type: "button", onclick: () => edit(false) }, "Cancel"));
+	const form = h("form.row", { hidden: true }, input, h("button.primary", "Save"), h("button", { type: "button", onclick: () => edit(false) }, "Cancel"));
 	const rename = button("Rename", problem, () => edit(true));
 	function edit(editing) {
 		form.hidden = !editing;
@@ -29,5 +29,5 @@ export function renamable(text, label, save) {
 			problem.replaceChildren(problemBox(error));
 		}
 	};
-	return h("div", { class: "stack" }, h("div", { class: "row" }, title, rename, form), problem);
+	return h("div.stack", h("div.row", title, rename, form), problem);
 }

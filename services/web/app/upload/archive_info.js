@@ -1,5 +1,4 @@
-// Reads the number and size of frames from a capture archive, so that the service can refuse too many or too large ones
-// before they are sent.
+// Reads the number and size of an archive's frames, so that the service can refuse them before they are sent.
 const END = 0x06054b50; // signatures of APPNOTE, sect. 4.3
 const ENTRY = 0x02014b50;
 const TAIL = 22 + 65535; // bytes in which the end of the directory begins
@@ -48,8 +47,7 @@ function sizeOf(head) {
 	return { width: head.getUint16(at + 7), height: head.getUint16(at + 5) };
 }
 
-// `frames`, and `width` and `height` of the first one if it is PNG or JPEG. What cannot be read is left out; the service
-// reports what is wrong with a file.
+// `frames`, and `width` and `height` of the first if it is PNG or JPEG. What cannot be read is left out.
 export async function readArchiveInfo(file) {
 	const info = {};
 	try {

@@ -15,7 +15,6 @@ export function recordOf(program, rate) {
 	return { format: "envmatte-capture/1", program: program.program, video };
 }
 
-// The capture archive of a film and its capture.json.
 export async function filmArchive(film, record, signal) {
 	const file = `film${ENDS.exec(film.name)?.[0].toLowerCase() ?? ".mp4"}`;
 	const name = record.name || film.name.replace(/\.\w+$/, "").slice(0, 200);
@@ -28,7 +27,7 @@ export async function askForRecord(where, signal) {
 	const { programs } = await getJson("v1/programs?limit=100", signal);
 	return new Promise((resolve, reject) => {
 		signal.addEventListener("abort", () => reject(signal.reason), { once: true });
-		const problem = h("p", { class: "hint", role: "status" });
+		const problem = h("p.hint", { role: "status" });
 		const which = h("select", { "aria-label": "Program" }, programs.map((one, n) => h("option", { value: n }, `${programName(one)}, ${when(one.created_at).textContent}`)));
 		const rate = h("input", { type: "number", min: 0.01, max: 120, step: "any", required: true });
 		const suggest = () => (rate.value = programs[which.value]?.showing?.patterns_per_second ?? 2);
@@ -45,12 +44,12 @@ export async function askForRecord(where, signal) {
 				own.value = "";
 			}
 		};
-		const form = h("form", { class: "stack" },
-			h("p", {}, h("strong", {}, "Which program does this film show?")),
+		const form = h("form.stack",
+			h("p", h("strong", "Which program does this film show?")),
 			programs.length
-				? [h("label", {}, "Program", which), h("label", {}, "Patterns a second", rate), h("p", { class: "row" }, h("button", { class: "primary" }, "Upload"))]
-				: h("p", {}, "There are no programs yet. ", h("a", { href: "#/film" }, "Play one and film it"), "."),
-			h("label", {}, "Or the capture.json that came with the program", own), problem);
+				? [h("label", "Program", which), h("label", "Patterns a second", rate), h("p.row", h("button.primary", "Upload"))]
+				: h("p", "There are no programs yet. ", h("a", { href: "#/film" }, "Play one and film it"), "."),
+			h("label", "Or the capture.json that came with the program", own), problem);
 		form.onsubmit = (event) => {
 			event.preventDefault();
 			getJson(`v1/programs/${programs[which.value].id}`, signal).then((program) => resolve(recordOf(program, Number(rate.value))), reject);

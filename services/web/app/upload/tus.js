@@ -44,8 +44,7 @@ const isCapture = (id, signal) => ask(`v1/captures/${id}`, { signal }).then(() =
 // Values of tus are bytes in Base64.
 const encoded = (value) => btoa(String.fromCharCode(...new TextEncoder().encode(value)));
 
-// Sends a file, continuing an upload of it where it was interrupted; returns the id of the upload. `filename` is that of
-// the film, if the file is an archive made of one.
+// Sends a file, from where an upload of it was interrupted; returns the upload's id. `filename` may be that of a film.
 export async function send(file, remembered, { filename, signal, progress, waiting }) {
 	let id = localStorage.getItem(remembered);
 	let offset = 0;

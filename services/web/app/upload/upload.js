@@ -1,21 +1,20 @@
 // Uploads: rows with the progress of each, and the zone where files are dropped or chosen.
 import { Problem, post, saveBlob } from "../lib/api.js";
 import { recordings } from "../lib/recordings.js";
-import { bytes, confirmed, duration, h, problemBox } from "../lib/dom.js";
+import { bytes, confirmed, duration, fileField, h, problemBox } from "../lib/dom.js";
 import { askForRecord, filmArchive, isFilm } from "./film_bundle.js";
 import { send } from "./tus.js";
 import { crc32 } from "./zip.js";
 
 const HEAD = 1 << 20; // bytes of an archive that contain its capture.json
 
-// Uploads outlive the view that shows them; the element moves to the next view that shows uploads.
-export const running = h("div", { class: "uploads" });
+// Uploads outlive their view; the element moves to the next view that shows uploads.
+export const running = h("div.uploads");
 const rows = new Set(); // of each upload, whether it is `busy`, and whether its film is `unsaved`: only in this page
 addEventListener("beforeunload", (event) => [...rows].some(({ busy, unsaved }) => busy || unsaved) && event.preventDefault());
 
-// Uploads a capture archive, or a film with its capture.json; without one, asks which program it shows. A film that is
-// `unsaved` was recorded here: it can be saved, and is deleted only after a question. One with a `warning` waits for
-// "Continue".
+// Uploads a capture archive, or a film with its capture.json; without one, asks for its program. An `unsaved` film was
+// recorded here: it can be saved, and is deleted only after a question. One with a `warning` waits for the user.
 export function begin(file, record, { unsaved = false, warning = "" } = {}) {
 	const state = { busy: false, unsaved };
 	const stop = new AbortController();
@@ -32,8 +31,8 @@ export function begin(file, record, { unsaved = false, warning = "" } = {}) {
 		end();
 	};
 	const cancel = h("button", { type: "button", onclick: drop }, unsaved ? "Delete the film" : "Cancel");
-	const row = h("section", { class: "panel", "aria-label": file.name },
-		h("p", { class: "row spread" }, h("strong", { class: "name" }, file.name), h("span", { class: "row" }, again, save, cancel)), bar, status, asked, problem);
+	const row = h("section.panel", { "aria-label": file.name },
+		h("p.row.spread", h("strong.name", file.name), h("span.row", again, save, cancel)), bar, status, asked, problem);
 	running.append(row);
 	rows.add(state);
 	let archive = isFilm(file) ? null : file;
@@ -99,30 +98,20 @@ const unreadable = ({ name }) => ({
 
 const startsAsZip = async (file) => /^PK[\x03\x05]/.test(await file.slice(0, 4).text());
 
-// Uploads capture archives and films, and shows them in the list of captures.
 export function upload(files) {
 	[...files].forEach((file) => begin(file));
 	location.hash = "#/captures";
 }
 
-// A field for capture archives and films.
-export function fileInput(id) {
-	const input = h("input", { type: "file", accept: ".zip,application/zip,video/*,.mkv,.mts,.m2ts", id, multiple: true });
-	input.onchange = () => {
-		upload(input.files);
-		input.value = "";
-	};
-	return input;
-}
+export const fileInput = (id) => fileField({ accept: ".zip,application/zip,video/*,.mkv,.mts,.m2ts", id, multiple: true }, upload);
 
-// The zone where they are dropped or chosen.
 export function dropZone() {
-	const zone = h("div", { class: "drop" },
-		h("label", { for: "zip" }, h("strong", {}, "Choose a capture archive or a film"), " or drop it here",
-			h("span", { class: "hint" }, "A ZIP with capture.json and its frames, or the film of a program. An interrupted upload continues where it stopped.")),
+	const zone = h("div.drop",
+		h("label", { for: "zip" }, h("strong", "Choose a capture archive or a film"), " or drop it here",
+			h("span.hint", "A ZIP with capture.json and its frames, or the film of a program. An interrupted upload continues where it stopped.")),
 		fileInput("zip"));
 	onDrop(zone, upload);
-	return h("div", {}, zone, running);
+	return h("div", zone, running);
 }
 
 export function onDrop(zone, take) {

@@ -47,7 +47,7 @@ function extension(...values) {
 	return view.buffer;
 }
 
-// The headers that precede each file, and the directory that follows the last. Files have `name` (ASCII), `size`, `crc`.
+// The headers before each file, and the directory after the last. Files have `name` (ASCII), `size`, `crc`.
 export function framed(files) {
 	const heads = [];
 	const directory = [];
@@ -71,7 +71,6 @@ export function framed(files) {
 	return { heads, end: new Blob([...directory, end]) };
 }
 
-// `files` are pairs of an ASCII name and a Blob.
 export async function zip(files, signal) {
 	const entries = [];
 	for (const [name, blob] of files) entries.push({ name, size: blob.size, crc: await crc32(blob, signal) });

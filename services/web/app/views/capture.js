@@ -1,22 +1,21 @@
 // One capture: its report, its frames, and the form that starts a recovery.
-import { getBlob, getJson, patchJson, remove } from "../lib/api.js";
-import { badge, button, bytes, confirmed, facts, h, newest, problemBox, prose, sentence, show, size, when } from "../lib/dom.js";
-import { recoveryForm } from "./recovery_form.js";
+import { getBlob, getJson, patchJson } from "../lib/api.js";
+import { badge, bytes, facts, h, newest, problemBox, prose, sentence, show, size, when } from "../lib/dom.js";
 import { followJob } from "../lib/job_progress.js";
 import { renamable } from "../lib/rename.js";
+import { CHECK, deletion, steps } from "../lib/view.js";
+import { matteCards } from "./mattes.js";
+import { recoveryForm } from "./recovery_form.js";
 
 export async function capture(main, signal, id) {
 	const found = await getJson(`v1/captures/${id}`, signal);
 	const problem = h("div");
 	const rename = async (name) => (await patchJson(`v1/captures/${id}`, { name })).name;
-	const deletion = button("Delete", problem, async () => {
-		if (!(await confirmed("Delete this capture?", "Its frames will be deleted. Mattes recovered from it stay.", "Delete capture"))) return;
-		await remove(`v1/captures/${id}`);
-		location.replace("#/captures");
-	}, "quiet");
+	const removal = deletion(`v1/captures/${id}`, problem, "Its frames will be deleted. Mattes recovered from it stay.");
 	main.append(
-		h("p", { class: "crumb" }, h("a", { href: "#/captures" }, "Captures")),
-		h("div", { class: "row spread" }, renamable(found.name || `Capture ${id.slice(0, 8)}`, "Name of the capture", rename), h("span", { class: "row" }, badge(found.state), deletion)),
+		steps(CHECK, "#/captures"),
+		h("p.crumb", h("a", { href: "#/captures" }, "Captures")),
+		h("div.row.spread", renamable(found.name || `Capture ${id.slice(0, 8)}`, "Name of the capture", rename), h("span.row", badge(found.state), removal)),
 		problem,
 		facts({
 			Frame: found.width && `${size(found)} pixels`, Frames: found.frames, Monitor: `${size(found.program.monitor)} pixels`,
@@ -25,28 +24,47 @@ export async function capture(main, signal, id) {
 		}),
 	);
 	if (found.state === "failed") return main.append(problemBox(found.problem));
-	const [report, form] = await Promise.all([found.state === "ready" ? reportPanels(found, signal) : [], recoveryForm(id, found.state, signal)]);
-	const panel = h("section", { class: "panel", hidden: found.state === "ready" }, h("h2", {}, "Reading the frames"));
-	main.append(panel, ...report, form);
-	if (found.state === "ready") return;
-	followJob(panel, found.job, signal).then(
-		() => signal.aborted || dispatchEvent(new HashChangeEvent("hashchange")), // shows the view of a capture that is ready or has failed
-		(error) => signal.aborted || panel.append(problemBox(error)),
-	);
+	if (found.state === "ready") {
+		const [report, { form }, made] = await Promise.all([getJson(found.report.slice(1), signal), recoveryForm(found, signal), mattesOf(id, signal)]);
+		return main.append(verdict(report), made, form, h("div.columns", frames(found, signal), sheet(found, signal)));
+	}
+	const panel = h("section.panel", h("h2", "Reading the frames"));
+	const { form, isAutomatic, start } = await recoveryForm(found, signal);
+	main.append(panel, form);
+	followJob(panel, found.job, signal).then(async ({ state }) => {
+		if (state === "succeeded" && isAutomatic() && (await getJson(`v1/captures/${id}/report`, signal)).level !== "bad") return start();
+		dispatchEvent(new HashChangeEvent("hashchange")); // shows the view of a capture that is ready or has failed
+	}).catch((error) => signal.aborted || panel.append(problemBox(error)));
 }
 
-async function reportPanels(found, signal) {
-	const report = await getJson(found.report.slice(1), signal);
-	const findings = h("section", { class: "panel" }, h("div", { class: "row" }, h("h2", {}, "Report"), badge(report.level)),
-		h("ul", { class: "findings" }, report.findings.map((one) =>
-			h("li", {}, badge(one.level), h("div", {}, h("p", {}, prose(sentence(one.message))), one.remedy && h("p", { class: "remedy" }, prose(sentence(one.remedy))))))));
-	return [findings, h("div", { class: "columns" }, frames(found, signal), sheet(found, signal))];
+async function mattesOf(id, signal) {
+	const { mattes } = await getJson(`v1/mattes?capture=${id}&limit=8`, signal);
+	const card = matteCards(signal);
+	return h("section.stack", { hidden: !mattes.length, "aria-label": "Mattes" }, h("h2", "Its mattes"),
+		h("ul.list", mattes.map((one) => h("li", card(one)))));
+}
+
+const GRADES = [[40, "excellent"], [30, "good"], [22, "fair"], [-Infinity, "poor"]]; // from so many dB on
+const VERDICTS = { good: "Ready: expect", warning: "Ready, with warnings: expect at best", bad: "Better filmed again: expect at best" };
+
+// The report: a verdict, then what is wrong with its remedies; what is fine is folded.
+function verdict({ level, quality, findings }) {
+	// Random grids without offsets suit frosted glass, all others clear glass.
+	const clear = quality && (quality.blocks == null ? quality.high : quality.low);
+	const [, grade] = quality ? GRADES.find(([least]) => clear >= least) : [];
+	const text = grade ? `${VERDICTS[level]} ${grade} clear glass` : VERDICTS[level].split(":")[0];
+	const rows = (some) => h("ul.findings", some.map((one) =>
+		h("li", badge(one.level), h("div", h("p", prose(sentence(one.message))), one.remedy && h("p.remedy", prose(sentence(one.remedy)))))));
+	const fine = findings.filter((one) => one.level === "good");
+	const wrong = findings.filter((one) => one.level !== "good");
+	return h("section.panel", { "aria-label": "Report" }, h("div.row", h("h2", text), badge(level)),
+		wrong.length ? rows(wrong) : "", h("details", { hidden: !fine.length }, h("summary", `What is fine (${fine.length})`), rows(fine)));
 }
 
 function frames(found, signal) {
 	const middle = found.frames >> 1; // the first ones are black and white
 	const image = h("img", { alt: `Frame ${middle + 1}`, width: found.width, height: found.height, hidden: true });
-	const frame = h("div", { class: "picture" }, image);
+	const frame = h("div.picture", image);
 	frame.style.aspectRatio = `${found.width} / ${found.height}`; // keeps its place until the picture is there
 	const number = h("input", { type: "range", id: "frame", min: 0, max: found.frames - 1, value: middle });
 	const position = h("output", { for: "frame" }, `${middle + 1} of ${found.frames}`);
@@ -65,18 +83,18 @@ function frames(found, signal) {
 		look();
 	};
 	look();
-	return h("section", { class: "panel" }, h("h2", {}, "Frames"), frame,
-		h("div", { class: "row" }, h("label", { for: "frame" }, "Frame"), number, position), problem);
+	return h("section.panel", h("h2", "Frames"), frame,
+		h("div.row", h("label", { for: "frame" }, "Frame"), number, position), problem);
 }
 
 function sheet(found, signal) {
 	const image = h("img", { alt: "Some of the frames side by side", hidden: true });
-	const frame = h("div", { class: "picture whole" }, image);
+	const frame = h("div.picture.whole", image);
 	frame.style.aspectRatio = `${2 * found.width} / ${1.1 * found.height}`; // most sheets are four by two frames: this keeps the page from moving when it loads
 	const fit = (blob) => show(image, blob).then(() => (frame.style.aspectRatio = `${image.naturalWidth} / ${image.naturalHeight}`));
 	getBlob(`v1/captures/${found.id}/contact-sheet.png`, signal).then(fit, (error) => {
 		if (!signal.aborted) image.replaceWith(problemBox(error));
 	});
-	return h("section", { class: "panel" }, h("h2", {}, "Contact sheet"), frame,
-		h("p", { class: "hint" }, "Red pixels are clipped at white, blue ones at black."));
+	return h("section.panel", h("h2", "Contact sheet"), frame,
+		h("p.hint", "Red pixels are clipped at white, blue ones at black."));
 }

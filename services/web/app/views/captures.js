@@ -1,8 +1,9 @@
 // The list of captures, and the zone to upload another one.
-import { getJson } from "../lib/api.js";
+import { getBlob, getJson } from "../lib/api.js";
 import { badge, button, bytes, empty, h, size, when } from "../lib/dom.js";
 import { areRemoved, fetchCapture, restoreSamples } from "../home/samples.js";
 import { list } from "../lib/list.js";
+import { FILM, steps, thumbnails } from "../lib/view.js";
 import { dropZone, upload } from "../upload/upload.js";
 
 export async function captures(main, signal) {
@@ -11,11 +12,13 @@ export async function captures(main, signal) {
 		restoreSamples();
 		location.hash = "#/";
 	});
+	const thumb = thumbnails(signal, (id) => getBlob(`v1/captures/${id}/thumbnail.png`, signal));
 	main.append(
-		h("h1", {}, "Captures"),
-		h("p", { class: "lead" }, "Films of a glass before a monitor that shows patterns. Upload one to see its report."),
+		steps(FILM),
+		h("h1", "Captures"),
+		h("p.lead", "Films of a glass before a monitor that shows patterns. Upload one to see its report."),
 		dropZone(),
-		h("p", { class: "row" }, button("Try it with a sample capture", problem, async () => upload([await fetchCapture(signal)])), areRemoved() && restore),
+		h("p.row", button("Try it with a sample capture", problem, async () => upload([await fetchCapture(signal)])), areRemoved() && restore),
 		problem,
 	);
 	await list(main, signal, {
@@ -23,9 +26,9 @@ export async function captures(main, signal) {
 		busy: (one) => one.state === "ingesting",
 		none: () => empty("No captures yet", "The first one appears here as soon as it is uploaded."),
 		item: (one) =>
-			h("a", { class: "card", href: `#/captures/${one.id}` },
-				h("span", { class: "name" }, one.name || `Capture ${one.id.slice(0, 8)}`), badge(one.state),
-				h("span", { class: "about" }, [size(one), `${one.frames} frames`, bytes(one.bytes)].filter(Boolean).join(" · ")),
+			h("a.card.pictured", { href: `#/captures/${one.id}` }, thumb(one),
+				h("span.name", one.name || `Capture ${one.id.slice(0, 8)}`), badge(one.state),
+				h("span.about", [size(one), `${one.frames} frames`, bytes(one.bytes)].filter(Boolean).join(" · ")),
 				when(one.created_at)),
 	});
 }

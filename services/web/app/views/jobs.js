@@ -1,63 +1,61 @@
 // Jobs: the list, and one job with its progress; a recovery fills in its frame tile by tile.
-import { ask, call, getJson, post, remove, save } from "../lib/api.js";
+import { getComposite, getJson, post, save } from "../lib/api.js";
+import { KINDS, jobCard } from "../lib/activity.js";
 import { backdrop } from "../composite/backdrops.js";
-import { badge, button, confirmed, empty, facts, h, newest, pause, problemBox, show, when } from "../lib/dom.js";
+import { button, empty, facts, h, newest, pause, problemBox, show, when } from "../lib/dom.js";
 import { ACTIVE } from "../lib/events.js";
 import { list } from "../lib/list.js";
 import { followJob } from "../lib/job_progress.js";
+import { RECOVER, CHECK, deletion, steps } from "../lib/view.js";
+import { automatic } from "./recovery_form.js";
 
 const REFRESH = 2000; // ms between two pictures of what is recovered
 const LONGER = 640; // pixels of their longer side, at most
-const KINDS = { ingest: "Ingest of a capture", recover: "Recovery of a matte", composite: "Composite of a clip" };
 
 export async function jobs(main, signal) {
-	main.append(h("h1", {}, "Jobs"));
+	main.append(h("h1", "Jobs"));
 	await list(main, signal, {
 		page: (after) => getJson(`v1/jobs?limit=50${after}`, signal).then((answer) => answer.jobs),
 		busy: (one) => ACTIVE.includes(one.state),
 		none: () => empty("No jobs yet", "Each capture and each matte starts one."),
-		item: (one) =>
-			h("a", { class: "card", href: `#/jobs/${one.id}` }, h("span", { class: "name" }, KINDS[one.kind]), badge(one.state),
-				h("span", { class: "about" }, one.problem?.detail ?? (one.state === "running" ? `${one.stage}, ${Math.floor(100 * one.progress)} %` : one.id)),
-				when(one.created_at)),
+		item: (one) => jobCard(one, when(one.created_at)),
 	});
 }
 
 export async function job(main, signal, id) {
 	const found = await getJson(`v1/jobs/${id}`, signal);
 	const problem = h("div");
-	const cancel = button("Cancel", problem, () => call("POST", `v1/jobs/${id}/cancel`));
+	const cancel = button("Cancel", problem, () => post(`v1/jobs/${id}/cancel`));
 	const retry = button("Try again", problem, async () => {
 		await post(`v1/jobs/${id}/retry`);
 		watch();
 	}, "primary");
-	const deletion = button("Delete", problem, async () => {
-		const lost = found.kind === "composite" ? "Its log and its video will be deleted." : "Its log will be deleted; its capture or matte stays.";
-		if (!(await confirmed("Delete this job?", lost, "Delete job"))) return;
-		await remove(`v1/jobs/${id}`);
-		location.replace("#/jobs");
-	}, "quiet");
-	const asked = h("details", { class: "panel", hidden: found.kind !== "recover" }, h("summary", {}, "Options"), facts(found.options));
-	const links = h("p", { class: "row" });
-	const panel = h("section", { class: "panel", "aria-label": "Progress", "data-log": "" });
+	const lost = found.kind === "composite" ? "Its log and its video will be deleted." : "Its log will be deleted; its capture or matte stays.";
+	const removal = deletion(`v1/jobs/${id}`, problem, lost);
+	const asked = h("details.panel", { hidden: found.kind !== "recover" }, h("summary", "Options"), facts(found.options));
+	const links = h("p.row");
+	const panel = h("section.panel", { "aria-label": "Progress", "data-log": "" });
 	const preview = found.kind === "recover" ? await progressPicture(found, signal) : null;
+	const step = { ingest: CHECK, recover: RECOVER }[found.kind];
 	main.append(
-		h("p", { class: "crumb" }, h("a", { href: "#/jobs" }, "Jobs")),
-		h("div", { class: "row spread" }, h("h1", {}, KINDS[found.kind]), h("span", { class: "row" }, cancel, retry, deletion)),
+		step ? steps(step, "#/captures", `#/captures/${found.capture}`) : "",
+		h("p.crumb", h("a", { href: "#/jobs" }, "Jobs")),
+		h("div.row.spread", h("h1", KINDS[found.kind]), h("span.row", cancel, retry, removal)),
 		problem,
 		facts({ Asked: when(found.created_at), Capture: found.capture && h("a", { href: `#/captures/${found.capture}` }, found.capture.slice(0, 8)), Method: found.options.method, Quality: found.options.quality }),
-		links, h("div", { class: preview ? "columns" : "stack" }, preview?.panel, h("div", { class: "stack" }, panel, asked)),
+		links, h("div", { class: preview ? "columns" : "stack" }, preview?.panel, h("div.stack", panel, asked)),
 	);
 	watch(found);
 
 	function update(now) {
 		cancel.hidden = !ACTIVE.includes(now.state);
-		deletion.hidden = ACTIVE.includes(now.state);
+		removal.hidden = ACTIVE.includes(now.state);
 		retry.hidden = now.state !== "failed";
 		const made = now.state === "succeeded";
+		if (made && automatic.delete(id)) return location.replace(`#/mattes/${now.matte}`);
 		links.replaceChildren(...[
-			made && now.kind === "recover" && h("a", { class: "primary", href: `#/mattes/${now.matte}` }, "Open the matte"),
-			made && now.kind === "ingest" && h("a", { class: "primary", href: `#/captures/${now.capture}` }, "Open the capture"),
+			made && now.kind === "recover" && h("a.primary", { href: `#/mattes/${now.matte}` }, "Open the matte"),
+			made && now.kind === "ingest" && h("a.primary", { href: `#/captures/${now.capture}` }, "Open the capture"),
 			made && now.video && button("Download the video", problem, () => save(now.video.slice(1), "composite.mp4"), "primary"),
 		].filter(Boolean));
 		preview?.update(now);
@@ -77,7 +75,7 @@ export async function job(main, signal, id) {
 async function progressPicture(found, signal) {
 	const { width, height } = await getJson(`v1/captures/${found.capture}`, signal).catch(() => ({}));
 	const image = h("img", { alt: "The composite of what is recovered so far", hidden: true });
-	const frame = h("div", { class: "picture filling" }, image);
+	const frame = h("div.picture.filling", image);
 	if (width) frame.style.aspectRatio = `${width} / ${height}`;
 	const before = backdrop("Checker", 640, 480);
 	let done = 0;
@@ -85,9 +83,7 @@ async function progressPicture(found, signal) {
 		if (now.tiles.done === done) return;
 		const size = Math.min(LONGER, Math.max(width ?? LONGER, height ?? LONGER));
 		try {
-			const headers = { Accept: "image/png" };
-			const answer = await ask(`v1/mattes/${now.matte}/composite?size=${size}`, { method: "POST", headers, body: await before, signal });
-			await show(image, await answer.blob());
+			await show(image, await getComposite(now.matte, { size }, "image/png", await before, signal));
 			done = now.tiles.done;
 			if (now.state === "running") await pause(REFRESH, signal);
 		} catch {
@@ -95,7 +91,7 @@ async function progressPicture(found, signal) {
 		}
 	});
 	return {
-		panel: h("section", { class: "panel" }, h("h2", {}, "The frame"), frame),
+		panel: h("section.panel", h("h2", "The frame"), frame),
 		update: (now) => now.tiles.done > 0 && ["running", "succeeded"].includes(now.state) && look(now),
 	};
 }

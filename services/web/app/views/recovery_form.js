@@ -1,6 +1,11 @@
 // The form that starts a recovery. Its options and their descriptions come from GET /v1/options.
 import { getJson, post } from "../lib/api.js";
-import { h, problemBox, prose } from "../lib/dom.js";
+import { duration, h, problemBox, prose } from "../lib/dom.js";
+
+const BY_HAND = "envmatte-recover-by-hand"; // in this browser's storage
+export const QUALITIES = { fast: "Draft", fine: "Best" };
+const ABOUT = { fast: "Clear glass, in half the time", fine: "All that the frames show" };
+export const automatic = new Set(); // jobs whose matte is shown once it is done
 
 function field(option) {
 	const id = `option-${option.method ?? "any"}-${option.name}`; // two methods may have an option of the same name
@@ -18,12 +23,11 @@ function field(option) {
 		});
 	}
 	const range = !option.values && option.minimum != null ? ` ${option.minimum} to ${option.maximum}.` : "";
-	const about = h("p", { class: "hint", id: `${id}-about` }, prose(option.description), range);
-	const row = h("div", { class: "option" }, h("label", { for: id }, option.name.replaceAll("_", " ")), input, about);
+	const about = h("p.hint", { id: `${id}-about` }, prose(option.description), range);
+	const row = h("div.option", h("label", { for: id }, option.name.replaceAll("_", " ")), input, about);
 	return { option, input, row };
 }
 
-// The options that differ from their defaults.
 function chosen(fields, method) {
 	const options = {};
 	for (const { option, input } of fields) {
@@ -34,34 +38,47 @@ function chosen(fields, method) {
 	return options;
 }
 
-export async function recoveryForm(capture, state, signal) {
+function cards({ name, default: usual }, seconds) {
+	return h("fieldset.row.qualities", h("legend", "Quality"), Object.entries(QUALITIES).map(([value, title]) =>
+		h("label.choice", h("input", { type: "radio", name, value, checked: value === usual, "aria-describedby": `about-${value}` }),
+			h("strong", title), seconds && ` about ${duration(Math.max(seconds[value], 1))}`, h("span.hint", { id: `about-${value}` }, ABOUT[value]))));
+}
+
+// The form; whether the recovery `isAutomatic` once the frames are read, and what starts it then.
+export async function recoveryForm(capture, signal) {
 	const { options } = await getJson("v1/options", signal);
-	const fields = options.map(field);
-	const choices = fields.filter(({ option }) => option.values);
-	const constants = fields.filter(({ option }) => !option.values);
+	const isQuality = ({ name }) => name === "quality";
+	const qualities = cards(options.find(isQuality), capture.recovery_seconds);
+	const fields = options.filter((option) => !isQuality(option)).map(field);
 	const method = fields.find(({ option }) => option.name === "method").input;
 	const problem = h("div");
-	const form = h("form", { class: "panel", id: "recovery" }, h("h2", {}, "Recover a matte"),
-		h("p", {}, "Finds, for each pixel, where on the monitor its light comes from. ",
-			state === "ingesting" && "It can be started now, and begins when the frames are read."),
-		h("div", { class: "options" }, choices.map(({ row }) => row)),
-		h("details", {}, h("summary", {}, "All options"), h("p", { class: "hint" }, "An empty field takes the default shown in grey, or what the choices above set."),
-			h("div", { class: "options" }, constants.map(({ row }) => row))),
-		problem, h("p", { class: "row" }, h("button", { class: "primary" }, "Start")));
-	const sort = () => fields.forEach(({ option, row, input }) => {
-		row.hidden = Boolean(option.method) && option.method !== method.value;
-		input.disabled = row.hidden;
-	});
+	const isWaiting = capture.state === "ingesting";
+	const itself = h("input", { type: "checkbox", checked: !localStorage.getItem(BY_HAND) });
+	itself.onchange = () => (itself.checked ? localStorage.removeItem(BY_HAND) : localStorage.setItem(BY_HAND, "1"));
+	const form = h("form.panel", { id: "recovery" }, h("h2", "Recover a matte"),
+		h("p", "Finds, for each pixel, where on the monitor its light comes from."),
+		qualities,
+		isWaiting && h("label", itself, " Recover automatically when ready"),
+		h("details", h("summary", "Expert"), h("p.hint", "An empty field takes the default shown in grey, or what the quality sets."),
+			h("div.options", fields.map(({ row }) => row))),
+		problem, h("p.row", h("button.primary", isWaiting ? "Recover as soon as possible" : "Recover")));
+	const sort = () => {
+		for (const { option, row, input } of fields) input.disabled = row.hidden = Boolean(option.method) && option.method !== method.value;
+		qualities.disabled = qualities.hidden = method.value !== options.find(isQuality).method;
+	};
 	method.onchange = sort;
 	sort();
-	form.onsubmit = async (event) => {
-		event.preventDefault();
+
+	async function start(once) {
 		const submit = form.querySelector("button.primary");
 		submit.disabled = true;
 		problem.replaceChildren();
 		fields.forEach(({ input }) => input.removeAttribute("aria-invalid"));
 		try {
-			const job = await post("v1/jobs", { capture, options: chosen(fields, method.value) });
+			const quality = new FormData(form).get("quality");
+			const wanted = { ...chosen(fields, method.value), ...(quality === "fast" && { quality }) };
+			const job = await post("v1/jobs", { capture: capture.id, options: wanted }, once);
+			if (once) automatic.add(job.id);
 			location.hash = `#/jobs/${job.id}`;
 		} catch (error) {
 			problem.replaceChildren(problemBox(error));
@@ -71,8 +88,13 @@ export async function recoveryForm(capture, state, signal) {
 		} finally {
 			submit.disabled = false;
 		}
+	}
+	form.onsubmit = (event) => {
+		event.preventDefault();
+		start();
 	};
-	// Opens the options when one of them is out of range: a closed section cannot show it.
+	// A closed section cannot show that an option is out of range.
 	form.addEventListener("invalid", () => (form.querySelector("details").open = true), true);
-	return form;
+	// Two tabs that show the same capture start one job.
+	return { form, isAutomatic: () => itself.checked, start: () => start(`recovery-of-${capture.id}`) };
 }

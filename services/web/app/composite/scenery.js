@@ -1,4 +1,4 @@
-// Backdrops for the samples, drawn here so that no picture has to be loaded.
+// Backdrops that are drawn here, so that no picture has to be loaded.
 
 // The same numbers from 0 to 1 each time.
 function numbers(seed) {
@@ -13,6 +13,15 @@ function fade(context, height, stops) {
 }
 
 const DRAWN = {
+	Checker(context, width, height) {
+		context.fillStyle = fade(context, height, [[0, "#fde7c3"], [0.5, "#f7a48b"], [1, "#3d7ea6"]]);
+		context.fillRect(0, 0, width, height);
+		const edge = Math.max(width, height) / 16;
+		context.fillStyle = "#10243e";
+		for (let y = 0; y * edge < height; y++) {
+			for (let x = y % 2; x * edge < width; x += 2) context.fillRect(x * edge, y * edge, edge, edge);
+		}
+	},
 	Dusk(context, width, height) {
 		const random = numbers(5);
 		const shore = 0.66 * height;
@@ -85,6 +94,17 @@ const DRAWN = {
 				}
 			}
 		}
+	},
+	Stripes(context, width, height) {
+		const colours = ["#f25f5c", "#ffe066", "#247ba0", "#70c1b3", "#50514f", "#f7f7f2"];
+		for (let i = 0; i < 24; i++) {
+			context.fillStyle = colours[i % colours.length];
+			context.fillRect((i * width) / 24, 0, width / 24 + 1, height);
+		}
+	},
+	White(context, width, height) {
+		context.fillStyle = "#fff";
+		context.fillRect(0, 0, width, height);
 	},
 };
 

@@ -1,0 +1,113 @@
+// Explains a pixel: its lobes on the backdrop, a line to the heaviest one, and words.
+import { getJson } from "../lib/api.js";
+import { facts, h, newest, pause, problemBox, svg } from "../lib/dom.js";
+import { drawPlaced } from "./backdrops.js";
+
+const CALM = 120; // ms that the pointer rests before its pixel is requested
+const INSET = 0.4; // widths of the stage that the backdrop takes
+const SHARP = 0.02; // widths of the monitor below which a lobe is sharp
+
+const mean = (colours) => colours.reduce((sum, one) => sum + one, 0) / colours.length;
+const percent = (share) => `${Math.round(100 * share)} %`;
+
+// `button` switches it on; then the pointer or arrow keys choose the pixel.
+export function explanation(stage, matte, signal) {
+	const { width, height, monitor: [wide, high] } = matte;
+	const [across, down] = [INSET * width, (INSET * width * high) / wide];
+	const inset = h("canvas.inset", { width: 320, height: Math.round((320 * high) / wide), "aria-hidden": "true", hidden: true });
+	const drawing = svg("svg", { viewBox: `0 0 ${width} ${height}`, class: "lobes", "aria-hidden": "true" });
+	const words = h("p", { role: "status" });
+	const figures = h("div");
+	const problem = h("div");
+	let pixel; // undefined while it is off
+
+	const look = newest(async () => {
+		try {
+			await pause(CALM, signal);
+			if (!pixel) return;
+			const [x, y] = pixel;
+			const found = await getJson(`v1/mattes/${matte.id}/transport?x=${x}&y=${y}`, signal);
+			if (!pixel) return;
+			words.textContent = `Pixel (${x}, ${y}): ${inWords(found)}`;
+			figures.replaceChildren(found.recovered ? figuresOf(found) : "");
+			draw(found);
+			problem.replaceChildren();
+		} catch (error) {
+			if (!signal.aborted) problem.replaceChildren(problemBox(error));
+		}
+	});
+
+	// The backdrop stands in the corner that is farthest from the pixel.
+	function draw({ x, y, lobes }) {
+		const [left, top] = [x < width / 2 ? width - across : 0, y < height / 2 ? height - down : 0];
+		Object.assign(inset.style, { left: `${(100 * left) / width}%`, top: `${(100 * top) / height}%`, width: `${100 * INSET}%` });
+		inset.hidden = !stage.backdrop?.picture;
+		if (!inset.hidden) drawPlaced(inset.getContext("2d"), stage.backdrop.picture, stage.place, matte.monitor);
+		const heaviest = Math.max(...lobes.map(({ weight }) => mean(weight)));
+		const marks = lobes.map(({ u, v, weight, sigma_u: a, sigma_v: b, theta }) => {
+			const [cx, cy] = [left + u * across, top + (1 - v) * down];
+			return svg("ellipse", {
+				cx, cy, rx: Math.max(2 * a * across, width / 150), ry: Math.max(2 * b * across, width / 150),
+				transform: `rotate(${(-theta * 180) / Math.PI} ${cx} ${cy})`, opacity: Math.max(0.25, mean(weight) / heaviest),
+			});
+		});
+		const line = lobes.length ? [svg("path", { d: `M${x + 0.5} ${y + 0.5}L${left + lobes[0].u * across} ${top + (1 - lobes[0].v) * down}` })] : [];
+		drawing.replaceChildren(...line, svg("circle", { cx: x + 0.5, cy: y + 0.5, r: width / 100 }), ...marks);
+	}
+
+	function choose(x, y) {
+		pixel = [Math.min(width - 1, Math.max(0, x)), Math.min(height - 1, Math.max(0, y))];
+		look();
+	}
+	stage.element.addEventListener("pointermove", (event) => {
+		if (!pixel || event.buttons) return;
+		const box = stage.element.getBoundingClientRect();
+		choose(Math.floor(((event.clientX - box.left) / box.width) * width), Math.floor(((event.clientY - box.top) / box.height) * height));
+	});
+	// Before the keys that move the backdrop.
+	stage.element.addEventListener("keydown", (event) => {
+		const by = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
+		if (!pixel || !by || event.ctrlKey || event.metaKey || event.altKey) return;
+		event.preventDefault();
+		event.stopImmediatePropagation();
+		const far = event.shiftKey ? 10 : 1;
+		choose(pixel[0] + far * by[0], pixel[1] + far * by[1]);
+	});
+	const button = h("button", {
+		type: "button", "aria-pressed": "false",
+		onclick: () => {
+			pixel = pixel ? undefined : [width >> 1, height >> 1];
+			button.ariaPressed = String(Boolean(pixel));
+			panel.hidden = !pixel;
+			inset.hidden = true;
+			drawing.replaceChildren();
+			if (pixel) look();
+		},
+	}, "Explain a pixel");
+	stage.element.append(inset, drawing);
+	const panel = h("div.stack", { hidden: true }, words, figures, problem);
+	return { button, panel };
+}
+
+function inWords({ recovered, S, rho, lobes }) {
+	if (!recovered) return "the mask left it out.";
+	const reflected = mean(S) >= 0.005 ? ` Reflections add ${percent(mean(S))} of white.` : "";
+	if (!lobes.length) return `no light of the monitor comes through.${reflected}`;
+	const [{ u, v, weight, sigma_u: a, sigma_v: b }] = lobes;
+	const part = (share, names) => names[Math.min(2, Math.floor(3 * Math.max(0, share)))];
+	const place = [part(1 - v, ["top", "", "bottom"]), part(u, ["left", "", "right"])].filter(Boolean).join(" ") || "middle";
+	const share = Math.min(1, mean(weight));
+	const how = Math.max(a, b) < SHARP ? "sharply" : `spread over ${percent(Math.min(1, 4 * Math.max(a, b)))} of its width`;
+	return `${percent(mean(rho))} of the monitor’s light comes through, ${percent(share)} of it from the ${place}, ${how}.${reflected}`;
+}
+
+// The figures of each colour. The centre and the spread of a lobe are in pixels of the monitor, from its top left.
+function figuresOf({ S, rho, monitor: [width, height], lobes }) {
+	const colours = (values) => values.map(percent).join(", ");
+	const lobe = ({ u, v, weight, sigma_u: a, sigma_v: b }) =>
+		`${colours(weight)} at ${Math.round(u * width)}, ${Math.round((1 - v) * height)}, ${(a * width).toFixed(1)} × ${(b * width).toFixed(1)} wide`;
+	return facts({
+		"Transparency (rho) for red, green, blue": colours(rho), "Reflections (S)": colours(S),
+		...Object.fromEntries(lobes.map((one, n) => [`Lobe ${n + 1}`, lobe(one)])),
+	});
+}

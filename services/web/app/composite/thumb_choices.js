@@ -1,0 +1,13 @@
+// Choices that are shown as small pictures.
+import { h, svg } from "../lib/dom.js";
+
+export const thumbs = (legend, choices) => h("fieldset.thumbs", h("legend", legend), h("div", choices));
+
+export function choice(group, name, picture, checked, chosen) {
+	const control = h("input", { type: "radio", name: group, checked, onchange: () => chosen(control) });
+	return h("label.thumb-choice", control, h("span.frame", picture), h("span", name));
+}
+
+export const cameraSymbol = () => svg("svg", { viewBox: "0 0 24 18", "aria-hidden": "true" }, svg("path", {
+	d: "M4 3h3l1.5-2h7L17 3h3a2 2 0 0 1 2 2v10a2 2 0 0 1-2 2H4a2 2 0 0 1-2-2V5a2 2 0 0 1 2-2zm8 2.5a4.5 4.5 0 1 0 0 9 4.5 4.5 0 0 0 0-9zm0 2a2.5 2.5 0 1 1 0 5 2.5 2.5 0 0 1 0-5z",
+}));

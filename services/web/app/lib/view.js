@@ -1,0 +1,53 @@
+// What several views have in common: steps, deletion, thumbnails.
+import { remove } from "./api.js";
+import { button, confirmed, h, newest, show } from "./dom.js";
+
+const STEPS = ["Film or upload", "Check", "Recover", "Play"];
+export const [FILM, CHECK, RECOVER, PLAY] = STEPS.keys();
+
+// Where one is on the way from a film to a composite; `links` lead to the steps before.
+export const steps = (at, ...links) =>
+	h("ol.steps", { "aria-label": "Steps" }, STEPS.map((name, n) =>
+		h("li", { "aria-current": n === at && "step" }, n < at && links[n] ? h("a", { href: links[n] }, name) : name)));
+
+// A button that deletes what a path such as `v1/captures/ID` names; then its list is shown.
+export function deletion(path, where, lost) {
+	const [, list] = path.split("/");
+	const one = list.slice(0, -1);
+	return button("Delete", where, async () => {
+		if (!(await confirmed(`Delete this ${one}?`, lost, `Delete ${one}`))) return;
+		await remove(path);
+		location.replace(`#/${list}`);
+	}, "quiet");
+}
+
+const thumbs = new Map(); // by id: what is ready never changes
+
+// A function that makes thumbnails. Pictures are requested one after the other, and only of what is in view.
+export function thumbnails(signal, request) {
+	const queue = [];
+	const draw = newest(async () => {
+		while (queue.length && !signal.aborted) {
+			const frame = queue.shift();
+			const { id } = frame.dataset;
+			try {
+				if (!thumbs.has(id)) thumbs.set(id, await request(id));
+				await show(frame.firstChild, thumbs.get(id));
+			} catch {} // the place stays empty
+		}
+	});
+	const seen = new IntersectionObserver((entries) => {
+		for (const { isIntersecting, target } of entries) {
+			if (!isIntersecting) continue;
+			seen.unobserve(target);
+			queue.push(target);
+		}
+		draw();
+	});
+	signal.addEventListener("abort", () => seen.disconnect());
+	return ({ id, state }) => {
+		const frame = h("span.thumb", { "data-id": id }, h("img", { alt: "", width: 96, height: 72, hidden: true }));
+		if (state === "ready") seen.observe(frame);
+		return frame;
+	};
+}

@@ -1,0 +1,122 @@
+"""The stage of a matte: what its URL keeps, what it is compared with, and what is around the glass."""
+
+import base64
+import io
+import re
+
+import numpy as np
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from numpy.typing import NDArray
+from PIL import Image
+from playwright.sync_api import Page, expect
+
+from tests.browser.pages import PHONE, SIZE, is_fitting, unfold
+from tests.end_to_end.conftest import BANDS, Service
+from tests.parts.captures import nested_program
+from workflows.simulation import glass_ball
+from workflows.simulation.scene import write_capture
+
+pytestmark = pytest.mark.slow
+
+CANVAS = "(canvas) => canvas.toDataURL('image/png')"
+
+
+@pytest.fixture(scope="module")
+def masked(service: Service, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A matte whose mask leaves out what is around the object."""
+    path = tmp_path_factory.mktemp("masked") / "ball.zip"
+    write_capture(
+        glass_ball.glass_ball(*SIZE, rays=9), nested_program(bands=BANDS, levels=5), path, mask=True
+    )
+    uploaded = service.client.upload(path)
+    service.client.wait(uploaded["job"])
+    return str(service.client.wait(service.client.recover(uploaded["id"], quality="fast")["id"])["matte"])
+
+
+def opened(page: Page, service: Service, matte: str, query: str = "") -> None:
+    page.goto(f"{service.url}/#/mattes/{matte}{query}")
+    expect(page.get_by_text("exact")).to_be_visible()
+    unfold(page)
+
+
+def pixels(page: Page, selector: str) -> NDArray[np.float64]:
+    """What a canvas shows, (rows, columns, 4)."""
+    url = page.locator(selector).evaluate(CANVAS)
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))).convert("RGBA"), float)
+
+
+def test_reload_and_link_show_the_same(desk: Page, service: Service, ready: tuple[str, str]) -> None:
+    opened(desk, service, ready[1])
+    expect(desk).to_have_url(re.compile(r"#/mattes/\w+$"))
+    desk.get_by_role("radio", name="Stripes").check()
+    desk.get_by_role("slider", name="Turn").fill("30")
+    desk.get_by_label("Transparent around the glass").check()
+    expect(desk).to_have_url(re.compile(r"\?angle=30&backdrop=Stripes&around=nothing$"))
+    desk.reload()
+    expect(desk.get_by_text("Stripes: exact")).to_be_visible()
+    unfold(desk)
+    expect(desk.get_by_role("radio", name="Stripes")).to_be_checked()
+    expect(desk.locator("output[for=place-angle]")).to_have_text("30°")
+    expect(desk.get_by_label("Transparent around the glass")).to_be_checked()
+
+
+def test_picture_is_divided_between_backdrop_and_glass(
+    desk: Page, service: Service, ready: tuple[str, str]
+) -> None:
+    opened(desk, service, ready[1], "?backdrop=Stripes&right=0.25")
+    aside = desk.locator("canvas.aside")
+    expect(aside).to_be_hidden()
+    desk.get_by_role("radio", name="Backdrop").check()
+    expect(aside).to_be_visible()
+    bare = pixels(desk, "canvas.aside")
+    np.testing.assert_array_equal(bare[:, :20, :3], 0)  # what is left of the backdrop is black
+    assert np.unique(bare[0, 30:, :3], axis=0).shape[0] >= 6
+    desk.get_by_role("slider", name="Divide").fill("20")
+    expect(aside).to_have_css("clip-path", "inset(0px 80% 0px 0px)")
+    before = aside.evaluate(CANVAS)
+    desk.get_by_role("radio", name="Live").check()
+    desk.wait_for_function("(before) => document.querySelector('.aside').toDataURL() !== before", arg=before)
+    desk.get_by_role("slider", name="Turn").press("ArrowRight")
+    expect(aside).to_be_hidden()  # until the picture is exact again
+    expect(aside).to_be_visible()
+
+
+def test_what_the_mask_left_out_shows_the_backdrop_or_nothing(
+    desk: Page, service: Service, masked: str
+) -> None:
+    opened(desk, service, masked, "?backdrop=White")
+    stage = desk.get_by_role("group", name="Composite.")
+    canvas = ".picture.stage > canvas:not(.aside, .inset)"
+    stage.press("ArrowRight")
+    stage.press("ArrowLeft")
+    expect(desk.get_by_text("White: exact")).to_be_visible()
+    around = pixels(desk, canvas)
+    assert (around[..., 3] == 255).all()
+    np.testing.assert_allclose(around[0, 5, :3], 255, atol=2)
+    desk.get_by_label("Transparent around the glass").check()
+    expect(desk.get_by_text("White: exact")).to_be_visible()
+    alone = pixels(desk, canvas)
+    assert (alone[0, 5] == 0).all()
+    assert 0.1 < np.mean(alone[..., 3] > 0) < 0.9
+
+
+def test_phone_has_the_controls_in_a_sheet_of_the_full_screen(
+    desk: Page, service: Service, ready: tuple[str, str]
+) -> None:
+    desk.set_viewport_size(PHONE)
+    desk.add_init_script("HTMLElement.prototype.requestFullscreen = undefined")  # as on many phones
+    opened(desk, service, ready[1])
+    desk.get_by_role("button", name="Full screen").click()
+    controls = desk.get_by_text("Controls", exact=True)
+    box = controls.bounding_box()
+    assert box is not None
+    assert box["y"] > 0.85 * PHONE["height"]  # folded, at the bottom
+    stage = desk.get_by_role("group", name="Composite.").bounding_box()
+    assert stage is not None
+    assert stage["width"] == PHONE["width"]
+    assert [one["id"] for one in Axe().run(desk).response["violations"]] == []
+    controls.click()
+    assert is_fitting(desk)
+    desk.get_by_role("button", name="Leave full screen").click()
+    expect(desk.get_by_role("list", name="Steps")).to_be_in_viewport()
