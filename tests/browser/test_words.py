@@ -142,3 +142,16 @@ def test_capture_is_renamed_in_place(desk: Page, service: Service, ready: tuple[
         assert service.http.get(f"/v1/captures/{ready[0]}").json()["name"] == name
     desk.reload()
     expect(title).to_have_text("a ball")
+
+
+def test_question_mark_shows_the_keys(desk: Page, service: Service) -> None:
+    desk.goto(f"{service.url}/#/captures")
+    expect(desk.get_by_role("heading", name="Captures")).to_be_visible()
+    keys = desk.get_by_role("dialog", name="Keys")
+    expect(keys).to_be_hidden()
+    desk.keyboard.press("?")
+    expect(keys).to_contain_text("arrows move the backdrop")
+    desk.keyboard.press("Escape")
+    expect(keys).to_be_hidden()
+    desk.get_by_label(ZIP).press("?")  # no key of the page while a field has the focus
+    expect(keys).to_be_hidden()

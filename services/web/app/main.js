@@ -81,5 +81,6 @@ for (const type of ["dragover", "drop"]) {
 		event.dataTransfer.dropEffect = "none";
 	});
 }
+addEventListener("keydown", ({ key, target }) => key === "?" && !target.matches("input, select") && document.getElementById("keys").showModal());
 addEventListener("hashchange", () => route(true));
 route(false);
