@@ -9,7 +9,7 @@ from storage.records import captures, jobs, mattes, tiles
 from tests.benchmarks.service.many_rows import calls, fill
 from tests.end_to_end.conftest import serving
 
-JOBS = 20_000
+JOBS = 10_000
 SECONDS = 0.5
 """The most that the quickest of three answers may take: it takes longer to read all rows."""
 

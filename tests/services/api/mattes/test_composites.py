@@ -84,6 +84,7 @@ def spooled() -> int:
     return size
 
 
+@pytest.mark.slow
 def test_backdrops_of_one_owner_keep_no_other_waiting_and_leave_nothing(api: Api) -> None:
     before, share = spooled(), BACKDROPS // 2
     sending = [api.begin("alice") for _ in range(share)]
