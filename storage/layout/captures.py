@@ -1,10 +1,10 @@
 """A capture in the store: the stack of its frames, and what was measured from them.
 
-``captures/ID`` is a zarr group with the arrays ``frames`` (frame, y, x, channel), optionally ``mask`` (y, x), and
-``images/N`` (row, column, channel) for the patterns that are images. A capture from a video also has ``shares`` (share,
-column): which frames of the video make up each frame of the stack. The attributes of the group hold the manifest, those
-of its subgroup ``measured`` the measurements. The uploaded archive stays where `storage.layout.uploads` has it until
-its frames are in the stack.
+``captures/ID`` is a zarr group with the arrays ``frames`` (frame, y, x, channel), ``thumbnails`` (frame, row, column),
+the mean values of square blocks of each frame, optionally ``mask`` (y, x), and ``images/N`` (row, column, channel) for
+the patterns that are images. A capture from a video also has ``shares`` (share, column): which frames of the video make
+up each frame of the stack. The attributes of the group hold the manifest, those of its subgroup ``measured`` the
+measurements. The uploaded archive stays where `storage.layout.uploads` has it until its frames are in the stack.
 """
 
 from collections.abc import Coroutine, Sequence
@@ -25,6 +25,8 @@ from storage.objects.zarr_store import EVERY_CHUNK
 MEASURED = "measured"
 CHUNK = 1 << 20
 """Approximate bytes of a chunk of the stack: small enough that a tile reads little more than its own pixels."""
+THUMBNAIL = 80
+"""Blocks along the longer side of a frame, at most, whose means are stored."""
 
 
 def path(capture: str) -> str:
@@ -86,6 +88,15 @@ def create_stack(
         compressors=CODECS,
         dimension_names=("frame", "y", "x", "channel"),
     )
+    blocks = [-(-size // thumbnail_edge(height, width)) for size in (height, width)]
+    group.create_array(
+        "thumbnails",
+        shape=(frames, *blocks),
+        dtype=np.uint16,
+        chunks=(slab, *blocks),
+        compressors=CODECS,
+        dimension_names=("frame", "row", "column"),
+    )
     whole: dict[str, Any] = {"config": EVERY_CHUNK, "compressors": CODECS}
     if mask is not None:
         group.create_array("mask", data=mask, dimension_names=("y", "x"), **whole)
@@ -97,10 +108,39 @@ def create_stack(
     return slab
 
 
-def write_slab(objects: Objects, capture: str, first: int, frames: NDArray[np.generic]) -> None:
-    """Write a slab of whole frames that begins with frame ``first``."""
-    (stack,) = gather(objects.array(f"{path(capture)}/frames"))
-    stack[first : first + len(frames)] = frames
+def write_slab(objects: Objects, capture: str, first: int, frames: NDArray[np.unsignedinteger]) -> None:
+    """Write a slab of whole frames that begins with frame ``first``, and their thumbnails."""
+    stack, thumbnails = gather(
+        objects.array(f"{path(capture)}/frames"), _optional(objects.array(f"{path(capture)}/thumbnails"))
+    )
+    span = slice(first, first + len(frames))
+    # The frames tell whether a slab is there. A stack begun by an earlier version has no thumbnails.
+    if thumbnails is not None:
+        thumbnails[span] = np.stack([_thumbnail(frame) for frame in frames])
+    stack[span] = frames
+
+
+def thumbnail_edge(height: int, width: int) -> int:
+    """The edge of a thumbnail's blocks in pixels."""
+    return -(-max(height, width) // THUMBNAIL)
+
+
+def _thumbnail(frame: NDArray[np.unsignedinteger]) -> NDArray[np.uint16]:
+    """The mean values of the blocks of a frame, over its channels too, (rows, columns); 65535 is full scale."""
+    height, width, channels = frame.shape
+    edge = thumbnail_edge(height, width)
+    down, across = (np.arange(0, size, edge) for size in (height, width))
+    sums = np.add.reduceat(np.add.reduceat(frame, down, axis=0, dtype=np.uint64), across, axis=1).sum(axis=2)
+    counts = np.outer(np.diff(down, append=height), np.diff(across, append=width))
+    scale = 65535 / (channels * np.iinfo(frame.dtype).max)
+    return np.asarray(np.rint(sums * scale / counts), np.uint16)
+
+
+async def _optional(found: Coroutine[Any, Any, Any]) -> Any:
+    try:
+        return await found
+    except FileNotFoundError:
+        return None
 
 
 class Stack:
@@ -117,21 +157,14 @@ class Stack:
 
     def __init__(self, objects: Objects, capture: str) -> None:
         at = path(capture)
-
-        async def optional(found: Coroutine[Any, Any, Any]) -> Any:
-            try:
-                return await found
-            except FileNotFoundError:
-                return None
-
         self._frames: zarr.Array[Any]
         self._mask: zarr.Array[Any] | None
         try:
             group, self._frames, self._mask, measured = gather(
                 objects.group(at),
                 objects.array(f"{at}/frames"),
-                optional(objects.array(f"{at}/mask")),
-                optional(objects.group(f"{at}/{MEASURED}")),
+                _optional(objects.array(f"{at}/mask")),
+                _optional(objects.group(f"{at}/{MEASURED}")),
             )
         except FileNotFoundError as error:
             raise Corrupt(f"capture {capture} is not in the store; upload it again") from error
@@ -186,6 +219,13 @@ class Stack:
     def shares(self) -> NDArray[np.int64]:
         """The frames of a video and what they are used for, as given to `create_stack`."""
         return np.asarray(self._array("shares")[:], np.int64)
+
+    def thumbnails(self) -> NDArray[np.uint16] | None:
+        """The mean values of blocks of `thumbnail_edge` pixels of all frames, (frames, rows, columns), 65535 being full
+        scale; None in captures of earlier versions.
+        """
+        (found,) = gather(_optional(self._objects.array(f"{self._path}/thumbnails")))
+        return None if found is None else np.asarray(found[:], np.uint16)
 
     def missing(self) -> list[int]:
         """The slabs that lack a chunk, ascending; lists the store and reads nothing."""

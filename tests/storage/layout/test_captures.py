@@ -73,9 +73,8 @@ def test_order_of_slabs_does_not_change_bytes(
     plain = digests("captures/c")
     fill(objects, values, order)
     assert digests("captures/c") == plain
-    assert (
-        sum("/c/" in name for name in plain)
-        == zarr.open_array(objects.zarr, path="captures/c/frames").nchunks
+    assert sum("/c/" in name for name in plain) == sum(
+        zarr.open_array(objects.zarr, path=f"captures/c/{name}").nchunks for name in ("frames", "thumbnails")
     )
 
 
@@ -178,3 +177,29 @@ def test_capture_without_frames_is_corrupt(objects: Objects, folder: Path) -> No
     (folder / "captures/c/frames/zarr.json").unlink()
     with pytest.raises(Corrupt, match="capture c"):
         Stack(objects, "c")
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_thumbnails_are_the_means_of_blocks(objects: Objects, dtype: type[np.unsignedinteger]) -> None:
+    shape, top = (2, 50, 161, 3), np.iinfo(dtype).max
+    frames = np.random.default_rng(2).integers(0, top, shape, dtype)
+    create_stack(objects, "c", shape, np.dtype(dtype), memory=1 << 20, attributes={}, mask=None, images=())
+    write_slab(objects, "c", 0, frames)
+    thumbnails = Stack(objects, "c").thumbnails()
+    assert thumbnails is not None
+    assert thumbnails.shape == (2, 17, 54)  # blocks of 3 x 3 pixels, the last of 2 x 2
+    unit = frames / top * 65535
+    np.testing.assert_allclose(thumbnails[1, 4, 5], unit[1, 12:15, 15:18].mean(), atol=0.5)
+    np.testing.assert_allclose(thumbnails[0, 16, 53], unit[0, 48:, 159:].mean(), atol=0.5)
+
+
+def test_stack_begun_by_an_earlier_version_has_no_thumbnails(
+    objects: Objects, folder: Path, values: NDArray[np.uint16]
+) -> None:
+    create(objects)
+    (folder / "captures/c/thumbnails/zarr.json").unlink()
+    for slab in (0, 4, 8):
+        write_slab(objects, "c", slab, values[slab : slab + 4])
+    stack = Stack(objects, "c")
+    assert stack.thumbnails() is None
+    np.testing.assert_array_equal(stack.read(), values)
