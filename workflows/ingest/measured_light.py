@@ -11,6 +11,7 @@ from pydantic import TypeAdapter
 from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import Curve, table
+from workflows.ingest.local_gain import local_gain
 from workflows.programs.border import border_light
 from workflows.programs.program import Program
 from workflows.recovery.normalise import Conditions
@@ -71,7 +72,8 @@ def exposures_of(attributes: dict[str, Any]) -> Floats:
 def read_light(stack: Stack, span: tuple[slice, slice], program: Program) -> tuple[Light, Bools]:
     """The light of each pattern at the pixels of a rectangle that are to be recovered, and their (y, x) bool mask.
 
-    Drift and flicker are corrected if `workflows.ingest.report.steadiness` was certain of them, crosstalk always.
+    Drift, flicker and local tone mapping are corrected if `workflows.ingest.report.steadiness` was certain of them,
+    crosstalk always.
 
     Raises
     ------
@@ -81,14 +83,20 @@ def read_light(stack: Stack, span: tuple[slice, slice], program: Program) -> tup
     attributes = stack.attributes
     shifts = attributes.get("shifts")
     look_up = look_up_of(stack)
-    top = clipped_from(stack)
+    top, gain = clipped_from(stack), local_gain(stack)
+
+    def flatten(light: Floats, frame: int) -> Floats:
+        if gain is not None:
+            light = light / gain.at(y, x, frame)[:, np.newaxis]
+        return even_out(light, frame, attributes)
+
     if shifts is None:
         codes, recovered = stack.read_masked(*span)
         codes = codes[:, recovered]
 
         def at_rest(frame: int) -> tuple[Floats, Bools]:
             return (
-                even_out(look_up[codes[frame]], frame, attributes),
+                flatten(look_up[codes[frame]], frame),
                 (codes[frame] > 0) & (codes[frame] < top),
             )
 
@@ -99,9 +107,11 @@ def read_light(stack: Stack, span: tuple[slice, slice], program: Program) -> tup
 
         def in_place(frame: int) -> tuple[Floats, Bools]:
             values, whole = unclipped_light(around[frame], shifts[frame], margin, look_up, top)
-            return even_out(values[recovered], frame, attributes), whole[recovered]
+            return flatten(values[recovered], frame), whole[recovered]
 
         frame_of = in_place
+    y, x = np.nonzero(recovered)
+    y, x = y + (span[0].start or 0), x + (span[1].start or 0)
     return light_of(frame_of, attributes, program, int(recovered.sum())), recovered
 
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
+from workflows.ingest.local_gain import local_gain
 from workflows.programs.border import border_light
 from workflows.programs.program import Program
 
@@ -44,6 +45,11 @@ class BorderValues:
         codes = np.concatenate([strip.reshape(stack.frames, -1, stack.channels) for strip in strips], axis=1)
         top = np.iinfo(codes.dtype).max
         self.codes = codes
+        self.local: NDArray[np.floating] = np.ones((1, 1))
+        gain = local_gain(stack)
+        if gain is not None:
+            places = [np.mgrid[: stack.height, x : x + WIDE].reshape(2, -1) for x in left]
+            self.local = gain.at(*np.concatenate(places, axis=1))
         self.usable = np.asarray(((codes > 0) & (codes < SHOULDER * top)).all(axis=2))
         bits = border_light(range(program.count))[:, stack.attributes["patterns"]]
         self.design = np.concatenate([np.ones((1, stack.frames)), bits]).T
@@ -62,7 +68,7 @@ class BorderValues:
         frame: ``v = g (a_0 + sum_b a_b B_b)``. The amounts a are fitted to v / g, and g to the light that they predict,
         in turn. Values that are clipped, or nearly, are filled in by what is predicted.
         """
-        light = look_up[self.codes].mean(axis=2, dtype=np.float64)
+        light = look_up[self.codes].mean(axis=2, dtype=np.float64) / self.local
         frames, terms = self.design.shape
         inverse = np.linalg.pinv(self.design)
         exposure = np.ones(frames)

@@ -11,6 +11,7 @@ from pydantic import TypeAdapter
 from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import Curve, Response, estimate, table, to_light
+from workflows.ingest.local_gain import local_gain
 from workflows.ingest.measured_light import clipped_from, exposures_of
 from workflows.ingest.report.border_exposure import TRIFLE, BorderValues, relative_to_white
 from workflows.ingest.report.camera_curve import HalfTones, Shown, are_scaled, fit_camera_curve
@@ -34,7 +35,9 @@ COMPRESSED_SAMPLES = 4096
 """At most how many pixels of all frames the noise of a video is measured from."""
 
 
-def measure(stack: Stack, gains: Sequence[float] | None = None) -> None:
+def measure(
+    stack: Stack, gains: Sequence[float] | None = None, tone_mapping: dict[str, float] | None = None
+) -> None:
     """Measure noise, crosstalk and unknown curves from the constant frames of a stack.
 
     Parameters
@@ -43,10 +46,15 @@ def measure(stack: Stack, gains: Sequence[float] | None = None) -> None:
         Annotated with the results, but not saved.
     gains : sequence of float, optional
         Gain of the monitor's light in each frame; 1 by default.
+    tone_mapping : dict, optional
+        See `workflows.ingest.report.tone_mapping`.
     """
     program = Program.model_validate(stack.attributes["program"])
     filmed = _take_squares(stack) if "video" in stack.attributes else None
-    stack.annotate(clipped_from=_clipped_from(stack, filmed))
+    stack.annotate(
+        tone_mapping=tone_mapping, clipped_from=_clipped_from(stack, None if filmed is None else filmed[0])
+    )
+    gain = local_gain(stack)
     frames, sent, exposures = constant_frames(stack, program)
     codes = np.stack([_sample(stack, frame) for frame in frames], axis=1)
     top, black = np.iinfo(stack.dtype).max, stack.attributes["storage"]["black"]
@@ -68,13 +76,15 @@ def measure(stack: Stack, gains: Sequence[float] | None = None) -> None:
     light, shown = look_up[codes], to_light(sent, found.monitor)
     if exposed is not None:
         light /= exposed[[frames[at] for at in shortest], np.newaxis].astype(np.float32)
+    if gain is not None:
+        light /= gain.at(*_places(stack))[[frames[at] for at in shortest]].T[..., np.newaxis]
     if gains is not None:
         shown *= np.array([gains[frames[at]] for at in shortest], np.float32)[:, np.newaxis]
     # Crosstalk between channels must not count as noise, so grey levels are used if there are enough.
     some = grey if np.count_nonzero(grey) >= 4 else np.ones_like(grey)
     noise = estimate_noise(light[:, some], shown[some], usable[:, some], 1 / (top - black))
     if filmed is not None and not _is_free(exposed):
-        noise = _compressed(stack, filmed, look_up, exposed, frames, shown, noise)
+        noise = _compressed(stack, *filmed, look_up, exposed, frames, shown, noise)
     stack.annotate(
         monitor_curve=_as_json(found.monitor),
         camera_curve=_as_json(found.camera),
@@ -148,6 +158,8 @@ def _halftones(stack: Stack, program: Program) -> Callable[[NDArray[np.float64]]
     if not there or not all(frames.size for frames in of_light):
         return None
     of_light += [frames for frames, _ in there]
+    gain = local_gain(stack)
+    local = None if gain is None else np.repeat(gain.at(*_places(stack)), 3, axis=1).astype(np.float64)
     codes = [
         np.stack([_sample(stack, int(n)).ravel() for n in frames]).astype(np.float32) / full
         for frames in of_light
@@ -158,19 +170,25 @@ def _halftones(stack: Stack, program: Program) -> Callable[[NDArray[np.float64]]
         if used.max() > MOST_APART * used.min():
             return None
         black, white, *tones = (
-            Shown(part, exposed[frames]) for part, frames in zip(codes, of_light, strict=True)
+            Shown(part, exposed[frames, np.newaxis] * (1.0 if local is None else local[frames]))
+            for part, frames in zip(codes, of_light, strict=True)
         )
         return HalfTones(black, white, tones, [share for _, share in there])
 
     return seen
 
 
-def _take_squares(stack: Stack) -> Codes:
-    """Values of some of the pixels to recover in all frames, (n, frames, channels)."""
-    squares = product(_spread(stack.height), _spread(stack.width))
+def _take_squares(stack: Stack) -> tuple[Codes, NDArray[np.intp]]:
+    """Values of some of the pixels to recover in all frames, (n, frames, channels), their rows and columns, (2, n)."""
+    squares = list(product(_spread(stack.height), _spread(stack.width)))
     read = [stack.read_masked(y, x) for y, x in squares]
     codes = np.concatenate([values[:, mask] for values, mask in read], axis=1).transpose(1, 0, 2)
-    return codes[:: -(-len(codes) // COMPRESSED_SAMPLES) or 1]
+    places = [
+        np.stack(np.nonzero(mask)) + np.array([[y.start], [x.start]])
+        for (y, x), (_, mask) in zip(squares, read, strict=True)
+    ]
+    step = -(-len(codes) // COMPRESSED_SAMPLES) or 1
+    return codes[::step], np.concatenate(places, axis=1)[:, ::step]
 
 
 def _clipped_from(stack: Stack, filmed: Codes | None) -> int:
@@ -186,6 +204,7 @@ def _clipped_from(stack: Stack, filmed: Codes | None) -> int:
 def _compressed(
     stack: Stack,
     filmed: Codes,
+    places: NDArray[np.intp],
     look_up: NDArray[np.float32],
     exposed: NDArray[np.float64] | None,
     constants: Sequence[int],
@@ -196,7 +215,9 @@ def _compressed(
 
     Each mean frame counts as one frame, because averaging does not remove compression noise.
     """
-    light = look_up[filmed]
+    light, gain = look_up[filmed], local_gain(stack)
+    if gain is not None:
+        light /= gain.at(*places).T[..., np.newaxis]
     if exposed is not None:
         light /= exposed[:, np.newaxis].astype(np.float32)
     design = np.stack([np.ones(len(shown)), shown.mean(axis=1)], axis=1)
@@ -253,6 +274,13 @@ def _sample(stack: Stack, frame: int) -> NDArray[Any]:
     ]
     pixels = np.concatenate(parts)
     return np.broadcast_to(pixels, (len(pixels), 3))
+
+
+def _places(stack: Stack) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Row and column of the pixels of `_sample`."""
+    parts = [np.mgrid[y, x].reshape(2, -1) for y in _spread(stack.height) for x in _spread(stack.width)]
+    y, x = np.concatenate(parts, axis=1)
+    return y, x
 
 
 def _spread(n: int) -> list[slice]:

@@ -38,7 +38,10 @@ Floats = NDArray[np.float32]
 
 
 class Shown(NamedTuple):
-    """Frames of one light: codes, 0 to 1, of n pixels and channels, (frames, n) float32, and the exposure of each."""
+    """Frames of one light: codes, 0 to 1, of n pixels and channels, (frames, n) float32, and the exposure of each.
+
+    The exposure is (frames, n) float64, or (frames, 1) where all have the same.
+    """
 
     codes: Floats
     exposures: NDArray[np.float64]
@@ -139,7 +142,7 @@ def _fit(seen: HalfTones) -> tuple[Curve, float] | None:
 
 def _light_of(shown: Shown, light: NDArray[np.floating]) -> NDArray[np.float64]:
     """The mean light of frames by the samples of a curve, (n,)."""
-    found = np.interp(shown.codes, np.linspace(0, 1, len(light)), light) / shown.exposures[:, np.newaxis]
+    found = np.interp(shown.codes, np.linspace(0, 1, len(light)), light) / shown.exposures
     mean: NDArray[np.float64] = found.mean(axis=0)
     return mean
 
@@ -183,7 +186,8 @@ def _mean_at(shown: Shown, values: NDArray[np.intp]) -> NDArray[np.float64]:
     """The weight of each sample of a curve in the mean light of some values, (SAMPLES,)."""
     place = np.clip(shown.codes[:, values], 0, 1).astype(np.float64) * (SAMPLES - 1)
     below = np.minimum(place.astype(np.intp), SAMPLES - 2)
-    part, over = place - below, 1 / (shown.exposures[:, np.newaxis] * place.size)
+    exposures = np.broadcast_to(shown.exposures, shown.codes.shape)[:, values]
+    part, over = place - below, 1 / (exposures * place.size)
     lower = np.bincount(below.ravel(), ((1 - part) * over).ravel(), SAMPLES)
     upper = np.bincount(below.ravel() + 1, (part * over).ravel(), SAMPLES)
     return np.asarray(lower + upper, np.float64)

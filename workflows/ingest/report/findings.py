@@ -36,6 +36,7 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
     found = [
         *_exposure(figures, attributes["storage"]),
         *_auto_exposure(attributes.get("auto_exposure"), costs["auto_exposure"]),
+        *_tone_mapping(attributes.get("tone_mapping")),
         *_steadiness(attributes.get("steadiness")),
         *_drift(figures.drift),
         *_scaling(program, scaled=attributes.get("scaled", False)),
@@ -45,7 +46,7 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
         *unexplained(costs["model_error"], attributes.get("model_error", 0.0)),
         *lost_colour(costs["lost_colour"]),
         *_noise(figures, attributes, costs["noise"]),
-        *_flicker(figures.flicker),
+        *_flicker(figures.flicker, mapped=bool(attributes.get("tone_mapping"))),
         _frames(figures),
         *quality(figures.quality, any(isinstance(part, Bernoulli) for part in program.parts)),
         *unmeasured(figures, program, attributes),
@@ -157,12 +158,31 @@ def _drift(drift: Drift | None) -> list[Finding]:
     ]
 
 
-def _flicker(flicker: Flicker | None) -> list[Finding]:
+def _tone_mapping(found: dict[str, float] | None) -> list[Finding]:
+    """Local tone mapping that is not certain is not reported: it is left out of recovery too."""
+    if not found:
+        return []
+    percent = 100 * found["power"] * found["spread"]
+    level = graded(percent, 1.0, 10.0)
+    return [
+        Finding(
+            name="tone_mapping",
+            level=level,
+            message=f"the camera brightens what is dark around a place and darkens what is bright, by {percent:.1f} % "
+            "between patterns, as local tone mapping and HDR do: recovery corrects it",
+            remedy=""
+            if level == "good"
+            else "switch HDR and every enhancement of the camera off, or shoot RAW",
+        )
+    ]
+
+
+def _flicker(flicker: Flicker | None, *, mapped: bool) -> list[Finding]:
     if flicker is None:
         return []
     limits = (2.0, 10.0) if flicker.corrected else (0.5, 2.0)
     level = graded(flicker.percent if flicker.percent > SURE * flicker.error else 0.0, *limits)
-    if level != "good" and flicker.follows < FOLLOWS:
+    if level != "good" and flicker.follows < FOLLOWS and not mapped:
         return [
             Finding(
                 name="tone_mapping",

@@ -11,17 +11,21 @@ from pydantic import TypeAdapter
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import Curve
 from workflows.ingest.measured_light import black_patterns
+from workflows.ingest.report.calibration import measure
+from workflows.ingest.report.tone_mapping import find_tone_mapping
 from workflows.ingest.report.trial_recovery import (
     FURTHEST,
     Doubles,
+    Sample,
     Trial,
     measure_rest,
     take_sample,
     try_recovery,
 )
-from workflows.ingest.report.unexplained import find_unexplained
+from workflows.ingest.report.unexplained import Unexplained, find_unexplained
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out
+from workflows.recovery.sensing import Patterns
 
 ROUNDS = 10
 """Rounds of measuring and correcting, at most."""
@@ -40,9 +44,11 @@ REST = 0.25
 """The last round may leave at most this share of what was found."""
 EXPLAINED = np.array([2.4, 1.5])
 """Largest residuals with which shifts and gains are believed, in standard deviations of the noise."""
-LEFT = 0.3
+LEFT = 0.4
 """The squared residual may keep this share of its excess over noise. If it keeps more, the frames differ from what is
 predicted in ways that only look like shifts and gains."""
+TONE_MAPPING_TURNS = 2
+"""Turns in which local tone mapping is found, and corrected: T has explained some of it before it is."""
 MEMORY = 4
 """Rounds before the last one from which the next is extrapolated."""
 MIN_FRAMES = 8
@@ -105,13 +111,12 @@ def find_steadiness(stack: Stack) -> None:
     sample = take_sample(stack)
     if sample is None:
         return
-    monitor: Curve = TypeAdapter[Curve](Curve).validate_python(stack.attributes["monitor_curve"])
-    light = lay_out(program, monitor, stack.images())
-    at_rest = np.zeros((stack.frames, 3))
-    recovered = find_unexplained(stack, program, monitor, light, sample, at_rest)
-    if recovered is None:
+    explained = _explain(stack, program, sample)
+    if explained is None:
         return
-    at_first, through = recovered
+    monitor, light, unexplained = explained
+    at_rest = np.zeros((stack.frames, 3))
+    at_first, through, _ = unexplained
     first = measure_rest(stack, program, monitor, through, sample, at_rest, at_first)
     try_out = partial(try_recovery, stack, program, monitor, through, sample)
     patterns = np.array(stack.attributes["patterns"])
@@ -163,6 +168,31 @@ def find_steadiness(stack: Stack) -> None:
     )
     if moves or flickers:
         find_unexplained(stack, program, monitor, light, sample, found * [moves, moves, flickers])
+
+
+def _explain(stack: Stack, program: Program, sample: Sample) -> tuple[Curve, Patterns, Unexplained] | None:
+    """Find what T leaves unexplained, local tone mapping first; None if the sample has too little contrast.
+
+    Returns
+    -------
+    Curve, Patterns
+        The monitor's curve, and the patterns' light by it, without glare.
+    Unexplained
+    """
+    at_rest, turn = np.zeros((stack.frames, 3)), 0
+    while True:
+        monitor: Curve = TypeAdapter[Curve](Curve).validate_python(stack.attributes["monitor_curve"])
+        light = lay_out(program, monitor, stack.images())
+        found = find_unexplained(stack, program, monitor, light, sample, at_rest)
+        if found is None:
+            return None
+        mapped = None
+        if turn < TONE_MAPPING_TURNS:
+            mapped = find_tone_mapping(stack, found.rest, sample, stack.attributes["tone_mapping"])
+        if mapped is None:
+            return monitor, light, found
+        measure(stack, tone_mapping=mapped)
+        turn += 1
 
 
 def _settle(

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
+from workflows.images.integer_formats import Codes
 from workflows.ingest.colour_detail import ColourDetail
+from workflows.ingest.local_gain import Places, local_gain
 from workflows.ingest.measured_light import clipped_from, even_out, exposures_of, look_up_of
 from workflows.ingest.report.calibration import constant_frames, measure
 from workflows.ingest.report.steadiness import find_steadiness
@@ -33,7 +35,7 @@ def survey(stack: Stack) -> None:
     find_steadiness(stack)
     if stack.attributes["gains"] is not None:
         noise = stack.attributes["noise"]
-        measure(stack, stack.attributes["gains"])
+        measure(stack, stack.attributes["gains"], stack.attributes["tone_mapping"])
         if stack.attributes["noise_of_patterns"]:
             stack.annotate(noise=noise)
     attributes = stack.attributes
@@ -55,18 +57,21 @@ def survey(stack: Stack) -> None:
     brightest: list[NDArray[np.float32]] = []
     tones = [] if attributes["scaled"] else _halftone_frames(stack, program)
     lit = np.zeros((2, len(tones)))  # of half-tones times white, of white squared
-    detail = ColourDetail()
+    detail, gain = ColourDetail(), local_gain(stack)
     coloured = chosen[is_pattern][:: -(-np.count_nonzero(is_pattern) // COLOUR_FRAMES) or 1].tolist()
     pixels = 0
+
+    def evened(codes: Codes, frame: int, y: Places, x: Places) -> NDArray[np.float32]:
+        light = even_out(look_up[codes].mean(axis=2), frame, attributes)
+        return light if gain is None else light / gain.at(y, x, frame).reshape(light.shape)
+
     for rows, columns in _windows(stack):
         wanted = stack.mask(rows, columns)
         if not wanted.any():
             continue
+        y, x = np.mgrid[rows, columns].reshape(2, -1)
         codes_black, codes_white = (stack.read(rows, columns, slice(n, n + 1))[0] for n in (black, white))
-        B, W = (
-            even_out(look_up[codes].mean(axis=2), frame, attributes)
-            for codes, frame in ((codes_black, black), (codes_white, white))
-        )
+        B, W = (evened(codes, frame, y, x) for codes, frame in ((codes_black, black), (codes_white, white)))
         top = clipped_from(stack)
         pixels += int(np.count_nonzero(wanted))
         ends[0] += [np.count_nonzero((c == 0).any(axis=2) & wanted) for c in (codes_black, codes_white)]
@@ -74,8 +79,7 @@ def survey(stack: Stack) -> None:
         contrasts.append((W - B)[wanted])
         whole = wanted & ((codes_black > 0) & (codes_white < top)).all(axis=2)
         for of_tone, (frame, _) in zip(lit.T, tones, strict=True):
-            tone = look_up[stack.read(rows, columns, slice(frame, frame + 1))[0]].mean(axis=2)
-            tone = even_out(tone, frame, attributes)
+            tone = evened(stack.read(rows, columns, slice(frame, frame + 1))[0], frame, y, x)
             of_tone += [((light - B) * (W - B))[whole].sum(dtype=np.float64) for light in (tone, W)]
         deviations.append(np.sqrt(noise.variance((B + W) / 2))[wanted])
         brightest.append(look_up[codes_white].max(axis=2)[wanted])

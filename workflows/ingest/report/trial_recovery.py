@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import Curve, to_light
+from workflows.ingest.local_gain import local_gain
 from workflows.ingest.measured_light import (
     LOBES,
     Light,
@@ -68,10 +69,13 @@ class Sample(NamedTuple):
         With `_MARGIN` on each side.
     chosen : three (n,) intp
         Square, row and column of each pixel, counted without the margins.
+    places : two (n,) intp
+        Row and column of each pixel in the frame.
     """
 
     codes: Codes
     chosen: tuple[NDArray[np.intp], ...]
+    places: tuple[NDArray[np.intp], NDArray[np.intp]]
 
 
 class _Seen(NamedTuple):
@@ -118,7 +122,8 @@ def take_sample(stack: Stack) -> Sample | None:
     chosen = np.stack(np.nonzero(inside))
     limit = max(min(PIXELS, VALUES // stack.frames), MIN_PIXELS)
     chosen = chosen[:, :: -(-chosen.shape[1] // limit)]
-    return Sample(np.stack(squares, axis=1), tuple(chosen))
+    y, x = np.array(corners, np.intp)[chosen[0]].T + chosen[1:]
+    return Sample(np.stack(squares, axis=1), tuple(chosen), (y, x))
 
 
 def _see(stack: Stack, sample: Sample, shifts: Doubles) -> _Seen:
@@ -138,6 +143,11 @@ def _see(stack: Stack, sample: Sample, shifts: Doubles) -> _Seen:
             near = picture[square, y + dy, x + dx] - picture[square, y - dy, x - dx]
             far = picture[square, y + 2 * dy, x + 2 * dx] - picture[square, y - 2 * dy, x - 2 * dx]
             slope[n] = (8 * near - far) / 12
+    gain = local_gain(stack)
+    if gain is not None:
+        local = gain.at(*sample.places)[..., np.newaxis]
+        for part in (values, across, down):
+            part /= local
     return _Seen(values, whole, (across, down))
 
 

@@ -1,5 +1,7 @@
 """What frames show beside T, S and rho: veiling glare, noise that constant frames don't tell, errors of the model."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -48,9 +50,17 @@ CONTRAST = 3.0
 _GREY = np.array([0.5], np.float32)
 
 
+class Unexplained(NamedTuple):
+    """The last recovery of a sample, the patterns through the glare that it was recovered from, and what it left."""
+
+    recovered: RecoveredSample
+    patterns: Patterns
+    rest: "Rest"
+
+
 def find_unexplained(
     stack: Stack, program: Program, monitor: Curve, patterns: Patterns, sample: Sample, state: Doubles
-) -> tuple[RecoveredSample, Patterns] | None:
+) -> Unexplained | None:
     """Estimate what T leaves unexplained in a sample of the pixels, and annotate the stack with it.
 
     ``glare`` are its shares of the light (`workflows.recovery.glare`), or None below 1 %. ``model_error`` is the
@@ -71,9 +81,8 @@ def find_unexplained(
 
     Returns
     -------
-    (RecoveredSample, Patterns) or None
-        The last recovery of the sample, and the patterns through the glare that it was recovered from; None if the
-        sample has too little contrast.
+    Unexplained or None
+        None if the sample has too little contrast.
 
     Notes
     -----
@@ -94,7 +103,7 @@ def find_unexplained(
         found = recover_sample(stack, program, monitor, through, sample, state)
         if found is None:
             return None
-        rest = _Rest(found, program, patterns, through, spreads, noise, stack.channels)
+        rest = Rest(stack, found, program, patterns, through, spreads, noise)
         last = shares
         shares = rest.shares(error)
         if not LEAST <= shares.sum() <= MOST_GLARE:
@@ -111,24 +120,29 @@ def find_unexplained(
                 pattern_error=rest.pattern_error(),
                 noise_of_patterns=of_patterns or noise != before,
             )
-            return found, through
+            return Unexplained(found, through, rest)
         through = filter_patterns(patterns, spreads, shares.tolist()) if shares.any() else patterns
 
 
-class _Rest:
+class Rest:
     """The residuals of a recovered sample, in units of T from -1 to 1; arrays are (n, channels, m)."""
 
     def __init__(
         self,
+        stack: Stack,
         found: RecoveredSample,
         program: Program,
         patterns: Patterns,
         through: Patterns,
         spreads: list[Spread],
         noise: Noise,
-        channels: int,
     ) -> None:
-        shown, at = program.measured, slice(None, channels)
+        shown, channels, self.noise = program.measured, stack.channels, noise
+        at = slice(None, channels)
+        first = {pattern: frame for frame, pattern in reversed(list(enumerate(stack.attributes["patterns"])))}
+        self.frames = np.array([first.get(pattern, 0) for pattern in shown.tolist()])
+        numbers, sent = program.constants
+        self.white = np.flatnonzero(np.isin(stack.attributes["patterns"], numbers[(sent == 1).all(axis=1)]))
         light, usable, worth = (
             found.light.values[:, shown],
             found.light.usable[:, shown],

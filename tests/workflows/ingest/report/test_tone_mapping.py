@@ -1,0 +1,138 @@
+"""Captures of a camera that brightens what is dark around a place: its power is measured, and nothing is else."""
+
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from storage.layout.captures import Stack
+from tests.parts.captures import nested_program
+from workflows.images.integer_formats import encode_png
+from workflows.images.tone_curves import to_light
+from workflows.ingest.local_gain import surroundings
+from workflows.ingest.report.report import report
+from workflows.ingest.report.tone_mapping import LEAST, find_tone_mapping
+from workflows.ingest.report.trial_recovery import Sample
+from workflows.ingest.report.unexplained import Rest
+from workflows.programs.program import Program
+from workflows.recovery.noise import Noise
+from workflows.simulation.glass_ball import glass_ball
+from workflows.simulation.scene import Scene
+
+Ingest = Callable[..., Stack]
+WIDTH, HEIGHT, MONITOR = 96, 72, (160, 120)
+NOISE = 0.003
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return glass_ball(WIDTH, HEIGHT, monitor=MONITOR, rays=4)
+
+
+@pytest.fixture(scope="module")
+def program() -> Program:
+    bands = ((8, 6, 14), (16, 12, 12), (32, 24, 12), (80, 60, 12))
+    return nested_program(MONITOR, bands=bands, levels=2)
+
+
+def filmed(scene: Scene, program: Program, power: float = 0.0, sharpening: float = 0.0) -> bytes:
+    """A capture of linear light: a gain follows the brightness around a place, then edges are sharpened."""
+    rng, target = np.random.default_rng(5), io.BytesIO()
+    with zipfile.ZipFile(target, "w") as archive:
+        frames = [{"file": f"{n}.png", "pattern": n} for n in range(program.count)]
+        record = {
+            "format": "envmatte-capture/1",
+            "program": program.model_dump(mode="json"),
+            "frames": frames,
+            "response": "linear",
+        }
+        archive.writestr("capture.json", json.dumps(record))
+        for n, picture in enumerate(program.pictures(0, program.count)):
+            light = 0.03 + 0.65 * scene.composite(to_light(picture, "srgb").astype(np.float32))
+            near = gaussian_filter(light.mean(axis=2) ** (1 / 2.2), WIDTH / 10)
+            light = light * ((near + 0.05)[..., np.newaxis] / 0.6) ** -power
+            light = light + sharpening * (light - gaussian_filter(light, (1, 1, 0)))
+            value = light + NOISE * rng.standard_normal(light.shape)
+            archive.writestr(f"{n}.png", encode_png(np.rint(np.clip(value, 0, 1) * 65535).astype(np.uint16)))
+    return target.getvalue()
+
+
+def left_by(power: float, pixels: int = 400, frames: int = 40) -> tuple[Stack, Rest, Sample]:
+    """Residuals of pixels that see patterns as all black or all white, by a camera that maps tones."""
+    rng = np.random.default_rng(1)
+    thumbnails = gaussian_filter(rng.random((frames, 60, 80)), (0, 6, 6))
+    thumbnails = np.clip(0.5 + (thumbnails - thumbnails.mean()) * 0.25 / thumbnails.std(), 0, 1)
+    attributes = {"response": "srgb", "storage": {"black": 0}, "patterns": list(range(frames))}
+    stack = SimpleNamespace(
+        attributes=attributes,
+        thumbnails=lambda: np.rint(65535 * thumbnails).astype(np.uint16),
+        height=240,
+        width=320,
+        dtype=np.dtype(np.uint16),
+    )
+    near = surroundings(cast(Stack, stack), 1 / 10)
+    assert near is not None
+    y, x = rng.integers(0, 240, pixels), rng.integers(0, 320, pixels)
+    around = near.at(y, x) - near.values.mean()
+    plain = rng.choice([-1.0, 1.0], (pixels, 3, frames))
+    level = 0.03 + 0.3 * (1 + plain)
+    flicker = 1 + 0.01 * rng.standard_normal(frames)
+    seen = level * (flicker * np.exp(-power * around.T[:, np.newaxis]) - 1)
+    rest = SimpleNamespace(
+        flat=rng.random(plain.shape) < 0.5,
+        frames=np.arange(frames),
+        white=np.arange(0),
+        level=level,
+        plain=plain,
+        rho=np.full(plain.shape, 0.6),
+        rest=(seen + NOISE * rng.standard_normal(plain.shape)) * 2 / 0.6,
+        noise=Noise(NOISE**2, 0.0),
+    )
+    sample = SimpleNamespace(places=(y, x), chosen=(np.arange(pixels) // 10,))
+    return cast(Stack, stack), cast(Rest, rest), cast(Sample, sample)
+
+
+def test_power_is_that_of_the_residuals() -> None:
+    found = find_tone_mapping(*left_by(0.1), None)
+    assert found is not None
+    assert found["power"] == pytest.approx(0.1, rel=0.05)
+    assert found["width"] == 1 / 10
+
+
+@pytest.mark.parametrize("power", [-0.1, 0.0, LEAST / 2])
+def test_what_is_no_tone_mapping_is_left_out(power: float) -> None:
+    assert find_tone_mapping(*left_by(power), None) is None
+
+
+def test_what_was_corrected_is_added_to() -> None:
+    known = {"power": 0.08, "width": 1 / 10, "usual": -0.5, "spread": 0.2}
+    found = find_tone_mapping(*left_by(0.02), known)
+    assert found is not None
+    assert found == known | {"power": pytest.approx(0.1, rel=0.05)}
+
+
+@pytest.mark.slow
+def test_power_is_measured_and_reported(scene: Scene, program: Program, ingest: Ingest) -> None:
+    stack = ingest("c", filmed(scene, program, power=0.1))
+    found = stack.attributes["tone_mapping"]
+    assert found["power"] == pytest.approx(0.1, rel=0.25)
+    assert found["width"] == 1 / 10
+    (finding,) = (f for f in report(stack.attributes, stack.frames).findings if f.name == "tone_mapping")
+    assert finding.level == "warning"
+    assert "recovery corrects it" in finding.message
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sharpening", [0.0, 0.5])
+def test_neither_a_clean_camera_nor_sharpening_is_taken_for_it(
+    scene: Scene, program: Program, ingest: Ingest, sharpening: float
+) -> None:
+    stack = ingest("c", filmed(scene, program, sharpening=sharpening))
+    assert stack.attributes["tone_mapping"] is None
+    assert not any(f.name == "tone_mapping" for f in report(stack.attributes, stack.frames).findings)

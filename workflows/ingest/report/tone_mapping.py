@@ -1,0 +1,133 @@
+"""Measure how much a camera brightens what is dark around a place, by what a trial recovery leaves unexplained."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.layout.captures import Stack
+from workflows.ingest.local_gain import surroundings
+from workflows.ingest.report.trial_recovery import HUBER, Doubles, Floats, Sample
+from workflows.ingest.report.unexplained import DETAIL, MIN_FLAT, Rest
+
+WIDTHS = (1 / 40, 1 / 20, 1 / 10)
+"""Widths of the surroundings that are tried, as shares of the frame's width,"""
+NARROWEST = 6.0
+"""unless they are narrower than this, in pixels: sharpening would look alike."""
+SURE = 5.0
+"""A power is real from so many standard errors on,"""
+LEAST = 0.02
+"""and a smaller one is left out: it changes light by less than 3 %."""
+REWEIGHTED, SWEEPS = 5, 8
+"""How often weights are updated, and sweeps over what is free at each update."""
+SPREAD = 0.01
+"""Errors that are in proportion to the light, at least, as a share of it."""
+
+
+class Power(NamedTuple):
+    """The power of local tone mapping, its standard error, and how much of the residuals it explains."""
+
+    power: float
+    error: float
+    explained: float
+
+
+def find_tone_mapping(
+    stack: Stack, rest: Rest, sample: Sample, known: dict[str, float] | None
+) -> dict[str, float] | None:
+    """The local tone mapping that a sample of the pixels shows; None if it is not certain, or a trifle.
+
+    Parameters
+    ----------
+    stack : Stack
+    rest : Rest
+        What the recovery of the sample leaves unexplained.
+    sample : Sample
+    known : dict, optional
+        What was found, and corrected, before: the rest is added to it.
+
+    Returns
+    -------
+    dict or None
+        ``power``; ``width`` of the surroundings, as a share of the frame's width; ``usual``, the logarithm of their
+        brightness, plus `workflows.ingest.local_gain.DARK`, that has a gain of 1; and ``spread``, the standard
+        deviation of the logarithm.
+
+    Notes
+    -----
+    A camera that multiplies light by ``m^-p``, m the brightness around a place, makes of the predicted value C one that
+    is larger by ``-p log(m) C``. Where a pixel sees a pattern as all black or all white, there is no error of T's place
+    or shape that could look alike, and the values of one pixel are alike too, so that no error of the camera's curve
+    does. Of the residuals there, each pixel's mean and each frame's gain are left free: S, rho and flicker are
+    uncertain. T has explained some of the rest, so that what is found is corrected, and searched for once more.
+    Sharpening is far narrower than the surroundings, and glare makes a place that is bright around not darker but
+    brighter.
+    """
+    y, x = sample.places
+    at = rest.flat
+    if np.count_nonzero(at) < MIN_FLAT:
+        return None
+    pixel, channel, shown = np.nonzero(at)
+    frame = rest.frames[shown]
+    level, value = rest.level[at], (rest.rest * rest.rho)[at] / 2
+    detail = DETAIL * np.maximum(1 - rest.plain[at] ** 2, 0) * (rest.rho[at] / 2) ** 2
+    weight = 1 / np.sqrt(rest.noise.variance(level) + (SPREAD * level) ** 2 + detail)
+    group = 2 * (pixel * at.shape[1] + channel) + (rest.plain[at] > 0)
+    free = [(group, weight), (shown, weight * level)]
+    clusters = [sample.chosen[0][pixel], shown]
+    found: tuple[Power, float, Floats] | None = None
+    wide = [width for width in WIDTHS if width * stack.width >= NARROWEST]
+    for width in (known["width"],) if known else wide:
+        near = surroundings(stack, width)
+        if near is None:
+            return None
+        around = near.at(y, x)
+        one = _fit(-(around[frame, pixel] - around.mean()) * level * weight, value * weight, free, clusters)
+        if found is None or (one.power > 0 and one.explained > found[0].explained):
+            found = one, width, around
+    if found is None:
+        return None
+    (power, error, _), width, around = found
+    if known:
+        return known | {"power": max(known["power"] + power, 0.0)}
+    if power < max(SURE * error, LEAST):
+        return None
+    usual = float(around.mean())
+    if rest.white.size:
+        # Composites are exposed for a backdrop between patterns, half of which is black, and white.
+        usual = (usual + float(around[rest.white].mean())) / 2
+    return {"power": power, "width": width, "usual": usual, "spread": float(around.std())}
+
+
+def _fit(
+    column: NDArray[np.floating],
+    value: NDArray[np.floating],
+    free: Sequence[tuple[NDArray[np.intp], NDArray[np.floating]]],
+    clusters: Sequence[NDArray[np.intp]],
+) -> Power:
+    """Robust least squares of a column to values, with an amount of each free column in each of its groups."""
+    trust = np.ones(len(value))
+    for _ in range(REWEIGHTED):
+        a, r = (_without(v.astype(np.float64), free, trust) for v in (column, value))
+        total = max(float((trust * a * a).sum()), 1e-12)
+        power = float((trust * a * r).sum()) / total
+        left = r - power * a
+        scale = max(1.4826 * float(np.median(np.abs(left))), 1e-12)
+        trust = np.minimum(1, HUBER * scale / np.maximum(np.abs(left), 1e-12))
+    # Pixels beside each other, and those of a frame, are not independent.
+    pulls = [np.bincount(cluster, trust * a * left) for cluster in clusters]
+    error = max(float(np.sqrt((pull**2).sum())) for pull in pulls) / total
+    return Power(power, error, power**2 * total / scale**2 if power > 0 else 0.0)
+
+
+def _without(
+    values: Doubles, free: Sequence[tuple[NDArray[np.intp], NDArray[np.floating]]], weight: Doubles
+) -> Doubles:
+    """Values without what is free, by sweeps over the groups of one column and of the next."""
+    for _ in range(SWEEPS):
+        for group, column in free:
+            own = np.bincount(group, weight * values * column)
+            amount = own / np.maximum(np.bincount(group, weight * column**2), 1e-20)
+            values = values - amount[group] * column
+    return values
