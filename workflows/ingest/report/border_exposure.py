@@ -93,6 +93,13 @@ class BorderValues:
         return exposure
 
 
+def shortest_white(exposures: Doubles, patterns: Sequence[int], program: Program) -> int | None:
+    """The frame of a white monitor that was exposed the shortest, and so clips least; None if there is none."""
+    numbers, sent = program.constants
+    white = np.flatnonzero(np.isin(patterns, numbers[(sent == 1).all(axis=1)]))
+    return int(white[np.argmin(exposures[white])]) if white.size else None
+
+
 def relative_to_white(exposures: Doubles, patterns: Sequence[int], program: Program) -> Doubles:
     """Exposures in units of the shortest of a white monitor; unchanged if no frame shows one.
 
@@ -106,6 +113,5 @@ def relative_to_white(exposures: Doubles, patterns: Sequence[int], program: Prog
         What each frame shows.
     program : Program
     """
-    numbers, sent = program.constants
-    white = np.isin(patterns, numbers[(sent == 1).all(axis=1)])
-    return exposures / exposures[white].min() if white.any() else exposures
+    white = shortest_white(exposures, patterns, program)
+    return exposures if white is None else exposures / exposures[white]

@@ -83,7 +83,7 @@ def measure(
     # Crosstalk between channels must not count as noise, so grey levels are used if there are enough.
     some = grey if np.count_nonzero(grey) >= 4 else np.ones_like(grey)
     noise = estimate_noise(light[:, some], shown[some], usable[:, some], 1 / (top - black))
-    if filmed is not None and not _is_free(exposed):
+    if filmed is not None and not is_free(exposed):
         noise = _compressed(stack, *filmed, look_up, exposed, frames, shown, noise)
     stack.annotate(
         monitor_curve=_as_json(found.monitor),
@@ -92,7 +92,7 @@ def measure(
         scaled=scaled,
         auto_exposure=None if exposed is None else exposed.round(5).tolist(),
         noise={"read": noise.read, "shot": noise.shot},
-        assumed_noise=bool((filmed is None and np.count_nonzero(some) < 4) or _is_free(exposed)),
+        assumed_noise=bool((filmed is None and np.count_nonzero(some) < 4) or is_free(exposed)),
         crosstalk=estimate_crosstalk(light, shown, usable).tolist(),
     )
 
@@ -126,12 +126,12 @@ def _camera(
             camera = curve or "unknown"
     if exposed is not None and np.log(exposed).std() < TRIFLE:
         exposed = None
-    if exposed is not None and _is_free(exposed):
+    if exposed is not None and is_free(exposed):
         exposed = relative_to_white(exposed, stack.attributes["patterns"], program)
     return camera, exposed, scaled
 
 
-def _is_free(exposed: NDArray[np.float64] | None) -> bool:
+def is_free(exposed: NDArray[np.float64] | None) -> bool:
     """Whether the exposure of a film was not locked.
 
     Then errors of the exposures make more values brighter than white than noise does.

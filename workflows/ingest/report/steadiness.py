@@ -11,7 +11,8 @@ from pydantic import TypeAdapter
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import Curve
 from workflows.ingest.measured_light import black_patterns
-from workflows.ingest.report.calibration import measure
+from workflows.ingest.report.border_exposure import shortest_white
+from workflows.ingest.report.calibration import is_free, measure
 from workflows.ingest.report.tone_mapping import find_tone_mapping
 from workflows.ingest.report.trial_recovery import (
     FURTHEST,
@@ -64,7 +65,7 @@ def find_steadiness(stack: Stack) -> None:
     don't explain what the frames show. Its ``drift`` and ``flicker`` are None if they are too large to be either.
     ``shifts`` (frames, 2), x and y in pixels, and ``gains`` (frames) are None unless they are to be corrected, which
     `workflows.ingest.measured_light` does. Shifts are relative to the mean position of the patterns, gains to their
-    median.
+    median, or to a white frame if the exposure was free.
 
     Notes
     -----
@@ -164,10 +165,21 @@ def find_steadiness(stack: Stack) -> None:
     stack.annotate(
         steadiness={"drift": drift if within[0] else None, "flicker": flicker if within[1] else None},
         **({"shifts": found[:, :2].round(4).tolist()} if moves else {}),
-        **({"gains": gain.round(5).tolist()} if flickers else {}),
+        **(
+            {"gains": (gain / unit_of(gain, stack.attributes, program)).round(5).tolist()} if flickers else {}
+        ),
     )
     if moves or flickers:
         find_unexplained(stack, program, monitor, light, sample, found * [moves, moves, flickers])
+
+
+def unit_of(gain: Doubles, attributes: dict[str, Any], program: Program) -> float:
+    """The gain that counts as 1: that of the patterns, or of the white frame in whose units a free exposure is."""
+    exposed = attributes["auto_exposure"]
+    if exposed is None or not is_free(np.array(exposed)):
+        return 1.0
+    white = shortest_white(np.array(exposed), attributes["patterns"], program)
+    return 1.0 if white is None else float(gain[white])
 
 
 def _explain(stack: Stack, program: Program, sample: Sample) -> tuple[Curve, Patterns, Unexplained] | None:
