@@ -7,7 +7,7 @@ import { ACTIVE } from "../lib/events.js";
 import { list } from "../lib/list.js";
 import { followJob } from "../lib/job_progress.js";
 import { RECOVER, CHECK, deletion, steps } from "../lib/view.js";
-import { automatic } from "./recovery_form.js";
+import { QUALITIES, automatic } from "./recovery_form.js";
 
 const REFRESH = 2000; // ms between two pictures of what is recovered
 const LONGER = 640; // pixels of their longer side, at most
@@ -42,7 +42,7 @@ export async function job(main, signal, id) {
 		h("p.crumb", h("a", { href: "#/jobs" }, "Jobs")),
 		h("div.row.spread", h("h1", KINDS[found.kind]), h("span.row", cancel, retry, removal)),
 		problem,
-		facts({ Asked: when(found.created_at), Capture: found.capture && h("a", { href: `#/captures/${found.capture}` }, found.capture.slice(0, 8)), Method: found.options.method, Quality: found.options.quality }),
+		facts({ Asked: when(found.created_at), Capture: found.capture && h("a", { href: `#/captures/${found.capture}` }, found.capture.slice(0, 8)), Method: found.options.method, Quality: QUALITIES[found.options.quality] }),
 		links, h("div", { class: preview ? "columns" : "stack" }, preview?.panel, h("div.stack", panel, asked)),
 	);
 	watch(found);
