@@ -304,7 +304,7 @@ def test_without_webgl_the_service_draws(context: BrowserContext, service: Servi
     page.on("request", lambda one: requests.append(one.url))
     page.get_by_role("group", name="Composite.").press("ArrowRight")
     expect(page.get_by_text(EXACT)).to_be_visible(timeout=MINUTE)
-    assert f"size={SIZE[0]}" in requests[0]
+    assert f"size={SIZE[0]}" in next(url for url in requests if "/composite?" in url)
     page.get_by_role("radio", name="Camera").check()
     expect(page.get_by_text("Camera: preview")).to_be_visible(timeout=MINUTE)
     until(lambda: page.evaluate("document.querySelector('.stage img').naturalWidth === 96"))

@@ -148,7 +148,7 @@ def test_early_drag_is_drawn_as_soon_as_the_browser_can(
             page.wait_for_timeout(50)
         live.pop().continue_()
         expect(page.get_by_text("Checker: live")).to_be_visible()
-        expect(page.locator(".picture.stage canvas")).to_be_visible()
+        expect(page.locator(".picture.stage canvas").first).to_be_visible()
         page.unroute("**/composite?*")
         for route in held:
             route.continue_()
