@@ -64,7 +64,7 @@ def test_running_job_is_followed_across_a_reload(
     with paused(service):
         job = service.client.recover(ready[0], quality="fast")["id"]
         desk.goto(f"{service.url}/#/jobs")
-        card = desk.locator(f'a[href="#/jobs/{job}"]')
+        card = desk.get_by_role("main").locator(f'a[href="#/jobs/{job}"]')
         card.focus()
         desk.keyboard.press("Enter")
         expect(desk.get_by_role("button", name="Cancel")).to_be_visible()

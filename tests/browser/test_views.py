@@ -168,6 +168,6 @@ def test_names_that_look_like_html_are_shown_as_text(
     assert name in problem["detail"]
     for path in ("jobs", f"jobs/{uploaded['job']}", "captures", f"captures/{uploaded['id']}"):
         desk.goto(f"{service.url}/#/{path}")
-        expect(desk.get_by_text(name).first).to_be_visible()
+        expect(desk.get_by_role("main").get_by_text(name).first).to_be_visible()
         desk.wait_for_load_state("networkidle")
         assert desk.evaluate("window.ran") is None, path
