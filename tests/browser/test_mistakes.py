@@ -181,6 +181,7 @@ def test_reload_and_back_button_keep_the_view(desk: Page, service: Service, read
     expect(desk.get_by_role("alert")).to_contain_text("Not found")
 
 
+@pytest.mark.exhaustive
 def test_deleting_what_another_tab_deleted_succeeds(desk: Page, service: Service, ball: Path) -> None:
     capture = service.client.upload(ball)
     service.client.wait(capture["job"])

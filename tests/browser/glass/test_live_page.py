@@ -130,6 +130,7 @@ def test_drag_keys_and_wheel_move_the_backdrop(glass: Page, service: Service, re
     assert psnr(drawn(glass), at_rest) > 60
 
 
+@pytest.mark.exhaustive
 def test_built_in_backdrops_differ(glass: Page) -> None:
     radios = glass.get_by_role("radio").all()
     assert len(radios) >= 3

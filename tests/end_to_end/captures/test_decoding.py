@@ -97,6 +97,7 @@ def peak_memory(one: psutil.Process) -> int:
     return int(found[1]) << 10
 
 
+@pytest.mark.exhaustive
 @pytest.mark.skipif(sys.platform != "linux", reason="it is Linux that limits what a process takes")
 def test_film_that_needs_too_much_memory_fails_only_its_job(
     capture_archive: Path, program: Program, tmp_path: Path

@@ -115,6 +115,7 @@ def test_cancelled_ingest_leaves_nothing(service: Service, capture: str, capture
     until(lambda: not any(uploaded["id"] in name for name in service.stored() - before))
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_ingest_that_failed_for_a_passing_reason_can_be_retried(
     capture_archive: Path, tmp_path: Path
