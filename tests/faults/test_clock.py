@@ -61,7 +61,7 @@ def filmed(archive: Path, width: int, height: int) -> Path:
 def test_jobs_and_upload_go_on_when_the_clock_jumps(tmp_path: Path, faketime: Path, table: list[Row]) -> None:
     clock = Clock(faketime, tmp_path / "offset")
     row = Row("clock an hour forward and back")
-    archive = filmed(tmp_path / "ball.zip", 64, 48)
+    archive = filmed(tmp_path / "ball.zip", 32, 24)
     content = archive.read_bytes()
     middle = len(content) // 2
     with serving(tmp_path / "data", **clock.environment) as service:
