@@ -56,9 +56,7 @@ def surroundings(stack: Stack, width: float) -> Surroundings | None:
     width : float
         Standard deviation of the Gaussian that the brightness is a mean by, as a share of the frame's width.
     """
-    from scipy.ndimage import (
-        gaussian_filter,
-    )  # takes long to import, and only captures with tone mapping need it
+    from scipy.ndimage import gaussian_filter  # takes long to import, and few processes need it
 
     thumbnails = stack.thumbnails()
     if thumbnails is None:

@@ -11,7 +11,7 @@ from pydantic import TypeAdapter
 from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import Curve, table
-from workflows.ingest.local_gain import local_gain
+from workflows.ingest.local_gain import Surroundings
 from workflows.programs.border import border_light
 from workflows.programs.program import Program
 from workflows.recovery.normalise import Conditions
@@ -69,11 +69,22 @@ def exposures_of(attributes: dict[str, Any]) -> Floats:
     return exposures
 
 
-def read_light(stack: Stack, span: tuple[slice, slice], program: Program) -> tuple[Light, Bools]:
+def read_light(
+    stack: Stack, span: tuple[slice, slice], program: Program, gain: Surroundings | None
+) -> tuple[Light, Bools]:
     """The light of each pattern at the pixels of a rectangle that are to be recovered, and their (y, x) bool mask.
 
     Drift, flicker and local tone mapping are corrected if `workflows.ingest.report.steadiness` was certain of them,
     crosstalk always.
+
+    Parameters
+    ----------
+    stack : Stack
+    span : (slice, slice)
+        Rows and columns.
+    program : Program
+    gain : Surroundings or None
+        As from `workflows.ingest.local_gain.local_gain`.
 
     Raises
     ------
@@ -83,7 +94,7 @@ def read_light(stack: Stack, span: tuple[slice, slice], program: Program) -> tup
     attributes = stack.attributes
     shifts = attributes.get("shifts")
     look_up = look_up_of(stack)
-    top, gain = clipped_from(stack), local_gain(stack)
+    top = clipped_from(stack)
 
     def flatten(light: Floats, frame: int) -> Floats:
         if gain is not None:
@@ -110,8 +121,7 @@ def read_light(stack: Stack, span: tuple[slice, slice], program: Program) -> tup
             return flatten(values[recovered], frame), whole[recovered]
 
         frame_of = in_place
-    y, x = np.nonzero(recovered)
-    y, x = y + (span[0].start or 0), x + (span[1].start or 0)
+    y, x = (at + (given.start or 0) for at, given in zip(np.nonzero(recovered), span, strict=True))
     return light_of(frame_of, attributes, program, int(recovered.sum())), recovered
 
 

@@ -12,6 +12,7 @@ from storage.layout.captures import Stack
 from storage.layout.mattes import Block, Matte
 from storage.objects.store import Objects
 from workflows.images.tone_curves import Curve, to_light
+from workflows.ingest.local_gain import Surroundings, local_gain
 from workflows.ingest.measured_light import conditions_of, read_light
 from workflows.mattes.options import RecoveryOptions
 from workflows.programs.program import Program
@@ -86,7 +87,7 @@ def _recover_block(
     program, monitor = program_of(objects, capture)
     attributes = stack.attributes
     noise = Noise(**attributes["noise"])
-    (light, usable, worth), recovered = read_light(stack, span, program)
+    (light, usable, worth), recovered = read_light(stack, span, program, gain_of(objects, capture))
     crosstalk = np.array(attributes["crosstalk"])
     numbers, sent = program.constants_among(attributes["patterns"])
     photometry = fit_photometry(
@@ -168,6 +169,12 @@ def patterns_of(objects: Objects, capture: str) -> Patterns:
     patterns = lay_out(program, monitor, _images_of(objects, capture))
     glare = Stack(objects, capture).attributes.get("glare")
     return filter_patterns(patterns, spread_patterns(patterns), glare) if glare else patterns
+
+
+@lru_cache(maxsize=1)
+def gain_of(objects: Objects, capture: str) -> Surroundings | None:
+    """The gain of a capture's camera at each place of its frames, if it mapped tones."""
+    return local_gain(Stack(objects, capture))
 
 
 def _images_of(objects: Objects, capture: str) -> list[NDArray[np.float32]]:

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from datetime import UTC, datetime
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import anyio.to_thread
 from fastapi import APIRouter, Body, Request, Response
@@ -32,12 +32,9 @@ class Link(BaseModel):
     expires_at: datetime
 
     @classmethod
-    def fields(cls, row: Row[Any]) -> dict[str, Any]:
-        """The fields that a row has."""
-        times = {
-            name: datetime.fromtimestamp(getattr(row, name), UTC) for name in ("created_at", "expires_at")
-        }
-        return {"id": row.id, **times}
+    def of(cls, row: Row[Any], **paths: str) -> Self:
+        created, expires = (datetime.fromtimestamp(at, UTC) for at in (row.created_at, row.expires_at))
+        return cls(id=row.id, created_at=created, expires_at=expires, **paths)
 
 
 class NewLink(Link):
@@ -69,7 +66,7 @@ def create_link(context: OwnerContext, id: str, days: Days = 30) -> NewLink:
     with writing(context.engine) as c:
         mattes.get_ready(c, id)
         token, row = links.create(c, id, days * DAY)
-    return NewLink(**Link.fields(row), path=f"/share/{token}", embed=f"/embed/{token}")
+    return NewLink.of(row, path=f"/share/{token}", embed=f"/embed/{token}")
 
 
 @router.get("/mattes/{id}/links")
@@ -77,7 +74,7 @@ def list_links(context: OwnerContext, id: str) -> Links:
     """The links to the matte that have not expired, newest first."""
     with reading(context.engine) as c:
         mattes.get(c, id)
-        return Links(links=[Link(**Link.fields(row)) for row in links.list_all(c, id)])
+        return Links(links=[Link.of(row) for row in links.list_all(c, id)])
 
 
 @router.delete("/mattes/{id}/links/{link}", status_code=204)

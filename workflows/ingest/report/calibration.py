@@ -11,7 +11,7 @@ from pydantic import TypeAdapter
 from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import Curve, Response, estimate, table, to_light
-from workflows.ingest.local_gain import local_gain
+from workflows.ingest.local_gain import Surroundings, local_gain
 from workflows.ingest.measured_light import clipped_from, exposures_of
 from workflows.ingest.report.border_exposure import TRIFLE, BorderValues, relative_to_white
 from workflows.ingest.report.camera_curve import HalfTones, Shown, are_scaled, fit_camera_curve
@@ -84,7 +84,7 @@ def measure(
     some = grey if np.count_nonzero(grey) >= 4 else np.ones_like(grey)
     noise = estimate_noise(light[:, some], shown[some], usable[:, some], 1 / (top - black))
     if filmed is not None and not is_free(exposed):
-        noise = _compressed(stack, *filmed, look_up, exposed, frames, shown, noise)
+        noise = _compressed(stack, *filmed, look_up, gain, exposed, frames, shown, noise)
     stack.annotate(
         monitor_curve=_as_json(found.monitor),
         camera_curve=_as_json(found.camera),
@@ -206,6 +206,7 @@ def _compressed(
     filmed: Codes,
     places: NDArray[np.intp],
     look_up: NDArray[np.float32],
+    gain: Surroundings | None,
     exposed: NDArray[np.float64] | None,
     constants: Sequence[int],
     shown: NDArray[np.float32],
@@ -215,7 +216,7 @@ def _compressed(
 
     Each mean frame counts as one frame, because averaging does not remove compression noise.
     """
-    light, gain = look_up[filmed], local_gain(stack)
+    light = look_up[filmed]
     if gain is not None:
         light /= gain.at(*places).T[..., np.newaxis]
     if exposed is not None:
