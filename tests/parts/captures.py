@@ -1,11 +1,14 @@
 """Programs and capture archives for tests."""
 
 import io
+import json
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
+from workflows.images.integer_formats import encode_png
 from workflows.programs.program import Bernoulli, Constant, Monitor, Program
 
 
@@ -35,6 +38,28 @@ def nested_program(
     ]
     constant = Constant(kind="constant", levels=tuple(np.linspace(0, 1, levels).round(6).tolist()))
     return Program(monitor=Monitor(width=monitor[0], height=monitor[1]), parts=(constant, *grids))
+
+
+def captured(program: Program, see: Callable[[int, NDArray[np.uint8]], NDArray[np.floating]]) -> bytes:
+    """The archive of a capture in linear light, 16 bits deep.
+
+    Parameters
+    ----------
+    see : callable
+        Returns what the camera makes of a pattern, (height, width, channels), 1 being full scale, by its number and its
+        picture. It is called for one after another.
+    """
+    record = {
+        "format": "envmatte-capture/1",
+        "program": program.model_dump(mode="json"),
+        "frames": [{"file": f"{n}.png", "pattern": n} for n in range(program.count)],
+        "response": "linear",
+    }
+    files = {"capture.json": json.dumps(record).encode()}
+    for n, picture in enumerate(program.pictures(0, program.count)):
+        codes = np.rint(np.clip(see(n, picture), 0, 1) * 65535).astype(np.uint16)
+        files[f"{n}.png"] = encode_png(codes)
+    return zip_bytes(files)
 
 
 def zip_bytes(files: Mapping[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:

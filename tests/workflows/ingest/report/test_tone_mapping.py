@@ -1,19 +1,16 @@
 """Captures of a camera that brightens what is dark around a place: its power is measured, and nothing is else."""
 
-import io
-import json
-import zipfile
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from storage.layout.captures import Stack
-from tests.parts.captures import nested_program
-from workflows.images.integer_formats import encode_png
+from tests.parts.captures import captured, nested_program
 from workflows.images.tone_curves import to_light
 from workflows.ingest.local_gain import surroundings
 from workflows.ingest.report.report import report
@@ -43,24 +40,16 @@ def program() -> Program:
 
 def filmed(scene: Scene, program: Program, power: float = 0.0, sharpening: float = 0.0) -> bytes:
     """A capture of linear light: a gain follows the brightness around a place, then edges are sharpened."""
-    rng, target = np.random.default_rng(5), io.BytesIO()
-    with zipfile.ZipFile(target, "w") as archive:
-        frames = [{"file": f"{n}.png", "pattern": n} for n in range(program.count)]
-        record = {
-            "format": "envmatte-capture/1",
-            "program": program.model_dump(mode="json"),
-            "frames": frames,
-            "response": "linear",
-        }
-        archive.writestr("capture.json", json.dumps(record))
-        for n, picture in enumerate(program.pictures(0, program.count)):
-            light = 0.03 + 0.65 * scene.composite(to_light(picture, "srgb").astype(np.float32))
-            near = gaussian_filter(light.mean(axis=2) ** (1 / 2.2), WIDTH / 10)
-            light = light * ((near + 0.05)[..., np.newaxis] / 0.6) ** -power
-            light = light + sharpening * (light - gaussian_filter(light, (1, 1, 0)))
-            value = light + NOISE * rng.standard_normal(light.shape)
-            archive.writestr(f"{n}.png", encode_png(np.rint(np.clip(value, 0, 1) * 65535).astype(np.uint16)))
-    return target.getvalue()
+    rng = np.random.default_rng(5)
+
+    def see(n: int, picture: NDArray[np.uint8]) -> NDArray[np.floating]:
+        light = 0.03 + 0.65 * scene.composite(to_light(picture, "srgb").astype(np.float32))
+        near = gaussian_filter(light.mean(axis=2) ** (1 / 2.2), WIDTH / 10)
+        light = light * ((near + 0.05)[..., np.newaxis] / 0.6) ** -power
+        light = light + sharpening * (light - gaussian_filter(light, (1, 1, 0)))
+        return light + NOISE * rng.standard_normal(light.shape)
+
+    return captured(program, see)
 
 
 def left_by(power: float, pixels: int = 400, frames: int = 40) -> tuple[Stack, Rest, Sample]:

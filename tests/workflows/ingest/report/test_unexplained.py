@@ -1,8 +1,5 @@
 """Captures with glare, with noise that constant frames don't tell, and with errors of the model: all are measured."""
 
-import io
-import json
-import zipfile
 from collections.abc import Callable
 
 import numpy as np
@@ -11,8 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from storage.layout.captures import Stack
-from tests.parts.captures import nested_program
-from workflows.images.integer_formats import encode_png
+from tests.parts.captures import captured, nested_program
 from workflows.images.tone_curves import to_light
 from workflows.ingest.report import unexplained
 from workflows.programs.program import Constant, Program
@@ -50,27 +46,20 @@ def filmed(
 
     Constant frames show a share of the noise.
     """
-    rng, target, sigma = np.random.default_rng(7), io.BytesIO(), WIDTHS[1] * MONITOR[0]
-    with zipfile.ZipFile(target, "w") as archive:
-        frames = [{"file": f"{n}.png", "pattern": n} for n in range(program.count)]
-        record = {
-            "format": "envmatte-capture/1",
-            "program": program.model_dump(mode="json"),
-            "frames": frames,
-        }
-        archive.writestr("capture.json", json.dumps(record | {"response": "linear"}))
-        inside = gaussian_filter(np.ones(MONITOR[::-1]), sigma, mode="constant")[..., np.newaxis]
-        for n, picture in enumerate(program.pictures(0, program.count)):
-            light = to_light(picture, "srgb")
-            blurred = gaussian_filter(light, (sigma, sigma, 0), mode="constant") / inside
-            seen = scene.composite(((1 - glare) * light + glare * blurred).astype(np.float32))
-            if n in program.measured:
-                seen = seen * (1 + error * rng.standard_normal((HEIGHT, WIDTH, 1)))
-            value = (0.02 + 0.7 * seen)[..., :channels]
-            seen_noise = noise if n in program.measured else shown * noise
-            value = value + seen_noise * rng.standard_normal(value.shape)
-            archive.writestr(f"{n}.png", encode_png(np.rint(np.clip(value, 0, 1) * 65535).astype(np.uint16)))
-    return target.getvalue()
+    rng, sigma = np.random.default_rng(7), WIDTHS[1] * MONITOR[0]
+    inside = gaussian_filter(np.ones(MONITOR[::-1]), sigma, mode="constant")[..., np.newaxis]
+
+    def see(n: int, picture: NDArray[np.uint8]) -> NDArray[np.floating]:
+        light = to_light(picture, "srgb")
+        blurred = gaussian_filter(light, (sigma, sigma, 0), mode="constant") / inside
+        seen = scene.composite(((1 - glare) * light + glare * blurred).astype(np.float32))
+        if n in program.measured:
+            seen = seen * (1 + error * rng.standard_normal((HEIGHT, WIDTH, 1)))
+        value = (0.02 + 0.7 * seen)[..., :channels]
+        seen_noise = noise if n in program.measured else shown * noise
+        return value + seen_noise * rng.standard_normal(value.shape)
+
+    return captured(program, see)
 
 
 def deviation(stack: Stack) -> NDArray[np.float64]:
