@@ -7,6 +7,8 @@ import sys
 from collections.abc import Iterator
 
 import pytest
+from xdist.remote import Producer
+from xdist.scheduler import LoadFileScheduling
 
 from storage.database.engine import open_engine
 from tests.parts import postgres
@@ -14,6 +16,8 @@ from tests.parts.s3 import s3, s3_server
 
 EXHAUSTIVE = 3
 """Value of ``--times`` from which on exhaustive tests run too."""
+SERVED = ("end_to_end", "browser")
+"""Folders whose tests share a service."""
 KERNELS = pytest.StashKey["subprocess.Popen[bytes]"]()
 __all__ = ["postgresql", "postgresql_server", "s3", "s3_server"]
 
@@ -42,6 +46,19 @@ def pytest_xdist_setupnodes(config: pytest.Config) -> None:
         stderr=subprocess.DEVNULL,
         start_new_session=True,
     )
+
+
+class OneService(LoadFileScheduling):
+    """Gives whole files to a process, and all tests of one service to the same, so that it starts once."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        folder = nodeid.split("/")[1]
+        return folder if folder in SERVED else super()._split_scope(nodeid)
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> OneService | None:
+    """Share services in the default run, which tests each for seconds only; slow tests are spread over processes."""
+    return None if config.getoption("--all") else OneService(config, log)
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:

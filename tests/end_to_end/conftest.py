@@ -18,6 +18,7 @@ from services.client import Client
 from storage.objects.checksums import SUFFIX
 from tests.parts.background import repeating
 from tests.parts.captures import nested_program
+from tests.parts.waiting import until
 from tests.services.cluster.clusters import workers
 from workflows.images import integer_formats
 from workflows.images.tone_curves import from_light
@@ -117,10 +118,8 @@ def paused(service: Service) -> Iterator[None]:
             with suppress(psutil.NoSuchProcess):
                 worker.suspend()
 
-    held = workers(service.process)
-    assert held
-    for worker in held:
-        worker.suspend()
+    until(lambda: workers(service.process))  # one that was idle or killed may just be replaced
+    hold()
     try:
         with repeating(hold, 0.1):
             yield
