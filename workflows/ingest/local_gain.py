@@ -72,7 +72,7 @@ def surroundings(stack: Stack, width: float) -> Surroundings | None:
 
 
 def local_gain(stack: Stack) -> Surroundings | None:
-    """The gain of the camera at each place of each frame, if `workflows.ingest.report.tone_mapping` has found one.
+    """The gain of the camera at each place of each frame, if `workflows.ingest.trial.tone_mapping` has found one.
 
     Notes
     -----

@@ -74,7 +74,7 @@ def read_light(
 ) -> tuple[Light, Bools]:
     """The light of each pattern at the pixels of a rectangle that are to be recovered, and their (y, x) bool mask.
 
-    Drift, flicker and local tone mapping are corrected if `workflows.ingest.report.steadiness` was certain of them,
+    Drift, flicker and local tone mapping are corrected if `workflows.ingest.trial.steadiness` was certain of them,
     crosstalk always.
 
     Parameters

@@ -17,10 +17,10 @@ from workflows.images.resample import smallest_grid
 from workflows.images.tone_curves import Response
 from workflows.ingest import films, stills
 from workflows.ingest.archive import CaptureArchive
+from workflows.ingest.camera.calibration import measure
 from workflows.ingest.manifest import MANIFEST
-from workflows.ingest.report.calibration import measure
-from workflows.ingest.report.recovery_time import core_seconds
 from workflows.ingest.report.survey import survey
+from workflows.ingest.trial.recovery_time import core_seconds
 from workflows.ingest.video.border_reader import LOOKS
 from workflows.ingest.video.frame_means import Share
 from workflows.ingest.video.matching import MAX_PATTERNS, MatchedFrames, match_frames

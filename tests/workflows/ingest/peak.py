@@ -13,7 +13,7 @@ from pathlib import Path
 from storage.layout.captures import Stack
 from storage.objects.store import Objects
 from workflows.ingest import steps as ingest_steps
-from workflows.ingest.report.calibration import measure
+from workflows.ingest.camera.calibration import measure
 from workflows.jobs import Task
 from workflows.untrusted.limits import Limits
 

@@ -32,7 +32,7 @@ def expected(
     survey : dict
         See `workflows.ingest.report.survey`.
     model_error : float
-        See `workflows.ingest.report.unexplained`, as a share of rho.
+        See `workflows.ingest.trial.unexplained`, as a share of rho.
     pattern_error : float, optional
         See there, in camera units.
     exposures : sequence of float, optional

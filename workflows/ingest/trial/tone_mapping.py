@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
 from workflows.ingest.local_gain import surroundings
-from workflows.ingest.report.trial_recovery import HUBER, Doubles, Floats, Sample
-from workflows.ingest.report.unexplained import DETAIL, MIN_FLAT, Rest
+from workflows.ingest.trial.trial_recovery import HUBER, Doubles, Floats, Sample
+from workflows.ingest.trial.unexplained import DETAIL, MIN_FLAT, Rest
 
 WIDTHS = (1 / 40, 1 / 20, 1 / 10)
 """Widths of the surroundings that are tried, as shares of the frame's width,"""

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from workflows.images.tone_curves import Curve, Gamma, Sampled, from_light, to_light
-from workflows.ingest.report.camera_curve import HalfTones, Shown, are_scaled, fit_camera_curve
+from workflows.ingest.camera.curve import HalfTones, Shown, are_scaled, fit_camera_curve
 from workflows.programs.parts import Halftone, Monitor
 
 SHARES = (0.25, 0.5, 0.75)

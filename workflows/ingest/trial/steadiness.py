@@ -10,11 +10,11 @@ from pydantic import TypeAdapter
 
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import Curve
+from workflows.ingest.camera.border_exposure import shortest_white
+from workflows.ingest.camera.calibration import is_free, measure
 from workflows.ingest.measured_light import black_patterns
-from workflows.ingest.report.border_exposure import shortest_white
-from workflows.ingest.report.calibration import is_free, measure
-from workflows.ingest.report.tone_mapping import find_tone_mapping
-from workflows.ingest.report.trial_recovery import (
+from workflows.ingest.trial.tone_mapping import find_tone_mapping
+from workflows.ingest.trial.trial_recovery import (
     FURTHEST,
     Doubles,
     Sample,
@@ -23,7 +23,7 @@ from workflows.ingest.report.trial_recovery import (
     take_sample,
     try_recovery,
 )
-from workflows.ingest.report.unexplained import Unexplained, find_unexplained
+from workflows.ingest.trial.unexplained import Unexplained, find_unexplained
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out
 from workflows.recovery.sensing import Patterns

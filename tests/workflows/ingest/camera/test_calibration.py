@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import table
-from workflows.ingest.report.calibration import MOST_APART, measure
+from workflows.ingest.camera.calibration import MOST_APART, measure
 from workflows.programs.border import border_light
 from workflows.programs.presets import preset
 from workflows.recovery.noise import Noise

@@ -9,9 +9,9 @@ import pytest
 
 from storage.layout.captures import Stack
 from tests.parts.captures import nested_program
-from workflows.ingest.report import recovery_time
-from workflows.ingest.report.recovery_time import core_seconds
-from workflows.ingest.report.trial_recovery import take_sample
+from workflows.ingest.trial import recovery_time
+from workflows.ingest.trial.recovery_time import core_seconds
+from workflows.ingest.trial.trial_recovery import take_sample
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import write_capture
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import Curve
-from workflows.ingest.report.trial_recovery import (
+from workflows.ingest.trial.trial_recovery import (
     Doubles,
     Floats,
     RecoveredSample,

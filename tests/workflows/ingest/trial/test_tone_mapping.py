@@ -14,9 +14,9 @@ from tests.parts.captures import captured, nested_program
 from workflows.images.tone_curves import to_light
 from workflows.ingest.local_gain import surroundings
 from workflows.ingest.report.report import report
-from workflows.ingest.report.tone_mapping import LEAST, find_tone_mapping
-from workflows.ingest.report.trial_recovery import Sample
-from workflows.ingest.report.unexplained import Rest
+from workflows.ingest.trial.tone_mapping import LEAST, find_tone_mapping
+from workflows.ingest.trial.trial_recovery import Sample
+from workflows.ingest.trial.unexplained import Rest
 from workflows.programs.program import Program
 from workflows.recovery.noise import Noise
 from workflows.simulation.glass_ball import glass_ball

@@ -7,7 +7,7 @@ from pydantic import TypeAdapter
 
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import Curve
-from workflows.ingest.report.trial_recovery import recover_sample, take_sample
+from workflows.ingest.trial.trial_recovery import recover_sample, take_sample
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out
 from workflows.recovery.glare import filter_patterns, spread_patterns

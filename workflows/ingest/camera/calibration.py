@@ -11,10 +11,10 @@ from pydantic import TypeAdapter
 from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import Curve, Response, estimate, table, to_light
+from workflows.ingest.camera.border_exposure import TRIFLE, BorderValues, relative_to_white
+from workflows.ingest.camera.curve import HalfTones, Shown, are_scaled, fit_camera_curve
 from workflows.ingest.local_gain import Surroundings, local_gain
 from workflows.ingest.measured_light import clipped_from, exposures_of
-from workflows.ingest.report.border_exposure import TRIFLE, BorderValues, relative_to_white
-from workflows.ingest.report.camera_curve import HalfTones, Shown, are_scaled, fit_camera_curve
 from workflows.programs.program import Program
 from workflows.recovery.noise import Noise, estimate_excess
 from workflows.recovery.photometry import estimate_crosstalk, estimate_noise
@@ -47,7 +47,7 @@ def measure(
     gains : sequence of float, optional
         Gain of the monitor's light in each frame; 1 by default.
     tone_mapping : dict, optional
-        See `workflows.ingest.report.tone_mapping`.
+        See `workflows.ingest.trial.tone_mapping`.
     """
     program = Program.model_validate(stack.attributes["program"])
     filmed = _take_squares(stack) if "video" in stack.attributes else None

@@ -7,8 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from workflows.images.tone_curves import table
-from workflows.ingest.report.border_exposure import BorderValues, relative_to_white, shortest_white
-from workflows.ingest.report.steadiness import unit_of
+from workflows.ingest.camera.border_exposure import BorderValues, relative_to_white, shortest_white
 from workflows.programs.border import border_light
 from workflows.programs.presets import preset
 
@@ -69,12 +68,3 @@ def test_white_is_the_unit_of_a_camera_that_was_not_locked() -> None:
     assert shortest_white(exposures[1:23], range(1, 23), PROGRAM) is None
     without = relative_to_white(exposures[1:23], range(1, 23), PROGRAM)
     np.testing.assert_array_equal(without, exposures[1:23])
-
-
-@pytest.mark.parametrize(("shortest", "unit"), [(1.0, 0.85), (1.9, 1.0)])
-def test_gains_are_in_units_of_the_white_that_a_free_exposure_is(shortest: float, unit: float) -> None:
-    exposures, gains = np.full(PROGRAM.count, 2.0), np.ones(PROGRAM.count)
-    exposures[23], gains[[0, 23, 36]] = shortest, (0.6, 0.85, 0.6)
-    attributes = {"auto_exposure": exposures.tolist(), "patterns": list(range(PROGRAM.count))}
-    assert unit_of(gains, attributes, PROGRAM) == unit
-    assert unit_of(gains, attributes | {"auto_exposure": None}, PROGRAM) == 1

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 from storage.layout.captures import Stack
 from tests.parts.captures import captured, nested_program
 from workflows.images.tone_curves import to_light
-from workflows.ingest.report import unexplained
+from workflows.ingest.trial import unexplained
 from workflows.programs.program import Constant, Program
 from workflows.recovery.glare import WIDTHS
 from workflows.simulation.glass_ball import glass_ball
