@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from tests.end_to_end.conftest import BANDS
-from tests.faults.rig import Rig, Row
 from tests.parts.captures import nested_program
+from tests.parts.rig import Rig, Row
 from workflows.simulation import glass_ball
 from workflows.simulation.scene import write_capture
 

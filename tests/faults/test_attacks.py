@@ -26,8 +26,8 @@ from storage.objects.store import Objects
 from storage.records import api_keys, captures, mattes
 from tests.conftest import EXHAUSTIVE
 from tests.end_to_end.conftest import BANDS, Service, serving
-from tests.faults.callers import PATIENCE
 from tests.parts.background import repeating
+from tests.parts.callers import PATIENCE
 from tests.parts.captures import nested_program
 from tests.parts.hostile_mattes import hostile_archive, large_matte
 from tests.parts.processes import running
@@ -198,7 +198,7 @@ def under_attack(attacked: Attacked, *paths: str) -> Iterator[Counter[str]]:
     command = [
         sys.executable,
         "-m",
-        "tests.faults.callers",
+        "tests.parts.callers",
         netloc,
         key,
         str(CALLERS),

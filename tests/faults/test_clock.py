@@ -9,7 +9,7 @@ import pytest
 from storage.objects.store import Objects
 from tests.end_to_end.conftest import serving
 from tests.faults.conftest import check
-from tests.faults.rig import Row, stored
+from tests.parts.rig import Row, stored
 from tests.parts.waiting import until
 from workflows.programs.presets import preset
 from workflows.simulation import glass_ball

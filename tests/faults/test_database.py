@@ -10,8 +10,8 @@ import pytest
 from services.client import Client
 from storage.objects.store import Objects
 from tests.faults.conftest import Prepared, check, prepare
-from tests.faults.rig import Rig, Row, freeze, thaw
 from tests.parts.postgres import TEMPLATE, Server
+from tests.parts.rig import Rig, Row, freeze, thaw
 from tests.parts.waiting import until
 
 pytestmark = pytest.mark.timeout(3600)

@@ -14,8 +14,8 @@ from storage.layout import mattes
 from storage.objects.store import Objects
 from tests.end_to_end.conftest import Service, paused, serving
 from tests.faults.conftest import check
-from tests.faults.rig import Row, stored
 from tests.parts.disks import small_disk
+from tests.parts.rig import Row, stored
 from tests.parts.waiting import until
 
 pytestmark = pytest.mark.timeout(900)

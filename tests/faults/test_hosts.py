@@ -9,8 +9,8 @@ import pytest
 from storage.database.engine import open_engine, reading
 from storage.records import leases
 from tests.faults.conftest import Prepared, check, prepare
-from tests.faults.hosts import Hosts
-from tests.faults.rig import Row
+from tests.parts.hosts import Hosts
+from tests.parts.rig import Row
 from tests.parts.waiting import until
 
 pytestmark = pytest.mark.timeout(3600)

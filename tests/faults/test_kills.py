@@ -16,8 +16,8 @@ from storage.objects.store import Objects
 from tests.conftest import EXHAUSTIVE
 from tests.end_to_end.conftest import serving
 from tests.faults.conftest import Prepared, check
-from tests.faults.rig import Row, freeze, stored, thaw
 from tests.parts.background import repeating
+from tests.parts.rig import Row, freeze, stored, thaw
 from tests.parts.waiting import until
 from tests.services.cluster.clusters import running
 

@@ -10,7 +10,7 @@ import pytest
 
 from tests.end_to_end.conftest import digests, serving
 from tests.faults.conftest import check
-from tests.faults.rig import Row
+from tests.parts.rig import Row
 from tests.parts.waiting import until
 
 pytestmark = pytest.mark.timeout(1800)

@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from tests.faults.conftest import Prepared, check, prepare
-from tests.faults.rig import Rig, Row
+from tests.parts.rig import Rig, Row
 from tests.parts.s3 import BUCKET, KEYS
 
 pytestmark = [pytest.mark.timeout(3600), pytest.mark.exhaustive]

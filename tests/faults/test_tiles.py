@@ -11,8 +11,8 @@ from distributed import Client
 
 from services.coordinator.job_run import LOSSES
 from tests.faults.conftest import Prepared, check
-from tests.faults.rig import Rig, Row
 from tests.parts.background import repeating
+from tests.parts.rig import Rig, Row
 from tests.services.cluster.clusters import listening
 
 pytestmark = pytest.mark.timeout(900)

@@ -7,7 +7,7 @@ import pytest
 
 from services.client import Client
 from tests.faults.conftest import Prepared
-from tests.faults.rig import Rig
+from tests.parts.rig import Rig
 from tests.parts.waiting import until
 
 pytestmark = [pytest.mark.exhaustive, pytest.mark.timeout(900)]

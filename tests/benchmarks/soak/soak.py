@@ -30,7 +30,7 @@ from storage.database.engine import open_engine, reading
 from tests.benchmarks.service.traffic import Traffic
 from tests.benchmarks.soak import users
 from tests.benchmarks.soak.trends import Trend, trend
-from tests.faults.rig import free_port, url_of
+from tests.parts.rig import free_port, url_of
 from tests.services.cluster.clusters import started, workers
 from tests.services.webhooks.receivers import receiver
 

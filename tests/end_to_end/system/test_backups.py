@@ -11,8 +11,8 @@ import pytest
 
 from storage.objects.store import Objects
 from tests.end_to_end.conftest import Service, digests, paused, serving
-from tests.faults.rig import stored
 from tests.parts.postgres import Server
+from tests.parts.rig import stored
 
 pytestmark = pytest.mark.slow
 

@@ -7,7 +7,7 @@ import pytest
 from services.runtime import certificates
 from storage.objects.store import Objects
 from tests.end_to_end.conftest import Service, digests, serving
-from tests.faults.rig import stored
+from tests.parts.rig import stored
 from tests.services.cluster.clusters import address, started
 
 

@@ -6,7 +6,7 @@ from sqlalchemy import Connection
 from storage.database import rows, tables
 from storage.errors import NotFound
 from storage.records import jobs
-from tests.storage.records.planned import planned
+from tests.storage.planned import planned
 
 
 def test_ids_are_opaque_and_unique() -> None:

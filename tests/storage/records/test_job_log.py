@@ -5,7 +5,7 @@ from itertools import pairwise
 from sqlalchemy import Connection
 
 from storage.records import job_log
-from tests.storage.records.planned import planned
+from tests.storage.planned import planned
 
 
 def test_log_lines_after_a_line(connection: Connection) -> None:

@@ -8,7 +8,7 @@ from storage.database import tables
 from storage.database.rows import ROW
 from storage.errors import Conflict, NotFound
 from storage.records import jobs, tiles
-from tests.storage.records.planned import log_of, planned
+from tests.storage.planned import log_of, planned
 
 
 def test_job_from_queued_to_succeeded(connection: Connection) -> None:

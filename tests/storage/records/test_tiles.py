@@ -5,7 +5,7 @@ from sqlalchemy import Connection, select
 from storage import steps
 from storage.database import tables
 from storage.records import jobs, tiles
-from tests.storage.records.planned import log_of, planned
+from tests.storage.planned import log_of, planned
 
 
 def test_plan_is_added_once(connection: Connection) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.workflows.ingest.peak import peak
+from tests.parts.peak import peak
 from workflows.composite.backdrop import backdrop_of, node_light
 from workflows.composite.placement import Placement
 

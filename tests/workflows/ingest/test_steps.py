@@ -18,9 +18,8 @@ from PIL import Image
 from storage.errors import CaptureError, Corrupt, OverLimit
 from storage.layout.captures import Stack
 from storage.objects.store import Objects
+from tests.parts import peak
 from tests.parts.captures import nested_program
-from tests.workflows.ingest import peak
-from tests.workflows.ingest.records import record
 from tests.workflows.ingest.video.camera import Camera, Film, capture, film
 from tests.workflows.ingest.video.films import CAMERA, PROGRAM, IngestFilm, program_with
 from workflows.images.integer_formats import encode_png
@@ -36,6 +35,22 @@ Ingest = Callable[..., Stack]
 Put = Callable[[str, bytes], None]
 Digests = Callable[[str], dict[str, str]]
 HEIGHT, WIDTH = 21, 37
+
+
+def record(patterns: list[int], suffix: str = "png", **more: Any) -> dict[str, Any]:
+    """The capture.json of six small patterns."""
+    return {
+        "format": "envmatte-capture/1",
+        "program": {
+            "monitor": {"width": 64, "height": 48},
+            "parts": [
+                {"kind": "constant", "levels": [0, 0.5, 1]},
+                {"kind": "bernoulli", "columns": 4, "rows": 3, "count": 3, "seed": 1},
+            ],
+        },
+        "response": "linear",
+        "frames": [{"file": f"{n}.{suffix}", "pattern": p} for n, p in enumerate(patterns)],
+    } | more
 
 
 def tiff(pixels: NDArray[Any]) -> bytes:

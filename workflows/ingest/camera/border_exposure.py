@@ -13,7 +13,7 @@ from workflows.programs.program import Program
 STRIPS, WIDE = 8, 4
 """Columns of the frame that are searched for the border, and how many pixels each is wide."""
 ROUNDS = 8
-"""Rounds of fitting the light of the border and the exposures, one given the other."""
+"""Rounds of fitting the light of the border and the exposures, one given the other: without veils, then with them."""
 FOLLOWS = (0.5, 0.7)
 """A value sees the border if the bits explain this share of its variance: in the first rounds, and then."""
 VARIES = 0.01
@@ -64,17 +64,19 @@ class BorderValues:
 
         Notes
         -----
-        What a value sees of the border is linear in the bits of the pattern's number, times the exposure g of the
-        frame: ``v = g (a_0 + sum_b a_b B_b)``. The amounts a are fitted to v / g, and g to the light that they predict,
-        in turn. Values that are clipped, or nearly, are filled in by what is predicted.
+        What a value sees of the border is linear in the bits of the pattern's number. Onto it comes the veil d of the
+        frame, light of the patterns that lens and room spread, and all is times the exposure g of the frame:
+        ``v = g (a_0 + sum_b a_b B_b + d)``. The amounts a are fitted to ``v / g - d``, and then g and d, by a straight
+        line in each frame, to the light that they predict. Without d, a frame with a bright pattern would seem to be
+        exposed longer. Values that are clipped, or nearly, are filled in by what is predicted.
         """
         light = look_up[self.codes].mean(axis=2, dtype=np.float64) / self.local
         frames, terms = self.design.shape
         inverse = np.linalg.pinv(self.design)
-        exposure = np.ones(frames)
+        exposure, veil = np.ones((frames, 1)), np.zeros((frames, 1))
         predicted = self.design @ (inverse @ light)
-        for turn in range(ROUNDS):
-            even = np.where(self.usable, light / exposure[:, np.newaxis], predicted)
+        for turn in range(2 * ROUNDS):
+            even = np.where(self.usable, light / exposure - veil, predicted)
             predicted = self.design @ (inverse @ even)
             whole, rest = np.var(even, axis=0), np.var(even - predicted, axis=0)
             unexplained = rest / np.maximum(whole, 1e-12) * (frames - 1) / (frames - terms)
@@ -83,14 +85,30 @@ class BorderValues:
             border = np.flatnonzero(follows & varies & (predicted.min(axis=0) > -LEAST))
             if border.size < MIN_VALUES:
                 return None
-            seen = predicted[:, border]
-            weight = np.where(self.usable[:, border] & (seen > LEAST), seen, 0)
-            total = (weight * seen).sum(axis=1)
-            exposure = np.where(
-                total > 0, (weight * light[:, border]).sum(axis=1) / np.maximum(total, 1e-12), 1
+            exposure, veil = _lines(
+                predicted[:, border], light[:, border], self.usable[:, border], turn >= ROUNDS
             )
-            exposure = np.maximum(exposure / np.median(exposure), 1e-3)
-        return exposure
+            veil -= self.design @ (inverse @ veil)  # that part is the border's own light
+        return exposure[:, 0]
+
+
+def _lines(
+    predicted: Doubles, light: Doubles, usable: NDArray[np.bool_], veiled: bool
+) -> tuple[Doubles, Doubles]:
+    """The exposure and the veil of each frame, (frames, 1): ``light = exposure (predicted + veil)``, by least squares.
+
+    A frame without usable values has an exposure of 1 and no veil; no frame has one unless they are ``veiled``.
+    """
+    x = y = np.zeros((len(light), 1))
+    if veiled:
+        count = np.maximum(usable.sum(axis=1, keepdims=True), 1)
+        x, y = (np.where(usable, v, 0).sum(axis=1, keepdims=True) / count for v in (predicted, light))
+    off = np.where(usable, predicted - x, 0)
+    spread = (off**2).sum(axis=1, keepdims=True)
+    slope = (off * (light - y)).sum(axis=1, keepdims=True) / np.maximum(spread, 1e-12)
+    exposure = np.where(spread > 0, slope, 1)
+    exposure = np.maximum(exposure / np.median(exposure), 1e-3)
+    return exposure, np.where(veiled & (spread > 0), y / exposure - x, 0)
 
 
 def shortest_white(exposures: Doubles, patterns: Sequence[int], program: Program) -> int | None:

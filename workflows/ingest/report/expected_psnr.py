@@ -12,6 +12,9 @@ from workflows.programs.program import Bernoulli, Constant, Halftone, Program
 UNLOCKED = 0.06
 """Exposures whose standard deviation is a larger share of their mean are not those of a locked camera."""
 
+BACKDROP = 1 / 3
+"""Mean square of a backdrop's light, if all from black to white is as frequent."""
+
 _NOISE = (19.0, 0.040), (5.5, 0.0044)  # k and c at the low and the high end
 _OTHER = 3.0, -5.0  # dB by which composites are worse than patterns at the low end, and at the high end
 _FIXED_GRIDS = (0.45, 1.2), (0.00045, 0.35)  # a and b at the low and the high end
@@ -48,13 +51,13 @@ def expected(
     The squared error is modelled as ``k s^2 / m + c rho^2 / m^1.2``. The first term is noise of standard deviation s in
     about k parameters of T, S and rho. The second is what m patterns leave undetermined, in proportion to the contrast
     rho. What no T explains of the patterns is not explained of a backdrop either, and is added, as is the detail of
-    colours that a film has lost (`workflows.ingest.colour_detail`). If random patterns have
+    colours that a film has lost (`workflows.ingest.report.colour_detail`). If random patterns have
     offsets, m counts all patterns but the random ones without. Otherwise it counts all, and ``a rho^2 / n^b`` is added
     for n blocks along the monitor's shorter side in the finest grid: it is not known where in a block the light comes
     from, which costs clear glass most and frosted glass least.
 
     If the exposure was not locked, nobody knows at which one the scene is to be shown: the standard deviation of the
-    exposures, as a share of rho, is added.
+    exposures, as a share of the light of a backdrop, is added.
 
     Without random patterns, as of stripes alone, composites are about as far from the truth as patterns from what T
     predicts: of five captures by a real camera, none was more than 3.4 dB worse, where backdrops are finer than
@@ -104,5 +107,5 @@ def costs_of(
         "noise": _NOISE[0][0] * survey["deviation"] ** 2 / max(program.measured.size, 1),
         "model_error": (model_error * rho) ** 2,
         "lost_colour": survey.get("lost_colour", 0.0),
-        "auto_exposure": (spread * rho) ** 2 if spread > UNLOCKED else 0.0,
+        "auto_exposure": BACKDROP * (spread * rho) ** 2 if spread > UNLOCKED else 0.0,
     }

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
 from workflows.ingest.camera.calibration import constant_frames, measure
-from workflows.ingest.colour_detail import ColourDetail
 from workflows.ingest.local_gain import Places, local_gain
 from workflows.ingest.measured_light import clipped_from, even_out, exposures_of, look_up_of
+from workflows.ingest.report.colour_detail import ColourDetail
 from workflows.ingest.trial.steadiness import find_steadiness
 from workflows.programs.program import Program
 from workflows.recovery.noise import Noise

@@ -20,7 +20,13 @@ class Film:
 
     channels, height, width = 3, 60, 80
 
-    def __init__(self, exposures: NDArray[np.floating], border: bool = True, missing: int = 0) -> None:
+    def __init__(
+        self,
+        exposures: NDArray[np.floating],
+        border: bool = True,
+        missing: int = 0,
+        veil: NDArray[np.floating] | float = 0.0,
+    ) -> None:
         random = np.random.default_rng(2)
         self.frames = PROGRAM.count - missing
         self.attributes: dict[str, Any] = {"patterns": list(range(missing, PROGRAM.count))}
@@ -29,6 +35,7 @@ class Film:
             lit = border_light(range(PROGRAM.count))[:, missing:] > 0
             of_column = lit[np.arange(80) // 4 % len(lit)]  # a cell is four pixels wide
             light[:, :5] = light[:, 55:] = np.where(of_column, 0.3, 0.03).T[:, np.newaxis, :, np.newaxis]
+        light += np.broadcast_to(veil, PROGRAM.count)[missing:, np.newaxis, np.newaxis, np.newaxis]
         light *= np.asarray(exposures)[: self.frames, np.newaxis, np.newaxis, np.newaxis]
         light += 0.002 * random.standard_normal(light.shape)
         self.codes = np.interp(light, LOOK_UP, np.arange(65536)).round().astype(np.uint16)
@@ -44,6 +51,14 @@ def test_exposures_are_followed_by_the_border(missing: int) -> None:
     assert found is not None
     true = drift[: PROGRAM.count - missing]
     np.testing.assert_allclose(found, true / np.median(true), rtol=0.02)
+
+
+def test_veil_of_bright_patterns_is_no_exposure() -> None:
+    drift = np.exp(np.linspace(-0.03, 0.03, PROGRAM.count))
+    veil = 0.02 * np.random.default_rng(4).random(PROGRAM.count)
+    found = BorderValues(Film(drift, veil=veil), PROGRAM).exposures(LOOK_UP)  # type: ignore[arg-type]
+    assert found is not None
+    np.testing.assert_allclose(found, drift / np.median(drift), rtol=0.01)
 
 
 def test_frames_exposed_half_as_long_and_twice_are_followed() -> None:

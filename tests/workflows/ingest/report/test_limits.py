@@ -8,7 +8,7 @@ import pytest
 
 from storage.layout.captures import Stack
 from tests.parts.captures import nested_program
-from tests.workflows.ingest.report.test_unexplained import filmed
+from tests.workflows.ingest.trial.test_unexplained import filmed
 from workflows.ingest.report.figures import Finding, Quality, ToneCurve
 from workflows.ingest.report.limits import lost_colour, quality, unexplained
 from workflows.ingest.report.report import Report, report

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from workflows.ingest.colour_detail import ColourDetail
+from workflows.ingest.report.colour_detail import ColourDetail
 
 ALL = np.ones((64, 96), bool)
 

@@ -16,7 +16,7 @@ import httpx2
 import pytest
 
 from services.runtime import certificates
-from tests.faults.rig import Rig, free_port, url_of
+from tests.parts.rig import Rig, free_port, url_of
 
 HOSTS = ("scheduler", "service0", "worker0", "worker1")
 """One host for each process."""

@@ -1,6 +1,6 @@
 """Callers that ask a service for the same paths again and again, in a process of their own until its stdin is closed.
 
-``python -m tests.faults.callers NETLOC KEY COUNT BODY PATH...`` prints how many answers had which status, as JSON. A
+``python -m tests.parts.callers NETLOC KEY COUNT BODY PATH...`` prints how many answers had which status, as JSON. A
 path of a composite is asked for with the contents of the file BODY. They are nice, because real callers take no cores
 of the service's.
 """
