@@ -15,9 +15,9 @@ Every layer has the frame's size. All values are linear light or plain numbers; 
 ``all.exr`` has the channels ``R``, ``G``, ``B``, ``A``: the glass before a white monitor, so that whatever opens an
 EXR shows something, and alpha; ``S.R`` to ``S.B``, ``rho.R`` to ``rho.B``, ``confidence.Y``; and of each lobe, from
 ``lobe0``, the heaviest, on, ``lobe0.u``, ``.v``, ``.weight.R`` to ``.weight.B``, ``.sigma_u``, ``.sigma_v``,
-``.theta``, see :func:`~workflows.recovery.lobe_table.ranked_lobes`. A pixel of fewer lobes has zeros in the others. One
-part with names of the form ``layer.channel`` is what compositors show as layers; of several parts some read the first
-alone. Places (u and v) have 32 bits, for half a float is too coarse for a monitor's pixels; all else has 16.
+``.theta``, see :func:`~workflows.recovery.clusters.lobe_table.ranked_lobes`. A pixel of fewer lobes has zeros in the
+others. One part with names of the form ``layer.channel`` is what compositors show as layers; of several parts some read
+the first alone. Places (u and v) have 32 bits, for half a float is too coarse for a monitor's pixels; all else has 16.
 
 Positions are those of an STMap: 0 to 1 over the backdrop, the origin at its bottom left, and the centre of column x of
 a backdrop w wide at ``(x + 0.5) / w``. The map takes the heaviest lobe, not the mean of the row: between what a pixel
@@ -53,7 +53,7 @@ from workflows.images import integer_formats
 from workflows.images.exr_writer import Types, write_exr
 from workflows.interruption import checkpoint
 from workflows.mattes.lobes import block_lobes
-from workflows.recovery.lobe_table import FIELDS
+from workflows.recovery.clusters.lobe_table import FIELDS
 
 NAMES = ("S", "rho", "alpha", "confidence")
 """The layers that are files of their own, as PNG and as EXR."""

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from storage.layout.mattes import Block, Matte
 from workflows.interruption import checkpoint
-from workflows.recovery.lobe_table import FIELDS, ranked_lobes
+from workflows.recovery.clusters.lobe_table import FIELDS, ranked_lobes
 from workflows.recovery.transport import Transport
 
 
@@ -21,7 +21,7 @@ def block_lobes(matte: Matte, block: Block, most: int) -> NDArray[np.float32]:
     Returns
     -------
     (h, w, most, 8) float32
-        See :func:`~workflows.recovery.lobe_table.ranked_lobes`.
+        See :func:`~workflows.recovery.clusters.lobe_table.ranked_lobes`.
     """
     width, height = matte.attributes["monitor"]
     lobes = ranked_lobes(rows_of(matte, block), most, height / width, checkpoint)

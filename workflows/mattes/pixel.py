@@ -9,7 +9,7 @@ from scipy.sparse import csr_array, diags_array, vstack
 
 from storage.errors import InvalidInput
 from storage.layout.mattes import Matte
-from workflows.recovery.lobe_table import ranked_lobes
+from workflows.recovery.clusters.lobe_table import ranked_lobes
 from workflows.recovery.pyramid import Pyramid
 from workflows.recovery.transport import Transport
 
@@ -39,7 +39,7 @@ class Pixel:
     weight : (n, 3) float32
         Their shares of each channel's light.
     lobes : (k, 8) float32
-        See :func:`~workflows.recovery.lobe_table.ranked_lobes`.
+        See :func:`~workflows.recovery.clusters.lobe_table.ranked_lobes`.
     """
 
     x: int

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from workflows.recovery.lobe_table import FIELDS, ranked_lobes
+from workflows.recovery.clusters.lobe_table import FIELDS, ranked_lobes
 from workflows.recovery.pyramid import Pyramid
 from workflows.recovery.transport import Transport
 
