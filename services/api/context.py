@@ -14,7 +14,7 @@ from sqlalchemy import Connection, Engine
 
 from services.api.auth import ADMIN, Caller, bearer, check_method, identify, require_scope
 from services.api.http.browser_security import require_own_site
-from services.api.together import Together
+from services.api.http.together import Together
 from services.api.work import Shares, run
 from services.decoding.pool import Decoders
 from services.settings import Settings

@@ -7,7 +7,7 @@ from itertools import count
 
 import pytest
 
-from services.api.together import INTERVAL, Together
+from services.api.http.together import INTERVAL, Together
 from storage.errors import NotFound
 
 
