@@ -16,7 +16,7 @@ from services.runtime.logs import about
 from services.runtime.problems import problem_of
 from storage import steps as job_steps
 from storage.errors import EnvmatteError, GaveUp, Unavailable
-from storage.records import job_log, jobs
+from storage.records import jobs
 from storage.records import tiles as tile_records
 from storage.steps import FINISH, PREPARE
 from workflows.jobs import Task, order
@@ -224,7 +224,7 @@ class JobRun:
         tracing.past_span("queue", row.trace, row.created_at, row.started_at, job=self.job, kind=row.kind)
         self.kind.prepared(connection, self.task, plan)
         for line in plan.get("notes", ()):
-            job_log.add(connection, self.job, line)
+            jobs.log(connection, self.job, line)
         steps = self.kind.steps
         tiles = order(steps, range(plan["tiles"]))
         return self._enter(connection, steps.stage, tiles, replace(self.task, plan=plan))

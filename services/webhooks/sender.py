@@ -15,7 +15,7 @@ from services.settings import CoordinatorSettings
 from services.webhooks import safe_http
 from storage.database.engine import reading, writing
 from storage.errors import NoRoom, NotFound, OptionError, Unavailable
-from storage.records import job_log, jobs, leases, webhook_deliveries
+from storage.records import jobs, leases, webhook_deliveries
 from storage.records.leases import Superseded
 
 logger = logging.getLogger(__name__)
@@ -133,4 +133,4 @@ def _note(connection: Connection, job: str, text: str) -> None:
         jobs.get(connection, job)
     except NotFound:  # deleted since
         return
-    job_log.add(connection, job, text)
+    jobs.log(connection, job, text)

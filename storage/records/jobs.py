@@ -13,8 +13,9 @@ from sqlalchemy import Connection, Row, func, insert, select, update
 
 from storage.database.rows import ROW, find, new_id
 from storage.database.tables import jobs, tiles
+from storage.database.tables import log as lines
 from storage.errors import Conflict
-from storage.records import job_log, webhook_deliveries
+from storage.records import webhook_deliveries
 
 ACTIVE = ("queued", "running")
 
@@ -58,7 +59,7 @@ def add(
         "created_at": time.time(),
     }
     connection.execute(insert(jobs).values(row))
-    job_log.add(connection, job, "queued")
+    log(connection, job, "queued")
     return job
 
 
@@ -105,7 +106,7 @@ def enter_stage(connection: Connection, job: str, stage: str) -> bool:
     values |= {"moved_at": now, "paced_at": None}
     result = connection.execute(update(jobs).where(jobs.c.id == job, jobs.c.state.in_(ACTIVE)).values(values))
     if result.rowcount:
-        job_log.add(connection, job, stage)
+        log(connection, job, stage)
     return bool(result.rowcount)
 
 
@@ -118,7 +119,7 @@ def end(connection: Connection, job: str, state: str, problem: dict[str, Any] | 
     values["leftovers"] = state == "cancelled"
     result = connection.execute(update(jobs).where(jobs.c.id == job, jobs.c.state.in_(ACTIVE)).values(values))
     if result.rowcount:
-        job_log.add(connection, job, f"{state}: {problem['detail']}" if problem else state)
+        log(connection, job, f"{state}: {problem['detail']}" if problem else state)
         row = get(connection, job)
         if row.webhook:
             webhook_deliveries.add(connection, row)
@@ -175,7 +176,7 @@ def retry(connection: Connection, job: str, *, replan: bool = False, trace: str 
     values["row_bytes"] = jobs.c.row_bytes + ROW  # the log goes on
     values["done"] = connection.scalar(select(func.count()).where(*done))
     connection.execute(update(jobs).where(jobs.c.id == job).values(values))
-    job_log.add(connection, job, "queued again")
+    log(connection, job, "queued again")
 
 
 def delete(connection: Connection, job: str) -> None:
@@ -192,3 +193,14 @@ def delete(connection: Connection, job: str) -> None:
     if row.state in ACTIVE:
         raise Conflict(f"job {job} is {row.state}; cancel it first")
     connection.execute(jobs.delete().where(jobs.c.id == job))
+
+
+def log(connection: Connection, job: str, text: str) -> None:
+    """Add a line to a job's log."""
+    connection.execute(insert(lines).values(job=job, at=time.time(), text=text))
+
+
+def log_lines(connection: Connection, job: str, after: int, limit: int) -> Sequence[Row[Any]]:
+    """Up to `limit` lines of a job's log that follow line number `after`, oldest first."""
+    query = select(lines).where(lines.c.job == job, lines.c.line > after).order_by(lines.c.line).limit(limit)
+    return connection.execute(query).all()

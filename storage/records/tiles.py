@@ -14,8 +14,7 @@ from sqlalchemy import Column, Connection, bindparam, insert, select, update
 
 from storage.database.rows import json_bytes
 from storage.database.tables import jobs, tiles, totals
-from storage.records import job_log
-from storage.records.jobs import get
+from storage.records.jobs import get, log
 from storage.steps import FINISH, PREPARE, step_name
 
 REMAINING = ("queued", "missing")
@@ -107,7 +106,7 @@ def _record(
     if not connection.execute(update(tiles).where(*here).values({counter: counter + 1})).rowcount:
         return False
     count = connection.scalar(select(counter).where(*here)) or 0
-    job_log.add(connection, job, f"{step_name(tile)}, {what} {count} of {allowed}: {reason}")
+    log(connection, job, f"{step_name(tile)}, {what} {count} of {allowed}: {reason}")
     _count(connection, job, **{"misses" if what == "attempt" else "losses": 1})
     if count < allowed:
         return True

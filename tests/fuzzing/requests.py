@@ -15,7 +15,7 @@ from services.settings import Settings
 from storage.database.engine import open_engine, writing
 from storage.layout import composites
 from storage.objects.store import Objects
-from storage.records import job_log, jobs, mattes, programs, tiles, uploads
+from storage.records import jobs, mattes, programs, tiles, uploads
 from tests.fuzzing import changes, seeds
 from tests.fuzzing.campaign import KEPT, Refused
 from tests.workflows.mattes.imports.conftest import make_matte
@@ -196,7 +196,7 @@ class Served:
             mattes.add_imported(c, "m", matte.attributes["options"], matte.figures, 1000, None)
             jobs.add(c, "composite", "", {}, "m", None, "v", 1000)
             tiles.add_steps(c, "v")
-            job_log.add(c, "v", "a line")
+            jobs.log(c, "v", "a line")
             jobs.end(c, "v", "succeeded")
             self.program = programs.add(c, BODIES[JSON[2]]["program"])
             uploads.add(c, "u", 100, "", 1e6, None)

@@ -2,7 +2,7 @@
 
 from sqlalchemy import Connection
 
-from storage.records import job_log, jobs, tiles
+from storage.records import jobs, tiles
 
 
 def planned(connection: Connection, count: int = 3) -> str:
@@ -14,4 +14,4 @@ def planned(connection: Connection, count: int = 3) -> str:
 
 def log_of(connection: Connection, job: str) -> list[str]:
     """The lines of a job's log."""
-    return [row.text for row in job_log.lines(connection, job, 0, 100)]
+    return [row.text for row in jobs.log_lines(connection, job, 0, 100)]

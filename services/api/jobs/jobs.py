@@ -24,7 +24,7 @@ from storage.database.rows import new_id, page
 from storage.database.tables import jobs as table
 from storage.errors import Conflict
 from storage.layout import composites
-from storage.records import captures, job_log, jobs, leases, mattes
+from storage.records import captures, jobs, leases, mattes
 from storage.records.leases import Heartbeat
 from workflows.mattes.options import describe_options, parse_options
 from workflows.programs.program import Program
@@ -228,7 +228,7 @@ def get_log(
     """The log of a job, line by line."""
     with reading(context.engine) as c:
         jobs.get(c, id)
-        rows = job_log.lines(c, id, after, limit)
+        rows = jobs.log_lines(c, id, after, limit)
     return Log(lines=[Line(line=r.line, at=datetime.fromtimestamp(r.at, UTC), text=r.text) for r in rows])
 
 

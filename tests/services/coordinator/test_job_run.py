@@ -11,7 +11,7 @@ from services.coordinator.job_run import LOSSES, JobRun
 from storage.database.engine import open_engine, writing
 from storage.database.tables import tiles, totals
 from storage.errors import Corrupt, Unavailable
-from storage.records import captures, job_log, jobs, mattes
+from storage.records import captures, jobs, mattes
 from storage.records import tiles as tile_records
 from storage.steps import FINISH, PREPARE
 from workflows.untrusted.limits import Limits
@@ -64,7 +64,7 @@ def working(connection: Connection, job: str, tiles: int = 3) -> JobRun:
 
 
 def lines(connection: Connection, job: str) -> list[str]:
-    return [row.text for row in job_log.lines(connection, job, 0, 100)]
+    return [row.text for row in jobs.log_lines(connection, job, 0, 100)]
 
 
 def test_steps_run_in_order(connection: Connection, job: str) -> None:

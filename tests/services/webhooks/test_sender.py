@@ -9,7 +9,7 @@ from services.settings import Settings
 from services.webhooks.sender import Sender
 from storage.database.engine import reading, writing
 from storage.database.tables import deliveries as table
-from storage.records import job_log, jobs, leases, webhook_deliveries
+from storage.records import jobs, leases, webhook_deliveries
 from tests.parts.waiting import until
 from tests.services.webhooks.receivers import receiver
 
@@ -36,7 +36,7 @@ def wait_for_log(engine: Engine, job: str) -> str:
 def log_of(engine: Engine, job: str) -> list[str]:
     """The lines of a job's log that mention its webhook."""
     with reading(engine) as c:
-        return [row.text for row in job_log.lines(c, job, 0, 100) if "webhook" in row.text]
+        return [row.text for row in jobs.log_lines(c, job, 0, 100) if "webhook" in row.text]
 
 
 def lease(engine: Engine) -> int:

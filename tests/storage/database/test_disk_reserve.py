@@ -6,7 +6,7 @@ from pathlib import Path
 
 from storage.database.disk_reserve import keep_reserve
 from storage.database.engine import open_engine, reading, writing
-from storage.records import job_log, jobs, leases
+from storage.records import jobs, leases
 from tests.parts.disks import small_disk
 
 
@@ -32,5 +32,5 @@ def test_rows_change_and_go_on_a_full_disk(tmp_path: Path) -> None:
             with writing(engine) as c:
                 jobs.delete(c, job)
         with reading(engine) as c:
-            assert [line.text for line in job_log.lines(c, made[0], 0, 9)] == ["queued", "cancelled"]
+            assert [line.text for line in jobs.log_lines(c, made[0], 0, 9)] == ["queued", "cancelled"]
         engine.dispose()

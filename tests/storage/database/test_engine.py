@@ -13,7 +13,7 @@ from sqlalchemy.exc import IntegrityError
 from storage.database.engine import open_engine, reading, writing
 from storage.database.tables import metadata
 from storage.errors import Unavailable
-from storage.records import job_log, jobs, tiles
+from storage.records import jobs, tiles
 from tests.parts.postgres import Server
 
 
@@ -37,7 +37,7 @@ def test_exception_rolls_back(engine: Engine) -> None:
 
 def test_log_line_needs_its_job(engine: Engine) -> None:
     with pytest.raises(IntegrityError), writing(engine) as connection:
-        job_log.add(connection, "none", "a line")
+        jobs.log(connection, "none", "a line")
 
 
 def test_writers_that_read_first_wait_for_each_other(engine: Engine) -> None:

@@ -21,7 +21,7 @@ from storage.database.revision import NEWEST, revision
 from storage.database.tables import coordinator, metadata, tiles, totals
 from storage.errors import Conflict, NotFound
 from storage.layout.uploads import Part
-from storage.records import captures, idempotency, job_log, jobs, mattes, programs, uploads
+from storage.records import captures, idempotency, jobs, mattes, programs, uploads
 from storage.records import tiles as tile_records
 from tests.parts.postgres import Server
 
@@ -139,7 +139,7 @@ def test_database_without_revision_keeps_its_rows(old: str) -> None:
             ("j", 0, "done", 1, 0.5, 0),
             ("j", 1, "queued", 2, None, 0),
         ]
-        assert [row.line for row in job_log.lines(connection, "j", 0, 10)] == [3]
+        assert [row.line for row in jobs.log_lines(connection, "j", 0, 10)] == [3]
         for table in (coordinator, totals):
             assert connection.scalar(select(func.count()).select_from(table)) == 0
     with writing(engine) as connection:

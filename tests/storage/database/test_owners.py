@@ -9,7 +9,7 @@ from storage.database.owners import NOBODY, across_owners, for_owner
 from storage.database.rows import page
 from storage.errors import NotFound
 from storage.layout import uploads as stored_uploads
-from storage.records import captures, job_log, jobs, leases, tiles, uploads
+from storage.records import captures, jobs, leases, tiles, uploads
 
 OWNERS = ("alice", "bob")
 
@@ -50,8 +50,8 @@ def test_lists_and_lookups_show_only_the_owners_rows(filled: Engine) -> None:
 
 def test_dependent_rows_belong_to_the_owner(filled: Engine) -> None:
     with reading(for_owner(filled, "alice")) as c:
-        assert [line.text for line in job_log.lines(c, "alice-job", 0, 10)] == ["queued"]
-        assert job_log.lines(c, "bob-job", 0, 10) == []
+        assert [line.text for line in jobs.log_lines(c, "alice-job", 0, 10)] == ["queued"]
+        assert jobs.log_lines(c, "bob-job", 0, 10) == []
         assert uploads.parts_of(c, "alice-upload") == [stored_uploads.Part("alice", 4)]
         assert uploads.parts_of(c, "bob-upload") == []
         for joined in (
@@ -72,7 +72,7 @@ def test_changes_and_deletions_affect_only_the_owners_rows(filled: Engine) -> No
         assert c.execute(delete(tables.captures)).rowcount == 1
     with reading(filled) as c:
         assert jobs.get(c, "bob-job").stage == "waiting"
-        assert len(job_log.lines(c, "bob-job", 0, 10)) == 1
+        assert len(jobs.log_lines(c, "bob-job", 0, 10)) == 1
         assert c.scalar(select(func.sum(tables.tiles.c.attempts)).where(tables.tiles.c.job == "bob-job")) == 0
         assert captures.exists(c, "bob-capture")
 

@@ -1,5 +1,7 @@
 """Jobs: from the queue to their end, cancelled, retried and deleted."""
 
+from itertools import pairwise
+
 import pytest
 from sqlalchemy import Connection, func, select
 
@@ -154,3 +156,16 @@ def test_each_attempt_counts_as_stored(connection: Connection) -> None:
         assert statistics.stored_bytes(connection) == attempts * ROW
         jobs.end(connection, job, "failed", {"detail": "", "status": 500})
         jobs.retry(connection, job)
+
+
+def test_log_lines_after_a_line(connection: Connection) -> None:
+    job, other = planned(connection), planned(connection)
+    for n in range(5):
+        jobs.log(connection, job, f"line {n}")
+        jobs.log(connection, other, "of another job")
+    read = jobs.log_lines(connection, job, 0, 3)
+    assert [row.text for row in read] == ["queued", "line 0", "line 1"]
+    rest = jobs.log_lines(connection, job, read[-1].line, 100)
+    assert [row.text for row in rest] == ["line 2", "line 3", "line 4"]
+    assert jobs.log_lines(connection, job, rest[-1].line, 100) == []
+    assert all(a.at <= b.at for a, b in pairwise(read))
