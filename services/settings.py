@@ -291,8 +291,8 @@ class Settings(CoordinatorSettings):
     matte_memory: int = _setting(1 << 30, "Bytes of mattes kept in memory for further composites.", ge=0)
     request_memory: int = _setting(
         512 << 20,
-        "Bytes that requests for frames, pixels, layers and composites may take together; further ones wait. Those of "
-        "one owner may take half of it.",
+        "Bytes that requests for frames, pixels, layers and composites, and archives that are checked, may take "
+        "together; further ones wait. Those of one owner may take half of it.",
         ge=64 << 20,
     )
     request_seconds: int = _setting(

@@ -44,7 +44,7 @@ class Context:
     decoders: Decoders
     """Processes that decode uploaded pictures."""
     memory: Shares
-    """Bytes that frames, pixels, layers and composites take while they are read, computed and encoded."""
+    """Bytes that frames, pixels, layers, composites and archives take while they are read, computed and encoded."""
     backdrops: Shares
     """Bytes of backdrops on disk, from their first byte until they are composited."""
     lists: Shares = field(default_factory=lambda: Shares(4, 2))
@@ -56,7 +56,7 @@ class Context:
     composites: Shares = field(default_factory=lambda: Shares(CORES + 1, CORES))
     """Composites computed at once: one more than there are cores."""
     captures: Shares = field(default_factory=lambda: Shares(2, 1))
-    """Capture archives checked at once; one may take 200 MB."""
+    """Capture archives checked at once."""
     imports: Shares = field(default_factory=lambda: Shares(2, 1))
     """Archives of mattes unpacked at once."""
     layers: Shares = field(default_factory=lambda: Shares(2, 1))

@@ -31,6 +31,8 @@ from workflows.interruption import checkpoint
 router = APIRouter(tags=["captures"])
 CALL = "POST /v1/captures"
 FROM_UPLOAD_BYTES = 1 << 16
+CHECK_BYTES = 200 << 20
+"""What checking a capture archive takes at most: its directory, and its capture.json with a program."""
 
 
 class FromUpload(BaseModel):
@@ -74,7 +76,7 @@ async def upload(
     if media_type == JSON:
         given = await read_json(request, FromUpload, FROM_UPLOAD_BYTES)
         create = partial(_from_upload, context, given, idempotency_key)
-        row = await context.compute(request, context.captures, create)
+        row = await context.compute(request, context.captures, create, memory=CHECK_BYTES)
     elif media_type == ZIP:
         row = await _from_body(context, request, name, idempotency_key, webhook)
     else:
@@ -103,7 +105,7 @@ async def _from_body(
             pieces = reservation.watch(limit.stream(request))
             parts = [await store_as_upload(pieces, context.objects, capture)]
             register = partial(_register, context, capture, parts, name, key, False, webhook)
-            row = await context.compute(request, context.captures, register)
+            row = await context.compute(request, context.captures, register, memory=CHECK_BYTES)
         except Unavailable:  # there may be a capture; a sweep removes bytes without one
             raise
         except Exception:  # not when cancelled: `register` may still be running in its thread

@@ -22,7 +22,7 @@ from storage.layout import uploads as stored_uploads
 from storage.layout.matte_archive import Archive
 from storage.layout.uploads import Part
 from storage.records import bodies, mattes
-from workflows.mattes.imports.importing import take_in
+from workflows.mattes.imports.importing import bytes_of_import, take_in
 
 router = APIRouter(tags=["mattes"])
 CALL = "POST /v1/mattes"
@@ -84,6 +84,7 @@ async def _from_body(context: Context, request: Request, key: str | None) -> Row
                 request,
                 context.imports,
                 partial(_import, context, matte, part, key),
+                memory=bytes_of_import(context.settings.limits),
                 seconds=context.settings.request_seconds * -(-part.size // ARCHIVE_BYTES),
             )
         finally:

@@ -4,12 +4,16 @@ import asyncio
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 from fastapi import Request
+from fastapi.testclient import TestClient
 
+from services.api.app import build_app
 from services.api.auth import identify
 from services.api.context import KEY_CHECK, Context
 from services.api.work import Shares
@@ -20,6 +24,8 @@ from storage.database.engine import open_engine, writing
 from storage.errors import Corrupt, NotFound
 from storage.objects.store import Objects
 from storage.records import api_keys, mattes
+from tests.parts.captures import captured, nested_program
+from tests.services.api.mattes.archives import archive
 from workflows.composite.cache import Cache
 
 
@@ -97,3 +103,27 @@ def test_work_larger_than_an_owners_share_of_memory_is_done_one_at_a_time(contex
 
     asyncio.run(several())
     assert at_once == [1, 1, 1]
+
+
+@pytest.mark.parametrize("route", ["captures", "mattes"])
+def test_archives_are_checked_once_there_is_memory(tmp_path: Path, route: str) -> None:
+    if route == "mattes":
+        sent = archive(tmp_path / "made", 8, 8)
+    else:
+        program = nested_program(bands=((8, 6, 16),), levels=2)
+        sent = captured(program, lambda n, picture: np.zeros((8, 8, 1)))
+    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
+    settings = Settings(data=tmp_path, request_seconds=1)
+    app = build_app(settings, engine, Objects((tmp_path / "store").as_uri()))
+    memory = app.state.context.memory
+    with TestClient(app, "http://127.0.0.1", headers={"Content-Type": "application/zip"}) as client:
+        assert client.portal is not None
+        with ExitStack() as taken:
+            for other in ("alice", "bob"):
+                turn = memory.take(other, 1, memory.each)
+                taken.enter_context(client.portal.wrap_async_context_manager(turn))
+            answer = client.post(f"/v1/{route}", content=sent)
+            assert (answer.status_code, answer.json()["type"]) == (429, "urn:envmatte:problem:too-many")
+        assert client.post(f"/v1/{route}", content=sent).status_code == 201
+    app.state.context.decoders.close()
+    engine.dispose()

@@ -16,8 +16,18 @@ from storage.layout.mattes import Matte
 from storage.objects.checksums import unseal
 from storage.objects.store import Objects
 from workflows.interruption import checkpoint
-from workflows.mattes.imports.reader import Reader
+from workflows.mattes.imports.reader import Reader, most_cells
 from workflows.untrusted.limits import Limits
+
+CELL_BYTES = 24
+"""Of a cell and its weight, packed, unpacked and while they are checked; 22 measured."""
+DIRECTORY_BYTES = 200 << 20
+"""Of the largest directory and manifest, which are read before any block; 201 MB measured."""
+
+
+def bytes_of_import(limits: Limits) -> int:
+    """Bytes of memory that `take_in` takes at most."""
+    return max(DIRECTORY_BYTES, CELL_BYTES * most_cells(limits))
 
 
 def take_in(file: BinaryIO, objects: Objects, matte: str, limits: Limits) -> Matte:

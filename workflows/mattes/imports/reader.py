@@ -80,7 +80,7 @@ class Reader:
         values = {name: self._frame(name, row, column)[:height, :width] for name in FRAMES}
         count = values["count"]
         entries = int(count.sum(dtype=np.uint64))
-        most = self._limits.memory // CHECK_BYTES
+        most = most_cells(self._limits)
         where = matte_archive.chunk_entry("count", row, column)
         if entries > most:
             raise ArchiveError(
@@ -222,6 +222,11 @@ class Reader:
             names.update(matte_archive.block_entries(row, column))
         for name in sorted(self._entries.keys() - names):
             raise refused(name, "it is nothing that a matte of this size has")
+
+
+def most_cells(limits: Limits) -> int:
+    """Cells that a block may have."""
+    return limits.memory // CHECK_BYTES
 
 
 def refused(entry: str, what: str) -> ArchiveError:
