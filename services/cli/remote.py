@@ -231,13 +231,14 @@ def share(matte: str, days: float, url: str, key: str | None, as_json: bool) -> 
         print_result({"url": client.share(matte, days)}, as_json, "url")
 
 
-@click.command("import", epilog=example("envmatte import matte.zip"))
+@click.command("import", epilog=example("envmatte import matte.zip --name 'glass ball'"))
 @click.argument("file", type=InputFile)
+@click.option("--name", default="", help="Name of the matte in lists; by default that of the file.")
 @_remote
-def import_(file: Path, url: str, key: str | None, as_json: bool) -> None:
+def import_(file: Path, name: str, url: str, key: str | None, as_json: bool) -> None:
     """Import a matte that `envmatte export` wrote. Prints its new id."""
     with _client(url, key) as client, Progress("import") as bar:
-        matte = client.import_matte(file, progress=lambda sent, size: bar.show(sent / size))
+        matte = client.import_matte(file, name=name, progress=lambda sent, size: bar.show(sent / size))
     print_result(matte.answer, as_json, "id")
 
 

@@ -287,11 +287,15 @@ class Client:
         finally:
             part.unlink(missing_ok=True)
 
-    def import_matte(self, file: Path, *, progress: Callable[[int, int], None] | None = None) -> Matte:
+    def import_matte(
+        self, file: Path, *, name: str = "", progress: Callable[[int, int], None] | None = None
+    ) -> Matte:
         """Import a matte from an archive.
 
         Parameters
         ----------
+        name : str
+            A name for people; by default that of the file, without its end.
         progress : callable, optional
             Is called with the bytes sent, and with all there are. The service checks them after the last.
         """
@@ -300,7 +304,16 @@ class Client:
         def body() -> Iterator[bytes]:
             return _parts(file, progress)
 
-        return self._matte(self._http.json("POST", Matte.path, computing=True, headers=headers, content=body))
+        return self._matte(
+            self._http.json(
+                "POST",
+                Matte.path,
+                computing=True,
+                params={"name": (name or file.stem[:200]).encode(errors="replace").decode()},
+                headers=headers,
+                content=body,
+            )
+        )
 
     def _matte(self, answer: dict[str, Any]) -> Matte:
         return Matte.of(answer, layers=Layers(lambda name: self.layer(answer["id"], name)))

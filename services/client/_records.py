@@ -1,7 +1,7 @@
 """Records that the service returns: captures, jobs and mattes."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 if TYPE_CHECKING:
@@ -29,8 +29,15 @@ class Record:
 
     @classmethod
     def of(cls, answer: dict[str, Any], **more: Any) -> Self:
-        """Make a record of an answer. Fields that only a newer service has are in `answer`."""
-        known = {f.name: answer[f.name] for f in fields(cls) if f.name != "answer" and f.name not in more}
+        """Make a record of an answer. Fields that only a newer service has are in `answer`.
+
+        A field that an older service lacks has its default.
+        """
+        known = {
+            f.name: answer[f.name]
+            for f in fields(cls)
+            if f.name not in ("answer", *more) and (f.name in answer or f.default is MISSING)
+        }
         return cls(answer=answer, **known, **more)
 
     def __getitem__(self, name: str) -> Any:
@@ -109,10 +116,11 @@ class Matte(Record):
     """A matte; ``state`` is ``recovering``, ``ready`` or ``failed``.
 
     ``width`` and ``height`` are in pixels, as is ``monitor``, the size of the monitor; None until they are known. An
-    imported matte has no ``capture`` and no ``job``.
+    imported matte has no ``capture`` and no ``job``. ``name`` is empty if the service is older than names of mattes.
     """
 
     path = "/v1/mattes"
+    name: str = ""
     capture: str | None
     job: str | None
     options: dict[str, Any]

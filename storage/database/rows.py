@@ -51,6 +51,7 @@ def page(
     limit: int,
     after: str | None,
     without: Container[str] = (),
+    name: str | None = None,
     **equal: str | None,
 ) -> Iterator[Row[Any]]:
     """One page of a table's rows, newest first; the table has the columns ``id`` and ``number``.
@@ -61,6 +62,8 @@ def page(
         The id of the last row of the previous page.
     without : container of str
         Columns that are not read.
+    name : str, optional
+        What is in the name of the rows, in upper or lower case.
     **equal : str or None
         Values that columns must have; None matches any value.
 
@@ -74,6 +77,8 @@ def page(
     for column, value in equal.items():
         if value is not None:
             query = query.where(table.c[column] == value)
+    if name:
+        query = query.where(table.c.name.icontains(name, autoescape=True))
     if after is not None:
         number = connection.scalar(select(table.c.number).where(table.c.id == after))
         if number is None:

@@ -15,6 +15,7 @@ from sqlalchemy import (
     Text,
     UniqueConstraint,
     false,
+    text,
 )
 
 from storage.database import owners
@@ -73,6 +74,7 @@ mattes = Table(
     _owner(),
     Column("expires_at", Float, index=True),
     Column("stored", BigInteger),  # as for a capture
+    Column("name", Text, nullable=False, server_default=text("''")),
     Index("mattes_by_owner", "owner", "number"),
     Index("mattes_by_state", "state"),
     Index("mattes_by_size", "stored", "state", "owner"),

@@ -16,10 +16,11 @@ def add(
     job: str,
     options: dict[str, Any],
     seconds: float | None = None,
+    name: str = "",
 ) -> None:
     """Add a matte that a job will recover; it expires after `seconds`, or never if that is None."""
     row = {"id": matte, "capture": capture, "job": job, "state": "recovering", "options": options}
-    connection.execute(insert(mattes).values(row | lifetime(seconds)))
+    connection.execute(insert(mattes).values(row | {"name": name} | lifetime(seconds)))
 
 
 def add_imported(
@@ -29,10 +30,11 @@ def add_imported(
     figures: dict[str, Any],
     stored: int | None = None,
     seconds: float | None = None,
+    name: str = "",
 ) -> None:
     """Add an imported matte, which is ready and has no capture and no job here."""
     row = {"id": matte, "state": "ready", "options": options, "figures": figures, "stored": stored}
-    connection.execute(insert(mattes).values(row | lifetime(seconds)))
+    connection.execute(insert(mattes).values(row | {"name": name} | lifetime(seconds)))
 
 
 def get(connection: Connection, matte: str) -> Row[Any]:

@@ -93,7 +93,7 @@ def add_rows(c: Connection) -> None:
     captures.add(c, "c", "ci", name="ball \u2713", bytes=5, frames=6, program={"levels": [0.25, 1e-300]})
     captures.change(c, "c", state="ready", owner="alice")
     captures.add(c, "i", "ii", name="", bytes=len(ARCHIVE), frames=6, program={}, seconds=1e6)
-    mattes.add(c, "m", "c", "mr", {"method": "none"})
+    mattes.add(c, "m", "c", "mr", {"method": "none"}, name="ball \u2713")
     mattes.change(c, "m", state="ready", figures={"width": 40})
     mattes.add(c, "r", "c", "rr", {})
     mattes.add_imported(c, "l", {}, {"width": 40}, stored=9)

@@ -3,16 +3,15 @@
 from datetime import UTC, datetime
 from typing import Any, Literal, Self
 
-import anyio.to_thread
 from fastapi import APIRouter, Request, Response
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 from sqlalchemy import Connection, Row
 
 from services.api.context import OwnerContext
-from services.api.http.bodies import read_json, schema_of
 from services.api.http.responses import bytes_response, json_response, utc_time
-from services.api.http.types import After, Limit
+from services.api.http.types import After, Limit, Named
 from services.api.jobs.eta import seconds_to_recover
+from services.api.renaming import CHANGE, rename
 from storage.database.engine import reading, writing
 from storage.database.rows import page
 from storage.database.tables import captures as table
@@ -24,7 +23,6 @@ from storage.records import captures, jobs
 from workflows.images.integer_formats import encode_png
 
 router = APIRouter(tags=["captures"])
-CHANGE_BYTES = 1 << 12
 PROGRAM_BYTES = 64 << 20
 """What the largest program that a capture may have takes in memory."""
 
@@ -80,13 +78,6 @@ class Capture(ListedCapture):
         return cls.of(row, seconds_to_recover(connection, row))
 
 
-class CaptureChange(BaseModel):
-    """What of a capture to change."""
-
-    model_config = ConfigDict(extra="forbid", str_strip_whitespace=True)
-    name: str = Field(max_length=200, pattern=r"\S", description="A name for people.")
-
-
 class Captures(BaseModel):
     """A page of captures, newest first."""
 
@@ -100,12 +91,13 @@ async def list_captures(
     limit: Limit = 100,
     after: After = None,
     state: Literal["ingesting", "ready", "failed"] | None = None,
+    name: Named = None,
 ) -> Response:
     """Captures, newest first, without their programs."""
 
     def make() -> Response:
         with reading(context.engine) as c:
-            rows = page(c, table, limit, after, without=("program",), state=state)
+            rows = page(c, table, limit, after, without=("program",), name=name, state=state)
             return json_response(Captures(captures=[ListedCapture.of(row) for row in rows]))
 
     return await context.compute(request, context.lists, make)
@@ -122,27 +114,10 @@ async def get_capture(context: OwnerContext, id: str, request: Request) -> Respo
     return await context.compute(request, context.lists, make)
 
 
-@router.patch(
-    "/captures/{id}",
-    response_model=Capture,
-    openapi_extra={"requestBody": {"content": {"application/json": {"schema": schema_of(CaptureChange)}}}},
-)
+@router.patch("/captures/{id}", response_model=Capture, openapi_extra=CHANGE)
 async def change_capture(context: OwnerContext, id: str, request: Request) -> Response:
     """Rename a capture."""
-
-    def require() -> None:
-        with reading(context.engine) as c:
-            captures.get(c, id)
-
-    def make() -> Response:
-        with writing(context.engine) as c:
-            captures.get(c, id)  # it may have been deleted meanwhile
-            captures.change(c, id, name=change.name)
-            return json_response(Capture.read(c, id))
-
-    await anyio.to_thread.run_sync(require)
-    change = await read_json(request, CaptureChange, CHANGE_BYTES)
-    return await context.compute(request, context.lists, make)
+    return await rename(context, request, id, captures, Capture.read)
 
 
 @router.delete("/captures/{id}", status_code=204)

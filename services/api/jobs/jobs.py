@@ -187,7 +187,7 @@ def post_job(
         job = jobs.add(
             c, "recover", capture.id, chosen, matte, tracing.current_traceparent(), webhook=request.webhook
         )
-        mattes.add(c, matte, capture.id, job, chosen, context.settings.matte_seconds)
+        mattes.add(c, matte, capture.id, job, chosen, context.settings.matte_seconds, capture.name)
         return job
 
     job = idempotent(context.engine, idempotency_key, CALL, Job.read, create)

@@ -1,10 +1,10 @@
 """Archives of mattes over HTTP: download a matte, and import it into another service."""
 
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import anyio.to_thread
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from sqlalchemy import Connection, Row
 
@@ -56,19 +56,23 @@ def get_archive(context: OwnerContext, id: str) -> StreamingResponse:
     openapi_extra={"requestBody": {"content": {ZIP: {"schema": {"type": "string", "format": "binary"}}}}},
 )
 async def post_archive(
-    context: OwnerContext, request: Request, response: Response, idempotency_key: IdempotencyKey = None
+    context: OwnerContext,
+    request: Request,
+    response: Response,
+    name: Annotated[str, Query(max_length=200, description="A name for people.")] = "",
+    idempotency_key: IdempotencyKey = None,
 ) -> Matte:
     """Import a matte: the body is an archive from `GET /v1/mattes/{id}/archive`.
 
     The whole archive is checked before the answer, which takes some seconds for each 100 MB.
     """
     require_media_type(request, ZIP, "the archive of a matte")
-    row = await _from_body(context, request, idempotency_key)
+    row = await _from_body(context, request, name, idempotency_key)
     response.headers["Location"] = f"/v1/mattes/{row.id}"
     return Matte.of(row)
 
 
-async def _from_body(context: Context, request: Request, key: str | None) -> Row[Any]:
+async def _from_body(context: Context, request: Request, name: str, key: str | None) -> Row[Any]:
     """Stream an archive into the store and import its matte; the archive is removed in any case."""
     limit = upload_limit(context.settings)
     length = limit.check_announced(request)
@@ -83,7 +87,7 @@ async def _from_body(context: Context, request: Request, key: str | None) -> Row
             row = await context.compute(
                 request,
                 context.imports,
-                partial(_import, context, matte, part, key),
+                partial(_import, context, matte, part, name, key),
                 memory=bytes_of_import(context.settings.limits),
                 seconds=context.settings.request_seconds * -(-part.size // ARCHIVE_BYTES),
             )
@@ -93,7 +97,7 @@ async def _from_body(context: Context, request: Request, key: str | None) -> Row
     return row
 
 
-def _import(context: Context, matte: str, part: Part, key: str | None) -> Row[Any]:
+def _import(context: Context, matte: str, part: Part, name: str, key: str | None) -> Row[Any]:
     """Import the matte of an archive that is stored."""
     context.check_key()
     objects = context.objects
@@ -106,7 +110,7 @@ def _import(context: Context, matte: str, part: Part, key: str | None) -> Row[An
     def create(c: Connection) -> str:
         bodies.release(c, matte)
         admit(c, context.settings, size=stored)
-        mattes.add_imported(c, matte, imported.attributes["options"], imported.figures, stored, kept)
+        mattes.add_imported(c, matte, imported.attributes["options"], imported.figures, stored, kept, name)
         return matte
 
     try:

@@ -5,11 +5,12 @@ from typing import Any, Literal
 
 from fastapi import APIRouter, Request, Response
 from pydantic import BaseModel
-from sqlalchemy import Row
+from sqlalchemy import Connection, Row
 
 from services.api.context import OwnerContext
 from services.api.http.responses import json_response, utc_time
-from services.api.http.types import After, Limit, Pair
+from services.api.http.types import After, Limit, Named, Pair
+from services.api.renaming import CHANGE, rename
 from storage.database.engine import reading, writing
 from storage.database.rows import page
 from storage.database.tables import mattes as table
@@ -24,6 +25,7 @@ class Matte(BaseModel):
     """A matte; an imported one has no capture and no job."""
 
     id: str
+    name: str
     state: Literal["recovering", "ready", "failed"]
     capture: str | None
     job: str | None
@@ -40,11 +42,16 @@ class Matte(BaseModel):
     def of(cls, row: Row[Any]) -> "Matte":
         figures = {name: value for name, value in (row.figures or {}).items() if name in cls.model_fields}
         return cls(
-            **{name: getattr(row, name) for name in ("id", "state", "capture", "job", "options")},
+            **{name: getattr(row, name) for name in ("id", "name", "state", "capture", "job", "options")},
             **figures,
             created_at=datetime.fromtimestamp(row.created_at, UTC),
             expires_at=utc_time(row.expires_at),
         )
+
+    @classmethod
+    def read(cls, connection: Connection, id: str) -> "Matte":
+        """A matte by its id; `NotFound` if there is none."""
+        return cls.of(mattes.get(connection, id))
 
 
 class Mattes(BaseModel):
@@ -61,12 +68,13 @@ async def list_mattes(
     after: After = None,
     state: Literal["recovering", "ready", "failed"] | None = None,
     capture: str | None = None,
+    name: Named = None,
 ) -> Response:
     """Mattes, newest first: all, or those of a capture."""
 
     def make() -> Response:
         with reading(context.engine) as c:
-            rows = page(c, table, limit, after, state=state, capture=capture)
+            rows = page(c, table, limit, after, name=name, state=state, capture=capture)
             return json_response(Mattes(mattes=[Matte.of(row) for row in rows]))
 
     return await context.compute(request, context.lists, make)
@@ -76,7 +84,13 @@ async def list_mattes(
 def get_matte(context: OwnerContext, id: str) -> Matte:
     """A matte."""
     with reading(context.engine) as c:
-        return Matte.of(mattes.get(c, id))
+        return Matte.read(c, id)
+
+
+@router.patch("/mattes/{id}", response_model=Matte, openapi_extra=CHANGE)
+async def change_matte(context: OwnerContext, id: str, request: Request) -> Response:
+    """Rename a matte."""
+    return await rename(context, request, id, mattes, Matte.read)
 
 
 @router.delete("/mattes/{id}", status_code=204)

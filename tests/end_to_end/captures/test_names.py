@@ -1,4 +1,4 @@
-"""How captures get their names, and new ones."""
+"""How captures and mattes get their names."""
 
 import json
 import zipfile
@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from tests.end_to_end.conftest import Service
-from tests.end_to_end.problems import check_problem
 
 
 @pytest.fixture(scope="module")
@@ -30,13 +29,16 @@ def test_capture_without_a_name_is_named_after_its_file(
     assert service.http.get(f"/v1/captures/{capture}").json()["name"] == "ball"  # that of its capture.json
 
 
-def test_capture_is_renamed(service: Service, capture: str) -> None:
-    path = f"/v1/captures/{capture}"
-    answer = service.http.patch(path, json={"name": "  tumbler "})
-    assert (answer.status_code, answer.json()["name"]) == (200, "tumbler")
-    listed = service.http.get("/v1/captures?limit=1000").json()["captures"]
-    assert [one["name"] for one in listed if one["id"] == capture] == ["tumbler"]
-    for wrong in ({"name": ""}, {"name": " "}, {"name": "x" * 201}, {"state": "ready"}, {}):
-        check_problem(service.http.patch(path, json=wrong), 422, "bad-request")
-    check_problem(service.http.patch("/v1/captures/none", json={"name": "x"}), 404, "not-found")
+def test_matte_is_named_after_its_capture(service: Service, capture: str, matte: str) -> None:
+    path = f"/v1/mattes/{matte}"
+    assert service.http.get(path).json()["name"] == service.client.matte(matte).name == "ball"
+    assert service.http.patch(path, json={"name": "tumbler"}).json()["name"] == "tumbler"
+    assert service.http.get(f"/v1/captures/{capture}").json()["name"] == "ball"
     service.http.patch(path, json={"name": "ball"})
+
+
+def test_imported_matte_is_named_after_its_file(service: Service, matte: str, tmp_path: Path) -> None:
+    archive = tmp_path / "whisky glass.zip"
+    service.client.export(matte, archive)
+    assert service.client.import_matte(archive).name == "whisky glass"
+    assert service.client.import_matte(archive, name="tumbler").name == "tumbler"

@@ -95,6 +95,7 @@ CALLS = {
     "GET /v1/mattes": Call(),
     "POST /v1/mattes": Call(needs="write", headers=ZIP, content=b"no archive"),
     "GET /v1/mattes/{id}": Call("matte"),
+    "PATCH /v1/mattes/{id}": Call("matte", needs="write", json={"name": "a name"}),
     "GET /v1/mattes/{id}/archive": Call("matte"),
     "GET /v1/mattes/{id}/layers/{file}": Call("matte"),
     "GET /v1/mattes/{id}/live": Call("matte"),

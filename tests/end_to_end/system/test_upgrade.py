@@ -64,6 +64,7 @@ def test_folder_of_0_1_0_opens_and_its_jobs_continue(facts: dict[str, Any], tmp_
         assert httpx2.get(f"{service.url}/v1/jobs").status_code == 401  # the key is still required
         with Client(service.url, facts["key"]) as client:
             # The finished matte.
+            assert client.matte(facts["ready"]).name == client.capture(facts["capture"]).name != ""
             assert exported(client, facts["ready"], tmp_path / "ready.zip") == facts["ready_sha256"]
             composite = client.composite(facts["ready"], tmp_path / "backdrop.png")
             pixels, expected = (

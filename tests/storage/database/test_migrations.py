@@ -289,3 +289,23 @@ def test_rows_before_owners_belong_to_default_owner(bare: Engine) -> None:
     with reading(engine) as connection:
         assert differences(connection) == []
     engine.dispose()
+
+
+def test_mattes_before_names_are_named_after_their_captures(bare: Engine) -> None:
+    with writing(bare) as connection:
+        migrations.upgrade(connection, "0010")
+        for statement in (
+            "INSERT INTO captures (id, name, state, job, bytes, frames, program, created_at) "
+            "VALUES ('c', 'ball', 'ready', 'j', 5, 4, '{}', 1000.5)",
+            "INSERT INTO mattes (id, capture, job, state, options, created_at) "
+            "VALUES ('m', 'c', 'j', 'ready', '{}', 1000.5)",
+            "INSERT INTO mattes (id, capture, job, state, options, created_at) "
+            "VALUES ('of a deleted capture', 'd', 'j', 'ready', '{}', 1000.5)",
+            "INSERT INTO mattes (id, state, options, created_at) VALUES ('imported', 'ready', '{}', 1000.5)",
+        ):
+            connection.exec_driver_sql(statement)
+    engine = open_engine(bare.url.render_as_string(hide_password=False))
+    with reading(engine) as connection:
+        names = {id: mattes.get(connection, id).name for id in ("m", "of a deleted capture", "imported")}
+    assert names == {"m": "ball", "of a deleted capture": "", "imported": ""}
+    engine.dispose()

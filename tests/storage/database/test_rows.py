@@ -5,7 +5,7 @@ from sqlalchemy import Connection
 
 from storage.database import rows, tables
 from storage.errors import NotFound
-from storage.records import jobs
+from storage.records import captures, jobs
 from tests.storage.planned import planned
 
 
@@ -34,3 +34,16 @@ def test_page_is_newest_first(connection: Connection) -> None:
     with pytest.raises(NotFound) as caught:
         ids(10, "none")
     assert caught.value.fields == {"field": "after"}
+
+
+def test_page_has_rows_whose_names_match(connection: Connection) -> None:
+    for number, name in enumerate(("Whisky glass", "100% glass", "ball")):
+        captures.add(connection, str(number), "j", name=name, bytes=1, frames=1, program={})
+
+    def ids(name: str | None) -> list[str]:
+        return [row.id for row in rows.page(connection, tables.captures, 10, None, name=name)]
+
+    assert ids("glass") == ["1", "0"]
+    assert ids("WHISKY") == ["0"]
+    assert ids("%") == ["1"]  # no wildcard
+    assert ids("") == ids(None) == ["2", "1", "0"]

@@ -1,0 +1,67 @@
+"""Renaming what has a name for people: captures and mattes."""
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import anyio.to_thread
+from fastapi import Request, Response
+from pydantic import BaseModel, ConfigDict, Field
+from sqlalchemy import Connection, Row
+
+from services.api.context import Context
+from services.api.http.bodies import read_json, schema_of
+from services.api.http.responses import json_response
+from storage.database.engine import reading, writing
+
+CHANGE_BYTES = 1 << 12
+
+
+class Change(BaseModel):
+    """What to change."""
+
+    model_config = ConfigDict(extra="forbid", str_strip_whitespace=True)
+    name: str = Field(max_length=200, pattern=r"\S", description="A name for people.")
+
+
+CHANGE: dict[str, Any] = {"requestBody": {"content": {"application/json": {"schema": schema_of(Change)}}}}
+"""For the ``openapi_extra`` of a route."""
+
+
+class Records(Protocol):
+    """A module of `storage.records` with rows that have a name."""
+
+    def get(self, connection: Connection, id: str, /) -> Row[Any]:
+        """A row; `NotFound` if there is none."""
+
+    def change(self, connection: Connection, id: str, /, *, name: str) -> None:
+        """Change a row."""
+
+
+async def rename(
+    context: Context,
+    request: Request,
+    id: str,
+    records: Records,
+    read: Callable[[Connection, str], BaseModel],
+) -> Response:
+    """Rename something, and answer with what ``read`` reads of it then.
+
+    Raises
+    ------
+    NotFound
+        If it does not exist, which is looked up before the body is read.
+    """
+
+    def require() -> None:
+        with reading(context.engine) as c:
+            records.get(c, id)
+
+    def make() -> Response:
+        with writing(context.engine) as c:
+            records.get(c, id)  # it may have been deleted meanwhile
+            records.change(c, id, name=change.name)
+            return json_response(read(c, id))
+
+    await anyio.to_thread.run_sync(require)
+    change = await read_json(request, Change, CHANGE_BYTES)
+    return await context.compute(request, context.lists, make)

@@ -1,0 +1,50 @@
+"""Renaming captures and mattes, and finding them by their names."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+
+from services.api.app import build_app
+from services.settings import Settings
+from storage.database.engine import open_engine, writing
+from storage.objects.store import Objects
+from storage.records import captures, mattes
+
+
+@pytest.fixture
+def http(tmp_path: Path) -> Iterator[TestClient]:
+    """An API with a capture and a matte, both of the id "ball"."""
+    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
+    with writing(engine) as c:
+        captures.add(c, "ball", "j", name="ball", bytes=1, frames=1, program={})
+        mattes.add_imported(c, "ball", {}, {}, name="ball")
+    app = build_app(Settings(data=tmp_path), engine, Objects((tmp_path / "store").as_uri()))
+    yield TestClient(app, "http://localhost")
+    app.state.context.decoders.close()
+    engine.dispose()
+
+
+@pytest.mark.parametrize("collection", ["captures", "mattes"])
+def test_what_is_renamed_is_found_by_its_new_name(http: TestClient, collection: str) -> None:
+    def found(name: str) -> list[str]:
+        answer = http.get(f"/v1/{collection}", params={"name": name})
+        return [one["name"] for one in answer.json()[collection]]
+
+    assert (found("BALL"), found("tumbler")) == (["ball"], [])
+    path = f"/v1/{collection}/ball"
+    answer = http.patch(path, json={"name": "  tumbler "})
+    assert (answer.status_code, answer.json()["name"]) == (200, "tumbler")
+    assert http.get(path).json()["name"] == "tumbler"
+    assert (found("ball"), found("umb")) == ([], ["tumbler"])
+
+
+@pytest.mark.parametrize("collection", ["captures", "mattes"])
+def test_invalid_changes_are_refused(http: TestClient, collection: str) -> None:
+    path = f"/v1/{collection}/ball"
+    for wrong in ({"name": ""}, {"name": " "}, {"name": "x" * 201}, {"state": "ready"}, {}):
+        assert http.patch(path, json=wrong).status_code == 422
+    assert http.get(path).json()["name"] == "ball"
+    assert http.patch(f"/v1/{collection}/none", json={"name": "x"}).status_code == 404
+    assert http.patch(path, content=b" " * 5000).status_code == 413
