@@ -11,7 +11,7 @@ from services.api.context import Context, authorized
 from services.api.jobs import events, jobs
 from services.api.mattes import archives, clips, composites, layers, links, live, mattes
 from services.api.programs import pattern_files, playback, programs
-from services.api.system import cluster, health, limits, metrics, network, pages
+from services.api.system import cluster, health, limits, metrics, network, pages, qr_codes
 from services.api.work import Shares
 from services.decoding.pool import Decoders
 from services.runtime import tracing
@@ -80,6 +80,7 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
     ):
         app.include_router(router, prefix="/v1", dependencies=[Depends(authorized)])
     app.include_router(pattern_files.page, prefix="/v1")
+    app.include_router(qr_codes.page, prefix="/v1")
     app.include_router(links.page)
     app.include_router(health.router)
     app.include_router(metrics.router)

@@ -25,7 +25,7 @@ class Network(BaseModel):
 @router.get("/network")
 def get_network(context: OwnerContext, request: Request) -> Network:
     """The address of the web app for other devices on the local network, or why there is none."""
-    host, port = context.settings.host, request.scope["server"][1]
+    host = context.settings.host
     if is_loopback(host):
         engine = request.app.state.context.engine  # the caller's own engine can't read keys
         key = "make a key with `envmatte keys make NAME`, and " if is_open(context.settings, engine) else ""
@@ -34,14 +34,26 @@ def get_network(context: OwnerContext, request: Request) -> Network:
             problem=f"The service listens on {host} only, where no other device can reach it: {key}start it with "
             "`envmatte serve --host 0.0.0.0`",
         )
-    if host in ANY:
-        own = _own_address()
-        if own is None:
-            return Network(
-                url=None, problem="This machine is not on a network: connect it to that of the phone"
-            )
-        host = own
-    return Network(url=f"http://{f'[{host}]' if ':' in host else host}:{port}", problem=None)
+    url = url_elsewhere(host, request)
+    if url is None:
+        return Network(url=None, problem="This machine is not on a network: connect it to that of the phone")
+    return Network(url=url, problem=None)
+
+
+def url_elsewhere(host: str, request: Request) -> str | None:
+    """The address of the service for devices on the same network, if it has one.
+
+    Parameters
+    ----------
+    host : str
+        That the service listens on.
+    request : Request
+        Any to this service, which tells the port.
+    """
+    own = _own_address() if host in ANY else host
+    if own is None or is_loopback(own):
+        return None
+    return f"http://{f'[{own}]' if ':' in own else own}:{request.scope['server'][1]}"
 
 
 def _own_address() -> str | None:

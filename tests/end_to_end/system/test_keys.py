@@ -106,6 +106,7 @@ CALLS = {
     "POST /v1/mattes/{id}/links": Call("matte", needs="write", json={"days": 1}),
     "DELETE /v1/mattes/{id}/links/{link}": Call("matte", needs="write", last=1),
     "GET /share/{token}": Call(needs=""),
+    "GET /v1/qr.svg": Call(needs=""),
     "GET /embed/{token}": Call(needs=""),
     "POST /v1/mattes/{id}/composite": Call(
         "matte", needs="write", content=png(np.full((9, 12, 3), 0.5), "srgb", np.uint8)
