@@ -14,8 +14,8 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
-from tests.workflows.images.dngs import dng
-from tests.workflows.images.heics import heic
+from tests.parts.dngs import dng
+from tests.parts.heics import heic
 from workflows.images.integer_formats import encode_png
 
 Files = tuple[bytes, ...]

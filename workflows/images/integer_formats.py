@@ -12,6 +12,7 @@ from PIL import Image
 from storage.errors import ImageError
 from workflows.images import heif, web_formats
 from workflows.images.orientation import ORIENTATION, inverse, upright
+from workflows.images.png_writer import write_png
 from workflows.untrusted import tiff_lzw
 from workflows.untrusted.limits import check_size
 
@@ -203,8 +204,10 @@ def _by_pillow(picture: Image.Image, memory: int) -> NDArray[np.uint8]:
 
 def encode_png(pixels: Codes) -> bytes:
     """Encode (height, width, 1 to 4) uint8 or uint16 values as PNG."""
-    plane = pixels[:, :, 0] if pixels.shape[2] == 1 else pixels
-    return bytes(imagecodecs.png_encode(np.ascontiguousarray(plane)))
+    file = io.BytesIO()
+    height, width, channels = pixels.shape
+    write_png(file, width, height, channels, pixels.dtype.type, [pixels])
+    return file.getvalue()
 
 
 def encode_jpeg(pixels: NDArray[np.uint8], quality: int) -> bytes:

@@ -49,8 +49,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.layout.mattes import Block, Matte
-from workflows.images import integer_formats
 from workflows.images.exr_writer import Types, write_exr
+from workflows.images.integer_formats import to_integers
+from workflows.images.png_writer import write_png
 from workflows.interruption import checkpoint
 from workflows.mattes.lobes import block_lobes
 from workflows.recovery.clusters.lobe_table import FIELDS
@@ -106,10 +107,8 @@ def layer(matte: Matte, name: str, rows: slice = slice(None)) -> NDArray[np.floa
 
 def png(matte: Matte, name: str, file: IO[bytes]) -> None:
     """Write a layer as a 16-bit PNG, its values linear and clipped to 0 to 1."""
-    codes = np.empty((matte.height, matte.width, len(_channels(name))), np.uint16)
-    for rows in _bands(matte):
-        codes[rows] = integer_formats.to_integers(layer(matte, name, rows), np.dtype(np.uint16))
-    file.write(integer_formats.encode_png(codes))
+    bands = (to_integers(layer(matte, name, rows), np.dtype(np.uint16)) for rows in _bands(matte))
+    write_png(file, matte.width, matte.height, len(_channels(name)), np.uint16, bands)
 
 
 def exr(matte: Matte, name: str, file: IO[bytes]) -> None:
@@ -180,13 +179,8 @@ def everything(matte: Matte, file: IO[bytes], lobes: int = LOBES) -> None:
     _write(file, matte, types, bands())
 
 
-def bytes_of_png(matte: Matte) -> int:
-    """Bytes that writing a PNG takes at most: three codes of 16 bits a pixel, and a file as large if they are noise."""
-    return 2 * 6 * matte.height * matte.width
-
-
 def bytes_of_band(matte: Matte, lobes: int) -> int:
-    """Bytes that writing an EXR takes at most: a band of `everything`."""
+    """Bytes that writing a file takes at most: a band of `everything`."""
     return bytes_of_everything(matte.width, matte.block, lobes)
 
 

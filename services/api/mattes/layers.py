@@ -119,8 +119,8 @@ async def get_layer(
         with context.stored(mattes.get_ready, id):
             return file_response(partial(write, matte), MEDIA_TYPES[kind], tag)
 
-    memory = layers.bytes_of_png(matte) if kind == "png" else layers.bytes_of_band(matte, lobes)
-    return await context.compute(request, context.layers, encode, memory=LOOK_BYTES + memory)
+    memory = LOOK_BYTES + layers.bytes_of_band(matte, lobes)
+    return await context.compute(request, context.layers, encode, memory=memory)
 
 
 @router.get("/mattes/{id}/transport", response_model=Transport)

@@ -15,10 +15,10 @@ from PIL import Image
 
 from services.decoding.pool import Decoders
 from storage.errors import ImageError, Unavailable
+from tests.parts.dngs import dng
+from tests.parts.heics import heic
 from tests.parts.waiting import until
 from tests.services.cluster.clusters import running
-from tests.workflows.images.dngs import dng
-from tests.workflows.images.heics import heic
 from workflows.images import decode, float_formats, integer_formats
 from workflows.untrusted import decoder
 from workflows.untrusted.decoder_process import NAME
