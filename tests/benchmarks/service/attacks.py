@@ -13,6 +13,7 @@ repository.
 """
 
 import argparse
+import json
 import os
 import subprocess
 import sys
@@ -25,16 +26,27 @@ from pathlib import Path
 import httpx2
 import numpy as np
 import psutil
+from numpy.typing import NDArray
 
 from tests.end_to_end.conftest import Service, serving
 from tests.faults.test_attacks import ATTACKS, MATTES, ZIP, Attacked, bearer, under_attack
+from tests.parts.captures import captured, nested_program, zip_bytes
 from tests.parts.hostile_mattes import hostile_archive
+from tests.parts.waiting import until
 from workflows.images.integer_formats import encode_png
+from workflows.programs.program import Constant, Program
 
 PATIENCE = 10.0
 """Seconds after which the other owner gives a request up."""
-MADE = tuple(name for name, path in ATTACKS.items() if any(f"{{{one}}}" in path for one in MATTES))
-"""The attacks that need nothing but imported mattes, which an earlier version takes too."""
+FRAME = 4000
+"""Edge of a square frame: 16 megapixels."""
+LARGE_PROGRAMS = 60
+"""Captures with a large program."""
+MADE = {name: path for name, path in ATTACKS.items() if any(f"{{{one}}}" in path for one in MATTES)} | {
+    "frames of 16 megapixels": ATTACKS["frames of 81 megapixels"],
+    f"lists of {LARGE_PROGRAMS} large programs": ATTACKS["lists of large programs"],
+}
+"""The paths of attacks that need nothing but uploads, which an earlier version takes too, by what they ask for."""
 
 
 def main() -> None:
@@ -56,9 +68,14 @@ def main() -> None:
             for name, costs in MATTES.items()
         }
         archives["own"] = hostile_archive(folder / "own", cells=20, columns=64, rows=48, edge=16)
+        captures = {
+            "frames": large_frames(),
+            **{f"program {n}": large_program() for n in range(LARGE_PROGRAMS)},
+        }
         (folder / "backdrop.png").write_bytes(encode_png(np.zeros((48, 64, 3), np.uint8)))
         prepared = {
-            version: prepare(folder, version, command, archives) for version, command in versions.items()
+            version: prepare(folder, version, command, archives, captures)
+            for version, command in versions.items()
         }
         print("| forty callers of | | `/healthz` | a composite | answered |\n|---|---|---|---|---|")
         for attack in MADE:
@@ -69,17 +86,59 @@ def main() -> None:
                     print(f"| {attack} | {version} | {measure(attacked, attack, args.seconds)} |", flush=True)
 
 
+def large_frames() -> bytes:
+    """A capture of few frames, the first of noise: a PNG of it is as large as it is."""
+    rng = np.random.default_rng(0)
+
+    def see(number: int, picture: NDArray[np.uint8]) -> NDArray[np.floating]:
+        shape = FRAME, FRAME, 1
+        return rng.random(shape, np.float32) if number == 0 else np.full(shape, number / 4, np.float32)
+
+    return captured(nested_program((64, 48), bands=((2, 2, 1),), levels=2), see)
+
+
+def large_program() -> bytes:
+    """A capture with a program of over a megabyte as JSON, which its film does not fit: it stays as it is listed."""
+    small = nested_program((64, 48), bands=((2, 2, 1),), levels=2)
+    colours = np.random.default_rng(0).random((19_990, 3)).tolist()
+    program = Program(
+        monitor=small.monitor, parts=(Constant(kind="constant", colours=colours), *small.parts[1:])
+    )
+    record = {
+        "format": "envmatte-capture/1",
+        "program": program.model_dump(mode="json"),
+        "video": {"file": "film.mp4", "patterns_per_second": 2},
+        "response": "linear",
+    }
+    return zip_bytes({"capture.json": json.dumps(record).encode(), "film.mp4": b"no film"})
+
+
 def prepare(
-    folder: Path, version: str, command: Sequence[str], archives: dict[str, bytes]
+    folder: Path,
+    version: str,
+    command: Sequence[str],
+    archives: dict[str, bytes],
+    captures: dict[str, bytes],
 ) -> tuple[dict[str, str], dict[str, str]]:
-    """Make keys, and import mattes; returns the keys by owner, and the ids by what they cost."""
+    """Make keys, import mattes and ingest captures; returns the keys by owner, and the ids by what they cost."""
     keys = {owner: make_key(command, folder / version, owner) for owner in ("alice", "mallory")}
     with started(folder / version, command) as service:
-        ids = {}
-        for name, archive in archives.items():
+
+        def send(route: str, name: str, archive: bytes) -> str:
             headers = ZIP | bearer(keys["alice" if name == "own" else "mallory"])
-            sent = httpx2.post(f"{service.url}/v1/mattes", content=archive, headers=headers, timeout=300)
-            ids[name] = str(sent.raise_for_status().json()["id"])
+            sent = httpx2.post(f"{service.url}/v1/{route}", content=archive, headers=headers, timeout=300)
+            return str(sent.raise_for_status().json()["id"])
+
+        def is_ingesting(capture: str) -> bool:
+            headers = bearer(keys["mallory"])
+            found = httpx2.get(f"{service.url}/v1/captures/{capture}", headers=headers, timeout=300)
+            return bool(found.raise_for_status().json()["state"] == "ingesting")
+
+        ids = {name: send("mattes", name, archive) for name, archive in archives.items()}
+        sent = {name: send("captures", name, archive) for name, archive in captures.items()}
+        for capture in sent.values():
+            until(lambda capture=capture: not is_ingesting(capture), 600)  # type: ignore[misc]
+        ids["frames"] = sent["frames"]
     return keys | {"mallory reads": keys["mallory"]}, ids
 
 
@@ -104,7 +163,7 @@ def measure(attacked: Attacked, attack: str, seconds: float) -> str:
     """The cells of a row: the seconds of both calls, and how many were answered."""
     took: dict[str, list[float]] = {"healthz": [], "composite": []}
     composite(attacked, 600)  # compiles and reads what it needs
-    with under_attack(attacked, ATTACKS[attack]):
+    with under_attack(attacked, MADE[attack]):
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             for name, seconds_of in took.items():
