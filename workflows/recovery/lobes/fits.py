@@ -12,7 +12,7 @@ from workflows.recovery.lobes.likelihood import penalty
 from workflows.recovery.lobes.mixture import Mixture, copy_mixture
 from workflows.recovery.lobes.nodes import gather_lobes, node_responses, spread_lobes
 from workflows.recovery.lobes.options import LobesOptions
-from workflows.recovery.lobes.posterior import update
+from workflows.recovery.lobes.posterior.mean import update
 from workflows.recovery.lobes.search import fit
 from workflows.recovery.normalise import Measurements
 from workflows.recovery.pyramid import Grids
@@ -122,7 +122,17 @@ def refit_from_posterior(
     node_responses(patterns, buffers.node, n, A)
     # with a literal, numba would compile another version of `update`
     passes = np.int64(1)
-    update(A, buffers.weight[:n], y, variance, patterns.strays, tried.stray, passes, options.gradients)
+    update(
+        A,
+        buffers.weight[:n],
+        buffers.end[:k],
+        y,
+        variance,
+        patterns.strays,
+        tried.stray,
+        passes,
+        options.gradients,
+    )
     gather_lobes(patterns.grids, buffers.node, buffers.weight, buffers.end, tried, k, options.fit_resolution)
     new_k, _, new = fit(patterns, y, variance, tried, k, options)
     if new + penalty(patterns.grids, tried.level, new_k) >= objective + penalty(

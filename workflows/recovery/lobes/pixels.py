@@ -20,7 +20,7 @@ from workflows.recovery.lobes.levenberg_marquardt import fit_amounts
 from workflows.recovery.lobes.mixture import Mixture
 from workflows.recovery.lobes.nodes import node_responses, spread_lobes
 from workflows.recovery.lobes.options import LobesOptions
-from workflows.recovery.lobes.posterior import update
+from workflows.recovery.lobes.posterior.mean import update
 from workflows.recovery.lobes.strays import subtract_strays, write_strays
 from workflows.recovery.solvers import subtract
 
@@ -36,7 +36,7 @@ class Diagnostics(NamedTuple):
     response, stray : (n, 3, m + 2) float32
         Predictions of the measurements: by T, and by stray light that is not constant.
     kappa, misfit : (n, 3) float64
-        As from :func:`~workflows.recovery.lobes.posterior.update`.
+        As from :func:`~workflows.recovery.lobes.posterior.mean.update`.
     nodes : (n, 3) int64
         Number of nodes of each row; a row that serves all channels comes first.
     """
@@ -84,8 +84,9 @@ def finish_fit(
     )
     A, weight = buffers.rows[: n * y.size].reshape(n, y.size), buffers.weight[:n]
     node_responses(patterns, buffers.node, n, A)
+    end = buffers.end[: fits.k[c]]
     kappa, misfit = update(
-        A, weight, y, variance, patterns.strays[:1], offset, options.passes, options.gradients
+        A, weight, end, y, variance, patterns.strays[:1], offset, options.passes, options.gradients
     )
     f = np.zeros_like(y)
     for i in range(n):

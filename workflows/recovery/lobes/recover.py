@@ -94,8 +94,8 @@ def recover(
     The model is eq. 5, T a sum of the pyramid's bumps. Lobes are added where they improve the fit most
     (:func:`~workflows.recovery.lobes.search.find_node`), all of them are fitted
     (:func:`~workflows.recovery.lobes.levenberg_marquardt.refine`), and kept if they lower -2 ln likelihood by more
-    than their penalty. The posterior mean (:func:`~workflows.recovery.lobes.posterior.update`) adds what lobes cannot
-    represent, such as a sharp edge or a bend.
+    than their penalty. The posterior mean (:func:`~workflows.recovery.lobes.posterior.mean.update`) adds what lobes
+    cannot represent, such as a sharp edge or a bend.
 
     Channels that saw the same patterns are averaged into one measurement, weighted by precision; others are stacked.
     Where the channels disagree, each gets its own T, whose fit starts from the common lobes or those of the most

@@ -5,24 +5,18 @@ from numba import njit
 from numpy.typing import NDArray
 
 from workflows.recovery.lobes.likelihood import estimate_kappa
-from workflows.recovery.lobes.strays import STRAY, write_strays
-from workflows.recovery.solvers import inner, subtract
+from workflows.recovery.lobes.posterior.covariance import (
+    Covariance,
+    Preconditioner,
+    Steps,
+    precondition,
+    solve_covariance,
+    stray_variance,
+)
+from workflows.recovery.lobes.strays import write_strays
+from workflows.recovery.solvers import inner
 
-# Prior standard deviation of the offset of a group, in units of T: an upper bound of the error of S.
-_OFFSET = 0.03
-# Conjugate gradients end when this fraction of the initial squared residual is left.
-_PRECISION = 1e-5
-# Where more than this fraction is left after the usual number of steps, they go on, up to this many times as many: so
-# far from the solution, all weights may come out negative.
-_UNSOLVED = 1e-2
-_MOST_STEPS = 4
 _LEAST_KAPPA = 1e-5
-
-
-@njit(nogil=True, cache=True, inline="always")
-def stray_variance(s: int) -> float:
-    """Prior variance of an amount of stray light, by its row."""
-    return _OFFSET**2 if s == 0 else STRAY**2
 
 
 @njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})
@@ -45,35 +39,6 @@ def add_row_moments(
         for j in range(mean.size):
             mean[j] += v * a[j]
             square[j] += v * a[j] * a[j]
-
-
-@njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})
-def add_products(
-    A: NDArray[np.float32],
-    scale: np.float32,
-    weight: NDArray[np.float32],
-    p: NDArray[np.float32],
-    out: NDArray[np.float32],
-) -> None:
-    """Add ``scale A' diag(weight) A p`` to `out`."""
-    n = A.shape[0]
-    # four rows at a time, while they are in the processor's cache
-    for i in range(0, n - 3, 4):
-        a, b, c, d = A[i], A[i + 1], A[i + 2], A[i + 3]
-        s, t, u, v = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
-        for j in range(p.size):
-            s += a[j] * p[j]
-            t += b[j] * p[j]
-            u += c[j] * p[j]
-            v += d[j] * p[j]
-        s *= scale * weight[i]
-        t *= scale * weight[i + 1]
-        u *= scale * weight[i + 2]
-        v *= scale * weight[i + 3]
-        for j in range(p.size):
-            out[j] += s * a[j] + t * b[j] + u * c[j] + v * d[j]
-    for i in range(n - n % 4, n):
-        subtract(out, -scale * weight[i] * inner(A[i], p), A[i])
 
 
 @njit(nogil=True, cache=True)
@@ -117,65 +82,6 @@ def total_variance(
 
 
 @njit(nogil=True, cache=True, inline="always")
-def apply_covariance(
-    A: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    kappa: float,
-    total: NDArray[np.float32],
-    strays: NDArray[np.float32],
-    measured: NDArray[np.bool_],
-    p: NDArray[np.float32],
-    out: NDArray[np.float32],
-) -> None:
-    """Write K p, K the covariance of the measurements due to T, to stray light, and to independent noise (`total`)."""
-    count, size = strays.shape
-    for j in range(p.size):
-        out[j] = total[j] * p[j]
-    for g in range(p.size // size):
-        of_group, to = p[g * size : (g + 1) * size], out[g * size : (g + 1) * size]
-        for s in range(count):
-            subtract(to, -np.float32(stray_variance(s)) * inner(strays[s], of_group), strays[s])
-    add_products(A, np.float32(kappa), weight, p, out)
-    for j in range(p.size):
-        out[j] = out[j] if measured[j] else 0.0
-
-
-@njit(nogil=True, cache=True, inline="always")
-def solve_covariance(
-    A: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    kappa: float,
-    total: NDArray[np.float32],
-    diagonal: NDArray[np.float32],
-    strays: NDArray[np.float32],
-    measured: NDArray[np.bool_],
-    r: NDArray[np.float32],
-    steps: int,
-    x: NDArray[np.float32],
-) -> None:
-    """Solve ``K x = r`` by conjugate gradients, preconditioned by the diagonal of K; r is overwritten."""
-    z, p, Kp = np.empty_like(r), np.empty_like(r), np.empty_like(r)
-    for j in range(r.size):
-        x[j], z[j] = 0.0, r[j] / diagonal[j]
-        p[j] = z[j]
-    left = inner(r, z)
-    goal, far = left * np.float32(_PRECISION), left * np.float32(_UNSOLVED)
-    for step in range(_MOST_STEPS * steps):
-        if left <= (goal if step < steps else far):
-            break
-        apply_covariance(A, weight, kappa, total, strays, measured, p, Kp)
-        length = left / inner(p, Kp)
-        subtract(x, -length, p)
-        subtract(r, length, Kp)
-        for j in range(r.size):
-            z[j] = r[j] / diagonal[j]
-        new = inner(r, z)
-        for j in range(r.size):
-            p[j] = z[j] + new / left * p[j]
-        left = new
-
-
-@njit(nogil=True, cache=True, inline="always")
 def reweight(
     A: NDArray[np.float32], kappa: float, x: NDArray[np.float32], weight: NDArray[np.float32]
 ) -> None:
@@ -196,12 +102,13 @@ def reweight(
 def update(
     A: NDArray[np.float32],
     weight: NDArray[np.float32],
+    end: NDArray[np.int64],
     y: NDArray[np.float32],
     variance: NDArray[np.float32],
     strays: NDArray[np.float32],
     stray: NDArray[np.float64],
     passes: int,
-    steps: int,
+    most: int,
 ) -> tuple[float, float]:
     """Replace the weights of a T by their posterior mean given the measurements, several times in succession.
 
@@ -211,6 +118,8 @@ def update(
         Responses of n nodes, as from :func:`~workflows.recovery.lobes.nodes.node_responses`.
     weight : (n,) float32
         Zero or more, of sum 1; changed in place.
+    end : (lobes,) int64
+        Where the nodes of each lobe end, as from :func:`~workflows.recovery.lobes.nodes.spread_lobes`.
     y, variance : (groups (m + 2),) float32
         Measurements, and their variances due to the camera; infinite where nothing was measured.
     strays : (s, m + 2) float32
@@ -219,7 +128,7 @@ def update(
         The amounts of stray light, changed in place.
     passes : int
         Number of updates; each starts from the weights of the one before.
-    steps : int
+    most : int
         Most conjugate gradient steps in a pass.
 
     Returns
@@ -235,27 +144,40 @@ def update(
     ``K x = r`` is solved by conjugate gradients.
     """
     count, size = strays.shape
-    groups = y.size // size
-    f, total, diagonal, r, x = (
-        np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y)
-    )  # fmt: skip
+    groups, lobes = y.size // size, end.size
+    f, noise, x = np.empty_like(y), np.empty_like(y), np.empty_like(y)
     mean, square, measured = np.empty_like(y), np.empty_like(y), variance < np.inf
+    of_lobe, share = np.empty((lobes, y.size), np.float32), np.empty(lobes)
+    rank = lobes + groups * count
+    approximate = Preconditioner(
+        np.empty((rank, y.size), np.float32),
+        np.empty_like(y),
+        np.empty((rank, rank)),
+        np.ones(rank, np.float32),
+    )
+    steps = Steps(np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y))
     kappa, misfit = 0.0, 0.0
     for _ in range(passes):
-        mean[:], square[:] = 0, 0
-        add_row_moments(A, weight, mean, square)
+        mean[:], square[:], of_lobe[:], share[:] = 0, 0, 0, 0
+        begin = 0
+        for i in range(lobes):
+            add_row_moments(A[begin : end[i]], weight[begin : end[i]], of_lobe[i], square)
+            for j in range(begin, end[i]):
+                share[i] += weight[j]
+            for j in range(y.size):
+                mean[j] += of_lobe[i, j]
+            begin = end[i]
         write_strays(strays, stray, 0, f)
         for j in range(y.size):
             f[j] += mean[j]
-        kappa, misfit = total_variance(y, f, mean, square, variance, groups, total)
+        kappa, misfit = total_variance(y, f, mean, square, variance, groups, noise)
         for j in range(y.size):
-            diagonal[j] = total[j] + np.float32(kappa) * square[j]
-            for s in range(count):
-                diagonal[j] += np.float32(stray_variance(s)) * strays[s, j % size] ** 2
             # where nothing was measured the residual is 0
-            r[j] = y[j] - f[j] if measured[j] else 0.0
-            total[j] = total[j] if measured[j] else 0.0
-        solve_covariance(A, weight, kappa, total, diagonal, strays, measured, r, steps, x)
+            steps.r[j] = y[j] - f[j] if measured[j] else 0.0
+            noise[j] = noise[j] if measured[j] else 0.0
+        K = Covariance(A, weight, kappa, noise, strays, measured)
+        precondition(K, of_lobe, share, square, approximate)
+        solve_covariance(K, approximate, most, steps, x)
         for g in range(groups):
             for s in range(count):
                 stray[g * count + s] += stray_variance(s) * inner(strays[s], x[g * size : (g + 1) * size])

@@ -5,7 +5,7 @@ import pytest
 
 from workflows.recovery.lobes.footprint import PatternCodes
 from workflows.recovery.lobes.nodes import node_responses
-from workflows.recovery.lobes.posterior import total_variance, update
+from workflows.recovery.lobes.posterior.mean import total_variance, update
 from workflows.recovery.pyramid import Pyramid
 
 # Standard deviation of an offset.
@@ -14,6 +14,8 @@ M = 50
 GRIDS = Pyramid.over(8, 6).arrays
 # No stray light but constant light, an offset.
 CONSTANT = np.ones((1, M + 2), np.float32)
+# All nodes are of one lobe.
+END = np.array([40])
 
 
 def problem(groups, n=40, seed=0, sigma=0.02):
@@ -38,7 +40,7 @@ def test_a_pass_is_the_closed_form(groups, left_out):
         variance[~there] = np.inf
         y[~there] = 100
     start, offset = weight.copy(), np.full(groups, 0.01)
-    kappa, misfit = update(A, weight, y, variance, CONSTANT, offset, 1, 500)
+    kappa, misfit = update(A, weight, END, y, variance, CONSTANT, offset, 1, 500)
 
     rows, t = A[:, there].astype(float), start.astype(float)
     group, of_patterns = np.divmod(np.flatnonzero(there), M + 2)
@@ -58,12 +60,20 @@ def test_a_pass_is_the_closed_form(groups, left_out):
     np.testing.assert_allclose(offset, expected, atol=0.02 * np.abs(expected - 0.01).max())
 
 
+def test_posterior_mean_does_not_depend_on_which_lobe_a_node_is_of():
+    A, weight, y, variance, _ = problem(1)
+    one, three = weight.copy(), weight.copy()
+    update(A, one, END, y, variance, CONSTANT, np.zeros(1), 1, 500)
+    update(A, three, np.array([7, 19, 40]), y, variance, CONSTANT, np.zeros(1), 1, 500)
+    assert np.abs(one - three).sum() < 0.01 * np.abs(one - weight).sum()
+
+
 def test_more_passes_come_closer_to_the_truth():
     A, weight, y, variance, truth = problem(1, seed=3)
     errors = []
     for _ in range(3):
         errors.append(np.abs(weight - truth).sum())
-        update(A, weight, y, variance, CONSTANT, np.zeros(1), 1, 50)
+        update(A, weight, END, y, variance, CONSTANT, np.zeros(1), 1, 50)
     assert errors[2] < 0.8 * errors[0]
 
 
@@ -74,7 +84,7 @@ def test_weights_stay_shares(seed):
         weight[::3] = 0
         weight /= weight.sum()
     empty = weight == 0
-    update(A, weight, y, variance, CONSTANT, np.zeros(1), 4, 10)
+    update(A, weight, END, y, variance, CONSTANT, np.zeros(1), 4, 10)
     assert weight.min() >= 0
     assert weight.sum() == pytest.approx(1, abs=1e-5)
     assert (weight[empty] == 0).all()
@@ -84,7 +94,7 @@ def test_weights_stay_without_measurements():
     A, weight, y, variance, _ = problem(1)
     variance[:] = np.inf
     start, offset = weight.copy(), np.full(1, 0.02)
-    update(A, weight, y, variance, CONSTANT, offset, 3, 10)
+    update(A, weight, END, y, variance, CONSTANT, offset, 3, 10)
     np.testing.assert_allclose(weight, start, rtol=1e-6)
     assert offset[0] == 0.02
 
@@ -92,7 +102,7 @@ def test_weights_stay_without_measurements():
 def test_weights_that_explain_the_measurements_stay():
     A, weight, _, variance, _ = problem(1)
     start, exact = weight.copy(), weight @ A
-    update(A, weight, exact, variance, CONSTANT, np.zeros(1), 3, 10)
+    update(A, weight, END, exact, variance, CONSTANT, np.zeros(1), 3, 10)
     np.testing.assert_allclose(weight, start, rtol=1e-3)
 
 
@@ -129,6 +139,6 @@ def test_few_steps_suffice_where_patterns_differ_little():
         y = (y + np.sqrt(variance) * rng.standard_normal(y.size)).astype(np.float32)
         few, many = start.astype(np.float32), start.astype(np.float32)
         for weight, steps in ((few, 9), (many, 500)):
-            update(A, weight, y, variance.astype(np.float32), CONSTANT, np.zeros(1), 2, steps)
+            update(A, weight, np.array([16]), y, variance.astype(np.float32), CONSTANT, np.zeros(1), 2, steps)
         far += np.abs(few - many).sum() > 0.6
     assert far <= 3

@@ -1,0 +1,1 @@
+"""The posterior mean of T, and the linear equations that give it."""
