@@ -13,6 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from workflows.recovery.pyramid import Grids
+from workflows.recovery.solvers import inner
 
 PARAMETERS = 6
 """Parameters of a lobe."""
@@ -128,7 +129,8 @@ def sample(
 
     Notes
     -----
-    With z = L^-1 (node - centre), ln share = -z'z / 2 + const, and d ln share = z' L^-1 (d centre + dL z).
+    With z = L^-1 (node - centre), ln share = -z'z / 2 + const, and d ln share = z' L^-1 (d centre + dL z). Along a row
+    ln share is a parabola, so the ratio of a share to the one before changes by a constant factor from node to node.
     """
     columns, rows, starts = grids
     spacing = 2.0**level
@@ -138,26 +140,34 @@ def sample(
     tall = math.sqrt(_REACH * yy)
     top = max(0, math.ceil((y - tall) / spacing - 0.5))
     bottom = min(rows[level] - 1, math.floor((y + tall) / spacing - 0.5))
+    inverse0, inverse1 = 1 / l00, 1 / l11
+    # from a node to the next of its row
+    step0 = spacing / l00
+    step1 = -l10 * step0 / l11
+    bend = math.exp(-(step0 * step0 + step1 * step1))
     n, total = 0, 0.0
     for row in range(top, bottom + 1):
         dy = (row + 0.5) * spacing - y
         wide = across * math.sqrt(max(_REACH - dy * dy / yy, 0.0))
         left = max(0, math.ceil((x + slope * dy - wide) / spacing - 0.5))
         right = min(columns[level] - 1, math.floor((x + slope * dy + wide) / spacing - 0.5))
+        z0 = ((left + 0.5) * spacing - x) / l00
+        z1 = (dy - l10 * z0) / l11
+        share = math.exp(-(z0 * z0 + z1 * z1) / 2)
+        ratio = math.exp(-(z0 * step0 + z1 * step1)) * math.sqrt(bend)
         for column in range(left, min(right + 1, left + NODES - n)):
-            dx = (column + 0.5) * spacing - x
-            z0 = dx / l00
-            z1 = (dy - l10 * z0) / l11
-            share = math.exp(-(z0 * z0 + z1 * z1) / 2)
             node[n] = starts[level] + row * columns[level] + column
             terms[0, n] = share
             if terms.shape[0] > 1:
-                g1 = z1 / l11
-                g0 = (z0 - l10 * g1) / l00
+                g1 = z1 * inverse1
+                g0 = (z0 - l10 * g1) * inverse0
                 terms[1, n], terms[2, n] = g0, g1
                 terms[3, n], terms[4, n], terms[5, n] = g0 * z0, g1 * z0, g1 * z1
             total += share
             n += 1
+            z0, z1 = z0 + step0, z1 + step1
+            share *= ratio
+            ratio *= bend
     if n == 0:
         column = min(max(math.floor(x / spacing), 0), columns[level] - 1)
         row = min(max(math.floor(y / spacing), 0), rows[level] - 1)
@@ -175,9 +185,7 @@ def _normalise(terms: NDArray[np.float32], n: int, total: float) -> None:
     for i in range(n):
         terms[0, i] /= total
     for k in range(1, terms.shape[0]):
-        mean = 0.0
-        for i in range(n):
-            mean += terms[0, i] * terms[k, i]
+        mean = inner(terms[0, :n], terms[k, :n])
         for i in range(n):
             terms[k, i] = terms[0, i] * (terms[k, i] - mean)
 

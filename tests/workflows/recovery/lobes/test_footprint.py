@@ -97,6 +97,17 @@ def test_derivatives_are_finite_differences(shape):
         assert abs(terms[t].sum()) < 1e-5
 
 
+@pytest.mark.parametrize(
+    "shape", [(-6.0, 40.0, 5.0, 2.0, 4.0), (64.2, 97.0, 0.7, 0.9, 0.6), (60, 40, 30, 28, 2.0)]
+)
+def test_shares_of_cut_and_slanted_lobes_are_those_of_the_plain_form(shape):
+    lobe = lobe_of(*shape)
+    node, terms = sampled(lobe, 0)
+    z = np.linalg.solve(np.array([[shape[2], 0], shape[3:]]), (places(node, 0) - shape[:2]).T)
+    share = np.exp(-(z**2).sum(axis=0) / 2)
+    np.testing.assert_allclose(terms[0], share / share.sum(), rtol=1e-5)
+
+
 @pytest.mark.parametrize("shape", SHAPES)
 def test_every_node_within_reach_is_sampled(shape):
     lobe = lobe_of(*shape)
