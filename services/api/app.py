@@ -5,9 +5,9 @@ from typing import Any
 from fastapi import Depends, FastAPI
 from sqlalchemy import Engine
 
-from services.api import errors
 from services.api.captures import captures, creation, manifest_schema, reports, tus, uploads
 from services.api.context import Context, authorized
+from services.api.http import errors
 from services.api.jobs import events, jobs
 from services.api.mattes import archives, clips, composites, layers, links, live, mattes
 from services.api.programs import pattern_files, playback, programs

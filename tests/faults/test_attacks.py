@@ -29,7 +29,7 @@ from tests.end_to_end.conftest import BANDS, Service, serving
 from tests.parts.background import repeating
 from tests.parts.callers import PATIENCE
 from tests.parts.captures import nested_program
-from tests.parts.hostile_mattes import hostile_archive, large_matte
+from tests.parts.inputs.hostile_mattes import hostile_archive, large_matte
 from tests.parts.processes import running
 from tests.parts.waiting import until
 from workflows.images.integer_formats import encode_png

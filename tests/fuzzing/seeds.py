@@ -14,8 +14,8 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
-from tests.parts.dngs import dng
-from tests.parts.heics import heic
+from tests.parts.inputs.dngs import dng
+from tests.parts.inputs.heics import heic
 from workflows.images.integer_formats import encode_png
 
 Files = tuple[bytes, ...]

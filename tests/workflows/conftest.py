@@ -15,7 +15,7 @@ from storage.layout import captures, uploads
 from storage.layout.captures import Stack
 from storage.objects.store import Objects
 from tests.parts.captures import zip_bytes
-from tests.parts.dngs import dng
+from tests.parts.inputs.dngs import dng
 from workflows.ingest import steps as ingest_steps
 from workflows.jobs import Task
 from workflows.untrusted.limits import Limits

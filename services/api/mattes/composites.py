@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from starlette.datastructures import Headers
 
 from services.api.context import Context, OwnerContext
-from services.api.errors import answer as answer_problem
 from services.api.http.bodies import BodyLimit, spool_body
+from services.api.http.errors import answer as answer_problem
 from services.api.http.media_types import preferred
 from services.api.http.responses import bytes_response, etag_matches
 from services.api.jobs.jobs import Job

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from tests.end_to_end.conftest import Service, serving
 from tests.faults.test_attacks import ATTACKS, MATTES, ZIP, Attacked, bearer, under_attack
 from tests.parts.captures import captured, nested_program, zip_bytes
-from tests.parts.hostile_mattes import hostile_archive
+from tests.parts.inputs.hostile_mattes import hostile_archive
 from tests.parts.waiting import until
 from workflows.images.integer_formats import encode_png
 from workflows.programs.program import Constant, Program

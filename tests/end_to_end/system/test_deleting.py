@@ -22,7 +22,7 @@ from storage.layout.captures import create_stack, write_slab
 from storage.objects.store import Objects
 from storage.records import captures, jobs, mattes
 from tests.end_to_end.conftest import Service
-from tests.parts.hostile_mattes import large_matte
+from tests.parts.inputs.hostile_mattes import large_matte
 from tests.parts.waiting import until
 
 READERS = 6

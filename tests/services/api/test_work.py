@@ -12,7 +12,7 @@ import pytest
 import uvicorn
 from fastapi import FastAPI, Request
 
-from services.api import errors
+from services.api.http import errors
 from services.api.work import Shares, run
 from services.runtime.problems import TooLarge
 from tests.parts.waiting import until

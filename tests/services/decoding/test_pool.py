@@ -15,8 +15,8 @@ from PIL import Image
 
 from services.decoding.pool import Decoders
 from storage.errors import ImageError, Unavailable
-from tests.parts.dngs import dng
-from tests.parts.heics import heic
+from tests.parts.inputs.dngs import dng
+from tests.parts.inputs.heics import heic
 from tests.parts.waiting import until
 from tests.services.cluster.clusters import running
 from workflows.images import decode, float_formats, integer_formats

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from storage.errors import ImageError
-from tests.parts.heics import heic
+from tests.parts.inputs.heics import heic
 from workflows.images import decode as any_format
 from workflows.images import heif, integer_formats
 from workflows.images.orientation import upright

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from storage.errors import ImageError
-from tests.parts.heics import heic
+from tests.parts.inputs.heics import heic
 from workflows.images.integer_formats import decode, encode_png, to_integers, to_unit
 
 MEMORY = 1 << 20

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from tests.parts.heics import heic
+from tests.parts.inputs.heics import heic
 from workflows.images.raw_files import is_raw
 
 COUNTS = np.random.default_rng(8).integers(200, 4000, (40, 60), np.uint16)

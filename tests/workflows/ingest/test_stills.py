@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from storage.errors import CaptureError
 from storage.layout.captures import Stack
-from tests.parts.heics import heic
+from tests.parts.inputs.heics import heic
 from workflows.images.integer_formats import encode_jpeg, encode_png
 from workflows.images.tone_curves import BLACK, table
 

@@ -20,7 +20,7 @@ from storage.database.engine import writing
 from storage.database.owners import for_owner
 from storage.objects.store import Objects
 from storage.records import api_keys, mattes
-from tests.parts.hostile_mattes import large_matte
+from tests.parts.inputs.hostile_mattes import large_matte
 from tests.parts.waiting import until
 from workflows.images.integer_formats import encode_png
 

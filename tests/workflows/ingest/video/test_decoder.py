@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from storage.errors import CaptureError
-from tests.parts.heics import heic
+from tests.parts.inputs.heics import heic
 from tests.workflows.composite.video.test_steps import clip, even, pictures
 from tests.workflows.ingest.video.camera import Camera, Film, as_transport_stream, boxes, film, turned
 from tests.workflows.ingest.video.films import IngestFilm, error_of, misplaced, missing

@@ -4,7 +4,7 @@ import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
-from services.api.errors import register
+from services.api.http.errors import register
 from services.runtime.problems import Unauthorized
 from storage.errors import EnvmatteError, NotFound, Unavailable
 
