@@ -40,7 +40,7 @@ class RecoveryOptions(BaseModel):
 class _LobesQuality(RecoveryOptions):
     quality: Literal["fine", "fast"] = Field(
         "fine",
-        description="`fast` takes half of the time and costs two and a half decibels. It changes the defaults: "
+        description="`fast` takes two thirds of the time and costs two and a half decibels. It changes the defaults: "
         + ", ".join(f"`{name}` {value}" for name, value in _FAST.items())
         + ".",
     )
