@@ -2,6 +2,7 @@
 
 import base64
 import hashlib
+import os
 import re
 from importlib.resources import files
 from pathlib import Path
@@ -9,7 +10,11 @@ from typing import Any
 
 from fastapi import APIRouter
 from fastapi.responses import FileResponse, HTMLResponse, Response
-from starlette.staticfiles import StaticFiles
+from starlette.datastructures import Headers
+from starlette.staticfiles import NotModifiedResponse, StaticFiles
+from starlette.types import Scope
+
+from services.api.system.minified import TYPES, minified, minified_file
 
 page = APIRouter()
 WEB = Path(__file__).parents[2] / "web"
@@ -41,13 +46,35 @@ class Files(StaticFiles):
         return answer
 
 
+class MinifiedFiles(Files):
+    """Static files that are sent without comments and spaces."""
+
+    def file_response(
+        self,
+        full_path: str | os.PathLike[str],
+        stat_result: os.stat_result,
+        scope: Scope,
+        status_code: int = 200,
+    ) -> Response:
+        path = Path(full_path)
+        if path.suffix not in TYPES:
+            return super().file_response(full_path, stat_result, scope, status_code)
+        content, tag = minified_file(path, stat_result.st_mtime)
+        headers = {**FRESH, "ETag": tag}
+        answer = Response(content, status_code, headers, TYPES[path.suffix])
+        if self.is_not_modified(answer.headers, Headers(scope=scope)):
+            return NotModifiedResponse(answer.headers)
+        return answer
+
+
 def _app() -> str:
     """The app's page, with a link for each module: browsers then load all of them at once, not one after another."""
     modules = sorted(path.relative_to(WEB).as_posix() for path in (WEB / "app").rglob("*.js"))
     links = "\n".join(
         f'<link rel="modulepreload" href="web/{module}">' for module in modules if module != "app/main.js"
     )
-    return (WEB / "app" / "index.html").read_text().replace("<!-- preload -->", links)
+    page = (WEB / "app" / "index.html").read_text(encoding="utf-8").replace("<!-- preload -->", links)
+    return minified(page, "text/html")
 
 
 def _app_policy() -> str:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from playwright.sync_api import Browser, sync_playwright
 
+from services.api.system.minified import TYPES, minified_file
 from services.cli.demo_run import service
 from tests.browser.conftest import ARGUMENTS, CHROMIUM
 
@@ -37,6 +38,10 @@ MOVES = """() => {
 """Whether a second picture of the glass was drawn: by itself at first, as it greets who opens the app."""
 
 
+def _sent_bytes(path: Path) -> int:
+    return len(minified_file(path, 0)[0]) if path.suffix in TYPES else path.stat().st_size
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -46,7 +51,7 @@ def main() -> None:
     files = [path for path in WEB.rglob("*") if path.is_file()]
     samples = [path for path in files if "samples" in path.parts]
     for name, some in (("the app", set(files) - set(samples)), ("its samples", samples)):
-        print(f"{name}: {len(some)} files, {sum(path.stat().st_size for path in some) / 1000:.0f} kB")
+        print(f"{name}: {len(some)} files, {sum(map(_sent_bytes, some)) / 1000:.0f} kB")
     print("`envmatte serve` listens after, s    glass moves after, s")
     for listens, moves in sorted(_start() for _ in range(3)):
         print(f"{listens:32.1f} {moves:23.1f}")

@@ -1,0 +1,60 @@
+"""Files of the web app over HTTP: smaller than their sources, asked for again each time, and answered by 304."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+
+from services.api.app import build_app
+from services.api.system import minified
+from services.api.system.pages import WEB
+from services.settings import Settings
+from storage.database.engine import open_engine
+from storage.objects.store import Objects
+
+FILES = ["app/main.js", "app/style.css", "app/icon.svg", "play/play.js"]
+
+
+@pytest.fixture
+def http(tmp_path: Path) -> Iterator[TestClient]:
+    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
+    yield TestClient(
+        build_app(Settings(data=tmp_path), engine, Objects((tmp_path / "store").as_uri())), "http://localhost"
+    )
+    engine.dispose()
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_files_are_sent_smaller_and_only_if_they_changed(http: TestClient, name: str) -> None:
+    pytest.importorskip("minify", reason="there are wheels of the minifier for Linux only")
+    answer = http.get(f"/web/{name}")
+    assert 0 < len(answer.content) < (WEB / name).stat().st_size
+    assert answer.headers["content-type"].partition(";")[0] == minified.TYPES[Path(name).suffix]
+    assert answer.headers["cache-control"] == "no-cache"
+    tag = answer.headers["etag"]
+    assert http.get(f"/web/{name}", headers={"If-None-Match": tag}).status_code == 304
+    assert http.get(f"/web/{name}", headers={"If-None-Match": '"other"'}).status_code == 200
+
+
+def test_changed_file_is_sent_anew(tmp_path: Path) -> None:
+    path = tmp_path / "one.js"
+    path.write_text("export const one = 1;\n")
+    first = minified.minified_file(path, 1.0)
+    path.write_text("export const two = 2;\n")
+    assert minified.minified_file(path, 1.0) == first
+    content, tag = minified.minified_file(path, 2.0)
+    assert b"two" in content
+    assert tag != first[1]
+
+
+def test_files_are_sent_as_they_are_without_the_minifier(
+    http: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(minified, "minify", None)
+    minified.minified_file.cache_clear()
+    try:
+        for name in FILES:
+            assert http.get(f"/web/{name}").content == (WEB / name).read_bytes()
+    finally:
+        minified.minified_file.cache_clear()
