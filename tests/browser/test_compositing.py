@@ -293,7 +293,8 @@ def test_clip_that_browser_cannot_play_is_explained(
     choose(page, b"no clip", "clip.mp4", "video/mp4")
     expect(page.get_by_role("alert")).to_contain_text("cannot play the clip")
     page.get_by_role("button", name="Make the video").click()
-    expect(page.get_by_text("failed", exact=True)).to_be_visible(timeout=MINUTE)
+    stage = page.get_by_role("region", name="Compositing")
+    expect(stage.get_by_text("failed", exact=True)).to_be_visible(timeout=MINUTE)
 
 
 def test_without_webgl_the_service_draws(context: BrowserContext, service: Service, ball: str) -> None:

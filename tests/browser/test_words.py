@@ -44,6 +44,7 @@ def test_sentences_begin_with_a_capital_and_names_stay(
     desk: Page, service: Service, detail: str, entry: str | None, shown: str
 ) -> None:
     desk.goto(service.url)
+    expect(desk.get_by_role("heading", level=1)).to_be_visible()
     assert desk.evaluate(SHOWN, [detail, entry]) == [shown, "none"]
 
 
@@ -122,6 +123,7 @@ def test_last_step_of_an_ingest_is_named(
     desk: Page, service: Service, stage: str, eta: float, text: str
 ) -> None:
     desk.goto(service.url)
+    expect(desk.get_by_role("heading", level=1)).to_be_visible()
     job = {"kind": "ingest", "state": "running", "stage": stage, "progress": 0.5, "eta_seconds": eta}
     assert desk.evaluate(STAGE, job | {"tiles": {"total": 1, "done": 1, "failed": 0}}) == text
 

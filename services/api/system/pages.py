@@ -68,10 +68,15 @@ class MinifiedFiles(Files):
 
 
 def _app() -> str:
-    """The app's page, with a link for each module: browsers then load all of them at once, not one after another."""
+    """The app's page, with a link for each module: browsers then load all of them at once, not one after another.
+
+    Words are left out: the app loads those of one language.
+    """
     modules = sorted(path.relative_to(WEB).as_posix() for path in (WEB / "app").rglob("*.js"))
     links = "\n".join(
-        f'<link rel="modulepreload" href="web/{module}">' for module in modules if module != "app/main.js"
+        f'<link rel="modulepreload" href="web/{module}">'
+        for module in modules
+        if module != "app/main.js" and not module.startswith("app/words/")
     )
     page = (WEB / "app" / "index.html").read_text(encoding="utf-8").replace("<!-- preload -->", links)
     return minified(page, "text/html")

@@ -8,6 +8,8 @@ import { capture } from "./views/capture.js";
 import { filming, program } from "./film/program.js";
 import { job, jobs } from "./views/jobs.js";
 import { matte, mattes } from "./views/mattes.js";
+import { loadWords } from "./lib/language.js";
+import { t } from "./lib/words.js";
 
 const VIEWS = { home: [home], film: [filming, program], captures: [captures, capture], jobs: [jobs, job], mattes: [mattes, matte] };
 const main = document.getElementById("main");
@@ -55,7 +57,7 @@ async function route(navigated) {
 		else view.resume = await VIEWS[name][id ? 1 : 0](view.element, view.signal, id);
 	} catch (error) {
 		const final = error.status >= 400 && error.status < 500;
-		const again = !final && h("p", h("button", { type: "button", onclick: () => route(true) }, "Try again"));
+		const again = !final && h("p", h("button", { type: "button", onclick: () => route(true) }, t("again")));
 		if (!view.signal.aborted) view.element.append(problemBox(error), again || "");
 	}
 	if (view !== shown) return;
@@ -82,5 +84,6 @@ for (const type of ["dragover", "drop"]) {
 	});
 }
 addEventListener("keydown", ({ key, target }) => key === "?" && !target.matches("input, select") && document.getElementById("keys").showModal());
+await loadWords();
 addEventListener("hashchange", () => route(true));
 route(false);

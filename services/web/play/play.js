@@ -1,8 +1,11 @@
 // Plays a program full screen, and reports its progress to the service for a phone that follows.
 import { LEAD, LEAD_SECONDS, borderOn, draw, schedule } from "./border.js";
 import { authorization } from "../app/lib/api.js";
-import { CHECKS } from "../app/film/checklist.js";
+import { checks } from "../app/film/checklist.js";
 import { countScreen, knownScreen, onZoom, rememberScreen } from "../app/film/screen.js";
+import { loadWords } from "../app/lib/language.js";
+import { parts, t } from "../app/lib/words.js";
+import { h } from "../app/lib/dom.js";
 
 const COUNTDOWN = 5; // seconds
 const AHEAD = 8; // pictures decoded ahead: all of them would fill the memory
@@ -153,12 +156,12 @@ function checkFit({ display, program }, found) {
 	const { width, height, isMeasured, isWindow } = surface;
 	const near = isMeasured ? 1 : devicePixelRatio;
 	const fits = Boolean(display) && Math.abs(display.width - width) < near && Math.abs(display.height - height) < near;
-	const made = display ? `This program is made for a screen of ${sizeOf(display)} pixels` : "This program has no border";
-	const misfit = `${made}; this ${isWindow ? "window" : "screen"} has ${sizeOf(surface)}, so patterns are stretched and less sharp.`;
+	const made = display ? t("play.made", { size: sizeOf(display) }) : t("play.borderless");
+	const misfit = t(isWindow ? "play.window" : "play.screen", { made, size: sizeOf(surface) });
 	const real = isMeasured ? surface : display;
 	const zoom = real && !isWindow ? zoomBetween(countScreen(), real) : 100;
-	const zoomed = `This page ${isMeasured ? "is" : "seems to be"} zoomed to ${zoom} %. Set the zoom to 100 % (Ctrl+0 or ⌘0).`;
-	$("misfit").textContent = zoom === 100 ? misfit : `${zoomed} ${isMeasured ? "" : "If this note stays: "}${misfit}`;
+	const zoomed = t(isMeasured ? "play.zoomed" : "play.maybe", { zoom });
+	$("misfit").textContent = zoom === 100 ? misfit : `${zoomed} ${isMeasured ? "" : `${t("play.stays")} `}${misfit}`;
 	$("refit").onclick = () => refit(program, { width, height }).catch((error) => setStatus(error.message));
 	$("fit").hidden = fits;
 	return fits;
@@ -167,13 +170,13 @@ function checkFit({ display, program }, found) {
 async function open() {
 	const program = await (await ask(`../${id}`)).json();
 	const { patterns, monitor } = program;
-	$("about").textContent = `${patterns} patterns of ${sizeOf(monitor)} pixels.`;
+	$("about").textContent = t("play.about", { n: patterns, size: sizeOf(monitor) });
 	checkFit(program, knownScreen());
 	onZoom(() => checkFit(program, knownScreen()));
 	const pictures = new Pictures();
-	setStatus("Loading the patterns.");
+	setStatus(t("play.loading"));
 	await pictures.load(patterns, ask, (share) => ($("loaded").value = share));
-	setStatus("Ready.");
+	setStatus(t("play.ready"));
 	$("start").disabled = false;
 	$("settings").onsubmit = (event) => {
 		event.preventDefault();
@@ -203,24 +206,24 @@ async function play(program, pictures, rate) {
 		// Without full screen for elements, the stage fills the window.
 		const full = await stage.requestFullscreen?.({ navigationUI: "hide" }).then(() => true, () => false);
 		lock = await navigator.wakeLock?.request("screen").catch(() => undefined);
-		listen(document, "keydown", (event) => event.key === "Escape" && end("Stopped."));
-		listen(document, "fullscreenchange", () => full && !document.fullscreenElement && end("Stopped."));
+		listen(document, "keydown", (event) => event.key === "Escape" && end(t("play.stopped")));
+		listen(document, "fullscreenchange", () => full && !document.fullscreenElement && end(t("play.stopped")));
 		// The back button stops the program without leaving the page and what it has loaded.
 		if (!history.state?.showing) history.pushState({ showing: true }, "");
-		listen(window, "popstate", () => end("Stopped."));
-		listen(document, "visibilitychange", () => document.hidden && end("Stopped: the page was hidden."));
+		listen(window, "popstate", () => end(t("play.stopped")));
+		listen(document, "visibilitychange", () => document.hidden && end(t("play.hidden")));
 		await pictures.prepare(0);
 		const found = { ...(await measure(canvas)), isWindow: !full };
 		if (full && found.isExact) rememberScreen(found);
 		const isNew = sizeOf(found) !== sizeOf(surface);
-		if (!checkFit(program, found) && isNew) throw new Error("Not started: the patterns do not fit. See the note above the button.");
+		if (!checkFit(program, found) && isNew) throw new Error(t("play.misfit"));
 		report(progress);
 		const refresh = await countDown($("countdown"), signal);
 		const { width, height } = await measure(canvas);
 		[canvas.width, canvas.height] = [width, height];
-		listen(window, "resize", () => end("Stopped: the window was resized."));
+		listen(window, "resize", () => end(t("play.resized")));
 		const border = borderOn(canvas.width, canvas.height);
-		if (!border.fits) throw new Error("The window is too small for the border: make it larger.");
+		if (!border.fits) throw new Error(t("play.small"));
 		const context = canvas.getContext("2d", { alpha: false });
 		Object.assign(progress, { phase: "showing", seconds: 0, border: { width: border.width, height: border.height } });
 		const passed = (number) => {
@@ -256,7 +259,7 @@ function finish(program, { width, height }, shown, refresh) {
 	URL.revokeObjectURL($("capture").href);
 	$("capture").href = URL.createObjectURL(new Blob([JSON.stringify(record, null, 1)], { type: "application/json" }));
 	$("record").hidden = false;
-	setStatus(`All ${patterns.length} patterns were shown, ${rate} a second. Stop recording.`);
+	setStatus(t("play.done", { n: patterns.length, rate }));
 	document.dispatchEvent(new CustomEvent("played", { detail: { shown, refresh, record } }));
 	return rate;
 }
@@ -268,7 +271,10 @@ $("unlock").onsubmit = (event) => {
 	start();
 };
 
-$("checks").append(...CHECKS.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
+await loadWords();
+document.title = `${t("play.title")} · envmatte`;
+$("record").append(...parts("play.record", { record: h("a", { id: "capture", download: "capture.json" }, "capture.json"), film: h("code", "film.mp4"), name: h("code", "capture.json") }));
+$("checks").append(...checks().map((text) => Object.assign(document.createElement("li"), { textContent: text })));
 $("follow").href = new URL(`/#/film/${id}`, here);
 
 const start = () => open().catch((error) => setStatus(error.message));

@@ -6,7 +6,12 @@ import { decodeLive } from "../app/composite/live_form.js";
 import { handleGestures, placement } from "../app/composite/placement.js";
 import { NAMES } from "../app/composite/scenery.js";
 import { h } from "../app/lib/dom.js";
+import { preferred, speak, t } from "../app/lib/words.js";
+import { de } from "../app/words/de.js";
+import { en } from "../app/words/en.js";
 
+const language = preferred();
+speak(language, { de, en }[language]);
 const stage = document.getElementById("stage");
 const choices = document.getElementById("choices");
 const monitor = document.body.dataset.monitor.split(" ").map(Number);
@@ -24,7 +29,7 @@ async function matte() {
 }
 
 const readable = (found) => {
-	if (!found.picture) throw new Error(`This browser cannot read ${found.name}. Use PNG, JPEG or WebP.`);
+	if (!found.picture) throw new Error(t("page.unreadable", found));
 	return found;
 };
 
@@ -37,15 +42,16 @@ function take([file]) {
 }
 
 async function start() {
-	if (!glass.gl) return say("This browser has no WebGL2, which draws the glass. Open the page in another one.");
-	glass.lost = () => say("The browser lost the graphics card. Reload the page to draw the glass again.");
+	say(t("stage.loading"));
+	if (!glass.gl) return say(t("page.nogl"));
+	glass.lost = () => say(t("page.lost"));
 	const found = await matte();
-	if (!glass.load(found, monitor)) return glass.gl && say("This matte is too large for the graphics card of this device.");
+	if (!glass.load(found, monitor)) return glass.gl && say(t("page.large"));
 	stage.style.setProperty("--aspect", found.width / found.height);
 	handleGestures(stage, placed);
 	const choice = (name, i) =>
-		h("label", h("input", { type: "radio", name: "backdrop", checked: i === 0, onchange: () => use(builtIn(name, monitor)) }), name);
-	choices.prepend(h("fieldset", h("legend", "Backdrop"), NAMES.map(choice)));
+		h("label", h("input", { type: "radio", name: "backdrop", checked: i === 0, onchange: () => use(builtIn(name, monitor)) }), t(`scene.${name}`));
+	choices.prepend(h("fieldset", h("legend", t("backdrop")), NAMES.map(choice)));
 	document.getElementById("reset").append(placed.reset);
 	const own = document.querySelector("#own input");
 	own.onchange = () => {
@@ -66,4 +72,4 @@ addEventListener("drop", (event) => {
 	stage.classList.remove("over");
 	take(event.dataTransfer.files);
 });
-start().catch((error) => say(`Cannot draw the glass: ${error.message}`));
+start().catch((error) => say(t("page.failed", { why: error.message })));

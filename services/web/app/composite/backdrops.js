@@ -1,5 +1,6 @@
 // Backdrops: built-in pictures, and files that users choose.
 import { scenery } from "./scenery.js";
+import { t } from "../lib/words.js";
 
 export const PREVIEW = 640; // pixels of the longer side, of what is sent while the user moves the backdrop
 const DRAWABLE = 2048; // pixels of the longer side of what this browser draws: as fine as monitors
@@ -24,7 +25,7 @@ export function drawPlaced(context, picture, { right, down, scale, angle }, [wid
 	context.setTransform(1, 0, 0, 1, 0, 0);
 }
 
-// A backdrop is `{name, exact, quick}`: two functions that make what the service gets, at full size and while the user
+// A backdrop is `{name, exact, quick}`, with a `label` if people read another name: two functions that make what the service gets, at full size and while the user
 // moves it. With `picture`, this browser can draw it too; a `moving` one plays; `close` frees what it holds.
 
 // A built-in backdrop, with the aspect of a monitor.
@@ -32,13 +33,13 @@ export async function builtIn(name, [wide, high]) {
 	const width = Math.min(wide, 1280);
 	const drawn = scenery(name, width, Math.max(1, Math.round((width * high) / wide)));
 	const blob = await blobOf(drawn.picture);
-	return { ...drawn, exact: () => blob, quick: () => blob };
+	return { ...drawn, label: t(`scene.${name}`), exact: () => blob, quick: () => blob };
 }
 
 // A picture from a file. `copy` makes what the service takes if it refuses the file: as large as this browser draws it.
 export async function fromFile(file) {
 	const exact = () => file;
-	const name = file.name || "Pasted picture";
+	const name = file.name || t("backdrop.pasted");
 	const read = { premultiplyAlpha: "none" };
 	const whole = await createImageBitmap(file, read).catch(() => null); // TIFF, EXR, RAW and mostly HEIC, which only the service reads
 	if (!whole) return { name, exact, quick: exact };

@@ -1,6 +1,7 @@
 // Divides the picture: its left shows the live picture, the bare backdrop or another matte.
 import { h, newest } from "../lib/dom.js";
 import { drawPlaced } from "./backdrops.js";
+import { t } from "../lib/words.js";
 
 // Returns the controls. `others` are mattes by a name.
 export function comparison(stage, matte, others) {
@@ -8,14 +9,14 @@ export function comparison(stage, matte, others) {
 	const aside = h("canvas.aside", { width, height, hidden: true, "aria-hidden": "true" });
 	const context = aside.getContext("2d");
 	const slider = h("input", { type: "range", min: 0, max: 100, step: 1, value: 50, id: "divide" });
-	const row = h("div.row", { hidden: true }, h("label", { for: "divide" }, "Divide"), slider);
+	const row = h("div.row", { hidden: true }, h("label", { for: "divide" }, t("compare.divide")), slider);
 	const cut = () => (aside.style.clipPath = `inset(0 ${100 - slider.value}% 0 0)`);
 	slider.oninput = cut;
 	cut();
 	const kinds = {
-		Nothing: null,
-		Live: () => stage.isLive && context.drawImage(stage.drawn(), 0, 0, width, height),
-		Backdrop: () => stage.backdrop.picture && drawPlaced(context, stage.backdrop.picture, stage.place, matte.monitor),
+		[t("compare.nothing")]: null,
+		[t("compare.live")]: () => stage.isLive && context.drawImage(stage.drawn(), 0, 0, width, height),
+		[t("backdrop")]: () => stage.backdrop.picture && drawPlaced(context, stage.backdrop.picture, stage.place, matte.monitor),
 	};
 	for (const [name, other] of Object.entries(others)) {
 		kinds[name] = async () => context.drawImage(await createImageBitmap(await stage.composite("image/jpeg", stage.backdrop, other.id)), 0, 0, width, height);
@@ -33,5 +34,5 @@ export function comparison(stage, matte, others) {
 	stage.element.addEventListener("moved", () => (aside.hidden = true));
 	const choice = (name) => h("label.choice",
 		h("input", { type: "radio", name: "compare", checked: !kinds[name], onchange: () => ((chosen = kinds[name]), draw()) }), name);
-	return h("div.stack", h("fieldset.row", h("legend", "Compare with"), Object.keys(kinds).map(choice)), row);
+	return h("div.stack", h("fieldset.row", h("legend", t("compare.with")), Object.keys(kinds).map(choice)), row);
 }

@@ -11,6 +11,7 @@ import { NAMES, scenery } from "./scenery.js";
 import { Stage } from "./stage.js";
 import { cameraSymbol, choice, thumbs } from "./thumb_choices.js";
 import { camera, clip } from "./video_backdrops.js";
+import { parts, t } from "../lib/words.js";
 
 const RAW = ".dng,.nef,.cr2,.cr3,.arw,.raf,.orf,.rw2"; // the usual names of camera RAW
 // Browsers know no type of MKV, and give MTS that of something else.
@@ -29,15 +30,15 @@ export function compositing(matte, others, signal) {
 		type: "button", hidden: true,
 		onclick: async () => {
 			await stage.pauseOrPlay();
-			play.textContent = stage.playing ? "Pause" : "Play";
+			play.textContent = t(stage.playing ? "pause" : "play");
 		},
-	}, "Pause");
+	}, t("pause"));
 	async function use(promise) {
 		const backdrop = await stage.use(promise);
 		if (!backdrop) return;
 		video.choose(backdrop.clip);
 		play.hidden = !backdrop.moving;
-		play.textContent = "Pause";
+		play.textContent = t("pause");
 	}
 	const transparent = h("input", { type: "checkbox", checked: given.around === "nothing" });
 	transparent.onchange = () => stage.putAround(!transparent.checked);
@@ -57,7 +58,7 @@ export function compositing(matte, others, signal) {
 	const choices = backdropChoices(matte, stage.element, use, taken.all, first, signal);
 	use(builtIn(first, matte.monitor));
 
-	const filled = (is) => ((sheet.open = !is), full.textContent = section.classList.toggle("full", Boolean(is)) ? "Leave full screen" : "Full screen");
+	const filled = (is) => ((sheet.open = !is), full.textContent = section.classList.toggle("full", Boolean(is)) ? t("full.leave") : t("full"));
 	const full = h("button", {
 		type: "button",
 		onclick() {
@@ -65,14 +66,14 @@ export function compositing(matte, others, signal) {
 			else if (section.requestFullscreen) section.requestFullscreen();
 			else filled(!section.classList.contains("full")); // the window: browsers of phones let only videos fill the screen
 		},
-	}, "Full screen");
+	}, t("full"));
 	const folded = (title, ...about) => h("details", h("summary", title), about);
-	const sheet = h("details.panel.sheet", { open: true }, h("summary", "Controls"),
-		h("div.row", full, play, explained.button, placed.reset, h("label", transparent, " Transparent around the glass")),
+	const sheet = h("details.panel.sheet", { open: true }, h("summary", t("controls")),
+		h("div.row", full, play, explained.button, placed.reset, h("label", transparent, " ", t("transparent"))),
 		stage.status, explained.panel, choices,
-		folded("Placement", h("p.hint", "Drag the picture to move the backdrop; then scroll, or pinch, to scale it."), placed.sliders),
-		folded("Comparison", comparison(stage, matte, others)), folded("Copy and download", taken.element), video.element, stage.renderer);
-	const section = h("section.composite", { "aria-label": "Compositing" }, stage.element, sheet);
+		folded(t("placement"), h("p.hint", t("placement.how")), placed.sliders),
+		folded(t("compare"), comparison(stage, matte, others)), folded(t("take"), taken.element), video.element, stage.renderer);
+	const section = h("section.composite", { "aria-label": t("compositing") }, stage.element, sheet);
 	section.addEventListener("fullscreenchange", () => filled(document.fullscreenElement));
 	return section;
 }
@@ -80,8 +81,8 @@ export function compositing(matte, others, signal) {
 // What can be a backdrop: a built-in one, the camera, or a file that is dropped, pasted or chosen. Of several files `all`
 // makes composites.
 function backdropChoices(matte, stage, use, all, first, signal) {
-	const builtIns = NAMES.map((name) => choice("backdrop", name, scenery(name, 96, 72).picture, name === first, () => use(builtIn(name, matte.monitor))));
-	const choices = thumbs("Backdrop", [...builtIns, choice("backdrop", "Camera", cameraSymbol(), false, () => use(camera()))]);
+	const builtIns = NAMES.map((name) => choice("backdrop", t(`scene.${name}`), scenery(name, 96, 72).picture, name === first, () => use(builtIn(name, matte.monitor))));
+	const choices = thumbs(t("backdrop"), [...builtIns, choice("backdrop", t("camera"), cameraSymbol(), false, () => use(camera()))]);
 	const take = (files) => {
 		if (files.length > 1) return all([...files]);
 		const [file] = files;
@@ -91,6 +92,6 @@ function backdropChoices(matte, stage, use, all, first, signal) {
 	const input = fileField({ id: "backdrop", multiple: true, accept: `image/*,.heic,.heif,.hif,.exr,.tif,.tiff,${RAW},video/*,.mts,.m2ts` }, take);
 	onDrop(stage, take);
 	addEventListener("paste", ({ clipboardData }) => clipboardData?.files.length && take(clipboardData.files), { signal });
-	return [choices, h("div.drop.small", h("label", { for: "backdrop" }, h("strong", "Your own picture or clip"), " drop, paste or choose it",
-		h("span.hint", "PNG, JPEG, WebP, AVIF, GIF, HEIC, TIFF, EXR, camera RAW or a video; several pictures come back as a ZIP")), input)];
+	return [choices, h("div.drop.small", h("label", { for: "backdrop" }, parts("backdrop.drop", { own: h("strong", t("backdrop.own")) }),
+		h("span.hint", t("backdrop.what"))), input)];
 }

@@ -3,6 +3,7 @@ import { Problem, saveBlob } from "../lib/api.js";
 import { button, h, problemBox } from "../lib/dom.js";
 import { zip } from "../upload/zip.js";
 import { fromFile } from "./backdrops.js";
+import { t } from "../lib/words.js";
 
 const FORMATS = { PNG: "image/png", JPEG: "image/jpeg", EXR: "image/x-exr" };
 const TIMES = 2;
@@ -22,7 +23,7 @@ export function downloads(stage, signal) {
 		const refused = [];
 		problem.replaceChildren();
 		for (const [n, file] of files.entries()) {
-			status.textContent = `Composite ${n + 1} of ${files.length}`;
+			status.textContent = t("take.n", { n: n + 1, all: files.length });
 			try {
 				const backdrop = await fromFile(file);
 				made.push([entryName(file.name, n), await stage.composite(FORMATS.PNG, backdrop)]);
@@ -33,16 +34,16 @@ export function downloads(stage, signal) {
 			}
 		}
 		if (made.length) saveBlob(await zip(made, signal), "composites.zip");
-		status.textContent = `${made.length} of ${files.length} composites are in composites.zip.`;
-		if (refused.length) problem.replaceChildren(problemBox({ title: "Some files cannot be backdrops", detail: refused.join("; "), entry: refused[0] }));
+		status.textContent = t("take.zip", { n: made.length, all: files.length });
+		if (refused.length) problem.replaceChildren(problemBox({ title: t("take.refused"), detail: refused.join("; "), entry: refused[0] }));
 	}
 
-	const copy = button("Copy picture", stage.problem, async () => {
+	const copy = button(t("take.copy"), stage.problem, async () => {
 		await copyPicture(stage);
-		status.textContent = "The picture is in the clipboard.";
+		status.textContent = t("take.copied");
 	});
-	const element = h("div.stack", h("div.row", copy, h("span", "Download as"), buttons,
-		h("label", larger, " Twice the size")), status, problem);
+	const element = h("div.stack", h("div.row", copy, h("span", t("take.as")), buttons,
+		h("label", larger, " ", t("take.twice"))), status, problem);
 	return { element, all: (files) => all(files).catch((error) => signal.aborted || problem.replaceChildren(problemBox(error))) };
 }
 
@@ -58,16 +59,16 @@ async function picture(stage, type, isLarger) {
 }
 
 async function copyPicture(stage) {
-	const title = "Cannot copy the picture";
+	const title = t("take.uncopied");
 	if (!navigator.clipboard?.write) {
-		throw new Problem({ title, detail: "Browsers copy pictures only on pages from https or from this device. Download it instead." });
+		throw new Problem({ title, detail: t("take.insecure") });
 	}
 	const made = stage.composite(FORMATS.PNG);
 	try {
 		await navigator.clipboard.write([new ClipboardItem({ [FORMATS.PNG]: made })]);
 	} catch {
 		await made; // says what the service refused
-		throw new Problem({ title, detail: "The browser did not allow it. Click into the page and try again, or download the picture." });
+		throw new Problem({ title, detail: t("take.forbidden") });
 	}
 }
 

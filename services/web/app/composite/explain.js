@@ -1,11 +1,14 @@
 // Explains a pixel: its lobes on the backdrop, a line to the heaviest one, and words.
 import { getJson } from "../lib/api.js";
-import { facts, h, newest, pause, problemBox, svg } from "../lib/dom.js";
+import { facts, h, newest, pause, problemBox, svg, tenths } from "../lib/dom.js";
 import { drawPlaced } from "./backdrops.js";
+import { t } from "../lib/words.js";
 
 const CALM = 120; // ms that the pointer rests before its pixel is requested
 const INSET = 0.4; // widths of the stage that the backdrop takes
 const SHARP = 0.02; // widths of the monitor below which a lobe is sharp
+
+const PLACES = ["topleft", "top", "topright", "left", "middle", "right", "bottomleft", "bottom", "bottomright"];
 
 const mean = (colours) => colours.reduce((sum, one) => sum + one, 0) / colours.length;
 const percent = (share) => `${Math.round(100 * share)} %`;
@@ -28,7 +31,7 @@ export function explanation(stage, matte, signal) {
 			const [x, y] = pixel;
 			const found = await getJson(`v1/mattes/${matte.id}/transport?x=${x}&y=${y}`, signal);
 			if (!pixel) return;
-			words.textContent = `Pixel (${x}, ${y}): ${inWords(found)}`;
+			words.textContent = t("pixel", { x, y, words: inWords(found) });
 			figures.replaceChildren(found.recovered ? figuresOf(found) : "");
 			draw(found);
 			problem.replaceChildren();
@@ -83,31 +86,31 @@ export function explanation(stage, matte, signal) {
 			drawing.replaceChildren();
 			if (pixel) look();
 		},
-	}, "Explain a pixel");
+	}, t("pixel.explain"));
 	stage.element.append(inset, drawing);
 	const panel = h("div.stack", { hidden: true }, words, figures, problem);
 	return { button, panel };
 }
 
 function inWords({ recovered, S, rho, lobes }) {
-	if (!recovered) return "the mask left it out.";
-	const reflected = mean(S) >= 0.005 ? ` Reflections add ${percent(mean(S))} of white.` : "";
-	if (!lobes.length) return `no light of the monitor comes through.${reflected}`;
+	if (!recovered) return t("pixel.masked");
+	const reflected = mean(S) >= 0.005 ? ` ${t("pixel.reflections", { share: percent(mean(S)) })}` : "";
+	if (!lobes.length) return t("pixel.opaque") + reflected;
 	const [{ u, v, weight, sigma_u: a, sigma_v: b }] = lobes;
-	const part = (share, names) => names[Math.min(2, Math.floor(3 * Math.max(0, share)))];
-	const place = [part(1 - v, ["top", "", "bottom"]), part(u, ["left", "", "right"])].filter(Boolean).join(" ") || "middle";
+	const third = (share) => Math.min(2, Math.floor(3 * Math.max(0, share)));
+	const place = t(`place.${PLACES[3 * third(1 - v) + third(u)]}`);
 	const share = Math.min(1, mean(weight));
-	const how = Math.max(a, b) < SHARP ? "sharply" : `spread over ${percent(Math.min(1, 4 * Math.max(a, b)))} of its width`;
-	return `${percent(mean(rho))} of the monitor’s light comes through, ${percent(share)} of it from the ${place}, ${how}.${reflected}`;
+	const how = Math.max(a, b) < SHARP ? t("pixel.sharp") : t("pixel.spread", { share: percent(Math.min(1, 4 * Math.max(a, b))) });
+	return t("pixel.through", { light: percent(mean(rho)), share: percent(share), place, how }) + reflected;
 }
 
 // The figures of each colour. The centre and the spread of a lobe are in pixels of the monitor, from its top left.
 function figuresOf({ S, rho, monitor: [width, height], lobes }) {
 	const colours = (values) => values.map(percent).join(", ");
 	const lobe = ({ u, v, weight, sigma_u: a, sigma_v: b }) =>
-		`${colours(weight)} at ${Math.round(u * width)}, ${Math.round((1 - v) * height)}, ${(a * width).toFixed(1)} × ${(b * width).toFixed(1)} wide`;
+		t("pixel.lobe", { weight: colours(weight), x: Math.round(u * width), y: Math.round((1 - v) * height), a: tenths(a * width), b: tenths(b * width) });
 	return facts({
-		"Transparency (rho) for red, green, blue": colours(rho), "Reflections (S)": colours(S),
-		...Object.fromEntries(lobes.map((one, n) => [`Lobe ${n + 1}`, lobe(one)])),
+		[t("pixel.rho")]: colours(rho), [t("pixel.S")]: colours(S),
+		...Object.fromEntries(lobes.map((one, n) => [t("pixel.lobe.n", { n: n + 1 }), lobe(one)])),
 	});
 }

@@ -1,14 +1,10 @@
 // The layers of a matte.
 import { getBlob, save } from "../lib/api.js";
 import { button, h, newest, problemBox, show } from "../lib/dom.js";
+import { t } from "../lib/words.js";
 
 const FIRST = "rho";
-const LAYERS = {
-	S: "Reflections: light that is there even when the monitor is black, such as a lamp that the glass mirrors.",
-	rho: "Transparency: how much of the monitor’s light comes through, for each colour.",
-	alpha: "White pixels were recovered; black ones were left out by the mask.",
-	confidence: "How well the matte explains what the camera saw: white is certain, black has failed.",
-};
+const LAYERS = ["S", "rho", "alpha", "confidence"];
 
 // Folded; the pictures are requested once it is opened.
 export function layers(matte, signal) {
@@ -19,20 +15,20 @@ export function layers(matte, signal) {
 	const problem = h("div");
 	const choose = newest(async (name) => {
 		try {
-			about.textContent = LAYERS[name];
+			about.textContent = t(`layer.${name}`);
 			await show(image, await getBlob(`v1/mattes/${matte.id}/layers/${name}.png`, signal));
-			image.alt = `The layer ${name}`;
+			image.alt = t("layer.name", { name });
 			image.classList.toggle("linear", ["S", "rho"].includes(name)); // linear light, to be encoded for the display
 			problem.replaceChildren();
 		} catch (error) {
 			if (!signal.aborted) problem.replaceChildren(problemBox(error));
 		}
 	});
-	const names = h("fieldset.row", h("legend", "Layer"), Object.keys(LAYERS).map((name) =>
+	const names = h("fieldset.row", h("legend", t("layer")), LAYERS.map((name) =>
 		h("label.choice", h("input", { type: "radio", name: "layer", checked: name === FIRST, onchange: () => choose(name) }), name)));
 	const files = ["all.exr", "stmap.exr"].map((name) => button(name, problem, () => save(`v1/mattes/${matte.id}/layers/${name}`, name)));
-	const panel = h("details.panel", h("summary", h("h2", "Layers")),
-		h("div.stack", names, frame, about, h("p.row", "For other tools:", files), problem));
+	const panel = h("details.panel", h("summary", h("h2", t("layers"))),
+		h("div.stack", names, frame, about, h("p.row", t("layers.tools"), files), problem));
 	panel.addEventListener("toggle", () => image.hidden && choose(FIRST), { once: true });
 	return panel;
 }

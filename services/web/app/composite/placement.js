@@ -1,14 +1,15 @@
 // Where the backdrop stands before the monitor: four numbers, set by sliders, keys, the wheel, a drag or a pinch.
 import { h } from "../lib/dom.js";
+import { t } from "../lib/words.js";
 
 const CONTROLS = [
-	// name, label, default, minimum, maximum, step of the slider and of the keys
-	["right", "Move right", 0, -2, 2, 0.01],
-	["down", "Move down", 0, -2, 2, 0.01],
-	["scale", "Size", 1, 0.1, 10, 0.01],
-	["angle", "Turn", 0, -180, 180, 1],
+	// name, default, minimum, maximum, step of the slider and of the keys
+	["right", 0, -2, 2, 0.01],
+	["down", 0, -2, 2, 0.01],
+	["scale", 1, 0.1, 10, 0.01],
+	["angle", 0, -180, 180, 1],
 ];
-const DEFAULTS = Object.fromEntries(CONTROLS.map(([name, , value]) => [name, value]));
+const DEFAULTS = Object.fromEntries(CONTROLS.map(([name, value]) => [name, value]));
 const KEYS = {
 	ArrowLeft: ["right", -2], ArrowRight: ["right", 2], ArrowUp: ["down", -2], ArrowDown: ["down", 2],
 	"+": ["scale", 5], "-": ["scale", -5], "[": ["angle", -2], "]": ["angle", 2],
@@ -17,7 +18,7 @@ const KEYS = {
 // The four numbers in `values`, at first those `given` as texts, and the elements that set them.
 export function placement(changed, given = {}) {
 	const values = { ...DEFAULTS };
-	const sliders = Object.fromEntries(CONTROLS.map(([name, , , min, max, step]) => {
+	const sliders = Object.fromEntries(CONTROLS.map(([name, , min, max, step]) => {
 		const logarithmic = name === "scale"; // as far from 1 to 10 as from 1 to a tenth
 		const [low, high, fine] = logarithmic ? [Math.log10(min), Math.log10(max), 0.01] : [min, max, step];
 		const input = h("input", { type: "range", id: `place-${name}`, min: low, max: high, step: fine });
@@ -26,7 +27,7 @@ export function placement(changed, given = {}) {
 	}));
 
 	function update(wanted) {
-		for (const [name, , , min, max] of CONTROLS) {
+		for (const [name, , min, max] of CONTROLS) {
 			let value = wanted[name] ?? values[name];
 			if (name === "angle") value = ((((value + 180) % 360) + 360) % 360) - 180;
 			values[name] = Number(Math.min(max, Math.max(min, value)).toFixed(4));
@@ -40,7 +41,7 @@ export function placement(changed, given = {}) {
 		changed();
 	}
 	function step(name, steps) {
-		const [, , , , , fine] = CONTROLS.find(([control]) => control === name);
+		const [, , , , fine] = CONTROLS.find(([control]) => control === name);
 		set({ [name]: name === "scale" ? values.scale * 1.02 ** steps : values[name] + steps * fine });
 	}
 
@@ -50,9 +51,9 @@ export function placement(changed, given = {}) {
 		get moved() {
 			return Object.entries(values).filter(([name, value]) => value !== DEFAULTS[name]);
 		},
-		sliders: h("div.sliders", CONTROLS.map(([name, label]) =>
-			[h("label", { for: `place-${name}` }, label), sliders[name].input, sliders[name].output])),
-		reset: h("button", { type: "button", onclick: () => set(DEFAULTS) }, "Reset"),
+		sliders: h("div.sliders", CONTROLS.map(([name]) =>
+			[h("label", { for: `place-${name}` }, t(`place-${name}`)), sliders[name].input, sliders[name].output])),
+		reset: h("button", { type: "button", onclick: () => set(DEFAULTS) }, t("reset")),
 	};
 }
 

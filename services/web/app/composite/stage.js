@@ -4,6 +4,7 @@ import { ask, getComposite } from "../lib/api.js";
 import { h, newest, problemBox, show } from "../lib/dom.js";
 import { decodeLive } from "./live_form.js";
 import { LiveGlass } from "./live_glass.js";
+import { t } from "../lib/words.js";
 
 const QUICK = 480; // pixels of the longer side of a preview
 
@@ -14,18 +15,18 @@ export class Stage extends LiveGlass {
 	isExact = false; // whether the picture shows the last change at full size
 	#preview = new AbortController();
 	#image;
-	status = h("p.hint", { role: "status" }, "Loading");
-	renderer = h("p.hint", "The service draws the glass while you move, until all of it is loaded.");
+	status = h("p.hint", { role: "status" }, t("stage.loading"));
+	renderer = h("p.hint", t("stage.until"));
 	problem = h("div");
 
 	constructor(matte, place, signal) {
 		const { width, height } = matte;
-		super(h("canvas", { role: "img", "aria-label": "The glass before the backdrop", width, height, hidden: true }), place, signal);
+		super(h("canvas", { role: "img", "aria-label": t("stage.alt"), width, height, hidden: true }), place, signal);
 		this.#matte = matte;
-		this.#image = h("img", { alt: "The glass before the backdrop", width, height, draggable: "false", hidden: true });
+		this.#image = h("img", { alt: t("stage.alt"), width, height, draggable: "false", hidden: true });
 		this.element = h("div", {
 			class: "picture stage", tabindex: 0, role: "group",
-			"aria-label": "Composite. Drag to move the backdrop; arrow keys move, plus and minus scale, square brackets turn it.",
+			"aria-label": t("stage.how"),
 		}, this.#image, this.canvas, this.problem);
 		this.element.style.setProperty("--aspect", width / height);
 		this.#fetch();
@@ -52,7 +53,7 @@ export class Stage extends LiveGlass {
 		this.#changes += 1;
 		this.isExact = false;
 		this.element.dispatchEvent(new Event("moved"));
-		this.#describe(this.isLive ? "live" : "preview");
+		this.#describe(t(this.isLive ? "stage.live" : "stage.preview"));
 		super.moved();
 		if (!this.isLive) this.#composite(false);
 	}
@@ -77,9 +78,9 @@ export class Stage extends LiveGlass {
 			if (![413, 422].includes(error.status) || !backdrop.copy) throw error;
 			const copy = await backdrop.copy();
 			const answer = await this.#request(copy, wanted, type);
-			const why = error.status === 413 || error.limit != null ? "does not take pictures this large" : "cannot read this file";
+			const why = error.status === 413 || error.limit != null ? "stage.large" : "stage.unread";
 			const { width, height } = backdrop.picture;
-			backdrop.note = `. The service ${why}, so this browser sends a copy of ${width} × ${height} pixels.`;
+			backdrop.note = `. ${t(why, { width, height })}`;
 			backdrop.exact = () => copy;
 			return answer;
 		}
@@ -112,7 +113,7 @@ export class Stage extends LiveGlass {
 			if (exact && changes === this.#changes) {
 				this.isExact = true;
 				this.element.dispatchEvent(new Event("exact"));
-				this.#describe(`exact, ${this.#matte.width} × ${this.#matte.height} pixels${backdrop.note ?? ""}`);
+				this.#describe(t("stage.exact", this.#matte) + (backdrop.note ?? ""));
 			}
 			this.problem.replaceChildren();
 		} catch (error) {
@@ -137,26 +138,25 @@ export class Stage extends LiveGlass {
 	}
 
 	#describe(how) {
-		const text = `${this.backdrop.name}: ${how}`;
+		const text = `${this.backdrop.label ?? this.backdrop.name}: ${how}`;
 		if (this.status.textContent !== text) this.status.textContent = text;
 	}
 
 	// Loads what this browser needs to draw the glass itself, if it can.
 	async #fetch() {
 		const say = (text) => (this.renderer.textContent = text);
-		if (!this.gl) return say("This browser has no WebGL2, so the service draws the glass while you move.");
+		if (!this.gl) return say(t("stage.nogl"));
 		try {
 			const found = decodeLive(await (await ask(`v1/mattes/${this.#matte.id}/live`, { signal: this.signal })).arrayBuffer());
 			if (!this.load(found, this.#matte.monitor)) {
-				if (this.gl) say("This matte is too large for the graphics card, so the service draws it while you move.");
+				if (this.gl) say(t("stage.toolarge"));
 				return;
 			}
-			const some = found.step > 1 ? `, one pixel in ${found.step ** 2} of it` : "";
-			say(`This browser draws the glass while you move${some}; when you stop, the service does.`);
+			say(t(found.step > 1 ? "stage.some" : "stage.all", { n: found.step ** 2 }));
 			if (!this.backdrop || this.isExact) return;
 			if (this.playing) return this.moved();
 			// Something was moved meanwhile: the exact picture is on its way.
-			this.#describe(this.isLive ? "live" : "preview");
+			this.#describe(t(this.isLive ? "stage.live" : "stage.preview"));
 			this.request();
 		} catch (error) {
 			this.fail(error);
@@ -164,7 +164,7 @@ export class Stage extends LiveGlass {
 	}
 
 	lost() {
-		this.renderer.textContent = "The browser lost the graphics card, so the service draws the glass while you move. Reload the page to draw it here again.";
+		this.renderer.textContent = t("stage.lost");
 		this.moved();
 	}
 }

@@ -1,28 +1,29 @@
 // Records a film.
 import { h, pause, problemBox } from "../lib/dom.js";
 import { setRecording } from "../lib/recordings.js";
+import { t } from "../lib/words.js";
 
 const TYPES = ["video/mp4;codecs=avc1.640034", "video/mp4;codecs=avc1.42E034", "video/webm;codecs=vp9", "video/webm;codecs=vp8", "video/webm"];
 const BITS = 40e6; // per second: stronger compression costs the matte decibels
-const LOCKED = { exposureMode: "exposure", whiteBalanceMode: "white balance", focusMode: "focus" };
+const LOCKED = ["exposureMode", "whiteBalanceMode", "focusMode"];
 const AFTER = 1000; // ms that recording continues after the program
 
 // Why this browser cannot record, in words; null if it can.
 export function noCamera() {
-	if (!isSecureContext) return "Browsers allow the camera only on pages from https or from this device. Record with the camera’s own app, and choose the film here.";
-	if (!navigator.mediaDevices?.getUserMedia || !window.MediaRecorder) return "This browser cannot record films. Use the camera’s own app, and choose the film here.";
+	if (!isSecureContext) return t("camera.insecure");
+	if (!navigator.mediaDevices?.getUserMedia || !window.MediaRecorder) return t("camera.unable");
 	return null;
 }
 
 // A panel to record with. `filmed(file, whole)` is called with every film; call `resume` when the panel is shown again.
 export function camera(signal, filmed) {
-	const picture = h("video", { muted: true, playsinline: true, "aria-label": "What the camera sees" });
+	const picture = h("video", { muted: true, playsinline: true, "aria-label": t("camera.sees") });
 	const frame = h("div.picture", { hidden: true }, picture);
 	const status = h("p.hint", { role: "status" });
 	const problem = h("div");
-	const which = h("select", { "aria-label": "Camera", hidden: true });
-	const open = h("button", { type: "button", onclick: () => use() }, "Use a camera of this device");
-	const shoot = h("button.primary", { type: "button", hidden: true, onclick: () => (recorder ? stop() : start()) }, "Start recording");
+	const which = h("select", { "aria-label": t("camera"), hidden: true });
+	const open = h("button", { type: "button", onclick: () => use() }, t("camera.use"));
+	const shoot = h("button.primary", { type: "button", hidden: true, onclick: () => (recorder ? stop() : start()) }, t("record.start"));
 	let stream;
 	let recorder;
 	let whole; // whether the program was shown to its end
@@ -41,12 +42,12 @@ export function camera(signal, filmed) {
 			const { width, height, deviceId: used } = stream.getVideoTracks()[0].getSettings();
 			picture.style.aspectRatio = `${width} / ${height}`;
 			const cameras = (await navigator.mediaDevices.enumerateDevices()).filter(({ kind }) => kind === "videoinput");
-			which.replaceChildren(...cameras.map(({ deviceId: id, label }, n) => h("option", { value: id, selected: id === used }, label || `Camera ${n + 1}`)));
-			status.textContent = `${width} × ${height} pixels. Recording starts and stops with the program.`;
+			which.replaceChildren(...cameras.map(({ deviceId: id, label }, n) => h("option", { value: id, selected: id === used }, label || `${t("camera")} ${n + 1}`)));
+			status.textContent = t("record.ready", { width, height });
 			await picture.play();
 		} catch (error) {
-			const detail = error.name === "NotAllowedError" ? "Allow it in the browser’s address bar, and try again." : error.message;
-			if (!signal.aborted) problem.replaceChildren(problemBox({ title: "Cannot use the camera", detail }));
+			const detail = error.name === "NotAllowedError" ? t("camera.allow") : error.message;
+			if (!signal.aborted) problem.replaceChildren(problemBox({ title: t("camera.failed"), detail }));
 		} finally {
 			open.disabled = false;
 		}
@@ -57,9 +58,9 @@ export function camera(signal, filmed) {
 	async function lock(track) {
 		const can = track.getCapabilities?.() ?? {};
 		const free = [];
-		for (const [mode, name] of Object.entries(LOCKED)) {
-			if (!can[mode]?.includes("manual")) free.push(name);
-			else await track.applyConstraints({ advanced: [{ [mode]: "manual" }] }).catch(() => free.push(name));
+		for (const mode of LOCKED) {
+			if (!can[mode]?.includes("manual")) free.push(t(`lock.${mode}`));
+			else await track.applyConstraints({ advanced: [{ [mode]: "manual" }] }).catch(() => free.push(t(`lock.${mode}`)));
 		}
 		return free;
 	}
@@ -72,9 +73,9 @@ export function camera(signal, filmed) {
 		mine.ondataavailable = ({ data }) => parts.push(data);
 		mine.onstop = () => {
 			recorder = undefined;
-			shoot.textContent = "Start recording";
+			shoot.textContent = t("record.start");
 			which.disabled = false;
-			status.textContent = "Recorded.";
+			status.textContent = t("record.done");
 			const [kind] = mine.mimeType.split(";");
 			filmed(new File(parts, `film.${kind.endsWith("mp4") ? "mp4" : "webm"}`, { type: kind }), whole);
 			setRecording(signal, false);
@@ -82,10 +83,10 @@ export function camera(signal, filmed) {
 		whole = false;
 		mine.start(1000);
 		setRecording(signal, true);
-		shoot.textContent = "Stop recording";
+		shoot.textContent = t("record.stop");
 		which.disabled = true;
 		const free = await lock(stream.getVideoTracks()[0]);
-		status.textContent = free.length ? `Recording. The browser cannot lock ${free.join(", ")} of this camera: make sure that nothing changes.` : "Recording.";
+		status.textContent = free.length ? t("record.free", { what: free.join(", ") }) : t("record.on");
 	}
 
 	async function stop(ended = true) {

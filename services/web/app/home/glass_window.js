@@ -1,7 +1,8 @@
 // A live glass that fills the window: a canvas under it shows what is around it.
 import { LiveGlass } from "../composite/live_glass.js";
 import { h } from "../lib/dom.js";
-import { fetchSample, still } from "./samples.js";
+import { fetchSample, still, titleOf } from "./samples.js";
+import { t } from "../lib/words.js";
 
 const FREE = 0.9; // share of the frame's shorter side that has to fit into the window
 const SHARPEST = 2; // device pixels per pixel of the page that are drawn around the glass
@@ -22,17 +23,17 @@ export class GlassWindow extends LiveGlass {
 		super(h("canvas.glass", { role: "img", hidden: true }), place, signal, { endless: true, around: false });
 		this.element = h("div", {
 			class: "glass-window", tabindex: 0, role: "group",
-			"aria-label": "Glass. Drag to move the backdrop; arrow keys move, plus and minus scale, square brackets turn it.",
+			"aria-label": t("home.glass"),
 		}, this.#surround, this.monitor, this.canvas, this.#still);
-		if (!this.gl) this.#stand("This browser has no WebGL2, so this picture stands still. The service draws your own glass all the same.");
+		if (!this.gl) this.#stand(t("home.still"));
 	}
 
 	// Shows a sample; of several, the one that was chosen last.
 	async show(sample) {
 		const choice = (this.#choices += 1);
 		this.#still.src = still(sample);
-		this.#still.alt = `${sample.title} before a checkerboard`;
-		this.canvas.ariaLabel = `${sample.title} before the backdrop`;
+		this.#still.alt = t("home.board", { glass: titleOf(sample) });
+		this.canvas.ariaLabel = t("home.before", { glass: titleOf(sample) });
 		const found = this.gl ? await fetchSample(sample, this.signal) : null;
 		if (choice !== this.#choices || this.signal.aborted) return;
 		this.#sample = sample;
@@ -91,7 +92,7 @@ export class GlassWindow extends LiveGlass {
 	}
 
 	lost() {
-		this.#stand("The browser lost the graphics card, so this picture stands still. Reload the page to play.");
+		this.#stand(t("home.lost"));
 	}
 
 	#stand(text) {

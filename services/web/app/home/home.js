@@ -7,7 +7,8 @@ import { handleGestures, placement } from "../composite/placement.js";
 import { camera } from "../composite/video_backdrops.js";
 import { fileInput, onDrop, upload } from "../upload/upload.js";
 import { GlassWindow } from "./glass_window.js";
-import { areRemoved, fetchSamples, removeSamples, still } from "./samples.js";
+import { aboutOf, areRemoved, fetchSamples, removeSamples, still, titleOf } from "./samples.js";
+import { t } from "../lib/words.js";
 
 const SCENES = ["Dusk", "Lights", "Tiles"];
 const GREETING = 2600; // ms that the backdrop moves by itself at first, to show that it can be moved
@@ -26,8 +27,8 @@ export async function home(main, signal) {
 	const about = h("p.about");
 
 	async function show(sample) {
-		title.textContent = sample.title;
-		about.textContent = `${sample.about}.${glass.gl ? " Drag the picture: what is behind the glass moves." : ""}`;
+		title.textContent = titleOf(sample);
+		about.textContent = `${aboutOf(sample)}. ${glass.gl ? t("home.drag") : ""}`;
 		await glass.show(sample).catch(fail);
 	}
 	let used; // the control of the backdrop that is shown
@@ -42,26 +43,26 @@ export async function home(main, signal) {
 		}
 	}
 	const drawn = (name) => Promise.resolve(scenery(name, ...samples[0].monitor));
-	const backdrops = SCENES.map((name, i) => choice("backdrop", name, scenery(name, 96, 72).picture, i === 0, (control) => use(drawn(name), control)));
-	backdrops.push(choice("backdrop", "Use my camera", cameraSymbol(), false, (control) => use(camera(), control)));
+	const backdrops = SCENES.map((name, i) => choice("backdrop", t(`scene.${name}`), scenery(name, 96, 72).picture, i === 0, (control) => use(drawn(name), control)));
+	backdrops.push(choice("backdrop", t("home.camera"), cameraSymbol(), false, (control) => use(camera(), control)));
 	const glasses = samples.map((sample, i) =>
-		choice("sample", sample.title, h("img", { src: still(sample), alt: "", width: 96, height: 72, draggable: "false" }), i === 0, () => show(sample)));
+		choice("sample", titleOf(sample), h("img", { src: still(sample), alt: "", width: 96, height: 72, draggable: "false" }), i === 0, () => show(sample)));
 
 	const take = (files) => {
 		if (!files[0].type.startsWith("image/")) return upload(files);
 		for (const control of main.querySelectorAll("[name=backdrop]")) control.checked = false;
-		use(fromFile(files[0]).then((found) => found.picture ? found : Promise.reject(new Error("This browser cannot show the picture. Use PNG or JPEG."))));
+		use(fromFile(files[0]).then((found) => found.picture ? found : Promise.reject(new Error(t("home.unreadable")))));
 	};
 	onDrop(glass.element, take);
-	const remove = button("Remove the samples", problem, () => {
+	const remove = button(t("home.remove"), problem, () => {
 		removeSamples();
 		location.hash = "#/captures";
 	}, "plain");
-	const sheet = h("section.controls", { "aria-label": "Sample" },
-		h("div.title", h("div.row", title, h("span.badge.sample", "Sample: traced, not filmed")), about, glass.status),
-		thumbs("Glass", glasses), glass.gl ? thumbs("Backdrop", backdrops) : null,
-		h("div.actions", h("a.primary", { href: "#/film" }, "Film your own"),
-			h("span.upload", fileInput("upload"), h("label", { for: "upload" }, "Upload")), remove),
+	const sheet = h("section.controls", { "aria-label": t("home.sample") },
+		h("div.title", h("div.row", title, h("span.badge.sample", t("home.traced"))), about, glass.status),
+		thumbs(t("home.glasses"), glasses), glass.gl ? thumbs(t("backdrop"), backdrops) : null,
+		h("div.actions", h("a.primary", { href: "#/film" }, t("home.film")),
+			h("span.upload", fileInput("upload"), h("label", { for: "upload" }, t("upload"))), remove),
 		problem);
 	main.append(h("div.home", glass.element, sheet));
 

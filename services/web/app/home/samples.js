@@ -1,6 +1,7 @@
 // The samples that come with the app: glass that was traced, filmed and recovered by `workflows/simulation/samples.py`.
 import { Problem } from "../lib/api.js";
 import { decodeLive } from "../composite/live_form.js";
+import { known, t } from "../lib/words.js";
 
 const FOLDER = "web/samples/";
 const REMOVED = "envmatte-samples-removed"; // in this browser's storage
@@ -9,12 +10,14 @@ export const areRemoved = () => localStorage.getItem(REMOVED) !== null;
 export const removeSamples = () => localStorage.setItem(REMOVED, "");
 export const restoreSamples = () => localStorage.removeItem(REMOVED);
 
+export const titleOf = ({ name, title }) => known(`sample.${name}`, title);
+export const aboutOf = ({ name, about }) => known(`sample.${name}.about`, about);
 export const still = ({ name }) => `${FOLDER}${name}.webp`;
 
 // Fetches a file of the app itself, which needs no key.
 async function fetchFile(name, signal) {
 	const answer = await fetch(FOLDER + name, { signal });
-	if (!answer.ok) throw new Problem({ title: "A sample is missing", detail: `This service has no file ${name}.`, status: answer.status });
+	if (!answer.ok) throw new Problem({ title: t("sample.missing"), detail: t("sample.file", { name }), status: answer.status });
 	return answer;
 }
 

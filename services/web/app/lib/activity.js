@@ -2,17 +2,19 @@
 import { getJson } from "./api.js";
 import { badge, h, newest } from "./dom.js";
 import { ACTIVE } from "./events.js";
+import { known, t } from "./words.js";
+import { languageSwitch } from "./language.js";
 
 const REFRESH = 4000; // ms
 const SHOWN = 8;
-export const KINDS = { ingest: "Ingest of a capture", recover: "Recovery of a matte", composite: "Composite of a clip" };
 const menu = document.getElementById("activities");
+const entries = menu.firstElementChild;
 const count = document.getElementById("active");
 let timer;
 
 export const jobCard = (job, ...more) =>
-	h("a.card", { href: `#/jobs/${job.id}` }, h("span.name", KINDS[job.kind]), badge(job.state),
-		h("span.about", job.problem?.detail ?? (job.state === "running" ? `${job.stage}, ${Math.floor(100 * job.progress)} %` : job.id)), more);
+	h("a.card", { href: `#/jobs/${job.id}` }, h("span.name", t(`job.${job.kind}`)), badge(job.state),
+		h("span.about", job.problem?.detail ?? (job.state === "running" ? `${known(`stage.${job.stage}`, job.stage)}, ${Math.floor(100 * job.progress)} %` : job.id)), more);
 
 export const refreshActivity = newest(async () => {
 	clearTimeout(timer);
@@ -22,14 +24,18 @@ export const refreshActivity = newest(async () => {
 		const active = jobs.filter(({ state }) => ACTIVE.includes(state)).length;
 		count.textContent = active || "";
 		const focused = menu.contains(document.activeElement) ? document.activeElement.hash : undefined;
-		menu.replaceChildren(
+		entries.replaceChildren(
 			h("ul.list", jobs.map((job) => h("li", jobCard(job)))),
-			jobs.length ? h("a", { href: "#/jobs" }, "All jobs") : h("p", "No jobs yet"));
+			jobs.length ? h("a", { href: "#/jobs" }, t("jobs.all")) : h("p", t("jobs.none")));
 		if (focused) menu.querySelector(`[href="${focused}"]`)?.focus();
 		if (!active && !isOpen) return;
 	}
 	if (jobs || isOpen) timer = setTimeout(refreshActivity, REFRESH);
 });
 
-menu.addEventListener("toggle", ({ newState }) => newState === "open" && refreshActivity());
+menu.addEventListener("toggle", ({ newState }) => {
+	if (newState !== "open") return;
+	menu.lastElementChild.replaceChildren(...languageSwitch());
+	refreshActivity();
+});
 addEventListener("hashchange", () => menu.hidePopover());

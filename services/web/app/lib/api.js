@@ -1,6 +1,7 @@
 // Requests to the service, with the key of this session.
 
 import { pause } from "./dom.js";
+import { t } from "./words.js";
 
 const KEY = "envmatte-key"; // the player page keeps it under the same name
 
@@ -11,13 +12,7 @@ export class Problem extends Error {
 	}
 }
 
-const UNREACHABLE = {
-	status: 0,
-	title: "The service does not answer",
-	detail: "Check that it runs and that this device is connected to it, then try again. Nothing stored is lost.",
-};
-
-const GONE = "It was deleted, it has expired, or it belongs to another key.";
+const unreachable = () => new Problem({ status: 0, title: t("away"), detail: t("away.check") });
 
 export const key = () => sessionStorage.getItem(KEY);
 
@@ -31,7 +26,7 @@ export function unlock(problem) {
 	asking ??= new Promise((resolve, reject) => {
 		const dialog = document.getElementById("unlock");
 		const field = document.getElementById("key");
-		document.getElementById("unlock-why").textContent = key() ? "The service does not know this key." : "";
+		document.getElementById("unlock-why").textContent = key() ? t("unlock.unknown") : "";
 		field.value = "";
 		dialog.onsubmit = () => {
 			sessionStorage.setItem(KEY, field.value.trim());
@@ -66,7 +61,7 @@ export async function ask(path, options = {}) {
 		try {
 			answer = await fetchTwice(path, { ...options, headers: { ...options.headers, ...authorization() } });
 		} catch (error) {
-			throw options.signal?.aborted ? options.signal.reason : new Problem(UNREACHABLE);
+			throw options.signal?.aborted ? options.signal.reason : unreachable();
 		}
 		if (answer.ok) return answer;
 		const problem = new Problem(await describe(answer));
@@ -77,8 +72,8 @@ export async function ask(path, options = {}) {
 
 async function describe(answer) {
 	const about = answer.headers.get("content-type")?.includes("json") ? await answer.json().catch(() => ({})) : {};
-	if (answer.status === 404) about.detail = GONE; // the service says it for those who call it
-	return { title: answer.statusText || "Refused", detail: `The service answered with ${answer.status}.`, ...about, status: answer.status };
+	if (answer.status === 404) about.detail = t("gone"); // the service says it for those who call it
+	return { title: answer.statusText || t("refused"), detail: t("answered", { status: answer.status }), ...about, status: answer.status };
 }
 
 export const getJson = async (path, signal) => (await ask(path, { signal })).json();

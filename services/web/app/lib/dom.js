@@ -1,4 +1,5 @@
 // Elements of pages, and text for numbers and times.
+import { known, locale, t } from "./words.js";
 
 // `h("p.hint", { id: "why" }, "Text")`: an element with its classes, its attributes if it has any, and its children.
 export function h(name, ...children) {
@@ -29,7 +30,7 @@ export const sentence = (text, name) =>
 
 // A box with an error as the API words it, or as the browser does.
 export const problemBox = (error) =>
-	h("div.problem", { role: "alert" }, h("strong", error.title ?? "Something went wrong in this page"),
+	h("div.problem", { role: "alert" }, h("strong", error.title ?? t("wrong")),
 		h("p", prose(sentence(error.detail ?? error.message, error.entry))));
 
 export const empty = (title, text) => h("div.empty", h("strong", title), h("p", text));
@@ -39,28 +40,30 @@ const LEVEL = {
 	warning: "warning", ingesting: "busy", recovering: "busy", running: "busy", queued: "busy",
 	bad: "bad", failed: "bad", cancelled: "off",
 };
-export const badge = (word) => h("span", { class: `badge ${LEVEL[word] ?? "off"}` }, word);
+export const badge = (word) => h("span", { class: `badge ${LEVEL[word] ?? "off"}` }, known(`state.${word}`, word));
 
 export const facts = (pairs) =>
 	h("dl.facts", Object.entries(pairs).filter(([, value]) => value != null && value !== "")
 		.map(([name, value]) => h("div", h("dt", name), h("dd", value))));
 
 export const bytes = (count) => {
-	const units = ["bytes", "kB", "MB", "GB", "TB"];
+	const units = [t("bytes"), "kB", "MB", "GB", "TB"];
 	const power = Math.min(units.length - 1, Math.floor(Math.log10(Math.max(count, 1)) / 3));
-	return `${(count / 1000 ** power).toLocaleString("en", { maximumFractionDigits: power ? 1 : 0 })} ${units[power]}`;
+	return `${(count / 1000 ** power).toLocaleString(locale(), { maximumFractionDigits: power ? 1 : 0 })} ${units[power]}`;
 };
+
+export const tenths = (number) => number.toLocaleString(locale(), { minimumFractionDigits: 1, maximumFractionDigits: 1 });
 
 export const duration = (seconds) => {
 	if (seconds == null) return null;
-	if (seconds < 10) return `${seconds.toFixed(1)} s`;
+	if (seconds < 10) return `${tenths(seconds)} s`;
 	if (seconds < 100) return `${Math.round(seconds)} s`;
 	if (seconds < 6000) return `${Math.round(seconds / 60)} min`;
-	return `${(seconds / 3600).toFixed(1)} h`;
+	return `${tenths(seconds / 3600)} h`;
 };
 
 export const when = (time) =>
-	h("time", { datetime: time }, new Date(time).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "short" }));
+	h("time", { datetime: time }, new Date(time).toLocaleString(locale(), { dateStyle: "medium", timeStyle: "short" }));
 
 export const size = ({ width, height }) => (width ? `${width} × ${height}` : null);
 

@@ -2,18 +2,19 @@
 import { getJson } from "./api.js";
 import { ACTIVE, follow } from "./events.js";
 import { badge, duration, facts, h, newest, pause, problemBox } from "./dom.js";
+import { known, locale, t } from "./words.js";
 
 const LOG_EVERY = 2000; // ms
 
 // Fills `panel` and follows a job to its end; resolves with its last state. `changed` gets every state, the `known` first.
 export async function followJob(panel, id, signal, changed = () => {}, known = null) {
-	const bar = h("progress", { max: 1, value: 0, "aria-label": "Progress" });
+	const bar = h("progress", { max: 1, value: 0, "aria-label": t("progress") });
 	const stage = h("p.stage", { role: "status" }, " ");
 	const waits = h("p.waits", { hidden: true });
 	const about = h("div");
 	const problem = h("div");
-	const lines = h("ol.log", { tabindex: 0, "aria-label": "Log" });
-	const log = h("details", { open: panel.dataset.log != null }, h("summary", "Log"), lines);
+	const lines = h("ol.log", { tabindex: 0, "aria-label": t("log") });
+	const log = h("details", { open: panel.dataset.log != null }, h("summary", t("log")), lines);
 	panel.append(stage, bar, waits, about, problem, log);
 
 	let last = 0;
@@ -21,7 +22,7 @@ export async function followJob(panel, id, signal, changed = () => {}, known = n
 		try {
 			const found = (await getJson(`v1/jobs/${id}/log?after=${last}`, signal)).lines;
 			const atEnd = lines.scrollTop + lines.clientHeight >= lines.scrollHeight - 8;
-			lines.append(...found.map(({ at, text }) => h("li", h("time", { datetime: at }, new Date(at).toLocaleTimeString("en-GB")), " ", text)));
+			lines.append(...found.map(({ at, text }) => h("li", h("time", { datetime: at }, new Date(at).toLocaleTimeString(locale())), " ", text)));
 			last = found.at(-1)?.line ?? last;
 			if (atEnd) lines.scrollTop = lines.scrollHeight;
 			if (!ended) await pause(LOG_EVERY, signal);
@@ -34,13 +35,13 @@ export async function followJob(panel, id, signal, changed = () => {}, known = n
 		bar.hidden = !active && job.state !== "failed";
 		stage.replaceChildren(badge(job.state), ` ${describe(job)}`);
 		waits.hidden = !job.waits_for;
-		waits.textContent = job.waits_for ? `Waiting: ${job.waits_for}` : "";
+		waits.textContent = job.waits_for ? t("job.waits", { why: job.waits_for }) : "";
 		about.replaceChildren(facts({
-			Tiles: job.tiles.total ? `${job.tiles.done} of ${job.tiles.total}` : null,
-			Failed: job.tiles.failed || null,
-			Workers: job.state === "running" ? job.workers : null,
-			Ran: job.run_seconds ? duration(job.run_seconds) : null,
-			Waited: job.queued_seconds >= 1 ? duration(job.queued_seconds) : null,
+			[t("job.tiles")]: job.tiles.total ? t("of", { n: job.tiles.done, all: job.tiles.total }) : null,
+			[t("job.lost")]: job.tiles.failed || null,
+			[t("job.workers")]: job.state === "running" ? job.workers : null,
+			[t("job.ran")]: job.run_seconds ? duration(job.run_seconds) : null,
+			[t("job.waited")]: job.queued_seconds >= 1 ? duration(job.queued_seconds) : null,
 		}));
 		problem.replaceChildren(...(job.problem ? [problemBox(job.problem)] : []));
 		read(!active);
@@ -49,7 +50,7 @@ export async function followJob(panel, id, signal, changed = () => {}, known = n
 	if (known) update(known);
 	const lost = (away) => {
 		panel.classList.toggle("lost", away);
-		if (away) stage.textContent = "The service does not answer; trying again. Jobs continue where they were.";
+		if (away) stage.textContent = t("job.away");
 	};
 	return follow(`v1/jobs/${id}/events`, signal, update, { lost, over: (job) => !ACTIVE.includes(job.state) });
 }
@@ -59,10 +60,10 @@ function describe(job) {
 	if (job.state === "running") {
 		// The last step has no tiles to count, and may take longer than it was expected to.
 		const last = job.stage === "finishing";
-		const doing = !last ? `${job.stage}, ${percent}` : job.kind === "ingest" ? "measuring and writing the report" : "finishing";
-		const left = job.eta_seconds == null || (last && job.eta_seconds < 1) ? "" : `, about ${duration(job.eta_seconds)} left`;
+		const doing = !last ? `${known(`stage.${job.stage}`, job.stage)}, ${percent}` : t(job.kind === "ingest" ? "job.reporting" : "stage.finishing");
+		const left = job.eta_seconds == null || (last && job.eta_seconds < 1) ? "" : t("job.left", { time: duration(job.eta_seconds) });
 		return doing + left;
 	}
-	if (job.state === "succeeded") return `in ${duration(job.run_seconds)}`;
-	return job.state === "queued" ? "" : `at ${percent}`;
+	if (job.state === "succeeded") return t("job.in", { time: duration(job.run_seconds) });
+	return job.state === "queued" ? "" : t("job.at", { percent });
 }

@@ -1,12 +1,13 @@
 // A list, newest first, that is refreshed while something in it is in progress.
 import { button, h, pause, problemBox } from "./dom.js";
+import { t } from "./words.js";
 
 const REFRESH = 5000; // ms
 
 export async function list(main, signal, { page, busy, none, item }) {
 	const items = h("ul.list");
 	const problem = h("div");
-	const more = button("Show older", problem, async () => add(await page(`&after=${last.id}`)), "more");
+	const more = button(t("older"), problem, async () => add(await page(`&after=${last.id}`)), "more");
 	let last;
 	let pages = 0;
 	const add = (found) => {
@@ -23,7 +24,7 @@ export async function list(main, signal, { page, busy, none, item }) {
 	};
 	const again = async (error) => {
 		signal.throwIfAborted();
-		problem.replaceChildren(problemBox(error), button("Try again", problem, () => start().catch(again)));
+		problem.replaceChildren(problemBox(error), button(t("again"), problem, () => start().catch(again)));
 	};
 	more.hidden = true;
 	main.append(items, problem, more);

@@ -1,13 +1,14 @@
 // A heading whose text the user can change in place.
 import { button, h, problemBox } from "./dom.js";
+import { t } from "./words.js";
 
 // `save` stores a new text, and resolves with the text as it is stored.
 export function renamable(text, label, save) {
 	const problem = h("div");
 	const title = h("h1", text);
 	const input = h("input", { type: "text", maxlength: 200, required: true, "aria-label": label });
-	const form = h("form.row", { hidden: true }, input, h("button.primary", "Save"), h("button", { type: "button", onclick: () => edit(false) }, "Cancel"));
-	const rename = button("Rename", problem, () => edit(true));
+	const form = h("form.row", { hidden: true }, input, h("button.primary", t("save")), h("button", { type: "button", onclick: () => edit(false) }, t("cancel")));
+	const rename = button(t("rename"), problem, () => edit(true));
 	function edit(editing) {
 		form.hidden = !editing;
 		title.hidden = rename.hidden = editing;

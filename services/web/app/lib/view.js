@@ -1,21 +1,21 @@
 // What several views have in common: steps, deletion, thumbnails.
 import { remove } from "./api.js";
 import { button, confirmed, h, newest, show } from "./dom.js";
+import { t } from "./words.js";
 
-const STEPS = ["Film or upload", "Check", "Recover", "Play"];
+const STEPS = ["film", "check", "recover", "play"];
 export const [FILM, CHECK, RECOVER, PLAY] = STEPS.keys();
 
 // Where one is on the way from a film to a composite; `links` lead to the steps before.
 export const steps = (at, ...links) =>
-	h("ol.steps", { "aria-label": "Steps" }, STEPS.map((name, n) =>
-		h("li", { "aria-current": n === at && "step" }, n < at && links[n] ? h("a", { href: links[n] }, name) : name)));
+	h("ol.steps", { "aria-label": t("steps") }, STEPS.map((name, n) =>
+		h("li", { "aria-current": n === at && "step" }, n < at && links[n] ? h("a", { href: links[n] }, t(`step.${name}`)) : t(`step.${name}`))));
 
 // A button that deletes what a path such as `v1/captures/ID` names; then its list is shown.
 export function deletion(path, where, lost) {
 	const [, list] = path.split("/");
-	const one = list.slice(0, -1);
-	return button("Delete", where, async () => {
-		if (!(await confirmed(`Delete this ${one}?`, lost, `Delete ${one}`))) return;
+	return button(t("delete"), where, async () => {
+		if (!(await confirmed(t(`delete.${list}?`), lost, t(`delete.${list}`)))) return;
 		await remove(path);
 		location.replace(`#/${list}`);
 	}, "quiet");

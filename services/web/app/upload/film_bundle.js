@@ -2,11 +2,12 @@
 import { getJson } from "../lib/api.js";
 import { h, size, when } from "../lib/dom.js";
 import { zip } from "./zip.js";
+import { parts, t } from "../lib/words.js";
 
 const ENDS = /\.(mp4|m4v|mov|mkv|webm|avi|3gp|mts|m2ts)$/i;
 export const isFilm = (file) => file.type.startsWith("video/") || ENDS.test(file.name);
 
-export const programName = (program) => `${program.patterns} patterns${program.display ? ` on a screen of ${size(program.display)}` : ""}`;
+export const programName = (program) => t(program.display ? "program.screen" : "program.plain", { n: program.patterns, size: size(program.display ?? {}) });
 
 // The capture.json of a film of a program, shown by the player page or as a video.
 export function recordOf(program, rate) {
@@ -28,7 +29,7 @@ export async function askForRecord(where, signal) {
 	return new Promise((resolve, reject) => {
 		signal.addEventListener("abort", () => reject(signal.reason), { once: true });
 		const problem = h("p.hint", { role: "status" });
-		const which = h("select", { "aria-label": "Program" }, programs.map((one, n) => h("option", { value: n }, `${programName(one)}, ${when(one.created_at).textContent}`)));
+		const which = h("select", { "aria-label": t("program") }, programs.map((one, n) => h("option", { value: n }, `${programName(one)}, ${when(one.created_at).textContent}`)));
 		const rate = h("input", { type: "number", min: 0.01, max: 120, step: "any", required: true });
 		const suggest = () => (rate.value = programs[which.value]?.showing?.patterns_per_second ?? 2);
 		which.onchange = suggest;
@@ -37,19 +38,19 @@ export async function askForRecord(where, signal) {
 		own.onchange = async () => {
 			try {
 				const found = JSON.parse(await own.files[0].text());
-				if (!found.video?.patterns_per_second) throw new Error("it describes no video");
+				if (!found.video?.patterns_per_second) throw new Error(t("record.novideo"));
 				resolve(found);
 			} catch (error) {
-				problem.textContent = `Not the capture.json of a film: ${error.message}. Choose the one that came with the program.`;
+				problem.textContent = t("record.wrong", { why: error.message });
 				own.value = "";
 			}
 		};
 		const form = h("form.stack",
-			h("p", h("strong", "Which program does this film show?")),
+			h("p", h("strong", t("program.which"))),
 			programs.length
-				? [h("label", "Program", which), h("label", "Patterns a second", rate), h("p.row", h("button.primary", "Upload"))]
-				: h("p", "There are no programs yet. ", h("a", { href: "#/film" }, "Play one and film it"), "."),
-			h("label", "Or the capture.json that came with the program", own), problem);
+				? [h("label", t("program"), which), h("label", t("rate"), rate), h("p.row", h("button.primary", t("upload")))]
+				: h("p", parts("program.none", { play: h("a", { href: "#/film" }, t("program.play")) })),
+			h("label", t("program.own"), own), problem);
 		form.onsubmit = (event) => {
 			event.preventDefault();
 			getJson(`v1/programs/${programs[which.value].id}`, signal).then((program) => resolve(recordOf(program, Number(rate.value))), reject);

@@ -2,6 +2,7 @@
 import { Problem, ask, authorization } from "../lib/api.js";
 import { readArchiveInfo } from "./archive_info.js";
 import { pause } from "../lib/dom.js";
+import { t } from "../lib/words.js";
 
 const PART = 8 << 20; // bytes of a request; the service takes 10,000 of them
 const LONGEST = 30_000; // ms between two attempts
@@ -20,13 +21,13 @@ function patch(path, offset, part, progress, signal) {
 		request.upload.onprogress = (event) => progress(offset + event.loaded);
 		request.onload = () => {
 			if (request.status === 204) return resolve(Number(request.getResponseHeader("Upload-Offset")));
-			const about = { title: "Refused", detail: `The service answered with ${request.status}.`, status: request.status };
+			const about = { title: t("refused"), detail: t("answered", { status: request.status }), status: request.status };
 			try {
 				Object.assign(about, JSON.parse(request.responseText));
 			} catch {} // from a proxy, which does not answer with JSON
 			reject(new Problem(about));
 		};
-		request.onerror = () => reject(new Problem({ status: 0, title: "The connection broke" }));
+		request.onerror = () => reject(new Problem({ status: 0, title: t("broke") }));
 		request.onabort = () => reject(signal.reason);
 		request.onloadend = () => signal.removeEventListener("abort", stop);
 		signal.addEventListener("abort", stop);

@@ -5,6 +5,7 @@ import { bytes, confirmed, duration, fileField, h, problemBox } from "../lib/dom
 import { askForRecord, filmArchive, isFilm } from "./film_bundle.js";
 import { send } from "./tus.js";
 import { crc32 } from "./zip.js";
+import { parts, t } from "../lib/words.js";
 
 const HEAD = 1 << 20; // bytes of an archive that contain its capture.json
 
@@ -18,19 +19,19 @@ addEventListener("beforeunload", (event) => [...rows].some(({ busy, unsaved }) =
 export function begin(file, record, { unsaved = false, warning = "" } = {}) {
 	const state = { busy: false, unsaved };
 	const stop = new AbortController();
-	const bar = h("progress", { max: 1, value: 0, "aria-label": `Upload of ${file.name}` });
-	const status = h("span", { role: "status" }, "Starting");
+	const bar = h("progress", { max: 1, value: 0, "aria-label": t("upload.of", { name: file.name }) });
+	const status = h("span", { role: "status" }, t("upload.starting"));
 	const problem = h("div");
 	const asked = h("div");
-	const again = h("button", { type: "button", hidden: true, onclick: () => work() }, "Continue");
-	const save = h("button", { type: "button", hidden: !unsaved, onclick: () => (saveBlob(file, file.name), (state.unsaved = false)) }, "Save the film");
+	const again = h("button", { type: "button", hidden: true, onclick: () => work() }, t("continue"));
+	const save = h("button", { type: "button", hidden: !unsaved, onclick: () => (saveBlob(file, file.name), (state.unsaved = false)) }, t("film.save"));
 	const end = () => (rows.delete(state), row.remove());
 	const drop = async () => {
-		if (state.unsaved && !(await confirmed("Delete this film?", "It is only in this page. Upload or save it first to keep it.", "Delete film"))) return;
+		if (state.unsaved && !(await confirmed(t("film.delete?"), t("film.lost"), t("film.delete")))) return;
 		stop.abort();
 		end();
 	};
-	const cancel = h("button", { type: "button", onclick: drop }, unsaved ? "Delete the film" : "Cancel");
+	const cancel = h("button", { type: "button", onclick: drop }, t(unsaved ? "film.discard" : "cancel"));
 	const row = h("section.panel", { "aria-label": file.name },
 		h("p.row.spread", h("strong.name", file.name), h("span.row", again, save, cancel)), bar, status, asked, problem);
 	running.append(row);
@@ -46,13 +47,12 @@ export function begin(file, record, { unsaved = false, warning = "" } = {}) {
 		state.busy = true;
 		try {
 			if (!archive) {
-				status.textContent = "Film";
+				status.textContent = t("upload.film");
 				record ??= await askForRecord(asked, stop.signal);
-				status.textContent = "Making the capture archive";
+				status.textContent = t("upload.zipping");
 				archive = await filmArchive(file, record, stop.signal);
 			} else if (!(await startsAsZip(archive))) {
-				const detail = `${file.name} is neither a ZIP nor a film. Drop the ZIP with capture.json and the frames, or the video that the camera recorded.`;
-				throw new Problem({ status: 422, title: "Not a capture", detail });
+				throw new Problem({ status: 422, title: t("upload.none"), detail: t("upload.neither", { name: file.name }) });
 			}
 			// A film with another capture.json is another archive.
 			remembered ??= `envmatte-upload ${file.name} ${archive.size} ${file.lastModified} ${record ? await crc32(archive.slice(0, HEAD)) : ""}`;
@@ -63,11 +63,11 @@ export function begin(file, record, { unsaved = false, warning = "" } = {}) {
 					first ??= done;
 					const left = (archive.size - done) / ((done - first) / (performance.now() - start) || Infinity) / 1000;
 					bar.value = archive.size ? done / archive.size : 1;
-					status.textContent = `${bytes(done)} of ${bytes(archive.size)}${left > 2 ? `, ${duration(left)} left` : ""}`;
+					status.textContent = t("of", { n: bytes(done), all: bytes(archive.size) }) + (left > 2 ? t("upload.left", { time: duration(left) }) : "");
 				},
-				waiting: (away, ms) => away && (status.textContent = `The service does not answer; trying again in ${duration(ms / 1000)}`),
+				waiting: (away, ms) => away && (status.textContent = t("upload.away", { time: duration(ms / 1000) })),
 			});
-			status.textContent = "Checking the archive";
+			status.textContent = t("upload.checking");
 			const made = await post("v1/captures", { upload }, `capture-of-${upload}`);
 			localStorage.removeItem(remembered);
 			end();
@@ -76,9 +76,9 @@ export function begin(file, record, { unsaved = false, warning = "" } = {}) {
 			if (stop.signal.aborted) return;
 			const refused = error.status >= 400 && error.status < 500 && error.status !== 401; // another key may be typed
 			if (refused) localStorage.removeItem(remembered);
-			status.textContent = refused ? "Refused" : "Stopped; the bytes sent so far are kept";
-			if (!unsaved) cancel.textContent = refused ? "Dismiss" : "Cancel";
-			again.textContent = "Continue";
+			status.textContent = t(refused ? "refused" : "upload.stopped");
+			if (!unsaved) cancel.textContent = t(refused ? "dismiss" : "cancel");
+			again.textContent = t("continue");
 			again.hidden = refused;
 			problem.replaceChildren(problemBox(/^Not(Found|Readable)Error$/.test(error.name) ? unreadable(file) : error));
 		} finally {
@@ -87,13 +87,13 @@ export function begin(file, record, { unsaved = false, warning = "" } = {}) {
 	}
 	if (!warning) return work();
 	status.textContent = warning;
-	again.textContent = "Upload anyway";
+	again.textContent = t("upload.anyway");
 	again.hidden = false;
 }
 
 const unreadable = ({ name }) => ({
-	title: "Cannot read the file",
-	detail: `${name} was changed, moved or removed after it was chosen, or it is a folder. Put it back and continue, or choose it again.`,
+	title: t("upload.unreadable"),
+	detail: t("upload.moved", { name }),
 });
 
 const startsAsZip = async (file) => /^PK[\x03\x05]/.test(await file.slice(0, 4).text());
@@ -107,8 +107,8 @@ export const fileInput = (id) => fileField({ accept: ".zip,application/zip,video
 
 export function dropZone() {
 	const zone = h("div.drop",
-		h("label", { for: "zip" }, h("strong", "Choose a capture archive or a film"), " or drop it here",
-			h("span.hint", "A ZIP with capture.json and its frames, or the film of a program. An interrupted upload continues where it stopped.")),
+		h("label", { for: "zip" }, parts("upload.drop", { choose: h("strong", t("upload.choose")) }),
+			h("span.hint", t("upload.what"))),
 		fileInput("zip"));
 	onDrop(zone, upload);
 	return h("div", zone, running);

@@ -6,21 +6,23 @@ import { renamable } from "../lib/rename.js";
 import { CHECK, deletion, steps } from "../lib/view.js";
 import { matteCards } from "./mattes.js";
 import { recoveryForm } from "./recovery_form.js";
+import { t } from "../lib/words.js";
 
 export async function capture(main, signal, id) {
 	const found = await getJson(`v1/captures/${id}`, signal);
 	const problem = h("div");
 	const rename = async (name) => (await patchJson(`v1/captures/${id}`, { name })).name;
-	const removal = deletion(`v1/captures/${id}`, problem, "Its frames will be deleted. Mattes recovered from it stay.");
+	const removal = deletion(`v1/captures/${id}`, problem, t("capture.lost"));
 	main.append(
 		steps(CHECK, "#/captures"),
-		h("p.crumb", h("a", { href: "#/captures" }, "Captures")),
-		h("div.row.spread", renamable(found.name || `Capture ${id.slice(0, 8)}`, "Name of the capture", rename), h("span.row", badge(found.state), removal)),
+		h("p.crumb", h("a", { href: "#/captures" }, t("nav.captures"))),
+		h("div.row.spread", renamable(found.name || t("capture.unnamed", { id: id.slice(0, 8) }), t("capture.name"), rename), h("span.row", badge(found.state), removal)),
 		problem,
 		facts({
-			Frame: found.width && `${size(found)} pixels`, Frames: found.frames, Monitor: `${size(found.program.monitor)} pixels`,
-			Size: bytes(found.bytes), Added: when(found.created_at), "Kept until": found.expires_at && when(found.expires_at),
-			"Read by": h("a", { href: `#/jobs/${found.job}` }, "its ingest job"),
+			[t("frame")]: found.width && t("pixels", { size: size(found) }), [t("frames")]: found.frames,
+			[t("monitor")]: t("pixels", { size: size(found.program.monitor) }), [t("size")]: bytes(found.bytes),
+			[t("added")]: when(found.created_at), [t("until")]: found.expires_at && when(found.expires_at),
+			[t("capture.by")]: h("a", { href: `#/jobs/${found.job}` }, t("capture.job")),
 		}),
 	);
 	if (found.state === "failed") return main.append(problemBox(found.problem));
@@ -28,7 +30,7 @@ export async function capture(main, signal, id) {
 		const [report, { form }, made] = await Promise.all([getJson(found.report.slice(1), signal), recoveryForm(found, signal), mattesOf(id, signal)]);
 		return main.append(verdict(report), made, form, h("div.columns", frames(found, signal), sheet(found, signal)));
 	}
-	const panel = h("section.panel", h("h2", "Reading the frames"));
+	const panel = h("section.panel", h("h2", t("capture.reading")));
 	const { form, isAutomatic, start } = await recoveryForm(found, signal);
 	main.append(panel, form);
 	followJob(panel, found.job, signal).then(async ({ state }) => {
@@ -40,61 +42,60 @@ export async function capture(main, signal, id) {
 async function mattesOf(id, signal) {
 	const { mattes } = await getJson(`v1/mattes?capture=${id}&limit=8`, signal);
 	const card = matteCards(signal);
-	return h("section.stack", { hidden: !mattes.length, "aria-label": "Mattes" }, h("h2", "Its mattes"),
+	return h("section.stack", { hidden: !mattes.length, "aria-label": t("nav.mattes") }, h("h2", t("capture.mattes")),
 		h("ul.list", mattes.map((one) => h("li", card(one)))));
 }
 
 const GRADES = [[40, "excellent"], [30, "good"], [22, "fair"], [-Infinity, "poor"]]; // from so many dB on
-const VERDICTS = { good: "Ready: expect", warning: "Ready, with warnings: expect at best", bad: "Better filmed again: expect at best" };
 
 // The report: a verdict, then what is wrong with its remedies; what is fine is folded.
 function verdict({ level, quality, findings }) {
 	// Random grids without offsets suit frosted glass, all others clear glass.
 	const clear = quality && (quality.blocks == null ? quality.high : quality.low);
 	const [, grade] = quality ? GRADES.find(([least]) => clear >= least) : [];
-	const text = grade ? `${VERDICTS[level]} ${grade} clear glass` : VERDICTS[level].split(":")[0];
+	const text = t(`verdict.${level}`) + (grade ? t(`verdict.${level === "good" ? "expect" : "best"}`, { grade: t(`grade.${grade}`) }) : "");
 	const rows = (some) => h("ul.findings", some.map((one) =>
 		h("li", badge(one.level), h("div", h("p", prose(sentence(one.message))), one.remedy && h("p.remedy", prose(sentence(one.remedy)))))));
 	const fine = findings.filter((one) => one.level === "good");
 	const wrong = findings.filter((one) => one.level !== "good");
-	return h("section.panel", { "aria-label": "Report" }, h("div.row", h("h2", text), badge(level)),
-		wrong.length ? rows(wrong) : "", h("details", { hidden: !fine.length }, h("summary", `What is fine (${fine.length})`), rows(fine)));
+	return h("section.panel", { "aria-label": t("report") }, h("div.row", h("h2", text), badge(level)),
+		wrong.length ? rows(wrong) : "", h("details", { hidden: !fine.length }, h("summary", t("report.fine", { n: fine.length })), rows(fine)));
 }
 
 function frames(found, signal) {
 	const middle = found.frames >> 1; // the first ones are black and white
-	const image = h("img", { alt: `Frame ${middle + 1}`, width: found.width, height: found.height, hidden: true });
+	const image = h("img", { alt: t("frame.n", { n: middle + 1 }), width: found.width, height: found.height, hidden: true });
 	const frame = h("div.picture", image);
 	frame.style.aspectRatio = `${found.width} / ${found.height}`; // keeps its place until the picture is there
 	const number = h("input", { type: "range", id: "frame", min: 0, max: found.frames - 1, value: middle });
-	const position = h("output", { for: "frame" }, `${middle + 1} of ${found.frames}`);
+	const position = h("output", { for: "frame" }, t("of", { n: middle + 1, all: found.frames }));
 	const problem = h("div");
 	const look = newest(async () => {
 		try {
 			await show(image, await getBlob(`v1/captures/${found.id}/frames/${number.value}.png`, signal));
-			image.alt = `Frame ${Number(number.value) + 1}`;
+			image.alt = t("frame.n", { n: Number(number.value) + 1 });
 			problem.replaceChildren();
 		} catch (error) {
 			if (!signal.aborted) problem.replaceChildren(problemBox(error));
 		}
 	});
 	number.oninput = () => {
-		position.textContent = `${Number(number.value) + 1} of ${found.frames}`;
+		position.textContent = t("of", { n: Number(number.value) + 1, all: found.frames });
 		look();
 	};
 	look();
-	return h("section.panel", h("h2", "Frames"), frame,
-		h("div.row", h("label", { for: "frame" }, "Frame"), number, position), problem);
+	return h("section.panel", h("h2", t("frames")), frame,
+		h("div.row", h("label", { for: "frame" }, t("frame")), number, position), problem);
 }
 
 function sheet(found, signal) {
-	const image = h("img", { alt: "Some of the frames side by side", hidden: true });
+	const image = h("img", { alt: t("sheet.alt"), hidden: true });
 	const frame = h("div.picture.whole", image);
 	frame.style.aspectRatio = `${2 * found.width} / ${1.1 * found.height}`; // most sheets are four by two frames: this keeps the page from moving when it loads
 	const fit = (blob) => show(image, blob).then(() => (frame.style.aspectRatio = `${image.naturalWidth} / ${image.naturalHeight}`));
 	getBlob(`v1/captures/${found.id}/contact-sheet.png`, signal).then(fit, (error) => {
 		if (!signal.aborted) image.replaceWith(problemBox(error));
 	});
-	return h("section.panel", h("h2", "Contact sheet"), frame,
-		h("p.hint", "Red pixels are clipped at white, blue ones at black."));
+	return h("section.panel", h("h2", t("sheet")), frame,
+		h("p.hint", t("sheet.clipped")));
 }

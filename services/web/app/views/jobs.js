@@ -1,23 +1,24 @@
 // Jobs: the list, and one job with its progress; a recovery fills in its frame tile by tile.
 import { getComposite, getJson, post, save } from "../lib/api.js";
-import { KINDS, jobCard } from "../lib/activity.js";
+import { jobCard } from "../lib/activity.js";
 import { backdrop } from "../composite/backdrops.js";
 import { button, empty, facts, h, newest, pause, problemBox, show, when } from "../lib/dom.js";
 import { ACTIVE } from "../lib/events.js";
 import { list } from "../lib/list.js";
 import { followJob } from "../lib/job_progress.js";
 import { RECOVER, CHECK, deletion, steps } from "../lib/view.js";
-import { QUALITIES, automatic } from "./recovery_form.js";
+import { automatic, qualityOf } from "./recovery_form.js";
+import { t } from "../lib/words.js";
 
 const REFRESH = 2000; // ms between two pictures of what is recovered
 const LONGER = 640; // pixels of their longer side, at most
 
 export async function jobs(main, signal) {
-	main.append(h("h1", "Jobs"));
+	main.append(h("h1", t("jobs")));
 	await list(main, signal, {
 		page: (after) => getJson(`v1/jobs?limit=50${after}`, signal).then((answer) => answer.jobs),
 		busy: (one) => ACTIVE.includes(one.state),
-		none: () => empty("No jobs yet", "Each capture and each matte starts one."),
+		none: () => empty(t("jobs.none"), t("jobs.first")),
 		item: (one) => jobCard(one, when(one.created_at)),
 	});
 }
@@ -25,24 +26,27 @@ export async function jobs(main, signal) {
 export async function job(main, signal, id) {
 	const found = await getJson(`v1/jobs/${id}`, signal);
 	const problem = h("div");
-	const cancel = button("Cancel", problem, () => post(`v1/jobs/${id}/cancel`));
-	const retry = button("Try again", problem, async () => {
+	const cancel = button(t("cancel"), problem, () => post(`v1/jobs/${id}/cancel`));
+	const retry = button(t("again"), problem, async () => {
 		await post(`v1/jobs/${id}/retry`);
 		watch();
 	}, "primary");
-	const lost = found.kind === "composite" ? "Its log and its video will be deleted." : "Its log will be deleted; its capture or matte stays.";
+	const lost = t(found.kind === "composite" ? "job.lost.video" : "job.lost.log");
 	const removal = deletion(`v1/jobs/${id}`, problem, lost);
-	const asked = h("details.panel", { hidden: found.kind !== "recover" }, h("summary", "Options"), facts(found.options));
+	const asked = h("details.panel", { hidden: found.kind !== "recover" }, h("summary", t("options")), facts(found.options));
 	const links = h("p.row");
-	const panel = h("section.panel", { "aria-label": "Progress", "data-log": "" });
+	const panel = h("section.panel", { "aria-label": t("progress"), "data-log": "" });
 	const preview = found.kind === "recover" ? await progressPicture(found, signal) : null;
 	const step = { ingest: CHECK, recover: RECOVER }[found.kind];
 	main.append(
 		step ? steps(step, "#/captures", `#/captures/${found.capture}`) : "",
-		h("p.crumb", h("a", { href: "#/jobs" }, "Jobs")),
-		h("div.row.spread", h("h1", KINDS[found.kind]), h("span.row", cancel, retry, removal)),
+		h("p.crumb", h("a", { href: "#/jobs" }, t("jobs"))),
+		h("div.row.spread", h("h1", t(`job.${found.kind}`)), h("span.row", cancel, retry, removal)),
 		problem,
-		facts({ Asked: when(found.created_at), Capture: found.capture && h("a", { href: `#/captures/${found.capture}` }, found.capture.slice(0, 8)), Method: found.options.method, Quality: QUALITIES[found.options.quality] }),
+		facts({
+			[t("job.asked")]: when(found.created_at), [t("capture")]: found.capture && h("a", { href: `#/captures/${found.capture}` }, found.capture.slice(0, 8)),
+			[t("method")]: found.options.method, [t("quality")]: qualityOf(found),
+		}),
 		links, h("div", { class: preview ? "columns" : "stack" }, preview?.panel, h("div.stack", panel, asked)),
 	);
 	watch(found);
@@ -54,9 +58,9 @@ export async function job(main, signal, id) {
 		const made = now.state === "succeeded";
 		if (made && automatic.delete(id)) return location.replace(`#/mattes/${now.matte}`);
 		links.replaceChildren(...[
-			made && now.kind === "recover" && h("a.primary", { href: `#/mattes/${now.matte}` }, "Open the matte"),
-			made && now.kind === "ingest" && h("a.primary", { href: `#/captures/${now.capture}` }, "Open the capture"),
-			made && now.video && button("Download the video", problem, () => save(now.video.slice(1), "composite.mp4"), "primary"),
+			made && now.kind === "recover" && h("a.primary", { href: `#/mattes/${now.matte}` }, t("job.matte")),
+			made && now.kind === "ingest" && h("a.primary", { href: `#/captures/${now.capture}` }, t("job.capture")),
+			made && now.video && button(t("video.download"), problem, () => save(now.video.slice(1), "composite.mp4"), "primary"),
 		].filter(Boolean));
 		preview?.update(now);
 	}
@@ -74,7 +78,7 @@ export async function job(main, signal, id) {
 // The composite of what is recovered so far; the rest is transparent.
 async function progressPicture(found, signal) {
 	const { width, height } = await getJson(`v1/captures/${found.capture}`, signal).catch(() => ({}));
-	const image = h("img", { alt: "The composite of what is recovered so far", hidden: true });
+	const image = h("img", { alt: t("job.sofar"), hidden: true });
 	const frame = h("div.picture.filling", image);
 	if (width) frame.style.aspectRatio = `${width} / ${height}`;
 	const before = backdrop("Checker", 640, 480);
@@ -91,7 +95,7 @@ async function progressPicture(found, signal) {
 		}
 	});
 	return {
-		panel: h("section.panel", h("h2", "The frame"), frame),
+		panel: h("section.panel", h("h2", t("job.frame")), frame),
 		update: (now) => now.tiles.done > 0 && ["running", "succeeded"].includes(now.state) && look(now),
 	};
 }

@@ -1,10 +1,11 @@
 // The form that starts a recovery. Its options and their descriptions come from GET /v1/options.
 import { getJson, post } from "../lib/api.js";
 import { duration, h, problemBox, prose } from "../lib/dom.js";
+import { t } from "../lib/words.js";
 
 const BY_HAND = "envmatte-recover-by-hand"; // in this browser's storage
-export const QUALITIES = { fast: "Draft", fine: "Best" };
-const ABOUT = { fast: "Clear glass, in half the time", fine: "All that the frames show" };
+const QUALITIES = ["fast", "fine"];
+export const qualityOf = ({ options: { quality } }) => QUALITIES.includes(quality) && t(`quality.${quality}`);
 export const automatic = new Set(); // jobs whose matte is shown once it is done
 
 function field(option) {
@@ -22,7 +23,7 @@ function field(option) {
 			placeholder: option.default ?? "", inputmode: whole ? "numeric" : "decimal",
 		});
 	}
-	const range = !option.values && option.minimum != null ? ` ${option.minimum} to ${option.maximum}.` : "";
+	const range = !option.values && option.minimum != null ? ` ${t("option.range", { least: option.minimum, most: option.maximum })}` : "";
 	const about = h("p.hint", { id: `${id}-about` }, prose(option.description), range);
 	const row = h("div.option", h("label", { for: id }, option.name.replaceAll("_", " ")), input, about);
 	return { option, input, row };
@@ -39,9 +40,9 @@ function chosen(fields, method) {
 }
 
 function cards({ name, default: usual }, seconds) {
-	return h("fieldset.row.qualities", h("legend", "Quality"), Object.entries(QUALITIES).map(([value, title]) =>
+	return h("fieldset.row.qualities", h("legend", t("quality")), QUALITIES.map((value) =>
 		h("label.choice", h("input", { type: "radio", name, value, checked: value === usual, "aria-describedby": `about-${value}` }),
-			h("strong", title), seconds && ` about ${duration(Math.max(seconds[value], 1))}`, h("span.hint", { id: `about-${value}` }, ABOUT[value]))));
+			h("strong", t(`quality.${value}`)), seconds && ` ${t("quality.takes", { time: duration(Math.max(seconds[value], 1)) })}`, h("span.hint", { id: `about-${value}` }, t(`quality.${value}.about`)))));
 }
 
 // The form; whether the recovery `isAutomatic` once the frames are read, and what starts it then.
@@ -55,13 +56,13 @@ export async function recoveryForm(capture, signal) {
 	const isWaiting = capture.state === "ingesting";
 	const itself = h("input", { type: "checkbox", checked: !localStorage.getItem(BY_HAND) });
 	itself.onchange = () => (itself.checked ? localStorage.removeItem(BY_HAND) : localStorage.setItem(BY_HAND, "1"));
-	const form = h("form.panel", { id: "recovery" }, h("h2", "Recover a matte"),
-		h("p", "Finds, for each pixel, where on the monitor its light comes from."),
+	const form = h("form.panel", { id: "recovery" }, h("h2", t("recover.title")),
+		h("p", t("recover.about")),
 		qualities,
-		isWaiting && h("label", itself, " Recover automatically when ready"),
-		h("details", h("summary", "Expert"), h("p.hint", "An empty field takes the default shown in grey, or what the quality sets."),
+		isWaiting && h("label", itself, " ", t("recover.itself")),
+		h("details", h("summary", t("recover.expert")), h("p.hint", t("recover.defaults")),
 			h("div.options", fields.map(({ row }) => row))),
-		problem, h("p.row", h("button.primary", isWaiting ? "Recover as soon as possible" : "Recover")));
+		problem, h("p.row", h("button.primary", t(isWaiting ? "recover.soon" : "recover"))));
 	const sort = () => {
 		for (const { option, row, input } of fields) input.disabled = row.hidden = Boolean(option.method) && option.method !== method.value;
 		qualities.disabled = qualities.hidden = method.value !== options.find(isQuality).method;

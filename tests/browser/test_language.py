@@ -1,0 +1,110 @@
+"""The app in German: every view, without an English word of its own, a key or a gap."""
+
+import re
+
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from tests.browser.pages import BY_HAND, MINUTE, ZIP, opened, unfold
+from tests.end_to_end.conftest import Service
+from tests.services.web.test_words import WEB, words
+
+pytestmark = pytest.mark.slow
+
+ENGLISH, GERMAN = (words(WEB / "app" / "words" / f"{name}.js") for name in ("en", "de"))
+# What only English says: long enough that nothing else is the same.
+PHRASES = [
+    text for key, text in ENGLISH.items() if len(text) > 14 and "{" not in text and text != GERMAN[key]
+]
+TEXTS = """() => [
+    document.body.innerText,
+    ...[...document.querySelectorAll("[aria-label], [alt], [placeholder], [title]")]
+        .flatMap((one) => [one.ariaLabel, one.alt, one.placeholder, one.title].filter(Boolean)),
+].join("\\n")"""
+
+
+def check(page: Page, name: str) -> None:
+    """Check what a view says, folded or not."""
+    expect(page.locator("main")).to_have_attribute("aria-busy", "false")
+    page.evaluate("document.querySelectorAll('main details').forEach((one) => (one.open = true))")
+    text = page.evaluate(TEXTS)
+    assert [phrase for phrase in PHRASES if phrase in text] == [], name
+    assert [
+        key for key in GERMAN if "." in key and re.search(rf"(?<![\w.]){re.escape(key)}(?![\w.])", text)
+    ] == []
+    assert "undefined" not in text, name
+    assert not re.search(r"\{\w+\}", text), name
+
+
+def test_every_view_speaks_german(browser: Browser, service: Service, ready: tuple[str, str]) -> None:
+    capture, matte = ready
+    shown = {"preset": "sketch", "monitor": {"width": 1200, "height": 800}, "border": True}
+    program = service.http.post("/v1/programs", json=shown).json()["id"]
+    job = service.client.matte(matte)["job"]
+    views = {
+        "": "Trinkglas",
+        "film": "Programm wählen",
+        f"film/{program}": "Vor dem Start",
+        "captures": "Aufnahmen",
+        f"captures/{capture}": "Kontaktbogen",
+        "jobs": "Aufträge",
+        f"jobs/{job}": "Berechnung einer Matte",
+        "mattes": "Matten",
+        f"mattes/{matte}": "Ebenen",
+        "mattes/none": None,
+    }
+    with opened(browser, locale="de-DE", viewport={"width": 1200, "height": 800}) as page:
+        loaded: list[str] = []
+        page.on("request", lambda request: loaded.append(request.url) if "/words/" in request.url else None)
+        page.goto(f"{service.url}/#/captures")
+        assert page.locator("html").get_attribute("lang") == "de"
+        for path, heading in views.items():
+            page.goto(f"{service.url}/#/{path}")
+            if heading:
+                expect(page.get_by_role("heading", name=heading).first).to_be_visible()
+            else:
+                expect(page.get_by_role("alert")).to_contain_text("gelöscht")
+            check(page, path)
+        page.goto(f"{service.url}/#/mattes/{matte}")
+        expect(page.get_by_text(re.compile("^Schachbrett: exakt, 96 × 72 Pixel"))).to_be_visible()
+        unfold(page)
+        page.get_by_role("button", name="Pixel erklären").click()
+        expect(page.get_by_text(re.compile(r"^Pixel \(48, 36\): .*\d %"))).to_be_visible()
+        check(page, "a pixel")
+        page.goto(f"{service.url}/v1/programs/{program}/play")
+        expect(page.get_by_role("status")).to_have_text("Bereit.", timeout=MINUTE)
+        assert page.get_by_role("button", name="Im Vollbild abspielen").is_enabled()
+        text = page.evaluate(TEXTS)
+        assert [phrase for phrase in PHRASES if phrase in text] == []
+        assert {url.rpartition("/")[2] for url in loaded} == {"de.js"}
+
+
+def test_page_of_a_link_speaks_the_language_of_its_reader(
+    browser: Browser, service: Service, ready: tuple[str, str]
+) -> None:
+    path = service.http.post(f"/v1/mattes/{ready[1]}/links", json={}).json()["path"]
+    for locale, text in (
+        ("de-AT", "Das Bild ziehen"),
+        ("fr-FR", "Drag the picture"),
+        ("en-US", "Drag the picture"),
+    ):
+        with opened(browser, locale=locale) as page:
+            page.goto(service.url + path)
+            expect(page.get_by_text(text)).to_be_visible()
+            assert page.locator("html").get_attribute("lang") == locale[:2].replace("fr", "en")
+
+
+def test_language_is_chosen_in_the_activity_menu_and_kept(desk: Page, service: Service) -> None:
+    desk.add_init_script(BY_HAND)
+    desk.goto(f"{service.url}/#/captures")
+    expect(desk.get_by_label(ZIP)).to_be_attached()
+    desk.get_by_role("button", name="Activity").click()
+    menu = desk.get_by_role("region", name="Activity")
+    expect(menu.get_by_role("button", name="English")).to_have_attribute("aria-pressed", "true")
+    menu.get_by_role("button", name="Deutsch").click()
+    expect(desk.get_by_role("heading", name="Aufnahmen")).to_be_visible()
+    desk.reload()
+    expect(desk.get_by_role("heading", name="Aufnahmen")).to_be_visible()
+    desk.get_by_role("button", name="Aktivität").click()
+    desk.get_by_role("region", name="Aktivität").get_by_role("button", name="English").click()
+    expect(desk.get_by_role("heading", name="Captures")).to_be_visible()

@@ -1,0 +1,124 @@
+"""The words of the app: the same in each language, all in use, and none of them elsewhere in the sources."""
+
+import json
+import re
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+WEB = Path(__file__).parents[3] / "services" / "web"
+WORDS = sorted((WEB / "app" / "words").glob("*.js"))
+SCRIPTS = [path for path in sorted(WEB.rglob("*.js")) if path not in WORDS]
+PAGES = sorted(WEB.rglob("*.html"))
+OF_SERVICE = "preset."
+"""What the service says in English, and only other languages say again."""
+COMMENT = re.compile(r"(?<!:)//[^\n]*|<!--.*?-->", re.DOTALL)
+QUOTED = re.compile(r'"((?:[^"\\\n]|\\.)*)"')
+FOUND = re.compile(r"\b(?:t|parts|known)\(`((?:[^`$]|\$\{[^{}]*\})*)`")
+"""A key that is put together of parts."""
+SENTENCE = re.compile(r"(?<![-\w])[A-Z][a-z]+(?:[ .,:]|$)|[a-z]{2,} (?:[a-z]{2,}\b)")
+BACKTICK = re.compile(r"(?<=\()/[^/\n]*`[^/\n]*/")
+"""A regular expression with backticks, which start no text."""
+NAMES = {
+    # What the code calls things: keys of the keyboard, headers, backdrops, types of drags, selectors.
+    *(
+        "Arrow",
+        "Escape",
+        "Location",
+        "Files",
+        "Checker",
+        "Dusk",
+        "Lights",
+        "Tiles",
+        "picture stage",
+        "#own input",
+        "Bearer ",
+    ),
+    *("Deutsch", "English"),  # each language in its own words
+}
+
+
+def words(path: Path) -> dict[str, str]:
+    """The words of a file, which are an object of JSON but for its last comma."""
+    found = re.fullmatch(r"//[^\n]*\nexport const \w+ = (\{\n.*),\n\};\n", path.read_text(), re.DOTALL)
+    assert found, path
+    return dict(json.loads(found[1] + "}"))
+
+
+def source(path: Path) -> str:
+    return COMMENT.sub("", path.read_text())
+
+
+def texts(script: str) -> list[str]:
+    """The texts in a script; those between backticks without the expressions in them."""
+    found: list[str] = []
+    open_: list[str] = []  # the marks that end what is open: texts, and expressions in them
+    for part in re.findall(r'\\.|"|`|\$\{|\{|\}|[^\\"`${}]+|.', BACKTICK.sub("", script), re.DOTALL):
+        inside = open_[-1] if open_ else "}"
+        if inside in '"`':
+            if part == inside:
+                open_.pop()
+            elif part == "${" and inside == "`":
+                open_.append("}")
+                found.append("")
+            else:
+                found[-1] += part
+        elif part in '"`':
+            open_.append(part)
+            found.append("")
+        elif part in ("{", "${"):
+            open_.append("}")
+        elif part == "}":
+            open_.pop()
+            found.append("")  # what continues after an expression
+    assert open_ == []
+    return found
+
+
+ENGLISH = words(WEB / "app" / "words" / "en.js")
+
+
+@pytest.mark.parametrize("path", WORDS, ids=lambda path: path.stem)
+def test_languages_have_the_same_words_with_the_same_places(path: Path) -> None:
+    found = {key: text for key, text in words(path).items() if not key.startswith(OF_SERVICE)}
+    assert list(words(path)) == sorted(words(path))
+    assert found.keys() == ENGLISH.keys()
+    for key, text in found.items():
+        assert text.strip(), key
+        assert Counter(re.findall(r"\{\w+\}", text)) == Counter(re.findall(r"\{\w+\}", ENGLISH[key])), key
+
+
+def test_all_words_are_used_and_all_that_are_used_exist() -> None:
+    text = "".join(map(source, SCRIPTS + PAGES))
+    literal = set(QUOTED.findall(text))
+    parted = [
+        re.compile("".join(r"[\w-]+" if part.startswith("${") else re.escape(part) for part in parts))
+        for parts in (re.split(r"(\$\{[^{}]*\})", one) for one in FOUND.findall(text))
+    ]
+    unused = [key for key in ENGLISH if key not in literal and not any(one.fullmatch(key) for one in parted)]
+    assert unused == []
+    named = re.findall(r'\b(?:t|parts)\("([^"]+)"', text) + re.findall(r'data-(?:word|label)="([^"]+)"', text)
+    assert [key for key in named if key not in ENGLISH] == []
+    keys = [key for path in WORDS for key in words(path)]
+    assert [one.pattern for one in parted if not any(map(one.fullmatch, keys))] == []
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.name)
+def test_scripts_have_no_words_of_their_own(path: Path) -> None:
+    if path.name == "webgl.js":
+        pytest.skip("its texts are programs of the graphics card")
+    script = re.sub(r"^import .*", "", source(path), flags=re.MULTILINE)
+    wrong = [text for text in texts(script) if SENTENCE.search(text) and text not in NAMES]
+    assert wrong == []
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: f"{path.parent.name}")
+def test_pages_have_no_words_of_their_own(path: Path) -> None:
+    text = re.sub(r"<(script|title|style)\b.*?</\1>", "", source(path), flags=re.DOTALL)
+    # What is read without scripts stands there in both languages.
+    text = re.sub(r"<p(?: [^>]*)?>[^<]*<span lang=.*?</p>", "", text)
+    text = text.replace("&nbsp;", "")
+    shown = [one.strip() for one in re.findall(r">([^<>]+)<", text)]
+    assert [one for one in shown if re.search("[A-Za-z]", one) and one != "envmatte" and "$" not in one] == []
+    assert re.findall(r'(?:aria-label|title|placeholder)="', text) == []
