@@ -20,6 +20,10 @@ SHORT = {
         {"kind": "bernoulli", "columns": 8, "rows": 6, "count": 10, "seed": 1, "colour": "grey"},
     ],
 }
+KEPT = """async (count) => {
+    const { allFilms } = await import("/web/app/upload/kept_films.js");
+    return (await allFilms()).filter(({ capture }) => !capture).length === count;
+}"""
 
 
 def test_preset_is_fitted_to_the_screen(desk: Page, service: Service) -> None:
@@ -74,6 +78,16 @@ def test_program_is_followed_and_recorded(browser: Browser, desk: Page, service:
     assert Program.model_validate(capture["program"]) == Program.model_validate(made["program"])
     # The fake camera does not see the monitor, so ingest finds no program in the film.
     expect(desk.get_by_role("alert")).to_contain_text("film.", timeout=2 * MINUTE)
+    for _ in range(2):  # and after a reload
+        film = desk.get_by_role("region", name="The film")
+        expect(film.get_by_label("The film’s first frame")).not_to_have_js_property("videoWidth", 0)
+        with desk.expect_download() as download:
+            film.get_by_role("button", name="Save the film").click()
+        assert download.value.path().stat().st_size > 1000
+        desk.reload()
+    film.get_by_role("link", name="Film again").click()
+    expect(desk).to_have_url(url)
+    expect(desk.get_by_role("button", name="Use a camera of this device")).to_be_visible()
 
 
 def test_followers_see_countdown_progress_and_stop(desk: Page, service: Service) -> None:
@@ -162,15 +176,54 @@ def test_interrupted_film_is_kept_until_user_decides(desk: Page, service: Servic
     desk.get_by_role("navigation").get_by_role("link", name="Film").click()
     expect(desk.get_by_role("heading", name="Choose a program")).to_be_visible()
     expect(row).to_be_visible()
-    assert asks_before_closing(desk)
-    row.get_by_role("button", name="Delete").click()
+    desk.wait_for_function(KEPT, arg=1)
+    desk.reload()
+    expect(row).to_contain_text("not uploaded yet. The program stopped before its end")
+    row.get_by_role("button", name="Discard").click()
     desk.get_by_role("button", name="Cancel").click()
     with desk.expect_download() as download:
         row.get_by_role("button", name="Save").click()
     assert download.value.path().stat().st_size > 1000
     row.get_by_role("button", name="Upload").click()
     expect(desk).to_have_url(re.compile(r"#/captures/\w+"), timeout=MINUTE)
-    expect(desk.get_by_role("heading", name="film")).to_be_visible()
+    expect(desk.get_by_role("heading", name="film", exact=True)).to_be_visible()
+    desk.reload()
+    expect(desk.get_by_role("heading", name="film", exact=True)).to_be_visible()
+    expect(row).to_have_count(0)
+
+
+def test_film_waits_in_one_page_until_it_is_discarded(desk: Page, service: Service) -> None:
+    program = filming(desk, service)
+    shown(service, program, "stopped")
+    row = desk.get_by_role("region", name=re.compile("^film\\."))
+    expect(row).to_contain_text("The program stopped before its end")
+    desk.wait_for_function(KEPT, arg=1)
+    other = desk.context.new_page()
+    other.goto(f"{service.url}/#/captures")
+    expect(other.get_by_role("heading", name="Captures")).to_be_visible()
+    other.wait_for_load_state("networkidle")
+    expect(other.get_by_role("region", name=re.compile("^film\\."))).to_have_count(0)
+    other.close()
+    row.get_by_role("button", name="Discard").click()
+    desk.get_by_role("button", name="Discard film").click()
+    expect(row).to_have_count(0)
+    desk.wait_for_function(KEPT, arg=0)
+
+
+def test_film_is_uploaded_after_a_reload(desk: Page, service: Service) -> None:
+    desk.route("**/v1/uploads", lambda route: route.abort("connectionreset"))
+    program = filming(desk, service)
+    shown(service, program, "shown")
+    row = desk.get_by_role("region", name=re.compile("^film\\."))
+    expect(row).to_contain_text("The service does not answer")
+    desk.wait_for_function(KEPT, arg=1)
+    desk.on("dialog", lambda dialog: dialog.accept())  # an upload is under way
+    desk.reload()
+    expect(row).to_contain_text("not uploaded yet.")
+    desk.unroute("**/v1/uploads")
+    row.get_by_role("button", name="Upload").click()
+    expect(desk).to_have_url(re.compile(r"#/captures/\w+"), timeout=MINUTE)
+    assert service.client.capture(desk.url.rpartition("/")[2])["name"] == "film"
 
 
 def test_another_upload_does_not_end_a_recording(desk: Page, service: Service, ball: Path) -> None:

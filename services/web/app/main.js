@@ -10,6 +10,7 @@ import { job, jobs } from "./views/jobs.js";
 import { matte, mattes } from "./views/mattes.js";
 import { loadWords } from "./lib/language.js";
 import { t } from "./lib/words.js";
+import { offerFilms } from "./upload/upload.js";
 
 const VIEWS = { home: [home], film: [filming, program], captures: [captures, capture], jobs: [jobs, job], mattes: [mattes, matte] };
 const main = document.getElementById("main");
@@ -87,3 +88,4 @@ addEventListener("keydown", ({ key, target }) => key === "?" && !target.matches(
 await loadWords();
 addEventListener("hashchange", () => route(true));
 route(false);
+offerFilms();

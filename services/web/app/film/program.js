@@ -1,5 +1,5 @@
 // Filming: the choice of a program, and one program with its checklist, its progress on the monitor, and its film.
-import { getJson, post } from "../lib/api.js";
+import { getJson, newKey, post } from "../lib/api.js";
 import { camera, noCamera } from "./recorder.js";
 import { checks } from "./checklist.js";
 import { badge, duration, empty, facts, fileField, h, pause, problemBox, prose, size, when } from "../lib/dom.js";
@@ -46,7 +46,7 @@ export async function filming(main, signal) {
 		h("p.lead", t("film.lead")),
 		form, running, await nearby(signal), h("h2", t("programs")));
 	await list(main, signal, {
-		page: (after) => getJson(`v1/programs?limit=50${after}`, signal).then((answer) => answer.programs),
+		kind: "programs", text: programName,
 		busy: isPlaying,
 		none: () => empty(t("programs.none"), t("programs.first")),
 		item: (one) => h("a.card", { href: `#/film/${one.id}` }, h("span.name", programName(one)), isPlaying(one) ? badge("running") : h("span"),
@@ -72,9 +72,9 @@ export async function program(main, signal, id) {
 	const problem = h("div");
 	const live = h("section.panel", h("h2", t("film.on")), phase, bar, about,
 		h("p.row", h("a.primary", { href: `v1/programs/${id}/play`, target: "_blank", rel: "opener" }, t("film.play"))));
-	const film = (file, about) => begin(file, recordOf(found, found.showing?.patterns_per_second ?? 2), about);
+	const film = (file, about) => begin(file, recordOf(found, found.showing?.patterns_per_second ?? 2), { again: `#/film/${id}`, ...about });
 	const why = noCamera();
-	const recorder = why ? null : camera(signal, (file, whole) => film(file, { unsaved: true, warning: whole ? "" : t("film.cut") }));
+	const recorder = why ? null : camera(signal, (file, whole) => film(file, { id: newKey(), warning: whole ? "" : t("film.cut") }));
 	const take = ([file]) => {
 		problem.replaceChildren();
 		if (isFilm(file)) film(file);

@@ -95,7 +95,7 @@ export const patchJson = async (path, body) =>
 	(await ask(path, { method: "PATCH", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) })).json();
 
 // Deletes; something that another tab has deleted already counts as deleted.
-export const remove = (path) => ask(path, { method: "DELETE" }).catch((error) => {
+export const remove = (path, options) => ask(path, { method: "DELETE", ...options }).catch((error) => {
 	if (error.status !== 404) throw error;
 });
 

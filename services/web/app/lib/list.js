@@ -1,51 +1,128 @@
-// A list, newest first, that is refreshed while something in it is in progress.
-import { button, h, pause, problemBox } from "./dom.js";
+// A list, newest first, that is refreshed while something in it is in progress. Where entries have states, they can be
+// searched, filtered, chosen and deleted.
+import { getJson } from "./api.js";
+import { button, empty, h, newest, pause, problemBox } from "./dom.js";
+import { deleteLater } from "./undo.js";
 import { t } from "./words.js";
 
 const REFRESH = 5000; // ms
+const PAGE = 50; // entries
 
-export async function list(main, signal, { page, busy, none, item }) {
+// `kind` names a path of the API and the key of its answer. `item` makes the card of an entry, `text` what a search looks
+// into, which begins with its name.
+export async function list(main, signal, { kind, states = [], busy, fixed = () => false, none, item, text }) {
 	const items = h("ul.list");
+	const nothing = h("div");
 	const problem = h("div");
-	const more = button(t("older"), problem, async () => add(await page(`&after=${last.id}`)), "more");
-	let last;
-	let pages = 0;
-	const add = (found) => {
-		items.append(...found.map((one) => h("li", item(one))));
-		last = found.at(-1);
-		more.hidden = found.length < 50;
-		pages += 1;
+	const refused = h("div");
+	const search = h("input", { type: "search", "aria-label": t("list.search"), placeholder: t("list.search") });
+	const state = h("select", { "aria-label": t("list.state") }, h("option", { value: "" }, t("list.all")),
+		states.map((one) => h("option", { value: one }, t(`state.${one}`))));
+	const all = h("input", { type: "checkbox", "aria-label": t("list.choose.all") });
+	const chosen = new Set(); // ids
+	const gone = new Set(); // ids of what is deleted, or will be
+	const rows = new Map(); // by id: the text of an entry and its element, which stays as long as nothing changes
+	let entries = [];
+	let isWhole = true; // whether the oldest entry is there
+	const get = async (after) => (await getJson(`v1/${kind}?limit=${PAGE}${state.value && `&state=${state.value}`}${after}`, signal))[kind];
+
+	// All that follows `found`: one page of it, or every page if `everything` is wanted.
+	async function read(found, everything) {
+		do {
+			const next = await get(found.length ? `&after=${found.at(-1).id}` : "");
+			found = [...found, ...next];
+			isWhole = next.length < PAGE;
+		} while (!isWhole && everything);
+		entries = found;
+		draw();
+	}
+	const load = newest(async () => {
+		try {
+			await read([], search.value.trim());
+			problem.replaceChildren();
+		} catch (error) {
+			signal.throwIfAborted();
+			problem.replaceChildren(problemBox(error), button(t("again"), refused, load));
+		}
+	});
+	const more = button(t("older"), problem, () => read(entries, false), "more");
+
+	const remove = h("button.danger", {
+		type: "button",
+		onclick() {
+			const ids = [...chosen];
+			for (const id of ids) gone.add(id);
+			const back = (some) => {
+				for (const id of some) gone.delete(id);
+				draw();
+			};
+			chosen.clear();
+			refused.replaceChildren();
+			draw();
+			main.append(deleteLater(kind, ids, signal, () => back(ids), (id, error) => {
+				refused.replaceChildren(problemBox(error));
+				back([id]);
+			}));
+		},
+	});
+	const count = () => {
+		remove.hidden = !chosen.size;
+		remove.textContent = t("list.delete", { n: chosen.size });
 	};
-	const start = async () => {
-		const first = await page("");
-		if (!first.length) items.before(none());
-		add(first);
-		watch(first).catch(() => {}); // the user left the view
+	const visible = () => {
+		const wanted = search.value.trim().toLowerCase();
+		return entries.filter((one) => !gone.has(one.id) && text(one).toLowerCase().includes(wanted));
 	};
-	const again = async (error) => {
-		signal.throwIfAborted();
-		problem.replaceChildren(problemBox(error), button(t("again"), problem, () => start().catch(again)));
+	all.onchange = () => {
+		chosen.clear();
+		if (all.checked) for (const one of visible()) if (!fixed(one)) chosen.add(one.id);
+		draw();
 	};
+
+	function row(one) {
+		const now = JSON.stringify(one);
+		const known = rows.get(one.id);
+		if (known?.now === now) return known.element;
+		const choose = states.length > 0 && h("input", {
+			type: "checkbox", "aria-label": t("list.choose", { name: text(one) }), disabled: fixed(one),
+			onchange: () => (choose.checked ? chosen.add(one.id) : chosen.delete(one.id), count()),
+		});
+		const element = h("li", { "data-id": one.id }, choose, item(one));
+		rows.set(one.id, { now, element });
+		return element;
+	}
+	function draw() {
+		const shown = visible().map(row);
+		const { activeElement } = document;
+		const [focused, tag] = [activeElement.closest("li")?.dataset.id, activeElement.localName];
+		if (shown.length !== items.childElementCount || shown.some((one, n) => one !== items.children[n])) {
+			items.replaceChildren(...shown);
+			if (focused) items.querySelector(`[data-id="${focused}"] ${tag}`)?.focus();
+		}
+		for (const one of shown) {
+			const choose = one.querySelector("[type=checkbox]");
+			if (choose) choose.checked = chosen.has(one.dataset.id);
+		}
+		const isFiltered = Boolean(search.value || state.value);
+		tools.hidden = !states.length || (!entries.length && !isFiltered);
+		nothing.replaceChildren(shown.length ? "" : isFiltered ? empty(t("list.none"), t("list.other")) : none());
+		more.hidden = isWhole;
+		if (!chosen.size) all.checked = false;
+		count();
+	}
+	const tools = h("div.row.tools", { role: "search", hidden: true }, h("label", all, " ", t("list.every")), search, state, remove);
+	search.oninput = () => (isWhole ? draw() : load().catch(() => {})); // the user left the view
+	state.onchange = () => (chosen.clear(), load().catch(() => {}));
 	more.hidden = true;
-	main.append(items, problem, more);
-	await start().catch(again);
+	main.append(tools, refused, nothing, items, problem, more);
+	await load();
+	watch().catch(() => {}); // the user left the view
 
 	// Refreshes the first page only, and only while no further page is shown.
-	async function watch(found) {
-		while (found.some(busy) && pages === 1) {
+	async function watch() {
+		for (;;) {
 			await pause(REFRESH, signal);
-			if (document.hidden) continue;
-			try {
-				found = await page("");
-				problem.replaceChildren();
-			} catch (error) {
-				signal.throwIfAborted();
-				problem.replaceChildren(problemBox(error));
-				continue;
-			}
-			const focused = items.contains(document.activeElement) ? document.activeElement.getAttribute("href") : undefined;
-			items.replaceChildren(...found.map((one) => h("li", item(one))));
-			if (focused) items.querySelector(`[href="${focused}"]`)?.focus();
+			if (!document.hidden && entries.length <= PAGE && entries.some(busy)) await load();
 		}
 	}
 }

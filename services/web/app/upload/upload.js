@@ -1,8 +1,9 @@
 // Uploads: rows with the progress of each, and the zone where files are dropped or chosen.
 import { Problem, post, saveBlob } from "../lib/api.js";
 import { recordings } from "../lib/recordings.js";
-import { bytes, confirmed, duration, fileField, h, problemBox } from "../lib/dom.js";
+import { bytes, confirmed, duration, fileField, h, problemBox, when } from "../lib/dom.js";
 import { askForRecord, filmArchive, isFilm } from "./film_bundle.js";
+import { forgetFilm, keepFilm, noteCapture, waitingFilms } from "./kept_films.js";
 import { send } from "./tus.js";
 import { crc32 } from "./zip.js";
 import { parts, t } from "../lib/words.js";
@@ -14,24 +15,29 @@ export const running = h("div.uploads");
 const rows = new Set(); // of each upload, whether it is `busy`, and whether its film is `unsaved`: only in this page
 addEventListener("beforeunload", (event) => [...rows].some(({ busy, unsaved }) => busy || unsaved) && event.preventDefault());
 
-// Uploads a capture archive, or a film with its capture.json; without one, asks for its program. An `unsaved` film was
-// recorded here: it can be saved, and is deleted only after a question. One with a `warning` waits for the user.
-export function begin(file, record, { unsaved = false, warning = "" } = {}) {
-	const state = { busy: false, unsaved };
+// Uploads a capture archive, or a film with its capture.json; without one, asks for its program. A film was filmed in the
+// view `again`. One that was recorded here has an `id`: it can be saved, is kept until its capture is ready, and is
+// discarded only after a question. One with a `warning` waits for the user; one that is `stored` is kept already.
+export function begin(file, record, { again: view = "#/film", id, at = Date.now(), warning = "", stored = false } = {}) {
+	const film = { id, at, file, record, again: view, warning };
+	const state = { busy: false, unsaved: Boolean(id) && !stored };
+	let saved = !id;
+	if (state.unsaved) keepFilm(film).then((isKept) => (state.unsaved &&= !isKept));
 	const stop = new AbortController();
 	const bar = h("progress", { max: 1, value: 0, "aria-label": t("upload.of", { name: file.name }) });
 	const status = h("span", { role: "status" }, t("upload.starting"));
 	const problem = h("div");
 	const asked = h("div");
 	const again = h("button", { type: "button", hidden: true, onclick: () => work() }, t("continue"));
-	const save = h("button", { type: "button", hidden: !unsaved, onclick: () => (saveBlob(file, file.name), (state.unsaved = false)) }, t("film.save"));
+	const save = h("button", { type: "button", hidden: !id, onclick: () => (saveBlob(file, file.name), (state.unsaved = false), (saved = true)) }, t("film.save"));
 	const end = () => (rows.delete(state), row.remove());
 	const drop = async () => {
-		if (state.unsaved && !(await confirmed(t("film.delete?"), t("film.lost"), t("film.delete")))) return;
+		if (!saved && !(await confirmed(t("film.delete?"), t("film.lost"), t("film.delete")))) return;
 		stop.abort();
+		if (id) forgetFilm(id);
 		end();
 	};
-	const cancel = h("button", { type: "button", onclick: drop }, t(unsaved ? "film.discard" : "cancel"));
+	const cancel = h("button", { type: "button", onclick: drop }, t(id ? "film.discard" : "cancel"));
 	const row = h("section.panel", { "aria-label": file.name },
 		h("p.row.spread", h("strong.name", file.name), h("span.row", again, save, cancel)), bar, status, asked, problem);
 	running.append(row);
@@ -70,6 +76,7 @@ export function begin(file, record, { unsaved = false, warning = "" } = {}) {
 			status.textContent = t("upload.checking");
 			const made = await post("v1/captures", { upload }, `capture-of-${upload}`);
 			localStorage.removeItem(remembered);
+			if (isFilm(file)) await noteCapture(film, made.id);
 			end();
 			if (running.isConnected && !recordings.size) location.hash = `#/captures/${made.id}`;
 		} catch (error) {
@@ -77,7 +84,7 @@ export function begin(file, record, { unsaved = false, warning = "" } = {}) {
 			const refused = error.status >= 400 && error.status < 500 && error.status !== 401; // another key may be typed
 			if (refused) localStorage.removeItem(remembered);
 			status.textContent = t(refused ? "refused" : "upload.stopped");
-			if (!unsaved) cancel.textContent = t(refused ? "dismiss" : "cancel");
+			if (!id) cancel.textContent = t(refused ? "dismiss" : "cancel");
 			again.textContent = t("continue");
 			again.hidden = refused;
 			problem.replaceChildren(problemBox(/^Not(Found|Readable)Error$/.test(error.name) ? unreadable(file) : error));
@@ -85,10 +92,15 @@ export function begin(file, record, { unsaved = false, warning = "" } = {}) {
 			state.busy = false;
 		}
 	}
-	if (!warning) return work();
-	status.textContent = warning;
-	again.textContent = t("upload.anyway");
+	if (!warning && !stored) return work();
+	status.textContent = stored ? `${t("film.kept", { time: when(at).textContent })} ${warning}` : warning;
+	again.textContent = t(warning ? "upload.anyway" : "upload");
 	again.hidden = false;
+}
+
+// Offers the films that were recorded here before the page was loaded.
+export async function offerFilms() {
+	for (const film of await waitingFilms()) begin(film.file, film.record, { ...film, stored: true });
 }
 
 const unreadable = ({ name }) => ({

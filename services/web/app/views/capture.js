@@ -7,6 +7,8 @@ import { CHECK, deletion, steps } from "../lib/view.js";
 import { matteCards } from "./mattes.js";
 import { recoveryForm } from "./recovery_form.js";
 import { t } from "../lib/words.js";
+import { failedFilm } from "../film/failed_film.js";
+import { forgetFilmOf } from "../upload/kept_films.js";
 
 export async function capture(main, signal, id) {
 	const found = await getJson(`v1/captures/${id}`, signal);
@@ -25,8 +27,9 @@ export async function capture(main, signal, id) {
 			[t("capture.by")]: h("a", { href: `#/jobs/${found.job}` }, t("capture.job")),
 		}),
 	);
-	if (found.state === "failed") return main.append(problemBox(found.problem));
+	if (found.state === "failed") return main.append(problemBox(found.problem), await failedFilm(id, signal));
 	if (found.state === "ready") {
+		forgetFilmOf(id);
 		const [report, { form }, made] = await Promise.all([getJson(found.report.slice(1), signal), recoveryForm(found, signal), mattesOf(id, signal)]);
 		return main.append(verdict(report), made, form, h("div.columns", frames(found, signal), sheet(found, signal)));
 	}

@@ -1,11 +1,13 @@
 // The list of captures, and the zone to upload another one.
-import { getBlob, getJson } from "../lib/api.js";
+import { getBlob } from "../lib/api.js";
 import { badge, button, bytes, empty, h, size, when } from "../lib/dom.js";
 import { areRemoved, fetchCapture, restoreSamples } from "../home/samples.js";
 import { list } from "../lib/list.js";
 import { FILM, steps, thumbnails } from "../lib/view.js";
 import { dropZone, upload } from "../upload/upload.js";
 import { t } from "../lib/words.js";
+
+const nameOf = ({ id, name }) => name || t("capture.unnamed", { id: id.slice(0, 8) });
 
 export async function captures(main, signal) {
 	const problem = h("div");
@@ -23,12 +25,12 @@ export async function captures(main, signal) {
 		problem,
 	);
 	await list(main, signal, {
-		page: (after) => getJson(`v1/captures?limit=50${after}`, signal).then((answer) => answer.captures),
+		kind: "captures", states: ["ingesting", "ready", "failed"], text: nameOf,
 		busy: (one) => one.state === "ingesting",
 		none: () => empty(t("captures.none"), t("captures.first")),
 		item: (one) =>
 			h("a.card.pictured", { href: `#/captures/${one.id}` }, thumb(one),
-				h("span.name", one.name || t("capture.unnamed", { id: one.id.slice(0, 8) })), badge(one.state),
+				h("span.name", nameOf(one)), badge(one.state),
 				h("span.about", [size(one), t("frames.n", { n: one.frames }), bytes(one.bytes)].filter(Boolean).join(" · ")),
 				when(one.created_at)),
 	});

@@ -13,11 +13,14 @@ import { t } from "../lib/words.js";
 const REFRESH = 2000; // ms between two pictures of what is recovered
 const LONGER = 640; // pixels of their longer side, at most
 
+const isActive = ({ state }) => ACTIVE.includes(state);
+
 export async function jobs(main, signal) {
 	main.append(h("h1", t("jobs")));
 	await list(main, signal, {
-		page: (after) => getJson(`v1/jobs?limit=50${after}`, signal).then((answer) => answer.jobs),
-		busy: (one) => ACTIVE.includes(one.state),
+		kind: "jobs", states: ["queued", "running", "succeeded", "failed", "cancelled"],
+		text: ({ id, kind }) => `${t(`job.${kind}`)} ${id}`,
+		busy: isActive, fixed: isActive,
 		none: () => empty(t("jobs.none"), t("jobs.first")),
 		item: (one) => jobCard(one, when(one.created_at)),
 	});

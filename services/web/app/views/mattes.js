@@ -12,17 +12,20 @@ import { t } from "../lib/words.js";
 const THUMB = 240; // pixels
 const checker = backdrop("Checker", THUMB, 180);
 
+export const nameOf = ({ id }) => t("matte.unnamed", { id: id.slice(0, 8) });
+
 export function matteCards(signal) {
 	const thumb = thumbnails(signal, async (id) => getComposite(id, { size: THUMB, around: "backdrop" }, "image/jpeg", await checker, signal));
 	return (one) => h("a.card.pictured", { href: `#/mattes/${one.id}` }, thumb(one),
-		h("span.name", t("matte.unnamed", { id: one.id.slice(0, 8) })), badge(one.state),
+		h("span.name", nameOf(one)), badge(one.state),
 		h("span.about", [size(one), one.options.method, qualityOf(one)].filter(Boolean).join(" · ")), when(one.created_at));
 }
 
 export async function mattes(main, signal) {
 	main.append(h("h1", t("nav.mattes")));
 	await list(main, signal, {
-		page: (after) => getJson(`v1/mattes?limit=50${after}`, signal).then((answer) => answer.mattes),
+		kind: "mattes", states: ["recovering", "ready", "failed"],
+		text: (one) => [nameOf(one), one.options.method, qualityOf(one)].filter(Boolean).join(" "),
 		busy: (one) => one.state === "recovering",
 		none: () => empty(t("mattes.none"), t("mattes.first")),
 		item: matteCards(signal),
@@ -40,7 +43,7 @@ export async function matte(main, signal, id) {
 	archive.hidden = page.hidden = !isReady;
 	main.append(
 		steps(PLAY, "#/captures", capture && `#/captures/${capture}`, job && `#/jobs/${job}`),
-		h("div.row.spread", h("h1", t("matte.unnamed", { id: id.slice(0, 8) })), badge(found.state)),
+		h("div.row.spread", h("h1", nameOf(found)), badge(found.state)),
 	);
 	const details = h("details.panel", { open: !isReady }, h("summary", h("h2", t("details"))), facts({
 		[t("frame")]: found.width && t("pixels", { size: size(found) }), [t("monitor")]: found.monitor && t("pixels", { size: found.monitor.join(" × ") }),

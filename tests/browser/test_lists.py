@@ -1,0 +1,150 @@
+"""Lists: searched, filtered, and cleared of several entries at once, which can be undone."""
+
+import re
+from collections.abc import Callable
+
+import pytest
+from playwright.sync_api import Locator, Page, Route, expect
+
+from tests.end_to_end.conftest import Service, paused
+from tests.parts.waiting import until
+
+pytestmark = pytest.mark.slow
+
+NOT_NOW = {"title": "Not now", "detail": "the service is busy", "status": 409}
+
+
+@pytest.fixture
+def cancelled(service: Service, ready: tuple[str, str]) -> list[str]:
+    """Two jobs that can be deleted."""
+    with paused(service):
+        jobs = [service.client.recover(ready[0])["id"] for _ in range(2)]
+        for job in jobs:
+            service.http.post(f"/v1/jobs/{job}/cancel")
+    return jobs
+
+
+def card(page: Page, job: str) -> Locator:
+    return page.get_by_role("main").locator(f'a[href="#/jobs/{job}"]')
+
+
+def choose(page: Page, jobs: list[str]) -> None:
+    for job in jobs:
+        page.get_by_role("checkbox", name=f"Choose Recovery of a matte {job}").check()
+    page.get_by_role("button", name=f"Delete {len(jobs)}", exact=True).click()
+    for job in jobs:
+        expect(card(page, job)).to_have_count(0)
+
+
+def is_gone(service: Service, jobs: list[str]) -> Callable[[], bool]:
+    return lambda: all(service.http.get(f"/v1/jobs/{job}").status_code == 404 for job in jobs)
+
+
+def is_there(service: Service, jobs: list[str]) -> bool:
+    return all(service.http.get(f"/v1/jobs/{job}").status_code == 200 for job in jobs)
+
+
+def test_list_is_searched_and_filtered_by_state(desk: Page, service: Service, cancelled: list[str]) -> None:
+    desk.goto(f"{service.url}/#/jobs")
+    entries = desk.get_by_role("main").get_by_role("listitem")
+    expect(card(desk, cancelled[0])).to_be_visible()
+    search = desk.get_by_role("searchbox", name="Search")
+    search.fill(f" {cancelled[0].upper()} ")
+    expect(entries).to_have_count(1)
+    expect(card(desk, cancelled[0])).to_be_visible()
+    search.fill("no such job")
+    expect(entries).to_have_count(0)
+    expect(desk.get_by_text("Nothing found")).to_be_visible()
+    search.fill("")
+    desk.get_by_label("State").select_option("succeeded")
+    expect(card(desk, cancelled[0])).to_have_count(0)
+    expect(entries.first).to_contain_text("succeeded")
+    desk.get_by_label("State").select_option("cancelled")
+    expect(card(desk, cancelled[1])).to_be_visible()
+    expect(entries.filter(has_not_text="cancelled")).to_have_count(0)
+
+
+def test_search_looks_into_all_pages(desk: Page, service: Service) -> None:
+    """A service with 120 captures, as far as the app can tell."""
+    captures = [
+        {
+            "id": f"c{n:03}",
+            "name": f"glass {n:03}",
+            "state": "ready",
+            "frames": 9,
+            "bytes": 900,
+            "created_at": "2026-01-01T00:00:00Z",
+        }
+        for n in range(120)
+    ]
+
+    def answer(route: Route) -> None:
+        after = re.search(r"after=c(\d+)", route.request.url)
+        first = int(after[1]) + 1 if after else 0
+        route.fulfill(json={"captures": captures[first : first + 50]})
+
+    desk.route("**/v1/captures?*", answer)
+    desk.route("**/v1/captures/*/thumbnail.png", lambda route: route.fulfill(status=404, json=NOT_NOW))
+    desk.goto(f"{service.url}/#/captures")
+    entries = desk.get_by_role("main").locator("ul.list > li")
+    expect(entries).to_have_count(50)
+    desk.get_by_role("button", name="Show older").click()
+    expect(entries).to_have_count(100)
+    desk.reload()
+    expect(entries).to_have_count(50)
+    desk.get_by_role("searchbox", name="Search").fill("glass 11")
+    expect(entries).to_have_count(10)
+    desk.get_by_label("Choose all that are shown").check()
+    expect(desk.get_by_role("button", name="Delete 10", exact=True)).to_be_visible()
+
+
+def test_deletion_is_undone(desk: Page, service: Service, cancelled: list[str]) -> None:
+    desk.clock.install()
+    desk.goto(f"{service.url}/#/jobs")
+    choose(desk, cancelled)
+    bar = desk.get_by_role("status").filter(has_text="Jobs deleted: 2")
+    bar.get_by_role("button", name="Undo").click()
+    for job in cancelled:
+        expect(card(desk, job)).to_be_visible()
+    desk.clock.fast_forward(20_000)
+    expect(bar).to_have_count(0)
+    assert is_there(service, cancelled)
+    # Without it they are deleted after some seconds.
+    choose(desk, cancelled)
+    assert is_there(service, cancelled)
+    desk.clock.fast_forward(20_000)
+    expect(bar).to_have_count(0)
+    until(is_gone(service, cancelled))
+
+
+@pytest.mark.parametrize("way", ["another view", "another page"])
+def test_leaving_deletes_at_once(desk: Page, service: Service, cancelled: list[str], way: str) -> None:
+    desk.goto(f"{service.url}/#/jobs")
+    choose(desk, cancelled)
+    assert is_there(service, cancelled)
+    if way == "another view":
+        desk.get_by_role("navigation").get_by_role("link", name="Captures").click()
+    else:
+        desk.goto("about:blank")
+    until(is_gone(service, cancelled))
+
+
+def test_what_cannot_be_deleted_comes_back(desk: Page, service: Service, cancelled: list[str]) -> None:
+    kept, lost = cancelled
+    desk.route(
+        f"**/v1/jobs/{kept}",
+        lambda route: (
+            route.fulfill(status=409, json=NOT_NOW, content_type="application/problem+json")
+            if route.request.method == "DELETE"
+            else route.continue_()
+        ),
+    )
+    desk.clock.install()
+    desk.goto(f"{service.url}/#/jobs")
+    choose(desk, cancelled)
+    desk.clock.fast_forward(20_000)
+    expect(card(desk, kept)).to_be_visible()
+    expect(desk.get_by_role("main").get_by_role("alert")).to_contain_text("The service is busy")
+    expect(card(desk, lost)).to_have_count(0)
+    until(is_gone(service, [lost]))
+    assert is_there(service, [kept])
