@@ -34,6 +34,7 @@ NAMES = {
         "picture stage",
         "#own input",
         "Bearer ",
+        "Enter",
     ),
     *("Deutsch", "English"),  # each language in its own words
 }

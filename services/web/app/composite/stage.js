@@ -132,6 +132,11 @@ export class Stage extends LiveGlass {
 		this.#composite(true);
 	}
 
+	// The picture or the canvas that is in front.
+	get front() {
+		return this.canvas.hidden ? this.#image : this.canvas;
+	}
+
 	#bringToFront(element) {
 		this.#image.hidden = element !== this.#image;
 		this.canvas.hidden = element !== this.canvas;

@@ -1,9 +1,8 @@
 // Records a film.
 import { h, pause, problemBox } from "../lib/dom.js";
-import { setRecording } from "../lib/recordings.js";
+import { setRecording, videoType } from "../lib/recordings.js";
 import { t } from "../lib/words.js";
 
-const TYPES = ["video/mp4;codecs=avc1.640034", "video/mp4;codecs=avc1.42E034", "video/webm;codecs=vp9", "video/webm;codecs=vp8", "video/webm"];
 const BITS = 40e6; // per second: stronger compression costs the matte decibels
 const LOCKED = ["exposureMode", "whiteBalanceMode", "focusMode"];
 const AFTER = 1000; // ms that recording continues after the program
@@ -67,9 +66,8 @@ export function camera(signal, filmed) {
 
 	async function start() {
 		if (!stream || recorder) return;
-		const type = TYPES.find((one) => MediaRecorder.isTypeSupported(one));
 		const parts = [];
-		const mine = (recorder = new MediaRecorder(stream, { mimeType: type, videoBitsPerSecond: BITS }));
+		const mine = (recorder = new MediaRecorder(stream, { mimeType: videoType(), videoBitsPerSecond: BITS }));
 		mine.ondataavailable = ({ data }) => parts.push(data);
 		mine.onstop = () => {
 			recorder = undefined;

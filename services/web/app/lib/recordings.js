@@ -7,3 +7,8 @@ export function setRecording(signal, isRecording) {
 	else recordings.delete(signal);
 	dispatchEvent(new Event("recording"));
 }
+
+const TYPES = ["video/mp4;codecs=avc1.640034", "video/mp4;codecs=avc1.42E034", "video/webm;codecs=vp9", "video/webm;codecs=vp8", "video/webm"];
+
+// The best type of video that this browser records.
+export const videoType = () => TYPES.find((one) => MediaRecorder.isTypeSupported(one));

@@ -1,4 +1,4 @@
-// What several views have in common: steps, deletion, thumbnails.
+// What several views have in common: steps, deletion, names, thumbnails.
 import { remove } from "./api.js";
 import { button, confirmed, h, newest, show } from "./dom.js";
 import { t } from "./words.js";
@@ -20,6 +20,8 @@ export function deletion(path, where, lost) {
 		location.replace(`#/${list}`);
 	}, "quiet");
 }
+
+export const matteName = ({ id, name }) => name || t("matte.unnamed", { id: id.slice(0, 8) });
 
 const thumbs = new Map(); // by id: what is ready never changes
 

@@ -5,19 +5,18 @@ import { badge, button, empty, facts, h, size, when } from "../lib/dom.js";
 import { compositing } from "../composite/compositing.js";
 import { layers } from "../composite/layers.js";
 import { list } from "../lib/list.js";
-import { PLAY, deletion, steps, thumbnails } from "../lib/view.js";
+import { PLAY, deletion, matteName, steps, thumbnails } from "../lib/view.js";
 import { qualityOf } from "./recovery_form.js";
 import { t } from "../lib/words.js";
+import { sharing } from "./sharing.js";
 
 const THUMB = 240; // pixels
 const checker = backdrop("Checker", THUMB, 180);
 
-export const nameOf = ({ id }) => t("matte.unnamed", { id: id.slice(0, 8) });
-
 export function matteCards(signal) {
 	const thumb = thumbnails(signal, async (id) => getComposite(id, { size: THUMB, around: "backdrop" }, "image/jpeg", await checker, signal));
 	return (one) => h("a.card.pictured", { href: `#/mattes/${one.id}` }, thumb(one),
-		h("span.name", nameOf(one)), badge(one.state),
+		h("span.name", matteName(one)), badge(one.state),
 		h("span.about", [size(one), one.options.method, qualityOf(one)].filter(Boolean).join(" · ")), when(one.created_at));
 }
 
@@ -25,7 +24,7 @@ export async function mattes(main, signal) {
 	main.append(h("h1", t("nav.mattes")));
 	await list(main, signal, {
 		kind: "mattes", states: ["recovering", "ready", "failed"],
-		text: (one) => [nameOf(one), one.options.method, qualityOf(one)].filter(Boolean).join(" "),
+		text: (one) => [matteName(one), one.options.method, qualityOf(one)].filter(Boolean).join(" "),
 		busy: (one) => one.state === "recovering",
 		none: () => empty(t("mattes.none"), t("mattes.first")),
 		item: matteCards(signal),
@@ -43,7 +42,7 @@ export async function matte(main, signal, id) {
 	archive.hidden = page.hidden = !isReady;
 	main.append(
 		steps(PLAY, "#/captures", capture && `#/captures/${capture}`, job && `#/jobs/${job}`),
-		h("div.row.spread", h("h1", nameOf(found)), badge(found.state)),
+		h("div.row.spread", h("h1", matteName(found)), badge(found.state)),
 	);
 	const details = h("details.panel", { open: !isReady }, h("summary", h("h2", t("details"))), facts({
 		[t("frame")]: found.width && t("pixels", { size: size(found) }), [t("monitor")]: found.monitor && t("pixels", { size: found.monitor.join(" × ") }),
@@ -53,7 +52,7 @@ export async function matte(main, signal, id) {
 		[t("job")]: job && h("a", { href: `#/jobs/${job}` }, job.slice(0, 8)),
 	}));
 	if (isReady) {
-		main.append(compositing(found, await otherQualities(found, signal), signal), layers(found, signal));
+		main.append(compositing(found, await otherQualities(found, signal), signal), layers(found, signal), sharing(id, signal));
 	} else {
 		const text = t(found.state === "failed" ? "matte.failed" : "matte.running");
 		main.append(h("div.empty", h("strong", t("matte.unready")), h("p", text), job && h("p", h("a", { href: `#/jobs/${job}` }, t("job.show")))));

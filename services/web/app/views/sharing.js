@@ -1,0 +1,52 @@
+// Links by which people without a key see a matte: made, copied, deleted.
+import { getJson, post, remove } from "../lib/api.js";
+import { button, h, problemBox, when } from "../lib/dom.js";
+import { parts, t } from "../lib/words.js";
+
+const DAYS = [7, 30, 365];
+const USUAL = 30;
+
+// Folded; the links are requested once it is opened.
+export function sharing(id, signal) {
+	const path = `v1/mattes/${id}/links`;
+	const days = h("select", { id: "days" }, DAYS.map((n) => h("option", { value: n, selected: n === USUAL }, t("share.days", { n }))));
+	const problem = h("div");
+	const made = h("div.stack");
+	const links = h("ul.list");
+
+	const row = ({ id: link, created_at: created, expires_at: expires }) => {
+		const end = button(t("delete"), problem, async () => {
+			await remove(`${path}/${link}`);
+			if (made.dataset.link === link) made.replaceChildren();
+			item.remove();
+		}, "quiet");
+		const item = h("li", h("span", parts("share.until", { from: when(created), to: when(expires) })), end);
+		return item;
+	};
+	const create = button(t("share.make"), problem, async () => {
+		const link = await post(path, { days: Number(days.value) });
+		made.dataset.link = link.id;
+		const to = (where) => new URL(where.slice(1), location.href.split("#")[0]).href;
+		made.replaceChildren(field(t("share.link"), to(link.path), problem),
+			field(t("share.embed"), h("iframe", { src: to(link.embed), width: 640, height: 560 }).outerHTML, problem),
+			h("p.hint", t("share.once")));
+		links.prepend(row(link));
+	}, "primary");
+	const panel = h("details.panel", h("summary", h("h2", t("share"))),
+		h("div.stack", h("p", t("share.about")), h("div.row", h("label", { for: "days" }, t("share.expires")), days, create), problem, made, links));
+	panel.addEventListener("toggle", () => getJson(path, signal).then(
+		(found) => links.append(...found.links.map(row)),
+		(error) => signal.aborted || problem.replaceChildren(problemBox(error)),
+	), { once: true });
+	return panel;
+}
+
+// A text to copy.
+function field(label, text, problem) {
+	const input = h("input", { type: "text", readonly: true, value: text, onfocus: () => input.select() });
+	const copy = button(t("share.copy"), problem, async () => {
+		await navigator.clipboard?.writeText(text);
+		input.select(); // for browsers that let no page of http write into the clipboard
+	});
+	return h("div.row.copied", h("label", label, input), copy);
+}
