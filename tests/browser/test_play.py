@@ -13,6 +13,7 @@ from PIL import Image
 from playwright.sync_api import Page, expect
 
 from tests.end_to_end.conftest import Service, serving
+from tests.parts.waiting import until
 from workflows.programs.border import (
     LEAD,
     MAX_PATTERNS,
@@ -242,3 +243,34 @@ def test_page_asks_for_a_key_where_needed(tab: Page, tmp_path_factory: pytest.Te
             key.press("Enter")
             expect(tab.get_by_role("status")).to_contain_text(status)
         expect(key).to_be_hidden()
+
+
+def test_aiming_shows_white_in_the_border_until_a_camera_sees_it(tab: Page, service: Service) -> None:
+    program = posted(service)
+    go(tab, service, program)
+
+    def phase() -> str | None:
+        found = service.http.get(f"/v1/programs/{program['id']}").json()["showing"]
+        return found and str(found["phase"])
+
+    def aim() -> None:
+        tab.get_by_role("button", name="Aim the camera").click()
+        tab.wait_for_function("() => document.getElementById('canvas').width === 640")
+
+    aim()
+    url = tab.evaluate("document.getElementById('canvas').toDataURL('image/png')")
+    shown = np.asarray(Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))).convert("RGB"))
+    white = np.full((1, 1, 3), 255, np.uint8)
+    np.testing.assert_array_equal(shown, draw_border(white, LEAD, Border(**SCREEN)))
+    tab.keyboard.press("Escape")
+    expect(tab.get_by_role("status")).to_have_text("Stopped.")
+    aim()
+    begun = {"phase": "countdown", "patterns_per_second": 2, "seconds": 8}
+    assert service.http.put(f"/v1/programs/{program['id']}/showing", json=begun).status_code == 204
+    until(lambda: phase() == "showing")
+    tab.keyboard.press("Escape")
+    until(lambda: phase() == "stopped")
+    aim()  # what was reported before starts nothing
+    tab.keyboard.press("Space")
+    until(lambda: phase() == "countdown")
+    tab.keyboard.press("Escape")

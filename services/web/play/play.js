@@ -6,6 +6,7 @@ import { countScreen, knownScreen, onZoom, rememberScreen } from "../app/film/sc
 import { loadWords } from "../app/lib/language.js";
 import { parts, t } from "../app/lib/words.js";
 import { h } from "../app/lib/dom.js";
+import { follow } from "../app/lib/events.js";
 
 const COUNTDOWN = 5; // seconds
 const AHEAD = 8; // pictures decoded ahead: all of them would fill the memory
@@ -177,10 +178,10 @@ async function open() {
 	setStatus(t("play.loading"));
 	await pictures.load(patterns, ask, (share) => ($("loaded").value = share));
 	setStatus(t("play.ready"));
-	$("start").disabled = false;
+	$("start").disabled = $("aim").disabled = false;
 	$("settings").onsubmit = (event) => {
 		event.preventDefault();
-		play(program, pictures, Number($("rate").value));
+		play(program, pictures, Number($("rate").value), event.submitter === $("aim"));
 	};
 }
 
@@ -190,7 +191,21 @@ async function refit(program, monitor) {
 	location.assign(new URL(`../${(await answer.json()).id}/play`, here));
 }
 
-async function play(program, pictures, rate) {
+// Shows white in the border until a click, a key, or a camera that sees it starts the program.
+async function aim(canvas, border, stopped, listen) {
+	const context = canvas.getContext("2d", { alpha: false });
+	draw(context, border, { number: LEAD, white: true });
+	const since = Date.now();
+	await new Promise((resolve, reject) => {
+		listen(document, "click", resolve);
+		listen(document, "keydown", ({ key }) => [" ", "Enter"].includes(key) && resolve());
+		stopped.addEventListener("abort", () => reject(stopped.reason));
+		const changed = ({ showing }) => showing?.phase === "countdown" && Date.now() - since > 1000 * showing.age_seconds && resolve();
+		follow(new URL("events", here).href, stopped, changed).catch(reject);
+	});
+}
+
+async function play(program, pictures, rate, isAimed) {
 	const [stage, canvas] = [$("stage"), $("canvas")];
 	const stop = new AbortController();
 	const { signal } = stop;
@@ -200,7 +215,7 @@ async function play(program, pictures, rate) {
 	let lock;
 	let reportedAt = -REPORT;
 	$("record").hidden = true;
-	$("start").disabled = true;
+	$("start").disabled = $("aim").disabled = true;
 	try {
 		stage.hidden = false;
 		// Without full screen for elements, the stage fills the window.
@@ -217,6 +232,14 @@ async function play(program, pictures, rate) {
 		if (full && found.isExact) rememberScreen(found);
 		const isNew = sizeOf(found) !== sizeOf(surface);
 		if (!checkFit(program, found) && isNew) throw new Error(t("play.misfit"));
+		if (isAimed) {
+			const { width, height } = found;
+			[canvas.width, canvas.height] = [width, height];
+			const border = borderOn(width, height);
+			if (!border.fits) throw new Error(t("play.small"));
+			await aim(canvas, border, signal, listen);
+			canvas.width = canvas.height = 0;
+		}
 		report(progress);
 		const refresh = await countDown($("countdown"), signal);
 		const { width, height } = await measure(canvas);
@@ -245,7 +268,7 @@ async function play(program, pictures, rate) {
 		canvas.width = canvas.height = 0;
 		$("countdown").textContent = "";
 		stage.hidden = true;
-		$("start").disabled = false;
+		$("start").disabled = $("aim").disabled = false;
 		$("start").focus();
 	}
 }

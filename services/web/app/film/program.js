@@ -1,5 +1,5 @@
 // Filming: the choice of a program, and one program with its checklist, its progress on the monitor, and its film.
-import { getJson, newKey, post } from "../lib/api.js";
+import { getJson, newKey, post, putJson } from "../lib/api.js";
 import { camera, noCamera } from "./recorder.js";
 import { checks } from "./checklist.js";
 import { badge, duration, empty, facts, fileField, h, pause, problemBox, prose, size, when } from "../lib/dom.js";
@@ -10,7 +10,9 @@ import { FILM, steps } from "../lib/view.js";
 import { countScreen, onZoom } from "./screen.js";
 import { begin, onDrop, running } from "../upload/upload.js";
 import { known, parts, t } from "../lib/words.js";
+import { placementDiagram } from "./placement_diagram.js";
 
+const COUNTDOWN = 8; // seconds, about
 const SILENT = 8; // seconds without a report after which the player page counts as gone; it reports every 2
 const isPlaying = ({ showing }) => ["countdown", "showing"].includes(showing?.phase) && showing.age_seconds < SILENT + showing.seconds;
 
@@ -73,8 +75,10 @@ export async function program(main, signal, id) {
 	const live = h("section.panel", h("h2", t("film.on")), phase, bar, about,
 		h("p.row", h("a.primary", { href: `v1/programs/${id}/play`, target: "_blank", rel: "opener" }, t("film.play"))));
 	const film = (file, about) => begin(file, recordOf(found, found.showing?.patterns_per_second ?? 2), { again: `#/film/${id}`, ...about });
+	// The player starts when it is told that a countdown has begun, and then reports its own.
+	const startPlayer = () => putJson(`v1/programs/${id}/showing`, { phase: "countdown", patterns_per_second: found.showing?.patterns_per_second ?? 2, seconds: COUNTDOWN });
 	const why = noCamera();
-	const recorder = why ? null : camera(signal, (file, whole) => film(file, { id: newKey(), warning: whole ? "" : t("film.cut") }));
+	const recorder = why ? null : camera(signal, (file, whole) => film(file, { id: newKey(), warning: whole ? "" : t("film.cut") }), startPlayer);
 	const take = ([file]) => {
 		problem.replaceChildren();
 		if (isFilm(file)) film(file);
@@ -90,7 +94,7 @@ export async function program(main, signal, id) {
 		h("h1", programName(found)),
 		facts({ [t("patterns")]: t("pixels", { size: size(found.monitor) }), [t("film.at")]: duration(found.patterns / 2), [t("made")]: when(found.created_at) }),
 		h("div.columns",
-			h("section.panel", h("h2", t("film.before")),
+			h("section.panel", h("h2", t("film.before")), placementDiagram(),
 				h("ul.checks", checks().map((text) => h("li", h("label", h("input", { type: "checkbox" }), h("span", text)))))),
 			h("div.stack", live, filmed)),
 		await nearby(signal),

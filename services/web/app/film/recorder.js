@@ -2,6 +2,7 @@
 import { h, pause, problemBox } from "../lib/dom.js";
 import { setRecording, videoType } from "../lib/recordings.js";
 import { t } from "../lib/words.js";
+import { aiming } from "./aim.js";
 
 const BITS = 40e6; // per second: stronger compression costs the matte decibels
 const LOCKED = ["exposureMode", "whiteBalanceMode", "focusMode"];
@@ -14,8 +15,9 @@ export function noCamera() {
 	return null;
 }
 
-// A panel to record with. `filmed(file, whole)` is called with every film; call `resume` when the panel is shown again.
-export function camera(signal, filmed) {
+// A panel to record with. `filmed(file, whole)` is called with every film, `ready` when all is well before one; call `resume`
+// when the panel is shown again.
+export function camera(signal, filmed, ready) {
 	const picture = h("video", { muted: true, playsinline: true, "aria-label": t("camera.sees") });
 	const frame = h("div.picture", { hidden: true }, picture);
 	const status = h("p.hint", { role: "status" });
@@ -23,6 +25,7 @@ export function camera(signal, filmed) {
 	const which = h("select", { "aria-label": t("camera"), hidden: true });
 	const open = h("button", { type: "button", onclick: () => use() }, t("camera.use"));
 	const shoot = h("button.primary", { type: "button", hidden: true, onclick: () => (recorder ? stop() : start()) }, t("record.start"));
+	const aim = aiming(picture, signal, () => ready().catch((error) => problem.replaceChildren(problemBox(error))));
 	let stream;
 	let recorder;
 	let whole; // whether the program was shown to its end
@@ -44,6 +47,7 @@ export function camera(signal, filmed) {
 			which.replaceChildren(...cameras.map(({ deviceId: id, label }, n) => h("option", { value: id, selected: id === used }, label || `${t("camera")} ${n + 1}`)));
 			status.textContent = t("record.ready", { width, height });
 			await picture.play();
+			aim.on = !recorder;
 		} catch (error) {
 			const detail = error.name === "NotAllowedError" ? t("camera.allow") : error.message;
 			if (!signal.aborted) problem.replaceChildren(problemBox({ title: t("camera.failed"), detail }));
@@ -77,10 +81,12 @@ export function camera(signal, filmed) {
 			const [kind] = mine.mimeType.split(";");
 			filmed(new File(parts, `film.${kind.endsWith("mp4") ? "mp4" : "webm"}`, { type: kind }), whole);
 			setRecording(signal, false);
+			aim.on = Boolean(stream);
 		};
 		whole = false;
 		mine.start(1000);
 		setRecording(signal, true);
+		aim.on = false;
 		shoot.textContent = t("record.stop");
 		which.disabled = true;
 		const free = await lock(stream.getVideoTracks()[0]);
@@ -98,9 +104,10 @@ export function camera(signal, filmed) {
 	function close() {
 		stream?.getTracks().forEach((track) => track.stop());
 		stream = undefined;
+		aim.on = false;
 	}
 	signal.addEventListener("abort", close, { once: true });
-	const panel = h("div.stack", h("div.row", open, which, shoot), frame, status, problem);
+	const panel = h("div.stack", h("div.row", open, which, shoot), frame, aim.element, status, problem);
 	const resume = () => picture.play().catch(() => {}); // the preview stops outside of the page, the recording does not
 	return { panel, start, stop, resume };
 }

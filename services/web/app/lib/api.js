@@ -91,8 +91,11 @@ export async function post(path, body, once = newKey()) {
 	return (await ask(path, { method: "POST", headers, body: JSON.stringify(body) })).json();
 }
 
-export const patchJson = async (path, body) =>
-	(await ask(path, { method: "PATCH", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) })).json();
+const send = (method, path, body) => ask(path, { method, headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
+
+export const patchJson = async (path, body) => (await send("PATCH", path, body)).json();
+
+export const putJson = (path, body) => send("PUT", path, body);
 
 // Deletes; something that another tab has deleted already counts as deleted.
 export const remove = (path, options) => ask(path, { method: "DELETE", ...options }).catch((error) => {
