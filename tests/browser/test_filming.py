@@ -43,6 +43,16 @@ def test_preset_is_fitted_to_the_screen(desk: Page, service: Service) -> None:
     expect(desk.get_by_role("link", name="37 patterns on a screen of 1200 × 800").first).to_be_visible()
 
 
+def test_phone_reads_the_address_off_the_screen(desk: Page, service: Service) -> None:
+    desk.route("**/v1/network", lambda route: route.fulfill(json={"url": service.url}))
+    desk.goto(f"{service.url}/#/film")
+    code = desk.get_by_role("img", name="The address as a QR code")
+    expect(code).to_be_visible()
+    expect(code).not_to_have_js_property("naturalWidth", 0)
+    assert desk.request.get(str(code.evaluate("(image) => image.src"))).ok
+    expect(desk.get_by_text(f"{service.url}/#/film", exact=True)).to_be_visible()
+
+
 def test_program_is_followed_and_recorded(browser: Browser, desk: Page, service: Service) -> None:
     made = service.http.post(
         "/v1/programs", json={"program": SHORT, "monitor": SCREEN, "border": True}

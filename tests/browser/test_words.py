@@ -128,20 +128,24 @@ def test_last_step_of_an_ingest_is_named(
     assert desk.evaluate(STAGE, job | {"tiles": {"total": 1, "done": 1, "failed": 0}}) == text
 
 
-def test_capture_is_renamed_in_place(desk: Page, service: Service, ready: tuple[str, str]) -> None:
-    desk.goto(f"{service.url}/#/captures/{ready[0]}")
+@pytest.mark.parametrize("kind", ["capture", "matte"])
+def test_capture_or_matte_is_renamed_in_place(
+    desk: Page, service: Service, ready: tuple[str, str], kind: str
+) -> None:
+    path = f"{kind}s/{ready[kind == 'matte']}"
+    desk.goto(f"{service.url}/#/{path}")
     title = desk.get_by_role("heading", level=1)
     expect(title).to_have_text("a ball")
     for name in ('<b>"glass" & more</b>', "a ball"):
         desk.get_by_role("button", name="Rename").click()
-        desk.get_by_label("Name of the capture").fill("something else")
+        desk.get_by_label(f"Name of the {kind}").fill("something else")
         desk.keyboard.press("Escape")
         desk.get_by_role("button", name="Rename").click()
         desk.keyboard.press("Control+A")
         desk.keyboard.type(name)
         desk.keyboard.press("Enter")
         expect(title).to_have_text(name)
-        assert service.http.get(f"/v1/captures/{ready[0]}").json()["name"] == name
+        assert service.http.get(f"/v1/{path}").json()["name"] == name
     desk.reload()
     expect(title).to_have_text("a ball")
 

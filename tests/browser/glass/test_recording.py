@@ -27,7 +27,7 @@ def test_movement_is_recorded_as_a_video(desk: Page, service: Service, ready: tu
         stop.click()
     expect(desk.get_by_role("button", name="Record", exact=True)).to_be_visible()
     name, _, kind = download.value.suggested_filename.rpartition(".")
-    assert name == f"Matte_{ready[1][:8]}"
+    assert name == "a_ball"
     assert kind in ("mp4", "webm")
     with av.open(str(download.value.path())) as video:
         frames = [frame.to_ndarray(format="rgb24").astype(float) for frame in video.decode(video=0)]

@@ -12,7 +12,6 @@ import { Stage } from "./stage.js";
 import { cameraSymbol, choice, thumbs } from "./thumb_choices.js";
 import { camera, clip } from "./video_backdrops.js";
 import { parts, t } from "../lib/words.js";
-import { matteName } from "../lib/view.js";
 import { recordButton } from "./recording.js";
 
 const RAW = ".dng,.nef,.cr2,.cr3,.arw,.raf,.orf,.rw2"; // the usual names of camera RAW
@@ -71,7 +70,7 @@ export function compositing(matte, others, signal) {
 	}, t("full"));
 	const folded = (title, ...about) => h("details", h("summary", title), about);
 	const sheet = h("details.panel.sheet", { open: true }, h("summary", t("controls")),
-		h("div.row", full, play, recordButton(stage, matte, matteName(matte), signal), explained.button, placed.reset, h("label", transparent, " ", t("transparent"))),
+		h("div.row", full, play, recordButton(stage, matte, signal), explained.button, placed.reset, h("label", transparent, " ", t("transparent"))),
 		stage.status, explained.panel, choices,
 		folded(t("placement"), h("p.hint", t("placement.how")), placed.sliders),
 		folded(t("compare"), comparison(stage, matte, others)), folded(t("take"), taken.element), video.element, stage.renderer);

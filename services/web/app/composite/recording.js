@@ -3,12 +3,13 @@ import { saveBlob } from "../lib/api.js";
 import { h } from "../lib/dom.js";
 import { videoType } from "../lib/recordings.js";
 import { t } from "../lib/words.js";
+import { matteName } from "../lib/view.js";
 
 const RATE = 30; // frames per second, at most
 const BITS = 12e6; // per second
 
 // The button; null where the browser cannot record. The file is named after the matte.
-export function recordButton(stage, matte, name, signal) {
+export function recordButton(stage, matte, signal) {
 	if (!window.MediaRecorder || !HTMLCanvasElement.prototype.captureStream) return null;
 	// H.264 has even sizes only. The stage's own canvas is smaller while it moves.
 	const canvas = Object.assign(document.createElement("canvas"), { width: matte.width & ~1, height: matte.height & ~1 });
@@ -27,7 +28,7 @@ export function recordButton(stage, matte, name, signal) {
 		mine.ondataavailable = ({ data }) => parts.push(data);
 		mine.onstop = () => {
 			const [type] = mine.mimeType.split(";");
-			const file = `${name.replace(/[^\p{L}\p{N}._-]+/gu, "_")}.${type.endsWith("mp4") ? "mp4" : "webm"}`;
+			const file = `${matteName(matte).replace(/[^\p{L}\p{N}._-]+/gu, "_")}.${type.endsWith("mp4") ? "mp4" : "webm"}`;
 			if (!signal.aborted) saveBlob(new Blob(parts, { type }), file);
 		};
 		draw();

@@ -46,7 +46,7 @@ export async function filming(main, signal) {
 	};
 	main.append(steps(FILM), h("h1", t("filming")),
 		h("p.lead", t("film.lead")),
-		form, running, await nearby(signal), h("h2", t("programs")));
+		form, running, await nearby(signal, "film"), h("h2", t("programs")));
 	await list(main, signal, {
 		kind: "programs", text: programName,
 		busy: isPlaying,
@@ -56,14 +56,16 @@ export async function filming(main, signal) {
 	});
 }
 
-// The address of this page for a phone, to be read off the screen.
-async function nearby(signal) {
+// The address of a view for a phone, to be read off the screen.
+async function nearby(signal, view) {
 	const isOwn = /^(localhost|127\.|\[::1\]$)/.test(location.hostname);
 	const { url, problem } = isOwn ? await getJson("v1/network", signal) : { url: location.origin };
+	if (!url) return h("section.panel", h("h2", t("phone")), h("p", prose(problem), "."));
+	const address = `${url}/#/${view}`;
+	const code = h("img.code", { src: `v1/qr.svg?${new URLSearchParams({ text: address })}`, alt: t("phone.code"), width: 160, height: 160 });
+	code.onerror = () => (code.hidden = true); // a proxy may have other names for the service than it knows
 	return h("section.panel", h("h2", t("phone")),
-		url ? [h("p", t("phone.at")), h("p.address", `${url}/#/film`),
-				h("p.hint", t("phone.choose"))]
-			: h("p", prose(problem), "."));
+		h("div.row", code, h("div.stack", h("p", t("phone.at")), h("p.address", address), view === "film" && h("p.hint", t("phone.choose")))));
 }
 
 export async function program(main, signal, id) {
@@ -97,7 +99,7 @@ export async function program(main, signal, id) {
 			h("section.panel", h("h2", t("film.before")), placementDiagram(),
 				h("ul.checks", checks().map((text) => h("li", h("label", h("input", { type: "checkbox" }), h("span", text)))))),
 			h("div.stack", live, filmed)),
-		await nearby(signal),
+		await nearby(signal, `film/${id}`),
 	);
 	let since = performance.now();
 	const age = () => (found.showing?.age_seconds ?? 0) + (performance.now() - since) / 1000;

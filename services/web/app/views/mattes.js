@@ -1,5 +1,5 @@
 // Mattes: the list, and one matte with its composite and layers.
-import { getComposite, getJson, save } from "../lib/api.js";
+import { getComposite, getJson, patchJson, save } from "../lib/api.js";
 import { backdrop } from "../composite/backdrops.js";
 import { badge, button, empty, facts, h, size, when } from "../lib/dom.js";
 import { compositing } from "../composite/compositing.js";
@@ -9,6 +9,7 @@ import { PLAY, deletion, matteName, steps, thumbnails } from "../lib/view.js";
 import { qualityOf } from "./recovery_form.js";
 import { t } from "../lib/words.js";
 import { sharing } from "./sharing.js";
+import { renamable } from "../lib/rename.js";
 
 const THUMB = 240; // pixels
 const checker = backdrop("Checker", THUMB, 180);
@@ -35,6 +36,7 @@ export async function matte(main, signal, id) {
 	const found = await getJson(`v1/mattes/${id}`, signal);
 	const problem = h("div");
 	const { capture, job, options } = found;
+	const rename = async (name) => (found.name = (await patchJson(`v1/mattes/${id}`, { name })).name);
 	const isReady = found.state === "ready";
 	const removal = deletion(`v1/mattes/${id}`, problem, t("matte.lost"));
 	const archive = button(t("matte.download"), problem, () => save(`v1/mattes/${id}/archive`, `matte-${id}.zip`));
@@ -42,7 +44,7 @@ export async function matte(main, signal, id) {
 	archive.hidden = page.hidden = !isReady;
 	main.append(
 		steps(PLAY, "#/captures", capture && `#/captures/${capture}`, job && `#/jobs/${job}`),
-		h("div.row.spread", h("h1", matteName(found)), badge(found.state)),
+		h("div.row.spread", renamable(matteName(found), t("matte.name"), rename), badge(found.state)),
 	);
 	const details = h("details.panel", { open: !isReady }, h("summary", h("h2", t("details"))), facts({
 		[t("frame")]: found.width && t("pixels", { size: size(found) }), [t("monitor")]: found.monitor && t("pixels", { size: found.monitor.join(" × ") }),
