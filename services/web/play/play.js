@@ -218,16 +218,18 @@ async function play(program, pictures, rate, isAimed) {
 	$("start").disabled = $("aim").disabled = true;
 	try {
 		stage.hidden = false;
-		// Without full screen for elements, the stage fills the window.
-		const full = await stage.requestFullscreen?.({ navigationUI: "hide" }).then(() => true, () => false);
-		lock = await navigator.wakeLock?.request("screen").catch(() => undefined);
+		// What stops it is heard from the start: full screen may take a while.
 		listen(document, "keydown", (event) => event.key === "Escape" && end(t("play.stopped")));
-		listen(document, "fullscreenchange", () => full && !document.fullscreenElement && end(t("play.stopped")));
+		listen(document, "visibilitychange", () => document.hidden && end(t("play.hidden")));
 		// The back button stops the program without leaving the page and what it has loaded.
 		if (!history.state?.showing) history.pushState({ showing: true }, "");
 		listen(window, "popstate", () => end(t("play.stopped")));
-		listen(document, "visibilitychange", () => document.hidden && end(t("play.hidden")));
+		// Without full screen for elements, the stage fills the window.
+		const full = await stage.requestFullscreen?.({ navigationUI: "hide" }).then(() => true, () => false);
+		listen(document, "fullscreenchange", () => full && !document.fullscreenElement && end(t("play.stopped")));
+		lock = await navigator.wakeLock?.request("screen").catch(() => undefined);
 		await pictures.prepare(0);
+		signal.throwIfAborted();
 		const found = { ...(await measure(canvas)), isWindow: !full };
 		if (full && found.isExact) rememberScreen(found);
 		const isNew = sizeOf(found) !== sizeOf(surface);
