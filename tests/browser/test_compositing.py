@@ -42,8 +42,8 @@ WITHOUT = """
         return kind === "webgl2" ? null : real.call(this, kind, ...args);
     };"""
 COARSER = """async ([id, picture, monitor]) => {
-    const { webglContext, createPainter } = await import("/web/app/composite/webgl.js");
-    const { decodeLive } = await import("/web/app/composite/live_form.js");
+    const { webglContext, createPainter } = await import("/web/app/composite/live/webgl.js");
+    const { decodeLive } = await import("/web/app/composite/live/live_form.js");
     const found = decodeLive(await (await fetch(`/v1/mattes/${id}/live`)).arrayBuffer());
     const gl = webglContext(document.createElement("canvas"));
     const painter = createPainter(gl, found, monitor);
@@ -59,7 +59,7 @@ COPY = """async (picture) => {
     await navigator.clipboard.write([new ClipboardItem({ "image/png": new Blob([bytes], { type: "image/png" }) })]);
 }"""
 LEVELS = """async (shorter) => {
-    const { Coarseness } = await import("/web/app/composite/coarseness.js");
+    const { Coarseness } = await import("/web/app/composite/live/coarseness.js");
     const coarseness = new Coarseness(shorter);
     return Array.from({ length: 12 }, (_, n) => coarseness.next(60 * n));
 }"""

@@ -1,10 +1,10 @@
 // The glass without a service: the page holds the matte, and the browser draws it. `services/api/mattes/live_page.py` makes
 // one file of this module, of those that it imports, and of a matte.
-import { builtIn, fromFile } from "../app/composite/backdrops.js";
-import { LiveGlass } from "../app/composite/live_glass.js";
-import { decodeLive } from "../app/composite/live_form.js";
+import { builtIn, fromFile } from "../app/composite/backdrops/backdrops.js";
+import { LiveGlass } from "../app/composite/live/live_glass.js";
+import { decodeLive } from "../app/composite/live/live_form.js";
 import { handleGestures, placement } from "../app/composite/placement.js";
-import { NAMES } from "../app/composite/scenery.js";
+import { NAMES } from "../app/composite/backdrops/scenery.js";
 import { h } from "../app/lib/dom.js";
 import { preferred, speak, t } from "../app/lib/words.js";
 import { de } from "../app/words/de.js";

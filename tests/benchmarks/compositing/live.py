@@ -50,12 +50,12 @@ PLACES = [
     {"right": -0.1, "down": 0, "scale": 0.5, "angle": -70},
 ]
 COARSEST = 2
-"""Resolution the app falls back to while a backdrop moves, see `services/web/app/composite/coarseness.js`."""
+"""Resolution the app falls back to while a backdrop moves, see `services/web/app/composite/live/coarseness.js`."""
 SOFTWARE = ("swiftshader", "llvmpipe", "software", "basic render")
 BROWSER = "--no-sandbox", "--enable-unsafe-swiftshader"
 OPEN = """async ([id, monitor]) => {
-    const { webglContext, createPainter } = await import("/web/app/composite/webgl.js");
-    const { decodeLive } = await import("/web/app/composite/live_form.js");
+    const { webglContext, createPainter } = await import("/web/app/composite/live/webgl.js");
+    const { decodeLive } = await import("/web/app/composite/live/live_form.js");
     const found = decodeLive(await (await fetch(`/v1/mattes/${id}/live`)).arrayBuffer());
     const gl = webglContext(document.createElement("canvas"));
     const info = gl.getExtension("WEBGL_debug_renderer_info");

@@ -209,7 +209,7 @@ def test_page_has_a_strict_policy_and_one_copy_of_each_module(saved: Path) -> No
     assert "unsafe" not in policy[1]
     script = bundle(PAGE / "page.js")
     assert text.count(script) == 1
-    assert script.count("#version 300 es") == (PAGE.parent / "app/composite/webgl.js").read_text().count(
+    assert script.count("#version 300 es") == (PAGE.parent / "app/composite/live/webgl.js").read_text().count(
         "#version 300 es"
     )
     assert not re.search(r"^(import|export)\b|</script|<!--", script, re.MULTILINE)

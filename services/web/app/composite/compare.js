@@ -1,6 +1,6 @@
 // Divides the picture: its left shows the live picture, the bare backdrop or another matte.
 import { h, newest } from "../lib/dom.js";
-import { drawPlaced } from "./backdrops.js";
+import { drawPlaced } from "./backdrops/backdrops.js";
 import { t } from "../lib/words.js";
 
 // Returns the controls. `others` are mattes by a name.

@@ -1,16 +1,16 @@
 // The stage of a matte, and its controls.
 import { fileField, h } from "../lib/dom.js";
 import { onDrop } from "../upload/upload.js";
-import { builtIn, fromFile } from "./backdrops.js";
+import { builtIn, fromFile } from "./backdrops/backdrops.js";
 import { clipJob } from "./clip_job.js";
 import { comparison } from "./compare.js";
 import { downloads } from "./downloads.js";
 import { explanation } from "./explain.js";
 import { handleGestures, placement } from "./placement.js";
-import { NAMES, scenery } from "./scenery.js";
+import { NAMES, scenery } from "./backdrops/scenery.js";
 import { Stage } from "./stage.js";
-import { cameraSymbol, choice, thumbs } from "./thumb_choices.js";
-import { camera, clip } from "./video_backdrops.js";
+import { cameraSymbol, choice, thumbs } from "./backdrops/thumb_choices.js";
+import { camera, clip } from "./backdrops/video_backdrops.js";
 import { parts, t } from "../lib/words.js";
 import { recordButton } from "./recording.js";
 

@@ -2,7 +2,7 @@
 import { Problem, saveBlob } from "../lib/api.js";
 import { button, h, problemBox } from "../lib/dom.js";
 import { zip } from "../upload/zip.js";
-import { fromFile } from "./backdrops.js";
+import { fromFile } from "./backdrops/backdrops.js";
 import { t } from "../lib/words.js";
 
 const FORMATS = { PNG: "image/png", JPEG: "image/jpeg", EXR: "image/x-exr" };

@@ -1,7 +1,7 @@
 // Explains a pixel: its lobes on the backdrop, a line to the heaviest one, and words.
 import { getJson } from "../lib/api.js";
 import { facts, h, newest, pause, problemBox, svg, tenths } from "../lib/dom.js";
-import { drawPlaced } from "./backdrops.js";
+import { drawPlaced } from "./backdrops/backdrops.js";
 import { t } from "../lib/words.js";
 
 const CALM = 120; // ms that the pointer rests before its pixel is requested

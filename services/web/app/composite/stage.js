@@ -2,8 +2,8 @@
 // the service's composite at full size is shown.
 import { ask, getComposite } from "../lib/api.js";
 import { h, newest, problemBox, show } from "../lib/dom.js";
-import { decodeLive } from "./live_form.js";
-import { LiveGlass } from "./live_glass.js";
+import { decodeLive } from "./live/live_form.js";
+import { LiveGlass } from "./live/live_glass.js";
 import { t } from "../lib/words.js";
 
 const QUICK = 480; // pixels of the longer side of a preview

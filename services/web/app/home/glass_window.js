@@ -1,5 +1,5 @@
 // A live glass that fills the window: a canvas under it shows what is around it.
-import { LiveGlass } from "../composite/live_glass.js";
+import { LiveGlass } from "../composite/live/live_glass.js";
 import { h } from "../lib/dom.js";
 import { fetchSample, still, titleOf } from "./samples.js";
 import { t } from "../lib/words.js";

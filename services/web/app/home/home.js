@@ -1,10 +1,10 @@
 // The first view: a sample to play with, before anything is read or filmed.
 import { button, h, problemBox } from "../lib/dom.js";
-import { fromFile } from "../composite/backdrops.js";
-import { scenery } from "../composite/scenery.js";
-import { cameraSymbol, choice, thumbs } from "../composite/thumb_choices.js";
+import { fromFile } from "../composite/backdrops/backdrops.js";
+import { scenery } from "../composite/backdrops/scenery.js";
+import { cameraSymbol, choice, thumbs } from "../composite/backdrops/thumb_choices.js";
 import { handleGestures, placement } from "../composite/placement.js";
-import { camera } from "../composite/video_backdrops.js";
+import { camera } from "../composite/backdrops/video_backdrops.js";
 import { fileInput, onDrop, upload } from "../upload/upload.js";
 import { GlassWindow } from "./glass_window.js";
 import { aboutOf, areRemoved, fetchSamples, removeSamples, still, titleOf } from "./samples.js";

@@ -1,6 +1,6 @@
 // The samples that come with the app: glass that was traced, filmed and recovered by `workflows/simulation/samples.py`.
 import { Problem } from "../lib/api.js";
-import { decodeLive } from "../composite/live_form.js";
+import { decodeLive } from "../composite/live/live_form.js";
 import { known, t } from "../lib/words.js";
 
 const FOLDER = "web/samples/";

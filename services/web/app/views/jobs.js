@@ -1,7 +1,7 @@
 // Jobs: the list, and one job with its progress; a recovery fills in its frame tile by tile.
 import { getComposite, getJson, post, save } from "../lib/api.js";
 import { jobCard } from "../lib/activity.js";
-import { backdrop } from "../composite/backdrops.js";
+import { backdrop } from "../composite/backdrops/backdrops.js";
 import { button, empty, facts, h, newest, pause, problemBox, show, when } from "../lib/dom.js";
 import { ACTIVE } from "../lib/events.js";
 import { list } from "../lib/list.js";

@@ -1,6 +1,6 @@
 // Mattes: the list, and one matte with its composite and layers.
 import { getComposite, getJson, patchJson, save } from "../lib/api.js";
-import { backdrop } from "../composite/backdrops.js";
+import { backdrop } from "../composite/backdrops/backdrops.js";
 import { badge, button, empty, facts, h, size, when } from "../lib/dom.js";
 import { compositing } from "../composite/compositing.js";
 import { layers } from "../composite/layers.js";

@@ -1,6 +1,6 @@
 // Backdrops: built-in pictures, and files that users choose.
 import { scenery } from "./scenery.js";
-import { t } from "../lib/words.js";
+import { t } from "../../lib/words.js";
 
 export const PREVIEW = 640; // pixels of the longer side, of what is sent while the user moves the backdrop
 const DRAWABLE = 2048; // pixels of the longer side of what this browser draws: as fine as monitors

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-WEB = Path(__file__).parents[3] / "services" / "web"
+WEB = Path(__file__).parents[2] / "services" / "web"
 WORDS = sorted((WEB / "app" / "words").glob("*.js"))
 SCRIPTS = [path for path in sorted(WEB.rglob("*.js")) if path not in WORDS]
 PAGES = sorted(WEB.rglob("*.html"))

@@ -1,7 +1,7 @@
 // Moving backdrops: the camera of this device, and clips.
-import { Problem } from "../lib/api.js";
+import { Problem } from "../../lib/api.js";
 import { PREVIEW, still } from "./backdrops.js";
-import { known, t } from "../lib/words.js";
+import { known, t } from "../../lib/words.js";
 
 const WHOLE = 1920; // pixels of the longer side of a frame that is sent as a still
 

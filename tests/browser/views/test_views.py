@@ -17,7 +17,7 @@ from tests.parts.waiting import until
 
 pytestmark = pytest.mark.slow
 
-WEB = Path(__file__).parents[2] / "services" / "web"
+WEB = Path(__file__).parents[3] / "services" / "web"
 SERIOUS = ("serious", "critical")
 SHIFTS = """
     window.shifts = [];

@@ -18,7 +18,7 @@ from tests.browser.test_compositing import WITHOUT
 from tests.end_to_end.conftest import Service
 from tests.parts.waiting import until
 
-SAMPLES = Path(__file__).parents[2] / "services" / "web" / "samples"
+SAMPLES = Path(__file__).parents[3] / "services" / "web" / "samples"
 NAMES = [one["title"] for one in json.loads((SAMPLES / "samples.json").read_text())]
 LIGHT = "(canvas) => canvas.toDataURL('image/png')"
 

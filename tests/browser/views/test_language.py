@@ -6,8 +6,8 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from tests.browser.pages import BY_HAND, MINUTE, ZIP, opened, unfold
+from tests.docs.test_app_words import WEB, words
 from tests.end_to_end.conftest import Service
-from tests.services.web.test_words import WEB, words
 
 pytestmark = pytest.mark.slow
 

@@ -1,5 +1,5 @@
 // Choices that are shown as small pictures.
-import { h, svg } from "../lib/dom.js";
+import { h, svg } from "../../lib/dom.js";
 
 export const thumbs = (legend, choices) => h("fieldset.thumbs", h("legend", legend), h("div", choices));
 
