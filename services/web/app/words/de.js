@@ -308,7 +308,7 @@ export const de = {
 	"progress": "Fortschritt",
 	"quality": "Qualität",
 	"quality.fast": "Entwurf",
-	"quality.fast.about": "Klares Glas, in der halben Zeit",
+	"quality.fast.about": "Für klares Glas, und schneller",
 	"quality.fine": "Beste",
 	"quality.fine.about": "Alles, was die Bilder zeigen",
 	"quality.takes": "etwa {time}",

@@ -303,7 +303,7 @@ export const en = {
 	"progress": "Progress",
 	"quality": "Quality",
 	"quality.fast": "Draft",
-	"quality.fast.about": "Clear glass, in half the time",
+	"quality.fast.about": "For clear glass, and quicker",
 	"quality.fine": "Best",
 	"quality.fine.about": "All that the frames show",
 	"quality.takes": "about {time}",
