@@ -6,6 +6,7 @@ These are all caches and variables that a process keeps from call to call;
 ================================================== ====== =============================================================
 name                                               size   holds
 ================================================== ====== =============================================================
+services.api.system.minified.minified_file         256    the files of the web app, as they are sent
 services.cluster.connect._loop                     1      the event loop of dask clients, and its thread
 services.cluster.task._objects                     1      a worker's open object store
 services.runtime.tracing._tracer                   1      the tracer, if traces are asked for
