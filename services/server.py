@@ -1,7 +1,7 @@
 """`envmatte serve`: the API, a coordinator and a cluster in one process tree; and `envmatte coordinator`."""
 
-import signal
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
@@ -78,7 +78,8 @@ def coordinate(settings: CoordinatorSettings) -> None:
     with _opened(settings, "coordinator") as (stack, engine, objects):
         _run_jobs(stack, settings, engine, objects)
         print("envmatte coordinates", flush=True)
-        signal.pause()
+        while True:
+            time.sleep(1)  # unlike signal.pause(), it ends although a signal comes just before it
 
 
 def _run_jobs(stack: ExitStack, settings: CoordinatorSettings, engine: Engine, objects: Objects) -> None:

@@ -23,7 +23,8 @@ CODES = {
 signals.exit_on_sigterm()
 try:
     print(child.pid, flush=True)
-    time.sleep(600)
+    while True:
+        time.sleep(0.1)  # a signal that comes just before a long one would be noticed after it
 finally:
     time.sleep(600)
 """,
