@@ -57,7 +57,7 @@ def test_every_view_speaks_german(browser: Browser, service: Service, ready: tup
         loaded: list[str] = []
         page.on("request", lambda request: loaded.append(request.url) if "/words/" in request.url else None)
         page.goto(f"{service.url}/#/captures")
-        assert page.locator("html").get_attribute("lang") == "de"
+        expect(page.locator("html")).to_have_attribute("lang", "de")
         for path, heading in views.items():
             page.goto(f"{service.url}/#/{path}")
             if heading:
@@ -73,7 +73,7 @@ def test_every_view_speaks_german(browser: Browser, service: Service, ready: tup
         check(page, "a pixel")
         page.goto(f"{service.url}/v1/programs/{program}/play")
         expect(page.get_by_role("status")).to_have_text("Bereit.", timeout=MINUTE)
-        assert page.get_by_role("button", name="Im Vollbild abspielen").is_enabled()
+        expect(page.get_by_role("button", name="Im Vollbild abspielen")).to_be_enabled()
         text = page.evaluate(TEXTS)
         assert [phrase for phrase in PHRASES if phrase in text] == []
         assert {url.rpartition("/")[2] for url in loaded} == {"de.js"}
@@ -91,7 +91,7 @@ def test_page_of_a_link_speaks_the_language_of_its_reader(
         with opened(browser, locale=locale) as page:
             page.goto(service.url + path)
             expect(page.get_by_text(text)).to_be_visible()
-            assert page.locator("html").get_attribute("lang") == locale[:2].replace("fr", "en")
+            expect(page.locator("html")).to_have_attribute("lang", locale[:2].replace("fr", "en"))
 
 
 def test_language_is_chosen_in_the_activity_menu_and_kept(desk: Page, service: Service) -> None:
