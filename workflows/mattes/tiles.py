@@ -96,11 +96,12 @@ def _recover_block(
     shown = program.measured
     measurements = np.ascontiguousarray(light[:, shown])
     given = (noise, usable[:, shown], worth[:, shown])
+    places = np.argwhere(recovered) + [part.start for part in span]
     method, conditions = options.of_method, conditions_of(stack, program)
     patterns = patterns_of(objects, capture)
     if isinstance(method, DgsrOptions):
         # Lobes find the light of a film's border, and fit S and rho to all frames.
-        found = lobes.recover(measurements, photometry, patterns, *given, FAST, conditions)
+        found = lobes.recover(measurements, photometry, patterns, *given, FAST, conditions, places)
         photometry = found.photometry
         if found.stray is not None:
             measurements -= found.stray
@@ -109,7 +110,7 @@ def _recover_block(
         measured = normalise(measurements, photometry, noise, constants.least_contrast, *given[1:])
         error, least_weight = dgsr.error_of(transport, photometry, measured, sensing), LEAST_WEIGHT
     else:
-        found = lobes.recover(measurements, photometry, patterns, *given, method, conditions)
+        found = lobes.recover(measurements, photometry, patterns, *given, method, conditions, places)
         transport, photometry, error = found.transport, found.photometry, found.error
         least_weight = method.least_weight
     if attributes.get("glare"):

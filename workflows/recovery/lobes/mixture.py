@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from workflows.recovery.lobes.footprint import PARAMETERS, PatternCodes, combine, sample, signed_codes
+from workflows.recovery.lobes.footprint import NODES, PARAMETERS, PatternCodes, combine, sample, signed_codes
 from workflows.recovery.lobes.strays import write_strays
 
 
@@ -36,20 +36,37 @@ class Mixture(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """Working space of :func:`predict`; t is 1, or 6 for derivatives.
+    """Working space of :func:`predict`; t is 6 for derivatives, or 1.
 
     Attributes
     ----------
     node : (NODES,) int64
     terms : (t, NODES) float32
-    light : (NODES, groups * m) float32
-    sums : (t, groups * m) float32
+    light : (NODES groups m or more,) float32
+    sums : (t, groups m or more) float32
     """
 
     node: NDArray[np.int64]
     terms: NDArray[np.float32]
     light: NDArray[np.float32]
     sums: NDArray[np.float32]
+
+
+@njit(nogil=True, cache=True, inline="always")
+def make_workspace(light: int) -> Workspace:
+    """Make working space with derivatives, for up to `light` patterns in all groups."""
+    return Workspace(
+        np.empty(NODES, np.int64),
+        np.empty((PARAMETERS, NODES), np.float32),
+        np.empty(NODES * light, np.float32),
+        np.empty((PARAMETERS, light), np.float32),
+    )
+
+
+@njit(nogil=True, cache=True, inline="always")
+def without_derivatives(workspace: Workspace) -> Workspace:
+    """The same working space, for predictions alone."""
+    return Workspace(workspace.node, workspace.terms[:1], workspace.light, workspace.sums[:1])
 
 
 @njit(nogil=True, cache=True)
@@ -75,13 +92,14 @@ def predict(
     f : (groups (m + 2),) float32
         Written: the prediction.
     """
-    node, terms, light, sums = workspace
+    node, terms, _, sums = workspace
     first = np.int64(0)  # with a literal, numba would compile another version of `signed_codes`
     groups, m = patterns.groups, patterns.m
+    light = workspace.light[: NODES * groups * m].reshape(NODES, groups * m)
     write_strays(patterns.strays, mixture.stray, 0, f)
     for i in range(k):
         n = sample(mixture.lobes[i], mixture.level[i], patterns.grids, node, terms)
-        signed_codes(patterns.code, patterns.first, light.shape[1], node, n, light, first)
+        signed_codes(patterns.code, patterns.first, groups * m, node, n, light, first)
         combine(terms, light, n, sums)
         for t in range(terms.shape[0]):
             of_lobe = response[i, t]

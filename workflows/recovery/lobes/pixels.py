@@ -1,4 +1,4 @@
-"""Recovery of pixels one by one: their fits of lobes, and the posterior mean of T given these."""
+"""The posterior means of T of pixels, given their fits, and how well they explain the measurements."""
 
 from typing import NamedTuple
 
@@ -6,25 +6,24 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from workflows.recovery.lobes.fits import (
+from workflows.recovery.lobes.fitting.fits import (
     ALL,
     Fits,
     NodeBuffers,
     Pixels,
-    fit_pixel,
+    fit_of,
+    make_buffers,
     measurements_of,
-    prefers_channels,
 )
-from workflows.recovery.lobes.footprint import NODES, PARAMETERS
-from workflows.recovery.lobes.levenberg_marquardt import fit_amounts
-from workflows.recovery.lobes.mixture import Mixture
+from workflows.recovery.lobes.fitting.levenberg_marquardt import fit_amounts
+from workflows.recovery.lobes.mixture import Workspace, make_workspace
 from workflows.recovery.lobes.nodes import node_responses, spread_lobes
 from workflows.recovery.lobes.options import LobesOptions
 from workflows.recovery.lobes.posterior.mean import update
 from workflows.recovery.lobes.strays import subtract_strays, write_strays
 from workflows.recovery.solvers import subtract
 
-# Initial capacity for the entries of a block's rows.
+# Initial capacity for the entries of rows.
 _CAPACITY = 1 << 16
 
 
@@ -47,16 +46,6 @@ class Diagnostics(NamedTuple):
     misfit: NDArray[np.float64]
     nodes: NDArray[np.int64]
 
-    def at(self, pixels: slice | NDArray[np.bool_]) -> "Diagnostics":
-        """Those of some pixels."""
-        return Diagnostics(
-            self.response[pixels],
-            self.stray[pixels],
-            self.kappa[pixels],
-            self.misfit[pixels],
-            self.nodes[pixels],
-        )
-
 
 @njit(nogil=True, cache=True, inline="always")
 def finish_fit(
@@ -66,25 +55,26 @@ def finish_fit(
     options: LobesOptions,
     fits: Fits,
     buffers: NodeBuffers,
+    workspace: Workspace,
     diagnostics: Diagnostics,
 ) -> int:
     """Write the posterior mean for the lobes of a fit to `buffers`, and its diagnostics; return its number of nodes."""
     patterns, y, variance = measurements_of(pixels, p, c)
-    mixture = Mixture(fits.lobes[c], fits.level[c], fits.stray[c])
+    mixture, lobes = fit_of(fits, p, c), fits.k[p, c]
     stray = np.zeros_like(y)
     count, size = patterns.strays.shape
     offset = mixture.stray[::count].copy()
     if count > 1:
-        fit_amounts(patterns, y, variance, mixture, fits.k[c])
+        fit_amounts(patterns, y, variance, mixture, lobes, workspace)
         write_strays(patterns.strays, mixture.stray, 1, stray)
         y, variance, offset[:] = y.copy(), variance.copy(), 0
         subtract_strays(y, variance, stray, size)
     n: int = spread_lobes(
-        patterns.grids, mixture, fits.k[c], options.resolution, buffers.node, buffers.weight, buffers.end
+        patterns.grids, mixture, lobes, options.resolution, buffers.node, buffers.weight, buffers.end
     )
     A, weight = buffers.rows[: n * y.size].reshape(n, y.size), buffers.weight[:n]
     node_responses(patterns, buffers.node, n, A)
-    end = buffers.end[: fits.k[c]]
+    end = buffers.end[:lobes]
     kappa, misfit = update(
         A, weight, end, y, variance, patterns.strays[:1], offset, options.passes, options.gradients
     )
@@ -102,51 +92,44 @@ def finish_fit(
 
 
 @njit(nogil=True, cache=True)
-def recover_pixels(
-    pixels: Pixels, separate: NDArray[np.bool_], options: LobesOptions, diagnostics: Diagnostics
+def finish_pixels(
+    pixels: Pixels,
+    first: int,
+    last: int,
+    separate: NDArray[np.bool_],
+    fits: Fits,
+    options: LobesOptions,
+    diagnostics: Diagnostics,
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Recover T of n pixels, one for all channels or one for each.
+    """Compute T of some pixels in succession, one for all channels or one for each.
 
     Parameters
     ----------
     pixels : Pixels
+    first, last : int
+        The first pixel, and the one after the last.
     separate : (n,) bool
-        Whether each channel gets its own T. Under coloured patterns this is decided here and written.
+        Whether each channel gets its own T.
+    fits : Fits
+        Lobes are moved to the levels for `options.resolution`.
     options : LobesOptions
     diagnostics : Diagnostics
         Written.
 
     Returns
     -------
-    node : (diagnostics.nodes.sum(),) int64
-    weight : (diagnostics.nodes.sum(),) float32
+    node : (diagnostics.nodes[first:last].sum(),) int64
+    weight : (diagnostics.nodes[first:last].sum(),) float32
         The entries of all rows, row after row.
     """
-    n, size = pixels.joint.value.shape
-    most, groups = options.most_lobes, pixels.code.shape[1] // (pixels.own.value.shape[2] - 2)
-    fits = Fits(
-        np.empty((4, most, PARAMETERS)),
-        np.empty((4, most), np.int64),
-        np.zeros((4, 3 * len(pixels.strays))),
-        np.zeros(4, np.int64),
-        np.zeros(4),
-    )
-    buffers = NodeBuffers(
-        np.empty(most * NODES, np.int64),
-        np.empty(most * NODES, np.float32),
-        np.empty(most, np.int64),
-        np.empty(most * NODES * size, np.float32),
-    )
+    size = pixels.joint.value.shape[1]
+    buffers, workspace = make_buffers(options.most_lobes, size), make_workspace(size)
     node, weight, end = np.empty(_CAPACITY, np.int64), np.empty(_CAPACITY, np.float32), 0
-    for p in range(n):
-        fit_pixel(pixels, p, separate[p], options, fits, buffers)
-        if groups == 3:
-            separate[p] = prefers_channels(fits, size)
-        diagnostics.nodes[p] = 0
+    for p in range(first, last):
         for c in range(0 if separate[p] else ALL, ALL if separate[p] else ALL + 1):
-            if fits.k[c] == 0:
+            if fits.k[p, c] == 0:
                 continue
-            found = finish_fit(pixels, p, c, options, fits, buffers, diagnostics)
+            found = finish_fit(pixels, p, c, options, fits, buffers, workspace, diagnostics)
             while end + found > node.size:
                 node = np.concatenate((node, np.empty_like(node)))
                 weight = np.concatenate((weight, np.empty_like(weight)))

@@ -5,9 +5,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from workflows.recovery.lobes.fits import Pixels
+from workflows.recovery.lobes.fitting.fits import Fits, Pixels
+from workflows.recovery.lobes.fitting.neighbours import coarse_to_fine
+from workflows.recovery.lobes.fitting.pixels import fit_pixels
 from workflows.recovery.lobes.options import FINE, LobesOptions
-from workflows.recovery.lobes.pixels import Diagnostics, recover_pixels
+from workflows.recovery.lobes.pixels import Diagnostics, finish_pixels
 from workflows.recovery.lobes.strays import find_strong_strays, subtract_strays
 from workflows.recovery.noise import Noise
 from workflows.recovery.normalise import (
@@ -23,7 +25,7 @@ from workflows.recovery.photometry import Photometry
 from workflows.recovery.sensing import Patterns
 from workflows.recovery.transport import Transport
 
-# Pixels per block: limits the working arrays.
+# Pixels whose entries of T are sorted at once: limits the working arrays.
 _BLOCK = 256
 # Least difference of white and black without stray light, of 2 with it, for which S and rho are corrected.
 _LEAST_CONTRAST = 0.5
@@ -60,6 +62,7 @@ def recover(
     frames: NDArray[np.number] | None = None,
     options: LobesOptions = FINE,
     conditions: Conditions = PLAIN,
+    places: NDArray[np.integer] | None = None,
 ) -> Recovery:
     """Recover T: a few oriented Gaussian lobes, refined to the posterior mean given the measurements.
 
@@ -79,6 +82,9 @@ def recover(
         Frames averaged into each value, above 0. Default: 1.
     options : LobesOptions
     conditions : Conditions
+    places : (n, 2) int, optional
+        Rows and columns of the pixels in their frame. Fits then start from those of neighbours. Default: each pixel is
+        recovered alone.
 
     Returns
     -------
@@ -92,10 +98,10 @@ def recover(
     Notes
     -----
     The model is eq. 5, T a sum of the pyramid's bumps. Lobes are added where they improve the fit most
-    (:func:`~workflows.recovery.lobes.search.find_node`), all of them are fitted
-    (:func:`~workflows.recovery.lobes.levenberg_marquardt.refine`), and kept if they lower -2 ln likelihood by more
-    than their penalty. The posterior mean (:func:`~workflows.recovery.lobes.posterior.mean.update`) adds what lobes
-    cannot represent, such as a sharp edge or a bend.
+    (:func:`~workflows.recovery.lobes.fitting.search.find_node`), all of them are fitted
+    (:func:`~workflows.recovery.lobes.fitting.levenberg_marquardt.refine`), and kept if they lower -2 ln likelihood by
+    more than their penalty. The posterior mean (:func:`~workflows.recovery.lobes.posterior.mean.update`) adds what
+    lobes cannot represent, such as a sharp edge or a bend.
 
     Channels that saw the same patterns are averaged into one measurement, weighted by precision; others are stacked.
     Where the channels disagree, each gets its own T, whose fit starts from the common lobes or those of the most
@@ -137,13 +143,9 @@ def recover(
         np.zeros((n, 3)),
         counts,
     )
-    parts = []
-    for first in range(0, max(n, 1), _BLOCK):
-        block = slice(first, first + _BLOCK)
-        of_block = Measurements(measured.value[block], measured.variance[block])
-        parts.append(
-            _recover_block(patterns, of_block, options, conditions.model_error, strays, found.at(block))
-        )
+    transport = _recover_measured(
+        patterns, measured, options, conditions.model_error, strays, coarse_to_fine(places, n), found
+    )
     if stray is not None:
         known = _are_known(measured, found.stray)
         weak = photometry.rho[..., np.newaxis] / 2 * found.stray[:, :, :-2]
@@ -155,44 +157,51 @@ def recover(
     if conditions.grey:
         better = Photometry(*(np.repeat(values[:, :1], 3, axis=1) for values in vars(better).values()))
     error = expected_error(better, measured, found.misfit)
-    return Recovery(Transport.concatenate(parts), better, error, stray)
+    return Recovery(transport, better, error, stray)
 
 
-def _recover_block(
+def _recover_measured(
     patterns: Patterns,
     measured: Measurements,
     options: LobesOptions,
     model_error: float,
     strays: NDArray[np.float32],
+    coarse_to_fine: tuple[NDArray[np.int64], NDArray[np.int64]],
     found: Diagnostics,
 ) -> Transport:
-    """Recover T of some pixels, and write `found`."""
+    """Recover T from measurements in +-1 form, and write `found`."""
     columns, rows = patterns.pyramid.grids[0]
+    n, channels, m = measured.value.shape
     alive: NDArray[np.bool_] = np.any(np.isfinite(measured.variance), axis=(1, 2))
-    own = Measurements(measured.value[alive], measured.variance[alive])
+    # The channels' errors of the model are alike, so their mean has the same.
+    own = less_certain(measured, model_error)
     if patterns.channels == 1:
-        joint = _average_channels(own)
-        separate = _channels_disagree(own, joint.value, options.disagreement)
-        # The channels' errors of the model are alike, so their mean has the same.
-        joint, own = (less_certain(part, model_error) for part in (joint, own))
+        joint = _average_channels(measured)
+        separate = _channels_disagree(measured, joint.value, options.disagreement)
+        joint = less_certain(joint, model_error)
     else:
-        n, channels, m = own.value.shape
-        own = less_certain(own, model_error)
         joint = Measurements(own.value.reshape(n, channels * m), own.variance.reshape(n, channels * m))
         separate = np.zeros(n, bool)
-    of_alive = found.at(alive)
     pixels = Pixels(patterns.pyramid.arrays, patterns.code, joint, own, strays)
-    node, weight = recover_pixels(pixels, separate, options, of_alive)
-    found.response[alive], found.stray[alive], found.nodes[alive] = (
-        of_alive.response,
-        of_alive.stray,
-        of_alive.nodes,
-    )
-    found.kappa[alive], found.misfit[alive] = of_alive.kappa, of_alive.misfit
-    shared = np.zeros(alive.size, bool)
-    shared[alive] = ~separate
-    # A node under two lobes occurs twice.
-    return Transport.from_entries(columns, rows, found.nodes, node, weight, shared, options.least_weight)
+    fits = Fits.of(n, options.most_lobes, len(strays))
+    fit_pixels(pixels, alive, *coarse_to_fine, separate, options, fits)
+    shared, parts = alive & ~separate, []
+    for first in range(0, max(n, 1), _BLOCK):
+        last = min(first + _BLOCK, n)
+        node, weight = finish_pixels(pixels, first, last, separate, fits, options, found)
+        # A node under two lobes occurs twice.
+        parts.append(
+            Transport.from_entries(
+                columns,
+                rows,
+                found.nodes[first:last],
+                node,
+                weight,
+                shared[first:last],
+                options.least_weight,
+            )
+        )
+    return Transport.concatenate(parts)
 
 
 def _average_channels(own: Measurements) -> Measurements:

@@ -6,16 +6,18 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from workflows.recovery.lobes.fitting.levenberg_marquardt import refine
 from workflows.recovery.lobes.footprint import PARAMETERS, PatternCodes, fit_level
-from workflows.recovery.lobes.levenberg_marquardt import refine
 from workflows.recovery.lobes.likelihood import penalty, weigh
-from workflows.recovery.lobes.mixture import Mixture, copy_mixture
+from workflows.recovery.lobes.mixture import Mixture, Workspace, copy_mixture
 from workflows.recovery.lobes.options import LobesOptions
 from workflows.recovery.pyramid import Grids
 
 # The fit of another lobe is abandoned after a round that leaves -2 ln likelihood higher than before by more than this.
 _MOST_LOSS = 30.0
 _HUGE = 1e30
+# All steps are tried: far from the solution they may lower chi-square by more than expected.
+_ANY = 0.0
 # How many times as many nodes are examined for the first lobe. Most of the light comes from it, and a wrong one
 # is not found out.
 _FIRST = 4
@@ -210,17 +212,19 @@ def fit(
     mixture: Mixture,
     k: int,
     options: LobesOptions,
+    workspace: Workspace,
 ) -> tuple[int, float, float]:
     """Fit lobes to a pixel, as many as lower -2 ln likelihood by more than their penalty.
 
     Parameters
     ----------
     patterns, y, variance
-        As in :func:`~workflows.recovery.lobes.levenberg_marquardt.refine`.
+        As in :func:`~workflows.recovery.lobes.fitting.levenberg_marquardt.refine`.
     mixture : Mixture
         Starts from its first k lobes and is changed in place; its arrays hold `options.most_lobes`.
     k : int
     options : LobesOptions
+    workspace : Workspace
 
     Returns
     -------
@@ -236,7 +240,9 @@ def fit(
         # initial prediction: light from the whole monitor, where patterns have a mean of about 0
         f[g * (m + 2) + m], f[g * (m + 2) + m + 1] = -1.0, 1.0
     if k > 0:
-        kappa, objective, f, precision = refine(patterns, y, variance, mixture, k, options, _HUGE)
+        kappa, objective, f, precision = refine(
+            patterns, y, variance, mixture, k, options, workspace, _ANY, _HUGE
+        )
         objective += penalty(grids, mixture.level, k)
     else:
         kappa, objective = weigh(y, f, variance, groups, groups, precision)
@@ -249,7 +255,15 @@ def fit(
         copy_mixture(k, strays, mixture, tried)
         _add_lobe(tried, k, grids, level, column, row, amount, options.fit_resolution)
         new_kappa, new, new_f, new_precision = refine(
-            patterns, y, variance, tried, k + 1, options, objective + _MOST_LOSS
+            patterns,
+            y,
+            variance,
+            tried,
+            k + 1,
+            options,
+            workspace,
+            _ANY,
+            objective + _MOST_LOSS,
         )
         new += penalty(grids, tried.level, k + 1)
         if new >= objective:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from workflows.recovery.lobes.fitting.search import find_node, fit
 from workflows.recovery.lobes.footprint import PARAMETERS, PatternCodes, bump_variance
-from workflows.recovery.lobes.mixture import Mixture
+from workflows.recovery.lobes.mixture import Mixture, make_workspace
 from workflows.recovery.lobes.options import LobesOptions
-from workflows.recovery.lobes.search import find_node, fit
 
 COLUMNS, ROWS, MOST = 64, 48, 3
 SIGMA = 0.01
@@ -78,7 +78,9 @@ def measure(patterns):
 def fitted(shown):
     def run(y, variance, most=MOST):
         mixture = Mixture(np.zeros((MOST, PARAMETERS)), np.zeros(MOST, np.int64), np.zeros(1))
-        k, kappa, objective = fit(shown, y, variance, mixture, 0, OPTIONS._replace(most_lobes=most))
+        k, kappa, objective = fit(
+            shown, y, variance, mixture, 0, OPTIONS._replace(most_lobes=most), make_workspace(shown.m)
+        )
         order = np.argsort(-mixture.lobes[:k, 0], kind="stable")
         return Fitted(mixture.lobes[order], mixture.level[order], mixture.stray, kappa, objective)
 

@@ -7,9 +7,15 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from workflows.recovery.lobes.footprint import NODES, PARAMETERS, PatternCodes, fit_level
+from workflows.recovery.lobes.footprint import PARAMETERS, PatternCodes, fit_level
 from workflows.recovery.lobes.likelihood import penalty, weigh
-from workflows.recovery.lobes.mixture import Mixture, Workspace, copy_mixture, predict
+from workflows.recovery.lobes.mixture import (
+    Mixture,
+    Workspace,
+    copy_mixture,
+    predict,
+    without_derivatives,
+)
 from workflows.recovery.lobes.options import LobesOptions
 from workflows.recovery.lobes.strays import STRAY
 from workflows.recovery.pyramid import Grids
@@ -164,15 +170,25 @@ def refine_round(
     precision: NDArray[np.float32],
     equations: Equations,
     new: Mixture,
+    least: float,
 ) -> None:
-    """Take Levenberg-Marquardt steps at fixed precisions; `mixture`, `response` and `f` are overwritten."""
+    """Take Levenberg-Marquardt steps at fixed precisions; `mixture`, `response` and `f` are overwritten.
+
+    The linear model expects a step to lower chi-square by about ``change b``. To try one takes longer than to solve it.
+    """
     damping, strays = _DAMPING, patterns.groups * len(patterns.strays)
     chi = chi_square(y, f, precision, equations.residual)
     for _ in range(options.steps):
         linearise(patterns, mixture, k, response, precision, equations)
-        better, new_chi = False, chi
+        better, new_chi, tried = False, chi, False
         for _ in range(_ATTEMPTS):
             if solve_damped(equations, damping):
+                expected = 0.0
+                for i in range(equations.b.size):
+                    expected += equations.b[i] * equations.change[i]
+                if expected < least:
+                    break
+                tried = True
                 copy_mixture(k, strays, mixture, new)
                 for s in range(strays):
                     new.stray[s] += equations.change[s]
@@ -184,7 +200,8 @@ def refine_round(
                     break
             damping *= _INCREASE
         if not better:
-            predict(patterns, mixture, k, workspace, response, f)
+            if tried:
+                predict(patterns, mixture, k, workspace, response, f)
             break
         damping = max(damping * _DECREASE, 1e-5)
         copy_mixture(k, strays, new, mixture)
@@ -195,7 +212,12 @@ def refine_round(
 
 @njit(nogil=True, cache=True)
 def fit_amounts(
-    patterns: PatternCodes, y: NDArray[np.float32], variance: NDArray[np.float32], mixture: Mixture, k: int
+    patterns: PatternCodes,
+    y: NDArray[np.float32],
+    variance: NDArray[np.float32],
+    mixture: Mixture,
+    k: int,
+    workspace: Workspace,
 ) -> None:
     """Fit the amounts of stray light and the weights of the lobes with the precisions that the fitted lobes leave.
 
@@ -208,18 +230,12 @@ def fit_amounts(
     mixture : Mixture
         Its stray light and weights are changed.
     k : int
+    workspace : Workspace
     """
     strays, groups = patterns.strays, patterns.groups
     count, size = strays.shape
-    light = groups * patterns.m
-    workspace = Workspace(
-        np.empty(NODES, np.int64),
-        np.empty((1, NODES), np.float32),
-        np.empty((NODES, light), np.float32),
-        np.empty((1, light), np.float32),
-    )
     f, precision, response = np.empty_like(y), np.empty_like(y), np.empty((k, 1, y.size), np.float32)
-    predict(patterns, mixture, k, workspace, response, f)
+    predict(patterns, mixture, k, without_derivatives(workspace), response, f)
     n = groups * count + k
     weigh(y, f, variance, groups, n, precision)
     rows = np.zeros((n, y.size), np.float32)
@@ -250,6 +266,8 @@ def refine(
     mixture: Mixture,
     k: int,
     options: LobesOptions,
+    workspace: Workspace,
+    least: float,
     bound: float,
 ) -> tuple[float, float, NDArray[np.float32], NDArray[np.float32]]:
     """Fit all parameters of k lobes by the Levenberg-Marquardt method, starting from their present values.
@@ -264,6 +282,9 @@ def refine(
     k : int
     options : LobesOptions
         `fit_resolution`, `rounds`, `steps` and `tolerance` are used.
+    workspace : Workspace
+    least : float
+        A step is not tried if the linear model expects it to lower chi-square by less than this.
     bound : float
         Rounds end once the objective plus the penalty is above it.
 
@@ -274,14 +295,8 @@ def refine(
     f, precision : (groups (m + 2),) float32
         Prediction and precisions.
     """
-    groups, size = patterns.groups, patterns.groups * patterns.m
+    groups = patterns.groups
     M, n = y.size, groups * len(patterns.strays) + PARAMETERS * k
-    workspace = Workspace(
-        np.empty(NODES, np.int64),
-        np.empty((PARAMETERS, NODES), np.float32),
-        np.empty((NODES, size), np.float32),
-        np.empty((PARAMETERS, size), np.float32),
-    )
     response = np.empty((k, PARAMETERS, M), np.float32)
     f, precision = np.empty_like(y), np.empty_like(y)
     equations = Equations(
@@ -297,7 +312,9 @@ def refine(
     kappa, objective = weigh(y, f, variance, groups, n, precision)
     for _ in range(options.rounds):
         before = objective
-        refine_round(patterns, y, mixture, k, options, workspace, response, f, precision, equations, new)
+        refine_round(
+            patterns, y, mixture, k, options, workspace, response, f, precision, equations, new, least
+        )
         kappa, objective = weigh(y, f, variance, groups, n, precision)
         if abs(before - objective) < 1 or objective + penalty(patterns.grids, mixture.level, k) > bound:
             break

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from workflows.recovery.lobes.levenberg_marquardt import solve
+from workflows.recovery.lobes.fitting.levenberg_marquardt import solve
 
 
 @pytest.mark.parametrize("n", [1, 7, 25])

@@ -1,0 +1,1 @@
+"""The fit of lobes to the measurements of a pixel."""

@@ -1,0 +1,124 @@
+"""The measurements of pixels, and the fits of lobes to them: one to all channels, or one to each."""
+
+from typing import NamedTuple, Self
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from workflows.recovery.lobes.footprint import NODES, PARAMETERS, PatternCodes
+from workflows.recovery.lobes.mixture import Mixture
+from workflows.recovery.normalise import Measurements
+from workflows.recovery.pyramid import Grids
+
+ALL = 3
+"""A pixel has four fits: 0 to 2 are those of its channels, and this is the one of all channels together."""
+
+
+class Pixels(NamedTuple):
+    """The measurements of n pixels, and their patterns.
+
+    Attributes
+    ----------
+    grids : Grids
+    code : (nodes, channels m) uint8
+        Light of the m patterns on the nodes of the pyramid; 1 or 3 channels.
+    joint : Measurements
+        Measurements of all channels together, (n, channels (m + 2)).
+    own : Measurements
+        Measurements of each channel, (n, 3, m + 2).
+    strays : (s, m + 2) float32
+        As in :class:`~workflows.recovery.lobes.footprint.PatternCodes`.
+    """
+
+    grids: Grids
+    code: NDArray[np.uint8]
+    joint: Measurements
+    own: Measurements
+    strays: NDArray[np.float32]
+
+
+class Fits(NamedTuple):
+    """The four fits of each of n pixels.
+
+    Attributes
+    ----------
+    lobes : (n, 4, most, 6) float64
+    level : (n, 4, most) int64
+    stray : (n, 4, 3 s) float64
+        As in :class:`~workflows.recovery.lobes.mixture.Mixture`.
+    k : (n, 4) int64
+        Number of lobes of each fit; 0 where there is no fit.
+    objective : (n, 4) float64
+        -2 ln likelihood.
+    rest : (n, 4) float64
+        Mean squared residual of the patterns.
+    """
+
+    lobes: NDArray[np.float64]
+    level: NDArray[np.int64]
+    stray: NDArray[np.float64]
+    k: NDArray[np.int64]
+    objective: NDArray[np.float64]
+    rest: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, pixels: int, most: int, strays: int) -> Self:
+        """No fits yet, of up to `most` lobes and with `strays` kinds of stray light."""
+        return cls(
+            np.zeros((pixels, 4, most, PARAMETERS)),
+            np.zeros((pixels, 4, most), np.int64),
+            np.zeros((pixels, 4, 3 * strays)),
+            np.zeros((pixels, 4), np.int64),
+            np.zeros((pixels, 4)),
+            np.zeros((pixels, 4)),
+        )
+
+
+@njit(nogil=True, cache=True, inline="always")
+def fit_of(fits: Fits, p: int, c: int) -> Mixture:
+    """Fit c of pixel p."""
+    return Mixture(fits.lobes[p, c], fits.level[p, c], fits.stray[p, c])
+
+
+class NodeBuffers(NamedTuple):
+    """Working space for the nodes under all lobes of a fit.
+
+    Attributes
+    ----------
+    node : (most NODES,) int64
+    weight : (most NODES,) float32
+    end : (most,) int64
+        As from :func:`~workflows.recovery.lobes.nodes.spread_lobes`.
+    rows : (most NODES channels (m + 2),) float32
+    """
+
+    node: NDArray[np.int64]
+    weight: NDArray[np.float32]
+    end: NDArray[np.int64]
+    rows: NDArray[np.float32]
+
+
+@njit(nogil=True, cache=True, inline="always")
+def make_buffers(most: int, size: int) -> NodeBuffers:
+    """Make working space for up to `most` lobes of a pixel of `size` measurements."""
+    return NodeBuffers(
+        np.empty(most * NODES, np.int64),
+        np.empty(most * NODES, np.float32),
+        np.empty(most, np.int64),
+        np.empty(most * NODES * size, np.float32),
+    )
+
+
+@njit(nogil=True, cache=True)
+def measurements_of(
+    pixels: Pixels, p: int, c: int
+) -> tuple[PatternCodes, NDArray[np.float32], NDArray[np.float32]]:
+    """The patterns, measurements and variances for fit c of pixel p."""
+    grids, code, joint, own, _ = pixels
+    m = own.value.shape[2] - 2
+    groups = code.shape[1] // m
+    if c == ALL:
+        return PatternCodes(grids, code, 0, groups, m, pixels.strays), joint.value[p], joint.variance[p]
+    first = c * m if groups == 3 else 0
+    return PatternCodes(grids, code, first, 1, m, pixels.strays), own.value[p, c], own.variance[p, c]

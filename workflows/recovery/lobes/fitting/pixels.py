@@ -1,0 +1,226 @@
+"""The fits of pixels, one by one: from the lobes of neighbours, or anew; a second time where much is unexplained."""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from workflows.recovery.lobes.fitting.fits import (
+    ALL,
+    Fits,
+    NodeBuffers,
+    Pixels,
+    fit_of,
+    make_buffers,
+    measurements_of,
+)
+from workflows.recovery.lobes.fitting.levenberg_marquardt import refine
+from workflows.recovery.lobes.fitting.neighbours import MOST_REST, mean_square, start_between, unexplained
+from workflows.recovery.lobes.fitting.search import fit
+from workflows.recovery.lobes.footprint import PARAMETERS, PatternCodes
+from workflows.recovery.lobes.likelihood import penalty
+from workflows.recovery.lobes.mixture import Mixture, Workspace, copy_mixture, make_workspace
+from workflows.recovery.lobes.nodes import gather_lobes, node_responses, spread_lobes
+from workflows.recovery.lobes.options import LobesOptions
+from workflows.recovery.lobes.posterior.mean import update
+
+# A fit that starts from neighbours ends when a step would lower chi-square by less than this for each parameter. Noise
+# alone makes it 1.
+_LEAST_STEP = 0.3
+
+
+@njit(nogil=True, cache=True, inline="always")
+def refit_from_posterior(
+    patterns: PatternCodes,
+    y: NDArray[np.float32],
+    variance: NDArray[np.float32],
+    mixture: Mixture,
+    k: int,
+    objective: float,
+    options: LobesOptions,
+    buffers: NodeBuffers,
+    workspace: Workspace,
+) -> tuple[int, float]:
+    """Fit the lobes of a pixel a second time, starting from the moments of the posterior mean.
+
+    A lobe that is too wide and slightly rotated does not become narrow in small steps. Its posterior mean is narrow.
+
+    Parameters
+    ----------
+    patterns, y, variance
+        As in :func:`~workflows.recovery.lobes.fitting.levenberg_marquardt.refine`.
+    mixture : Mixture
+        Changed in place if the new fit is better.
+    k : int
+    objective : float
+        -2 ln likelihood of the lobes.
+    options : LobesOptions
+    buffers : NodeBuffers
+    workspace : Workspace
+
+    Returns
+    -------
+    k : int
+    objective : float
+    """
+    tried = Mixture(mixture.lobes.copy(), mixture.level.copy(), mixture.stray.copy())
+    n = spread_lobes(patterns.grids, tried, k, options.resolution, buffers.node, buffers.weight, buffers.end)
+    A = buffers.rows[: n * y.size].reshape(n, y.size)
+    node_responses(patterns, buffers.node, n, A)
+    # with a literal, numba would compile another version of `update`
+    passes = np.int64(1)
+    update(
+        A,
+        buffers.weight[:n],
+        buffers.end[:k],
+        y,
+        variance,
+        patterns.strays,
+        tried.stray,
+        passes,
+        options.gradients,
+    )
+    gather_lobes(patterns.grids, buffers.node, buffers.weight, buffers.end, tried, k, options.fit_resolution)
+    new_k, _, new = fit(patterns, y, variance, tried, k, options, workspace)
+    if new + penalty(patterns.grids, tried.level, new_k) >= objective + penalty(
+        patterns.grids, mixture.level, k
+    ):
+        return k, objective
+    copy_mixture(new_k, patterns.groups * len(patterns.strays), tried, mixture)
+    return new_k, new
+
+
+@njit(nogil=True, cache=True, inline="always")
+def leading_channel(variance: NDArray[np.float32]) -> int:
+    """The channel with the highest total precision, from the variances (3, m + 2) of a pixel."""
+    lead, highest = ALL, -1.0
+    for c in range(3):
+        precision = 0.0
+        for j in range(variance.shape[1]):
+            precision += 1 / variance[c, j]
+        if precision > highest:
+            lead, highest = c, precision
+    return lead
+
+
+@njit(nogil=True, cache=True, inline="always")
+def search_anew(
+    patterns: PatternCodes,
+    y: NDArray[np.float32],
+    variance: NDArray[np.float32],
+    mixture: Mixture,
+    k: int,
+    options: LobesOptions,
+    buffers: NodeBuffers,
+    workspace: Workspace,
+) -> tuple[int, float]:
+    """Fit the lobes of a pixel, starting from its first k lobes; return their number and the -2 ln likelihood."""
+    k, kappa, objective = fit(patterns, y, variance, mixture, k, options, workspace)
+    if kappa > options.doubt:
+        k, objective = refit_from_posterior(
+            patterns, y, variance, mixture, k, objective, options, buffers, workspace
+        )
+    return k, objective
+
+
+@njit(nogil=True, cache=True, inline="always")
+def fit_pixel(
+    pixels: Pixels,
+    p: int,
+    separate: bool,
+    neighbours: NDArray[np.int64],
+    options: LobesOptions,
+    fits: Fits,
+    buffers: NodeBuffers,
+    workspace: Workspace,
+) -> None:
+    """Write the fits of a pixel that are needed.
+
+    If `separate`, these are one fit for each channel, that of the most precise channel first. Otherwise they are the
+    fit of all channels together, and under coloured patterns then also one for each channel.
+
+    A fit starts from those of the neighbours. Where it leaves more unexplained than theirs, lobes are searched anew,
+    for all fits but the first starting from the first, and the better fit is kept.
+    """
+    own = pixels.own.variance[p]
+    groups = pixels.code.shape[1] // (own.shape[1] - 2)
+    lead = leading_channel(own) if separate else ALL
+    for turn in range(-1, 3):
+        c = lead if turn < 0 else turn
+        if turn == lead or (c < ALL and (np.isinf(own[c]).all() or (lead == ALL and groups == 1))):
+            continue
+        patterns, y, variance = measurements_of(pixels, p, c)
+        strays = patterns.groups * len(patterns.strays)
+        mixture = fit_of(fits, p, c)
+        k, rest = start_between(patterns, y, variance, fits, neighbours, c, mixture, options, workspace)
+        objective, most = np.inf, MOST_REST * rest
+        if k > 0:
+            least = _LEAST_STEP * (strays + PARAMETERS * k)
+            _, objective, f, _ = refine(patterns, y, variance, mixture, k, options, workspace, least, np.inf)
+            rest = mean_square(patterns, y, variance, f)
+        if k == 0 or rest > most:
+            tried = Mixture(
+                np.empty_like(mixture.lobes), np.empty_like(mixture.level), np.zeros_like(mixture.stray)
+            )
+            first = fits.k[p, lead] if turn >= 0 else np.int64(0)
+            copy_mixture(first, np.int64(0), fit_of(fits, p, lead), tried)
+            found, new = search_anew(patterns, y, variance, tried, first, options, buffers, workspace)
+            if k == 0 or new + penalty(patterns.grids, tried.level, found) < objective + penalty(
+                patterns.grids, mixture.level, k
+            ):
+                k, objective = found, new
+                copy_mixture(k, strays, tried, mixture)
+                rest = unexplained(patterns, y, variance, mixture, k, workspace)
+        fits.k[p, c], fits.objective[p, c], fits.rest[p, c] = k, objective, rest
+
+
+@njit(nogil=True, cache=True, inline="always")
+def prefers_channels(fits: Fits, p: int, size: int) -> bool:
+    """Whether one T for each channel explains a pixel better than one T for all, given `size` measurements.
+
+    Decided by the Bayesian information criterion, with a kappa for each T. Centres are ordinary parameters here, since
+    the channels' lobes are near the common ones.
+    """
+    log_size = math.log(size)
+    joint = fits.objective[p, ALL] + log_size * (PARAMETERS * fits.k[p, ALL] + 1)
+    separate = 0.0
+    for c in range(3):
+        separate += fits.objective[p, c] + log_size * (PARAMETERS * fits.k[p, c] + 1)
+    better: bool = separate < joint
+    return better
+
+
+@njit(nogil=True, cache=True)
+def fit_pixels(
+    pixels: Pixels,
+    alive: NDArray[np.bool_],
+    order: NDArray[np.int64],
+    neighbours: NDArray[np.int64],
+    separate: NDArray[np.bool_],
+    options: LobesOptions,
+    fits: Fits,
+) -> None:
+    """Fit the lobes of n pixels.
+
+    Parameters
+    ----------
+    pixels : Pixels
+    alive : (n,) bool
+        Pixels with a measurement; the others get no lobes.
+    order, neighbours
+        As from :func:`~workflows.recovery.lobes.fitting.neighbours.coarse_to_fine`.
+    separate : (n,) bool
+        Whether each channel gets its own T. Under coloured patterns this is decided here and written.
+    options : LobesOptions
+    fits : Fits
+        Written.
+    """
+    size = pixels.joint.value.shape[1]
+    groups = size // pixels.own.value.shape[2]
+    buffers, workspace = make_buffers(options.most_lobes, size), make_workspace(size)
+    for p in order:
+        if alive[p]:
+            fit_pixel(pixels, p, separate[p], neighbours[p], options, fits, buffers, workspace)
+            if groups == 3:
+                separate[p] = prefers_channels(fits, p, size)
