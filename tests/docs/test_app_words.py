@@ -1,5 +1,6 @@
 """The words of the app: the same in each language, all in use, and none of them elsewhere in the sources."""
 
+import ast
 import json
 import re
 from collections import Counter
@@ -9,10 +10,20 @@ import pytest
 
 WEB = Path(__file__).parents[2] / "services" / "web"
 WORDS = sorted((WEB / "app" / "words").glob("*.js"))
-SCRIPTS = [path for path in sorted(WEB.rglob("*.js")) if path not in WORDS]
+OF_SERVICE = sorted((WEB / "app" / "words" / "service").glob("*.js"))
+"""What the service says, in languages other than its own: its sentences, with {places} for what differs."""
+SCRIPTS = [path for path in sorted(WEB.rglob("*.js")) if path not in WORDS + OF_SERVICE]
 PAGES = sorted(WEB.rglob("*.html"))
-OF_SERVICE = "preset."
-"""What the service says in English, and only other languages say again."""
+SAYING = [
+    "services/api/jobs/wait_reason.py",
+    "services/runtime/problems.py",
+    "workflows/ingest/report/findings.py",
+    "workflows/ingest/report/limits.py",
+    "workflows/ingest/video/missing_patterns.py",
+    "workflows/programs/preset_names.py",
+    "workflows/recovery/dgsr/options.py",
+]
+"""Modules of which everything that people read is translated."""
 PROGRAMS = "webgl.js"
 """A script whose texts are programs of the graphics card."""
 COMMENT = re.compile(r"(?<!:)//[^\n]*|<!--.*?-->", re.DOTALL)
@@ -84,8 +95,8 @@ ENGLISH = words(WEB / "app" / "words" / "en.js")
 
 @pytest.mark.parametrize("path", WORDS, ids=lambda path: path.stem)
 def test_languages_have_the_same_words_with_the_same_places(path: Path) -> None:
-    found = {key: text for key, text in words(path).items() if not key.startswith(OF_SERVICE)}
-    assert list(words(path)) == sorted(words(path))
+    found = words(path)
+    assert list(found) == sorted(found)
     assert found.keys() == ENGLISH.keys()
     for key, text in found.items():
         assert text.strip(), key
@@ -123,3 +134,48 @@ def test_pages_have_no_words_of_their_own(path: Path) -> None:
     shown = [one.strip() for one in re.findall(r">([^<>]+)<", text)]
     assert [one for one in shown if re.search("[A-Za-z]", one) and one != "envmatte" and "$" not in one] == []
     assert re.findall(r'(?:aria-label|title|placeholder)="', text) == []
+
+
+def literals(path: Path, *, with_docstrings: bool = False) -> list[str]:
+    """The texts in a module of Python; a text with values in it is in parts."""
+    tree = ast.parse(path.read_text())
+    docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    constants = (node for node in ast.walk(tree) if isinstance(node, ast.Constant))
+    return [
+        " ".join(node.value.split())
+        for node in constants
+        if isinstance(node.value, str) and (with_docstrings or id(node) not in docstrings)
+    ]
+
+
+def phrases(text: str) -> list[str]:
+    """The parts of a text, between values and marks, that are more than a word."""
+    parts = [part.strip(" .,;:()") for part in re.split(r"\{\w+\}|[.,;:] ", text)]
+    return [part for part in parts if re.search(r"[A-Za-z']{2} (?:.* )?[A-Za-z']{2}", part)]
+
+
+@pytest.mark.parametrize("path", OF_SERVICE, ids=lambda path: path.stem)
+def test_sentences_of_the_service_are_those_that_it_says(path: Path) -> None:
+    root = WEB.parents[1]
+    modules = [
+        path for floor in ("services", "workflows", "storage") for path in (root / floor).rglob("*.py")
+    ]
+    everything = "\n".join(text for module in modules for text in literals(module, with_docstrings=True))
+    sentences = words(path)
+    assert list(sentences) == sorted(sentences)
+    stale = {text: [part for part in phrases(text) if part not in everything] for text in sentences}
+    assert {text: parts for text, parts in stale.items() if parts} == {}
+    for sentence, translation in sentences.items():
+        places, translated = (re.findall(r"\{\w+\}", text) for text in (sentence, translation))
+        assert len(set(places)) == len(places), sentence
+        assert set(translated) <= set(places), sentence
+    known = "\n".join(sentences)
+    lacking = {
+        name: [part for text in literals(root / name) for part in phrases(text) if part not in known]
+        for name in SAYING
+    }
+    assert lacking == {name: [] for name in SAYING}
+
+
+def test_each_language_has_the_sentences_of_the_service_but_its_own() -> None:
+    assert {path.stem for path in OF_SERVICE} == {path.stem for path in WORDS} - {"en"}

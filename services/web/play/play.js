@@ -4,7 +4,7 @@ import { authorization } from "../app/lib/api.js";
 import { checks } from "../app/film/checklist.js";
 import { countScreen, knownScreen, onZoom, rememberScreen } from "../app/film/screen.js";
 import { loadWords } from "../app/lib/language.js";
-import { parts, t } from "../app/lib/words.js";
+import { parts, said, t } from "../app/lib/words.js";
 import { h } from "../app/lib/dom.js";
 import { follow } from "../app/lib/events.js";
 
@@ -133,7 +133,7 @@ const sizeOf = ({ width, height }) => `${width} x ${height}`;
 async function ask(path, options = {}) {
 	const answer = await fetch(new URL(path, here), { ...options, headers: { ...options.headers, ...authorization() } });
 	if (answer.status === 401) $("unlock").hidden = false;
-	if (!answer.ok) throw new Error((await answer.json()).detail);
+	if (!answer.ok) throw new Error(said((await answer.json()).detail));
 	return answer;
 }
 

@@ -45,7 +45,7 @@ def ranges(numbers: Iterable[int]) -> str:
     Examples
     --------
     >>> ranges([1, 4, 5, 6])
-    '1, 4 to 6'
+    '1, 4-6'
     """
     runs: list[list[int]] = []
     for number in numbers:
@@ -53,7 +53,7 @@ def ranges(numbers: Iterable[int]) -> str:
             runs[-1][1] = number
         else:
             runs.append([number, number])
-    return ", ".join(str(a) if a == b else f"{a} to {b}" for a, b in runs)
+    return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in runs)
 
 
 def remedy(reasons: Iterable[str]) -> str:

@@ -3,7 +3,7 @@ import { Problem, saveBlob } from "../lib/api.js";
 import { button, h, problemBox } from "../lib/dom.js";
 import { zip } from "../upload/zip.js";
 import { fromFile } from "./backdrops/backdrops.js";
-import { t } from "../lib/words.js";
+import { said, t } from "../lib/words.js";
 
 const FORMATS = { PNG: "image/png", JPEG: "image/jpeg", EXR: "image/x-exr" };
 const TIMES = 2;
@@ -30,7 +30,7 @@ export function downloads(stage, signal) {
 				backdrop.close?.();
 			} catch (error) {
 				signal.throwIfAborted();
-				refused.push(`${file.name}: ${error.detail ?? error.message}`);
+				refused.push(`${file.name}: ${said(error.detail ?? error.message)}`);
 			}
 		}
 		if (made.length) saveBlob(await zip(made, signal), "composites.zip");

@@ -9,7 +9,7 @@ import { list } from "../lib/list.js";
 import { FILM, steps } from "../lib/view.js";
 import { countScreen, onZoom } from "./screen.js";
 import { begin, onDrop, running } from "../upload/upload.js";
-import { known, parts, t } from "../lib/words.js";
+import { parts, said, t } from "../lib/words.js";
 import { placementDiagram } from "./placement_diagram.js";
 
 const COUNTDOWN = 8; // seconds, about
@@ -25,7 +25,7 @@ export async function filming(main, signal) {
 	fill();
 	onZoom(fill, signal);
 	const choices = presets.map(({ name, description }, n) => {
-		const about = h("span.hint", { id: `preset-${name}` }, known(`preset.${name}`, description));
+		const about = h("span.hint", { id: `preset-${name}` }, said(description));
 		return h("p", h("label.choice", h("input", { type: "radio", name: "preset", value: name, checked: n === 0, "aria-describedby": about.id }), name), " ", about);
 	});
 	const form = h("form.panel", h("h2", t("film.choose")),

@@ -2,7 +2,7 @@
 import { getJson } from "./api.js";
 import { badge, h, newest } from "./dom.js";
 import { ACTIVE } from "./events.js";
-import { known, t } from "./words.js";
+import { known, said, t } from "./words.js";
 import { languageSwitch } from "./language.js";
 
 const REFRESH = 4000; // ms
@@ -14,7 +14,7 @@ let timer;
 
 export const jobCard = (job, ...more) =>
 	h("a.card", { href: `#/jobs/${job.id}` }, h("span.name", t(`job.${job.kind}`)), badge(job.state),
-		h("span.about", job.problem?.detail ?? (job.state === "running" ? `${known(`stage.${job.stage}`, job.stage)}, ${Math.floor(100 * job.progress)} %` : job.id)), more);
+		h("span.about", job.problem ? said(job.problem.detail) : (job.state === "running" ? `${known(`stage.${job.stage}`, job.stage)}, ${Math.floor(100 * job.progress)} %` : job.id)), more);
 
 export const refreshActivity = newest(async () => {
 	clearTimeout(timer);

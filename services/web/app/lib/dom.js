@@ -1,5 +1,5 @@
 // Elements of pages, and text for numbers and times.
-import { known, locale, t } from "./words.js";
+import { known, locale, said, t } from "./words.js";
 
 // `h("p.hint", { id: "why" }, "Text")`: an element with its classes, its attributes if it has any, and its children.
 export function h(name, ...children) {
@@ -26,12 +26,12 @@ export const prose = (text) => text.split(/`([^`]*)`/).map((part, i) => (i % 2 ?
 
 // A text of the API with a capital letter, unless it begins with a name: of a file, a field or an option.
 export const sentence = (text, name) =>
-	name && text.startsWith(name) ? text : text.replace(/^[a-z]+(?=[ ,])/, (word) => word[0].toUpperCase() + word.slice(1));
+	name && text.startsWith(name) ? text : text.replace(/^\p{Ll}+(?=[ ,])/u, (word) => word[0].toUpperCase() + word.slice(1));
 
 // A box with an error as the API words it, or as the browser does.
 export const problemBox = (error) =>
-	h("div.problem", { role: "alert" }, h("strong", error.title ?? t("wrong")),
-		h("p", prose(sentence(error.detail ?? error.message, error.entry))));
+	h("div.problem", { role: "alert" }, h("strong", said(error.title ?? t("wrong"))),
+		h("p", prose(sentence(said(error.detail ?? error.message), error.entry))));
 
 export const empty = (title, text) => h("div.empty", h("strong", title), h("p", text));
 

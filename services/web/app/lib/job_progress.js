@@ -2,7 +2,7 @@
 import { getJson } from "./api.js";
 import { ACTIVE, follow } from "./events.js";
 import { badge, duration, facts, h, newest, pause, problemBox } from "./dom.js";
-import { known, locale, t } from "./words.js";
+import { known, locale, said, t } from "./words.js";
 
 const LOG_EVERY = 2000; // ms
 
@@ -22,7 +22,7 @@ export async function followJob(panel, id, signal, changed = () => {}, known = n
 		try {
 			const found = (await getJson(`v1/jobs/${id}/log?after=${last}`, signal)).lines;
 			const atEnd = lines.scrollTop + lines.clientHeight >= lines.scrollHeight - 8;
-			lines.append(...found.map(({ at, text }) => h("li", h("time", { datetime: at }, new Date(at).toLocaleTimeString(locale())), " ", text)));
+			lines.append(...found.map(({ at, text }) => h("li", h("time", { datetime: at }, new Date(at).toLocaleTimeString(locale())), " ", said(text))));
 			last = found.at(-1)?.line ?? last;
 			if (atEnd) lines.scrollTop = lines.scrollHeight;
 			if (!ended) await pause(LOG_EVERY, signal);
@@ -35,7 +35,7 @@ export async function followJob(panel, id, signal, changed = () => {}, known = n
 		bar.hidden = !active && job.state !== "failed";
 		stage.replaceChildren(badge(job.state), ` ${describe(job)}`);
 		waits.hidden = !job.waits_for;
-		waits.textContent = job.waits_for ? t("job.waits", { why: job.waits_for }) : "";
+		waits.textContent = job.waits_for ? t("job.waits", { why: said(job.waits_for) }) : "";
 		about.replaceChildren(facts({
 			[t("job.tiles")]: job.tiles.total ? t("of", { n: job.tiles.done, all: job.tiles.total }) : null,
 			[t("job.lost")]: job.tiles.failed || null,

@@ -1,15 +1,17 @@
 // The language of the app: that of the browser, or the one that was chosen here. Only its words are loaded.
 import { h } from "./dom.js";
-import { LANGUAGES, locale, preferred, speak, t } from "./words.js";
+import { LANGUAGES, learn, locale, preferred, speak, t } from "./words.js";
 
+const SERVICE = "en"; // the language that the service speaks
 const KEPT = "envmatte-language"; // in this browser's storage
 
 export async function loadWords() {
 	const language = preferred(localStorage.getItem(KEPT));
-	const file = `../words/${language}.js`;
 	// Once more under another name: when the network changes, browsers abort what they load.
-	const found = await import(file).catch(() => import(`${file}?again`));
-	speak(language, found[language]);
+	const load = async (file) => (await import(file).catch(() => import(`${file}?again`)))[language];
+	const [words, service] = await Promise.all([load(`../words/${language}.js`), language === SERVICE ? {} : load(`../words/service/${language}.js`)]);
+	learn(service);
+	speak(language, words);
 }
 
 export const languageSwitch = () => [t("language"), ...Object.entries(LANGUAGES).map(([language, name]) => h("button", {

@@ -6,7 +6,7 @@ import { renamable } from "../lib/rename.js";
 import { CHECK, deletion, steps } from "../lib/view.js";
 import { matteCards } from "./mattes.js";
 import { recoveryForm } from "./recovery_form.js";
-import { t } from "../lib/words.js";
+import { said, t } from "../lib/words.js";
 import { failedFilm } from "../film/failed_film.js";
 import { forgetFilmOf } from "../upload/kept_films.js";
 
@@ -58,7 +58,7 @@ function verdict({ level, quality, findings }) {
 	const [, grade] = quality ? GRADES.find(([least]) => clear >= least) : [];
 	const text = t(`verdict.${level}`) + (grade ? t(`verdict.${level === "good" ? "expect" : "best"}`, { grade: t(`grade.${grade}`) }) : "");
 	const rows = (some) => h("ul.findings", some.map((one) =>
-		h("li", badge(one.level), h("div", h("p", prose(sentence(one.message))), one.remedy && h("p.remedy", prose(sentence(one.remedy)))))));
+		h("li", badge(one.level), h("div", h("p", prose(sentence(said(one.message)))), one.remedy && h("p.remedy", prose(sentence(said(one.remedy))))))));
 	const fine = findings.filter((one) => one.level === "good");
 	const wrong = findings.filter((one) => one.level !== "good");
 	return h("section.panel", { "aria-label": t("report") }, h("div.row", h("h2", text), badge(level)),

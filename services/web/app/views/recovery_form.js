@@ -1,7 +1,7 @@
 // The form that starts a recovery. Its options and their descriptions come from GET /v1/options.
 import { getJson, post } from "../lib/api.js";
 import { duration, h, problemBox, prose } from "../lib/dom.js";
-import { t } from "../lib/words.js";
+import { said, t } from "../lib/words.js";
 
 const BY_HAND = "envmatte-recover-by-hand"; // in this browser's storage
 const QUALITIES = ["fast", "fine"];
@@ -24,7 +24,7 @@ function field(option) {
 		});
 	}
 	const range = !option.values && option.minimum != null ? ` ${t("option.range", { least: option.minimum, most: option.maximum })}` : "";
-	const about = h("p.hint", { id: `${id}-about` }, prose(option.description), range);
+	const about = h("p.hint", { id: `${id}-about` }, prose(said(option.description)), range);
 	const row = h("div.option", h("label", { for: id }, option.name.replaceAll("_", " ")), input, about);
 	return { option, input, row };
 }

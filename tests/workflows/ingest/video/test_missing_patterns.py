@@ -35,7 +35,7 @@ def test_patterns_without_a_frame_are_named_with_a_remedy(
 
 
 @pytest.mark.parametrize(
-    ("numbers", "text"), [([7], "7"), ([1, 2], "1 to 2"), ([0, 3, 4, 5, 9, 11, 12], "0, 3 to 5, 9, 11 to 12")]
+    ("numbers", "text"), [([7], "7"), ([1, 2], "1-2"), ([0, 3, 4, 5, 9, 11, 12], "0, 3-5, 9, 11-12")]
 )
 def test_numbers_in_words(numbers: list[int], text: str) -> None:
     assert ranges(numbers) == text
