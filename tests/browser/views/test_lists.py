@@ -1,7 +1,7 @@
 """Lists: searched, filtered, and cleared of several entries at once, which can be undone."""
 
-import re
 from collections.abc import Callable
+from urllib.parse import parse_qs, urlsplit
 
 import pytest
 from playwright.sync_api import Locator, Page, Route, expect
@@ -64,8 +64,21 @@ def test_list_is_searched_and_filtered_by_state(desk: Page, service: Service, ca
     expect(entries.filter(has_not_text="cancelled")).to_have_count(0)
 
 
+@pytest.mark.parametrize("kind", ["captures", "mattes"])
+def test_names_are_searched(desk: Page, service: Service, ready: tuple[str, str], kind: str) -> None:
+    desk.goto(f"{service.url}/#/{kind}")
+    found = desk.locator(f'a[href="#/{kind}/{ready[kind == "mattes"]}"]')
+    expect(found).to_be_visible()
+    search = desk.get_by_role("searchbox", name="Search")
+    search.fill("no such name")
+    expect(found).to_have_count(0)
+    expect(desk.get_by_text("Nothing found")).to_be_visible()
+    search.fill(" A BAL ")
+    expect(found).to_be_visible()
+
+
 def test_search_looks_into_all_pages(desk: Page, service: Service) -> None:
-    """A service with 120 captures, as far as the app can tell."""
+    """A service with 120 captures, as far as the app can tell, which finds them by name."""
     captures = [
         {
             "id": f"c{n:03}",
@@ -77,11 +90,14 @@ def test_search_looks_into_all_pages(desk: Page, service: Service) -> None:
         }
         for n in range(120)
     ]
+    asked: list[dict[str, list[str]]] = []
 
     def answer(route: Route) -> None:
-        after = re.search(r"after=c(\d+)", route.request.url)
-        first = int(after[1]) + 1 if after else 0
-        route.fulfill(json={"captures": captures[first : first + 50]})
+        query = parse_qs(urlsplit(route.request.url).query)
+        asked.append(query)
+        found = [one for one in captures if query.get("name", [""])[0] in str(one["name"])]
+        first = [one["id"] for one in found].index(query["after"][0]) + 1 if "after" in query else 0
+        route.fulfill(json={"captures": found[first : first + 50]})
 
     desk.route("**/v1/captures?*", answer)
     desk.route("**/v1/captures/*/thumbnail.png", lambda route: route.fulfill(status=404, json=NOT_NOW))
@@ -90,12 +106,18 @@ def test_search_looks_into_all_pages(desk: Page, service: Service) -> None:
     expect(entries).to_have_count(50)
     desk.get_by_role("button", name="Show older").click()
     expect(entries).to_have_count(100)
-    desk.reload()
-    expect(entries).to_have_count(50)
-    desk.get_by_role("searchbox", name="Search").fill("glass 11")
+    search = desk.get_by_role("searchbox", name="Search")
+    asked.clear()
+    search.fill("glass 11")
     expect(entries).to_have_count(10)
+    assert asked == [{"limit": ["50"], "name": ["glass 11"]}]
     desk.get_by_label("Choose all that are shown").check()
     expect(desk.get_by_role("button", name="Delete 10", exact=True)).to_be_visible()
+    # What is found may take more than a page.
+    search.fill("glass 0")
+    expect(entries).to_have_count(50)
+    desk.get_by_role("button", name="Show older").click()
+    expect(entries).to_have_count(100)
 
 
 def test_deletion_is_undone(desk: Page, service: Service, cancelled: list[str]) -> None:

@@ -8,14 +8,14 @@ import { t } from "./words.js";
 const REFRESH = 5000; // ms
 const PAGE = 50; // entries
 
-// `kind` names a path of the API and the key of its answer. `item` makes the card of an entry, `text` what a search looks
-// into, which begins with its name.
-export async function list(main, signal, { kind, states = [], busy, fixed = () => false, none, item, text }) {
+// `kind` names a path of the API and the key of its answer. `item` makes the card of an entry, and `text` says which one
+// it is. Where entries are `named`, the API searches their names; else this page searches their texts.
+export async function list(main, signal, { kind, states = [], named = false, busy, fixed = () => false, none, item, text }) {
 	const items = h("ul.list");
 	const nothing = h("div");
 	const problem = h("div");
 	const refused = h("div");
-	const search = h("input", { type: "search", "aria-label": t("list.search"), placeholder: t("list.search") });
+	const search = h("input", { type: "search", maxlength: 200, "aria-label": t("list.search"), placeholder: t("list.search") });
 	const state = h("select", { "aria-label": t("list.state") }, h("option", { value: "" }, t("list.all")),
 		states.map((one) => h("option", { value: one }, t(`state.${one}`))));
 	const all = h("input", { type: "checkbox", "aria-label": t("list.choose.all") });
@@ -24,28 +24,30 @@ export async function list(main, signal, { kind, states = [], busy, fixed = () =
 	const rows = new Map(); // by id: the text of an entry and its element, which stays as long as nothing changes
 	let entries = [];
 	let isWhole = true; // whether the oldest entry is there
-	const get = async (after) => (await getJson(`v1/${kind}?limit=${PAGE}${state.value && `&state=${state.value}`}${after}`, signal))[kind];
+	const wanted = () => search.value.trim();
 
-	// All that follows `found`: one page of it, or every page if `everything` is wanted.
-	async function read(found, everything) {
+	// What follows `found`: one page of it, or every page if this page searches them.
+	async function read(found) {
 		do {
-			const next = await get(found.length ? `&after=${found.at(-1).id}` : "");
+			const query = { limit: PAGE, state: state.value, name: named && wanted(), after: found.at(-1)?.id };
+			const given = Object.entries(query).filter(([, value]) => value);
+			const next = (await getJson(`v1/${kind}?${new URLSearchParams(given)}`, signal))[kind];
 			found = [...found, ...next];
 			isWhole = next.length < PAGE;
-		} while (!isWhole && everything);
+		} while (!isWhole && !named && wanted());
 		entries = found;
 		draw();
 	}
 	const load = newest(async () => {
 		try {
-			await read([], search.value.trim());
+			await read([]);
 			problem.replaceChildren();
 		} catch (error) {
 			signal.throwIfAborted();
 			problem.replaceChildren(problemBox(error), button(t("again"), refused, load));
 		}
 	});
-	const more = button(t("older"), problem, () => read(entries, false), "more");
+	const more = button(t("older"), problem, () => read(entries), "more");
 
 	const remove = h("button.danger", {
 		type: "button",
@@ -69,10 +71,8 @@ export async function list(main, signal, { kind, states = [], busy, fixed = () =
 		remove.hidden = !chosen.size;
 		remove.textContent = t("list.delete", { n: chosen.size });
 	};
-	const visible = () => {
-		const wanted = search.value.trim().toLowerCase();
-		return entries.filter((one) => !gone.has(one.id) && text(one).toLowerCase().includes(wanted));
-	};
+	const isFound = (one) => named || text(one).toLowerCase().includes(wanted().toLowerCase());
+	const visible = () => entries.filter((one) => !gone.has(one.id) && isFound(one));
 	all.onchange = () => {
 		chosen.clear();
 		if (all.checked) for (const one of visible()) if (!fixed(one)) chosen.add(one.id);
@@ -111,7 +111,7 @@ export async function list(main, signal, { kind, states = [], busy, fixed = () =
 		count();
 	}
 	const tools = h("div.row.tools", { role: "search", hidden: true }, h("label", all, " ", t("list.every")), search, state, remove);
-	search.oninput = () => (isWhole ? draw() : load().catch(() => {})); // the user left the view
+	search.oninput = () => (isWhole && !named ? draw() : load().catch(() => {})); // the user left the view
 	state.onchange = () => (chosen.clear(), load().catch(() => {}));
 	more.hidden = true;
 	main.append(tools, refused, nothing, items, problem, more);

@@ -25,7 +25,7 @@ export async function captures(main, signal) {
 		problem,
 	);
 	await list(main, signal, {
-		kind: "captures", states: ["ingesting", "ready", "failed"], text: nameOf,
+		kind: "captures", states: ["ingesting", "ready", "failed"], named: true, text: nameOf,
 		busy: (one) => one.state === "ingesting",
 		none: () => empty(t("captures.none"), t("captures.first")),
 		item: (one) =>

@@ -24,8 +24,7 @@ export function matteCards(signal) {
 export async function mattes(main, signal) {
 	main.append(h("h1", t("nav.mattes")));
 	await list(main, signal, {
-		kind: "mattes", states: ["recovering", "ready", "failed"],
-		text: (one) => [matteName(one), one.options.method, qualityOf(one)].filter(Boolean).join(" "),
+		kind: "mattes", states: ["recovering", "ready", "failed"], named: true, text: matteName,
 		busy: (one) => one.state === "recovering",
 		none: () => empty(t("mattes.none"), t("mattes.first")),
 		item: matteCards(signal),
