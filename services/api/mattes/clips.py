@@ -44,7 +44,7 @@ async def composite_clip(
     Parameters
     ----------
     options : dict
-        ``transfer``, and ``placement`` as `Placement` takes it.
+        ``transfer``, ``around``, and ``placement`` as `Placement` takes it.
     webhook : str, optional
         URL that is notified when the job has ended.
 

@@ -36,7 +36,7 @@ class CompositeParams(BaseModel):
     around: Literal["nothing", "backdrop"] = Field(
         "nothing",
         description="What is shown where the mask left pixels out: nothing, so that a PNG is transparent and a JPEG "
-        "black there, or the backdrop, as if the frame saw the whole monitor.",
+        "or a video black there, or the backdrop, as if the frame saw the whole monitor.",
     )
     depth: Distance | None = Field(
         None, description="Distance of the backdrop from the object, if it is not where the monitor was."
@@ -90,8 +90,8 @@ class CompositeParams(BaseModel):
             If a parameter is given that only stills have.
         """
         placement = {"right": self.right, "down": self.down, "scale": self.scale, "angle": self.angle}
-        for name in self.model_fields_set - placement.keys() - {"transfer", "webhook"}:
+        for name in self.model_fields_set - placement.keys() - {"transfer", "around", "webhook"}:
             raise OptionError(
-                f"{name} is for stills: a clip takes transfer, {', '.join(placement)}", field=name
+                f"{name} is for stills: a clip takes transfer, around, {', '.join(placement)}", field=name
             )
-        return {"transfer": self.transfer, "placement": placement}
+        return {"transfer": self.transfer, "around": self.around, "placement": placement}

@@ -19,7 +19,11 @@ from workflows.images import integer_formats
 
 VIDEO = {"Content-Type": "video/mp4"}
 
-OPTIONS = {"transfer": "srgb", "placement": {"right": 0, "down": 0, "scale": 1, "angle": 0}}
+OPTIONS = {
+    "transfer": "srgb",
+    "around": "nothing",
+    "placement": {"right": 0, "down": 0, "scale": 1, "angle": 0},
+}
 
 
 def stored(service: Service) -> set[str]:

@@ -22,8 +22,10 @@ from storage.layout.mattes import Matte
 from storage.objects.byte_objects import PART
 from storage.objects.store import Objects, gather
 from workflows.composite import composite
+from workflows.composite.around import put_around
 from workflows.composite.backdrop import Backdrop
 from workflows.composite.cache import Cache
+from workflows.composite.engine import Window
 from workflows.composite.placement import Placement
 from workflows.composite.quantise import encode
 from workflows.composite.video import segments
@@ -115,12 +117,17 @@ def work(objects: Objects, task: Task, tile: int) -> int:
     ticks = _ticks(objects, job)[tile * length : (tile + 1) * length]
     cache = Cache(objects, KEPT)
     put, light = cache.matte(matte), tone_curves.table(transfer, np.dtype(np.uint16))
+    has_around = task.options.get("around") == "backdrop"  # missing from jobs of earlier versions
 
     def shown(frame: NDArray[np.uint16]) -> NDArray[np.uint8]:
-        """An 8 bit picture, black where the mask left the matte out."""
+        """An 8 bit picture; where the mask left the matte out, it is black or shows the backdrop."""
         backdrop = Backdrop(frame, light)
         where = None if placement == Placement() else placement
         picture = composite(put, backdrop, placement=where, read=partial(cache.strip, matte), threads=1)
+        if has_around:
+            wide, high = put.attributes["monitor"]
+            size = put.width, put.height
+            picture = put_around(picture, backdrop, Window.of(put), size, (wide, high), where, threads=1)
         return encode(picture, transfer, np.dtype(np.uint8), 1)[..., :3].astype(np.uint8, copy=False)
 
     with _reading(objects, task) as (decoder, file):

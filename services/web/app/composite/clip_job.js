@@ -4,7 +4,7 @@ import { button, h, problemBox } from "../lib/dom.js";
 import { followJob } from "../lib/job_progress.js";
 import { t } from "../lib/words.js";
 
-// The controls for the clip that is chosen; `place` returns where it stands.
+// The controls for the clip that is chosen; `place` returns where it stands, and what is around the glass.
 export function clipJob(matte, place, signal) {
 	const problem = h("div");
 	const progress = h("div.stack");

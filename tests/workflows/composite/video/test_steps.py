@@ -22,6 +22,7 @@ from storage.objects.store import Objects
 from storage.steps import FINISH, PREPARE
 from tests.workflows.ingest.video.camera import interlaced
 from workflows.composite import composite
+from workflows.composite.backdrop import Backdrop, frame_light
 from workflows.composite.video import steps as video_steps
 from workflows.composite.video.steps import STEPS
 from workflows.images.tone_curves import from_light, to_light
@@ -44,7 +45,14 @@ def short_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
 def matte(objects: Objects) -> Matte:
     """A matte that turns a backdrop upside down; it has an odd size, and lacks a corner."""
     made = mattes.create(
-        objects, "m", height=HEIGHT, width=WIDTH, columns=COLUMNS, rows=ROWS, crosstalk=np.eye(3).tolist()
+        objects,
+        "m",
+        height=HEIGHT,
+        width=WIDTH,
+        columns=COLUMNS,
+        rows=ROWS,
+        crosstalk=np.eye(3).tolist(),
+        monitor=[72, 54],
     )
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     cells = (ROWS - 1 - y * ROWS // HEIGHT) * COLUMNS + x * COLUMNS // WIDTH
@@ -137,10 +145,16 @@ def make(objects: Objects, matte: Matte) -> Make:
     """Runs the steps of a job over a clip; returns the video."""
 
     def steps(
-        data: bytes, job: str = "j", order: Callable[[range], Any] = iter, transfer: str = "srgb"
+        data: bytes,
+        job: str = "j",
+        order: Callable[[range], Any] = iter,
+        transfer: str = "srgb",
+        placement: dict[str, float] | None = None,
+        **options: str,
     ) -> bytes:
         objects.put(composites.clip_path(job), data)
-        task = Task(job, "c", "m", {"transfer": transfer, "placement": {}}, LIMITS)
+        given = {"transfer": transfer, "placement": placement or {}, **options}
+        task = Task(job, "c", "m", given, LIMITS)
         task = replace(task, plan=run(STEPS, objects, task, PREPARE)[1])
         for tile in order(range(task.plan["tiles"])):
             assert run(STEPS, objects, task, tile)[1] % (HEIGHT * WIDTH) == 0
@@ -183,6 +197,21 @@ def test_every_frame_is_its_still_composite(make: Make, matte: Matte) -> None:
         assert np.sqrt(np.mean(error**2)) < 0.03
         assert frame[:HEIGHT, :WIDTH][left_out].max() < 12
         np.testing.assert_allclose(frame[-1].astype(int), frame[-2], atol=12)  # the row that makes it even
+
+
+@pytest.mark.parametrize("placement", [{}, {"right": 0.2}], ids=["where the monitor was", "moved"])
+def test_backdrop_is_around_the_glass(make: Make, matte: Matte, placement: dict[str, float]) -> None:
+    shown = pictures(3)
+    made, *_ = frames_of(make(clip(shown, even(3), crf="4"), placement=placement, around="backdrop"))
+    without, *_ = frames_of(make(clip(shown, even(3), crf="4"), "k", placement=placement))
+    for picture, frame, black in zip(shown, made, without, strict=True):
+        light = to_light(picture.astype(np.float32) / 255, "srgb")
+        moved = round(72 * placement.get("right", 0))
+        light = np.pad(light, ((0, 0), (moved, 0), (0, 0)))[:, :72]
+        behind = from_light(frame_light(Backdrop(light), WIDTH, HEIGHT, 1), "srgb")[:6, :6]
+        assert np.sqrt(np.mean((frame[:6, :6] / 255 - behind) ** 2)) < 0.05
+        assert black[:6, :6].max() < 12
+        assert np.sqrt(np.mean((frame[12:].astype(float) - black[12:]) ** 2)) < 4  # the glass is the same
 
 
 def test_linear_codes_are_light(make: Make, matte: Matte) -> None:
