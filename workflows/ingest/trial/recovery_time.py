@@ -28,7 +28,8 @@ def core_seconds(stack: Stack) -> dict[str, float] | None:
     -----
     The time of a pixel depends on its glass: more lobes take longer. So the pixels of `take_sample`, which are spread
     over the frame, are tried, with the shifts and gains that were found. Kernels are compiled by then: steadiness was
-    measured with them. Reading the frames and writing the matte are left out.
+    measured with them. What counts is the time of this thread on its core: a trial takes half a second, in which other
+    processes often have half of the core. Reading the frames and writing the matte are left out.
     """
     sample = take_sample(stack)
     if sample is None:
@@ -47,8 +48,8 @@ def core_seconds(stack: Stack) -> dict[str, float] | None:
     share = float(np.count_nonzero(stack.mask()) / len(sample.chosen[0]))
     seconds = {}
     for name, options in QUALITIES.items():
-        start = time.perf_counter()
+        start = time.thread_time()
         if recover_sample(stack, program, monitor, patterns, sample, state, options) is None:
             return None
-        seconds[name] = round(share * (time.perf_counter() - start), 2)
+        seconds[name] = round(share * (time.thread_time() - start), 2)
     return seconds

@@ -33,7 +33,7 @@ def test_seconds_of_a_trial_count_for_all_pixels(
     share = np.count_nonzero(stack.mask()) / len(sample.chosen[0])
     assert share > 1
     clock = count()  # each trial lasts a second
-    monkeypatch.setattr(recovery_time.time, "perf_counter", lambda: float(next(clock)))
+    monkeypatch.setattr(recovery_time.time, "thread_time", lambda: float(next(clock)))
     assert core_seconds(stack) == {"fine": round(share, 2), "fast": round(share, 2)}
 
 
