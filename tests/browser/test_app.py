@@ -157,9 +157,9 @@ def test_backdrop_moves_by_mouse_and_keys(tab: Page, service: Service, ready: tu
 def test_layers_and_lobes_of_a_pixel(tab: Page, service: Service, ready: tuple[str, str]) -> None:
     tab.goto(f"{service.url}/#/mattes/{ready[1]}")
     unfold(tab)
-    for name in ("S", "alpha", "confidence", "rho"):
+    for name in ("Reflections", "Mask", "Confidence", "Transparency"):
         tab.get_by_role("radio", name=name, exact=True).check()
-        expect(tab.get_by_alt_text(f"The layer {name}")).to_be_visible()
+        expect(tab.get_by_alt_text(f"The layer “{name}”")).to_be_visible()
         assert shown(tab, ".layer img").shape == (SIZE[1], SIZE[0], 3)
     tab.get_by_role("button", name="Explain a pixel").click()
     stage = tab.get_by_role("group", name="Composite.")

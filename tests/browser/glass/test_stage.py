@@ -118,5 +118,19 @@ def test_phone_has_the_controls_in_a_sheet_of_the_full_screen(
     assert [one["id"] for one in Axe().run(desk).response["violations"]] == []
     controls.click()
     assert is_fitting(desk)
-    desk.get_by_role("button", name="Leave full screen").click()
+    controls.click()
+    desk.get_by_role("button", name="Leave full screen").click()  # which does not need the controls
     expect(desk.get_by_role("list", name="Steps")).to_be_in_viewport()
+
+
+def test_refused_picture_is_said_not_to_be_shown(
+    desk: Page, service: Service, ready: tuple[str, str]
+) -> None:
+    opened(desk, service, ready[1])
+    before = desk.locator(".picture.stage img").get_attribute("src")
+    desk.get_by_label("Your own picture or clip").set_input_files(
+        {"name": "beach.png", "mimeType": "image/png", "buffer": b"none"}
+    )
+    expect(desk.get_by_role("alert")).to_contain_text("The image can't be used")
+    expect(desk.get_by_text("beach.png: not shown")).to_be_visible()
+    assert desk.locator(".picture.stage img").get_attribute("src") == before

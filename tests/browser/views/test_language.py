@@ -14,10 +14,11 @@ from tests.parts.waiting import until
 
 pytestmark = pytest.mark.slow
 
-ENGLISH, GERMAN = (words(WEB / "app" / "words" / f"{name}.js") for name in ("en", "de"))
+ENGLISH, GERMAN, SAID = (words(WEB / "app" / "words" / name) for name in ("en.js", "de.js", "service/de.js"))
 # What only English says: long enough that nothing else is the same.
 PHRASES = [
-    text for key, text in ENGLISH.items() if len(text) > 14 and "{" not in text and text != GERMAN[key]
+    *(text for key, text in ENGLISH.items() if len(text) > 14 and "{" not in text and text != GERMAN[key]),
+    *(part for text in SAID for part in phrases(text) if len(part) > 14),
 ]
 TEXTS = """() => [
     document.body.innerText,

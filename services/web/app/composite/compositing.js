@@ -59,22 +59,22 @@ export function compositing(matte, others, signal) {
 	const choices = backdropChoices(matte, stage.element, use, taken.all, first, signal);
 	use(builtIn(first, matte.monitor));
 
-	const filled = (is) => ((sheet.open = !is), full.textContent = section.classList.toggle("full", Boolean(is)) ? t("full.leave") : t("full"));
-	const full = h("button", {
-		type: "button",
-		onclick() {
-			if (document.fullscreenElement) document.exitFullscreen();
-			else if (section.requestFullscreen) section.requestFullscreen();
-			else filled(!section.classList.contains("full")); // the window: browsers of phones let only videos fill the screen
-		},
-	}, t("full"));
+	const filled = (is) => {
+		section.classList.toggle("full", Boolean(is));
+		sheet.open = !is;
+		full.hidden = Boolean(is);
+		leave.hidden = !is;
+	};
+	// Browsers of phones let only videos fill the screen: there it is the window.
+	const full = h("button", { type: "button", onclick: () => (section.requestFullscreen ? section.requestFullscreen() : filled(true)) }, t("full"));
+	const leave = h("button.leave", { type: "button", hidden: true, onclick: () => (document.fullscreenElement ? document.exitFullscreen() : filled(false)) }, t("full.leave"));
 	const folded = (title, ...about) => h("details", h("summary", title), about);
 	const sheet = h("details.panel.sheet", { open: true }, h("summary", t("controls")),
 		h("div.row", full, play, recordButton(stage, matte, signal), explained.button, placed.reset, h("label", transparent, " ", t("transparent"))),
 		stage.status, explained.panel, choices,
 		folded(t("placement"), h("p.hint", t("placement.how")), placed.sliders),
 		folded(t("compare"), comparison(stage, matte, others)), folded(t("take"), taken.element), video.element, stage.renderer);
-	const section = h("section.composite", { "aria-label": t("compositing") }, stage.element, sheet);
+	const section = h("section.composite", { "aria-label": t("compositing") }, stage.element, leave, sheet);
 	section.addEventListener("fullscreenchange", () => filled(document.fullscreenElement));
 	return section;
 }

@@ -6,9 +6,11 @@ import { t } from "../lib/words.js";
 const FIRST = "rho";
 const LAYERS = ["S", "rho", "alpha", "confidence"];
 
+const altOf = (name) => t("layer.name", { name: t(`layer.label.${name}`) });
+
 // Folded; the pictures are requested once it is opened.
 export function layers(matte, signal) {
-	const image = h("img", { alt: FIRST, width: matte.width, height: matte.height, hidden: true });
+	const image = h("img", { alt: altOf(FIRST), width: matte.width, height: matte.height, hidden: true });
 	const frame = h("div.picture.layer", image);
 	frame.style.aspectRatio = `${matte.width} / ${matte.height}`;
 	const about = h("p.hint");
@@ -17,7 +19,7 @@ export function layers(matte, signal) {
 		try {
 			about.textContent = t(`layer.${name}`);
 			await show(image, await getBlob(`v1/mattes/${matte.id}/layers/${name}.png`, signal));
-			image.alt = t("layer.name", { name });
+			image.alt = altOf(name);
 			image.classList.toggle("linear", ["S", "rho"].includes(name)); // linear light, to be encoded for the display
 			problem.replaceChildren();
 		} catch (error) {
@@ -25,7 +27,7 @@ export function layers(matte, signal) {
 		}
 	});
 	const names = h("fieldset.row", h("legend", t("layer")), LAYERS.map((name) =>
-		h("label.choice", h("input", { type: "radio", name: "layer", checked: name === FIRST, onchange: () => choose(name) }), name)));
+		h("label.choice", h("input", { type: "radio", name: "layer", checked: name === FIRST, onchange: () => choose(name) }), t(`layer.label.${name}`))));
 	const files = ["all.exr", "stmap.exr"].map((name) => button(name, problem, () => save(`v1/mattes/${matte.id}/layers/${name}`, name)));
 	const panel = h("details.panel", h("summary", h("h2", t("layers"))),
 		h("div.stack", names, frame, about, h("p.row", t("layers.tools"), files), problem));

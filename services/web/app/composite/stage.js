@@ -117,7 +117,10 @@ export class Stage extends LiveGlass {
 			}
 			this.problem.replaceChildren();
 		} catch (error) {
-			if (error.name !== "AbortError") this.fail(error);
+			if (error.name !== "AbortError") {
+				this.#describe(t(this.isLive ? "stage.live" : "stage.failed"));
+				this.fail(error);
+			}
 		}
 		if (!exact && this.playing && !this.isLive && !this.signal.aborted) this.#composite(false); // the next frame
 	});

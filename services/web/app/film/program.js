@@ -30,7 +30,7 @@ export async function filming(main, signal) {
 	});
 	const form = h("form.panel", h("h2", t("film.choose")),
 		h("fieldset.stack", h("legend", t("film.shows")), choices),
-		h("div.row", h("label", t("film.width"), width), h("label", t("film.height"), height), t("film.pixels")),
+		h("div.row", h("label", t("film.width"), width), h("label", t("film.height"), height), h("span.unit", t("film.pixels"))),
 		h("p.hint", t("film.screen")),
 		problem, h("p.row", h("button.primary", t("continue"))));
 	form.onsubmit = async (event) => {
@@ -60,7 +60,7 @@ export async function filming(main, signal) {
 async function nearby(signal, view) {
 	const isOwn = /^(localhost|127\.|\[::1\]$)/.test(location.hostname);
 	const { url, problem } = isOwn ? await getJson("v1/network", signal) : { url: location.origin };
-	if (!url) return h("section.panel", h("h2", t("phone")), h("p", prose(problem), "."));
+	if (!url) return h("section.panel", h("h2", t("phone")), h("p", prose(said(problem)), "."));
 	const address = `${url}/#/${view}`;
 	const code = h("img.code", { src: `v1/qr.svg?${new URLSearchParams({ text: address })}`, alt: t("phone.code"), width: 160, height: 160 });
 	code.onerror = () => (code.hidden = true); // a proxy may have other names for the service than it knows
