@@ -146,6 +146,7 @@ def test_failures_are_explained_in_german(
         ),
         ("expose half a stop more", "eine halbe Blende reichlicher belichten"),
         ("nobody has translated this: 1.5 of it", "nobody has translated this: 1.5 of it"),
+        pytest.param("a: b; " * 300, "a: b; " * 300, id="many parts"),
     ],
 )
 def test_sentences_are_put_together_of_what_is_known(

@@ -3,6 +3,8 @@ export const LANGUAGES = { de: "Deutsch", en: "English" };
 const LOCALES = { de: "de-DE", en: "en-GB" };
 const spoken = { language: "en", words: {} };
 let sentences = []; // of the service: what matches each, and its translation
+const MOST = 8; // parts of a sentence
+const LONGEST = 800; // characters of one, so that no text takes long
 
 // The first language of this browser that the app knows, unless another one is `kept`.
 export const preferred = (kept) =>
@@ -21,23 +23,33 @@ export const parts = (key, elements) => spoken.words[key].split(/\{(\w+)\}/).map
 export const known = (key, otherwise) => spoken.words[key] ?? otherwise;
 
 // The values that stand in {places} of the service's sentences: numbers get the language's decimal mark.
-const value = (text) => translated(text) ?? text.replace(/^([-+]?\d+)\.(\d+)$/, `$1${(0.5).toLocaleString(locale())[1]}$2`);
+const value = (text) => said(text).replace(/^([-+]?\d+)\.(\d+)$/, `$1${(0.5).toLocaleString(locale())[1]}$2`);
 
-// A text of the service, or undefined if the language has no sentence for any part of it.
+// A sentence of the service, or undefined if the language does not have it.
 function translated(text) {
+	if (text.length > LONGEST) return;
 	for (const [pattern, words] of sentences) {
 		const found = pattern.exec(text);
 		if (found) return words.replace(/\{(\w+)\}/g, (_, name) => value(found.groups[name]));
 	}
-	for (const { 0: mark, index } of text.matchAll(/[;:] /g)) {
-		const [before, after] = [text.slice(0, index), text.slice(index + mark.length)];
-		const [first, rest] = [before, after].map(translated);
-		if (first ?? rest) return (first ?? before) + mark + (rest ?? after);
-	}
 }
 
-// What the service says, in the language of the reader as far as that has its sentences.
-export const said = (text) => translated(text) ?? text;
+// What the service says, in the language of the reader as far as that has its sentences. Of the parts between colons and
+// semicolons, the most that are one sentence are translated together, from the left.
+export function said(text) {
+	const parts = text.split(/(?<=[;:] )/);
+	let all = "";
+	for (let at = 0, n; at < parts.length; at += n) {
+		for (n = MOST; n > 0; n--) {
+			const [, run, mark = ""] = /^(.*?)([;:] )?$/s.exec(parts.slice(at, at + n).join(""));
+			const words = translated(run);
+			if (words === undefined && n > 1) continue;
+			all += (words ?? run) + mark;
+			break;
+		}
+	}
+	return all;
+}
 
 // Takes what the service says, in another language: what is most of a text is tried first.
 export function learn(service) {
