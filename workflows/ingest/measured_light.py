@@ -228,11 +228,24 @@ def stray_light(attributes: dict[str, Any], program: Program) -> Floats:
     if not attributes.get("border"):
         return np.ones((1, shown.size + 2), np.float32)
     border = border_light(range(program.count))
-    numbers, sent = program.constants_among(attributes["patterns"])
+    numbers, sent = constants_of(attributes, program)
     slope = np.stack([np.ones(len(numbers)), sent.mean(axis=1)], axis=1)
     ends = np.array([[1, 0], [1, 1]]) @ np.linalg.pinv(slope)
     rows = np.concatenate([border[:, shown], border[:, numbers] @ ends.T.astype(np.float32)], axis=1)
     return np.concatenate([np.ones((1, rows.shape[1]), np.float32), rows])
+
+
+def constants_of(attributes: dict[str, Any], program: Program) -> tuple[NDArray[np.intp], Floats]:
+    """The constant patterns that S and rho are fitted to, and the values sent to the monitor in each.
+
+    Beside a border they are the grey ones, if there are two levels: its bits differ between the frames that are black
+    to one channel and those that are to another, so that `stray_light` would be another in each.
+    """
+    numbers, sent = program.constants_among(attributes["patterns"])
+    grey = np.ptp(sent, axis=1) == 0
+    if attributes.get("border") and np.ptp(sent[grey, :1]) > 0:
+        return numbers[grey], sent[grey]
+    return numbers, sent
 
 
 def black_patterns(program: Program) -> NDArray[np.intp]:

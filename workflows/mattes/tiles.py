@@ -13,7 +13,7 @@ from storage.layout.mattes import Block, Matte
 from storage.objects.store import Objects
 from workflows.images.tone_curves import Curve, to_light
 from workflows.ingest.local_gain import Surroundings, local_gain
-from workflows.ingest.measured_light import conditions_of, read_light
+from workflows.ingest.measured_light import conditions_of, constants_of, read_light
 from workflows.mattes.options import RecoveryOptions
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out, pyramid_of
@@ -89,7 +89,7 @@ def _recover_block(
     noise = Noise(**attributes["noise"])
     (light, usable, worth), recovered = read_light(stack, span, program, gain_of(objects, capture))
     crosstalk = np.array(attributes["crosstalk"])
-    numbers, sent = program.constants_among(attributes["patterns"])
+    numbers, sent = constants_of(attributes, program)
     photometry = fit_photometry(
         light[:, numbers], to_light(sent, monitor), usable[:, numbers], noise, worth[:, numbers]
     )

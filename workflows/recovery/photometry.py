@@ -75,7 +75,9 @@ def fit_photometry(
 
     Notes
     -----
-    Least-squares fit of eq. 6, ``C = S + rho b``, weighted by the inverse variance of the values, with rho >= 0.
+    Least-squares fit of eq. 6, ``C = S + rho b``, weighted by the inverse variance of the values, with rho >= 0. It is
+    the variance at the value that an unweighted fit predicts: by the values themselves, those that are too dark would
+    weigh most, whether by noise or since they see a dark part of a film's border.
 
     Examples
     --------
@@ -88,17 +90,26 @@ def fit_photometry(
     _check_shapes(values, levels, usable)
     if (np.ptp(levels, axis=0) == 0).any():
         raise ValueError("every channel needs at least two different constant levels")
-    weight = (frames[:, None] if frames.ndim == 1 else frames) / noise.variance(values).astype(np.float64)
-    weight = np.where(_select_values(levels, usable), weight, 0)
+    worth = np.where(
+        _select_values(levels, usable), frames[:, None] if frames.ndim == 1 else frames, 0
+    ).astype(np.float64)
+    S, rho, *_ = _fit_line(values, levels, worth)
+    weight = worth / noise.variance(S[:, None] + rho[:, None] * levels)
+    return Photometry(*(array.astype(np.float32) for array in _fit_line(values, levels, weight)))
+
+
+def _fit_line(
+    values: NDArray[np.float32], levels: NDArray[np.float32], weight: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], ...]:
+    """S, rho, and the variances of S and S + rho for values whose variance is 1 / weight, (n, 3) each."""
     total = weight.sum(axis=1)
     mean_level = (weight * levels).sum(axis=1) / total
     mean_value = (weight * values).sum(axis=1) / total
     offset = levels - mean_level[:, None]
     spread = (weight * offset**2).sum(axis=1)
     rho = np.maximum((weight * offset * values).sum(axis=1) / spread, 0)
-    S = mean_value - rho * mean_level
     black, white = (1 / total + (level - mean_level) ** 2 / spread for level in (0, 1))
-    return Photometry(*(array.astype(np.float32) for array in (S, rho, black, white)))
+    return mean_value - rho * mean_level, rho, black, white
 
 
 def estimate_noise(

@@ -22,8 +22,11 @@ def test_fit_is_weighted_least_squares():
     fit = fit_photometry(values, levels, np.ones(values.shape, bool), NOISE, frames)
     for p in range(5):
         for c in range(3):
-            root = np.sqrt(frames / NOISE.variance(values[p, :, c]))
-            design = np.stack([np.ones(8), levels[:, c]], axis=1) * root[:, None]
+            design = np.stack([np.ones(8), levels[:, c]], axis=1)
+            even = np.sqrt(frames)
+            first = np.linalg.lstsq(design * even[:, None], values[p, :, c] * even, rcond=None)[0]
+            root = even / np.sqrt(NOISE.variance(design @ first))
+            design *= root[:, None]
             expected = np.linalg.lstsq(design, values[p, :, c] * root, rcond=None)[0]
             np.testing.assert_allclose([fit.S[p, c], fit.rho[p, c]], expected, atol=2e-6)
             (black, both), (_, slope) = np.linalg.inv(design.T @ design)
@@ -32,6 +35,15 @@ def test_fit_is_weighted_least_squares():
     np.testing.assert_allclose(fit.S, S, atol=0.01)
     np.testing.assert_allclose(fit.rho, rho, atol=0.03)
     assert fit.S.dtype == fit.rho.dtype == np.float32
+
+
+def test_lit_and_dark_parts_of_a_border_weigh_alike():
+    black, white = [0.02, 0.48, 0.48], [0.23, 0.69, 0.69]
+    values = np.repeat(np.array(black + white, np.float32)[np.newaxis, :, np.newaxis], 3, axis=2)
+    levels = np.repeat(np.repeat([0, 1], 3)[:, np.newaxis], 3, axis=1).astype(np.float32)
+    fit = fit_photometry(values, levels, np.ones(values.shape, bool), NOISE, np.ones(6))
+    np.testing.assert_allclose(fit.S, np.mean(black), atol=1e-6)
+    np.testing.assert_allclose(fit.S + fit.rho, np.mean(white), atol=1e-6)
 
 
 def test_clipped_levels_are_left_out():

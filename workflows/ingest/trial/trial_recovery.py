@@ -15,6 +15,7 @@ from workflows.ingest.measured_light import (
     Light,
     clipped_from,
     conditions_of,
+    constants_of,
     even_out,
     exposures_of,
     light_of,
@@ -191,7 +192,7 @@ def recover_sample(
     noise = Noise(**attributes["noise"])
     found = light_of(lambda n: (seen.values[n], seen.whole[n]), attributes, program, len(sample.chosen[0]))
     light, usable, worth = found
-    numbers, sent = program.constants_among(attributes["patterns"])
+    numbers, sent = constants_of(attributes, program)
     levels = to_light(sent, monitor)
     photometry = fit_photometry(light[:, numbers], levels, usable[:, numbers], noise, worth[:, numbers])
     alive = photometry.rho**2 > CONTRAST**2 * noise.variance(photometry.S + photometry.rho / 2)
