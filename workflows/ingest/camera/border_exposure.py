@@ -10,8 +10,10 @@ from workflows.ingest.local_gain import local_gain
 from workflows.programs.border import border_light
 from workflows.programs.program import Program
 
-STRIPS, WIDE = 8, 4
-"""Columns of the frame that are searched for the border, and how many pixels each is wide."""
+STRIPS, WIDE = 32, 2
+"""Strips of the frame that are searched for the border, and how many columns each is wide,"""
+ROWS = 512
+"""and the rows of them that are looked at, at most, spread over the frame."""
 ROUNDS = 8
 """Rounds of fitting the light of the border and the exposures, one given the other: without veils, then with them."""
 FOLLOWS = (0.5, 0.7)
@@ -41,14 +43,15 @@ class BorderValues:
 
     def __init__(self, stack: Stack, program: Program) -> None:
         left = [int((n + 0.5) * stack.width / STRIPS) for n in range(STRIPS)]
-        strips = [stack.read(columns=slice(x, x + WIDE)) for x in left]
+        rows = slice(None, None, -(-stack.height // ROWS))
+        strips = [stack.read(columns=slice(x, x + WIDE))[:, rows] for x in left]
         codes = np.concatenate([strip.reshape(stack.frames, -1, stack.channels) for strip in strips], axis=1)
         top = np.iinfo(codes.dtype).max
         self.codes = codes
         self.local: NDArray[np.floating] = np.ones((1, 1))
         gain = local_gain(stack)
         if gain is not None:
-            places = [np.mgrid[: stack.height, x : x + WIDE].reshape(2, -1) for x in left]
+            places = [np.mgrid[: stack.height : rows.step, x : x + WIDE].reshape(2, -1) for x in left]
             self.local = gain.at(*np.concatenate(places, axis=1))
         self.usable = np.asarray(((codes > 0) & (codes < SHOULDER * top)).all(axis=2))
         bits = border_light(range(program.count))[:, stack.attributes["patterns"]]
@@ -86,26 +89,27 @@ class BorderValues:
             if border.size < MIN_VALUES:
                 return None
             exposure, veil = _lines(
-                predicted[:, border], light[:, border], self.usable[:, border], turn >= ROUNDS
+                predicted[:, border],
+                light[:, border],
+                self.usable[:, border] / np.maximum(rest[border], np.median(rest[border])),
+                turn >= ROUNDS,
             )
             veil -= self.design @ (inverse @ veil)  # that part is the border's own light
         return exposure[:, 0]
 
 
-def _lines(
-    predicted: Doubles, light: Doubles, usable: NDArray[np.bool_], veiled: bool
-) -> tuple[Doubles, Doubles]:
+def _lines(predicted: Doubles, light: Doubles, weight: Doubles, veiled: bool) -> tuple[Doubles, Doubles]:
     """The exposure and the veil of each frame, (frames, 1): ``light = exposure (predicted + veil)``, by least squares.
 
     A frame without usable values has an exposure of 1 and no veil; no frame has one unless they are ``veiled``.
     """
     x = y = np.zeros((len(light), 1))
     if veiled:
-        count = np.maximum(usable.sum(axis=1, keepdims=True), 1)
-        x, y = (np.where(usable, v, 0).sum(axis=1, keepdims=True) / count for v in (predicted, light))
-    off = np.where(usable, predicted - x, 0)
-    spread = (off**2).sum(axis=1, keepdims=True)
-    slope = (off * (light - y)).sum(axis=1, keepdims=True) / np.maximum(spread, 1e-12)
+        total = np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
+        x, y = ((weight * v).sum(axis=1, keepdims=True) / total for v in (predicted, light))
+    off = predicted - x
+    spread = (weight * off**2).sum(axis=1, keepdims=True)
+    slope = (weight * off * (light - y)).sum(axis=1, keepdims=True) / np.maximum(spread, 1e-12)
     exposure = np.where(spread > 0, slope, 1)
     exposure = np.maximum(exposure / np.median(exposure), 1e-3)
     return exposure, np.where(veiled & (spread > 0), y / exposure - x, 0)

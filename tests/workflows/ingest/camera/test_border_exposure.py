@@ -7,7 +7,12 @@ import pytest
 from numpy.typing import NDArray
 
 from workflows.images.tone_curves import table
-from workflows.ingest.camera.border_exposure import BorderValues, relative_to_white, shortest_white
+from workflows.ingest.camera.border_exposure import (
+    TRIFLE,
+    BorderValues,
+    relative_to_white,
+    shortest_white,
+)
 from workflows.programs.border import border_light
 from workflows.programs.presets import preset
 
@@ -26,6 +31,7 @@ class Film:
         border: bool = True,
         missing: int = 0,
         veil: NDArray[np.floating] | float = 0.0,
+        between: bool = False,
     ) -> None:
         random = np.random.default_rng(2)
         self.frames = PROGRAM.count - missing
@@ -35,6 +41,8 @@ class Film:
             lit = border_light(range(PROGRAM.count))[:, missing:] > 0
             of_column = lit[np.arange(80) // 4 % len(lit)]  # a cell is four pixels wide
             light[:, :5] = light[:, 55:] = np.where(of_column, 0.3, 0.03).T[:, np.newaxis, :, np.newaxis]
+            if between:  # four rows see the patterns' edge too
+                light[:, 5:9] = 0.7 * light[:, :1] + 0.1 * random.random((self.frames, 1, 1, 1))
         light += np.broadcast_to(veil, PROGRAM.count)[missing:, np.newaxis, np.newaxis, np.newaxis]
         light *= np.asarray(exposures)[: self.frames, np.newaxis, np.newaxis, np.newaxis]
         light += 0.002 * random.standard_normal(light.shape)
@@ -59,6 +67,13 @@ def test_veil_of_bright_patterns_is_no_exposure() -> None:
     found = BorderValues(Film(drift, veil=veil), PROGRAM).exposures(LOOK_UP)  # type: ignore[arg-type]
     assert found is not None
     np.testing.assert_allclose(found, drift / np.median(drift), rtol=0.01)
+
+
+def test_values_that_see_the_edge_of_the_patterns_hardly_count() -> None:
+    film = Film(np.ones(PROGRAM.count), between=True)
+    found = BorderValues(film, PROGRAM).exposures(LOOK_UP)  # type: ignore[arg-type]
+    assert found is not None
+    assert np.log(found).std() < TRIFLE
 
 
 def test_frames_exposed_half_as_long_and_twice_are_followed() -> None:
