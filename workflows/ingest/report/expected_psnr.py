@@ -35,7 +35,7 @@ def expected(
     survey : dict
         See `workflows.ingest.report.survey`.
     model_error : float
-        See `workflows.ingest.trial.unexplained`, as a share of rho.
+        See `error_of`.
     pattern_error : float, optional
         See there, in camera units.
     exposures : sequence of float, optional
@@ -89,6 +89,14 @@ def expected(
         error = k * s2 / patterns + c * rho**2 / patterns**1.2 + unexplained
         ends.append(-10 * log10(error if blocks is None else error + a * rho**2 / blocks**b))
     return Quality(low=ends[0], high=ends[1], blocks=blocks)
+
+
+def error_of(attributes: dict[str, Any]) -> float:
+    """The error of the model that a stack's measurements promise of composites, as a share of rho.
+
+    See `workflows.ingest.trial.unexplained`; captures of earlier versions have no ``smooth_error``.
+    """
+    return float(attributes.get("smooth_error", attributes.get("model_error", 0.0)))
 
 
 def costs_of(

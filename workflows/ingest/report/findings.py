@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from workflows.ingest.report.expected_psnr import costs_of
+from workflows.ingest.report.expected_psnr import costs_of, error_of
 from workflows.ingest.report.figures import LEVELS, Drift, Figures, Finding, Flicker, graded
 from workflows.ingest.report.limits import (
     curves,
@@ -32,7 +32,7 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
     scaled patterns, curves, glare, colours.
     """
     survey = attributes["survey"]
-    costs = costs_of(program, survey, attributes.get("model_error", 0.0), attributes.get("auto_exposure"))
+    costs = costs_of(program, survey, error_of(attributes), attributes.get("auto_exposure"))
     found = [
         *_exposure(figures, attributes["storage"]),
         *_auto_exposure(attributes.get("auto_exposure"), costs["auto_exposure"]),
@@ -43,7 +43,7 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
         *curves(figures, program, linear=attributes["storage"]["black"] > 0),
         *_glare(attributes.get("glare")),
         _crosstalk(figures, program, grey=survey.get("grey", False)),
-        *unexplained(costs["model_error"], attributes.get("model_error", 0.0)),
+        *unexplained(costs["model_error"], error_of(attributes)),
         *lost_colour(costs["lost_colour"]),
         *_noise(figures, attributes, costs["noise"]),
         *_flicker(figures.flicker, mapped=bool(attributes.get("tone_mapping"))),

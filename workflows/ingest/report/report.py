@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from workflows.ingest.report.expected_psnr import expected
+from workflows.ingest.report.expected_psnr import error_of, expected
 from workflows.ingest.report.figures import (
     LEVELS,
     Clipping,
@@ -78,7 +78,7 @@ def report(attributes: dict[str, Any], frames: int) -> Report:
         quality=expected(
             program,
             survey,
-            attributes.get("model_error", 0.0),
+            error_of(attributes),
             attributes.get("pattern_error"),
             attributes.get("auto_exposure"),
         ),

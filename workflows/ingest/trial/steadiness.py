@@ -105,6 +105,7 @@ def find_steadiness(stack: Stack) -> None:
         gains=None,
         glare=None,
         model_error=0.0,
+        smooth_error=0.0,
         pattern_error=None,
         noise_of_patterns=False,
     )

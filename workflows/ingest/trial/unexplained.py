@@ -64,9 +64,11 @@ def find_unexplained(
     """Estimate what T leaves unexplained in a sample of the pixels, and annotate the stack with it.
 
     ``glare`` are its shares of the light (`workflows.recovery.glare`), or None below 1 %. ``model_error`` is the
-    standard deviation of what neither T nor noise explains, as a share of rho. ``pattern_error`` is the root mean
+    standard deviation of what neither T nor noise explains, as a share of rho; ``smooth_error`` is the part of it that
+    neighbours have in common, or as much if there are too few. ``pattern_error`` is the root mean
     square difference of all patterns from what T predicts, in camera units. ``noise`` is replaced if it was only
-    assumed, for want of constant frames, or if that of patterns is larger: ``noise_of_patterns`` says whether.
+    assumed, for want of constant frames, if that of patterns is larger, or in a film smaller: ``noise_of_patterns``
+    says whether.
 
     Parameters
     ----------
@@ -89,9 +91,11 @@ def find_unexplained(
     Where T lies in a part of a pattern that is all black or all white, no error of T's place or shape matters. What
     still differs there is glare, whose shares are fitted, and then noise and errors of the model: scattered light, a
     curve that is not quite right, a monitor whose white depends on the picture. Errors of the model are alike in the
-    three channels, and noise is not, so that the covariance of the channels tells them apart.
+    three channels, and noise is not, so that the covariance of the channels tells them apart. Compression makes errors
+    that are alike in the channels, but not in neighbouring pixels: they limit the weight of a measurement, but
+    composites have little of them, since patterns are many.
     """
-    stack.annotate(glare=None, model_error=0.0, pattern_error=None)
+    stack.annotate(glare=None, model_error=0.0, smooth_error=0.0, pattern_error=None)
     before, assumed = Noise(**stack.attributes["noise"]), stack.attributes["assumed_noise"]
     noise, of_patterns = before, stack.attributes["noise_of_patterns"]
     spreads, through = spread_patterns(patterns), patterns
@@ -116,6 +120,7 @@ def find_unexplained(
             stack.annotate(
                 noise={"read": noise.read, "shot": noise.shot},
                 model_error=error,
+                smooth_error=min(error, rest.smooth_error(sample, error)),
                 glare=[round(float(share), 5) for share in shares] if shares.any() else None,
                 pattern_error=rest.pattern_error(),
                 noise_of_patterns=of_patterns or noise != before,
@@ -138,6 +143,7 @@ class Rest:
         noise: Noise,
     ) -> None:
         shown, channels, self.noise = program.measured, stack.channels, noise
+        self.filmed = "video" in stack.attributes
         at = slice(None, channels)
         first = {pattern: frame for frame, pattern in reversed(list(enumerate(stack.attributes["patterns"])))}
         self.frames = np.array([first.get(pattern, 0) for pattern in shown.tolist()])
@@ -214,8 +220,28 @@ class Rest:
             found = fit_noise(level, square, noise.read / 100) or noise
             if assumed or found.variance(_GREY)[0] > HIDDEN * noise.variance(_GREY)[0]:
                 noise = found
+            elif self.filmed:
+                # Exposures and local tone mapping that are not quite right widen what a film shows beyond black and
+                # white, which its noise was measured by. All that is left is an upper limit.
+                square = (self.rest[flat] / 2 * self.rho[flat]) ** 2 * self.worth[flat]
+                limit = fit_noise(level, square.astype(np.float64), noise.read / 100)
+                if limit and limit.variance(_GREY)[0] < noise.variance(_GREY)[0]:
+                    noise = limit
         error = float(np.sqrt(max(common, 0.0)) / 2)
         return noise, error if error >= LEAST_ERROR else 0.0
+
+    def smooth_error(self, sample: Sample, otherwise: float) -> float:
+        """The error of the model in a film by pixels above each other, where both see a pattern alike."""
+        if not self.filmed:
+            return otherwise
+        index = {place: n for n, place in enumerate(zip(*(at.tolist() for at in sample.chosen), strict=True))}
+        below = [(n, index.get((square, y + 1, x))) for (square, y, x), n in index.items()]
+        pairs = np.array([pair for pair in below if pair[1] is not None], np.intp).reshape(-1, 2).T
+        both = self.flat[pairs].all(axis=0) & (self.plain[pairs[0]] * self.plain[pairs[1]] > 0)
+        if np.count_nonzero(both) < MIN_FLAT:
+            return otherwise
+        common = _mean_without_outliers((self.rest[pairs[0]] * self.rest[pairs[1]])[both])
+        return float(np.sqrt(max(common, 0.0)) / 2)
 
 
 def mean_places(transport: Transport, pyramid: Pyramid) -> tuple[Doubles, Doubles]:

@@ -87,7 +87,7 @@ def test_stated_curve_is_checked_by_half_tones(stack: Stack) -> None:
 def test_of_one_level_the_costliest_comes_first(stack: Stack) -> None:
     survey = stack.attributes["survey"]
     for lost, error, first in ((1e-3, 0.02, "colour_detail"), (2e-4, 0.04, "unexplained")):
-        made, _ = findings(stack, model_error=error, survey=survey | {"lost_colour": lost})
+        made, _ = findings(stack, smooth_error=error, survey=survey | {"lost_colour": lost})
         assert made.findings[0].name == first
         costs = [finding.cost for finding in made.findings if finding.level == "warning"]
         assert costs[:2] == sorted(costs[:2], reverse=True)

@@ -5,13 +5,17 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 from scipy.ndimage import gaussian_filter
 
 from storage.layout.captures import Stack
 from tests.parts.captures import captured, nested_program
-from workflows.images.tone_curves import to_light
+from workflows.images.tone_curves import Curve, to_light
+from workflows.ingest.report.expected_psnr import error_of
 from workflows.ingest.trial import unexplained
+from workflows.ingest.trial.trial_recovery import take_sample
 from workflows.programs.program import Constant, Program
+from workflows.programs.pyramid_light import lay_out
 from workflows.recovery.glare import WIDTHS
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import Scene
@@ -116,3 +120,22 @@ def test_error_of_the_model_is_what_channels_have_in_common(
     # half of the light is black, which has no error
     assert stack.attributes["model_error"] == pytest.approx(0.03 / np.sqrt(2), rel=0.3)
     np.testing.assert_allclose(deviation(stack), NOISE, rtol=0.4)
+
+
+@pytest.mark.slow
+def test_errors_of_compression_are_no_promise_and_limit_the_noise_of_a_film(
+    scene: Scene, program: Program, ingest: Ingest
+) -> None:
+    """Compression's errors are alike in the channels and differ from pixel to pixel."""
+    stack = ingest("c", filmed(scene, program, error=0.02))
+    assert error_of(stack.attributes) == stack.attributes["model_error"] > 0.01
+    stack.annotate(video={}, noise={"read": (5 * NOISE) ** 2, "shot": 0.0})
+    sample = take_sample(stack)
+    assert sample is not None
+    monitor = TypeAdapter[Curve](Curve).validate_python(stack.attributes["monitor_curve"])
+    patterns = lay_out(program, monitor, [])
+    unexplained.find_unexplained(stack, program, monitor, patterns, sample, np.zeros((stack.frames, 3)))
+    assert stack.attributes["model_error"] > 0.01
+    assert error_of(stack.attributes) < 0.5 * stack.attributes["model_error"]
+    assert stack.attributes["noise_of_patterns"]
+    assert deviation(stack)[1] < 3 * NOISE
