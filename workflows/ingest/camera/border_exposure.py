@@ -1,6 +1,7 @@
 """How the exposure of a film changed from pattern to pattern, by the border, whose light is known."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,32 @@ TRIFLE = 0.003
 Doubles = NDArray[np.float64]
 
 
+class BorderLight(NamedTuple):
+    """What the n values that see the border of a film show, in the order of the frames.
+
+    Attributes
+    ----------
+    exposure : (frames,) float64
+        Their median is 1.
+    own : (frames, n) float64
+        The border's own light.
+    rest : (frames, n) float64
+        The light, by the exposure, that neither the border nor the veil of the frame explains; 0 if not usable.
+    usable : (frames, n) bool
+    design : (frames, k) float64
+        What each value's own light is a sum of, in unknown amounts.
+    places : (2, n) intp
+        Row and column of each value.
+    """
+
+    exposure: Doubles
+    own: Doubles
+    rest: Doubles
+    usable: NDArray[np.bool_]
+    design: Doubles
+    places: NDArray[np.intp]
+
+
 class BorderValues:
     """Values that may see the border of a film, in all frames.
 
@@ -48,17 +75,21 @@ class BorderValues:
         codes = np.concatenate([strip.reshape(stack.frames, -1, stack.channels) for strip in strips], axis=1)
         top = np.iinfo(codes.dtype).max
         self.codes = codes
-        self.local: NDArray[np.floating] = np.ones((1, 1))
+        places = [np.mgrid[: stack.height : rows.step, x : x + WIDE].reshape(2, -1) for x in left]
+        self.places = np.concatenate(places, axis=1)
         gain = local_gain(stack)
-        if gain is not None:
-            places = [np.mgrid[: stack.height : rows.step, x : x + WIDE].reshape(2, -1) for x in left]
-            self.local = gain.at(*np.concatenate(places, axis=1))
+        self.local: NDArray[np.floating] = np.ones((1, 1)) if gain is None else gain.at(*self.places)
         self.usable = np.asarray(((codes > 0) & (codes < SHOULDER * top)).all(axis=2))
         bits = border_light(range(program.count))[:, stack.attributes["patterns"]]
         self.design = np.concatenate([np.ones((1, stack.frames)), bits]).T
 
     def exposures(self, look_up: NDArray[np.float32]) -> Doubles | None:
-        """The exposure of each frame, (frames,) float64, their median 1; None if too few values see the border.
+        """The exposure of each frame, as of `fit`."""
+        found = self.fit(look_up)
+        return None if found is None else found.exposure
+
+    def fit(self, look_up: NDArray[np.float32]) -> BorderLight | None:
+        """The exposure of each frame and the border's light; None if too few values see the border.
 
         Parameters
         ----------
@@ -95,7 +126,11 @@ class BorderValues:
                 turn >= ROUNDS,
             )
             veil -= self.design @ (inverse @ veil)  # that part is the border's own light
-        return exposure[:, 0]
+        usable = self.usable[:, border]
+        even = np.where(usable, light[:, border] / exposure - veil, predicted[:, border])
+        own = self.design @ (inverse @ even)
+        rest = np.where(usable, even - own, 0)
+        return BorderLight(exposure[:, 0], own, rest, usable, self.design, self.places[:, border])
 
 
 def _lines(predicted: Doubles, light: Doubles, weight: Doubles, veiled: bool) -> tuple[Doubles, Doubles]:

@@ -10,9 +10,9 @@ from pydantic import TypeAdapter
 
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import Curve
-from workflows.ingest.camera.border_exposure import shortest_white
+from workflows.ingest.camera.border_exposure import BorderLight, BorderValues, shortest_white
 from workflows.ingest.camera.calibration import is_free, measure
-from workflows.ingest.measured_light import black_patterns
+from workflows.ingest.measured_light import black_patterns, look_up_of
 from workflows.ingest.trial.tone_mapping import find_tone_mapping
 from workflows.ingest.trial.trial_recovery import (
     FURTHEST,
@@ -201,11 +201,23 @@ def _explain(stack: Stack, program: Program, sample: Sample) -> tuple[Curve, Pat
             return None
         mapped = None
         if turn < TONE_MAPPING_TURNS:
-            mapped = find_tone_mapping(stack, found.rest, sample, stack.attributes["tone_mapping"])
+            known, border = stack.attributes["tone_mapping"], _border(stack, program)
+            mapped = find_tone_mapping(stack, found.rest, sample, known, border)
         if mapped is None:
             return monitor, light, found
         measure(stack, tone_mapping=mapped)
         turn += 1
+
+
+def _border(stack: Stack, program: Program) -> BorderLight | None:
+    """The light of a film's border, if its exposure was locked.
+
+    One that was not follows the patterns, as local tone mapping does, and errors of the curve hide the latter.
+    """
+    exposed = stack.attributes["auto_exposure"]
+    if not stack.attributes.get("border") or (exposed is not None and is_free(np.array(exposed))):
+        return None
+    return BorderValues(stack, program).fit(look_up_of(stack))
 
 
 def _settle(

@@ -1,14 +1,16 @@
 """Measure how much a camera brightens what is dark around a place, by what a trial recovery leaves unexplained."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
-from workflows.ingest.local_gain import surroundings
-from workflows.ingest.trial.trial_recovery import HUBER, Doubles, Floats, Sample
+from workflows.ingest.camera.border_exposure import BorderLight
+from workflows.ingest.local_gain import Surroundings, surroundings
+from workflows.ingest.trial.border_tone_mapping import Power, border_power
+from workflows.ingest.trial.trial_recovery import HUBER, Doubles, Sample
 from workflows.ingest.trial.unexplained import DETAIL, MIN_FLAT, Rest
 
 WIDTHS = (1 / 40, 1 / 20, 1 / 10)
@@ -25,18 +27,14 @@ SPREAD = 0.01
 """Errors that are in proportion to the light, at least, as a share of it."""
 
 
-class Power(NamedTuple):
-    """The power of local tone mapping, its standard error, and how much of the residuals it explains."""
-
-    power: float
-    error: float
-    explained: float
-
-
 def find_tone_mapping(
-    stack: Stack, rest: Rest, sample: Sample, known: dict[str, float] | None
+    stack: Stack,
+    rest: Rest,
+    sample: Sample,
+    known: dict[str, float] | None,
+    border: BorderLight | None = None,
 ) -> dict[str, float] | None:
-    """The local tone mapping that a sample of the pixels shows; None if it is not certain, or a trifle.
+    """The local tone mapping that a sample of the pixels, or a border, shows; None if it is not certain, or a trifle.
 
     Parameters
     ----------
@@ -46,6 +44,8 @@ def find_tone_mapping(
     sample : Sample
     known : dict, optional
         What was found, and corrected, before: the rest is added to it.
+    border : BorderLight, optional
+        Of a film. Its power counts if its standard error is the smaller one.
 
     Returns
     -------
@@ -62,12 +62,35 @@ def find_tone_mapping(
     does. Of the residuals there, each pixel's mean and each frame's gain are left free: S, rho and flicker are
     uncertain. T has explained some of the rest, so that what is found is corrected, and searched for once more.
     Sharpening is far narrower than the surroundings, and glare makes a place that is bright around not darker but
-    brighter.
+    brighter. The border of a film has light that no T has to explain (`border_power`).
     """
-    y, x = sample.places
-    at = rest.flat
-    if np.count_nonzero(at) < MIN_FLAT:
+    widths = [known["width"]] if known else [w for w in WIDTHS if w * stack.width >= NARROWEST]
+    tried = [(width, near) for width in widths if (near := surroundings(stack, width)) is not None]
+    ways = [_power_of(rest, sample)] if np.count_nonzero(rest.flat) >= MIN_FLAT else []
+    if border is not None:
+        ways.append(partial(border_power, border))
+    if not tried or not ways:
         return None
+    by_way = [
+        max(((way(near), width, near) for width, near in tried), key=lambda one: one[0].explained)
+        for way in ways
+    ]
+    (power, error, _), width, near = min(by_way, key=lambda one: one[0].error)
+    if known:
+        return known | {"power": max(known["power"] + power, 0.0)}
+    if power < max(SURE * error, LEAST):
+        return None
+    around = near.at(*sample.places)
+    usual = float(around.mean())
+    if rest.white.size:
+        # Composites are exposed for a backdrop between patterns, half of which is black, and white.
+        usual = (usual + float(around[rest.white].mean())) / 2
+    return {"power": power, "width": width, "usual": usual, "spread": float(around.std())}
+
+
+def _power_of(rest: Rest, sample: Sample) -> Callable[[Surroundings], Power]:
+    """A function from surroundings to the power that the residuals of a sample show."""
+    at = rest.flat
     pixel, channel, shown = np.nonzero(at)
     frame = rest.frames[shown]
     level, value = rest.level[at], (rest.rest * rest.rho)[at] / 2
@@ -76,28 +99,13 @@ def find_tone_mapping(
     group = 2 * (pixel * at.shape[1] + channel) + (rest.plain[at] > 0)
     free = [(group, weight), (shown, weight * level)]
     clusters = [sample.chosen[0][pixel], shown]
-    found: tuple[Power, float, Floats] | None = None
-    wide = [width for width in WIDTHS if width * stack.width >= NARROWEST]
-    for width in (known["width"],) if known else wide:
-        near = surroundings(stack, width)
-        if near is None:
-            return None
-        around = near.at(y, x)
-        one = _fit(-(around[frame, pixel] - around.mean()) * level * weight, value * weight, free, clusters)
-        if found is None or (one.power > 0 and one.explained > found[0].explained):
-            found = one, width, around
-    if found is None:
-        return None
-    (power, error, _), width, around = found
-    if known:
-        return known | {"power": max(known["power"] + power, 0.0)}
-    if power < max(SURE * error, LEAST):
-        return None
-    usual = float(around.mean())
-    if rest.white.size:
-        # Composites are exposed for a backdrop between patterns, half of which is black, and white.
-        usual = (usual + float(around[rest.white].mean())) / 2
-    return {"power": power, "width": width, "usual": usual, "spread": float(around.std())}
+
+    def power(near: Surroundings) -> Power:
+        around = near.at(*sample.places)
+        column = -(around[frame, pixel] - around.mean()) * level * weight
+        return _fit(column, value * weight, free, clusters)
+
+    return power
 
 
 def _fit(

@@ -76,6 +76,19 @@ def test_values_that_see_the_edge_of_the_patterns_hardly_count() -> None:
     assert np.log(found).std() < TRIFLE
 
 
+def test_light_of_the_border_is_told_apart_from_the_veil() -> None:
+    veil = 0.02 * np.random.default_rng(4).random(PROGRAM.count)
+    found = BorderValues(Film(np.ones(PROGRAM.count), veil=veil), PROGRAM).fit(LOOK_UP)  # type: ignore[arg-type]
+    assert found is not None
+    y, _ = found.places
+    assert found.own.shape == found.rest.shape == (PROGRAM.count, y.size)
+    assert not ((y >= 5) & (y < 55)).any()
+    assert found.rest.std() == pytest.approx(
+        0.002 / np.sqrt(3), rel=0.2
+    )  # of three channels, without the bits' part
+    assert found.own.max() > 0.29
+
+
 def test_frames_exposed_half_as_long_and_twice_are_followed() -> None:
     steps = np.array([0.5, 1.0, 2.0])[np.arange(PROGRAM.count) % 3]
     found = BorderValues(Film(steps), PROGRAM).exposures(LOOK_UP)  # type: ignore[arg-type]

@@ -5,6 +5,8 @@ import json
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -21,6 +23,7 @@ from workflows.images.resample import area_mean
 from workflows.images.tone_curves import to_light
 from workflows.ingest.report.findings import Finding
 from workflows.ingest.report.report import report
+from workflows.ingest.trial import steadiness
 from workflows.ingest.trial.steadiness import unit_of
 from workflows.jobs import Task, run
 from workflows.mattes.steps import STEPS
@@ -214,3 +217,29 @@ def test_gains_are_in_units_of_the_white_that_a_free_exposure_is(shortest: float
     attributes = {"auto_exposure": exposures.tolist(), "patterns": list(range(shown.count))}
     assert unit_of(gains, attributes, shown) == unit
     assert unit_of(gains, attributes | {"auto_exposure": None}, shown) == 1
+
+
+@pytest.mark.parametrize(
+    ("border", "exposed", "asked"),
+    [(True, None, True), (True, [1.0, 1.1], True), (True, [1.0, 2.0], False), (False, None, False)],
+)
+def test_border_tells_tone_mapping_if_the_exposure_was_locked(
+    monkeypatch: pytest.MonkeyPatch, border: bool, exposed: list[float] | None, asked: bool
+) -> None:
+    taken: list[Any] = []
+    unexplained = SimpleNamespace(rest=None)
+    values = SimpleNamespace(fit=lambda look_up: "light of the border")
+    monkeypatch.setattr(steadiness, "BorderValues", lambda stack, program: values)
+    monkeypatch.setattr(steadiness, "find_unexplained", lambda *given: unexplained)
+    monkeypatch.setattr(steadiness, "find_tone_mapping", lambda *given: taken.append(given[-1]))
+    attributes = {
+        "border": border,
+        "auto_exposure": exposed,
+        "tone_mapping": None,
+        "monitor_curve": "srgb",
+        "camera_curve": "srgb",
+        "storage": {"black": 0},
+    }
+    stack = SimpleNamespace(attributes=attributes, dtype=np.dtype(np.uint8), frames=2, images=list)
+    steadiness._explain(cast(Stack, stack), preset("sketch", 320, 240), cast(Any, None))
+    assert taken == ["light of the border" if asked else None]

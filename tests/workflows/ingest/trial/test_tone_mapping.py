@@ -12,8 +12,11 @@ from scipy.ndimage import gaussian_filter
 from storage.layout.captures import Stack
 from tests.parts.captures import captured, nested_program
 from workflows.images.tone_curves import to_light
+from workflows.ingest.camera.border_exposure import BorderLight
 from workflows.ingest.local_gain import surroundings
 from workflows.ingest.report.report import report
+from workflows.ingest.trial import tone_mapping
+from workflows.ingest.trial.border_tone_mapping import Power
 from workflows.ingest.trial.tone_mapping import LEAST, find_tone_mapping
 from workflows.ingest.trial.trial_recovery import Sample
 from workflows.ingest.trial.unexplained import Rest
@@ -104,6 +107,26 @@ def test_what_was_corrected_is_added_to() -> None:
     found = find_tone_mapping(*left_by(0.02), known)
     assert found is not None
     assert found == known | {"power": pytest.approx(0.1, rel=0.05)}
+
+
+@pytest.mark.parametrize(("error", "told"), [(0.0001, 0.05), (0.5, 0.1)])
+def test_smaller_error_decides_between_sample_and_border(
+    monkeypatch: pytest.MonkeyPatch, error: float, told: float
+) -> None:
+    monkeypatch.setattr(tone_mapping, "border_power", lambda border, near: Power(0.05, error, 30.0))
+    found = find_tone_mapping(*left_by(0.1), None, cast(BorderLight, "border"))
+    assert found is not None
+    assert found["power"] == pytest.approx(told, rel=0.05)
+
+
+def test_border_tells_alone_where_too_few_pixels_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    stack, rest, sample = left_by(0.1)
+    rest.flat[:] = False
+    assert find_tone_mapping(stack, rest, sample, None) is None
+    monkeypatch.setattr(tone_mapping, "border_power", lambda border, near: Power(0.05, 0.005, 30.0))
+    found = find_tone_mapping(stack, rest, sample, None, cast(BorderLight, "border"))
+    assert found is not None
+    assert found["power"] == 0.05
 
 
 @pytest.mark.slow
