@@ -48,6 +48,8 @@ EXPLAINED = np.array([2.4, 1.5])
 LEFT = 0.4
 """The squared residual may keep this share of its excess over noise. If it keeps more, the frames differ from what is
 predicted in ways that only look like shifts and gains."""
+NOTHING_LEFT = 0.1
+"""An excess of the squared residual over noise that is as good as none."""
 TONE_MAPPING_TURNS = 2
 """Turns in which local tone mapping is found, and corrected: T has explained some of it before it is."""
 MEMORY = 4
@@ -136,9 +138,7 @@ def find_steadiness(stack: Stack) -> None:
         size, error = _sizes(found, last, shown)
         there = (size >= least) & (size >= SURE * error)
         sure = there & (_sizes(left, last, shown)[0] <= REST * size) & _within(found, shown)
-        believed = (last.residual < EXPLAINED) & (
-            last.residual**2 - 1 <= LEFT * max(first.residual**2 - 1, 0.0)
-        )
+        believed = _believed(first.residual, last.residual)
         moves = bool(sure[0] and believed[0])
         # Movement that is not a common shift looks like flicker.
         flickers = bool(sure[1] and believed[1] and has_black and (moves or not there[0]))
@@ -181,6 +181,13 @@ def unit_of(gain: Doubles, attributes: dict[str, Any], program: Program) -> floa
         return 1.0
     white = shortest_white(np.array(exposed), attributes["patterns"], program)
     return 1.0 if white is None else float(gain[white])
+
+
+def _believed(before: float, after: float) -> NDArray[np.bool_]:
+    """Whether shifts and gains are believed, by the residuals before and after they were taken out."""
+    left = max(LEFT * (before**2 - 1), NOTHING_LEFT)
+    believed: NDArray[np.bool_] = (after < EXPLAINED) & (after**2 - 1 <= left)
+    return believed
 
 
 def _explain(stack: Stack, program: Program, sample: Sample) -> tuple[Curve, Patterns, Unexplained] | None:

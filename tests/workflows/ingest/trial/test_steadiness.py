@@ -243,3 +243,18 @@ def test_border_tells_tone_mapping_if_the_exposure_was_locked(
     stack = SimpleNamespace(attributes=attributes, dtype=np.dtype(np.uint8), frames=2, images=list)
     steadiness._explain(cast(Stack, stack), preset("sketch", 320, 240), cast(Any, None))
     assert taken == ["light of the border" if asked else None]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "believed"),
+    [
+        (3.0, 1.2, [True, True]),
+        (4.0, 2.0, [True, False]),  # gains explain more than shifts
+        (1.5, 1.4, [False, False]),  # most is left
+        (1.09, 1.04, [True, True]),  # half is left, but of nothing
+    ],
+)
+def test_corrections_that_explain_the_frames_are_believed(
+    before: float, after: float, believed: list[bool]
+) -> None:
+    assert steadiness._believed(before, after).tolist() == believed
