@@ -20,7 +20,7 @@ from workflows.programs.presets import preset
 from workflows.simulation import glass_ball
 from workflows.simulation.scene import write_capture
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
 FOLDER = Path(__file__).parents[2] / "docker"
 KEY = "a-key-of-the-test"
@@ -29,7 +29,7 @@ KEY = "a-key-of-the-test"
 def run(*command: str, **environment: str) -> str:
     """Run a command and return what it prints; if it fails, the test fails with its output."""
     done = subprocess.run(
-        command, capture_output=True, text=True, timeout=600, env=os.environ | environment, check=False
+        command, capture_output=True, text=True, timeout=1500, env=os.environ | environment, check=False
     )
     assert done.returncode == 0, f"{' '.join(command)}\n{done.stdout}\n{done.stderr}"
     return done.stdout.strip()
