@@ -109,14 +109,14 @@ def test_what_was_corrected_is_added_to() -> None:
     assert found == known | {"power": pytest.approx(0.1, rel=0.05)}
 
 
-@pytest.mark.parametrize(("error", "told"), [(0.0001, 0.05), (0.5, 0.1)])
+@pytest.mark.parametrize(("error", "power"), [(0.0001, 0.05), (0.5, 0.1)])
 def test_smaller_error_decides_between_sample_and_border(
-    monkeypatch: pytest.MonkeyPatch, error: float, told: float
+    monkeypatch: pytest.MonkeyPatch, error: float, power: float
 ) -> None:
     monkeypatch.setattr(tone_mapping, "border_power", lambda border, near: Power(0.05, error, 30.0))
     found = find_tone_mapping(*left_by(0.1), None, cast(BorderLight, "border"))
     assert found is not None
-    assert found["power"] == pytest.approx(told, rel=0.05)
+    assert found["power"] == pytest.approx(power, rel=0.05)
 
 
 def test_border_tells_alone_where_too_few_pixels_do(monkeypatch: pytest.MonkeyPatch) -> None:

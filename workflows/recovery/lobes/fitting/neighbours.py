@@ -23,7 +23,7 @@ from workflows.recovery.lobes.mixture import (
 from workflows.recovery.lobes.options import LobesOptions
 
 MOST_REST = 1.7
-"""Lobes are searched anew where the squared residual is this many times that of the neighbours. Of 128 measurements,
+"""Lobes are searched again where the squared residual is this many times that of the neighbours. Of 128 measurements,
 noise alone makes it 1.4 in one pixel of a hundred."""
 
 # Distance of the pixels that are fitted first, a power of two.

@@ -1,4 +1,4 @@
-"""The fits of pixels, one by one: from the lobes of neighbours, or anew; a second time where much is unexplained."""
+"""The fits of pixels: from the lobes of neighbours, or by a search; a second time where much is unexplained."""
 
 import math
 
@@ -28,6 +28,24 @@ from workflows.recovery.lobes.posterior.mean import update
 # A fit that starts from neighbours ends when a step would lower chi-square by less than this for each parameter. Noise
 # alone makes it 1.
 _LEAST_STEP = 0.3
+
+
+@njit(nogil=True, cache=True, inline="always")
+def keep_better(
+    patterns: PatternCodes,
+    mixture: Mixture,
+    k: int,
+    objective: float,
+    tried: Mixture,
+    new_k: int,
+    new: float,
+) -> tuple[int, float]:
+    """Copy the lobes that were tried to `mixture` if they are better, their penalty counted; return what is kept."""
+    before = objective + penalty(patterns.grids, mixture.level, k)
+    if new + penalty(patterns.grids, tried.level, new_k) >= before:
+        return k, objective
+    copy_mixture(new_k, patterns.groups * len(patterns.strays), tried, mixture)
+    return new_k, new
 
 
 @njit(nogil=True, cache=True, inline="always")
@@ -83,12 +101,8 @@ def refit_from_posterior(
     )
     gather_lobes(patterns.grids, buffers.node, buffers.weight, buffers.end, tried, k, options.fit_resolution)
     new_k, _, new = fit(patterns, y, variance, tried, k, options, workspace)
-    if new + penalty(patterns.grids, tried.level, new_k) >= objective + penalty(
-        patterns.grids, mixture.level, k
-    ):
-        return k, objective
-    copy_mixture(new_k, patterns.groups * len(patterns.strays), tried, mixture)
-    return new_k, new
+    k, objective = keep_better(patterns, mixture, k, objective, tried, new_k, new)
+    return k, objective
 
 
 @njit(nogil=True, cache=True, inline="always")
@@ -105,7 +119,7 @@ def leading_channel(variance: NDArray[np.float32]) -> int:
 
 
 @njit(nogil=True, cache=True, inline="always")
-def search_anew(
+def search_lobes(
     patterns: PatternCodes,
     y: NDArray[np.float32],
     variance: NDArray[np.float32],
@@ -140,7 +154,7 @@ def fit_pixel(
     If `separate`, these are one fit for each channel, that of the most precise channel first. Otherwise they are the
     fit of all channels together, and under coloured patterns then also one for each channel.
 
-    A fit starts from those of the neighbours. Where it leaves more unexplained than theirs, lobes are searched anew,
+    A fit starts from those of the neighbours. Where it leaves more unexplained than theirs, lobes are searched again,
     for all fits but the first starting from the first, and the better fit is kept.
     """
     own = pixels.own.variance[p]
@@ -165,13 +179,9 @@ def fit_pixel(
             )
             first = fits.k[p, lead] if turn >= 0 else np.int64(0)
             copy_mixture(first, np.int64(0), fit_of(fits, p, lead), tried)
-            found, new = search_anew(patterns, y, variance, tried, first, options, buffers, workspace)
-            if k == 0 or new + penalty(patterns.grids, tried.level, found) < objective + penalty(
-                patterns.grids, mixture.level, k
-            ):
-                k, objective = found, new
-                copy_mixture(k, strays, tried, mixture)
-                rest = unexplained(patterns, y, variance, mixture, k, workspace)
+            found, new = search_lobes(patterns, y, variance, tried, first, options, buffers, workspace)
+            k, objective = keep_better(patterns, mixture, k, objective, tried, found, new)
+            rest = unexplained(patterns, y, variance, mixture, k, workspace)
         fits.k[p, c], fits.objective[p, c], fits.rest[p, c] = k, objective, rest
 
 
