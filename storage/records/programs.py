@@ -49,11 +49,17 @@ def delete(connection: Connection, program: str) -> None:
 def set_showing(connection: Connection, program: str, showing: dict[str, Any]) -> None:
     """Store the playback progress of a program, with the current time.
 
+    A page that is left reports the end at once, and an earlier report of the same playback may arrive later: it is
+    ignored.
+
     Raises
     ------
     NotFound
         If there is no such program.
     """
-    find(connection, table, program)
+    last = find(connection, table, program).showing or {}
+    has_ended = last.get("phase") in ("shown", "stopped")
+    if has_ended and showing["playback"] and last.get("playback") == showing["playback"]:
+        return
     record = showing | {"at": time.time()}
     connection.execute(update(table).where(table.c.id == program).values(showing=record))

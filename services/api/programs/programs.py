@@ -78,6 +78,11 @@ class PlaybackState(BaseModel):
     """How far the page that plays a program is."""
 
     model_config = ConfigDict(extra="forbid")
+    playback: str | None = Field(
+        None,
+        max_length=64,
+        description="A name for this playback, for example a UUID: what arrives after its end is ignored.",
+    )
     phase: Literal["countdown", "showing", "shown", "stopped"]
     patterns_per_second: float = Field(ge=0.01, le=120)
     seconds: float = Field(0, ge=0, le=3600, description="Until the first pattern.")
@@ -149,7 +154,9 @@ def _showing(state: dict[str, Any] | None) -> Showing | None:
         return None
     age = max(time.time() - state["at"], 0.0)
     at = datetime.fromtimestamp(state["at"], UTC)
-    return Showing(**{name: state[name] for name in PlaybackState.model_fields}, told_at=at, age_seconds=age)
+    return Showing.model_validate(
+        {name: value for name, value in state.items() if name != "at"} | {"told_at": at, "age_seconds": age}
+    )
 
 
 async def _request(request: Request) -> ProgramRequest:

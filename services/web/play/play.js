@@ -1,6 +1,6 @@
 // Plays a program full screen, and reports its progress to the service for a phone that follows.
 import { LEAD, LEAD_SECONDS, borderOn, draw, schedule } from "./border.js";
-import { authorization } from "../app/lib/api.js";
+import { authorization, newKey } from "../app/lib/api.js";
 import { checks } from "../app/film/checklist.js";
 import { countScreen, knownScreen, onZoom, rememberScreen } from "../app/film/screen.js";
 import { loadWords } from "../app/lib/language.js";
@@ -211,7 +211,8 @@ async function play(program, pictures, rate, isAimed) {
 	const { signal } = stop;
 	const listen = (target, event, listener) => target.addEventListener(event, listener, { signal });
 	const end = (why) => stop.abort(new Error(why));
-	const progress = { phase: "countdown", patterns_per_second: rate, seconds: COUNTDOWN + LEAD_SECONDS.reduce((sum, one) => sum + one) };
+	const progress = { playback: newKey(), phase: "countdown", patterns_per_second: rate, seconds: COUNTDOWN + LEAD_SECONDS.reduce((sum, one) => sum + one) };
+	const reportStop = () => report({ ...progress, phase: "stopped", seconds: 0 });
 	let lock;
 	let reportedAt = -REPORT;
 	$("record").hidden = true;
@@ -221,6 +222,7 @@ async function play(program, pictures, rate, isAimed) {
 		// What stops it is heard from the start: full screen may take a while.
 		listen(document, "keydown", (event) => event.key === "Escape" && end(t("play.stopped")));
 		listen(document, "visibilitychange", () => document.hidden && end(t("play.hidden")));
+		listen(window, "pagehide", reportStop); // what a page sends later, even a microtask later, is sometimes lost
 		// The back button stops the program without leaving the page and what it has loaded.
 		if (!history.state?.showing) history.pushState({ showing: true }, "");
 		listen(window, "popstate", () => end(t("play.stopped")));
@@ -260,7 +262,7 @@ async function play(program, pictures, rate, isAimed) {
 		progress.patterns_per_second = finish(program, border, shown, refresh);
 		report({ ...progress, phase: "shown", shown: program.patterns });
 	} catch (error) {
-		report({ ...progress, phase: "stopped", seconds: 0 });
+		reportStop();
 		setStatus(error.message);
 	} finally {
 		stop.abort();

@@ -43,6 +43,11 @@ def posted(service: Service, **changes: Any) -> dict[str, Any]:
     return found
 
 
+def phase(service: Service, program: dict[str, Any]) -> str | None:
+    showing = service.http.get(f"/v1/programs/{program['id']}").json()["showing"]
+    return showing and str(showing["phase"])
+
+
 def go(tab: Page, service: Service, program: dict[str, Any]) -> str:
     url = f"{service.url}/v1/programs/{program['id']}/play"
     tab.goto(url)
@@ -210,11 +215,16 @@ def test_back_button_stops_and_keeps_loaded_patterns(tab: Page, service: Service
 def test_leaving_the_page_stops_the_program(tab: Page, service: Service) -> None:
     program = posted(service)
     go(tab, service, program)
-    tab.get_by_role("button", name="full screen").click()
-    expect(tab.locator("#stage")).to_be_visible()
+    with tab.expect_request("**/showing") as report:
+        tab.get_by_role("button", name="full screen").click()
+    expect(tab.locator("#countdown")).to_have_text("4")
     tab.goto(f"{service.url}/#/captures")
-    while service.http.get(f"/v1/programs/{program['id']}").json()["showing"]["phase"] != "stopped":
-        tab.wait_for_timeout(100)
+    until(lambda: phase(service, program) == "stopped" or tab.wait_for_timeout(50))
+    countdown = report.value.post_data_json
+    assert countdown["phase"] == "countdown"
+    late = service.http.put(f"/v1/programs/{program['id']}/showing", json=countdown)
+    assert late.status_code == 204
+    assert phase(service, program) == "stopped"
 
 
 def test_program_of_another_size_is_fitted_to_this_screen(tab: Page, service: Service) -> None:

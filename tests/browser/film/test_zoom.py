@@ -10,6 +10,7 @@ from playwright.sync_api import Page, expect, sync_playwright
 
 from tests.browser.conftest import ARGUMENTS, CHROMIUM
 from tests.end_to_end.conftest import Service
+from tests.parts.waiting import until
 
 pytestmark = pytest.mark.slow
 
@@ -85,8 +86,12 @@ def test_program_that_a_zoomed_page_would_resample_is_not_started(zoomed: Page, 
     expect(note).to_contain_text("This page is zoomed to 125 %. Set the zoom to 100 % (Ctrl+0")
     expect(note).to_contain_text("made for a screen of 800 x 450 pixels; this screen has 640 x 360")
     expect(stage).to_be_hidden()
-    while (service.http.get(f"/v1/programs/{program}").json()["showing"] or {}).get("phase") != "stopped":
-        zoomed.wait_for_timeout(100)
+    until(
+        lambda: (
+            (service.http.get(f"/v1/programs/{program}").json()["showing"] or {}).get("phase") == "stopped"
+            or zoomed.wait_for_timeout(50)
+        )
+    )
     start.click()  # the note has been shown: a second start plays
     expect(stage).to_be_visible()
     zoomed.keyboard.press("Escape")
