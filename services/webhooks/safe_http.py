@@ -126,7 +126,7 @@ def post(
     deadline = time.monotonic() + seconds
     connection = (http.client.HTTPSConnection if secure else http.client.HTTPConnection)(host, parts.port)
     sock = _connect(addresses, connection.port, deadline)
-    timed_out = threading.Event()
+    timed_out, late = threading.Event(), TimeoutError(f"no complete answer within {seconds:g} s")
 
     def abort() -> None:  # the socket's own timeout starts again with every byte that comes
         timed_out.set()
@@ -145,13 +145,17 @@ def post(
         target = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
         connection.request("POST", target, body, {**headers, "Connection": "close"})
         status = connection.getresponse().status
-        if timed_out.is_set():
-            raise TimeoutError(f"no complete answer within {seconds:g} s")
-        return status
+    except (OSError, http.client.HTTPException) as error:
+        if timed_out.is_set():  # what else goes wrong then follows from that
+            raise late from error
+        raise
     finally:
         timer.cancel()
         connection.close()
         sock.close()
+    if timed_out.is_set():
+        raise late
+    return status
 
 
 def _split(url: str) -> SplitResult:
