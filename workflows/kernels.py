@@ -32,7 +32,6 @@ from workflows.composite.depth import from_two, places_of
 from workflows.composite.live.encode import encode_live
 from workflows.composite.placement import Placement
 from workflows.composite.quantise import encode
-from workflows.composite.threads import CORES
 from workflows.images import integer_formats
 from workflows.images.decode import decode
 from workflows.images.tone_curves import from_light
@@ -45,6 +44,7 @@ from workflows.programs.pyramid_light import lay_out
 from workflows.recovery.glare import WIDTHS, add_glare, filter_patterns, spread_patterns
 from workflows.simulation.glass_ball import backdrop, glass_ball
 from workflows.simulation.scene import write_capture
+from workflows.threads import CORES
 from workflows.untrusted.limits import Limits
 
 WIDTH, HEIGHT = 16, 12

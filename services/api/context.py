@@ -23,7 +23,7 @@ from storage.database.owners import for_owner
 from storage.errors import Corrupt, Unavailable
 from storage.objects.store import Objects
 from workflows.composite.cache import Cache
-from workflows.composite.threads import CORES
+from workflows.threads import CORES
 
 T = TypeVar("T")
 R = TypeVar("R")

@@ -130,6 +130,9 @@ class Recovery(JobKind):
             raise Conflict(f"capture {capture.id} could not be ingested: {capture.problem['detail']}")
         return bool(capture.state == "ready")
 
+    def prepared(self, connection: Connection, task: Task, plan: dict[str, Any]) -> None:
+        mattes.change(connection, task.matte, figures=plan.get("figures"))
+
     def succeeded(self, connection: Connection, task: Task, figures: dict[str, Any]) -> None:
         mattes.change(connection, task.matte, state="ready", figures=figures)
 

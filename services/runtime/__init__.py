@@ -13,13 +13,13 @@ services.runtime.tracing._tracer                   1      the tracer, if traces 
 storage.objects.store._loop                        1      the event loop that reads and writes arrays, and its thread
 storage.objects.zarr_store.array_metadata          1 each the zarr metadata of a dtype
 workflows.composite.quantise._edges                1 each the codes of a transfer and a dtype: 0.4 MB or less
-workflows.composite.threads._pool                  1      the threads that composite
 workflows.mattes.imports.reader._document_of_group 1      the zarr.json of a group
 workflows.mattes.imports.reader._document_of_one   1 each the zarr.json of an array of a dtype
 workflows.mattes.tiles.gain_of                     1      the local tone mapping of the last capture recovered
 workflows.mattes.tiles.patterns_of                 1      the patterns of the last capture recovered by lobes
 workflows.mattes.tiles.program_of                  2      the program and the monitor curve of a capture
 workflows.mattes.tiles.sensing_of                  1      the sensing matrices of the last capture recovered by NN-DGSR
+workflows.threads._pool                            1      the threads of composites and previews
 workflows.untrusted.decoder_process._signs         1      in a decoder, when it last gave a sign of life
 ================================================== ====== =============================================================
 

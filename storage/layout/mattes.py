@@ -74,6 +74,11 @@ def path(matte: str) -> str:
     return f"mattes/{matte}"
 
 
+def preview_of(matte: str) -> str:
+    """Name in the store of a matte's preview, a coarse matte that is there until the matte itself is complete."""
+    return f"{matte}/preview"
+
+
 class Matte:
     """A matte in the store.
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from workflows.composite.threads import in_parts
 from workflows.interruption import checkpoint, interruptible
+from workflows.threads import in_parts
 
 
 def test_nothing_is_checked_unless_somebody_asks() -> None:

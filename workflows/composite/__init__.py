@@ -12,7 +12,7 @@ from workflows.composite.depth import Rays
 from workflows.composite.engine import Window, compose
 from workflows.composite.placement import Placement
 from workflows.composite.strips import Strip, read_strip
-from workflows.composite.threads import CORES
+from workflows.threads import CORES
 
 
 def composite(

@@ -9,12 +9,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from workflows.composite.placement import Placement, place
-from workflows.composite.threads import in_parts
 from workflows.images.decode import Transfer
 from workflows.images.float_formats import Floats
 from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import table
 from workflows.recovery.pyramid import Pyramid
+from workflows.threads import in_parts
 
 ROWS = 64
 """Rows of cells that a thread computes at a time."""

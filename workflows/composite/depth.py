@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from storage.errors import Conflict
 from storage.layout.mattes import Matte
-from workflows.composite.threads import in_parts
 from workflows.interruption import checkpoint
 from workflows.mattes.lobes import block_lobes
 from workflows.recovery.pyramid import Grids
+from workflows.threads import in_parts
 
 LOBES = 3
 """Lobes of a pixel that are fitted; the heaviest is used."""

@@ -13,10 +13,10 @@ from storage.layout.mattes import Matte
 from workflows.composite.depth import Rays, arrived_along
 from workflows.composite.gather import gather
 from workflows.composite.strips import LENGTH, Strip
-from workflows.composite.threads import in_parts
 from workflows.images.resample import area_mean
 from workflows.interruption import checkpoint
 from workflows.recovery.pyramid import Grids, Pyramid
+from workflows.threads import in_parts
 
 SHRUNK_AT_ONCE = 64
 """Rows or columns."""

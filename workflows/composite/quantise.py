@@ -7,9 +7,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from workflows.composite.threads import in_parts
 from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import to_light
+from workflows.threads import in_parts
 
 STEPS = 1 << 14
 """Entries of the look-up table that gives a code close to the right one."""

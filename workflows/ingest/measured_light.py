@@ -81,7 +81,7 @@ def read_light(
     ----------
     stack : Stack
     span : (slice, slice)
-        Rows and columns.
+        Rows and columns; they may have a step if frames are not shifted.
     program : Program
     gain : Surroundings or None
         As from `workflows.ingest.local_gain.local_gain`.
@@ -121,8 +121,16 @@ def read_light(
             return flatten(values[recovered], frame), whole[recovered]
 
         frame_of = in_place
-    y, x = (at + (given.start or 0) for at, given in zip(np.nonzero(recovered), span, strict=True))
+    y, x = places_in(span, recovered).T
     return light_of(frame_of, attributes, program, int(recovered.sum())), recovered
+
+
+def places_in(span: tuple[slice, slice], recovered: Bools) -> NDArray[np.intp]:
+    """Rows and columns in the frame of the recovered pixels of a rectangle, (n, 2)."""
+    first = [part.start or 0 for part in span]
+    step = [part.step or 1 for part in span]
+    places: NDArray[np.intp] = np.argwhere(recovered) * step + first
+    return places
 
 
 def light_of(frame_of: FrameOf, attributes: dict[str, Any], program: Program, pixels: int) -> Light:

@@ -8,17 +8,18 @@ from storage.layout.captures import Stack
 from storage.layout.mattes import Matte
 from storage.objects.store import Objects
 from workflows.jobs import Steps, Task
-from workflows.mattes import tiles
+from workflows.mattes import preview, tiles
 from workflows.mattes.options import parse_options
 
 
 def prepare(objects: Objects, task: Task) -> dict[str, Any]:
-    """Create the empty matte of a capture.
+    """Create the empty matte of a capture, and recover its preview if it has one.
 
     Returns
     -------
     dict
-        ``tiles``: how many there are.
+        ``tiles``: how many there are. ``figures``: of the matte, with ``preview``, of how many of its rows and columns
+        the preview has one, or None.
     """
     stack = Stack(objects, task.capture)
     program, _ = tiles.program_of(objects, task.capture)
@@ -36,7 +37,13 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
         # Without the size of tiles, which changes nothing in the matte.
         options=options.model_dump(mode="json", exclude={"tile"}),
     )
-    return {"tiles": len(tiles.cut(matte, options.tile or matte.block))}
+    spacing = preview.spacing_of(stack)
+    if spacing is not None:
+        preview.recover_preview(objects, task.capture, matte, task.matte, spacing)
+    return {
+        "tiles": len(tiles.cut(matte, options.tile or matte.block)),
+        "figures": matte.figures | {"preview": spacing},
+    }
 
 
 def work(objects: Objects, task: Task, tile: int) -> int:
@@ -57,7 +64,8 @@ def missing(objects: Objects, task: Task) -> list[int]:
 
 
 def finish(objects: Objects, task: Task) -> dict[str, Any]:
-    """Remove what interrupted workers left beside the matte, and return its figures."""
+    """Remove the preview, and what interrupted workers left beside the matte; returns its figures."""
+    objects.delete(mattes.path(mattes.preview_of(task.matte)))
     objects.sweep(mattes.path(task.matte))
     return Matte(objects, task.matte).figures
 

@@ -13,7 +13,7 @@ from storage.layout.mattes import Block, Matte
 from storage.objects.store import Objects
 from workflows.images.tone_curves import Curve, to_light
 from workflows.ingest.local_gain import Surroundings, local_gain
-from workflows.ingest.measured_light import conditions_of, constants_of, read_light
+from workflows.ingest.measured_light import conditions_of, constants_of, places_in, read_light
 from workflows.mattes.options import RecoveryOptions
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out, pyramid_of
@@ -75,15 +75,22 @@ def recover_tile(objects: Objects, capture: str, matte: str, options: RecoveryOp
     rows, columns = cut(target, options.tile or target.block)[index]
     pixels = 0
     for row, column in product(rows, columns):
-        block = _recover_block(objects, stack, capture, target.span(row, column), options)
+        block = recover_block(objects, stack, capture, target.span(row, column), options)
         target.write(row, column, block)
         pixels += int(block.recovered.sum())
     return pixels
 
 
-def _recover_block(
+def recover_block(
     objects: Objects, stack: Stack, capture: str, span: tuple[slice, slice], options: RecoveryOptions
 ) -> Block:
+    """Recover a block of a matte.
+
+    Parameters
+    ----------
+    span : (slice, slice)
+        Rows and columns of the frame; they may have a step if frames are not shifted.
+    """
     program, monitor = program_of(objects, capture)
     attributes = stack.attributes
     noise = Noise(**attributes["noise"])
@@ -96,7 +103,7 @@ def _recover_block(
     shown = program.measured
     measurements = np.ascontiguousarray(light[:, shown])
     given = (noise, usable[:, shown], worth[:, shown])
-    places = np.argwhere(recovered) + [part.start for part in span]
+    places = places_in(span, recovered)
     method, conditions = options.of_method, conditions_of(stack, program)
     patterns = patterns_of(objects, capture)
     if isinstance(method, DgsrOptions):

@@ -30,7 +30,6 @@ from storage.objects.store import Objects
 from storage.steps import FINISH, PREPARE
 from workflows.composite import composite
 from workflows.composite.live.encode import encode_live
-from workflows.composite.threads import CORES
 from workflows.images.resample import area_mean
 from workflows.images.tone_curves import from_light
 from workflows.ingest.steps import STEPS as INGEST
@@ -43,6 +42,7 @@ from workflows.simulation.glass_ball import backdrop
 from workflows.simulation.scene import Scene, write_capture
 from workflows.simulation.solids import Solid
 from workflows.simulation.tracer import trace
+from workflows.threads import CORES
 from workflows.untrusted.limits import Limits
 
 SIZE = 640, 480

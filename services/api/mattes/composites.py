@@ -3,8 +3,7 @@
 import hashlib
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from itertools import product
+from functools import partial
 from typing import IO, Annotated, TypeVar
 
 import anyio.to_thread
@@ -21,22 +20,20 @@ from services.api.http.responses import bytes_response, etag_matches
 from services.api.jobs.jobs import Job
 from services.api.mattes import clips
 from services.api.mattes.composite_params import CompositeParams
+from services.api.mattes.progress import Progress, progress_of, while_there
 from services.runtime.problems import NotAcceptable, NotNeeded, problem_of
-from storage.database.engine import reading
 from storage.errors import Conflict, OptionError
 from storage.records import mattes
-from storage.records import tiles as tile_records
 from workflows.composite import composite
 from workflows.composite.around import put_around
 from workflows.composite.backdrop import Backdrop, backdrop_of
 from workflows.composite.depth import Rays, from_one, from_two
 from workflows.composite.engine import Window, shrink
+from workflows.composite.preview import enlarge, put_behind, window_of_preview
 from workflows.composite.quantise import encode
 from workflows.composite.strips import Strip
-from workflows.composite.threads import CORES
 from workflows.images import float_formats, integer_formats
-from workflows.mattes.options import parse_options
-from workflows.mattes.tiles import cut
+from workflows.threads import CORES
 
 router = APIRouter(tags=["mattes"])
 R = TypeVar("R")
@@ -59,6 +56,8 @@ PICTURE_BYTES = 16
 """Of a pixel while it is composited: light and alpha."""
 SHRUNK_BYTES = 32
 """Of a pixel while a picture is made smaller, and of the answer."""
+ENLARGED_BYTES = 50
+"""Of a pixel while a preview is enlarged: the light and alpha of its neighbours, and their mean."""
 LIGHT_BYTES = 16
 """Of a cell of the monitor: the light of three channels, with the coarser grids."""
 AROUND_BYTES = 48
@@ -95,8 +94,9 @@ async def post_composite(
 
     A PNG has as many bits as the backdrop, 8 or 16, and 16 for a float backdrop. Pixels that were not recovered are
     transparent in a PNG and black in a JPEG. An EXR holds linear light, with values that may be negative or above 1.
-    If the matte is still being recovered, the composite shows the blocks that are done, and `Envmatte-Recovered` is
-    their share. A composite that the caller already has, by `If-None-Match`, is not computed again; the answer is 412.
+    If the matte is still being recovered, the composite shows the blocks that are done, elsewhere the preview if there
+    is one, and `Envmatte-Recovered` is the share of the blocks. A composite that the caller already has, by
+    `If-None-Match`, is not computed again; the answer is 412.
 
     If the body is a video, `Content-Type: video/*`, the answer is 202 and the job that composites its frames.
     """
@@ -108,70 +108,46 @@ async def post_composite(
     media_type = preferred(accept, ANSWERS)
     if media_type is None:
         raise NotAcceptable(f"composites are answered as {', '.join(ANSWERS)}, not as {accept}")
-    state = await anyio.to_thread.run_sync(_matte_state, context, id)
+    progress = await anyio.to_thread.run_sync(progress_of, context, id)
     limit = context.settings.backdrop_bytes
     announced = BodyLimit(limit).check_announced(request) or limit
     turn = context.backdrops.take(context.caller.owner, context.settings.request_seconds, announced)
     async with turn, spool_body(request, limit) as body:
 
         def answer() -> Response:
-            with context.stored(mattes.get, id):
-                return _answer(context, state, body, media_type, params, request.headers)
+            return while_there(
+                context,
+                progress,
+                lambda now: _answer(context, now, body, media_type, params, request.headers),
+            )
 
-        memory = await anyio.to_thread.run_sync(_bytes_of_composite, context, state, params, media_type)
+        memory = await anyio.to_thread.run_sync(_bytes_of_composite, context, progress, params, media_type)
         return await context.compute(request, context.composites, answer, memory=memory)
 
 
-@dataclass(frozen=True)
-class MatteState:
-    """How much of a matte is recovered.
-
-    Attributes
-    ----------
-    blocks : set of (int, int), optional
-        Rows and columns of the recovered blocks; None if all are.
-    share : float
-        Of all blocks, from 0 to 1.
-    """
-
-    id: str
-    blocks: frozenset[tuple[int, int]] | None = None
-    share: float = 1.0
-
-
-def _matte_state(context: Context, id: str) -> MatteState:
-    with context.stored(mattes.get, id) as row:
-        if row.state == "ready":
-            return MatteState(id)
-        with reading(context.engine) as c:
-            done = tile_records.done(c, row.job) if row.state == "recovering" else []
-        if not done:
-            raise Conflict(f"matte {id} is {row.state}, and nothing of it is there yet; see job {row.job}")
-        matte = context.cache.matte(id)
-        tiles = cut(matte, parse_options(row.options).tile or matte.block)
-        blocks = frozenset(block for tile in done for block in product(*tiles[tile]))
-        return MatteState(id, blocks, len(blocks) / (matte.block_rows * matte.block_columns))
-
-
-def _bytes_of_composite(context: Context, state: MatteState, params: CompositeParams, media_type: str) -> int:
+def _bytes_of_composite(
+    context: Context, progress: Progress, params: CompositeParams, media_type: str
+) -> int:
     """Bytes that a composite takes at most, apart from the strips of the matte and from backdrops.
 
     The bound of these is ENVMATTE_BACKDROP_BYTES times the composites at once: if they counted at their most here,
     composites of one owner would wait for one another.
     """
-    with context.stored(mattes.get, state.id):
-        matte = context.cache.matte(state.id)
+    with context.stored(mattes.get, progress.id):
+        matte = context.cache.matte(progress.id)
     window = Window.of(matte, params.x, params.y, params.width, params.height)
     of_pixel = PICTURE_BYTES + (SHRUNK_BYTES if params.size is not None else ANSWER_BYTES[media_type])
     of_rays = RAYS_BYTES * matte.width * matte.height if params.depth is not None else 0
     of_frame = AROUND_BYTES * matte.width * matte.height if params.around == "backdrop" else 0
+    if progress.preview is not None:
+        of_pixel += ENLARGED_BYTES
     of_window = of_pixel * window.width * window.height
     return LIGHT_BYTES * matte.columns * matte.rows + of_window + of_rays + of_frame
 
 
 def _answer(
     context: Context,
-    state: MatteState,
+    progress: Progress,
     body: IO[bytes],
     media_type: str,
     params: CompositeParams,
@@ -185,28 +161,34 @@ def _answer(
         times.append(f"{name};dur={(time.perf_counter() - start) * 1e3:.1f}")
         return result
 
+    body.seek(0)
     digest = hashlib.blake2b(body.read()).digest()
-    inputs = f"{state.id} {sorted(state.blocks or ())} {media_type} {params.model_dump_json()} ".encode()
+    inputs = (
+        f"{progress.id} {sorted(progress.blocks or ())} {media_type} {params.model_dump_json()} ".encode()
+    )
     tag = f'"{hashlib.blake2b(inputs + digest, digest_size=16).hexdigest()}"'
-    extra = {"ETag": tag, "Envmatte-Recovered": f"{state.share:.4f}"}
+    extra = {"ETag": tag} | progress.headers
     if etag_matches(headers, tag):
         return answer_problem(
             problem_of(NotNeeded(f"the caller already has this composite: {tag}")), {"ETag": tag}
         )
-    matte = timed("open", lambda: context.cache.matte(state.id))
+    matte = timed("open", lambda: context.cache.matte(progress.id))
     window = Window.of(matte, params.x, params.y, params.width, params.height)
     body.seek(0)
     pixels = timed("decode", lambda: context.decoders.decode(body.read(), params.transfer))
     backdrop = backdrop_of(pixels, params.transfer)
 
     def read(row: int, number: int) -> Strip:
-        return context.cache.strip(state.id, row, number, state.blocks)
+        return context.cache.strip(progress.id, row, number, progress.blocks)
 
-    rays = timed("rays", lambda: _rays(context, state, params)) if params.depth is not None else None
+    rays = timed("rays", lambda: _rays(context, progress, params)) if params.depth is not None else None
     picture = timed(
         "composite",
         lambda: composite(matte, backdrop, placement=params.placement, rays=rays, window=window, read=read),
     )
+    if progress.preview is not None:
+        spacing = progress.preview
+        timed("preview", lambda: _add_preview(context, progress, spacing, picture, backdrop, window, params))
     if params.around == "backdrop":
         wide, high = matte.attributes["monitor"]
         frame = matte.width, matte.height
@@ -220,17 +202,38 @@ def _answer(
     return bytes_response(answer, media_type, extra | {"Server-Timing": ", ".join(times)})
 
 
-def _rays(context: Context, state: MatteState, params: CompositeParams) -> Rays:
+def _add_preview(
+    context: Context,
+    progress: Progress,
+    spacing: int,
+    picture: NDArray[np.float32],
+    backdrop: Backdrop,
+    window: Window,
+    params: CompositeParams,
+) -> None:
+    """Show the preview in a picture of a window where blocks of the matte are not done."""
+    assert progress.blocks is not None  # else there is no preview
+    name = progress.whole_frame
+    preview = context.cache.matte(name)
+    size = preview.width, preview.height
+    part = window_of_preview(window, spacing, *size)
+    read = partial(context.cache.strip, name)
+    small = composite(preview, backdrop, placement=params.placement, window=part, read=read)
+    block = context.cache.matte(progress.id).block
+    put_behind(picture, enlarge(small, part, window, spacing, *size), window, progress.blocks, block)
+
+
+def _rays(context: Context, progress: Progress, params: CompositeParams) -> Rays:
     """The rays to a backdrop at another depth."""
-    if state.blocks is not None:
+    if progress.blocks is not None:
         raise Conflict(
-            f"matte {state.id} is still being recovered; a backdrop at another depth needs all of it"
+            f"matte {progress.id} is still being recovered; a backdrop at another depth needs all of it"
         )
     assert params.depth is not None  # `CompositeParams` checks it, and the two below
     assert params.distance is not None
-    places = context.cache.places(state.id, CORES)
+    places = context.cache.places(progress.id, CORES)
     if params.camera is not None:
-        wide, high = context.cache.matte(state.id).attributes["monitor"]
+        wide, high = context.cache.matte(progress.id).attributes["monitor"]
         return from_one(places, high / wide, params.distance, params.camera, params.depth)
     assert params.other is not None
     assert params.other_distance is not None
@@ -238,7 +241,7 @@ def _rays(context: Context, state: MatteState, params: CompositeParams) -> Rays:
         others = context.cache.places(params.other, CORES)
     if others.shape != places.shape:
         raise OptionError(
-            f"matte {params.other} has {others.shape[1]} x {others.shape[0]} pixels, {state.id} {places.shape[1]} x "
+            f"matte {params.other} has {others.shape[1]} x {others.shape[0]} pixels, {progress.id} {places.shape[1]} x "
             f"{places.shape[0]}: both must be from the same camera in the same place",
             field="other",
         )

@@ -13,6 +13,7 @@ from pydantic_core import to_json
 from services.api.context import Context, OwnerContext
 from services.api.http.responses import bytes_response, etag_matches, file_response
 from services.api.http.types import Colour, Pair
+from services.api.mattes.progress import Progress, open_whole_frame, while_there
 from storage.errors import InvalidInput, NotFound
 from storage.layout import mattes as stored_mattes
 from storage.records import mattes
@@ -96,14 +97,21 @@ async def get_layer(
     context: OwnerContext, id: str, file: str, request: Request, lobes: Lobes = layers.LOBES
 ) -> Response:
     """A layer: `S`, `rho`, `alpha` or `confidence`, as `.png` (16 bits, linear, clipped to 0 to 1) or `.exr`;
-    `stmap.exr`; or `all.exr`, all layers with the lobes of each pixel."""
+    `stmap.exr`; or `all.exr`, all layers with the lobes of each pixel.
+
+    If the matte is still being recovered, they are those of its preview, which is smaller.
+    """
     if file not in FILES and file != ALL:
         raise NotFound(f"there is no layer {file}; the layers are {', '.join([*FILES, ALL])}")
 
-    matte = await anyio.to_thread.run_sync(_open, context, id)
-    tag = {"ETag": f'"{id}-{file}-{lobes}"'}  # a matte never changes once it is ready
-    if etag_matches(request.headers, tag["ETag"]):
-        return Response(status_code=304, headers=tag)
+    def headers_of(progress: Progress) -> dict[str, str]:
+        # Neither a matte that is ready nor a preview ever changes.
+        return progress.headers | {"ETag": f'"{progress.whole_frame}-{file}-{lobes}"'}
+
+    progress, matte = await anyio.to_thread.run_sync(open_whole_frame, context, id)
+    headers = headers_of(progress)
+    if etag_matches(request.headers, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
     size = layers.bytes_of_everything(matte.width, matte.height, lobes)
     if file == ALL and size > MOST_BYTES:
         raise InvalidInput(
@@ -115,12 +123,13 @@ async def get_layer(
     kind = file.rpartition(".")[2]
     write = partial(layers.everything, lobes=lobes) if file == ALL else FILES[file]
 
-    def encode() -> Response:
-        with context.stored(mattes.get_ready, id):
-            return file_response(partial(write, matte), MEDIA_TYPES[kind], tag)
+    def encode(now: Progress) -> Response:
+        found = context.cache.matte(now.whole_frame)
+        return file_response(partial(write, found), MEDIA_TYPES[kind], headers_of(now))
 
+    work = partial(while_there, context, progress, encode)
     memory = LOOK_BYTES + layers.bytes_of_band(matte, lobes)
-    return await context.compute(request, context.layers, encode, memory=memory)
+    return await context.compute(request, context.layers, work, memory=memory)
 
 
 @router.get("/mattes/{id}/transport", response_model=Transport)
@@ -213,8 +222,3 @@ def _describe(pixel: Pixel, cells: int, skip: int) -> dict[str, Any]:
             for u, v, r, g, b, sigma_u, sigma_v, theta in pixel.lobes.tolist()
         ],
     }
-
-
-def _open(context: Context, id: str) -> stored_mattes.Matte:
-    with context.stored(mattes.get_ready, id):
-        return context.cache.matte(id)

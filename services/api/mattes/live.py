@@ -1,6 +1,7 @@
 """Mattes for graphics hardware over HTTP: for the web app, and as a page that draws the glass without a service."""
 
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import anyio.to_thread
@@ -10,13 +11,14 @@ from sqlalchemy import Row
 from services.api.context import Context, OwnerContext
 from services.api.http.responses import bytes_response, etag_matches
 from services.api.mattes.live_page import make_page
+from services.api.mattes.progress import Progress, open_whole_frame, while_there
 from storage.database.engine import reading
 from storage.errors import NoRoom, NotFound
 from storage.layout import live as stored_live
 from storage.layout.mattes import Matte
 from storage.records import captures, mattes
 from workflows.composite.live import encode
-from workflows.composite.threads import CORES
+from workflows.threads import CORES
 
 router = APIRouter(tags=["mattes"])
 BLOCK_BYTES = 16 << 20
@@ -33,18 +35,24 @@ BLOCK_BYTES = 16 << 20
 async def get_live(context: OwnerContext, id: str, request: Request) -> Response:
     """The matte for a graphics card: a few look-ups per pixel in mip-mapped textures, with S, rho and alpha.
 
-    It is computed for the first request and kept in the store.
+    It is computed for the first request and kept in the store. If the matte is still being recovered, it is that of its
+    preview, and `Envmatte-Recovered` is the share of the matte that is recovered.
     """
 
-    def load() -> Response:
-        encoded = _encoded(context, id, matte)
-        return bytes_response(encoded, "application/octet-stream", tag | {"Content-Encoding": "gzip"})
+    def load(now: Progress) -> Response:
+        if now.blocks is None:
+            encoded = _encoded(context, id, context.cache.matte(id))
+        else:
+            encoded = encode.encode_live(context.cache.matte(now.whole_frame), CORES)
+        headers = _headers(now) | {"Content-Encoding": "gzip"}
+        return bytes_response(encoded, "application/octet-stream", headers)
 
-    _, matte = await anyio.to_thread.run_sync(_open, context, id)
-    tag = {"ETag": f'"{id}-{encode.FORMAT}"'}  # a matte never changes once it is ready
-    if etag_matches(request.headers, tag["ETag"]):
-        return Response(status_code=304, headers=tag)
-    return await context.compute(request, context.layers, load, memory=_bytes_of(matte))
+    progress, matte = await anyio.to_thread.run_sync(open_whole_frame, context, id)
+    headers = _headers(progress)
+    if etag_matches(request.headers, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    work = partial(while_there, context, progress, load)
+    return await context.compute(request, context.layers, work, memory=_bytes_of(matte))
 
 
 @router.get(
@@ -74,6 +82,11 @@ async def live_page(context: Context, id: str, request: Request, headers: dict[s
 
     row, matte = await anyio.to_thread.run_sync(_open, context, id)
     return await context.compute(request, context.layers, load, memory=_bytes_of(matte))
+
+
+def _headers(progress: Progress) -> dict[str, str]:
+    # Neither a matte that is ready nor a preview ever changes.
+    return progress.headers | {"ETag": f'"{progress.whole_frame}-{encode.FORMAT}"'}
 
 
 def _open(context: Context, id: str) -> tuple[Row[Any], Matte]:

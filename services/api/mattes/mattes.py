@@ -4,7 +4,7 @@ from datetime import UTC, datetime
 from typing import Any, Literal
 
 from fastapi import APIRouter, Request, Response
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 from sqlalchemy import Connection, Row
 
 from services.api.context import OwnerContext
@@ -35,12 +35,19 @@ class Matte(BaseModel):
     monitor: Pair | None = None
     columns: int | None = None
     rows: int | None = None
+    preview: int | None = Field(
+        None,
+        description="While it is recovered: composites show every so many-th row and column of what is not done yet, "
+        "and `live` and `layers` have these only. Null if there is no preview.",
+    )
     created_at: datetime
     expires_at: datetime | None
 
     @classmethod
     def of(cls, row: Row[Any]) -> "Matte":
         figures = {name: value for name, value in (row.figures or {}).items() if name in cls.model_fields}
+        if row.state != "recovering":
+            figures.pop("preview", None)
         return cls(
             **{name: getattr(row, name) for name in ("id", "name", "state", "capture", "job", "options")},
             **figures,

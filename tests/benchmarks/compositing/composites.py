@@ -33,12 +33,12 @@ from workflows.composite.backdrop import node_light
 from workflows.composite.cache import Cache
 from workflows.composite.engine import Window, compose
 from workflows.composite.strips import LENGTH
-from workflows.composite.threads import CORES
 from workflows.images import integer_formats
 from workflows.images.tone_curves import table
 from workflows.programs.presets import preset
 from workflows.simulation import glass_ball
 from workflows.simulation.scene import write_capture
+from workflows.threads import CORES
 
 
 def main() -> None:

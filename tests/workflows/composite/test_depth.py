@@ -10,10 +10,10 @@ from storage.objects.store import Objects
 from workflows.composite import composite
 from workflows.composite.depth import MIN_DIRECT, Rays, from_one, from_two, places_of
 from workflows.composite.engine import Window
-from workflows.composite.threads import CORES
 from workflows.images.resample import area_mean
 from workflows.simulation import glass_ball
 from workflows.simulation.scene import Scene
+from workflows.threads import CORES
 
 WIDTH, HEIGHT = 96, 72
 COLUMNS, ROWS = 320, 240

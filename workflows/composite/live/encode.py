@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 
 from storage.layout.mattes import Matte
 from workflows.composite.live.lookups import FIELDS, fit_lookups
-from workflows.composite.threads import in_parts
 from workflows.recovery.pyramid import Pyramid
+from workflows.threads import in_parts
 
 FORMAT = "live-1"
 """To be changed whenever the encoded bytes change."""

@@ -18,7 +18,7 @@ const RAW = ".dng,.nef,.cr2,.cr3,.arw,.raf,.orf,.rw2"; // the usual names of cam
 // Browsers know no type of MKV, and give MTS that of something else.
 const isVideo = (file) => file.type.startsWith("video/") || /\.(mp4|mov|mkv|webm|avi|mts|m2ts)$/i.test(file.name);
 
-// `others` are mattes to compare with, by a name.
+// The section, and its stage. `others` are mattes to compare with, by a name.
 export function compositing(matte, others, signal) {
 	const given = Object.fromEntries(new URLSearchParams(location.hash.split("?")[1]));
 	const placed = placement(() => stage.moved(), given);
@@ -76,7 +76,7 @@ export function compositing(matte, others, signal) {
 		folded(t("compare"), comparison(stage, matte, others)), folded(t("take"), taken.element), video.element, stage.renderer);
 	const section = h("section.composite", { "aria-label": t("compositing") }, stage.element, leave, sheet);
 	section.addEventListener("fullscreenchange", () => filled(document.fullscreenElement));
-	return section;
+	return { section, stage };
 }
 
 // What can be a backdrop: a built-in one, the camera, or a file that is dropped, pasted or chosen. Of several files `all`

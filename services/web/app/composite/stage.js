@@ -29,7 +29,7 @@ export class Stage extends LiveGlass {
 			"aria-label": t("stage.how"),
 		}, this.#image, this.canvas, this.problem);
 		this.element.style.setProperty("--aspect", width / height);
-		this.#fetch();
+		this.fetch();
 	}
 
 	fail = (error) => this.signal.aborted || this.problem.replaceChildren(problemBox(error));
@@ -150,8 +150,13 @@ export class Stage extends LiveGlass {
 		if (this.status.textContent !== text) this.status.textContent = text;
 	}
 
-	// Loads what this browser needs to draw the glass itself, if it can.
-	async #fetch() {
+	// Shows what was recovered since the last picture, unless something moves.
+	renew() {
+		if (this.isExact) this.#composite(true);
+	}
+
+	// Loads what this browser needs to draw the glass itself, if it can; again once all of it is recovered.
+	async fetch() {
 		const say = (text) => (this.renderer.textContent = text);
 		if (!this.gl) return say(t("stage.nogl"));
 		try {
@@ -160,8 +165,10 @@ export class Stage extends LiveGlass {
 				if (this.gl) say(t("stage.toolarge"));
 				return;
 			}
-			say(t(found.step > 1 ? "stage.some" : "stage.all", { n: found.step ** 2 }));
-			if (!this.backdrop || this.isExact) return;
+			const step = found.step * (this.#matte.preview ?? 1);
+			say(t(step > 1 ? "stage.some" : "stage.all", { n: step ** 2 }));
+			if (!this.backdrop) return;
+			if (this.isExact) return this.renew();
 			if (this.playing) return this.moved();
 			// Something was moved meanwhile: the exact picture is on its way.
 			this.#describe(t(this.isLive ? "stage.live" : "stage.preview"));

@@ -52,15 +52,25 @@ export async function job(main, signal, id) {
 		}),
 		links, h("div", { class: preview ? "columns" : "stack" }, preview?.panel, h("div.stack", panel, asked)),
 	);
+	let hasPreview = false; // the matte, from some moment of its recovery on
+	let looked;
 	watch(found);
+
+	async function lookForPreview(now) {
+		hasPreview = Boolean((await getJson(`v1/mattes/${now.matte}`, signal)).preview);
+		if (hasPreview) update(now);
+	}
 
 	function update(now) {
 		cancel.hidden = !ACTIVE.includes(now.state);
 		removal.hidden = ACTIVE.includes(now.state);
 		retry.hidden = now.state !== "failed";
 		const made = now.state === "succeeded";
-		if (made && automatic.delete(id)) return location.replace(`#/mattes/${now.matte}`);
+		if (now.stage === "recovering") looked ??= lookForPreview(now);
+		const isShown = made || (hasPreview && now.state === "running");
+		if (isShown && automatic.delete(id)) return location.replace(`#/mattes/${now.matte}`);
 		links.replaceChildren(...[
+			isShown && !made && h("a.primary", { href: `#/mattes/${now.matte}` }, t("job.preview")),
 			made && now.kind === "recover" && h("a.primary", { href: `#/mattes/${now.matte}` }, t("job.matte")),
 			made && now.kind === "ingest" && h("a.primary", { href: `#/captures/${now.capture}` }, t("job.capture")),
 			made && now.video && button(t("video.download"), problem, () => save(now.video.slice(1), "composite.mp4"), "primary"),
@@ -85,7 +95,7 @@ async function progressPicture(found, signal) {
 	const frame = h("div.picture.filling", image);
 	if (width) frame.style.aspectRatio = `${width} / ${height}`;
 	const before = backdrop("Checker", 640, 480);
-	let done = 0;
+	let done = -1;
 	const look = newest(async (now) => {
 		if (now.tiles.done === done) return;
 		const size = Math.min(LONGER, Math.max(width ?? LONGER, height ?? LONGER));
@@ -99,6 +109,6 @@ async function progressPicture(found, signal) {
 	});
 	return {
 		panel: h("section.panel", h("h2", t("job.frame")), frame),
-		update: (now) => now.tiles.done > 0 && ["running", "succeeded"].includes(now.state) && look(now),
+		update: (now) => now.tiles.total > 0 && ["running", "succeeded"].includes(now.state) && look(now),
 	};
 }

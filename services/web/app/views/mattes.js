@@ -1,9 +1,10 @@
 // Mattes: the list, and one matte with its composite and layers.
 import { getComposite, getJson, patchJson, save } from "../lib/api.js";
 import { backdrop } from "../composite/backdrops/backdrops.js";
-import { badge, button, empty, facts, h, size, when } from "../lib/dom.js";
+import { badge, button, empty, facts, h, newest, pause, problemBox, size, when } from "../lib/dom.js";
 import { compositing } from "../composite/compositing.js";
 import { layers } from "../composite/layers.js";
+import { followJob } from "../lib/job_progress.js";
 import { list } from "../lib/list.js";
 import { PLAY, deletion, matteName, steps, thumbnails } from "../lib/view.js";
 import { qualityOf } from "./recovery_form.js";
@@ -12,6 +13,7 @@ import { sharing } from "./sharing.js";
 import { renamable } from "../lib/rename.js";
 
 const THUMB = 240; // pixels
+const LOOK = 3000; // ms between two pictures of a matte that is being recovered
 const checker = backdrop("Checker", THUMB, 180);
 
 export function matteCards(signal) {
@@ -37,28 +39,55 @@ export async function matte(main, signal, id) {
 	const { capture, job, options } = found;
 	const rename = async (name) => (found.name = (await patchJson(`v1/mattes/${id}`, { name })).name);
 	const isReady = found.state === "ready";
+	const state = badge(found.state);
 	const removal = deletion(`v1/mattes/${id}`, problem, t("matte.lost"));
 	const archive = button(t("matte.download"), problem, () => save(`v1/mattes/${id}/archive`, `matte-${id}.zip`));
 	const page = button(t("matte.page"), problem, () => save(`v1/mattes/${id}/live.html`, `matte-${id}.html`));
 	archive.hidden = page.hidden = !isReady;
 	main.append(
 		steps(PLAY, "#/captures", capture && `#/captures/${capture}`, job && `#/jobs/${job}`),
-		h("div.row.spread", renamable(matteName(found), t("matte.name"), rename), badge(found.state)),
+		h("div.row.spread", renamable(matteName(found), t("matte.name"), rename), state),
 	);
-	const details = h("details.panel", { open: !isReady }, h("summary", h("h2", t("details"))), facts({
+	const details = h("details.panel", { open: !isReady && !found.preview }, h("summary", h("h2", t("details"))), facts({
 		[t("frame")]: found.width && t("pixels", { size: size(found) }), [t("monitor")]: found.monitor && t("pixels", { size: found.monitor.join(" × ") }),
 		[t("made")]: when(found.created_at), [t("until")]: found.expires_at && when(found.expires_at),
 		[t("method")]: options.method, [t("quality")]: qualityOf(found),
 		[t("capture")]: capture && h("a", { href: `#/captures/${capture}` }, capture.slice(0, 8)),
 		[t("job")]: job && h("a", { href: `#/jobs/${job}` }, job.slice(0, 8)),
 	}));
-	if (isReady) {
-		main.append(compositing(found, await otherQualities(found, signal), signal), layers(found, signal), sharing(id, signal));
+	const more = h("div.stack");
+	const complete = () => more.replaceChildren(layers(found, signal), sharing(id, signal));
+	if (isReady || found.preview) {
+		const { section, stage } = compositing(found, await otherQualities(found, signal), signal);
+		main.append(section, more);
+		if (isReady) complete();
+		else more.append(recovery(found, stage, signal, () => {
+			complete();
+			state.replaceWith(badge(found.state));
+			archive.hidden = page.hidden = false;
+		}));
 	} else {
 		const text = t(found.state === "failed" ? "matte.failed" : "matte.running");
 		main.append(h("div.empty", h("strong", t("matte.unready")), h("p", text), job && h("p", h("a", { href: `#/jobs/${job}` }, t("job.show")))));
 	}
 	main.append(details, h("p.row", page, archive, removal), problem);
+}
+
+// The progress of a recovery whose preview is on the stage; `done` is called once all of the matte is there.
+function recovery(matte, stage, signal, done) {
+	const panel = h("section.panel", { "aria-label": t("progress") }, h("p", t("matte.preview")));
+	const look = newest(async () => {
+		stage.renew();
+		await pause(LOOK, signal).catch(() => {});
+	});
+	followJob(panel, matte.job, signal, async (job) => {
+		if (job.state === "running") return look();
+		if (job.state !== "succeeded") return;
+		Object.assign(matte, await getJson(`v1/mattes/${matte.id}`, signal));
+		stage.fetch();
+		done();
+	}).catch((error) => signal.aborted || panel.append(problemBox(error)));
+	return panel;
 }
 
 // The newest matte of the same capture in each other quality, by its name.

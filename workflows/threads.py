@@ -42,4 +42,4 @@ def in_parts(work: Callable[[int], None], parts: Iterable[int], threads: int) ->
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(2 * CORES, thread_name_prefix="composite")
+    return ThreadPoolExecutor(2 * CORES, thread_name_prefix="parts")
