@@ -8,7 +8,7 @@ Each workflow declares its steps beside them, as ``STEPS``: `workflows.ingest.st
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -71,6 +71,9 @@ class Steps:
     scattered : bool
         Whether tiles are taken from all over the frame, so that the first ones predict how long the rest take, and not
         in sequence, as a video is read.
+    inside : callable, optional
+        Returns the tiles that show some of a region of the frame, given the plan, the options, and the region's x, y,
+        width and height; None if tiles are no parts of a frame.
     """
 
     kind: str
@@ -80,14 +83,15 @@ class Steps:
     missing: Callable[[Objects, Task], list[int]]
     finish: Callable[[Objects, Task], dict[str, Any]]
     scattered: bool
+    inside: Callable[[dict[str, Any], dict[str, Any], Sequence[int]], Container[int]] | None = None
 
 
-def order(steps: Steps, tiles: Sequence[int]) -> list[int]:
-    """The order in which tiles of a job are best done."""
+def order(steps: Steps, tiles: Iterable[int], first: Container[int] = ()) -> list[int]:
+    """The order in which tiles of a job are best done, after those that are wanted first."""
     if not steps.scattered:
         return sorted(tiles)
     # Multiples of the golden ratio, modulo 1, are spread evenly over the unit interval however many there are.
-    return sorted(tiles, key=lambda tile: tile * GOLDEN % 1)
+    return sorted(tiles, key=lambda tile: (tile not in first, tile * GOLDEN % 1))
 
 
 def run(steps: Steps, objects: Objects, task: Task, tile: int) -> tuple[float, Any]:

@@ -130,6 +130,24 @@ def wait(job: str, url: str, key: str | None, as_json: bool) -> None:
         print_result(client.wait(job, progress=bar.job).answer, as_json, "state")
 
 
+@click.command(epilog=example("envmatte pause JOB"))
+@click.argument("job")
+@_remote
+def pause(job: str, url: str, key: str | None, as_json: bool) -> None:
+    """Pause a job; what is under way is done. Prints its state."""
+    with _client(url, key) as client:
+        print_result(client.pause(job).answer, as_json, "state")
+
+
+@click.command(epilog=example("envmatte resume JOB"))
+@click.argument("job")
+@_remote
+def resume(job: str, url: str, key: str | None, as_json: bool) -> None:
+    """Continue a job that is paused. Prints its state."""
+    with _client(url, key) as client:
+        print_result(client.resume(job).answer, as_json, "state")
+
+
 @click.command(epilog=example("envmatte cancel JOB"))
 @click.argument("job")
 @_remote
@@ -275,4 +293,4 @@ def _parse_option(option: str) -> tuple[str, Any]:
         return name, value
 
 
-COMMANDS = (upload, recover, status, wait, cancel, composite, export, share, import_, layers)
+COMMANDS = (upload, recover, status, wait, pause, resume, cancel, composite, export, share, import_, layers)

@@ -80,22 +80,47 @@ class Client:
         body = {"name": name} | ({"webhook": webhook} if webhook else {})
         return Capture.of(_upload.send(self._http, Path(file), body, progress))
 
-    def recover(self, capture: Capture | str, *, webhook: str | None = None, **options: Any) -> Job:
+    def recover(
+        self,
+        capture: Capture | str,
+        *,
+        webhook: str | None = None,
+        region: tuple[int, int, int, int] | None = None,
+        **options: Any,
+    ) -> Job:
         """Queue the recovery of a matte.
 
         Parameters
         ----------
         webhook : str, optional
             URL to notify when the job has ended.
+        region : (x, y, width, height), optional
+            The part of the frame that is recovered first, in pixels.
         **options
             As ``GET /v1/options`` lists them.
         """
-        body = {"capture": _id(capture), "options": options} | ({"webhook": webhook} if webhook else {})
+        body: dict[str, Any] = {"capture": _id(capture), "options": options}
+        body |= ({"webhook": webhook} if webhook else {}) | ({"region": _region(region)} if region else {})
         return Job.of(self._http.json("POST", Job.path, json=body, headers=_key()))
 
     def job(self, job: Job | str) -> Job:
         """Get the current state of a job."""
         return Job.of(self._http.json("GET", _path(Job, job)))
+
+    def pause(self, job: Job | str) -> Job:
+        """Pause a job; what is under way is done."""
+        return self._change(job, paused=True)
+
+    def resume(self, job: Job | str) -> Job:
+        """Continue a job that is paused."""
+        return self._change(job, paused=False)
+
+    def recover_first(self, job: Job | str, region: tuple[int, int, int, int]) -> Job:
+        """Recover a part of the frame first: x, y, width and height in pixels. The rest follows."""
+        return self._change(job, region=_region(region))
+
+    def _change(self, job: Job | str, **changes: Any) -> Job:
+        return Job.of(self._http.json("PATCH", _path(Job, job), json=changes, safe=True))
 
     def cancel(self, job: Job | str) -> Job:
         """Cancel a job; cancelling it again changes nothing."""
@@ -321,6 +346,10 @@ class Client:
 
 def _id(record: Record | str) -> str:
     return record if isinstance(record, str) else record.id
+
+
+def _region(region: tuple[int, int, int, int]) -> dict[str, int]:
+    return dict(zip(("x", "y", "width", "height"), region, strict=True))
 
 
 def _path(kind: type[Record], record: Record | str) -> str:

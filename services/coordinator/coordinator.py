@@ -197,7 +197,9 @@ class Coordinator:
             active = {row.id: row for row in jobs.active(c)}
             cancelled = jobs.cancelled_with_leftovers(c)
         for row in active.values():
-            if row.id not in self._runs:
+            if row.id in self._runs:
+                self._runs[row.id].follow(row)
+            elif not row.paused:
                 self._guarded(row.id, self._start, row)
         for job in self._runs.keys() - active.keys():
             self._drop(job)
@@ -323,8 +325,8 @@ class Coordinator:
         """
         dispatcher = self._dispatcher
         under_way = {job: dispatcher.under_way(job) for job in self._runs}
-        dispatcher.want(sum(len(run.to_do) + under_way[job] for job, run in self._runs.items()))
-        waiting = [run for run in self._runs.values() if run.to_do]
+        waiting = [run for run in self._runs.values() if run.to_do and not run.paused]
+        dispatcher.want(sum(under_way.values()) + sum(len(run.to_do) for run in waiting))
         for _ in range(dispatcher.free):
             if not waiting:
                 return

@@ -3,7 +3,7 @@
 import logging
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -65,6 +65,10 @@ class JobRun:
         Number of threads of the cluster when the pace of its tiles was last measured; 0 until it was.
     trace : str, optional
         The ``traceparent`` of the request that asked for the job.
+    paused : bool
+        Whether none of its tiles are to be submitted now.
+    region : list of int, optional
+        x, y, width and height of the part of the frame whose tiles are done first.
     start, spent : float
         Worker seconds that the job is credited with at its start, and those it has used since.
     counted : int
@@ -80,6 +84,8 @@ class JobRun:
     written_at: float = 0.0
     paced: int = 0
     trace: str | None = None
+    paused: bool = False
+    region: list[int] | None = None
     start: float = 0.0
     spent: float = 0.0
     counted: int = 0
@@ -108,10 +114,22 @@ class JobRun:
         if row.plan is None:
             stage, to_do = "preparing", [PREPARE]
         elif tiles:
-            stage, to_do = kind.steps.stage, order(kind.steps, tiles)
+            stage, to_do = kind.steps.stage, _ordered(kind, task, row.region, tiles)
         else:
             stage, to_do = "finishing", [FINISH]
-        return cls(row.id, kind, stage, task, deque(to_do), trace=row.trace)
+        return cls(
+            row.id, kind, stage, task, deque(to_do), trace=row.trace, paused=row.paused, region=row.region
+        )
+
+    def follow(self, row: Row[Any]) -> None:
+        """Do what was asked for since the job was last read: pause or continue, or do a region first."""
+        if self.paused and not row.paused:
+            self.paced = 0
+        self.paused = row.paused
+        if row.region != self.region:
+            self.region = row.region
+            if self.stage == self.kind.steps.stage:
+                self.to_do = deque(_ordered(self.kind, self.task, self.region, self.to_do))
 
     def record_outcome(self, outcome: Outcome) -> None:
         """Keep the outcome of a tile until `write` writes it to the ledger."""
@@ -225,9 +243,9 @@ class JobRun:
         self.kind.prepared(connection, self.task, plan)
         for line in plan.get("notes", ()):
             jobs.log(connection, self.job, line)
-        steps = self.kind.steps
-        tiles = order(steps, range(plan["tiles"]))
-        return self._enter(connection, steps.stage, tiles, replace(self.task, plan=plan))
+        task = replace(self.task, plan=plan)
+        tiles = _ordered(self.kind, task, self.region, range(plan["tiles"]))
+        return self._enter(connection, self.kind.steps.stage, tiles, task)
 
     def _finished(self, connection: Connection, figures: dict[str, Any]) -> Next:
         if missing := figures.get("missing"):
@@ -243,6 +261,14 @@ class JobRun:
             logger.info("succeeded")
             self.kind.succeeded(connection, self.task, figures)
         return Next(self.stage, (), self.task, ended=True)
+
+
+def _ordered(kind: JobKind, task: Task, region: list[int] | None, tiles: Iterable[int]) -> list[int]:
+    steps = kind.steps
+    # A plan made by an earlier version lacks the figures.
+    if region is None or steps.inside is None or "figures" not in task.plan:
+        return order(steps, tiles)
+    return order(steps, tiles, steps.inside(task.plan, task.options, region))
 
 
 def write_failure(connection: Connection, kind: JobKind, task: Task, error: EnvmatteError) -> None:

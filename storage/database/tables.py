@@ -124,6 +124,8 @@ jobs = Table(
     Column("webhook", Text),  # URL to notify when the job has ended
     Column("row_bytes", BigInteger, nullable=False, server_default="0"),  # of the plan
     Column("leftovers", Boolean, nullable=False, server_default=false()),  # see `storage.records.jobs.end`
+    Column("paused", Boolean, nullable=False, server_default=false()),
+    Column("region", JSON(none_as_null=True)),  # x, y, width and height of what is recovered first
     Index("jobs_by_state", "state", "leftovers"),
     Index("jobs_by_owner_and_state", "owner", "state", "number"),
     Index("jobs_by_kind", "kind", "state", "stored", "total", "done", "failed"),

@@ -30,6 +30,7 @@ def add(
     job: str | None = None,
     stored: int | None = None,
     webhook: str | None = None,
+    region: Sequence[int] | None = None,
 ) -> str:
     """Queue a job; returns its id.
 
@@ -43,6 +44,8 @@ def add(
         The ``traceparent`` (W3C Trace Context) of the request.
     webhook : str, optional
         URL to notify when the job has ended.
+    region : (x, y, width, height), optional
+        The part of the frame that is recovered first, in pixels.
     """
     job = job or new_id()
     row = {
@@ -56,6 +59,7 @@ def add(
         "trace": trace,
         "stored": stored,
         "webhook": webhook,
+        "region": region,
         "created_at": time.time(),
     }
     connection.execute(insert(jobs).values(row))
@@ -110,12 +114,45 @@ def enter_stage(connection: Connection, job: str, stage: str) -> bool:
     return bool(result.rowcount)
 
 
+def pause(connection: Connection, job: str, paused: bool) -> None:
+    """Pause an active job, or continue it: the tiles under way are done, and no others until it continues.
+
+    Raises
+    ------
+    NotFound
+        If there is none.
+    Conflict
+        If it has ended.
+    """
+    row = require_active(connection, job)
+    if row.paused != paused:
+        # Its pace is measured again: the pause is no part of it.
+        change(connection, job, paused=paused, moved_at=time.time(), paced_at=None)
+        log(connection, job, "paused" if paused else "continued")
+
+
+def require_active(connection: Connection, job: str) -> Row[Any]:
+    """The row of a job that has not ended.
+
+    Raises
+    ------
+    NotFound
+        If there is none.
+    Conflict
+        If it has ended.
+    """
+    row = get(connection, job)
+    if row.state not in ACTIVE:
+        raise Conflict(f"job {job} has already {row.state}")
+    return row
+
+
 def end(connection: Connection, job: str, state: str, problem: dict[str, Any] | None = None) -> bool:
     """End an active job and queue its webhook; returns false and changes nothing if it has already ended.
 
     A cancelled job has leftovers until the coordinator has removed what it made.
     """
-    values = {"state": state, "stage": state, "problem": problem, "finished_at": time.time()}
+    values = {"state": state, "stage": state, "problem": problem, "finished_at": time.time(), "paused": False}
     values["leftovers"] = state == "cancelled"
     result = connection.execute(update(jobs).where(jobs.c.id == job, jobs.c.state.in_(ACTIVE)).values(values))
     if result.rowcount:

@@ -1,5 +1,6 @@
 """The steps of a recovery: create the matte, recover its tiles, read its figures."""
 
+from collections.abc import Sequence
 from itertools import product
 from typing import Any
 
@@ -70,4 +71,10 @@ def finish(objects: Objects, task: Task) -> dict[str, Any]:
     return Matte(objects, task.matte).figures
 
 
-STEPS = Steps("recover", "recovering", prepare, work, missing, finish, scattered=True)
+def inside(plan: dict[str, Any], options: dict[str, Any], region: Sequence[int]) -> set[int]:
+    """The tiles that show some of a region."""
+    width, height, block = (plan["figures"][name] for name in ("width", "height", "block"))
+    return tiles.cut_inside(width, height, block, options.get("tile") or block, region)
+
+
+STEPS = Steps("recover", "recovering", prepare, work, missing, finish, scattered=True, inside=inside)

@@ -1,5 +1,6 @@
 """How a frame is cut into tiles, and the work of one: what a dask task runs."""
 
+from collections.abc import Sequence
 from functools import lru_cache
 from itertools import product
 from typing import TypeVar
@@ -54,6 +55,29 @@ def cut(matte: Matte, tile: int) -> list[tuple[range, range]]:
         for row in range(0, matte.block_rows, edge)
         for column in range(0, matte.block_columns, edge)
     ]
+
+
+def cut_inside(width: int, height: int, block: int, tile: int, region: Sequence[int]) -> set[int]:
+    """The numbers, as of `cut`, of the tiles that show some of a region.
+
+    Parameters
+    ----------
+    width, height : int
+        Of the frame.
+    block : int
+        Edge of a block.
+    tile : int
+        Edge of a tile in pixels.
+    region : (x, y, width, height)
+        It may reach beyond the frame.
+    """
+    edge = -(-tile // block) * block
+    x, y, wide, high = region
+    if x >= width or y >= height:
+        return set()
+    rows = range(y // edge, -(-min(y + high, height) // edge))
+    columns = range(x // edge, -(-min(x + wide, width) // edge))
+    return {row * -(-width // edge) + column for row, column in product(rows, columns)}
 
 
 def recover_tile(objects: Objects, capture: str, matte: str, options: RecoveryOptions, index: int) -> int:

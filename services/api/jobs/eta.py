@@ -22,7 +22,7 @@ def seconds_left(connection: Connection, row: Row[Any], now: float) -> float | N
     now : float
         Seconds of the epoch.
     """
-    if not row.total:
+    if not row.total or row.paused:
         return None
     finishing = _finishing(connection, row) if row.kind == "ingest" else 0.0
     if row.done == row.total:

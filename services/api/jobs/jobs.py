@@ -22,7 +22,7 @@ from services.webhooks.sender import check_webhook
 from storage.database.engine import reading, writing
 from storage.database.rows import new_id, page
 from storage.database.tables import jobs as table
-from storage.errors import Conflict
+from storage.errors import Conflict, OptionError
 from storage.layout import composites
 from storage.records import captures, jobs, leases, mattes
 from storage.records.leases import Heartbeat
@@ -35,6 +35,28 @@ REQUEST_BYTES = 64 << 10
 State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 
 
+class Region(BaseModel):
+    """A rectangle of the frame, in pixels; what reaches beyond the frame does not matter."""
+
+    model_config = ConfigDict(extra="forbid")
+    x: int = Field(ge=0, le=1 << 20)
+    y: int = Field(ge=0, le=1 << 20)
+    width: int = Field(ge=1, le=1 << 20)
+    height: int = Field(ge=1, le=1 << 20)
+
+    @classmethod
+    def of(cls, stored: list[int] | None) -> "Region | None":
+        """A region as it is stored."""
+        return (
+            None if stored is None else cls.model_validate(dict(zip(cls.model_fields, stored, strict=True)))
+        )
+
+    @property
+    def stored(self) -> list[int]:
+        """As it is stored."""
+        return [self.x, self.y, self.width, self.height]
+
+
 class JobRequest(BaseModel):
     """The capture to recover a matte from, and the options."""
 
@@ -42,6 +64,20 @@ class JobRequest(BaseModel):
     capture: str
     options: dict[str, Any] = Field(default_factory=dict, description="GET /v1/options lists them.")
     webhook: str | None = Field(None, description="URL, https, that is notified when the job has ended.")
+    region: Region | None = Field(None, description="The part of the frame that is recovered first.")
+
+
+class JobChange(BaseModel):
+    """What to change of a job that has not ended."""
+
+    model_config = ConfigDict(extra="forbid")
+    paused: bool | None = Field(
+        None,
+        description="Whether it pauses: what is under way is done, the rest waits until it is continued.",
+    )
+    region: Region | None = Field(
+        None, description="The part of the frame that is recovered first, from now on. For recoveries only."
+    )
 
 
 async def _job_request(request: Request) -> JobRequest:
@@ -71,6 +107,8 @@ class Job(BaseModel):
     queued_seconds: float
     run_seconds: float
     workers: int
+    paused: bool
+    region: Region | None
     capture: str | None
     matte: str | None
     options: dict[str, Any]
@@ -95,7 +133,11 @@ class Job(BaseModel):
         # The step after the last tile counts as one more tile, so only a job that has succeeded is at 1.
         progress = 1.0 if row.state == "succeeded" else row.done / (row.total + 1) if row.total else 0.0
         return cls(
-            **{name: getattr(row, name) for name in ("id", "kind", "state", "stage", "pixels", "matte")},
+            **{
+                name: getattr(row, name)
+                for name in ("id", "kind", "state", "stage", "pixels", "matte", "paused")
+            },
+            region=Region.of(row.region),
             capture=row.capture or None,  # the composite of an imported matte has none
             progress=progress,
             tiles=Tiles(total=row.total, done=row.done, failed=row.failed),
@@ -185,7 +227,14 @@ def post_job(
         matte = new_id()
         chosen = options.model_dump(mode="json")
         job = jobs.add(
-            c, "recover", capture.id, chosen, matte, tracing.current_traceparent(), webhook=request.webhook
+            c,
+            "recover",
+            capture.id,
+            chosen,
+            matte,
+            tracing.current_traceparent(),
+            webhook=request.webhook,
+            region=request.region.stored if request.region else None,
         )
         mattes.add(c, matte, capture.id, job, chosen, context.settings.matte_seconds, capture.name)
         return job
@@ -230,6 +279,30 @@ def get_log(
         jobs.get(c, id)
         rows = jobs.log_lines(c, id, after, limit)
     return Log(lines=[Line(line=r.line, at=datetime.fromtimestamp(r.at, UTC), text=r.text) for r in rows])
+
+
+async def _job_change(request: Request) -> JobChange:
+    return await read_json(request, JobChange, REQUEST_BYTES)
+
+
+@router.patch(
+    "/jobs/{id}",
+    dependencies=[Depends(get_job)],  # an unknown job is reported before a bad body
+    openapi_extra={"requestBody": {"content": {"application/json": {"schema": schema_of(JobChange)}}}},
+)
+def change_job(context: OwnerContext, id: str, change: Annotated[JobChange, Depends(_job_change)]) -> Job:
+    """Pause a job or continue it, or recover a part of the frame first."""
+    with writing(context.engine) as c:
+        row = jobs.require_active(c, id)
+        if change.region is not None:
+            if JOB_KINDS[row.kind].steps.inside is None:
+                raise OptionError(
+                    f"job {id} is no recovery, so no part of a frame comes first", field="region"
+                )
+            jobs.change(c, id, region=change.region.stored)
+        if change.paused is not None:
+            jobs.pause(c, id, change.paused)
+        return Job.read(c, id)
 
 
 @router.post("/jobs/{id}/cancel")

@@ -36,6 +36,8 @@ def reason(connection: Connection, row: Row[Any], sign: Heartbeat | None) -> str
     """Why an active job waits; None if it does not wait, or has ended."""
     if row.state not in jobs.ACTIVE:
         return None
+    if row.paused:
+        return "it is paused, and does what is left once it is continued"
     trouble = trouble_of(sign)
     if trouble is not None:
         return trouble

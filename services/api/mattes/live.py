@@ -112,7 +112,7 @@ def _encoded(context: Context, id: str, matte: Matte) -> bytes:
     """A matte as `workflows.composite.live.encode` encodes it."""
     encoded = stored_live.read(context.objects, id, encode.FORMAT)
     if encoded is None:
-        with context.stored(mattes.get_ready, id):
+        with context.stored(mattes.get, id):
             encoded = encode.encode_live(matte, CORES)
         # The answer needs no room, and it can be encoded again; or the matte was deleted just now.
         with suppress(NoRoom, FileNotFoundError):

@@ -83,6 +83,8 @@ def progress_of(context: Context, id: str) -> Progress:
         matte = context.cache.matte(id)
         tiles = cut(matte, parse_options(row.options).tile or matte.block)
         blocks = frozenset(block for tile in done for block in product(*tiles[tile]))
+        if len(blocks) == matte.block_rows * matte.block_columns:
+            return Progress(id)  # it is complete, and its preview may be gone, just before it is ready
         return Progress(id, blocks, len(blocks) / (matte.block_rows * matte.block_columns), preview)
 
 

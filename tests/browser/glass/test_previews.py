@@ -7,7 +7,7 @@ from playwright.sync_api import Page, expect
 
 from tests.browser.pages import MINUTE
 from tests.end_to_end.conftest import Service, paused
-from tests.end_to_end.mattes.test_previews import WIDTH, upload_large
+from tests.end_to_end.mattes.test_previews import HEIGHT, WIDTH, upload_large
 from tests.parts.waiting import until
 
 pytestmark = pytest.mark.slow
@@ -34,8 +34,24 @@ def test_glass_is_in_the_hand_before_it_is_recovered(desk: Page, service: Servic
         expect(drawn.and_(stage.locator("canvas"))).to_be_visible()  # drawn here, of the preview
         desk.mouse.up()
         expect(stage.locator("img")).to_be_visible()
+        placed = desk.url
         expect(desk.get_by_text("replaces it step by step")).to_be_visible()
         expect(desk.get_by_role("button", name="Download the matte")).to_be_hidden()
+        desk.get_by_role("button", name="Recover a part first").click()
+        box = stage.bounding_box()  # the page may have scrolled
+        assert box
+        desk.mouse.move(box["x"] + box["width"] / 4, box["y"] + box["height"] / 2)
+        desk.mouse.down()
+        desk.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] * 3 / 4, steps=3)
+        desk.mouse.up()
+        until(lambda: service.client.job(job["id"]).answer["region"] or desk.wait_for_timeout(50))
+        region = service.client.job(job["id"]).answer["region"]
+        expected = {"x": WIDTH / 4, "y": HEIGHT / 2, "width": WIDTH / 4, "height": HEIGHT / 4}
+        assert region == pytest.approx(expected, abs=3)
+        assert desk.url == placed  # the backdrop did not move
+        desk.get_by_role("button", name="Pause").click()
+        desk.get_by_role("button", name="Continue").click()
+        expect(desk.get_by_role("button", name="Pause")).to_be_visible()
     expect(desk.get_by_role("button", name="Download the matte")).to_be_visible(timeout=2 * MINUTE)
     expect(desk.get_by_role("heading", name="Layers")).to_be_visible()
     expect(desk.get_by_text("This browser draws the glass while you move; when")).to_be_visible()

@@ -89,6 +89,7 @@ CALLS = {
     "GET /v1/jobs/{id}/log": Call("job"),
     "GET /v1/jobs/{id}/events": Call("job"),
     "GET /v1/jobs/{id}/video.mp4": Call("job"),
+    "PATCH /v1/jobs/{id}": Call("job", needs="write", json={"paused": True}),
     "POST /v1/jobs/{id}/cancel": Call("job", needs="write"),
     "POST /v1/jobs/{id}/retry": Call("job", needs="write"),
     "DELETE /v1/jobs/{id}": Call("job", needs="write", last=3),

@@ -57,6 +57,8 @@ REMOTE = {
     "recover": ["c"],
     "status": ["j"],
     "wait": ["j"],
+    "pause": ["j"],
+    "resume": ["j"],
     "cancel": ["j"],
     "composite": ["m", "backdrop.png", "-o", "composite.png"],
     "export": ["m", "-o", "matte.zip"],

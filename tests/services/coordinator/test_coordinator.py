@@ -1,6 +1,7 @@
 """Jobs that end before they start, files that are still written when they are removed, and the cost of progress."""
 
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import pytest
 from sqlalchemy import Connection, Engine, Row
 
 from services.coordinator import coordinator
-from services.coordinator.coordinator import WRITE, Coordinator
+from services.coordinator.coordinator import POLL, WRITE, Coordinator
 from services.coordinator.job_kinds import JOB_KINDS
 from services.settings import CoordinatorSettings
 from storage.database.engine import reading, writing
@@ -16,6 +17,7 @@ from storage.errors import Unavailable
 from storage.layout import uploads
 from storage.objects.store import Objects
 from storage.records import captures, jobs
+from storage.steps import PREPARE
 from tests.benchmarks.cluster.overhead import measure
 from tests.parts.waiting import until
 
@@ -75,6 +77,24 @@ def test_job_cancelled_while_it_is_started_is_not_run(
     assert dispatcher.submitted == []
     with reading(engine) as c:
         assert (jobs.get(c, job).state, jobs.get(c, job).started_at) == ("cancelled", None)
+
+
+def test_paused_job_is_not_run_until_it_is_continued(
+    engine: Engine, objects: Objects, job: str, tmp_path: Path
+) -> None:
+    with writing(engine) as c:
+        jobs.pause(c, job, True)
+    dispatcher = Idle()
+    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, dispatcher):  # type: ignore[arg-type]
+        time.sleep(3 * POLL)
+        assert dispatcher.submitted == []
+        with writing(engine) as c:
+            jobs.pause(c, job, False)
+        until(lambda: dispatcher.submitted)
+        with writing(engine) as c:
+            jobs.pause(c, job, True)  # what is submitted stays
+        time.sleep(3 * POLL)
+    assert dispatcher.submitted == [(job, PREPARE)]
 
 
 def test_files_that_cannot_be_removed_are_removed_later(

@@ -169,3 +169,27 @@ def test_a_cancelled_job_does_not_succeed(connection: Connection, job: str) -> N
     assert not advance(connection, run, done(run, FINISH, {}))
     assert jobs.get(connection, job).state == "cancelled"
     assert mattes.get(connection, "mat").state == "recovering"
+
+
+def test_region_comes_first(connection: Connection, job: str) -> None:
+    run = start(connection, job)
+    figures = {"width": 160, "height": 48, "block": 16}  # 3 rows of 10 tiles
+    assert advance(connection, run, done(run, PREPARE, {"tiles": 30, "figures": figures}))
+    jobs.change(connection, job, region=[40, 20, 20, 10])
+    run.follow(jobs.get(connection, job))
+    assert set(list(run.to_do)[:2]) == {12, 13}
+    assert sorted(run.to_do) == list(range(30))
+    advance(connection, run, done(run, 12), under_way=28)
+    again = start(connection, job)
+    assert (again.to_do[0], len(again.to_do)) == (13, 29)
+    jobs.change(connection, job, region=[0, 0, 1000, 1])
+    again.follow(jobs.get(connection, job))
+    assert set(list(again.to_do)[:10]) == set(range(10))
+
+
+def test_region_of_a_plan_that_an_earlier_version_made_is_ignored(connection: Connection, job: str) -> None:
+    run = working(connection, job)
+    before = list(run.to_do)
+    jobs.change(connection, job, region=[0, 0, 1, 1])
+    run.follow(jobs.get(connection, job))
+    assert list(run.to_do) == before

@@ -169,3 +169,18 @@ def test_log_lines_after_a_line(connection: Connection) -> None:
     assert [row.text for row in rest] == ["line 2", "line 3", "line 4"]
     assert jobs.log_lines(connection, job, rest[-1].line, 100) == []
     assert all(a.at <= b.at for a, b in pairwise(read))
+
+
+def test_job_is_paused_and_continued(connection: Connection) -> None:
+    job = planned(connection)
+    jobs.change(connection, job, paced_at=1.0)
+    for paused in (True, True, False):
+        jobs.pause(connection, job, paused)
+        row = jobs.get(connection, job)
+        assert (row.paused, row.paced_at) == (paused, None)
+    assert log_of(connection, job)[-2:] == ["paused", "continued"]  # each once
+    jobs.pause(connection, job, True)
+    jobs.cancel(connection, job)
+    assert not jobs.get(connection, job).paused
+    with pytest.raises(Conflict, match="already cancelled"):
+        jobs.pause(connection, job, True)

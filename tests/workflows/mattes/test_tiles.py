@@ -22,7 +22,7 @@ from workflows.composite import composite
 from workflows.images.integer_formats import decode, encode_png
 from workflows.jobs import Task, run
 from workflows.mattes.steps import STEPS
-from workflows.mattes.tiles import cut
+from workflows.mattes.tiles import cut, cut_inside
 from workflows.programs.border import border_light
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import Scene, write_capture
@@ -49,6 +49,26 @@ def test_every_block_is_in_one_tile(objects: Objects, height: int, width: int, t
     assert covered.min() == covered.max() == 1
     edge = -(-tile // matte.block) * matte.block
     assert len(tiles) == -(-height // edge) * -(-width // edge)
+
+
+@pytest.mark.parametrize(("height", "width"), [(16, 16), (17, 33), (40, 100), (600, 1100)])
+@pytest.mark.parametrize("tile", [16, 17, 50, 1024])
+@pytest.mark.parametrize(
+    "region", [(0, 0, 1, 1), (16, 16, 1, 1), (15, 5, 30, 12), (90, 0, 5000, 5000), (32, 16, 1, 1)]
+)
+def test_tiles_inside_a_region_show_some_of_it(
+    objects: Objects, height: int, width: int, tile: int, region: tuple[int, int, int, int]
+) -> None:
+    matte = mattes.create(objects, "m", height=height, width=width, columns=1, rows=1)
+    x, y, wide, high = region
+    frame = np.zeros((height, width), bool)
+    frame[y : y + high, x : x + wide] = True
+    shown = {
+        number
+        for number, (rows, columns) in enumerate(cut(matte, tile))
+        if any(frame[matte.span(row, column)].any() for row in rows for column in columns)
+    }
+    assert cut_inside(width, height, matte.block, tile, region) == shown
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 import { getComposite, getJson, post, save } from "../lib/api.js";
 import { jobCard } from "../lib/activity.js";
 import { backdrop } from "../composite/backdrops/backdrops.js";
+import { pauseButton } from "../composite/recovering.js";
 import { button, empty, facts, h, newest, pause, problemBox, show, when } from "../lib/dom.js";
 import { ACTIVE } from "../lib/events.js";
 import { list } from "../lib/list.js";
@@ -29,6 +30,7 @@ export async function jobs(main, signal) {
 export async function job(main, signal, id) {
 	const found = await getJson(`v1/jobs/${id}`, signal);
 	const problem = h("div");
+	const halt = pauseButton(id, problem);
 	const cancel = button(t("cancel"), problem, () => post(`v1/jobs/${id}/cancel`));
 	const retry = button(t("again"), problem, async () => {
 		await post(`v1/jobs/${id}/retry`);
@@ -44,7 +46,7 @@ export async function job(main, signal, id) {
 	main.append(
 		step ? steps(step, "#/captures", `#/captures/${found.capture}`) : "",
 		h("p.crumb", h("a", { href: "#/jobs" }, t("jobs"))),
-		h("div.row.spread", h("h1", t(`job.${found.kind}`)), h("span.row", cancel, retry, removal)),
+		h("div.row.spread", h("h1", t(`job.${found.kind}`)), h("span.row", halt.button, cancel, retry, removal)),
 		problem,
 		facts({
 			[t("job.asked")]: when(found.created_at), [t("capture")]: found.capture && h("a", { href: `#/captures/${found.capture}` }, found.capture.slice(0, 8)),
@@ -62,6 +64,7 @@ export async function job(main, signal, id) {
 	}
 
 	function update(now) {
+		halt.update(now);
 		cancel.hidden = !ACTIVE.includes(now.state);
 		removal.hidden = ACTIVE.includes(now.state);
 		retry.hidden = now.state !== "failed";

@@ -1,10 +1,10 @@
 // Mattes: the list, and one matte with its composite and layers.
 import { getComposite, getJson, patchJson, save } from "../lib/api.js";
 import { backdrop } from "../composite/backdrops/backdrops.js";
-import { badge, button, empty, facts, h, newest, pause, problemBox, size, when } from "../lib/dom.js";
+import { badge, button, empty, facts, h, size, when } from "../lib/dom.js";
 import { compositing } from "../composite/compositing.js";
 import { layers } from "../composite/layers.js";
-import { followJob } from "../lib/job_progress.js";
+import { recovering } from "../composite/recovering.js";
 import { list } from "../lib/list.js";
 import { PLAY, deletion, matteName, steps, thumbnails } from "../lib/view.js";
 import { qualityOf } from "./recovery_form.js";
@@ -13,7 +13,6 @@ import { sharing } from "./sharing.js";
 import { renamable } from "../lib/rename.js";
 
 const THUMB = 240; // pixels
-const LOOK = 3000; // ms between two pictures of a matte that is being recovered
 const checker = backdrop("Checker", THUMB, 180);
 
 export function matteCards(signal) {
@@ -61,7 +60,7 @@ export async function matte(main, signal, id) {
 		const { section, stage } = compositing(found, await otherQualities(found, signal), signal);
 		main.append(section, more);
 		if (isReady) complete();
-		else more.append(recovery(found, stage, signal, () => {
+		else more.append(recovering(found, stage, signal, () => {
 			complete();
 			state.replaceWith(badge(found.state));
 			archive.hidden = page.hidden = false;
@@ -71,23 +70,6 @@ export async function matte(main, signal, id) {
 		main.append(h("div.empty", h("strong", t("matte.unready")), h("p", text), job && h("p", h("a", { href: `#/jobs/${job}` }, t("job.show")))));
 	}
 	main.append(details, h("p.row", page, archive, removal), problem);
-}
-
-// The progress of a recovery whose preview is on the stage; `done` is called once all of the matte is there.
-function recovery(matte, stage, signal, done) {
-	const panel = h("section.panel", { "aria-label": t("progress") }, h("p", t("matte.preview")));
-	const look = newest(async () => {
-		stage.renew();
-		await pause(LOOK, signal).catch(() => {});
-	});
-	followJob(panel, matte.job, signal, async (job) => {
-		if (job.state === "running") return look();
-		if (job.state !== "succeeded") return;
-		Object.assign(matte, await getJson(`v1/mattes/${matte.id}`, signal));
-		stage.fetch();
-		done();
-	}).catch((error) => signal.aborted || panel.append(problemBox(error)));
-	return panel;
 }
 
 // The newest matte of the same capture in each other quality, by its name.

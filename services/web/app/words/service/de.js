@@ -108,6 +108,7 @@ export const de = {
 	"glare and what else the patterns don't explain": "Streulicht und was die Muster sonst nicht erklären",
 	"half a stop": "eine halbe Blende",
 	"ingesting": "Einlesen",
+	"it is paused, and does what is left once it is continued": "er ist angehalten und macht weiter, sobald er fortgesetzt wird",
 	"it looks unlike others of its kind, as if something had been in front": "es sieht anders aus als andere seiner Art, als wäre etwas davor gewesen",
 	"it makes no difference to black and white": "für Schwarz und Weiß ist sie ohne Belang",
 	"it shares {workers} workers with {jobs} other jobs": "er teilt sich {workers} Worker mit {jobs} anderen Aufträgen",
