@@ -21,6 +21,10 @@ SYNC = b"\x47"
 MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".exr": "image/x-exr"}
 """Of composites, by the ends of file names."""
 LAYERS = ("all.exr", "stmap.exr", "S.png", "rho.png", "alpha.png", "confidence.png")
+NODES = {"blender": ("lookups.exr", "blender.py")}
+"""Files that make a node of a tool."""
+MOST_LOBES = 8
+"""What a node draws of a pixel: all that there are, because a node is for the best picture."""
 InputFile = click.Path(exists=True, dir_okay=False, path_type=Path)
 OutputFile = click.Path(dir_okay=False, path_type=Path)
 
@@ -260,27 +264,32 @@ def import_(file: Path, name: str, url: str, key: str | None, as_json: bool) -> 
     print_result(matte.answer, as_json, "id")
 
 
-@click.command(epilog=example("envmatte layers MATTE layers"))
+@click.command(epilog=example("envmatte layers MATTE layers", "envmatte layers MATTE glass --for blender"))
 @click.argument("matte")
 @click.argument("folder", type=click.Path(file_okay=False, path_type=Path))
+@click.option(
+    "--for", "tool", type=click.Choice(list(NODES)), help="Write what makes a node of this tool instead."
+)
 @_remote
-def layers(matte: str, folder: Path, url: str, key: str | None, as_json: bool) -> None:
+def layers(matte: str, folder: Path, tool: str | None, url: str, key: str | None, as_json: bool) -> None:
     """Write the layers of a matte for other tools to FOLDER: all.exr, stmap.exr, and 16-bit PNGs.
 
-    The files appear once all of them are complete.
+    With --for they are a node that draws the glass in front of any backdrop. The files appear once all of them are
+    complete.
     """
     import tempfile
 
+    names, lobes = (NODES[tool], MOST_LOBES) if tool else (LAYERS, None)
     with _client(url, key) as client:
         client.matte(matte)  # fails before a folder is made
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as part:
-            for name in LAYERS:
-                Path(part, name).write_bytes(client.layer(matte, name))
+            for name in names:
+                Path(part, name).write_bytes(client.layer(matte, name, lobes=lobes))
             folder.mkdir(exist_ok=True)
-            for name in LAYERS:
+            for name in names:
                 os.replace(Path(part, name), folder / name)
-    print_result({"folder": str(folder), "layers": LAYERS}, as_json, "folder")
+    print_result({"folder": str(folder), "layers": names}, as_json, "folder")
 
 
 def _parse_option(option: str) -> tuple[str, Any]:

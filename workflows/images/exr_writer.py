@@ -45,7 +45,7 @@ def write_exr(
     bands : iterable of mappings of str to (rows, width) arrays
         The rows of all channels from the top. Each band but the last has a multiple of `LINES` rows.
     header : mapping, optional
-        Further attributes: text, a pair of integers, or a (3, 3) array.
+        Further attributes: text, a pair of integers, a (3, 3) array, or x and y of three primaries and of white, (8,).
     """
     names = sorted(types)
     corners = struct.pack("<4i", 0, 0, width - 1, height - 1)
@@ -92,7 +92,7 @@ def _typed(value: Any) -> tuple[str, bytes]:
     if isinstance(value, str):
         return "string", value.encode()
     if isinstance(value, np.ndarray):
-        return "m33f", value.astype("<f4").tobytes()
+        return "m33f" if value.ndim == 2 else "chromaticities", value.astype("<f4").tobytes()
     return "v2i", struct.pack("<2i", *value)
 
 

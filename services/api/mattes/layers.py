@@ -17,20 +17,21 @@ from services.api.mattes.progress import Progress, open_whole_frame, while_there
 from storage.errors import InvalidInput, NotFound
 from storage.layout import mattes as stored_mattes
 from storage.records import mattes
+from workflows.composite.live import nodes
 from workflows.mattes import layers
 from workflows.mattes.pixel import Pixel, bytes_of_pixel, look_into
 from workflows.mattes.pixel_picture import picture
 
 router = APIRouter(tags=["mattes"])
 MOST_BYTES = 1 << 30
-"""The most that `all.exr` may have before it is compressed: it waits in a temporary file until it is sent."""
-MEDIA_TYPES = {"png": "image/png", "exr": "image/x-exr"}
+"""The most that a file with lobes may have before it is compressed: it waits in a temporary file until it is sent."""
+MEDIA_TYPES = {"png": "image/png", "exr": "image/x-exr", "py": "text/x-python"}
 FILES: dict[str, Callable[[stored_mattes.Matte, IO[bytes]], None]] = {
     f"{name}.{kind}": lambda matte, file, name=name, write=write: write(matte, name, file)
     for name in layers.NAMES
     for kind, write in (("png", layers.png), ("exr", layers.exr))
 } | {"stmap.exr": layers.stmap}
-ALL = "all.exr"
+WITH_LOBES = {"all.exr": layers.everything} | nodes.FILES
 Lobes = Annotated[
     int,
     Query(
@@ -97,12 +98,13 @@ async def get_layer(
     context: OwnerContext, id: str, file: str, request: Request, lobes: Lobes = layers.LOBES
 ) -> Response:
     """A layer: `S`, `rho`, `alpha` or `confidence`, as `.png` (16 bits, linear, clipped to 0 to 1) or `.exr`;
-    `stmap.exr`; or `all.exr`, all layers with the lobes of each pixel.
+    `stmap.exr`; `all.exr`, all layers with the lobes of each pixel; or `lookups.exr`, for a node that draws the glass,
+    and the file that makes this node: `blender.py`.
 
     If the matte is still being recovered, they are those of its preview, which is smaller.
     """
-    if file not in FILES and file != ALL:
-        raise NotFound(f"there is no layer {file}; the layers are {', '.join([*FILES, ALL])}")
+    if file not in FILES and file not in WITH_LOBES:
+        raise NotFound(f"there is no layer {file}; the layers are {', '.join([*FILES, *WITH_LOBES])}")
 
     def headers_of(progress: Progress) -> dict[str, str]:
         # Neither a matte that is ready nor a preview ever changes.
@@ -113,7 +115,7 @@ async def get_layer(
     if etag_matches(request.headers, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     size = layers.bytes_of_everything(matte.width, matte.height, lobes)
-    if file == ALL and size > MOST_BYTES:
+    if file in WITH_LOBES and size > MOST_BYTES:
         raise InvalidInput(
             f"all layers with {lobes} lobes take {size} bytes, and the limit is {MOST_BYTES}: ask for fewer "
             "lobes, or for the layers one by one",
@@ -121,7 +123,12 @@ async def get_layer(
             limit=MOST_BYTES,
         )
     kind = file.rpartition(".")[2]
-    write = partial(layers.everything, lobes=lobes) if file == ALL else FILES[file]
+
+    def write(found: stored_mattes.Matte, target: IO[bytes]) -> None:
+        if file in WITH_LOBES:
+            WITH_LOBES[file](found, target, lobes)
+        else:
+            FILES[file](found, target)
 
     def encode(now: Progress) -> Response:
         found = context.cache.matte(now.whole_frame)

@@ -121,3 +121,14 @@ def test_the_command_writes_a_folder_of_layers(service: Service, matte: str, tmp
     written = json.loads(done.output)["layers"]
     assert sorted(path.name for path in out.iterdir()) == sorted(written)
     assert (out / "stmap.exr").read_bytes() == service.client.layer(matte, "stmap.exr")
+
+
+def test_the_command_writes_the_node_of_a_tool(service: Service, matte: str, tmp_path: Path) -> None:
+    out = tmp_path / "blender"
+    done = CliRunner().invoke(main, ["layers", matte, str(out), "--for", "blender", "--url", service.url])
+    assert done.exit_code == 0, done.output
+    assert {path.name for path in out.iterdir()} == {"lookups.exr", "blender.py"}
+    assert "'lookups': 8" in (out / "blender.py").read_text()
+    with OpenEXR.File(str(out / "lookups.exr"), separate_channels=True) as file:
+        lookups = [name for name in file.channels() if name.startswith("lookup") and name.endswith(".R")]
+        assert len(lookups) == 8

@@ -1,0 +1,95 @@
+"""The nodes of Blender, made and rendered by Blender itself, without a window."""
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from storage.layout.mattes import Matte
+from storage.objects.store import Objects
+from tests.workflows.composite.live.nodes.drawing import (
+    Image,
+    backdrops,
+    draw,
+    few_nodes,
+    psnr,
+    read_channels,
+    recovered,
+    write_picture,
+)
+from workflows.composite import composite
+from workflows.composite.live.nodes.blender import write_blender
+from workflows.composite.live.nodes.exr import write_lookups
+
+needs_blender = pytest.mark.skipif(
+    importlib.util.find_spec("bpy") is None,
+    reason="Blender is not installed (on Python 3.11: pip install --no-deps bpy==4.5.0)",
+)
+BARS = {"photo": 45, "strokes": 45, "ramp": 45, "checker": 40, "tiles": 40}
+"""PSNR of the nodes against the service's composite, at least."""
+SHORT = {"photo": 43.5, "strokes": 41.5, "checker": 34, "tiles": 35.5}
+"""The same of the tumbler, of whose pixels eight look-ups hold less."""
+
+
+def write_nodes(matte: Matte, folder: Path, lookups: int) -> None:
+    for name, write in (("lookups.exr", write_lookups), ("blender.py", write_blender)):
+        with (folder / name).open("wb") as file:
+            write(matte, file, lookups)
+
+
+def render(folder: Path, backdrop: Image, *more: str) -> Image:
+    """What Blender makes of the nodes in a folder, (height, width, 4)."""
+    write_picture(folder / "backdrop.exr", backdrop)
+    files = ["--backdrop", str(folder / "backdrop.exr"), "--output", str(folder / "glass.exr"), *more]
+    command = [sys.executable, str(folder / "blender.py"), "--", *files]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    channels, _ = read_channels(folder / "glass.exr")
+    return np.stack([channels[c] for c in "RGBA"], axis=-1)
+
+
+def test_the_script_has_the_figures_of_the_matte(objects: Objects, tmp_path: Path) -> None:
+    write_nodes(few_nodes(objects, 3), tmp_path, 4)
+    script = (tmp_path / "blender.py").read_text()
+    compile(script, "blender.py", "exec")
+    assert "((75, 37), (38, 19), (19, 10))" in script
+    assert "'lookups': 4" in script
+
+
+@needs_blender
+def test_blender_draws_the_composite_where_lookups_suffice(objects: Objects, tmp_path: Path) -> None:
+    matte = few_nodes(objects, 3)
+    write_nodes(matte, tmp_path, 3)
+    backdrop = np.random.default_rng(1).random((74, 150, 3), np.float32)
+    seen = render(tmp_path, backdrop, "--save", str(tmp_path / "glass.blend"))
+    expected = composite(matte, backdrop)
+    np.testing.assert_allclose(seen, expected, atol=2e-3)
+    assert (tmp_path / "glass.blend").stat().st_size > 1000
+
+
+@needs_blender
+def test_backdrop_of_any_size_is_averaged_over_the_cells(objects: Objects, tmp_path: Path) -> None:
+    matte = few_nodes(objects, 3)
+    write_nodes(matte, tmp_path, 3)
+    y, x = np.mgrid[:90, :200]
+    backdrop = np.stack([x / 200, y / 90, 0.5 + 0.4 * np.sin(x / 20)], axis=-1).astype(np.float32)
+    expected = composite(matte, backdrop)
+    assert psnr(render(tmp_path, backdrop), expected, expected[..., 3] > 0) > 50
+
+
+@needs_blender
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ball", "lens", "tumbler"])
+def test_blender_draws_a_recovered_glass(objects: Objects, tmp_path: Path, name: str) -> None:
+    matte = recovered(objects, name)
+    write_nodes(matte, tmp_path, 8)
+    bars = BARS | SHORT if name == "tumbler" else BARS
+    for kind, backdrop in backdrops().items():
+        seen, service = render(tmp_path, backdrop), composite(matte, backdrop)
+        glass = service[..., 3] > 0
+        np.testing.assert_array_equal(seen[..., 3], service[..., 3])
+        assert psnr(seen, draw(tmp_path / "lookups.exr", backdrop), glass) > 80, kind
+        assert psnr(seen, service, glass) > bars[kind], kind

@@ -1,0 +1,16 @@
+"""A matte's lookups as an EXR, and files that make nodes of compositing software which draw the glass from it.
+
+`FILES` has what writes each file, by its name, with a number of lookups of a pixel.
+"""
+
+from collections.abc import Callable
+from typing import IO
+
+from storage.layout.mattes import Matte
+from workflows.composite.live.nodes.blender import write_blender
+from workflows.composite.live.nodes.exr import write_lookups
+
+FILES: dict[str, Callable[[Matte, IO[bytes], int], None]] = {
+    "lookups.exr": write_lookups,
+    "blender.py": write_blender,
+}

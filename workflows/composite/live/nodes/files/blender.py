@@ -1,0 +1,232 @@
+"""A glass of envmatte as a node of Blender's compositor: a backdrop goes in, the glass in front of it comes out.
+
+Keep this file beside `lookups.exr`. In Blender, open it in the text editor and run it: the compositor gets a group of
+nodes. Put any linear picture, clip or render into its input. It stretches over the monitor that the glass was filmed
+before. Or without a window::
+
+    blender -b -P blender.py -- --backdrop sky.exr --output glass.exr --save glass.blend
+
+`python` with the package `bpy` does the same as `blender -b -P`. It takes Blender 4.5.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+MATTE: dict[str, Any] = {}
+FINEST_TAPS, MOST_TAPS = 4, 16
+"""Samples of the backdrop in each cell of the first level, along an axis, at least and at most."""
+Value = Any  # a socket, or a number
+
+
+class Nodes:
+    """The nodes of a group, each made by the arithmetic that it does."""
+
+    def __init__(self, name: str, inputs: Sequence[tuple[str, str]]) -> None:
+        self.tree = bpy.data.node_groups.new(name, "CompositorNodeTree")
+        for label, kind in inputs:
+            self.tree.interface.new_socket(label, in_out="INPUT", socket_type=f"NodeSocket{kind}")
+        self.tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+        self.inputs = self.tree.nodes.new("NodeGroupInput").outputs
+
+    def add(self, kind: str, *values: Value, **settings: Any) -> Any:
+        """Add a node, with its inputs linked or set; return its outputs."""
+        node = self.tree.nodes.new(f"CompositorNode{kind}")
+        for name, value in settings.items():
+            setattr(node, name, value)
+        for socket, value in zip(node.inputs, values, strict=False):
+            if isinstance(value, bpy.types.NodeSocket):
+                self.tree.links.new(value, socket)
+            else:
+                socket.default_value = value
+        return node.outputs
+
+    def math(self, operation: str, *values: Value) -> Value:
+        return self.add("Math", *values, operation=operation)[0]
+
+    def mix(self, blend: str, share: Value, first: Value, second: Value) -> Value:
+        return self.add("MixRGB", share, first, second, blend_type=blend)[0]
+
+    def group(self, tree: Any, *values: Value) -> Value:
+        return self.add("Group", *values, node_tree=tree)[0]
+
+    def look_up(self, light: Value, u: Value, v: Value) -> Value:
+        """The pixel of `light` at (u, v)."""
+        place = self.add("CombineXYZ", u, v, 1.0)[0]  # the third is what Map UV takes for alpha
+        return self.add("MapUV", light, place, filter_type="NEAREST")[0]
+
+    def between(self, value: Value, low: float, high: float) -> Value:
+        return self.math("MAXIMUM", self.math("MINIMUM", value, high), low)
+
+    def finish(self, result: Value) -> Any:
+        self.tree.links.new(result, self.tree.nodes.new("NodeGroupOutput").inputs[0])
+        for n, node in enumerate(self.tree.nodes):
+            node.location = 180 * (n // 12), -170 * (n % 12)
+        return self.tree
+
+
+def resampled(
+    nodes: Nodes, light: Value, size: tuple[int, int], axis: int, places: list[tuple[Any, float]]
+) -> Value:
+    """Light on a grid of a size: the weighted sum of what `light` shows at some places along an axis.
+
+    A place is a function of the column or row, counted from the top left: it returns the coordinate from 0 to 1.
+    """
+    name = f"envmatte {size[0]} x {size[1]}"
+    grid = bpy.data.images.get(name) or bpy.data.images.new(name, *size)
+    grid.use_fake_user = True
+    normalised = nodes.add("ImageCoordinates", nodes.add("Image", image=grid)[0])[1]
+    u, v, _ = nodes.add("SeparateXYZ", normalised)
+    along = u if axis == 0 else nodes.math("SUBTRACT", 1.0, v)
+    number = nodes.math("FLOOR", nodes.math("MULTIPLY", along, float(size[axis])))
+    total = None
+    for place, weight in places:
+        at = place(number)
+        seen = (
+            nodes.look_up(light, at, v)
+            if axis == 0
+            else nodes.look_up(light, u, nodes.math("SUBTRACT", 1.0, at))
+        )
+        seen = nodes.mix("MULTIPLY", 1.0, seen, (weight, weight, weight, 1))
+        total = seen if total is None else nodes.mix("ADD", 1.0, total, seen)
+    return total
+
+
+def first_level(cells: tuple[int, int], taps: int) -> Any:
+    """A group that averages a picture over each cell."""
+    nodes = Nodes("envmatte cells", [("Image", "Color")])
+    light = nodes.inputs[0]
+
+    def places(count: int) -> list[tuple[Any, float]]:
+        def place(tap: int) -> Any:
+            share = (tap + 0.5) / taps / count
+            return lambda number: nodes.math("MULTIPLY_ADD", number, 1 / count, share)
+
+        return [(place(tap), 1 / taps) for tap in range(taps)]
+
+    columns, rows = cells
+    light = resampled(nodes, light, (columns, rows * taps), 0, places(columns))
+    return nodes.finish(resampled(nodes, light, cells, 1, places(rows)))
+
+
+def next_level(fine: tuple[int, int], coarse: tuple[int, int]) -> Any:
+    """A group that halves a level, with the weights [1, 3, 3, 1] / 8 along each axis; the edge is repeated."""
+    nodes = Nodes(f"envmatte {fine[0]} to {coarse[0]} columns", [("Image", "Color")])
+    light = nodes.inputs[0]
+
+    def places(count: int) -> list[tuple[Any, float]]:
+        def place(shift: int) -> Any:
+            def at(number: Value) -> Value:
+                node = nodes.between(nodes.math("MULTIPLY_ADD", number, 2.0, float(shift)), 0.0, count - 1.0)
+                return nodes.math("DIVIDE", nodes.math("ADD", node, 0.5), float(count))
+
+            return at
+
+        return [(place(shift), weight / 8) for shift, weight in ((-1, 1), (0, 3), (1, 3), (2, 1))]
+
+    light = resampled(nodes, light, (coarse[0], fine[1]), 0, places(fine[0]))
+    return nodes.finish(resampled(nodes, light, coarse, 1, places(fine[1])))
+
+
+def bilinear(level: int, size: tuple[int, int]) -> Any:
+    """A group that looks up places in a level: x and y, in cells of the first one, from its top left."""
+    nodes = Nodes(f"envmatte look-up in level {level}", [("Image", "Color"), ("x", "Float"), ("y", "Float")])
+    light = nodes.inputs[0]
+    coordinates, shares = [], []
+    for place, count in zip((nodes.inputs[1], nodes.inputs[2]), size, strict=True):
+        at = nodes.between(nodes.math("MULTIPLY_ADD", place, 0.5**level, -0.5), 0.0, count - 1.0)
+        first = nodes.math("FLOOR", at)
+        second = nodes.math("MINIMUM", nodes.math("ADD", first, 1.0), count - 1.0)
+        shares.append(nodes.math("SUBTRACT", at, first))
+        coordinates.append(
+            [nodes.math("DIVIDE", nodes.math("ADD", n, 0.5), float(count)) for n in (first, second)]
+        )
+    up = [nodes.math("SUBTRACT", 1.0, down) for down in coordinates[1]]
+    rows = [
+        nodes.mix("MIX", shares[0], *(nodes.look_up(light, across, v) for across in coordinates[0]))
+        for v in up
+    ]
+    return nodes.finish(nodes.mix("MIX", shares[1], *rows))
+
+
+def glass(exr: Path, taps: int) -> Any:
+    """The group of the matte."""
+    levels = MATTE["levels"]
+    columns, rows = levels[0]
+    nodes = Nodes(MATTE["name"], [("Backdrop", "Color")])
+    held = bpy.data.images.load(str(exr), check_existing=True)
+    layers = nodes.add("Image", image=held)
+    pyramid = [nodes.group(first_level(levels[0], taps), nodes.inputs[0])]
+    for fine, coarse in pairwise(levels):
+        pyramid.append(nodes.group(next_level(fine, coarse), pyramid[-1]))
+    samplers = [bilinear(level, size) for level, size in enumerate(levels)]
+    arrived = (0.0, 0.0, 0.0, 1.0)
+    for k in range(MATTE["lookups"]):
+        u, v, level, _ = nodes.add("SeparateColor", layers[f"lookup{k}"])
+        x = nodes.math("MULTIPLY", u, float(columns))
+        y = nodes.math("MULTIPLY", nodes.math("SUBTRACT", 1.0, v), float(rows))
+        for n, light in enumerate(pyramid):
+            distance = nodes.math("ABSOLUTE", nodes.math("SUBTRACT", level, float(n)))
+            share = nodes.math("MAXIMUM", nodes.math("SUBTRACT", 1.0, distance), 0.0)
+            weight = nodes.mix("MULTIPLY", 1.0, layers[f"weight{k}"], share)
+            seen = nodes.mix("MULTIPLY", 1.0, weight, nodes.group(samplers[n], light, x, y))
+            arrived = nodes.mix("ADD", 1.0, arrived, seen)
+    through = nodes.add("SeparateColor", nodes.mix("MULTIPLY", 1.0, layers["rho"], arrived))
+    result = layers["S"]
+    for channel, column in enumerate(zip(*MATTE["crosstalk"], strict=True)):
+        lit = nodes.mix("MULTIPLY", 1.0, through[channel], (*column, 1.0))
+        result = nodes.mix("ADD", 1.0, result, lit)
+    return nodes.finish(nodes.add("SetAlpha", result, layers["Alpha"], mode="REPLACE_ALPHA")[0])
+
+
+def folder() -> Path:
+    """Where this script lies: in Blender's text editor ``__file__`` is only its name."""
+    text = bpy.data.texts.get(Path(__file__).name)
+    return Path(bpy.path.abspath(text.filepath) if text else __file__).resolve().parent
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--backdrop", type=Path, help="A picture; linear light if it is an EXR.")
+    parser.add_argument("--output", type=Path, help="An EXR to render.")
+    parser.add_argument("--save", type=Path, help="A .blend to write.")
+    given = parser.parse_args(sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else [])
+    scene = bpy.context.scene
+    scene.use_nodes = True
+    if given.output:  # a scene of its own, without the cube and the render that new scenes show
+        scene.node_tree.nodes.clear()
+    nodes, links = scene.node_tree.nodes, scene.node_tree.links
+    size, backdrop = MATTE["levels"][0], None
+    if given.backdrop:
+        backdrop = nodes.new("CompositorNodeImage")
+        backdrop.image = bpy.data.images.load(str(given.backdrop.resolve()))
+        size = backdrop.image.size
+    # Samples fall on pixels where the cells have a whole number of them.
+    pixels = max(-(-n // cells) for n, cells in zip(size, MATTE["levels"][0], strict=True))
+    taps = min(pixels * -(-FINEST_TAPS // pixels), MOST_TAPS)
+    group = nodes.new("CompositorNodeGroup")
+    group.node_tree, group.label, group.width = glass(folder() / "lookups.exr", taps), MATTE["name"], 200
+    output = nodes.new("CompositorNodeComposite")
+    group.location, output.location = (300, 300), (600, 300)
+    links.new(group.outputs[0], output.inputs[0])
+    if backdrop:
+        links.new(backdrop.outputs[0], group.inputs[0])
+    if given.output:
+        scene.render.resolution_x, scene.render.resolution_y = MATTE["size"]
+        scene.render.resolution_percentage = 100
+        scene.render.compositor_device, scene.render.compositor_precision = "CPU", "FULL"
+        kept = scene.render.image_settings
+        kept.file_format, kept.color_mode, kept.color_depth = "OPEN_EXR", "RGBA", "32"
+        scene.render.filepath = str(given.output.resolve())
+        bpy.ops.render.render(write_still=True)
+    if given.save:
+        bpy.ops.wm.save_as_mainfile(filepath=str(given.save.resolve()))
+
+
+if __name__ == "__main__":
+    main()
