@@ -25,7 +25,7 @@ from workflows.mattes.pixel_picture import picture
 router = APIRouter(tags=["mattes"])
 MOST_BYTES = 1 << 30
 """The most that a file with lobes may have before it is compressed: it waits in a temporary file until it is sent."""
-MEDIA_TYPES = {"png": "image/png", "exr": "image/x-exr", "py": "text/x-python"}
+MEDIA_TYPES = {"png": "image/png", "exr": "image/x-exr", "py": "text/x-python", "nk": "text/plain"}
 FILES: dict[str, Callable[[stored_mattes.Matte, IO[bytes]], None]] = {
     f"{name}.{kind}": lambda matte, file, name=name, write=write: write(matte, name, file)
     for name in layers.NAMES
@@ -99,7 +99,7 @@ async def get_layer(
 ) -> Response:
     """A layer: `S`, `rho`, `alpha` or `confidence`, as `.png` (16 bits, linear, clipped to 0 to 1) or `.exr`;
     `stmap.exr`; `all.exr`, all layers with the lobes of each pixel; or `lookups.exr`, for a node that draws the glass,
-    and the file that makes this node: `blender.py`.
+    and the file that makes this node: `blender.py` or `nuke.nk`.
 
     If the matte is still being recovered, they are those of its preview, which is smaller.
     """

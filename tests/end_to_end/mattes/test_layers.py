@@ -123,12 +123,17 @@ def test_the_command_writes_a_folder_of_layers(service: Service, matte: str, tmp
     assert (out / "stmap.exr").read_bytes() == service.client.layer(matte, "stmap.exr")
 
 
-def test_the_command_writes_the_node_of_a_tool(service: Service, matte: str, tmp_path: Path) -> None:
-    out = tmp_path / "blender"
-    done = CliRunner().invoke(main, ["layers", matte, str(out), "--for", "blender", "--url", service.url])
+@pytest.mark.parametrize(
+    ("tool", "file", "last"), [("blender", "blender.py", "'lookups': 8"), ("nuke", "nuke.nk", " name add7\n")]
+)
+def test_the_command_writes_the_node_of_a_tool(
+    service: Service, matte: str, tmp_path: Path, tool: str, file: str, last: str
+) -> None:
+    out = tmp_path / tool
+    done = CliRunner().invoke(main, ["layers", matte, str(out), "--for", tool, "--url", service.url])
     assert done.exit_code == 0, done.output
-    assert {path.name for path in out.iterdir()} == {"lookups.exr", "blender.py"}
-    assert "'lookups': 8" in (out / "blender.py").read_text()
-    with OpenEXR.File(str(out / "lookups.exr"), separate_channels=True) as file:
-        lookups = [name for name in file.channels() if name.startswith("lookup") and name.endswith(".R")]
+    assert {path.name for path in out.iterdir()} == {"lookups.exr", file}
+    assert last in (out / file).read_text()
+    with OpenEXR.File(str(out / "lookups.exr"), separate_channels=True) as held:
+        lookups = [name for name in held.channels() if name.startswith("lookup") and name.endswith(".R")]
         assert len(lookups) == 8

@@ -9,8 +9,10 @@ from typing import IO
 from storage.layout.mattes import Matte
 from workflows.composite.live.nodes.blender import write_blender
 from workflows.composite.live.nodes.exr import write_lookups
+from workflows.composite.live.nodes.nuke import write_nuke
 
 FILES: dict[str, Callable[[Matte, IO[bytes], int], None]] = {
     "lookups.exr": write_lookups,
     "blender.py": write_blender,
+    "nuke.nk": write_nuke,
 }

@@ -1,0 +1,69 @@
+"""The node of Nuke: its script parsed, and its kernels run by a C++ compiler. Nuke itself is not there to run it."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from storage.layout.mattes import Matte
+from storage.objects.store import Objects
+from tests.workflows.composite.live.nodes.drawing import draw, few_nodes, read_channels
+from tests.workflows.composite.live.nodes.nuke_script import CLASSES, Node, parse, run
+from workflows.composite import composite
+from workflows.composite.live.nodes.exr import write_lookups
+from workflows.composite.live.nodes.nuke import write_nuke
+
+needs_compiler = pytest.mark.skipif(
+    shutil.which("g++") is None, reason="g++, which runs the kernels, is not installed"
+)
+
+
+def written(matte: Matte, folder: Path, lookups: int) -> str:
+    for name, write in (("lookups.exr", write_lookups), ("nuke.nk", write_nuke)):
+        with (folder / name).open("wb") as file:
+            write(matte, file, lookups)
+    return (folder / "nuke.nk").read_text()
+
+
+def test_nodes_knobs_and_connections(objects: Objects, tmp_path: Path) -> None:
+    group, nodes = parse(written(few_nodes(objects, 3), tmp_path, 2))
+    assert group.knobs["name"] == "envmatte_glass"
+    by_name = {node.knobs["name"]: node for node in nodes}
+    assert len(by_name) == len(nodes)
+    for node in nodes:
+        assert node.kind in CLASSES
+        assert len(node.inputs) == (CLASSES[node.kind] if node.kind != "BlinkScript" else len(node.inputs))
+
+    def inputs(name: str) -> list[str]:
+        return [one.knobs["name"] for one in by_name[name].inputs]
+
+    assert inputs("cells") == ["canvas", "whole"]
+    assert (inputs("level1"), inputs("level2")) == (["cells"], ["level1"])
+    assert inputs("add0") == ["lookup0", "weight0", "dark", "level2"]
+    assert inputs("add1") == ["lookup1", "weight1", "add0", "level2"]
+    assert (inputs("through"), inputs("crosstalk")) == (["add1", "rho"], ["through"])
+    assert (inputs("glass"), inputs("alpha")) == (["crosstalk", "S"], ["glass", "lookups"])
+    assert inputs("image") == ["frame"]
+    assert by_name["lookups"].knobs["raw"] == "true"
+    assert by_name["lookups"].knobs["file"] == r'"\[file dirname \[value root.name\]\]/lookups.exr"'
+    assert by_name["frame"].knobs["box"] == "{0 0 35 20}"
+    assert 'columns, "columns", 75)' in by_name["cells"].kernel
+    assert _unconnected(nodes) == {"image"}
+
+
+@needs_compiler
+def test_kernels_draw_the_composite_where_lookups_suffice(objects: Objects, tmp_path: Path) -> None:
+    matte = few_nodes(objects, 3)
+    _, nodes = parse(written(matte, tmp_path, 3))
+    channels, _ = read_channels(tmp_path / "lookups.exr")
+    backdrop = np.random.default_rng(1).random((90, 200, 3), np.float32)
+    seen = run(nodes, backdrop, channels, tmp_path)
+    np.testing.assert_allclose(seen, composite(matte, backdrop), atol=1e-3)  # half floats
+    np.testing.assert_allclose(seen[..., :3], draw(tmp_path / "lookups.exr", backdrop), atol=2e-5)
+
+
+def _unconnected(nodes: list[Node]) -> set[str]:
+    """The names of nodes that no other takes."""
+    taken = {id(one) for node in nodes for one in node.inputs}
+    return {node.knobs["name"] for node in nodes if id(node) not in taken}

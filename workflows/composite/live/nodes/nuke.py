@@ -1,0 +1,107 @@
+"""A matte's node for Nuke: a group of BlinkScript nodes and arithmetic, as text that Nuke opens or pastes."""
+
+from itertools import pairwise
+from pathlib import Path
+from string import Template
+from typing import IO, Any
+
+from storage.layout.mattes import Matte
+from workflows.recovery.pyramid import Pyramid
+
+NAME = "envmatte_glass"
+"""Of the group of nodes."""
+_KERNELS = Path(__file__).with_name("files")
+_ESCAPED = str.maketrans({c: f"\\{c}" for c in '\\"{}[]$'} | {"\n": "\\n", "\t": "\\t"})
+Level = dict[str, int]
+
+
+def write_nuke(matte: Matte, file: IO[bytes], lobes: int) -> None:
+    """Write the group.
+
+    Parameters
+    ----------
+    matte : Matte
+    file : IO[bytes]
+    lobes : int
+        Lookups of a pixel, in the EXR that lies beside it.
+    """
+    levels = _levels(matte)
+    first = levels[0]
+    canvas = (
+        max(one["left"] + one["columns"] for one in levels),
+        max(one["bottom"] + one["rows"] for one in levels),
+    )
+    nodes = _Nodes()
+    backdrop = nodes.add("Input", name="backdrop")
+    backdrop = nodes.add("Crop", (backdrop,), name="whole", box="{0 0 {input.width} {input.height}}")
+    held = nodes.add(
+        "Read", name="lookups", file=_quoted("[file dirname [value root.name]]/lookups.exr"), raw="true"
+    )
+    light = nodes.add("Constant", name="canvas", format=_format(canvas))
+    light = nodes.blink("cells", "cells", (light, backdrop), columns=first["columns"], rows=first["rows"])
+    for n, (fine, coarse) in enumerate(pairwise(levels), start=1):
+        finer = {f"fine{name.capitalize()}": value for name, value in fine.items()}
+        light = nodes.blink(f"level{n}", "halve", (light,), **coarse, **finer)
+    arrived = nodes.add("Constant", name="dark", format=_format((matte.width, matte.height)))
+    for k in range(lobes):
+        of_lookup = (nodes.layer(held, f"lookup{k}"), nodes.layer(held, f"weight{k}"), arrived, light)
+        sizes = {"columns": first["columns"], "rows": first["rows"], "levels": len(levels)}
+        arrived = nodes.blink(f"add{k}", "lookup", of_lookup, **sizes)
+    through = nodes.add("Merge2", (arrived, nodes.layer(held, "rho")), name="through", operation="multiply")
+    matrix = " ".join(
+        "{" + " ".join(f"{value:.9g}" for value in row) + "}" for row in matte.attributes["crosstalk"]
+    )
+    mixed = nodes.add("ColorMatrix", (through,), name="crosstalk", matrix=f"{{{matrix}}}")
+    seen = nodes.add("Merge2", (mixed, nodes.layer(held, "S")), name="glass", operation="plus")
+    whole = nodes.add("Copy", (seen, held), name="alpha", from0="rgba.alpha", to0="rgba.alpha")
+    size = f"{{0 0 {matte.width} {matte.height}}}"
+    nodes.add("Output", (nodes.add("Crop", (whole,), name="frame", box=size),), name="image")
+    file.write(nodes.text().encode())
+
+
+def _levels(matte: Matte) -> list[Level]:
+    """Where each level lies on the canvas: the first at the left, the others right of it, one above the other."""
+    levels: list[Level] = []
+    left = bottom = 0
+    for columns, rows in Pyramid.over(matte.columns, matte.rows).grids:
+        levels.append({"columns": columns, "rows": rows, "left": left, "bottom": bottom})
+        bottom += rows if left else 0
+        left = matte.columns
+    return levels
+
+
+def _format(size: tuple[int, int]) -> str:
+    width, height = size
+    return f'"{width} {height} 0 0 {width} {height} 1 envmatte_{width}x{height}"'
+
+
+def _quoted(text: str) -> str:
+    """A text as the value of a knob."""
+    return f'"{text.translate(_ESCAPED)}"'
+
+
+class _Nodes:
+    """Nodes as the text of a script, in which each takes its inputs from a stack, the first one from its top."""
+
+    def __init__(self) -> None:
+        self._lines: list[str] = []
+
+    def add(self, kind: str, inputs: tuple[str, ...] = (), **knobs: Any) -> str:
+        """Add a node; return what others find it by."""
+        self._lines += [f"push ${node}" for node in reversed(inputs)]
+        self._lines += [f"{kind} {{", f" inputs {len(inputs)}"]
+        self._lines += [f" {name} {value}" for name, value in knobs.items()]
+        self._lines += ["}", f"set N{knobs['name']} [stack 0]"]
+        return f"N{knobs['name']}"
+
+    def layer(self, image: str, name: str) -> str:
+        """Add a node that shows a layer of an image as its colours."""
+        return self.add("Shuffle", (image,), **{"in": name}, name=name)
+
+    def blink(self, name: str, kernel: str, inputs: tuple[str, ...], **params: int) -> str:
+        """Add a node that runs a kernel, with the defaults of its parameters."""
+        source = Template((_KERNELS / f"{kernel}.blink").read_text()).substitute(params)
+        return self.add("BlinkScript", inputs, name=name, kernelSource=_quoted(source))
+
+    def text(self) -> str:
+        return "\n".join(["Group {", f" name {NAME}", " inputs 1", "}", *self._lines, "end_group", ""])
