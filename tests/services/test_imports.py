@@ -11,6 +11,7 @@ from contextlib import suppress
 
 ours = ("services", "workflows", "storage")
 files = [path for package in ours for path in sorted(pathlib.Path(package).rglob("*.py"))]
+files = [path for path in files if "files" not in path.parts]  # scripts for other programs
 files = [path for path in files if "versions" not in path.parts and path.name not in ("__main__.py", "env.py")]
 
 
