@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workflows.recovery.lobes.fitting.fits import Fits, Pixels
-from workflows.recovery.lobes.fitting.neighbours import coarse_to_fine
+from workflows.recovery.lobes.fitting.neighbours import FEWEST_COLOURED, coarse_to_fine
 from workflows.recovery.lobes.fitting.pixels import fit_pixels
 from workflows.recovery.lobes.options import FINE, LobesOptions
 from workflows.recovery.lobes.pixels import Diagnostics, finish_pixels
@@ -83,8 +83,8 @@ def recover(
     options : LobesOptions
     conditions : Conditions
     places : (n, 2) int, optional
-        Rows and columns of the pixels in their frame. Fits then start from those of neighbours. Default: each pixel is
-        recovered alone.
+        Rows and columns of the pixels in their frame. Fits then start from those of neighbours, unless there are only
+        few coloured patterns. Default: each pixel is recovered alone.
 
     Returns
     -------
@@ -143,9 +143,9 @@ def recover(
         np.zeros((n, 3)),
         counts,
     )
-    transport = _recover_measured(
-        patterns, measured, options, conditions.model_error, strays, coarse_to_fine(places, n), found
-    )
+    alone = patterns.channels > 1 and m < FEWEST_COLOURED
+    order = coarse_to_fine(None if alone else places, n)
+    transport = _recover_measured(patterns, measured, options, conditions.model_error, strays, order, found)
     if stray is not None:
         known = _are_known(measured, found.stray)
         weak = photometry.rho[..., np.newaxis] / 2 * found.stray[:, :, :-2]
