@@ -21,7 +21,11 @@ SYNC = b"\x47"
 MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".exr": "image/x-exr"}
 """Of composites, by the ends of file names."""
 LAYERS = ("all.exr", "stmap.exr", "S.png", "rho.png", "alpha.png", "confidence.png")
-NODES = {"blender": ("lookups.exr", "blender.py"), "nuke": ("lookups.exr", "nuke.nk")}
+NODES = {
+    "blender": ("lookups.exr", "blender.py"),
+    "nuke": ("lookups.exr", "nuke.nk"),
+    "glsl": ("matte.live", "envmatte.js", "glass.html"),
+}
 """Files that make a node of a tool."""
 MOST_LOBES = 8
 """What a node draws of a pixel: all that there are, because a node is for the best picture."""

@@ -12,8 +12,14 @@ WEB = Path(__file__).parents[2] / "services" / "web"
 WORDS = sorted((WEB / "app" / "words").glob("*.js"))
 OF_SERVICE = sorted((WEB / "app" / "words" / "service").glob("*.js"))
 """What the service says, in languages other than its own: its sentences, with {places} for what differs."""
-SCRIPTS = [path for path in sorted(WEB.rglob("*.js")) if path not in WORDS + OF_SERVICE]
-PAGES = sorted(WEB.rglob("*.html"))
+FOR_OTHERS = WEB / "module"
+"""What pages of other people are made of: it says nothing in the app."""
+SCRIPTS = [
+    path
+    for path in sorted(WEB.rglob("*.js"))
+    if path not in WORDS + OF_SERVICE and FOR_OTHERS not in path.parents
+]
+PAGES = [path for path in sorted(WEB.rglob("*.html")) if FOR_OTHERS not in path.parents]
 SAYING = [
     "services/api/jobs/wait_reason.py",
     "services/runtime/problems.py",

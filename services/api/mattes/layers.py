@@ -13,25 +13,36 @@ from pydantic_core import to_json
 from services.api.context import Context, OwnerContext
 from services.api.http.responses import bytes_response, etag_matches, file_response
 from services.api.http.types import Colour, Pair
+from services.api.mattes import live_module
 from services.api.mattes.progress import Progress, open_whole_frame, while_there
 from storage.errors import InvalidInput, NotFound
 from storage.layout import mattes as stored_mattes
 from storage.records import mattes
 from workflows.composite.live import nodes
+from workflows.composite.live.encode import bytes_of_live
 from workflows.mattes import layers
 from workflows.mattes.pixel import Pixel, bytes_of_pixel, look_into
 from workflows.mattes.pixel_picture import picture
+from workflows.threads import CORES
 
 router = APIRouter(tags=["mattes"])
 MOST_BYTES = 1 << 30
 """The most that a file with lobes may have before it is compressed: it waits in a temporary file until it is sent."""
-MEDIA_TYPES = {"png": "image/png", "exr": "image/x-exr", "py": "text/x-python", "nk": "text/plain"}
+MEDIA_TYPES = {
+    "png": "image/png",
+    "exr": "image/x-exr",
+    "py": "text/x-python",
+    "nk": "text/plain",
+    "html": "text/html",
+    "js": "text/javascript",
+    "live": "application/octet-stream",
+}
 FILES: dict[str, Callable[[stored_mattes.Matte, IO[bytes]], None]] = {
     f"{name}.{kind}": lambda matte, file, name=name, write=write: write(matte, name, file)
     for name in layers.NAMES
     for kind, write in (("png", layers.png), ("exr", layers.exr))
 } | {"stmap.exr": layers.stmap}
-WITH_LOBES = {"all.exr": layers.everything} | nodes.FILES
+WITH_LOBES = {"all.exr": layers.everything} | nodes.FILES | live_module.FILES
 Lobes = Annotated[
     int,
     Query(
@@ -99,7 +110,8 @@ async def get_layer(
 ) -> Response:
     """A layer: `S`, `rho`, `alpha` or `confidence`, as `.png` (16 bits, linear, clipped to 0 to 1) or `.exr`;
     `stmap.exr`; `all.exr`, all layers with the lobes of each pixel; or `lookups.exr`, for a node that draws the glass,
-    and the file that makes this node: `blender.py` or `nuke.nk`.
+    and the file that makes this node: `blender.py` or `nuke.nk`. `envmatte.js` is a module of JavaScript that draws
+    `matte.live`, and `glass.html` a page that uses it.
 
     If the matte is still being recovered, they are those of its preview, which is smaller.
     """
@@ -108,7 +120,9 @@ async def get_layer(
 
     def headers_of(progress: Progress) -> dict[str, str]:
         # Neither a matte that is ready nor a preview ever changes.
-        return progress.headers | {"ETag": f'"{progress.whole_frame}-{file}-{lobes}"'}
+        headers = progress.headers | {"ETag": f'"{progress.whole_frame}-{file}-{lobes}"'}
+        # Saved and not shown: here it would be a page of the service.
+        return headers | ({"Content-Disposition": "attachment"} if file.endswith(".html") else {})
 
     progress, matte = await anyio.to_thread.run_sync(open_whole_frame, context, id)
     headers = headers_of(progress)
@@ -136,6 +150,8 @@ async def get_layer(
 
     work = partial(while_there, context, progress, encode)
     memory = LOOK_BYTES + layers.bytes_of_band(matte, lobes)
+    if file == live_module.LIVE:
+        memory += bytes_of_live(matte, lobes) + CORES * LOOK_BYTES
     return await context.compute(request, context.layers, work, memory=memory)
 
 

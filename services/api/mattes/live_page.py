@@ -74,6 +74,16 @@ def bundle(module: Path) -> str:
     return "".join(parts)
 
 
+def bundle_module(module: Path) -> str:
+    """One module of JavaScript with all that a module imports, and with its exports and its first comment."""
+    text = module.read_text()
+    about = re.split("^import ", text, maxsplit=1, flags=re.MULTILINE)[0]
+    exported = ", ".join(found[2] for found in _EXPORT.finditer(text))
+    script = bundle(module).replace(about, "")
+    (last,) = re.findall(r"^const (module\d+) = ", script, re.MULTILINE)[-1:]
+    return f"{about}{script}export const {{ {exported} }} = {last};\n"
+
+
 def _colours() -> str:
     """The rules of the app's style sheet that name its colours, light and dark."""
     found = re.match(

@@ -183,6 +183,7 @@ export const de = {
 	"layer.name": "Die Ebene „{name}“",
 	"layer.rho": "Durchlässigkeit: wie viel vom Licht des Monitors durchkommt, für jede Farbe.",
 	"layers": "Ebenen",
+	"layers.nodes": "Als Knoten für Blender oder Nuke, neben lookups.exr:",
 	"layers.tools": "Für andere Programme:",
 	"list.all": "Alle Zustände",
 	"list.choose": "{name} auswählen",

@@ -183,6 +183,7 @@ export const en = {
 	"layer.name": "The layer “{name}”",
 	"layer.rho": "Transparency: how much of the monitor’s light comes through, for each colour.",
 	"layers": "Layers",
+	"layers.nodes": "As a node of Blender or Nuke, beside lookups.exr:",
 	"layers.tools": "For other tools:",
 	"list.all": "All states",
 	"list.choose": "Choose {name}",
