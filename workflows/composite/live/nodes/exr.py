@@ -61,7 +61,9 @@ def write_lookups(matte: Matte, file: IO[bytes], lobes: int) -> None:
     def bands() -> Iterator[dict[str, NDArray[np.float32]]]:
         for row in range(matte.block_rows):
             rows = matte.span(row, 0)[0]
-            planes = {name: np.zeros((rows.stop - rows.start, matte.width), np.float32) for name in types}
+            planes = {
+                name: np.zeros((rows.stop - rows.start, matte.width), kind) for name, kind in types.items()
+            }
             for column in range(matte.block_columns):
                 checkpoint()
                 block = matte.read(row, column)

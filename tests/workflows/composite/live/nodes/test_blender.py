@@ -80,6 +80,30 @@ def test_backdrop_of_any_size_is_averaged_over_the_cells(objects: Objects, tmp_p
     assert psnr(render(tmp_path, backdrop), expected, expected[..., 3] > 0) > 50
 
 
+TEXT_EDITOR = """
+import sys, bpy
+text = bpy.data.texts.load(sys.argv[1])
+names = {"__name__": "__main__", "__file__": "/untitled.blend/" + text.name}
+exec(compile(text.as_string(), names["__file__"], "exec"), names)
+(group,) = [node for node in bpy.context.scene.node_tree.nodes if node.bl_idname == "CompositorNodeGroup"]
+(output,) = [node for node in bpy.context.scene.node_tree.nodes if node.bl_idname == "CompositorNodeComposite"]
+(held,) = [node.image for node in group.node_tree.nodes if node.bl_idname == "CompositorNodeImage"]
+print(group.label, [one.name for one in (*group.inputs, *group.outputs)], held.filepath, sep="|")
+"""
+"""Runs a script as the text editor does, where only the text's name is in ``__file__``."""
+
+
+@needs_blender
+def test_the_text_editor_adds_a_group_and_leaves_the_output(objects: Objects, tmp_path: Path) -> None:
+    write_nodes(few_nodes(objects, 3), tmp_path, 3)
+    command = [sys.executable, "-c", TEXT_EDITOR, str(tmp_path / "blender.py")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    found = done.stdout.splitlines()[-1].split("|")
+    assert found[:2] == ["envmatte glass", "['Backdrop', 'Image']"]
+    assert found[2] == str(tmp_path / "lookups.exr")
+
+
 @needs_blender
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["ball", "lens", "tumbler"])

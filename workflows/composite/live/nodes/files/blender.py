@@ -1,8 +1,8 @@
 """A glass of envmatte as a node of Blender's compositor: a backdrop goes in, the glass in front of it comes out.
 
 Keep this file beside `lookups.exr`. In Blender, open it in the text editor and run it: the compositor gets a group of
-nodes. Put any linear picture, clip or render into its input. It stretches over the monitor that the glass was filmed
-before. Or without a window::
+nodes. Connect any linear picture, clip or render to its input, and the output to what it leads to. The backdrop
+stretches over the monitor that the glass was filmed before. Or without a window::
 
     blender -b -P blender.py -- --backdrop sky.exr --output glass.exr --save glass.blend
 
@@ -211,9 +211,13 @@ def main() -> None:
     taps = min(pixels * -(-FINEST_TAPS // pixels), MOST_TAPS)
     group = nodes.new("CompositorNodeGroup")
     group.node_tree, group.label, group.width = glass(folder() / "lookups.exr", taps), MATTE["name"], 200
-    output = nodes.new("CompositorNodeComposite")
-    group.location, output.location = (300, 300), (600, 300)
-    links.new(group.outputs[0], output.inputs[0])
+    group.location = 300, 600
+    if not any(
+        node.bl_idname == "CompositorNodeComposite" for node in nodes
+    ):  # else what is there stays the output
+        output = nodes.new("CompositorNodeComposite")
+        output.location = 600, 600
+        links.new(group.outputs[0], output.inputs[0])
     if backdrop:
         links.new(backdrop.outputs[0], group.inputs[0])
     if given.output:
