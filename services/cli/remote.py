@@ -27,8 +27,6 @@ NODES = {
     "glsl": ("matte.live", "envmatte.js", "glass.html"),
 }
 """Files that make a node of a tool."""
-MOST_LOBES = 8
-"""What a node draws of a pixel: all that there are, because a node is for the best picture."""
 InputFile = click.Path(exists=True, dir_okay=False, path_type=Path)
 OutputFile = click.Path(dir_okay=False, path_type=Path)
 
@@ -283,13 +281,13 @@ def layers(matte: str, folder: Path, tool: str | None, url: str, key: str | None
     """
     import tempfile
 
-    names, lobes = (NODES[tool], MOST_LOBES) if tool else (LAYERS, None)
+    names = NODES[tool] if tool else LAYERS
     with _client(url, key) as client:
         client.matte(matte)  # fails before a folder is made
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as part:
             for name in names:
-                Path(part, name).write_bytes(client.layer(matte, name, lobes=lobes))
+                Path(part, name).write_bytes(client.layer(matte, name))
             folder.mkdir(exist_ok=True)
             for name in names:
                 os.replace(Path(part, name), folder / name)

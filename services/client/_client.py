@@ -264,14 +264,9 @@ class Client:
             at += target.write(answer.content)
             size = int(answer.headers.get("Content-Range", f"/{at}").rpartition("/")[2])
 
-    def layer(self, matte: Matte | str, name: str, *, lobes: int | None = None) -> bytes:
-        """Get a layer of a matte as a file, such as ``confidence.png``; ``Matte.layers`` has them as arrays.
-
-        ``lobes`` is the most that ``all.exr`` and the files of nodes have for a pixel, from 1 to 8.
-        """
-        path = f"{_path(Matte, matte)}/layers/{name}"
-        wanted = {} if lobes is None else {"lobes": lobes}
-        return self._http.send("GET", path, params=wanted, computing=True).content
+    def layer(self, matte: Matte | str, name: str) -> bytes:
+        """Get a layer of a matte as a file, such as ``confidence.png``; ``Matte.layers`` has them as arrays."""
+        return self._http.send("GET", f"{_path(Matte, matte)}/layers/{name}", computing=True).content
 
     def live_page(self, matte: Matte | str) -> bytes:
         """Get a matte as a web page in one file, which draws the glass without a service."""

@@ -20,6 +20,7 @@ from storage.layout import mattes as stored_mattes
 from storage.records import mattes
 from workflows.composite.live import nodes
 from workflows.composite.live.encode import bytes_of_live
+from workflows.composite.live.nodes.exr import LOOKUPS, bytes_of_lookups
 from workflows.mattes import layers
 from workflows.mattes.pixel import Pixel, bytes_of_pixel, look_into
 from workflows.mattes.pixel_picture import picture
@@ -27,7 +28,7 @@ from workflows.threads import CORES
 
 router = APIRouter(tags=["mattes"])
 MOST_BYTES = 1 << 30
-"""The most that a file with lobes may have before it is compressed: it waits in a temporary file until it is sent."""
+"""The most that a file of lobes or look-ups may have before it is compressed: it waits in a temporary file."""
 MEDIA_TYPES = {
     "png": "image/png",
     "exr": "image/x-exr",
@@ -42,13 +43,22 @@ FILES: dict[str, Callable[[stored_mattes.Matte, IO[bytes]], None]] = {
     for name in layers.NAMES
     for kind, write in (("png", layers.png), ("exr", layers.exr))
 } | {"stmap.exr": layers.stmap}
-WITH_LOBES = {"all.exr": layers.everything} | nodes.FILES | live_module.FILES
+ALL = "all.exr"
+NODES = nodes.FILES | live_module.FILES
 Lobes = Annotated[
     int,
     Query(
         ge=1,
         le=layers.MOST_LOBES,
         description="The most lobes of a pixel; further ones are merged into these.",
+    ),
+]
+Lookups = Annotated[
+    int,
+    Query(
+        ge=1,
+        le=LOOKUPS,
+        description="The most look-ups of a pixel in the files of a node; further cells are merged into these.",
     ),
 ]
 MOST_CELLS = 10_000
@@ -106,7 +116,12 @@ class Transport(BaseModel):
     responses={200: {"content": {kind: {} for kind in MEDIA_TYPES.values()}, "description": "The layer"}},
 )
 async def get_layer(
-    context: OwnerContext, id: str, file: str, request: Request, lobes: Lobes = layers.LOBES
+    context: OwnerContext,
+    id: str,
+    file: str,
+    request: Request,
+    lobes: Lobes = layers.LOBES,
+    lookups: Lookups = LOOKUPS,
 ) -> Response:
     """A layer: `S`, `rho`, `alpha` or `confidence`, as `.png` (16 bits, linear, clipped to 0 to 1) or `.exr`;
     `stmap.exr`; `all.exr`, all layers with the lobes of each pixel; or `lookups.exr`, for a node that draws the glass,
@@ -115,12 +130,12 @@ async def get_layer(
 
     If the matte is still being recovered, they are those of its preview, which is smaller.
     """
-    if file not in FILES and file not in WITH_LOBES:
-        raise NotFound(f"there is no layer {file}; the layers are {', '.join([*FILES, *WITH_LOBES])}")
+    if file not in (known := [*FILES, ALL, *NODES]):
+        raise NotFound(f"there is no layer {file}; the layers are {', '.join(known)}")
 
     def headers_of(progress: Progress) -> dict[str, str]:
         # Neither a matte that is ready nor a preview ever changes.
-        headers = progress.headers | {"ETag": f'"{progress.whole_frame}-{file}-{lobes}"'}
+        headers = progress.headers | {"ETag": f'"{progress.whole_frame}-{file}-{lobes}-{lookups}"'}
         # Saved and not shown: here it would be a page of the service.
         return headers | ({"Content-Disposition": "attachment"} if file.endswith(".html") else {})
 
@@ -128,19 +143,23 @@ async def get_layer(
     headers = headers_of(progress)
     if etag_matches(request.headers, headers["ETag"]):
         return Response(status_code=304, headers=headers)
-    size = layers.bytes_of_everything(matte.width, matte.height, lobes)
-    if file in WITH_LOBES and size > MOST_BYTES:
+    size, number, name = layers.bytes_of_everything(matte.width, matte.height, lobes), lobes, "lobes"
+    if file in NODES:
+        size, number, name = bytes_of_lookups(matte.width, matte.height, lookups), lookups, "lookups"
+    if file not in FILES and size > MOST_BYTES:
         raise InvalidInput(
-            f"all layers with {lobes} lobes take {size} bytes, and the limit is {MOST_BYTES}: ask for fewer "
-            "lobes, or for the layers one by one",
-            field="lobes",
+            f"{file} with {number} {name} takes {size} bytes, and the limit is {MOST_BYTES}: ask for fewer {name}, or "
+            "for the layers one by one",
+            field=name,
             limit=MOST_BYTES,
         )
     kind = file.rpartition(".")[2]
 
     def write(found: stored_mattes.Matte, target: IO[bytes]) -> None:
-        if file in WITH_LOBES:
-            WITH_LOBES[file](found, target, lobes)
+        if file in NODES:
+            NODES[file](found, target, lookups)
+        elif file == ALL:
+            layers.everything(found, target, lobes)
         else:
             FILES[file](found, target)
 
@@ -150,8 +169,9 @@ async def get_layer(
 
     work = partial(while_there, context, progress, encode)
     memory = LOOK_BYTES + layers.bytes_of_band(matte, lobes)
-    if file == live_module.LIVE:
-        memory += bytes_of_live(matte, lobes) + CORES * LOOK_BYTES
+    if file in NODES:
+        band = bytes_of_lookups(matte.width, matte.block, lookups)
+        memory = CORES * LOOK_BYTES + (bytes_of_live(matte) if file == live_module.LIVE else band)
     return await context.compute(request, context.layers, work, memory=memory)
 
 

@@ -18,9 +18,9 @@ from storage.objects.store import Objects
 from tests.workflows.composite.live.nodes.drawing import backdrops, draw, psnr, recovered
 from tests.workflows.composite.live.nodes.test_blender import render, write_nodes
 from workflows.composite import composite
+from workflows.composite.live.nodes.exr import LOOKUPS
 from workflows.images.tone_curves import from_light
 
-LOOKUPS = (8, 4)
 SHOWN = "photo", "strokes"
 GREY = 0.25
 """Light where the mask left pixels out."""
@@ -40,18 +40,17 @@ def _measure(name: str) -> NDArray[np.floating]:
         matte = recovered(Objects(Path(folder, "store").as_uri()), name)
         entries = matte.layer("count").sum(axis=-1)[matte.layer("recovered")]
         print(f"{name}: entries of a pixel, median and 90th percentile: {np.percentile(entries, (50, 90))}")
-        for lookups in LOOKUPS:
-            write_nodes(matte, Path(folder), lookups)
-            of_service, of_formula = {}, {}
-            for kind, backdrop in backdrops().items():
-                seen, service = render(Path(folder), backdrop), composite(matte, backdrop)
-                glass = service[..., 3] > 0
-                of_service[kind] = round(psnr(seen, service, glass), 1)
-                of_formula[kind] = round(psnr(seen, draw(Path(folder, "lookups.exr"), backdrop), glass), 1)
-                if lookups == max(LOOKUPS) and kind in SHOWN:
-                    tiles += [*map(_shown, (seen, service)), _difference(seen, service)]
-            print(f"{name}, {lookups} look-ups, against the service: {of_service}", flush=True)
-            print(f"{name}, {lookups} look-ups, against the formula: {of_formula}", flush=True)
+        write_nodes(matte, Path(folder), LOOKUPS)
+        of_service, of_formula = {}, {}
+        for kind, backdrop in backdrops().items():
+            seen, service = render(Path(folder), backdrop), composite(matte, backdrop)
+            glass = service[..., 3] > 0
+            of_service[kind] = round(psnr(seen, service, glass), 1)
+            of_formula[kind] = round(psnr(seen, draw(Path(folder, "lookups.exr"), backdrop), glass), 1)
+            if kind in SHOWN:
+                tiles += [*map(_shown, (seen, service)), _difference(seen, service)]
+        print(f"{name} against the service: {of_service}")
+        print(f"{name} against the formula: {of_formula}", flush=True)
     return np.concatenate(
         [np.pad(tile, ((2, 2), (2, 2), (0, 0)), constant_values=1) for tile in tiles], axis=1
     )

@@ -66,10 +66,13 @@ def test_unknown_layer_names_the_known_ones(service: Service, matte: str, file: 
         assert known in answer.json()["detail"]
 
 
-@pytest.mark.parametrize("lobes", ["0", "9", "many"])
-def test_lobe_count_outside_the_limits_is_refused(service: Service, matte: str, lobes: str) -> None:
-    answer = service.http.get(f"/v1/mattes/{matte}/layers/all.exr", params={"lobes": lobes})
-    assert (answer.status_code, answer.json()["field"]) == (422, "lobes")
+@pytest.mark.parametrize("value", ["0", "17", "many"])
+@pytest.mark.parametrize(("file", "name"), [("all.exr", "lobes"), ("lookups.exr", "lookups")])
+def test_lobe_count_outside_the_limits_is_refused(
+    service: Service, matte: str, file: str, name: str, value: str
+) -> None:
+    answer = service.http.get(f"/v1/mattes/{matte}/layers/{file}", params={name: value})
+    assert (answer.status_code, answer.json()["field"]) == (422, name)
 
 
 def test_pixel_lists_where_its_light_comes_from(service: Service, matte: str) -> None:
@@ -124,7 +127,8 @@ def test_the_command_writes_a_folder_of_layers(service: Service, matte: str, tmp
 
 
 @pytest.mark.parametrize(
-    ("tool", "file", "last"), [("blender", "blender.py", "'lookups': 8"), ("nuke", "nuke.nk", " name add7\n")]
+    ("tool", "file", "last"),
+    [("blender", "blender.py", "'lookups': 16"), ("nuke", "nuke.nk", " name add15\n")],
 )
 def test_the_command_writes_the_node_of_a_tool(
     service: Service, matte: str, tmp_path: Path, tool: str, file: str, last: str
@@ -136,4 +140,4 @@ def test_the_command_writes_the_node_of_a_tool(
     assert last in (out / file).read_text()
     with OpenEXR.File(str(out / "lookups.exr"), separate_channels=True) as held:
         lookups = [name for name in held.channels() if name.startswith("lookup") and name.endswith(".R")]
-        assert len(lookups) == 8
+        assert len(lookups) == 16

@@ -15,9 +15,8 @@ from workflows.recovery.pyramid import Pyramid
 
 FIELDS = ("x", "y", "level", "R", "G", "B")
 """The values of a lookup, in this order."""
-_MOST_CLUSTERS = 24
-"""Most clusters of a pixel that merge by Ward's cost. While there are more, those in each 2 x 2 square of a grid
-merge."""
+CLUSTERS = 24
+"""Most clusters of a pixel that merge by Ward's cost, unless another number is asked for."""
 _MOST_READ = 1 << 14
 """Clusters of a pixel that are held while its entries are read; if there are more, squares merge already then."""
 _CHUNK = 64
@@ -35,6 +34,7 @@ def fit_lookups(
     weight: NDArray[np.float32],
     most: int,
     wanted: NDArray[np.bool_],
+    clusters: int = CLUSTERS,
 ) -> NDArray[np.float32]:
     """Approximate rows of T by a few texture lookups.
 
@@ -48,6 +48,9 @@ def fit_lookups(
         Lookups of a pixel.
     wanted : (n,) bool
         Pixels to process; the others get zeros.
+    clusters : int
+        Most clusters of a pixel that merge by Ward's cost. While there are more, those in each 2 x 2 square of a grid
+        merge, which takes less time and is less exact.
 
     Returns
     -------
@@ -69,11 +72,11 @@ def fit_lookups(
     begin = np.concatenate([[0], np.cumsum(sizes.sum(axis=1))])
     capacity = min(max(int(np.diff(begin).max(initial=0)), 1), _MOST_READ)
     lookups = np.zeros((len(sizes), most, len(FIELDS)), np.float32)
-    clusters, grid = np.empty((capacity, _CLUSTER)), (pyramid.starts, pyramid.arrays.columns)
+    held, grid = np.empty((capacity, _CLUSTER)), (pyramid.starts, pyramid.arrays.columns)
     for first in range(0, len(sizes), _CHUNK):
         checkpoint()
         at = slice(first, first + _CHUNK)
-        _fit(sizes[at], begin[at], wanted[at], shared[at], cell, weight, *grid, clusters, lookups[at])
+        _fit(sizes[at], begin[at], wanted[at], shared[at], cell, weight, *grid, held, clusters, lookups[at])
     return lookups
 
 
@@ -88,6 +91,7 @@ def _fit(
     starts: NDArray[np.int64],
     columns: NDArray[np.int64],
     clusters: NDArray[np.float64],
+    most_clusters: int,
     lookups: NDArray[np.float32],
 ) -> None:
     """Write the lookups of one pixel after another."""
@@ -98,7 +102,7 @@ def _fit(
         n = _read_clusters(sizes[i], begin[i], shared[i], cell, weight, starts, columns, clusters, key, copy)
         if not shared[i]:  # the channels' rows have many nodes in common
             n = _merge_equal(clusters, key, n, copy)
-        n = _merge_squares(clusters, key, n, copy)
+        n = _merge_squares(clusters, key, n, most_clusters, copy)
         n = _merge_nearest(clusters, partner, cost, n, lookups.shape[1])
         for k in range(n):
             heaviest = k
@@ -151,10 +155,10 @@ def _read_clusters(
 
 @njit(nogil=True, cache=True)
 def _merge_squares(
-    clusters: NDArray[np.float64], key: NDArray[np.int64], n: int, copy: NDArray[np.float64]
+    clusters: NDArray[np.float64], key: NDArray[np.int64], n: int, most: int, copy: NDArray[np.float64]
 ) -> int:
     """Merge clusters in each 2 x 2 square of a grid until there are few; return the number left, which come first."""
-    while n > _MOST_CLUSTERS:
+    while n > most:
         left = _halve(clusters, key, n, copy)
         if left == n and (key[:n] % 2**48 == 0).all():
             break  # one cluster per level

@@ -28,9 +28,9 @@ export function layers(matte, signal) {
 	});
 	const names = h("fieldset.row", h("legend", t("layer")), LAYERS.map((name) =>
 		h("label.choice", h("input", { type: "radio", name: "layer", checked: name === FIRST, onchange: () => choose(name) }), t(`layer.label.${name}`))));
-	const file = (name, query = "") => button(name, problem, () => save(`v1/mattes/${matte.id}/layers/${name}${query}`, name));
-	const files = ["all.exr", "stmap.exr"].map((name) => file(name));
-	const nodes = ["lookups.exr", "blender.py", "nuke.nk"].map((name) => file(name, "?lobes=8"));
+	const file = (name) => button(name, problem, () => save(`v1/mattes/${matte.id}/layers/${name}`, name));
+	const files = ["all.exr", "stmap.exr"].map(file);
+	const nodes = ["lookups.exr", "blender.py", "nuke.nk"].map(file);
 	const panel = h("details.panel", h("summary", h("h2", t("layers"))),
 		h("div.stack", names, frame, about, h("p.row", t("layers.tools"), files), h("p.row", t("layers.nodes"), nodes), problem));
 	panel.addEventListener("toggle", () => image.hidden && choose(FIRST), { once: true });

@@ -13,21 +13,21 @@ _SCRIPT = Path(__file__).with_name("files") / "blender.py"
 _PLACE = "MATTE: dict[str, Any] = {}\n"
 
 
-def write_blender(matte: Matte, file: IO[bytes], lobes: int) -> None:
+def write_blender(matte: Matte, file: IO[bytes], lookups: int) -> None:
     """Write the script.
 
     Parameters
     ----------
     matte : Matte
     file : IO[bytes]
-    lobes : int
-        Lookups of a pixel, in the EXR that lies beside it.
+    lookups : int
+        Of a pixel, in the EXR that lies beside it.
     """
     figures = {
         "name": NAME,
         "size": (matte.width, matte.height),
         "levels": Pyramid.over(matte.columns, matte.rows).grids,
-        "lookups": lobes,
+        "lookups": lookups,
         "crosstalk": matte.attributes["crosstalk"],
     }
     before, _, after = _SCRIPT.read_text().partition(_PLACE)

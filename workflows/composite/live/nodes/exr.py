@@ -29,17 +29,21 @@ from numpy.typing import NDArray
 from storage.layout.mattes import Block, Matte
 from workflows.composite.live.lookups import fit_lookups
 from workflows.images.exr_writer import Types, write_exr
-from workflows.interruption import checkpoint
+from workflows.threads import CORES, in_parts
 
 REC_709 = np.array([0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290], np.float32)
 """x and y of red, green, blue and white."""
+LOOKUPS = 16
+"""Lookups of a pixel, unless another number is asked for, and at most: a node is for the best picture."""
+CLUSTERS = 64
+"""Of a pixel, see `fit_lookups`: more than the web app's, for the same reason."""
 _COMMENTS = (
     "C = S + crosstalk (rho * sum_k weight_k * light(lookup_k)). lookup: u, v from the bottom left, level of the "
     "backdrop's pyramid, whose first has `cells`. Linear light."
 )
 
 
-def write_lookups(matte: Matte, file: IO[bytes], lobes: int) -> None:
+def write_lookups(matte: Matte, file: IO[bytes], lookups: int) -> None:
     """Write the EXR of this module.
 
     Parameters
@@ -47,15 +51,15 @@ def write_lookups(matte: Matte, file: IO[bytes], lobes: int) -> None:
     matte : Matte
     file : IO[bytes]
         Empty, and seekable.
-    lobes : int
-        Lookups of a pixel; further nodes of T are merged into these.
+    lookups : int
+        Of a pixel; further nodes of T are merged into these.
 
     Raises
     ------
     Corrupt
         If a block of the matte is missing.
     """
-    types = _types(lobes)
+    types = _types(lookups)
     crosstalk = np.array(matte.attributes["crosstalk"], np.float32)
 
     def bands() -> Iterator[dict[str, NDArray[np.float32]]]:
@@ -64,14 +68,16 @@ def write_lookups(matte: Matte, file: IO[bytes], lobes: int) -> None:
             planes = {
                 name: np.zeros((rows.stop - rows.start, matte.width), kind) for name, kind in types.items()
             }
-            for column in range(matte.block_columns):
-                checkpoint()
+
+            def draw(column: int, row: int = row, planes: dict[str, NDArray[np.floating]] = planes) -> None:
                 block = matte.read(row, column)
                 at = slice(None), matte.span(row, column)[1]
-                for name, values in _images(matte, block, lobes, crosstalk).items():
+                for name, values in _images(matte, block, lookups, crosstalk).items():
                     for c, channel in enumerate("RGB"):
                         planes[f"{name}.{channel}" if name else channel][at] = values[..., c]
                 planes["A"][at] = block.recovered
+
+            in_parts(draw, range(matte.block_columns), CORES)
             yield planes
 
     header = {
@@ -82,6 +88,11 @@ def write_lookups(matte: Matte, file: IO[bytes], lobes: int) -> None:
         "comments": _COMMENTS,
     }
     write_exr(file, matte.width, matte.height, types, bands(), header)
+
+
+def bytes_of_lookups(width: int, height: int, lookups: int) -> int:
+    """Bytes of a frame's values in the EXR, before they are compressed."""
+    return width * height * (10 * 2 + lookups * (3 * 4 + 3 * 2))
 
 
 def _types(lookups: int) -> Types:
@@ -106,6 +117,7 @@ def _images(
         block.weight,
         lookups,
         np.ones(block.recovered.size, bool),
+        CLUSTERS,
     ).reshape(*block.recovered.shape, lookups, 6)
     used = found[..., 3:].any(axis=-1)
     found[..., 0] /= matte.columns

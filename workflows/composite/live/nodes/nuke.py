@@ -15,15 +15,15 @@ _ESCAPED = str.maketrans({c: f"\\{c}" for c in '\\"{}[]$'} | {"\n": "\\n", "\t":
 Level = dict[str, int]
 
 
-def write_nuke(matte: Matte, file: IO[bytes], lobes: int) -> None:
+def write_nuke(matte: Matte, file: IO[bytes], lookups: int) -> None:
     """Write the group.
 
     Parameters
     ----------
     matte : Matte
     file : IO[bytes]
-    lobes : int
-        Lookups of a pixel, in the EXR that lies beside it.
+    lookups : int
+        Of a pixel, in the EXR that lies beside it.
     """
     levels = _levels(matte)
     first = levels[0]
@@ -43,7 +43,7 @@ def write_nuke(matte: Matte, file: IO[bytes], lobes: int) -> None:
         finer = {f"fine{name.capitalize()}": value for name, value in fine.items()}
         light = nodes.blink(f"level{n}", "halve", (light,), **coarse, **finer)
     arrived = nodes.add("Constant", name="dark", format=_format((matte.width, matte.height)))
-    for k in range(lobes):
+    for k in range(lookups):
         of_lookup = (nodes.layer(held, f"lookup{k}"), nodes.layer(held, f"weight{k}"), arrived, light)
         sizes = {"columns": first["columns"], "rows": first["rows"], "levels": len(levels)}
         arrived = nodes.blink(f"add{k}", "lookup", of_lookup, **sizes)

@@ -22,7 +22,7 @@ from tests.workflows.composite.live.nodes.drawing import (
 )
 from workflows.composite import composite
 from workflows.composite.live.nodes.blender import write_blender
-from workflows.composite.live.nodes.exr import write_lookups
+from workflows.composite.live.nodes.exr import LOOKUPS, write_lookups
 
 needs_blender = pytest.mark.skipif(
     importlib.util.find_spec("bpy") is None,
@@ -30,8 +30,6 @@ needs_blender = pytest.mark.skipif(
 )
 BARS = {"photo": 45, "strokes": 45, "ramp": 45, "checker": 40, "tiles": 40}
 """PSNR of the nodes against the service's composite, at least."""
-SHORT = {"photo": 43.5, "strokes": 41.5, "checker": 34, "tiles": 35.5}
-"""The same of the tumbler, of whose pixels eight look-ups hold less."""
 
 
 def write_nodes(matte: Matte, folder: Path, lookups: int) -> None:
@@ -109,11 +107,10 @@ def test_the_text_editor_adds_a_group_and_leaves_the_output(objects: Objects, tm
 @pytest.mark.parametrize("name", ["ball", "lens", "tumbler"])
 def test_blender_draws_a_recovered_glass(objects: Objects, tmp_path: Path, name: str) -> None:
     matte = recovered(objects, name)
-    write_nodes(matte, tmp_path, 8)
-    bars = BARS | SHORT if name == "tumbler" else BARS
+    write_nodes(matte, tmp_path, LOOKUPS)
     for kind, backdrop in backdrops().items():
         seen, service = render(tmp_path, backdrop), composite(matte, backdrop)
         glass = service[..., 3] > 0
         np.testing.assert_array_equal(seen[..., 3], service[..., 3])
         assert psnr(seen, draw(tmp_path / "lookups.exr", backdrop), glass) > 80, kind
-        assert psnr(seen, service, glass) > bars[kind], kind
+        assert psnr(seen, service, glass) > BARS[kind], kind
