@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.layout.mattes import Matte
-from workflows.composite.live.lookups import FIELDS, fit_lookups
+from workflows.composite.live.lookups import block_lookups
 from workflows.recovery.pyramid import Pyramid
 from workflows.threads import in_parts
 
@@ -153,17 +153,7 @@ def _encode_block(
     wanted = np.zeros(block.recovered.shape, bool)
     wanted[source] = True
     lookups = len(encoded.codes)
-    fitted = fit_lookups(
-        matte.columns,
-        matte.rows,
-        block.count.reshape(-1, 3),
-        block.shared.reshape(-1),
-        block.cell,
-        block.weight,
-        lookups,
-        wanted.reshape(-1),
-    ).reshape(*block.recovered.shape, lookups, len(FIELDS))[source]
-    fitted = np.moveaxis(fitted, (0, 1), (2, 3))
+    fitted = np.moveaxis(block_lookups(matte, block, lookups, wanted)[source], (0, 1), (2, 3))
     for code, scale in enumerate((65536 / texture[0], 65536 / texture[1], SIXTEENTHS)):
         encoded.codes[:, code, *target] = np.minimum(np.rint(fitted[:, code] * np.float32(scale)), 65535)
     encoded.shares[:, :, *target] = _quantise_shares(fitted[:, 3:])

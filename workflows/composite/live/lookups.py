@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from storage.layout.mattes import Block, Matte
 from workflows.interruption import checkpoint
 from workflows.recovery.pyramid import Pyramid
 
@@ -78,6 +79,25 @@ def fit_lookups(
         at = slice(first, first + _CHUNK)
         _fit(sizes[at], begin[at], wanted[at], shared[at], cell, weight, *grid, held, clusters, lookups[at])
     return lookups
+
+
+def block_lookups(
+    matte: Matte, block: Block, most: int, wanted: NDArray[np.bool_] | None = None, clusters: int = CLUSTERS
+) -> NDArray[np.float32]:
+    """The lookups of the pixels of a block, (h, w, most, 6), as of `fit_lookups`; by default of all pixels."""
+    wanted = np.ones(block.recovered.shape, bool) if wanted is None else wanted
+    found = fit_lookups(
+        matte.columns,
+        matte.rows,
+        block.count.reshape(-1, 3),
+        block.shared.reshape(-1),
+        block.cell,
+        block.weight,
+        most,
+        wanted.reshape(-1),
+        clusters,
+    )
+    return found.reshape(*block.recovered.shape, most, len(FIELDS))
 
 
 @njit(nogil=True, cache=True)

@@ -1,5 +1,6 @@
 // A matte that is being recovered while its preview is on the stage: its progress, a pause, and what comes first.
 import { getJson, patchJson } from "../lib/api.js";
+import { ACTIVE } from "../lib/events.js";
 import { button, h, newest, pause, problemBox } from "../lib/dom.js";
 import { followJob } from "../lib/job_progress.js";
 import { t } from "../lib/words.js";
@@ -24,6 +25,7 @@ export function recovering(matte, stage, signal, done) {
 		if (job.state !== "succeeded") return;
 		Object.assign(matte, await getJson(`v1/mattes/${matte.id}`, signal));
 		stage.fetch();
+		stage.renew(); // also where this browser cannot draw the glass
 		done();
 	}).catch((error) => signal.aborted || problem.replaceChildren(problemBox(error)));
 	return h("section.panel", { "aria-label": t("progress") }, h("p", t("matte.preview")), h("p.row", halt.button, region), progress, problem);
@@ -37,7 +39,7 @@ export function pauseButton(id, problem) {
 	return {
 		button: made,
 		update: ({ state, paused }) => {
-			made.hidden = !["queued", "running"].includes(state);
+			made.hidden = !ACTIVE.includes(state);
 			isPaused = paused;
 			const text = t(paused ? "job.continue" : "job.pause");
 			if (made.textContent !== text) made.textContent = text;

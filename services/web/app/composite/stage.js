@@ -167,8 +167,7 @@ export class Stage extends LiveGlass {
 			}
 			const step = found.step * (this.#matte.preview ?? 1);
 			say(t(step > 1 ? "stage.some" : "stage.all", { n: step ** 2 }));
-			if (!this.backdrop) return;
-			if (this.isExact) return this.renew();
+			if (!this.backdrop || this.isExact) return;
 			if (this.playing) return this.moved();
 			// Something was moved meanwhile: the exact picture is on its way.
 			this.#describe(t(this.isLive ? "stage.live" : "stage.preview"));

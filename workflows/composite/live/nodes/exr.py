@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.layout.mattes import Block, Matte
-from workflows.composite.live.lookups import fit_lookups
+from workflows.composite.live.lookups import block_lookups
 from workflows.images.exr_writer import Types, write_exr
 from workflows.threads import CORES, in_parts
 
@@ -108,17 +108,7 @@ def _images(
     matte: Matte, block: Block, lookups: int, crosstalk: NDArray[np.float32]
 ) -> dict[str, NDArray[np.float32]]:
     """The images (h, w, 3) of a block by name; that of the glass in front of white has none."""
-    found = fit_lookups(
-        matte.columns,
-        matte.rows,
-        block.count.reshape(-1, 3),
-        block.shared.reshape(-1),
-        block.cell,
-        block.weight,
-        lookups,
-        np.ones(block.recovered.size, bool),
-        CLUSTERS,
-    ).reshape(*block.recovered.shape, lookups, 6)
+    found = block_lookups(matte, block, lookups, clusters=CLUSTERS)
     used = found[..., 3:].any(axis=-1)
     found[..., 0] /= matte.columns
     found[..., 1] = np.where(used, 1 - found[..., 1] / matte.rows, 0)
