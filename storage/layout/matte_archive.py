@@ -19,7 +19,7 @@ from storage.errors import Corrupt
 from storage.layout import mattes
 from storage.layout.mattes import CHANNELS, FRAMES, Matte
 from storage.objects.checksums import is_checked, is_intact, unseal
-from storage.objects.store import Objects, gather
+from storage.objects.store import Objects
 
 FORMAT = "envmatte-archive/1"
 MANIFEST = "envmatte.json"
@@ -106,7 +106,7 @@ class Archive:
 
     def _read(self, names: list[str]) -> list[bytes]:
         try:
-            return gather(*(self._objects.get(f"{self._path}/{name}") for name in names))
+            return self._objects.get([f"{self._path}/{name}" for name in names])
         except FileNotFoundError as error:
             raise self._corrupt(str(error)) from error
 

@@ -22,6 +22,7 @@ A block is a square of ``block`` pixels and one chunk of each frame-shaped array
 all of it and nothing else, so blocks can be written in any order, by any worker, and repeatedly.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -33,8 +34,9 @@ from zarr.storage import MemoryStore
 
 from storage.errors import Corrupt
 from storage.layout.blocks import block_edge
-from storage.objects.checksums import CODECS
+from storage.objects.checksums import CODECS, is_checked
 from storage.objects.store import Objects, gather
+from storage.objects.zarr_store import decode_chunk
 
 FORMAT = "envmatte-matte/1"
 FRAMES = ("S", "rho", "error", "recovered", "shared", "count")
@@ -67,6 +69,17 @@ class Block:
     count: NDArray[np.uint32]
     cell: NDArray[np.uint32]
     weight: NDArray[np.float32]
+
+
+def empty_block(height: int, width: int) -> Block:
+    """A block in which no pixel is recovered."""
+    zeros, no = np.zeros((height, width, 3), np.float32), np.zeros((height, width), bool)
+    count = np.zeros((height, width, 3), np.uint32)
+    return Block(zeros, zeros, zeros[..., 0].copy(), no, no, count, *_no_rows())
+
+
+def _no_rows() -> tuple[NDArray[np.uint32], NDArray[np.float32]]:
+    return np.zeros(0, np.uint32), np.zeros(0, np.float32)
 
 
 def path(matte: str) -> str:
@@ -102,6 +115,7 @@ class Matte:
         self._objects = objects
         self._path = at
         self._frames: dict[str, zarr.Array[Any]] = dict(zip(FRAMES, frames, strict=True))
+        self._is_checked = is_checked(self._frames["S"].metadata.to_dict())
         self.attributes: dict[str, Any] = dict(group.attrs)
         self.height, self.width, self.columns, self.rows, self.block = (
             int(self.attributes[name]) for name in ("height", "width", "columns", "rows", "block")
@@ -161,24 +175,37 @@ class Matte:
         Corrupt
             If some of it is missing or damaged.
         """
-        span = self.span(row, column)
-
-        async def of_rows(name: str) -> Any:
-            array = await self._objects.array(f"{self._path}/T/{row}.{column}/{name}")
-            return await array.async_array.getitem(slice(None))
-
-        try:
-            cell, weight, *values = gather(
-                of_rows("cell"),
-                of_rows("weight"),
-                *(array.async_array.getitem(span) for array in self._frames.values()),
-            )
-        except FileNotFoundError as error:
-            raise self._corrupt(row, column) from error
-        frames = dict(zip(self._frames, values, strict=True))
-        if not len(cell) == len(weight) == frames["count"].sum():
+        count, recovered = self._chunks(row, column, "count", "recovered")
+        entries = int(count.sum())
+        if entries == 0 and not recovered.any():  # most of a frame: the mask leaves it out
+            return empty_block(*count.shape[:2])
+        S, rho, error, shared = self._chunks(row, column, "S", "rho", "error", "shared")
+        cell, weight = self._rows(row, column) if entries else _no_rows()
+        if not len(cell) == len(weight) == entries:
             raise self._corrupt(row, column)
-        return Block(**frames, cell=cell, weight=weight)
+        return Block(S, rho, error, recovered, shared, count, cell, weight)
+
+    def _chunks(self, row: int, column: int, *names: str) -> list[NDArray[Any]]:
+        """The values of a block in frame-shaped arrays."""
+        arrays = [self._frames[name] for name in names]
+        height, width = (span.stop - span.start for span in self.span(row, column))
+        paths = [self._chunk(name, row, column) for name in names]
+        values = self._decoded(paths, [array.dtype for array in arrays])
+        # Chunks at the edges of the frame are padded to full size.
+        return [
+            np.ascontiguousarray(one.reshape(array.chunks)[:height, :width])
+            for one, array in zip(values, arrays, strict=True)
+        ]
+
+    def _rows(self, row: int, column: int) -> list[NDArray[Any]]:
+        """Cells and weights of the rows T of a block that has some."""
+        rows = f"{self._path}/T/{row}.{column}"
+        types = [np.dtype(np.uint32), np.dtype(np.float32)]
+        return self._decoded([f"{rows}/cell/c/0", f"{rows}/weight/c/0"], types)
+
+    def _decoded(self, paths: Sequence[str], types: Sequence[np.dtype[Any]]) -> list[NDArray[Any]]:
+        stored = self._objects.get(paths)
+        return [decode_chunk(*one, self._is_checked) for one in zip(paths, stored, types, strict=True)]
 
     def layer(self, name: str, rows: slice = slice(None)) -> NDArray[Any]:
         """A frame-shaped array, or some rows of it.
@@ -195,10 +222,7 @@ class Matte:
         stored = self._objects.paths_below(self._path)
 
         def is_complete(row: int, column: int) -> bool:
-            chunks = (
-                f"{self._path}/{name}/c/{row}/{column}" + "/0" * (array.ndim - 2)
-                for name, array in self._frames.items()
-            )
+            chunks = (self._chunk(name, row, column) for name in FRAMES)
             rows = [f"{self._path}/T/{row}.{column}/{name}" for name in ("cell", "weight")]
             # A block whose rows T are all empty has neither chunk.
             return (
@@ -209,6 +233,10 @@ class Matte:
 
         blocks = product(range(self.block_rows), range(self.block_columns))
         return {block for block in blocks if not is_complete(*block)}
+
+    def _chunk(self, name: str, row: int, column: int) -> str:
+        """Path of the chunk of a block in a frame-shaped array."""
+        return f"{self._path}/{name}/c/{row}/{column}" + ("/0" if name in CHANNELS else "")
 
     def _corrupt(self, row: int, column: int) -> Corrupt:
         return Corrupt(f"block {row}.{column} of the matte is missing or damaged; recover the matte again")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import zarr
+from numcodecs.zstd import Zstd
 from obstore.store import ObjectStore
 from zarr.buffer import default_buffer_prototype
 from zarr.storage import MemoryStore, StorePath, WrapperStore
@@ -21,12 +22,14 @@ from storage.objects.retries import translate_errors
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from numpy.typing import NDArray
     from zarr.abc.store import ByteRequest
     from zarr.core.array_spec import ArrayConfigParams
     from zarr.core.buffer import Buffer, BufferPrototype
 
 EVERY_CHUNK: ArrayConfigParams = {"write_empty_chunks": True}
 """Configuration of every array: chunks of zeros are stored too, so that a missing chunk means damage."""
+_ZSTD = Zstd()
 METADATA = ("zarr.json", ".zarray", ".zgroup", ".zattrs", ".zmetadata")
 """Objects by which zarr finds out whether there is an array or a group: they may be missing."""
 
@@ -62,6 +65,46 @@ def array_metadata(dtype: np.dtype[Any]) -> dict[str, Any]:
     return array.metadata.to_dict()
 
 
+def decode_chunk(path: str, data: bytes, dtype: np.dtype[Any], checked: bool) -> NDArray[Any]:
+    """The values of a chunk that was encoded with `CODECS`, decoded in the calling thread.
+
+    zarr hands each chunk from thread to thread, which takes longer than to decode it.
+
+    Parameters
+    ----------
+    path : str
+        Path of the chunk, for the error.
+    data : bytes
+        The chunk.
+    dtype : numpy.dtype
+        Type of its array.
+    checked : bool
+        Whether its array has checksums.
+
+    Returns
+    -------
+    (n,) array
+        In the order of the chunk.
+
+    Raises
+    ------
+    Corrupt
+        If it is damaged.
+    """
+    if checked and not checksums.is_intact(data):
+        raise checksums.damaged(path)
+    try:
+        plain = _ZSTD.decode(memoryview(data)[: -checksums.SUM] if checked else data)
+        return np.frombuffer(plain, dtype).copy()  # writable, like what zarr reads
+    except (RuntimeError, ValueError) as error:
+        raise checksums.damaged(path) from error
+
+
+def missing_chunk(path: str) -> Corrupt:
+    """The error to raise for a chunk that is not in the store."""
+    return Corrupt(f"{path} is missing in the store: {checksums.remedy(path)}")
+
+
 class StrictStore(WrapperStore[ZarrStore[ObjectStore]]):
     """A store for zarr in which a missing chunk is an error; zarr alone would silently read its fill value.
 
@@ -74,7 +117,7 @@ class StrictStore(WrapperStore[ZarrStore[ObjectStore]]):
         with translate_errors():
             value = await self._store.get(key, prototype, byte_range)
         if value is None and not key.endswith(METADATA):
-            raise Corrupt(f"{key} is missing in the store: {checksums.remedy(key)}")
+            raise missing_chunk(key)
         return value
 
     async def set(self, key: str, value: Buffer) -> None:

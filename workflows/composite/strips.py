@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.layout.mattes import Block, Matte
+from storage.layout.mattes import Matte, empty_block
 
 LENGTH = 256
 """Width of a strip in pixels; the last one of a row may have fewer."""
@@ -69,7 +69,7 @@ def read_strip(matte: Matte, row: int, number: int, there: Blocks | None = None)
     blocks = [
         matte.read(row, column)
         if there is None or (row, column) in there
-        else _empty_block(matte, row, column)
+        else empty_block(*(span.stop - span.start for span in matte.span(row, column)))
         for column in columns_of(matte, number)
     ]
 
@@ -92,10 +92,3 @@ def read_strip(matte: Matte, row: int, number: int, there: Blocks | None = None)
         in_rows("cell"),
         in_rows("weight"),
     )
-
-
-def _empty_block(matte: Matte, row: int, column: int) -> Block:
-    height, width = (span.stop - span.start for span in matte.span(row, column))
-    zero, no = np.zeros((height, width, 3), np.float32), np.zeros((height, width), bool)
-    count = np.zeros((height, width, 3), np.uint32)
-    return Block(zero, zero, zero[..., 0], no, no, count, np.zeros(0, np.uint32), np.zeros(0, np.float32))

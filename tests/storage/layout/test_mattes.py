@@ -91,7 +91,7 @@ def test_block_of_zeros_is_stored(objects: Objects) -> None:
     "file",
     [
         *("S/c/1/2/0", "rho/c/1/2/0", "count/c/1/2/0", "error/c/1/2", "recovered/c/1/2", "shared/c/1/2"),
-        *("T/1.2/cell/c/0", "T/1.2/weight/c/0", "T/1.2/cell/zarr.json", "T/1.2/weight/zarr.json"),
+        *("T/1.2/cell/c/0", "T/1.2/weight/c/0"),
     ],
 )
 def test_missing_file_is_corrupt(matte: Matte, folder: Path, objects: Objects, file: str, dark: bool) -> None:
@@ -103,6 +103,16 @@ def test_missing_file_is_corrupt(matte: Matte, folder: Path, objects: Objects, f
         again.read(1, 2)
     assert again.missing() == {(1, 2)}
     same(again.read(0, 0), block(16, 16, seed=0))
+
+
+@pytest.mark.parametrize("array", ["cell", "weight"])
+def test_block_is_read_without_the_metadata_of_its_rows(
+    matte: Matte, folder: Path, objects: Objects, array: str
+) -> None:
+    (folder / f"mattes/m/T/1.2/{array}/zarr.json").unlink()
+    again = Matte(objects, "m")
+    same(again.read(1, 2), block(5, 8, seed=12))
+    assert again.missing() == {(1, 2)}
 
 
 def test_block_that_was_never_written_is_corrupt(objects: Objects) -> None:

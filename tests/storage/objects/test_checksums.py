@@ -31,7 +31,7 @@ READS: dict[str, tuple[str, Callable[[Objects], Any]]] = {
     "truths": ("mattes/m/shared/c/1/2", lambda o: Matte(o, "m").read(1, 2)),
     "cells": ("mattes/m/T/1.2/cell/c/0", lambda o: Matte(o, "m").read(1, 2)),
     "weights": ("mattes/m/T/1.2/weight/c/0", lambda o: Matte(o, "m").read(1, 2)),
-    "rows": ("mattes/m/T/1.2/weight/zarr.json", lambda o: Matte(o, "m").read(1, 2)),
+    "rows": ("mattes/m/T/1.2/weight/zarr.json", lambda o: list(Archive(o, "m"))),
     "export": ("mattes/m/T/1.2/weight/c/0", lambda o: list(Archive(o, "m"))),
     "part": ("uploads/i/all.part", lambda o: uploads.read(o, "i").read()),
     "index": ("uploads/i/parts.json", lambda o: uploads.read(o, "i")),

@@ -77,7 +77,7 @@ export async function program(main, signal, id) {
 	const live = h("section.panel", h("h2", t("film.on")), phase, bar, about,
 		h("p.row", h("a.primary", { href: `v1/programs/${id}/play`, target: "_blank", rel: "opener" }, t("film.play"))));
 	const film = (file, about) => begin(file, recordOf(found, found.showing?.patterns_per_second ?? 2), { again: `#/film/${id}`, ...about });
-	// The player starts when it is told that a countdown has begun, and then reports its own.
+	// The player starts when it learns that a countdown has begun, and then reports its own.
 	const startPlayer = () => putJson(`v1/programs/${id}/showing`, { phase: "countdown", patterns_per_second: found.showing?.patterns_per_second ?? 2, seconds: COUNTDOWN });
 	const why = noCamera();
 	const recorder = why ? null : camera(signal, (file, whole) => film(file, { id: newKey(), warning: whole ? "" : t("film.cut") }), startPlayer);
