@@ -17,6 +17,13 @@ MOSTLY = 0.5
 
 # Most pixels used to estimate the noise.
 _SAMPLE = 4096
+# If more than this share of dark or bright values is not usable, noise is measured beyond the level below, or above,
+# which most of these are.
+_MOST_UNUSABLE, _MOST = 0.01, 0.95
+# Dark values are below this share of the brightest.
+_DARK = 0.25
+# Least dark and bright values that tell the noise.
+_LEAST_SAMPLES = 120
 # A camera with a larger row sum of crosstalk is taken as one that does not separate colours.
 _MOST_CROSSTALK = 0.9
 
@@ -153,6 +160,9 @@ def estimate_noise(
     mean of ``r^2 / a`` in a bin, without the largest tenth, divided by the trimmed mean of a chi-square variable, is a
     robust sample of ``read + shot (b / a)``. This line is fitted with both terms >= 0. (A median would fail where
     rounding leaves only a few different values.)
+
+    Clipping hides noise: of a black near 0 only the values above it are seen, which are close together. So levels at
+    which values are not usable are left out.
     """
     _check_shapes(values, levels, usable)
     floor = max(quantum**2 / 12, LEAST_READ)
@@ -160,10 +170,12 @@ def estimate_noise(
     channels = range(3) if len(levels) >= 4 else ()
     step = max(1, -(-values.shape[0] // _SAMPLE))
     share = 1 / (np.ones(len(levels)) if frames is None else frames)
-    pairs = [_residuals(values[::step, :, c], levels[:, c], usable[::step, :, c], share) for c in channels]
-    level = np.concatenate([np.zeros(0), *(pair[0] for pair in pairs)])
-    square = np.concatenate([np.zeros(0), *(pair[1] for pair in pairs)])
-    return fit_noise(level, square, floor) or typical
+    found = [_residuals(values[::step, :, c], levels[:, c], usable[::step, :, c], share) for c in channels]
+    level, square, unused = (
+        np.concatenate([np.zeros(0), *arrays]) for arrays in (zip(*found, strict=True) if found else [()] * 3)
+    )
+    whole = _unclipped(level, unused)
+    return fit_noise(level[whole], square[whole], floor) or typical
 
 
 def estimate_crosstalk(
@@ -269,8 +281,11 @@ def _residuals(
     levels: NDArray[np.float32],
     usable: NDArray[np.bool_],
     share: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """b / a and r^2 / a of :func:`estimate_noise` for one channel, from values of shape (n, k)."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """b / a and r^2 / a of :func:`estimate_noise` for one channel, from values of shape (n, k).
+
+    The third array has the values that the fitted lines have where no usable value is.
+    """
     mask = usable.astype(np.float64)
     count = np.maximum(mask.sum(axis=1, keepdims=True), 1)
     offset = mask * (levels - (mask * levels).sum(axis=1, keepdims=True) / count)
@@ -285,4 +300,26 @@ def _residuals(
     a = squared @ share
     b = np.einsum("nij,nj->ni", squared, fitted * share)
     kept = (mask > 0) & (a > 1e-6)
-    return b[kept] / a[kept], (data - fitted)[kept] ** 2 / a[kept]
+    slope = np.einsum("ni,ni->n", offset, data) / spread[:, 0]
+    mean = (mask * (data - slope[:, None] * levels)).sum(axis=1) / count[:, 0]
+    unused = (mean[:, None] + slope[:, None] * levels)[mask == 0]
+    return b[kept] / a[kept], (data - fitted)[kept] ** 2 / a[kept], unused
+
+
+def _unclipped(level: NDArray[np.float64], unused: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which levels, (k,), clipping leaves alone; all if these are too few.
+
+    Parameters
+    ----------
+    level, unused : (k,) and (u,) float64
+        Levels of the values that are usable, and of those that are not.
+    """
+    limit = _DARK * level.max(initial=0)
+    whole = np.ones(level.size, bool)
+    dark, lost_dark = level < limit, unused < limit
+    if lost_dark.sum() > _MOST_UNUSABLE * dark.sum():
+        whole &= level > np.quantile(unused[lost_dark], _MOST)
+    if (~lost_dark).sum() > _MOST_UNUSABLE * (~dark).sum():
+        whole &= level < np.quantile(unused[~lost_dark], 1 - _MOST)
+    enough = min((whole & dark).sum(), (whole & ~dark).sum()) >= _LEAST_SAMPLES
+    return whole if enough else np.ones_like(whole)

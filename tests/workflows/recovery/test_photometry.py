@@ -106,6 +106,20 @@ def test_noise_is_recovered(frames):
         assert found.variance(np.float32(v)) == pytest.approx(NOISE.variance(np.float32(v)), rel=0.12)
 
 
+def test_noise_is_not_hidden_by_a_black_that_is_clipped():
+    true, step = Noise(5e-6, 6e-5), 1 / 255
+    random = np.random.default_rng(0)
+    levels = np.repeat(np.array([0.0, 1.0], np.float32), 4)[:, np.newaxis] * np.ones(3, np.float32)
+    black = np.where(np.arange(4000) % 4 == 0, 4, 1)[:, np.newaxis, np.newaxis] * step  # most are near 0
+    light = black + 0.7 * levels
+    noisy = light + np.sqrt(true.variance(light)) * random.standard_normal(light.shape)
+    codes = np.clip(np.round(noisy / step), 0, 255)
+    found = estimate_noise((codes * step).astype(np.float32), levels, codes > 0, step)
+    for v in (0.02, 0.7):
+        expected = true.variance(np.float32(v)) + step**2 / 12
+        assert found.variance(np.float32(v)) == pytest.approx(expected, rel=0.15)
+
+
 def test_noise_withstands_a_few_wild_pixels():
     values, levels, _, _ = constants(3000, seed=4)
     values[::50] += np.random.default_rng(0).normal(0, 0.2, values[::50].shape).astype(np.float32)
