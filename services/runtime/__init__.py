@@ -13,6 +13,7 @@ services.runtime.tracing._tracer                   1      the tracer, if traces 
 storage.objects.store._loop                        1      the event loop that reads and writes arrays, and its thread
 storage.objects.zarr_store.array_metadata          1 each the zarr metadata of a dtype
 workflows.composite.quantise._edges                1 each the codes of a transfer and a dtype: 0.4 MB or less
+workflows.composite.strips._empty_strip            8      strips in which nothing is recovered, of a size each: 0.7 MB
 workflows.mattes.imports.reader._document_of_group 1      the zarr.json of a group
 workflows.mattes.imports.reader._document_of_one   1 each the zarr.json of an array of a dtype
 workflows.mattes.tiles.gain_of                     1      the local tone mapping of the last capture recovered

@@ -2,6 +2,7 @@
 
 from collections.abc import Set
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -40,8 +41,8 @@ class Strip:
 
     @property
     def nbytes(self) -> int:
-        """Size of its arrays."""
-        return sum(getattr(self, field.name).nbytes for field in fields(self))
+        """Size of its arrays; 0 if nothing is recovered, for all such strips share theirs."""
+        return sum(getattr(self, field.name).nbytes for field in fields(self)) if self.recovered.any() else 0
 
 
 def columns_of(matte: Matte, number: int) -> range:
@@ -73,6 +74,9 @@ def read_strip(matte: Matte, row: int, number: int, there: Blocks | None = None)
         for column in columns_of(matte, number)
     ]
 
+    if not any(block.recovered.any() for block in blocks):
+        return _empty_strip(len(blocks[0].recovered), sum(block.recovered.shape[1] for block in blocks))
+
     def side_by_side(name: str) -> NDArray[Any]:
         return np.concatenate([getattr(block, name) for block in blocks], axis=1)
 
@@ -92,3 +96,10 @@ def read_strip(matte: Matte, row: int, number: int, there: Blocks | None = None)
         in_rows("cell"),
         in_rows("weight"),
     )
+
+
+@lru_cache(maxsize=8)
+def _empty_strip(height: int, width: int) -> Strip:
+    """A strip in which nothing is recovered. Those of a frame have few sizes."""
+    block = empty_block(height, width)
+    return Strip(**{field.name: getattr(block, field.name) for field in fields(Strip)})

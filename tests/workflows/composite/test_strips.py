@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from storage.layout import mattes
-from storage.layout.mattes import Block, Matte
+from storage.layout.mattes import Block, Matte, empty_block
 from storage.objects.store import Objects
 from workflows.composite import composite
 from workflows.composite.engine import Window
@@ -37,6 +37,18 @@ def wide(tmp_path: Path) -> Matte:
             weight = rng.random(n, np.float32)
             matte.write(row, column, Block(S, rho, S[..., 0], recovered, shared, count, cell, weight))
     return matte
+
+
+def test_strips_in_which_nothing_is_recovered_take_no_memory_each(wide: Matte) -> None:
+    for column in columns_of(wide, 0):
+        for row in range(wide.block_rows):
+            height, width = (span.stop - span.start for span in wide.span(row, column))
+            wide.write(row, column, empty_block(height, width))
+    first, again = read_strip(wide, 0, 0), read_strip(wide, 0, 0)
+    assert (first.recovered.shape, first.nbytes) == ((16, LENGTH), 0)
+    assert first.S is again.S
+    assert read_strip(wide, 0, 1).nbytes > 0
+    assert not composite(wide, np.ones((3, 4, 3), np.float32), window=Window.of(wide, width=LENGTH)).any()
 
 
 def test_a_strip_has_the_rows_of_its_blocks(wide: Matte) -> None:
