@@ -40,6 +40,8 @@ ADMIN = Caller(DEFAULT, "admin")
 """The caller with a key of the settings."""
 ANYONE = Caller(DEFAULT, "admin", known=False)
 """Every caller of a service without keys."""
+STRANGER = Caller("", "read", known=False)
+"""Every caller of a route without keys: they share one turn, and own nothing."""
 
 
 def identify(settings: Settings, engine: Engine, key: str | None) -> Caller:

@@ -6,13 +6,14 @@ from collections.abc import Callable, Hashable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Annotated, TypeVar
+from typing import Annotated, TypeVar, TypeVarTuple, Unpack
 
+import anyio.to_thread
 from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials
 from sqlalchemy import Connection, Engine
 
-from services.api.auth import ADMIN, Caller, bearer, check_method, identify, require_scope
+from services.api.auth import STRANGER, Caller, bearer, check_method, identify, require_scope
 from services.api.http.browser_security import require_own_site
 from services.api.http.together import Together
 from services.api.work import Shares, run
@@ -27,6 +28,7 @@ from workflows.threads import CORES
 
 T = TypeVar("T")
 R = TypeVar("R")
+Args = TypeVarTuple("Args")
 KEY_CHECK = 1.0
 """Seconds between two checks of a caller's key during a download."""
 
@@ -63,9 +65,22 @@ class Context:
     """Layers of mattes, and mattes for browsers, encoded at once."""
     together: Together = field(default_factory=Together)
     """Reads what streams of events follow."""
-    caller: Caller = ADMIN
+    calls: Shares = field(default_factory=lambda: Shares(8, 4))
+    """Short calls at once: each takes a thread, and most of them a connection to the database or its write lock."""
+    caller: Caller = STRANGER
     check_key: Callable[[], object] = lambda: None
     """Checks again that the caller's key is valid, as `auth.identify` does: for requests that take long."""
+
+    async def call(self, work: Callable[[Unpack[Args]], T], *args: *Args) -> T:
+        """Do short work of a request in a thread, in its owner's turn.
+
+        Raises
+        ------
+        TooMany
+            If its turn does not come within ENVMATTE_REQUEST_SECONDS.
+        """
+        async with self.calls.take(self.caller.owner, self.settings.request_seconds):
+            return await anyio.to_thread.run_sync(work, *args)
 
     async def compute(
         self,
@@ -186,7 +201,7 @@ PublicContext = Annotated[Context, Depends(_service_context)]
 
 def _for_admins(request: Request, context: OwnerContext) -> Context:
     require_scope(context.caller, "admin")
-    return _service_context(request)
+    return replace(_service_context(request), caller=context.caller)
 
 
 AdminContext = Annotated[Context, Depends(_for_admins)]

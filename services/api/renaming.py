@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any, Protocol
 
-import anyio.to_thread
 from fastapi import Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection, Row
@@ -62,6 +61,6 @@ async def rename(
             records.change(c, id, name=change.name)
             return json_response(read(c, id))
 
-    await anyio.to_thread.run_sync(require)
+    await context.call(require)
     change = await read_json(request, Change, CHANGE_BYTES)
     return await context.compute(request, context.lists, make)

@@ -1,8 +1,8 @@
-"""Callers that ask a service for the same paths again and again, in a process of their own until its stdin is closed.
+"""Callers that make the same calls again and again, in a process of their own until its stdin is closed.
 
-``python -m tests.parts.callers NETLOC KEY COUNT BODY PATH...`` prints how many answers had which status, as JSON. A
-path of a composite is asked for with the contents of the file BODY. They are nice, because real callers take no cores
-of the service's.
+``python -m tests.parts.callers NETLOC KEY COUNT BODY CALL...`` prints how many answers had which status, as JSON. A
+call is a method, a path and the fields of a JSON body, such as ``PATCH /v1/mattes/1 name=glass``; without fields a POST
+sends the contents of the file BODY. They are nice, because real callers take no cores of the service's.
 """
 
 import http.client
@@ -19,18 +19,18 @@ PIECE = 1 << 18
 NICE = 19
 
 
-def call(netloc: str, key: str, body: bytes, paths: list[str], first: int, answers: Counter[str]) -> None:
-    """Ask for one path after another, each on a new connection, without end."""
+def repeat(netloc: str, key: str, body: bytes, calls: list[str], first: int, answers: Counter[str]) -> None:
+    """Make one call after another, each on a new connection, without end."""
     number = first
     while True:
         connection = http.client.HTTPConnection(netloc, timeout=PATIENCE)
         try:
-            path = paths[number % len(paths)]
+            method, path, *fields = calls[number % len(calls)].split()
             headers = {"Authorization": f"Bearer {key}"}
-            if path.endswith("/composite"):
-                connection.request("POST", path, body, headers)
-            else:
-                connection.request("GET", path, headers=headers)
+            content = body if method == "POST" else None
+            if fields:
+                content = json.dumps(dict(field.split("=") for field in fields)).encode()
+            connection.request(method, path, content, headers)
             answer = connection.getresponse()
             while answer.read(PIECE):
                 pass
@@ -42,12 +42,12 @@ def call(netloc: str, key: str, body: bytes, paths: list[str], first: int, answe
         number += 1
 
 
-def main(netloc: str, key: str, count: str, body: str, *paths: str) -> None:
+def main(netloc: str, key: str, count: str, body: str, *calls: str) -> None:
     os.nice(NICE)
     answers: Counter[str] = Counter()
     for first in range(int(count)):
-        args = netloc, key, Path(body).read_bytes(), list(paths), first, answers
-        threading.Thread(target=call, args=args, daemon=True).start()
+        args = netloc, key, Path(body).read_bytes(), list(calls), first, answers
+        threading.Thread(target=repeat, args=args, daemon=True).start()
     print("calling", flush=True)
     sys.stdin.read()
     print(json.dumps(answers), flush=True)

@@ -3,12 +3,13 @@
 from datetime import UTC, datetime
 from typing import Any, Literal, Self
 
-from fastapi import APIRouter, Request, Response
+from fastapi import Request, Response
 from pydantic import BaseModel, Field
 from sqlalchemy import Connection, Row
 
 from services.api.context import OwnerContext
 from services.api.http.responses import bytes_response, json_response, utc_time
+from services.api.http.router import Router
 from services.api.http.types import After, Limit, Named
 from services.api.jobs.eta import seconds_to_recover
 from services.api.renaming import CHANGE, rename
@@ -22,7 +23,7 @@ from storage.layout.captures import Stack
 from storage.records import captures, jobs
 from workflows.images.integer_formats import encode_png
 
-router = APIRouter(tags=["captures"])
+router = Router(tags=["captures"])
 PROGRAM_BYTES = 64 << 20
 """What the largest program that a capture may have takes in memory."""
 

@@ -4,7 +4,7 @@ from functools import partial
 from typing import Annotated, Any
 
 import anyio.to_thread
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection, Row
 
@@ -14,6 +14,7 @@ from services.api.context import Context, OwnerContext
 from services.api.http.bodies import read_json, schema_of, store_as_upload, upload_limit
 from services.api.http.idempotency import IdempotencyKey, find_earlier, idempotent
 from services.api.http.media_types import JSON, ZIP, media_type_of
+from services.api.http.router import Router
 from services.api.limits.quotas import admit
 from services.api.limits.reservations import reserved
 from services.runtime import tracing
@@ -28,7 +29,7 @@ from storage.records import bodies, captures, jobs, uploads
 from workflows.ingest.archive import CaptureArchive
 from workflows.interruption import checkpoint
 
-router = APIRouter(tags=["captures"])
+router = Router(tags=["captures"])
 CALL = "POST /v1/captures"
 FROM_UPLOAD_BYTES = 1 << 16
 CHECK_BYTES = 200 << 20
@@ -92,10 +93,10 @@ async def _from_body(
     context: Context, request: Request, name: str, key: str | None, webhook: str | None
 ) -> Row[Any]:
     """Stream the archive into the store and create its capture; if anything fails, nothing is kept."""
-    await anyio.to_thread.run_sync(check_webhook, webhook, context.settings)  # may resolve the URL's host
+    check_webhook(webhook, context.settings)
     limit = upload_limit(context.settings)
     length = limit.check_announced(request)
-    earlier = await anyio.to_thread.run_sync(_find_earlier, context, key)
+    earlier = await context.call(_find_earlier, context, key)
     if earlier is not None:
         return earlier
     capture = new_id()

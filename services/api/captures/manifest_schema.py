@@ -2,12 +2,13 @@
 
 from typing import Any
 
-from fastapi import APIRouter
 from fastapi.responses import JSONResponse
 
+from services.api.context import OwnerContext
+from services.api.http.router import Router
 from workflows.ingest.manifest import MANIFEST, Manifest
 
-router = APIRouter(tags=["captures"])
+router = Router(tags=["captures"])
 
 
 class SchemaResponse(JSONResponse):
@@ -17,7 +18,7 @@ class SchemaResponse(JSONResponse):
 
 
 @router.get("/capture.schema.json", response_class=SchemaResponse)
-def get_capture_schema() -> dict[str, Any]:
+def get_capture_schema(context: OwnerContext) -> dict[str, Any]:
     """The JSON Schema of `capture.json`, the manifest in a capture's ZIP.
 
     The same schema is `capture.json` among the schemas of this document.

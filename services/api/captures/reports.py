@@ -3,17 +3,18 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from fastapi import APIRouter, Request, Response
+from fastapi import Request, Response
 
 from services.api.context import Context, OwnerContext
 from services.api.http.responses import bytes_response, json_response
+from services.api.http.router import Router
 from storage.errors import Conflict
 from storage.layout.captures import Stack
 from storage.records import captures
 from workflows.ingest.report.contact_sheet import bytes_of_contact_sheet, contact_sheet, thumbnail
 from workflows.ingest.report.report import Report, report
 
-router = APIRouter(tags=["captures"])
+router = Router(tags=["captures"])
 
 
 @router.get("/captures/{id}/report", response_model=Report)

@@ -6,7 +6,7 @@ from email.utils import format_datetime
 from typing import Any
 
 import anyio.to_thread
-from fastapi import APIRouter, Depends, Request, Response
+from fastapi import Depends, Request, Response
 from sqlalchemy import Row
 from sqlalchemy.exc import IntegrityError
 from starlette.requests import ClientDisconnect
@@ -26,6 +26,7 @@ from services.api.context import Context, OwnerContext
 from services.api.http.bodies import BodyLimit, has_body, upload_limit
 from services.api.http.idempotency import IdempotencyKey
 from services.api.http.media_types import require_media_type
+from services.api.http.router import Router
 from services.api.limits.quotas import admit_bytes, admit_upload
 from services.api.limits.reservations import STEP, Reservation
 from storage.database.engine import reading, writing
@@ -43,7 +44,7 @@ LOOK = 1.0
 PATIENCE = 5.0
 """Seconds that a request waits for the writer of its upload to end."""
 
-router = APIRouter(prefix="/uploads", tags=["uploads"])
+router = Router(prefix="/uploads", tags=["uploads"])
 Versioned = Depends(require_version)
 
 
@@ -79,7 +80,7 @@ async def create_upload(
         limits.check_frames(known["frames"])
     if "width" in known and "height" in known:
         limits.check_pixels(known["width"], known["height"])
-    row, new = await anyio.to_thread.run_sync(_create, context, length, metadata, idempotency_key)
+    row, new = await context.call(_create, context, length, metadata, idempotency_key)
     if with_body and new:
         row = await _append(context, request, row, checksum)
     return Response(status_code=201, headers={"Location": f"/v1/uploads/{row.id}"} | _headers(row))
@@ -101,7 +102,7 @@ async def append(context: OwnerContext, request: Request, id: str) -> Response:
     If the connection breaks, the bytes that came are kept. A body with an `Upload-Checksum` is kept whole or not at
     all.
     """
-    row = await anyio.to_thread.run_sync(_get, context, id)
+    row = await context.call(_get, context, id)
     _require_chunk(request)
     checksum = Checksum.of(request)
     uploads.check_offset(row, byte_count(request, "Upload-Offset"))
@@ -161,20 +162,20 @@ async def _append(context: Context, request: Request, row: Row[Any], checksum: C
                 await anyio.to_thread.run_sync(context.objects.delete, empty)
             if not checksum:
                 args = context, row.id, offset, stored, reservation, not more
-                offset = await anyio.to_thread.run_sync(_advance, *args)
+                offset = await context.call(_advance, *args)
                 stored = []
         if stopped:
             raise stopped
         if checksum:
             checksum.check()
-            await anyio.to_thread.run_sync(_advance, context, row.id, offset, stored, reservation, True)
+            await context.call(_advance, context, row.id, offset, stored, reservation, True)
     except Exception:
         # Not when cancelled: `_advance` may still be running in its thread. Then the next start removes the parts.
         await anyio.to_thread.run_sync(_remove_unrecorded, context, row.id, stored)
         raise
     finally:
         await anyio.to_thread.run_sync(reservation.release)
-    return await anyio.to_thread.run_sync(_get, context, row.id)
+    return await context.call(_get, context, row.id)
 
 
 async def _claim(context: Context, row: Row[Any], writer: str, size: int) -> None:
@@ -195,13 +196,13 @@ async def _claim(context: Context, row: Row[Any], writer: str, size: int) -> Non
         with writing(context.engine) as c:
             bodies.ask_for(c, row.id)
 
-    if await anyio.to_thread.run_sync(claim):
+    if await context.call(claim):
         return
-    await anyio.to_thread.run_sync(ask)
+    await context.call(ask)
     deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
         await anyio.sleep(LOOK / 4)
-        if await anyio.to_thread.run_sync(claim):
+        if await context.call(claim):
             return
     raise Conflict(f"another request is writing upload {row.id}; request its offset and continue from there")
 

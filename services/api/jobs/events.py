@@ -6,20 +6,20 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from functools import partial
 from typing import Annotated, TypeVar
 
-import anyio.to_thread
-from fastapi import APIRouter, Header, Response
+from fastapi import Header, Response
 from fastapi.responses import StreamingResponse
 from fastapi.sse import format_sse_event
 from pydantic import BaseModel
 
 from services.api.context import Context, OwnerContext
+from services.api.http.router import Router
 from services.api.jobs.jobs import Job
 from services.runtime.problems import Unauthorized
 from storage.database.engine import reading
 from storage.errors import NotFound, Unavailable
 from storage.records import jobs
 
-router = APIRouter(tags=["jobs"])
+router = Router(tags=["jobs"])
 MEDIA_TYPE = "text/event-stream"
 T = TypeVar("T", bound=BaseModel)
 KEEP_ALIVE = 15.0
@@ -43,7 +43,7 @@ async def follow_job(
 
     With `Last-Event-ID`, which an `EventSource` sends when it reconnects, the stream starts with the first new event.
     """
-    job = await anyio.to_thread.run_sync(_read, context, id)
+    job = await context.call(_read, context, id)
     if _has_ended(job) and _event_id(job) == last_event_id:
         return Response(status_code=204)
 

@@ -2,16 +2,18 @@
 
 import time
 from datetime import UTC, datetime
+from functools import partial
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi import Depends, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection, Row
 
-from services.api.context import OwnerContext
+from services.api.context import Context, OwnerContext
 from services.api.http.bodies import read_json, schema_of
-from services.api.http.idempotency import IdempotencyKey, idempotent
+from services.api.http.idempotency import IdempotencyKey, find_earlier, idempotent
 from services.api.http.responses import json_response, utc_time
+from services.api.http.router import Router, in_turn
 from services.api.http.types import After, Limit
 from services.api.jobs.eta import seconds_left
 from services.api.jobs.wait_reason import reason
@@ -29,7 +31,7 @@ from storage.records.leases import Heartbeat
 from workflows.mattes.options import describe_options, parse_options
 from workflows.programs.program import Program
 
-router = APIRouter(tags=["jobs"])
+router = Router(tags=["jobs"])
 CALL = "POST /v1/jobs"
 REQUEST_BYTES = 64 << 10
 State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
@@ -197,7 +199,7 @@ class Log(BaseModel):
 
 
 @router.get("/options")
-def list_options() -> Options:
+def list_options(context: OwnerContext) -> Options:
     """All options of recovery."""
     return Options.model_validate({"options": describe_options()})
 
@@ -207,22 +209,37 @@ def list_options() -> Options:
     status_code=202,
     openapi_extra={"requestBody": {"content": {"application/json": {"schema": schema_of(JobRequest)}}}},
 )
-def post_job(
+async def post_job(
     context: OwnerContext,
-    request: Annotated[JobRequest, Depends(_job_request)],
+    given: Annotated[JobRequest, Depends(_job_request)],
+    request: Request,
     response: Response,
     idempotency_key: IdempotencyKey = None,
 ) -> Job:
     """Queue the recovery of a matte; the capture may still be ingesting."""
+    # A program may take as long to read as those in lists.
+    queue = partial(_queue, context, given, idempotency_key)
+    job = await context.compute(request, context.lists, queue)
+    response.headers["Location"] = f"/v1/jobs/{job.id}"
+    return job
+
+
+def _queue(context: Context, request: JobRequest, key: str | None) -> Job:
+    """Add the job of a recovery, and its matte; a repeated request is answered with the first's job."""
     options = parse_options(request.options)
     check_webhook(request.webhook, context.settings)
+    earlier = find_earlier(context.engine, key, CALL, Job.read)
+    if earlier is not None:
+        return earlier
+    with reading(context.engine) as c:
+        program = captures.get(c, request.capture).program
+    # Grids that do not nest are refused here, not by the job; and before the transaction, for which others wait.
+    Program.model_validate(program).bands()
 
     def create(c: Connection) -> str:
         capture = captures.get(c, request.capture)
         if capture.state == "failed":
             raise Conflict(f"capture {capture.id} failed: {capture.problem['detail']}")
-        # Grids that do not nest are refused here, not by the job.
-        Program.model_validate(capture.program).bands()
         admit(c, context.settings, jobs=1)
         matte = new_id()
         chosen = options.model_dump(mode="json")
@@ -239,9 +256,7 @@ def post_job(
         mattes.add(c, matte, capture.id, job, chosen, context.settings.matte_seconds, capture.name)
         return job
 
-    job = idempotent(context.engine, idempotency_key, CALL, Job.read, create)
-    response.headers["Location"] = f"/v1/jobs/{job.id}"
-    return job
+    return idempotent(context.engine, key, CALL, Job.read, create)
 
 
 @router.get("/jobs", response_model=Jobs)
@@ -287,7 +302,7 @@ async def _job_change(request: Request) -> JobChange:
 
 @router.patch(
     "/jobs/{id}",
-    dependencies=[Depends(get_job)],  # an unknown job is reported before a bad body
+    dependencies=[Depends(in_turn(get_job))],  # an unknown job is reported before a bad body
     openapi_extra={"requestBody": {"content": {"application/json": {"schema": schema_of(JobChange)}}}},
 )
 def change_job(context: OwnerContext, id: str, change: Annotated[JobChange, Depends(_job_change)]) -> Job:

@@ -61,7 +61,7 @@ class Reservation:
                 coming = coming or asyncio.ensure_future(_next(pieces))
                 await asyncio.wait({coming}, timeout=self._check_every)
                 if time.monotonic() - checked_at >= self._check_every:
-                    await anyio.to_thread.run_sync(self._check)
+                    await self._context.call(self._check)
                     checked_at = time.monotonic()
                 if not coming.done():
                     continue
@@ -71,7 +71,7 @@ class Reservation:
                 self._come += len(piece)
                 self._came_at = time.monotonic()
                 if self._come > self._size:
-                    await anyio.to_thread.run_sync(self._grow)
+                    await self._context.call(self._grow)
                 if self._come - self._looked_at >= STEP:
                     await anyio.to_thread.run_sync(self._look_at_disk)
                 yield piece
@@ -153,7 +153,7 @@ async def reserved(
             admit_upload(c, context.settings, context.objects, size, room=room, captures=captures, jobs=jobs)
             bodies.add(c, id, min(size, STEP), size)
 
-    await anyio.to_thread.run_sync(reserve)
+    await context.call(reserve)
     reservation = Reservation(context, id, min(size, STEP), size or limit, check_every=bodies.RENEW)
     try:
         yield reservation

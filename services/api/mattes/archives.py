@@ -4,7 +4,7 @@ from functools import partial
 from typing import Annotated, Any
 
 import anyio.to_thread
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import Query, Request, Response
 from fastapi.responses import StreamingResponse
 from sqlalchemy import Connection, Row
 
@@ -12,6 +12,7 @@ from services.api.context import Context, OwnerContext
 from services.api.http.bodies import store_as_upload, upload_limit
 from services.api.http.idempotency import IdempotencyKey, find_earlier, idempotent
 from services.api.http.media_types import ZIP, require_media_type
+from services.api.http.router import Router
 from services.api.limits.quotas import admit
 from services.api.limits.reservations import reserved
 from services.api.mattes.mattes import Matte
@@ -24,7 +25,7 @@ from storage.layout.uploads import Part
 from storage.records import bodies, mattes
 from workflows.mattes.imports.importing import bytes_of_import, take_in
 
-router = APIRouter(tags=["mattes"])
+router = Router(tags=["mattes"])
 CALL = "POST /v1/mattes"
 ARCHIVE_BYTES = 1 << 30
 """Of an archive, which may take ENVMATTE_REQUEST_SECONDS; a larger one may take as much longer."""
@@ -76,7 +77,7 @@ async def _from_body(context: Context, request: Request, name: str, key: str | N
     """Stream an archive into the store and import its matte; the archive is removed in any case."""
     limit = upload_limit(context.settings)
     length = limit.check_announced(request)
-    earlier = await anyio.to_thread.run_sync(find_earlier, context.engine, key, CALL, mattes.get)
+    earlier = await context.call(find_earlier, context.engine, key, CALL, mattes.get)
     if earlier is not None:
         return earlier
     matte = new_id()

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from typing import Any, BinaryIO
 
 import anyio.to_thread
-from fastapi import APIRouter, Request, Response
+from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
 from sqlalchemy import Connection
 
@@ -13,6 +13,7 @@ from services.api.context import Context, OwnerContext
 from services.api.http.bodies import store_body, upload_limit
 from services.api.http.idempotency import find_earlier, idempotent
 from services.api.http.media_types import JSON, media_type_of
+from services.api.http.router import Router
 from services.api.jobs.jobs import Job
 from services.api.limits.quotas import admit
 from services.api.limits.reservations import reserved
@@ -24,7 +25,7 @@ from storage.errors import Conflict, Corrupt, Unavailable
 from storage.layout import composites
 from storage.records import bodies, jobs, mattes
 
-router = APIRouter(tags=["jobs"])
+router = Router(tags=["jobs"])
 CALL = "POST /v1/mattes/{id}/composite"
 PIECE = 1 << 20
 """Bytes of a video that are read from the store at once."""
@@ -60,19 +61,19 @@ async def composite_clip(
     OptionError
         If the URL can't be a webhook.
     """
-    await anyio.to_thread.run_sync(check_webhook, webhook, context.settings)  # may resolve the URL's host
+    check_webhook(webhook, context.settings)
     limit = upload_limit(context.settings, "a clip")
     length = limit.check_announced(request)
     key = request.headers.get("idempotency-key", "")[:256]
-    job = await anyio.to_thread.run_sync(find_earlier, context.engine, key, CALL, Job.read)
+    job = await context.call(find_earlier, context.engine, key, CALL, Job.read)
     if job is None:
-        await anyio.to_thread.run_sync(_require_ready, context, matte)
+        await context.call(_require_ready, context, matte)
         id = new_id()
         async with reserved(context, id, length, context.settings.upload_bytes, jobs=1) as reservation:
             try:
                 pieces = reservation.watch(limit.stream(request))
                 size = await store_body(pieces, context.objects, composites.clip_path(id))
-                job = await anyio.to_thread.run_sync(_queue, context, id, matte, options, key, size, webhook)
+                job = await context.call(_queue, context, id, matte, options, key, size, webhook)
             except Unavailable:  # there may be a job; a sweep removes clips without one
                 raise
             except Exception:  # not when cancelled: `_queue` may still be running in its thread

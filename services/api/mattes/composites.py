@@ -6,9 +6,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import IO, Annotated, TypeVar
 
-import anyio.to_thread
 import numpy as np
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import Query, Request, Response
 from numpy.typing import NDArray
 from starlette.datastructures import Headers
 
@@ -17,6 +16,7 @@ from services.api.http.bodies import BodyLimit, spool_body
 from services.api.http.errors import answer as answer_problem
 from services.api.http.media_types import preferred
 from services.api.http.responses import bytes_response, etag_matches
+from services.api.http.router import Router
 from services.api.jobs.jobs import Job
 from services.api.mattes import clips
 from services.api.mattes.composite_params import CompositeParams
@@ -35,7 +35,7 @@ from workflows.composite.strips import Strip
 from workflows.images import float_formats, integer_formats
 from workflows.threads import CORES
 
-router = APIRouter(tags=["mattes"])
+router = Router(tags=["mattes"])
 R = TypeVar("R")
 BACKDROPS = (
     "image/png",
@@ -108,7 +108,7 @@ async def post_composite(
     media_type = preferred(accept, ANSWERS)
     if media_type is None:
         raise NotAcceptable(f"composites are answered as {', '.join(ANSWERS)}, not as {accept}")
-    progress = await anyio.to_thread.run_sync(progress_of, context, id)
+    progress = await context.call(progress_of, context, id)
     limit = context.settings.backdrop_bytes
     announced = BodyLimit(limit).check_announced(request) or limit
     turn = context.backdrops.take(context.caller.owner, context.settings.request_seconds, announced)
@@ -121,7 +121,7 @@ async def post_composite(
                 lambda now: _answer(context, now, body, media_type, params, request.headers),
             )
 
-        memory = await anyio.to_thread.run_sync(_bytes_of_composite, context, progress, params, media_type)
+        memory = await context.call(_bytes_of_composite, context, progress, params, media_type)
         return await context.compute(request, context.composites, answer, memory=memory)
 
 

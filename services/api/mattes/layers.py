@@ -5,13 +5,13 @@ from dataclasses import replace
 from functools import partial
 from typing import IO, Annotated, Any
 
-import anyio.to_thread
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import Query, Request, Response
 from pydantic import BaseModel
 from pydantic_core import to_json
 
 from services.api.context import Context, OwnerContext
 from services.api.http.responses import bytes_response, etag_matches, file_response
+from services.api.http.router import Router
 from services.api.http.types import Colour, Pair
 from services.api.mattes import live_module
 from services.api.mattes.progress import Progress, open_whole_frame, while_there
@@ -26,7 +26,7 @@ from workflows.mattes.pixel import Pixel, bytes_of_pixel, look_into
 from workflows.mattes.pixel_picture import picture
 from workflows.threads import CORES
 
-router = APIRouter(tags=["mattes"])
+router = Router(tags=["mattes"])
 MOST_BYTES = 1 << 30
 """The most that a file of lobes or look-ups may have before it is compressed: it waits in a temporary file."""
 MEDIA_TYPES = {
@@ -139,7 +139,7 @@ async def get_layer(
         # Saved and not shown: here it would be a page of the service.
         return headers | ({"Content-Disposition": "attachment"} if file.endswith(".html") else {})
 
-    progress, matte = await anyio.to_thread.run_sync(open_whole_frame, context, id)
+    progress, matte = await context.call(open_whole_frame, context, id)
     headers = headers_of(progress)
     if etag_matches(request.headers, headers["ETag"]):
         return Response(status_code=304, headers=headers)
@@ -235,7 +235,7 @@ async def _look(
         with context.stored(mattes.get_ready, id):
             return answer(look_into(matte, *place, lobes))
 
-    matte, size = await anyio.to_thread.run_sync(measure)
+    matte, size = await context.call(measure)
     return await context.compute(request, context.memory, look, size)
 
 

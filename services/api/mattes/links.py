@@ -4,19 +4,19 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Annotated, Any, Self
 
-import anyio.to_thread
 from fastapi import APIRouter, Body, Request, Response
 from pydantic import BaseModel, Field
 from sqlalchemy import Row
 
 from services.api.auth import Caller
 from services.api.context import OwnerContext, PublicContext
+from services.api.http.router import Router
 from services.api.mattes.live import live_page
 from storage.database.engine import reading, writing
 from storage.database.owners import for_owner
 from storage.records import links, mattes
 
-router = APIRouter(tags=["mattes"])
+router = Router(tags=["mattes"])
 page = APIRouter(tags=["mattes"])
 DAY = 86_400
 """Seconds."""
@@ -103,7 +103,7 @@ async def _shown(context: PublicContext, token: str, request: Request, headers: 
         with reading(context.engine) as c:
             return links.find(c, token)
 
-    row = await anyio.to_thread.run_sync(find)
+    row = await context.call(find)
     # What it costs counts as its owner's.
     bound = replace(context, engine=for_owner(context.engine, row.owner), caller=Caller(row.owner, "read"))
     # Asked for again each time, so that a deleted link shows nothing.

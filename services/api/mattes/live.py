@@ -4,12 +4,12 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
-import anyio.to_thread
-from fastapi import APIRouter, Request, Response
+from fastapi import Request, Response
 from sqlalchemy import Row
 
 from services.api.context import Context, OwnerContext
 from services.api.http.responses import bytes_response, etag_matches
+from services.api.http.router import Router
 from services.api.mattes.live_page import make_page
 from services.api.mattes.progress import Progress, open_whole_frame, while_there
 from storage.database.engine import reading
@@ -20,7 +20,7 @@ from storage.records import captures, mattes
 from workflows.composite.live import encode
 from workflows.threads import CORES
 
-router = APIRouter(tags=["mattes"])
+router = Router(tags=["mattes"])
 BLOCK_BYTES = 16 << 20
 """What a thread takes for the block that it encodes."""
 
@@ -47,7 +47,7 @@ async def get_live(context: OwnerContext, id: str, request: Request) -> Response
         headers = _headers(now) | {"Content-Encoding": "gzip"}
         return bytes_response(encoded, "application/octet-stream", headers)
 
-    progress, matte = await anyio.to_thread.run_sync(open_whole_frame, context, id)
+    progress, matte = await context.call(open_whole_frame, context, id)
     headers = _headers(progress)
     if etag_matches(request.headers, headers["ETag"]):
         return Response(status_code=304, headers=headers)
@@ -80,7 +80,7 @@ async def live_page(context: Context, id: str, request: Request, headers: dict[s
         page = make_page(_title(context, row), row.figures["monitor"], _encoded(context, id, matte))
         return bytes_response(page, "text/html", headers)
 
-    row, matte = await anyio.to_thread.run_sync(_open, context, id)
+    row, matte = await context.call(_open, context, id)
     return await context.compute(request, context.layers, load, memory=_bytes_of(matte))
 
 

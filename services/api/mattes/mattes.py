@@ -3,12 +3,13 @@
 from datetime import UTC, datetime
 from typing import Any, Literal
 
-from fastapi import APIRouter, Request, Response
+from fastapi import Request, Response
 from pydantic import BaseModel, Field
 from sqlalchemy import Connection, Row
 
 from services.api.context import OwnerContext
 from services.api.http.responses import json_response, utc_time
+from services.api.http.router import Router
 from services.api.http.types import After, Limit, Named, Pair
 from services.api.renaming import CHANGE, rename
 from storage.database.engine import reading, writing
@@ -18,7 +19,7 @@ from storage.errors import Conflict
 from storage.layout import mattes as stored_mattes
 from storage.records import jobs, mattes
 
-router = APIRouter(tags=["mattes"])
+router = Router(tags=["mattes"])
 
 
 class Matte(BaseModel):

@@ -9,6 +9,7 @@ from fastapi.responses import FileResponse, StreamingResponse
 
 from services.api.context import OwnerContext
 from services.api.http.responses import bytes_response, file_response
+from services.api.http.router import Router, in_turn
 from services.api.system.pages import HEADERS, WEB
 from storage.database.engine import reading
 from storage.errors import NotFound
@@ -18,7 +19,7 @@ from workflows.programs import video
 from workflows.programs.files import pictures, png, zip_program
 from workflows.programs.program import Program
 
-router = APIRouter(tags=["programs"])
+router = Router(tags=["programs"])
 page = APIRouter(tags=["programs"])
 
 
@@ -27,7 +28,7 @@ def _read(context: OwnerContext, id: str) -> Program:
         return Program.model_validate(programs.get(c, id).program)
 
 
-Stored = Annotated[Program, Depends(_read)]
+Stored = Annotated[Program, Depends(in_turn(_read))]
 
 
 @router.get("/programs/{id}/patterns/{n}.png", response_class=Response)
@@ -76,7 +77,7 @@ async def get_film(
 
 
 @page.get("/programs/{id}/play", response_class=FileResponse)
-def get_page(id: str) -> FileResponse:
+async def get_page(id: str) -> FileResponse:
     """The page that plays a program full screen. The page itself needs no key: it fetches the program, and asks the
     user for a key if that takes one."""
     return FileResponse(WEB / "play" / "play.html", media_type="text/html", headers=HEADERS)

@@ -4,18 +4,18 @@ import hashlib
 from functools import partial
 from typing import Annotated
 
-import anyio.to_thread
-from fastapi import APIRouter, Depends, Header, Request, Response
+from fastapi import Depends, Header, Request, Response
 from fastapi.responses import StreamingResponse
 
 from services.api.context import OwnerContext
 from services.api.http.bodies import read_json, schema_of
+from services.api.http.router import Router, in_turn
 from services.api.jobs.events import stream
 from services.api.programs.programs import PlaybackState, Program, get_program
 from storage.database.engine import writing
 from storage.records import programs
 
-router = APIRouter(tags=["programs"])
+router = Router(tags=["programs"])
 REQUEST_BYTES = 4 << 10
 
 
@@ -26,7 +26,7 @@ async def _state(request: Request) -> PlaybackState:
 @router.put(
     "/programs/{id}/showing",
     status_code=204,
-    dependencies=[Depends(get_program)],  # an unknown program is reported before a bad body
+    dependencies=[Depends(in_turn(get_program))],  # an unknown program is reported before a bad body
     openapi_extra={"requestBody": {"content": {"application/json": {"schema": schema_of(PlaybackState)}}}},
 )
 def put_showing(context: OwnerContext, id: str, state: Annotated[PlaybackState, Depends(_state)]) -> None:
@@ -46,7 +46,7 @@ async def follow_program(
     async def read() -> Program:
         return await context.follow(("program", id), now)
 
-    return stream(read, await anyio.to_thread.run_sync(now), _event_id, last_event_id)
+    return stream(read, await context.call(now), _event_id, last_event_id)
 
 
 def _event_id(program: Program) -> str:

@@ -4,13 +4,14 @@ import time
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal, Self
 
-from fastapi import APIRouter, Depends, Request, Response
+from fastapi import Depends, Request, Response
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from sqlalchemy import Row
 
 from services.api.context import OwnerContext
 from services.api.http.bodies import read_json, schema_of
 from services.api.http.responses import json_response
+from services.api.http.router import Router
 from services.api.http.types import After, Limit
 from services.api.limits.quotas import admit
 from storage.database.engine import reading, writing
@@ -24,7 +25,7 @@ from workflows.programs.parts import Monitor
 from workflows.programs.preset_names import PRESETS
 from workflows.programs.program import Program as PatternProgram
 
-router = APIRouter(tags=["programs"])
+router = Router(tags=["programs"])
 REQUEST_BYTES = 64 << 10
 MAX_PIXELS = 1 << 24
 """Of a monitor. A picture in colour then takes 48 MiB, and a few times that while it is drawn."""
@@ -164,7 +165,7 @@ async def _request(request: Request) -> ProgramRequest:
 
 
 @router.get("/presets")
-def list_presets() -> Presets:
+def list_presets(context: OwnerContext) -> Presets:
     """All presets."""
     return Presets(presets=[Preset(name=name, description=text) for name, text in PRESETS.items()])
 

@@ -1,9 +1,9 @@
 """Workers, the queue and the coordinator over HTTP."""
 
-from fastapi import APIRouter
 from pydantic import BaseModel, Field
 
 from services.api.context import AdminContext
+from services.api.http.router import Router
 from services.api.jobs.wait_reason import trouble_of
 from storage import statistics
 from storage.database.engine import reading
@@ -12,7 +12,7 @@ from storage.records.jobs import ACTIVE
 from storage.records.leases import Heartbeat
 from workflows.untrusted import confinement
 
-router = APIRouter(tags=["system"])
+router = Router(tags=["system"])
 
 
 class Worker(BaseModel):

@@ -1,13 +1,13 @@
 """Limits of the service and of its owners, over HTTP."""
 
-from fastapi import APIRouter
 from pydantic import BaseModel, Field
 
 from services.api.context import OwnerContext
+from services.api.http.router import Router
 from services.api.limits.quotas import Unit, limits_of
 from storage.database.engine import reading
 
-router = APIRouter(tags=["system"])
+router = Router(tags=["system"])
 
 
 class Limit(BaseModel):

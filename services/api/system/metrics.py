@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from fastapi import APIRouter, Request, Response
+from fastapi import Request, Response
 from prometheus_client import CollectorRegistry, Metric
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, SummaryMetricFamily
 from prometheus_client.exposition import choose_encoder
@@ -11,6 +11,7 @@ from prometheus_client.registry import Collector
 from sqlalchemy import Connection
 
 from services.api.context import AdminContext
+from services.api.http.router import Router
 from services.api.jobs.wait_reason import trouble_of
 from storage import statistics
 from storage.database.engine import reading
@@ -18,7 +19,7 @@ from storage.records import leases
 from storage.records.jobs import ACTIVE
 from storage.records.leases import Heartbeat
 
-router = APIRouter(tags=["system"])
+router = Router(tags=["system"])
 KINDS = ("ingest", "recover", "composite")
 JOB_STATES = ("queued", "running", "succeeded", "failed", "cancelled")
 Labelled = Iterable[tuple[tuple[str, ...], float]]

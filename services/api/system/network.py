@@ -2,14 +2,15 @@
 
 import socket
 
-from fastapi import APIRouter, Request
+from fastapi import Request
 from pydantic import BaseModel, Field
 
 from services.api.auth import is_open
 from services.api.context import OwnerContext
+from services.api.http.router import Router
 from services.runtime.addresses import is_loopback
 
-router = APIRouter(tags=["system"])
+router = Router(tags=["system"])
 ELSEWHERE = "192.0.2.1", 9
 """An address reserved for documentation (RFC 5737). Routing to it reveals this machine's own; nothing is sent."""
 ANY = ("0.0.0.0", "::")

@@ -99,12 +99,12 @@ DOCS = {**FRESH, "Content-Security-Policy": POLICY.replace("img-src 'self'", "im
 
 
 @page.get("/", include_in_schema=False, response_class=HTMLResponse)
-def get_app() -> HTMLResponse:
+async def get_app() -> HTMLResponse:
     """The web app. The page itself needs no key: it asks the user for one if the API needs it."""
     return HTMLResponse(APP, headers=HEADERS)
 
 
 @page.get("/docs", include_in_schema=False, response_class=FileResponse)
-def get_docs() -> FileResponse:
+async def get_docs() -> FileResponse:
     """The API's documentation, in Swagger UI."""
     return FileResponse(WEB / "docs" / "index.html", media_type="text/html", headers=DOCS)

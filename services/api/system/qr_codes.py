@@ -5,13 +5,14 @@ from typing import Annotated
 from urllib.parse import urlsplit
 
 import segno
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import Query, Request, Response
 
 from services.api.context import PublicContext
+from services.api.http.router import Router
 from services.api.system.network import url_elsewhere
 from storage.errors import InvalidInput
 
-page = APIRouter(tags=["system"])
+page = Router(tags=["system"])
 SVG = "image/svg+xml"
 # The same text always gives the same picture, which runs and loads nothing.
 HEADERS = {"Cache-Control": "public, max-age=86400", "Content-Security-Policy": "default-src 'none'"}

@@ -29,12 +29,11 @@ import psutil
 from numpy.typing import NDArray
 
 from tests.end_to_end.conftest import Service, serving
-from tests.faults.test_attacks import ATTACKS, MATTES, ZIP, Attacked, bearer, under_attack
+from tests.faults.test_attacks import ATTACKS, MATTES, ZIP, Attacked, bearer, large_program, under_attack
 from tests.parts.captures import captured, nested_program, zip_bytes
 from tests.parts.inputs.hostile_mattes import hostile_archive
 from tests.parts.waiting import until
 from workflows.images.integer_formats import encode_png
-from workflows.programs.program import Constant, Program
 
 PATIENCE = 10.0
 """Seconds after which the other owner gives a request up."""
@@ -42,11 +41,15 @@ FRAME = 4000
 """Edge of a square frame: 16 megapixels."""
 LARGE_PROGRAMS = 60
 """Captures with a large program."""
-MADE = {name: path for name, path in ATTACKS.items() if any(f"{{{one}}}" in path for one in MATTES)} | {
+MADE = {
+    name: call
+    for name, call in ATTACKS.items()
+    if call.startswith("GET ") and any(f"{{{one}}}" in call for one in MATTES)
+} | {
     "frames of 16 megapixels": ATTACKS["frames of 81 megapixels"],
     f"lists of {LARGE_PROGRAMS} large programs": ATTACKS["lists of large programs"],
 }
-"""The paths of attacks that need nothing but uploads, which an earlier version takes too, by what they ask for."""
+"""The calls of attacks that need nothing but uploads, which an earlier version takes too, by what they ask for."""
 
 
 def main() -> None:
@@ -70,7 +73,7 @@ def main() -> None:
         archives["own"] = hostile_archive(folder / "own", cells=20, columns=64, rows=48, edge=16)
         captures = {
             "frames": large_frames(),
-            **{f"program {n}": large_program() for n in range(LARGE_PROGRAMS)},
+            **{f"program {n}": large_capture() for n in range(LARGE_PROGRAMS)},
         }
         (folder / "backdrop.png").write_bytes(encode_png(np.zeros((48, 64, 3), np.uint8)))
         prepared = {
@@ -97,16 +100,11 @@ def large_frames() -> bytes:
     return captured(nested_program((64, 48), bands=((2, 2, 1),), levels=2), see)
 
 
-def large_program() -> bytes:
-    """A capture with a program of over a megabyte as JSON, which its film does not fit: it stays as it is listed."""
-    small = nested_program((64, 48), bands=((2, 2, 1),), levels=2)
-    colours = np.random.default_rng(0).random((19_990, 3)).tolist()
-    program = Program(
-        monitor=small.monitor, parts=(Constant(kind="constant", colours=colours), *small.parts[1:])
-    )
+def large_capture() -> bytes:
+    """A capture with a large program, which its film does not fit: it stays as it is listed."""
     record = {
         "format": "envmatte-capture/1",
-        "program": program.model_dump(mode="json"),
+        "program": large_program().model_dump(mode="json"),
         "video": {"file": "film.mp4", "patterns_per_second": 2},
         "response": "linear",
     }

@@ -38,9 +38,11 @@ STATES = ("succeeded",) * 7 + ("failed", "cancelled", "cancelled")
 PATHS = (
     "/v1/captures",
     "/v1/captures?limit=1000",
+    "/v1/captures?name=of+no+capture",
     "/v1/captures/{capture}",
     "/v1/mattes",
     "/v1/mattes?limit=1000",
+    "/v1/mattes?name=of+no+matte",
     "/v1/mattes/{matte}",
     "/v1/mattes?capture={capture}",
     "/v1/jobs",

@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from fastapi import Request
 from fastapi.testclient import TestClient
 
 from services.api.app import build_app
-from services.api.auth import identify
+from services.api.auth import Caller, identify
 from services.api.context import KEY_CHECK, Context
 from services.api.work import Shares
 from services.decoding.pool import Decoders
@@ -103,6 +104,22 @@ def test_work_larger_than_an_owners_share_of_memory_is_done_one_at_a_time(contex
 
     asyncio.run(several())
     assert at_once == [1, 1, 1]
+
+
+def test_calls_that_wait_hold_up_no_other_owner(context: Context) -> None:
+    released = threading.Event()
+
+    async def of_two_owners() -> None:
+        alice, bob = (replace(context, caller=Caller(owner, "write")) for owner in ("alice", "bob"))
+        waiting = [asyncio.create_task(alice.call(released.wait, 60)) for _ in range(50)]
+        try:
+            async with asyncio.timeout(30):
+                assert await bob.call(lambda: "done") == "done"
+        finally:
+            released.set()
+        assert all(await asyncio.gather(*waiting))
+
+    asyncio.run(of_two_owners())
 
 
 @pytest.mark.parametrize("route", ["captures", "mattes"])
