@@ -5,6 +5,7 @@ If a decoder fails, only its own request is refused.
 
 import logging
 import threading
+from typing import IO
 
 from storage.errors import ImageError, Unavailable
 from workflows.images.decode import Transfer, decode_file
@@ -44,7 +45,7 @@ class Decoders:
             logger.warning("%s", lacking)
         server.start()  # at the same time as the service
 
-    def decode(self, data: bytes, transfer: Transfer) -> Codes | Floats:
+    def decode(self, file: bytes | IO[bytes], transfer: Transfer) -> Codes | Floats:
         """Decode a picture, as `workflows.images.decode.decode` does. Any number of threads may call it.
 
         Raises
@@ -56,20 +57,18 @@ class Decoders:
         """
         decoder = self._take()
         try:
-            return decoder.picture(decode_file, data, transfer=transfer, memory=self._memory)
+            return decoder.picture(decode_file, file, transfer=transfer, memory=self._memory)
         except MemoryError as error:
             raise ImageError(
                 f"decoding the image takes too much memory: send a smaller one, or {ADVICE}"
             ) from error
         except TimeoutError as error:
-            logger.warning("decoding a picture of %d bytes took too long", len(data))
+            logger.warning("decoding a picture took too long")
             raise ImageError(
                 f"decoding the image takes more than {self._seconds:g} s: send a smaller one, or {ADVICE}"
             ) from error
         except DecoderEnded as error:
-            logger.warning(
-                "a picture of %d bytes ended its decoder: %s, %.300r", len(data), error, error.__cause__
-            )
+            logger.warning("a picture ended its decoder: %s, %.300r", error, error.__cause__)
             raise ImageError(
                 f"decoding the image ended the process of the decoder ({error}): {ADVICE}"
             ) from error

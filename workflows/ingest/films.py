@@ -72,8 +72,9 @@ def scan(
         If it can't be read, or has more frames than fit.
     """
     with blaming(entry, decoder):
-        arguments = {"entry": entry, "memory": decoder.image, "max_bytes": max_bytes, "every": every}
-        answers = decoder.run(_scan, file, **arguments)
+        answers = decoder.run(
+            _scan, file, entry=entry, memory=decoder.image, max_bytes=max_bytes, every=every
+        )
         with decoder.checking():
             found, signatures, ticks, grey, frames = answers
             film = Film.model_validate(found)

@@ -5,6 +5,7 @@ answers is validated and never unpickled: an attacker who takes one over control
 files, but not the service.
 """
 
+import io
 import json
 import logging
 import os
@@ -13,7 +14,7 @@ import socket
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from typing import Annotated, Any, BinaryIO, Literal, Self
+from typing import IO, Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,7 +140,9 @@ class Decoder:
             return False
         return False
 
-    def run(self, function: Function, file: bytes | BinaryIO, **arguments: Any) -> Iterator[Any]:
+    def run(
+        self, function: Function, file: bytes | IO[bytes], *, whole: bool = False, **arguments: Any
+    ) -> Iterator[Any]:
         """Run a function on a file in the process.
 
         Parameters
@@ -147,8 +150,10 @@ class Decoder:
         function : callable
             At the top of a module of `workflows`; it takes a seekable file and the arguments, and yields arrays and
             fields.
-        file : bytes or BinaryIO
+        file : bytes or IO[bytes]
             Bytes are sent whole; of an open file, what the function reads.
+        whole : bool
+            Whether an open file is sent whole too.
         **arguments
             Plain values.
 
@@ -168,8 +173,9 @@ class Decoder:
         DecoderEnded
             If the process ends or sends something invalid.
         """
-        whole = isinstance(file, bytes)
-        length = len(file) if isinstance(file, bytes) else file.seek(0, os.SEEK_END)
+        if isinstance(file, bytes):
+            file, whole = io.BytesIO(file), True
+        length = file.seek(0, os.SEEK_END)
         name = f"{function.__module__}:{function.__qualname__}"
         request = {"function": name, "arguments": arguments, "length": length, "sent": whole}
         text = json.dumps(request).encode()
@@ -178,8 +184,9 @@ class Decoder:
         try:
             with self.checking():
                 self._send(HEAD.pack(len(text)) + text, deadline)
-                if isinstance(file, bytes):
-                    self._send(file, deadline)
+                file.seek(0)
+                while whole and (piece := file.read(PIECE)):
+                    self._send(piece, deadline)
             while not isinstance(answer, _Done | _Refused | _Failed | _OutOfMemory):
                 with self.checking():
                     answer = self._receive(deadline)
@@ -194,7 +201,7 @@ class Decoder:
                     yield values
                 deadline = time.monotonic() + self._seconds
                 if isinstance(answer, _Read):
-                    piece = _read(file, answer)  # type: ignore[arg-type]
+                    piece = _read(file, answer)
                     with self.checking():
                         self._send(piece, deadline)
         except BaseException:
@@ -208,8 +215,8 @@ class Decoder:
         if isinstance(answer, _Refused):
             raise ImageError(answer.refused, **({} if answer.limit is None else {"limit": answer.limit}))
 
-    def picture(self, function: Function, file: bytes, **arguments: Any) -> NDArray[Any]:
-        """Run a function that yields a single picture, and check that it is one.
+    def picture(self, function: Function, file: bytes | IO[bytes], **arguments: Any) -> NDArray[Any]:
+        """Run a function that yields a single picture on a file that is sent whole, and check that it is one.
 
         Returns
         -------
@@ -221,7 +228,7 @@ class Decoder:
             As `run`.
         """
         with self.checking():
-            (pixels,) = self.run(function, file, **arguments)  # a second one would be an error
+            (pixels,) = self.run(function, file, whole=True, **arguments)  # a second one would be an error
             if not isinstance(pixels, np.ndarray) or pixels.ndim != 3 or not pixels.size:
                 raise ValueError("it sent no picture")
             if pixels.shape[2] not in ((1, 3) if pixels.dtype == np.float32 else (1, 2, 3, 4)):
@@ -332,7 +339,7 @@ def blaming(entry: str, decoder: Decoder) -> Iterator[None]:
         raise Unavailable(f"decoding {entry} ended the process of the decoder ({error}): {ADVICE}") from error
 
 
-def _read(file: BinaryIO, asked: _Read) -> bytes:
+def _read(file: IO[bytes], asked: _Read) -> bytes:
     file.seek(asked.read)
     return file.read(asked.count)
 

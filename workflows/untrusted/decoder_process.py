@@ -84,7 +84,7 @@ def _serve(connection: io.FileIO) -> None:
     while head := connection.read(HEAD.size):  # so few bytes come together
         request = json.loads(_read(connection, *HEAD.unpack(head)))
         sent, length = request["sent"], request["length"]
-        file = io.BytesIO(_read(connection, length)) if sent else _remote(connection, length)
+        file = _whole(connection, length) if sent else _remote(connection, length)
         module, _, name = request["function"].partition(":")
         answer: dict[str, Any]
         try:
@@ -142,6 +142,16 @@ class _Remote(io.RawIOBase):
             buffer[:count] = _read(self._connection, count)
             self._at += count
         return count
+
+
+def _whole(connection: io.FileIO, length: int) -> BinaryIO:
+    """A file that is sent whole. It is in memory once, also when a function has read all of it."""
+    file = io.BytesIO()
+    for start in range(0, length, PIECE):
+        file.write(_read(connection, min(PIECE, length - start)))
+    file.getvalue()  # cuts the buffer to its length; only then `read` shares it
+    file.seek(0)
+    return file
 
 
 def _remote(connection: io.FileIO, length: int) -> BinaryIO:

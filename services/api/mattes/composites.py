@@ -15,7 +15,7 @@ from services.api.context import Context, OwnerContext
 from services.api.http.bodies import BodyLimit, spool_body
 from services.api.http.errors import answer as answer_problem
 from services.api.http.media_types import preferred
-from services.api.http.responses import bytes_response, etag_matches
+from services.api.http.responses import MEMORY_BYTES, bytes_response, etag_matches
 from services.api.http.router import Router
 from services.api.jobs.jobs import Job
 from services.api.mattes import clips
@@ -162,11 +162,11 @@ def _answer(
         return result
 
     body.seek(0)
-    digest = hashlib.blake2b(body.read()).digest()
-    inputs = (
-        f"{progress.id} {sorted(progress.blocks or ())} {media_type} {params.model_dump_json()} ".encode()
-    )
-    tag = f'"{hashlib.blake2b(inputs + digest, digest_size=16).hexdigest()}"'
+    inputs = f"{progress.id} {sorted(progress.blocks or ())} {media_type} {params.model_dump_json()} "
+    digest = hashlib.blake2b(inputs.encode(), digest_size=16)
+    for piece in iter(partial(body.read, MEMORY_BYTES), b""):
+        digest.update(piece)
+    tag = f'"{digest.hexdigest()}"'
     extra = {"ETag": tag} | progress.headers
     if etag_matches(headers, tag):
         return answer_problem(
@@ -174,8 +174,7 @@ def _answer(
         )
     matte = timed("open", lambda: context.cache.matte(progress.id))
     window = Window.of(matte, params.x, params.y, params.width, params.height)
-    body.seek(0)
-    pixels = timed("decode", lambda: context.decoders.decode(body.read(), params.transfer))
+    pixels = timed("decode", lambda: context.decoders.decode(body, params.transfer))
     backdrop = backdrop_of(pixels, params.transfer)
 
     def read(row: int, number: int) -> Strip:

@@ -109,6 +109,12 @@ def hang(file: BinaryIO) -> Iterator[dict[str, Any]]:
     yield {"alive": True}
 
 
+def measure(file: BinaryIO) -> Iterator[dict[str, int]]:
+    """Read a file whole."""
+    data = file.read()
+    yield {"size": len(data)}
+
+
 def hoard(file: BinaryIO, size: int) -> Iterator[np.ndarray]:
     """Take memory."""
     yield np.ones(size, np.uint8)[:1]

@@ -88,6 +88,15 @@ def test_file_is_read_piece_by_piece_as_it_is_needed() -> None:
             assert pixels.tobytes() == pieces
 
 
+@pytest.mark.skipif(os.uname().sysname != "Linux", reason="it is Linux that limits what a process takes")
+def test_file_that_is_sent_whole_is_in_memory_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(decoder, "COPIES", 0)
+    monkeypatch.setattr(decoder, "EXTRA", 180 << 20)
+    with Decoder(IMAGE) as found:
+        answers = found.run(taken_over.measure, io.BytesIO(bytes(120 << 20)), whole=True)
+        assert list(answers) == [{"size": 120 << 20}]
+
+
 def framed(text: bytes) -> bytes:
     return struct.pack("<I", len(text)) + text
 
