@@ -4,12 +4,13 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Annotated, Any, Self
 
-from fastapi import APIRouter, Body, Request, Response
-from pydantic import BaseModel, Field
+from fastapi import APIRouter, Depends, Request, Response
+from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Row
 
 from services.api.auth import Caller
 from services.api.context import OwnerContext, PublicContext
+from services.api.http.bodies import has_body, read_json, schema_of
 from services.api.http.router import Router
 from services.api.mattes.live import live_page
 from storage.database.engine import reading, writing
@@ -18,6 +19,7 @@ from storage.records import links, mattes
 
 router = Router(tags=["mattes"])
 page = APIRouter(tags=["mattes"])
+REQUEST_BYTES = 4 << 10
 DAY = 86_400
 """Seconds."""
 SANDBOX = "sandbox allow-scripts; frame-ancestors"
@@ -52,20 +54,32 @@ class Links(BaseModel):
     links: list[Link]
 
 
-Days = Annotated[
-    float, Body(gt=0, le=3650, embed=True, description="Days until the link expires, a fraction too.")
-]
+class LinkRequest(BaseModel):
+    """How long a link leads to the matte."""
+
+    model_config = ConfigDict(extra="forbid")
+    days: float = Field(default=30, gt=0, le=3650, description="Days until the link expires, a fraction too.")
 
 
-@router.post("/mattes/{id}/links", status_code=201)
-def create_link(context: OwnerContext, id: str, days: Days = 30) -> NewLink:
+async def _link_request(request: Request) -> LinkRequest:
+    return await read_json(request, LinkRequest, REQUEST_BYTES) if has_body(request) else LinkRequest()
+
+
+@router.post(
+    "/mattes/{id}/links",
+    status_code=201,
+    openapi_extra={"requestBody": {"content": {"application/json": {"schema": schema_of(LinkRequest)}}}},
+)
+def create_link(
+    context: OwnerContext, id: str, given: Annotated[LinkRequest, Depends(_link_request)]
+) -> NewLink:
     """Make a link by which anyone can see the matte, live before pictures of their own, but nothing else.
 
     Its path is in this answer only. The page has the matte as `GET /v1/mattes/{id}/live` sends it.
     """
     with writing(context.engine) as c:
         mattes.get_ready(c, id)
-        token, row = links.create(c, id, days * DAY)
+        token, row = links.create(c, id, given.days * DAY)
     return NewLink.of(row, path=f"/share/{token}", embed=f"/embed/{token}")
 
 

@@ -25,3 +25,8 @@ def test_no_route_takes_a_thread_out_of_turn(routes: list[APIRoute]) -> None:
     """FastAPI runs a plain function in one of the threads that all owners share."""
     assert len(routes) > 60
     assert [route.path for route in routes if not iscoroutinefunction(route.endpoint)] == []
+
+
+def test_no_route_leaves_its_body_to_fastapi(routes: list[APIRoute]) -> None:
+    """It reads a body whole, however large it is."""
+    assert [route.path for route in routes if route.body_field is not None] == []
