@@ -30,10 +30,12 @@ class _Main(click.Group):
         except ValueError as error:
             from pydantic import ValidationError
 
+            from workflows.untrusted.validation import reason
+
             if isinstance(error, ValidationError):
                 first = error.errors()[0]
                 field = ".".join(map(str, first["loc"]))
-                raise click.UsageError(f"{field} {first['msg']}".strip()) from error
+                raise click.UsageError(f"{field} {reason(first)}".strip()) from error
             raise
 
 

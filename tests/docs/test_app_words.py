@@ -28,6 +28,7 @@ SAYING = [
     "workflows/ingest/video/missing_patterns.py",
     "workflows/programs/preset_names.py",
     "workflows/recovery/dgsr/options.py",
+    "workflows/untrusted/validation.py",
 ]
 """Modules of which everything that people read is translated."""
 PROGRAMS = "webgl.js"

@@ -11,6 +11,7 @@ from storage.errors import CaptureError
 from workflows.images.tone_curves import Response
 from workflows.programs.border import Border
 from workflows.programs.program import Program
+from workflows.untrusted.validation import reason
 
 MANIFEST = "capture.json"
 MANIFEST_BYTES = 4 << 20
@@ -138,10 +139,9 @@ def parse_manifest(text: bytes) -> Manifest:
         return Manifest.model_validate_json(text)
     except ValidationError as error:
         # Each member of a union that was tried gives an error; the deepest one is the most specific.
-        first = max(error.errors(include_url=False, include_context=False), key=lambda e: len(e["loc"]))
+        first = max(error.errors(include_url=False), key=lambda e: len(e["loc"]))
         names = [str(part) for part in first["loc"] if part not in UNION_TAGS]
         field = ".".join(name for name in names if "[" not in name)
-        reason = first["msg"].removeprefix("Value error, ")
         raise CaptureError(
-            f"{MANIFEST}: {field + ': ' if field else ''}{reason}", entry=MANIFEST, field=field
+            f"{MANIFEST}: {field + ': ' if field else ''}{reason(first)}", entry=MANIFEST, field=field
         ) from error

@@ -20,6 +20,7 @@ from workflows.programs.border import Border
 from workflows.programs.preset_names import PRESETS
 from workflows.programs.presets import preset
 from workflows.programs.program import Images, Program
+from workflows.untrusted.validation import reason
 
 Size = tuple[int, int]
 DEFAULT_SCREEN = 1280, 960
@@ -96,7 +97,7 @@ def _resize(program: Program, width: int, height: int) -> Program:
     try:
         return Program.model_validate(program.model_dump() | {"monitor": monitor})
     except ValidationError as error:
-        why = error.errors()[0]["msg"].removeprefix("Value error, ")
+        why = reason(error.errors()[0])
         raise OptionError(f"on a monitor of {width} x {height} pixels: {why}", field="monitor") from error
 
 

@@ -13,6 +13,7 @@ from starlette.routing import Match, Route
 
 from services.runtime.problems import MEDIA_TYPE, Unauthorized, problem_detail, problem_of
 from storage.errors import EnvmatteError, InvalidInput, TooMany, Unavailable
+from workflows.untrusted.validation import reason
 
 RESPONSES: dict[int | str, dict[str, Any]] = {
     "default": {
@@ -73,7 +74,7 @@ def register(app: FastAPI) -> None:
     async def _validation(request: Request, error: RequestValidationError) -> JSONResponse:
         first = error.errors()[0]
         field = ".".join(str(part) for part in first["loc"][1:])
-        detail = f"{field or first['loc'][0]}: {first['msg']}"
+        detail = f"{field or first['loc'][0]}: {reason(first)}"
         return answer(problem_of(InvalidInput(detail, field=field)))
 
     @app.exception_handler(ClientDisconnect)

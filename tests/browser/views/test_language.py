@@ -145,6 +145,7 @@ def test_failures_are_explained_in_german(
             "Bilder davon gleichen sich: Es war zu kurz, oder etwas hat sich bewegt)",
         ),
         ("expose half a stop more", "eine halbe Blende reichlicher belichten"),
+        ("name: must have at most 200 characters", "name: darf höchstens 200 Zeichen haben"),
         ("nobody has translated this: 1.5 of it", "nobody has translated this: 1.5 of it"),
         pytest.param("a: b; " * 300, "a: b; " * 300, id="many parts"),
     ],

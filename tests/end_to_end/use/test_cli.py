@@ -147,7 +147,7 @@ def test_patterns_need_a_new_or_empty_folder(tmp_path: Path) -> None:
         (["quick"], "OUT"),
         (["quick", "x", "--monitor", "1280"], "WIDTHxHEIGHT"),
         (["quick", "x", "--monitor", "2x2"], "too small"),
-        (["quick", "x", "--monitor", "99999x960"], "less than or equal to 16384"),
+        (["quick", "x", "--monitor", "99999x960"], "must be at most 16384"),
     ],
 )
 def test_invalid_patterns_are_refused(

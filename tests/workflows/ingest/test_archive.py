@@ -100,7 +100,7 @@ def test_archive_without_a_record_is_refused(make_zip: Zip) -> None:
         (lambda r: r.update(response={"gamma": 99}), "response", ""),
         (lambda r: r.update(response="kodak"), "response", "linear"),
         (lambda r: r.update(name="x" * 201), "name", "200"),
-        (lambda r: r["program"]["monitor"].update(width=0), "program.monitor.width", "greater than"),
+        (lambda r: r["program"]["monitor"].update(width=0), "program.monitor.width", "must be at least 1"),
         (
             lambda r: r["program"]["parts"][0].update(levels=[0.5, 0.5]),
             "program",
@@ -110,7 +110,7 @@ def test_archive_without_a_record_is_refused(make_zip: Zip) -> None:
         (lambda r: r["program"]["parts"][1].update(columns=65), "program", "finer than the monitor"),
         (lambda r: r["program"]["parts"][1].pop("seed"), "program.parts.1.seed", "required"),
         (lambda r: r["program"]["parts"][1].update(kind="hadamard"), "program.parts.1", "kind"),
-        (lambda r: r["frames"][3].update(pattern=-1), "frames.3.pattern", "greater than or equal to 0"),
+        (lambda r: r["frames"][3].update(pattern=-1), "frames.3.pattern", "must be at least 0"),
         (lambda r: r["frames"][3].update(pattern=5), "frames.3.pattern", "0 to 4"),
         (lambda r: r["frames"][3].update(pattern=10**30), "frames.3.pattern", ""),
         (lambda r: r["frames"][3].pop("file"), "frames.3.file", "required"),

@@ -58,11 +58,11 @@ def test_malformed_text_is_refused(text: bytes) -> None:
 @pytest.mark.parametrize(
     ("change", "field", "reason"),
     [
-        (lambda r: r.update(response={"gamma": 99}), "response.gamma", "less than or equal to 5"),
+        (lambda r: r.update(response={"gamma": 99}), "response.gamma", "must be at most 5"),
         (
             lambda r: r["program"]["parts"][3].update(count=99),
             "program.parts.3.count",
-            "less than or equal to 14",
+            "must be at most 14",
         ),
     ],
 )

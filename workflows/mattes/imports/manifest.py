@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from storage.errors import ArchiveError
+from workflows.untrusted.validation import reason
 
 Model = TypeVar("Model", bound=BaseModel)
 Side = Annotated[int, Field(ge=1, le=16384)]
@@ -54,8 +55,8 @@ def valid(model: type[Model], given: Any, entry: str, within: str = "") -> Model
     try:
         return model.model_validate(given)
     except ValidationError as error:
-        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        first = error.errors(include_url=False, include_input=False)[0]
         field = within + ".".join(str(part) for part in first["loc"])
         raise ArchiveError(
-            f"{entry}: {field + ': ' if field else ''}{first['msg']}", entry=entry, field=field
+            f"{entry}: {field + ': ' if field else ''}{reason(first)}", entry=entry, field=field
         ) from error
