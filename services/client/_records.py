@@ -66,11 +66,13 @@ class Job(Record):
     """A job; ``state`` is ``queued``, ``running``, ``succeeded``, ``failed`` or ``cancelled``.
 
     ``progress`` goes from 0 to 1 and never back; ``tiles`` has ``total``, ``done`` and ``failed``; ``waits_for`` says
-    what the job waits for; ``matte`` is the id of the matte that it makes.
+    what the job waits for; ``matte`` is the id of the matte that it makes. ``name`` is that of the matte, or else of
+    the capture; it is empty once they are deleted, or if the service is older than names of jobs.
     """
 
     path = "/v1/jobs"
     kind: str
+    name: str = ""
     stage: str
     progress: float
     tiles: dict[str, int]

@@ -12,7 +12,7 @@ from typing import Any
 from sqlalchemy import Connection, Row, func, insert, select, update
 
 from storage.database.rows import ROW, find, new_id
-from storage.database.tables import jobs, tiles
+from storage.database.tables import captures, jobs, mattes, tiles
 from storage.database.tables import log as lines
 from storage.errors import Conflict
 from storage.records import webhook_deliveries
@@ -82,6 +82,15 @@ def active(connection: Connection) -> Sequence[Row[Any]]:
     """Jobs that are queued or running, oldest first."""
     query = select(jobs).where(jobs.c.state.in_(ACTIVE)).order_by(jobs.c.number)
     return connection.execute(query).all()
+
+
+def names(connection: Connection, rows: Sequence[Row[Any]]) -> dict[str, str]:
+    """The names of what jobs are about, by the jobs' ids: those of their mattes or else of their captures, if any."""
+    found: dict[str, str] = {}
+    for table, ids in ((captures, {row.capture for row in rows}), (mattes, {row.matte for row in rows})):
+        query = select(table.c.id, table.c.name).where(table.c.id.in_(ids))
+        found.update((id, name) for id, name in connection.execute(query))
+    return {row.id: found.get(row.matte) or found.get(row.capture, "") for row in rows}
 
 
 def is_retryable(problem: dict[str, Any]) -> bool:

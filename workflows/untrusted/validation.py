@@ -1,4 +1,4 @@
-"""Why a value does not fit a model, in our words: those of pydantic name types of Python, and stay English in the app."""
+"""Why a value does not fit a model, in our words: pydantic's name types of Python, and stay English in the app."""
 
 from pydantic_core import ErrorDetails
 

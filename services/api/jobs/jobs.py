@@ -1,8 +1,10 @@
 """Jobs over HTTP: start, list, read, cancel, retry and delete them."""
 
 import time
+from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from functools import partial
+from itertools import islice
 from typing import Annotated, Any, Literal
 
 from fastapi import Depends, Query, Request, Response
@@ -34,6 +36,7 @@ from workflows.programs.program import Program
 router = Router(tags=["jobs"])
 CALL = "POST /v1/jobs"
 REQUEST_BYTES = 64 << 10
+ROWS_AT_ONCE = 20
 State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 
 
@@ -95,10 +98,11 @@ class Tiles(BaseModel):
 
 
 class Job(BaseModel):
-    """A job."""
+    """A job; `name` is that of its matte, or else of its capture, and empty once they are deleted."""
 
     id: str
     kind: Literal["ingest", "recover", "composite"]
+    name: str
     state: State
     stage: str
     progress: float
@@ -123,12 +127,21 @@ class Job(BaseModel):
     @classmethod
     def read(cls, connection: Connection, id: str) -> "Job":
         """A job by its id; `NotFound` if there is none."""
-        return cls.of(connection, jobs.get(connection, id))
+        return next(cls.of(connection, [jobs.get(connection, id)]))
 
     @classmethod
-    def of(cls, connection: Connection, row: Row[Any], sign: Heartbeat | None = None) -> "Job":
+    def of(cls, connection: Connection, rows: Iterable[Row[Any]]) -> Iterator["Job"]:
+        """Jobs by their rows, of which few are in memory at a time: a plan may be large."""
+        sign = leases.last_heartbeat(connection)
+        rows = iter(rows)
+        while some := list(islice(rows, ROWS_AT_ONCE)):
+            names = jobs.names(connection, some)
+            for row in some:
+                yield cls._of(connection, row, names[row.id], sign)
+
+    @classmethod
+    def _of(cls, connection: Connection, row: Row[Any], name: str, sign: Heartbeat | None) -> "Job":
         now = time.time()
-        sign = sign or leases.last_heartbeat(connection)
         # Not below zero: the clock may go back.
         ran = max((row.finished_at or now) - row.started_at, 0.0) if row.started_at else 0.0
         running = row.state == "running"
@@ -139,6 +152,7 @@ class Job(BaseModel):
                 name: getattr(row, name)
                 for name in ("id", "kind", "state", "stage", "pixels", "matte", "paused")
             },
+            name=name,
             region=Region.of(row.region),
             capture=row.capture or None,  # the composite of an imported matte has none
             progress=progress,
@@ -271,9 +285,8 @@ async def list_jobs(
 
     def make() -> Response:
         with reading(context.engine) as c:
-            sign = leases.last_heartbeat(c)  # once for all of them
             rows = page(c, table, limit, after, state=state)
-            return json_response(Jobs(jobs=[Job.of(c, row, sign) for row in rows]))
+            return json_response(Jobs(jobs=list(Job.of(c, rows))))
 
     return await context.compute(request, context.lists, make)
 

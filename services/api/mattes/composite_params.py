@@ -25,6 +25,12 @@ class CompositeParams(BaseModel):
     size: int | None = Field(
         None, ge=1, description="Longer side of the answer in pixels, to scale it down. Never scales up."
     )
+    enlarge: int = Field(
+        1,
+        ge=1,
+        le=2,
+        description="How many times as wide and high the answer is. It is smoother, and shows no more detail.",
+    )
     quality: int = Field(90, ge=1, le=100, description="Quality of a JPEG.")
     right: float = Field(
         0, ge=-100, le=100, description="Moves the backdrop to the right, in widths of the monitor."
@@ -71,6 +77,8 @@ class CompositeParams(BaseModel):
             )
         if self.around == "backdrop" and self.depth is not None:
             raise ValueError("a backdrop at another depth is not shown around the glass: omit around")
+        if self.size is not None and self.enlarge > 1:
+            raise ValueError("size makes a picture smaller, enlarge larger: omit one of them")
         if self.other_distance is not None and self.other_distance == self.distance:
             raise ValueError("the two distances must differ")
         return self

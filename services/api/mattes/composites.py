@@ -28,7 +28,7 @@ from workflows.composite import composite
 from workflows.composite.around import put_around
 from workflows.composite.backdrop import Backdrop, backdrop_of
 from workflows.composite.depth import Rays, from_one, from_two
-from workflows.composite.engine import Window, shrink
+from workflows.composite.engine import Window, double, shrink
 from workflows.composite.preview import enlarge, put_behind, window_of_preview
 from workflows.composite.quantise import encode
 from workflows.composite.strips import Strip
@@ -56,6 +56,8 @@ PICTURE_BYTES = 16
 """Of a pixel while it is composited: light and alpha."""
 SHRUNK_BYTES = 32
 """Of a pixel while a picture is made smaller, and of the answer."""
+DOUBLED_BYTES = 96
+"""Of a pixel while a picture is made twice as wide and high: twice as wide, and then the whole."""
 ENLARGED_BYTES = 50
 """Of a pixel while a preview is enlarged: the light and alpha of its neighbours, and their mean."""
 LIGHT_BYTES = 16
@@ -136,7 +138,8 @@ def _bytes_of_composite(
     with context.stored(mattes.get, progress.id):
         matte = context.cache.matte(progress.id)
     window = Window.of(matte, params.x, params.y, params.width, params.height)
-    of_pixel = PICTURE_BYTES + (SHRUNK_BYTES if params.size is not None else ANSWER_BYTES[media_type])
+    of_answer = SHRUNK_BYTES if params.size is not None else params.enlarge**2 * ANSWER_BYTES[media_type]
+    of_pixel = PICTURE_BYTES + of_answer + (DOUBLED_BYTES if params.enlarge > 1 else 0)
     of_rays = RAYS_BYTES * matte.width * matte.height if params.depth is not None else 0
     of_frame = AROUND_BYTES * matte.width * matte.height if params.around == "backdrop" else 0
     if progress.preview is not None:
@@ -197,6 +200,8 @@ def _answer(
         )
     if params.size is not None:
         picture = shrink(picture, params.size)
+    if params.enlarge == 2:
+        picture = double(picture)
     answer = timed("encode", lambda: _encoded(picture, backdrop, media_type, params))
     return bytes_response(answer, media_type, extra | {"Server-Timing": ", ".join(times)})
 

@@ -33,7 +33,12 @@ def test_matte_is_named_after_its_capture(service: Service, capture: str, matte:
     path = f"/v1/mattes/{matte}"
     assert service.http.get(path).json()["name"] == service.client.matte(matte).name == "ball"
     assert service.http.patch(path, json={"name": "tumbler"}).json()["name"] == "tumbler"
-    assert service.http.get(f"/v1/captures/{capture}").json()["name"] == "ball"
+    found = service.http.get(f"/v1/captures/{capture}").json()
+    assert found["name"] == "ball"
+    names = {one["id"]: one["name"] for one in service.http.get("/v1/jobs").json()["jobs"]}
+    recovery = service.client.matte(matte)["job"]
+    assert names[recovery] == service.client.job(recovery).name == "tumbler"  # of what it makes
+    assert names[found["job"]] == "ball"
     service.http.patch(path, json={"name": "ball"})
 
 

@@ -74,6 +74,21 @@ def test_crop_and_preview(service: Service, matte: str) -> None:
     assert decoded(post_composite(service, matte, size=500)).shape == whole.shape
 
 
+@pytest.mark.parametrize("kind", ["image/png", "image/jpeg", "image/x-exr"])
+def test_twice_the_size(service: Service, matte: str, kind: str) -> None:
+    def read(answer: httpx2.Response) -> np.ndarray:
+        if kind == "image/x-exr":
+            return float_formats.decode(answer.content, memory=1 << 24)[..., :3]
+        return decoded(answer)[..., :3].astype(float) / 255
+
+    whole = read(post_composite(service, matte, accept=kind))
+    large = read(post_composite(service, matte, accept=kind, enlarge=2))
+    assert large.shape == (2 * whole.shape[0], 2 * whole.shape[1], 3)
+    same = large.reshape(*whole.shape[:1], 2, whole.shape[1], 2, 3).mean(axis=(1, 3))
+    assert np.abs(same - whole).mean() < 0.03
+    check_problem(post_composite(service, matte, enlarge=2, size=30), 422, "bad-request")
+
+
 @pytest.mark.parametrize(
     ("query", "field"),
     [({"x": 64}, "x"), ({"y": 40, "height": 9}, "y"), ({"width": 65}, "x"), ({"x": 60, "width": 10}, "x")],
@@ -84,7 +99,9 @@ def test_crop_outside_is_refused(service: Service, matte: str, query: dict[str, 
     assert "64 x 48" in problem["detail"]
 
 
-@pytest.mark.parametrize("query", [{"size": 0}, {"quality": 101}, {"scale": 0}, {"crop": 1}, {"x": -1}])
+@pytest.mark.parametrize(
+    "query", [{"size": 0}, {"quality": 101}, {"scale": 0}, {"crop": 1}, {"x": -1}, {"enlarge": 3}]
+)
 def test_invalid_query_is_refused(service: Service, matte: str, query: dict[str, int]) -> None:
     assert check_problem(post_composite(service, matte, **query), 422, "bad-request")["field"] in query
 

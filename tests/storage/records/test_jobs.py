@@ -9,7 +9,7 @@ from storage import statistics
 from storage.database import tables
 from storage.database.rows import ROW
 from storage.errors import Conflict, NotFound
-from storage.records import jobs, tiles
+from storage.records import captures, jobs, mattes, tiles
 from tests.storage.planned import log_of, planned
 
 
@@ -184,3 +184,23 @@ def test_job_is_paused_and_continued(connection: Connection) -> None:
     assert not jobs.get(connection, job).paused
     with pytest.raises(Conflict, match="already cancelled"):
         jobs.pause(connection, job, True)
+
+
+def test_job_has_the_name_of_its_matte_or_else_of_its_capture(connection: Connection) -> None:
+    ingest = jobs.add(connection, "ingest", "cap", {})
+    recovery = jobs.add(connection, "recover", "cap", {}, matte="mat")
+    composite = jobs.add(connection, "composite", "", {}, matte="imported")
+    gone = jobs.add(connection, "recover", "none", {}, matte="none")
+    captures.add(connection, "cap", ingest, name="ball", program={}, frames=1, bytes=1)
+    mattes.add(connection, "mat", "cap", recovery, {}, name="glass ball")
+    mattes.add_imported(connection, "imported", {}, {}, name="tumbler")
+    rows = [jobs.get(connection, job) for job in (ingest, recovery, composite, gone)]
+    assert jobs.names(connection, rows) == {
+        ingest: "ball",
+        recovery: "glass ball",
+        composite: "tumbler",
+        gone: "",
+    }
+    mattes.delete(connection, "mat")
+    assert jobs.names(connection, rows)[recovery] == "ball"
+    assert jobs.names(connection, []) == {}

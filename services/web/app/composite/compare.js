@@ -19,7 +19,7 @@ export function comparison(stage, matte, others) {
 		[t("backdrop")]: () => stage.backdrop.picture && drawPlaced(context, stage.backdrop.picture, stage.place, matte.monitor),
 	};
 	for (const [name, other] of Object.entries(others)) {
-		kinds[name] = async () => context.drawImage(await createImageBitmap(await stage.composite("image/jpeg", stage.backdrop, other.id)), 0, 0, width, height);
+		kinds[name] = async () => context.drawImage(await createImageBitmap(await stage.composite("image/jpeg", {}, stage.backdrop, other.id)), 0, 0, width, height);
 	}
 	let chosen = null;
 	const draw = newest(async () => {

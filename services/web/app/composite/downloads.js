@@ -6,7 +6,6 @@ import { fromFile } from "./backdrops/backdrops.js";
 import { said, t } from "../lib/words.js";
 
 const FORMATS = { PNG: "image/png", JPEG: "image/jpeg", EXR: "image/x-exr" };
-const TIMES = 2;
 
 // `element`, and `all`, which composites several files.
 export function downloads(stage, signal) {
@@ -14,9 +13,7 @@ export function downloads(stage, signal) {
 	const problem = h("div");
 	const larger = h("input", { type: "checkbox" });
 	const buttons = Object.entries(FORMATS).map(([name, type]) =>
-		button(name, stage.problem, async () => saveBlob(await picture(stage, type, larger.checked), `composite.${name.toLowerCase()}`)));
-	// A browser cannot write EXR, and scales what is in 8 bits.
-	larger.onchange = () => (buttons.at(-1).hidden = larger.checked);
+		button(name, stage.problem, async () => saveBlob(await stage.composite(type, { enlarge: larger.checked ? 2 : 1 }), `composite.${name.toLowerCase()}`)));
 
 	async function all(files) {
 		const made = [];
@@ -26,7 +23,7 @@ export function downloads(stage, signal) {
 			status.textContent = t("take.n", { n: n + 1, all: files.length });
 			try {
 				const backdrop = await fromFile(file);
-				made.push([entryName(file.name, n), await stage.composite(FORMATS.PNG, backdrop)]);
+				made.push([entryName(file.name, n), await stage.composite(FORMATS.PNG, {}, backdrop)]);
 				backdrop.close?.();
 			} catch (error) {
 				signal.throwIfAborted();
@@ -45,17 +42,6 @@ export function downloads(stage, signal) {
 	const element = h("div.stack", h("div.row", copy, h("span", t("take.as")), buttons,
 		h("label", larger, " ", t("take.twice"))), status, problem);
 	return { element, all: (files) => all(files).catch((error) => signal.aborted || problem.replaceChildren(problemBox(error))) };
-}
-
-// The composite as a file; twice as large it is smoother, and shows no more detail.
-async function picture(stage, type, isLarger) {
-	if (!isLarger) return stage.composite(type);
-	const bitmap = await createImageBitmap(await stage.composite(FORMATS.PNG));
-	const canvas = Object.assign(document.createElement("canvas"), { width: TIMES * bitmap.width, height: TIMES * bitmap.height });
-	const context = canvas.getContext("2d");
-	context.imageSmoothingQuality = "high";
-	context.drawImage(bitmap, 0, 0, canvas.width, canvas.height);
-	return new Promise((resolve) => canvas.toBlob(resolve, type, 0.95));
 }
 
 async function copyPicture(stage) {

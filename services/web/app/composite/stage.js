@@ -70,14 +70,14 @@ export class Stage extends LiveGlass {
 	}
 
 	// The service's composite of the whole frame. If it refuses the backdrop's file, this browser sends a copy.
-	async composite(type, backdrop = this.backdrop, matte = this.#matte.id) {
-		const wanted = type === "image/jpeg" ? { quality: 95 } : {};
+	async composite(type, more = {}, backdrop = this.backdrop, matte = this.#matte.id) {
+		const wanted = type === "image/jpeg" ? { quality: 95, ...more } : more;
 		try {
 			return await this.#request(await backdrop.exact(), wanted, type, this.signal, matte);
 		} catch (error) {
 			if (![413, 422].includes(error.status) || !backdrop.copy) throw error;
 			const copy = await backdrop.copy();
-			const answer = await this.#request(copy, wanted, type);
+			const answer = await this.#request(copy, wanted, type, this.signal, matte);
 			const why = error.status === 413 || error.limit != null ? "stage.large" : "stage.unread";
 			const { width, height } = backdrop.picture;
 			backdrop.note = `. ${t(why, { width, height })}`;
@@ -106,7 +106,7 @@ export class Stage extends LiveGlass {
 	#composite = newest(async (exact) => {
 		const [backdrop, changes] = [this.backdrop, this.#changes];
 		try {
-			const picture = await (exact ? this.composite(this.#shown, backdrop) : this.#quick(backdrop));
+			const picture = await (exact ? this.composite(this.#shown, {}, backdrop) : this.#quick(backdrop));
 			if (backdrop !== this.backdrop || (this.isLive && changes !== this.#changes)) return; // the live picture is newer
 			await show(this.#image, picture);
 			this.#bringToFront(this.#image);

@@ -52,7 +52,7 @@ export async function filming(main, signal) {
 		busy: isPlaying,
 		none: () => empty(t("programs.none"), t("programs.first")),
 		item: (one) => h("a.card", { href: `#/film/${one.id}` }, h("span.name", programName(one)), isPlaying(one) ? badge("running") : h("span"),
-			h("span.about", one.id), when(one.created_at)),
+			h("span.about", duration(one.patterns / 2)), when(one.created_at)),
 	});
 }
 

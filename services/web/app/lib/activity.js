@@ -2,6 +2,7 @@
 import { getJson } from "./api.js";
 import { badge, h, newest } from "./dom.js";
 import { ACTIVE } from "./events.js";
+import { qualityOf } from "./view.js";
 import { known, said, t } from "./words.js";
 import { languageSwitch } from "./language.js";
 
@@ -12,9 +13,11 @@ const entries = menu.firstElementChild;
 const count = document.getElementById("active");
 let timer;
 
+export const jobTitle = ({ kind, name }) => t(`job.${kind}`) + (name && `: ${name}`);
+
 export const jobCard = (job, ...more) =>
-	h("a.card", { href: `#/jobs/${job.id}` }, h("span.name", t(`job.${job.kind}`)), badge(job.state),
-		h("span.about", job.problem ? said(job.problem.detail) : (job.state === "running" ? `${known(`stage.${job.stage}`, job.stage)}, ${Math.floor(100 * job.progress)} %` : job.id)), more);
+	h("a.card", { href: `#/jobs/${job.id}` }, h("span.name", jobTitle(job)), badge(job.state),
+		h("span.about", job.problem ? said(job.problem.detail) : (job.state === "running" ? `${known(`stage.${job.stage}`, job.stage)}, ${Math.floor(100 * job.progress)} %` : qualityOf(job) || "")), more);
 
 export const refreshActivity = newest(async () => {
 	clearTimeout(timer);

@@ -1,4 +1,4 @@
-// What several views have in common: steps, deletion, names, thumbnails.
+// What several views have in common: steps, deletion, names, qualities, thumbnails.
 import { remove } from "./api.js";
 import { button, confirmed, h, newest, show } from "./dom.js";
 import { t } from "./words.js";
@@ -20,6 +20,9 @@ export function deletion(path, where, lost) {
 		location.replace(`#/${list}`);
 	}, "quiet");
 }
+
+export const QUALITIES = ["fast", "fine"];
+export const qualityOf = ({ options: { quality } }) => QUALITIES.includes(quality) && t(`quality.${quality}`);
 
 export const matteName = ({ id, name }) => name || t("matte.unnamed", { id: id.slice(0, 8) });
 

@@ -1,14 +1,14 @@
 // Jobs: the list, and one job with its progress; a recovery fills in its frame tile by tile.
 import { getComposite, getJson, post, save } from "../lib/api.js";
-import { jobCard } from "../lib/activity.js";
+import { jobCard, jobTitle } from "../lib/activity.js";
 import { backdrop } from "../composite/backdrops/backdrops.js";
 import { pauseButton } from "../composite/recovering.js";
 import { button, empty, facts, h, newest, pause, problemBox, show, when } from "../lib/dom.js";
 import { ACTIVE } from "../lib/events.js";
 import { list } from "../lib/list.js";
 import { followJob } from "../lib/job_progress.js";
-import { RECOVER, CHECK, deletion, steps } from "../lib/view.js";
-import { automatic, qualityOf } from "./recovery_form.js";
+import { RECOVER, CHECK, deletion, qualityOf, steps } from "../lib/view.js";
+import { automatic } from "./recovery_form.js";
 import { t } from "../lib/words.js";
 
 const REFRESH = 2000; // ms between two pictures of what is recovered
@@ -20,7 +20,7 @@ export async function jobs(main, signal) {
 	main.append(h("h1", t("jobs")));
 	await list(main, signal, {
 		kind: "jobs", states: ["queued", "running", "succeeded", "failed", "cancelled"],
-		text: ({ id, kind }) => `${t(`job.${kind}`)} ${id}`,
+		text: (one) => `${jobTitle(one)} ${one.id}`,
 		busy: isActive, fixed: isActive,
 		none: () => empty(t("jobs.none"), t("jobs.first")),
 		item: (one) => jobCard(one, when(one.created_at)),
@@ -46,10 +46,10 @@ export async function job(main, signal, id) {
 	main.append(
 		step ? steps(step, "#/captures", `#/captures/${found.capture}`) : "",
 		h("p.crumb", h("a", { href: "#/jobs" }, t("jobs"))),
-		h("div.row.spread", h("h1", t(`job.${found.kind}`)), h("span.row", halt.button, cancel, retry, removal)),
+		h("div.row.spread", h("h1", jobTitle(found)), h("span.row", halt.button, cancel, retry, removal)),
 		problem,
 		facts({
-			[t("job.asked")]: when(found.created_at), [t("capture")]: found.capture && h("a", { href: `#/captures/${found.capture}` }, found.capture.slice(0, 8)),
+			[t("job.asked")]: when(found.created_at), [t("capture")]: found.capture && h("a", { href: `#/captures/${found.capture}` }, t("job.capture")),
 			[t("method")]: found.options.method, [t("quality")]: qualityOf(found),
 		}),
 		links, h("div", { class: preview ? "columns" : "stack" }, preview?.panel, h("div.stack", panel, asked)),

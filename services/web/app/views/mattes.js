@@ -6,8 +6,7 @@ import { compositing } from "../composite/compositing.js";
 import { layers } from "../composite/layers.js";
 import { recovering } from "../composite/recovering.js";
 import { list } from "../lib/list.js";
-import { PLAY, deletion, matteName, steps, thumbnails } from "../lib/view.js";
-import { qualityOf } from "./recovery_form.js";
+import { PLAY, deletion, matteName, qualityOf, steps, thumbnails } from "../lib/view.js";
 import { t } from "../lib/words.js";
 import { sharing } from "./sharing.js";
 import { renamable } from "../lib/rename.js";
@@ -51,8 +50,8 @@ export async function matte(main, signal, id) {
 		[t("frame")]: found.width && t("pixels", { size: size(found) }), [t("monitor")]: found.monitor && t("pixels", { size: found.monitor.join(" × ") }),
 		[t("made")]: when(found.created_at), [t("until")]: found.expires_at && when(found.expires_at),
 		[t("method")]: options.method, [t("quality")]: qualityOf(found),
-		[t("capture")]: capture && h("a", { href: `#/captures/${capture}` }, capture.slice(0, 8)),
-		[t("job")]: job && h("a", { href: `#/jobs/${job}` }, job.slice(0, 8)),
+		[t("capture")]: capture && h("a", { href: `#/captures/${capture}` }, t("job.capture")),
+		[t("job")]: job && h("a", { href: `#/jobs/${job}` }, t("job.show")),
 	}));
 	const more = h("div.stack");
 	const complete = () => more.replaceChildren(layers(found, signal), sharing(id, signal));

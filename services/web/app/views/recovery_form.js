@@ -1,11 +1,10 @@
 // The form that starts a recovery. Its options and their descriptions come from GET /v1/options.
 import { getJson, post } from "../lib/api.js";
 import { duration, h, problemBox, prose } from "../lib/dom.js";
+import { QUALITIES } from "../lib/view.js";
 import { said, t } from "../lib/words.js";
 
 const BY_HAND = "envmatte-recover-by-hand"; // in this browser's storage
-const QUALITIES = ["fast", "fine"];
-export const qualityOf = ({ options: { quality } }) => QUALITIES.includes(quality) && t(`quality.${quality}`);
 export const automatic = new Set(); // jobs whose matte is shown once it is done
 
 function field(option) {
