@@ -3,6 +3,7 @@
 import base64
 import io
 import json
+import re
 import zipfile
 import zlib
 from pathlib import Path
@@ -54,6 +55,20 @@ def test_film_with_its_record_becomes_a_capture(desk: Page, service: Service, cl
     expect(desk.get_by_role("region", name="Report")).to_be_visible(timeout=2 * MINUTE)
     found = service.client.capture(desk.url.rpartition("/")[2])
     assert (found["state"], found["width"], found["height"]) == ("ready", 96, 72)
+
+
+def test_archive_of_a_matte_comes_back_as_a_matte(
+    desk: Page, service: Service, ready: tuple[str, str], tmp_path: Path
+) -> None:
+    archive = tmp_path / "whisky glass.zip"
+    service.client.export(ready[1], archive)
+    desk.goto(f"{service.url}/#/captures")
+    desk.get_by_label(ZIP).set_input_files(archive)
+    expect(desk.get_by_role("heading", name="whisky glass")).to_be_visible(timeout=MINUTE)
+    expect(desk.get_by_text("exact, 96 × 72 pixels")).to_be_visible()
+    matte = re.sub(r".*mattes/(\w+).*", r"\1", desk.url)
+    assert matte != ready[1]
+    assert service.client.matte(matte).capture is None
 
 
 def test_film_without_record_asks_for_its_program(desk: Page, service: Service, clip: Path) -> None:

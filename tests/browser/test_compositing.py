@@ -216,6 +216,7 @@ def test_missing_camera_is_explained(context: BrowserContext, service: Service, 
     page = opened(context, service, ball)
     page.get_by_role("radio", name="Camera").check()
     expect(page.get_by_role("alert")).to_contain_text("Open this page at https")
+    expect(page.get_by_role("radio", name="Checker")).to_be_checked()  # which is still shown
 
 
 def test_clip_is_composited_and_downloaded(

@@ -1,5 +1,5 @@
-"""The web app's size, how long its views take in a browser from the click to the first paint, and how long a newcomer
-waits from `envmatte serve` for glass that moves.
+"""The web app's size, how long its views take in a browser from the click to the first paint, how long a newcomer
+waits from `envmatte serve` for glass that moves, and how often it is drawn while it is dragged.
 
     python -m tests.benchmarks.service.app [--times 10]
 
@@ -8,12 +8,14 @@ root of the repository.
 """
 
 import argparse
+import math
 import statistics
 import tempfile
 import time
+from itertools import pairwise
 from pathlib import Path
 
-from playwright.sync_api import Browser, sync_playwright
+from playwright.sync_api import Browser, Playwright, sync_playwright
 
 from services.api.system.minified import TYPES, minified_file
 from services.cli.demo_run import service
@@ -36,6 +38,12 @@ MOVES = """() => {
     return picture !== first && document.querySelector("main").ariaBusy === "false";
 }"""
 """Whether a second picture of the glass was drawn: by itself at first, as it greets who opens the app."""
+WATCH = """() => {
+    window.painted = [];
+    requestAnimationFrame(function next(now) { painted.push(now); requestAnimationFrame(next); });
+}"""
+DRAGGED = 4.0
+"""Seconds, after a second in which the app finds how many pixels the device keeps up with."""
 
 
 def _sent_bytes(path: Path) -> int:
@@ -60,6 +68,8 @@ def main() -> None:
         service(Path(folder, "data"), 1) as url,
         sync_playwright() as playwright,
     ):
+        print("a sample of 640 x 480 pixels is dragged in software, ms between pictures: median   95 %")
+        print(f"{'':72} {' '.join(f'{one:6.0f}' for one in _drag(playwright, url))}")
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         print("view        first paint, ms: median   max    loaded, ms: median    kB received")
         for view in VIEWS:
@@ -86,6 +96,27 @@ def _start() -> tuple[float, float]:
             moves = time.perf_counter() - start
         browser.close()
     return listens, moves
+
+
+def _drag(playwright: Playwright, url: str) -> tuple[float, float]:
+    """Milliseconds between two pictures of the first view while its backdrop is dragged, median and 95th percentile."""
+    browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+    page = browser.new_page(viewport={"width": 1280, "height": 800}, reduced_motion="reduce")
+    page.goto(url)
+    page.locator("canvas.glass:visible").wait_for()
+    page.mouse.move(640, 300)
+    page.mouse.down()
+    page.evaluate(WATCH)
+    for seconds in (1, DRAGGED):
+        page.evaluate("painted.length = 0")
+        end = time.perf_counter() + seconds
+        while (left := end - time.perf_counter()) > 0:
+            page.mouse.move(640 + 200 * math.sin(3 * left), 300 + 50 * math.cos(2 * left))
+            page.wait_for_timeout(10)
+    painted = page.evaluate("painted")
+    browser.close()
+    between = sorted(after - before for before, after in pairwise(painted))
+    return statistics.median(between), between[int(0.95 * len(between))]
 
 
 def _open(browser: Browser, url: str) -> tuple[float, float, float]:

@@ -144,6 +144,22 @@ def filming(page: Page, service: Service) -> str:
     return str(made["id"])
 
 
+@pytest.mark.parametrize(
+    ("failure", "why"),
+    [("NotReadableError", "Another program uses the camera"), ("AbortError", "cannot start it (AbortError)")],
+)
+def test_camera_that_fails_is_explained_in_our_words(
+    desk: Page, service: Service, failure: str, why: str
+) -> None:
+    made = service.http.post("/v1/programs", json={"preset": "sketch", "border": True}).json()
+    desk.add_init_script(
+        f"navigator.mediaDevices.getUserMedia = () => Promise.reject(new DOMException('raw', '{failure}'))"
+    )
+    desk.goto(f"{service.url}/#/film/{made['id']}")
+    desk.get_by_role("button", name="Use a camera of this device").click()
+    expect(desk.get_by_role("alert")).to_contain_text(why)
+
+
 def test_recording_continues_while_another_view_is_shown(desk: Page, service: Service) -> None:
     program = filming(desk, service)
     note = desk.get_by_role("link", name="Recording a film")

@@ -16,6 +16,22 @@ from workflows.images import float_formats, integer_formats
 from workflows.simulation.scene import Scene
 
 PROBLEM = "application/problem+json"
+WHITE = float_formats.encode_exr("RGB", np.ones((3, 4, 3), np.float32))
+
+
+def empty_pixels(service: Service, matte: str) -> int:
+    """How many pixels let light through and show none of a white backdrop, which makes them black before any."""
+    exr = {"Accept": "image/x-exr"}
+    answer = service.http.post(f"/v1/mattes/{matte}/composite", content=WHITE, headers=exr)
+    seen = float_formats.decode(answer.content, memory=1 << 26)[..., :3]
+    layers = service.client.matte(matte).layers
+    S, rho = layers["S"], layers["rho"]
+    assert np.mean(rho > 0.05) > 0.5
+    return int(np.count_nonzero((rho > 0.05) & (seen - S < 0.5 * rho)))
+
+
+def test_no_pixel_that_lets_light_through_is_empty(service: Service, matte: str) -> None:
+    assert empty_pixels(service, matte) == 0
 
 
 @pytest.mark.parametrize("name", ["S", "rho", "alpha", "confidence"])

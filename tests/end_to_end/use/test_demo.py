@@ -9,10 +9,13 @@ import psutil
 import pytest
 from PIL import Image
 
+from tests.end_to_end.conftest import Service
+from tests.end_to_end.mattes.test_layers import empty_pixels
+
 
 @pytest.mark.exhaustive
 @pytest.mark.slow
-def test_demo_writes_its_picture_and_files(tmp_path: Path) -> None:
+def test_demo_writes_its_picture_and_files(service: Service, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "services", "demo", "-o", "picture.png", "--keep", "kept", "--json"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
@@ -23,6 +26,10 @@ def test_demo_writes_its_picture_and_files(tmp_path: Path) -> None:
         assert picture.width > 4 * picture.height
     assert sorted(path.name for path in (tmp_path / "kept").iterdir()) == ["backdrop.png", "glass-ball.zip"]
     assert "done" in done.stderr
+    uploaded = service.client.upload(tmp_path / "kept" / "glass-ball.zip")
+    service.client.wait(uploaded["job"])
+    matte = service.client.wait(service.client.recover(uploaded["id"])["id"])["matte"]
+    assert empty_pixels(service, matte) == 0
 
 
 @pytest.mark.exhaustive

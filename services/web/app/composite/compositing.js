@@ -34,9 +34,12 @@ export function compositing(matte, others, signal) {
 			play.textContent = t(stage.playing ? "pause" : "play");
 		},
 	}, t("pause"));
-	async function use(promise) {
+	let used; // the control of the backdrop that is shown, if it has one
+	async function use(promise, control) {
 		const backdrop = await stage.use(promise);
+		if (backdrop === false && used) used.checked = true;
 		if (!backdrop) return;
+		used = control;
 		video.choose(backdrop.clip);
 		play.hidden = !backdrop.moving;
 		play.textContent = t("pause");
@@ -57,7 +60,7 @@ export function compositing(matte, others, signal) {
 	});
 	const taken = downloads(stage, signal);
 	const choices = backdropChoices(matte, stage.element, use, taken.all, first, signal);
-	use(builtIn(first, matte.monitor));
+	use(builtIn(first, matte.monitor), choices[0].querySelector(":checked"));
 
 	const filled = (is) => {
 		section.classList.toggle("full", Boolean(is));
@@ -82,8 +85,8 @@ export function compositing(matte, others, signal) {
 // What can be a backdrop: a built-in one, the camera, or a file that is dropped, pasted or chosen. Of several files `all`
 // makes composites.
 function backdropChoices(matte, stage, use, all, first, signal) {
-	const builtIns = NAMES.map((name) => choice("backdrop", t(`scene.${name}`), scenery(name, 96, 72).picture, name === first, () => use(builtIn(name, matte.monitor))));
-	const choices = thumbs(t("backdrop"), [...builtIns, choice("backdrop", t("camera"), cameraSymbol(), false, () => use(camera()))]);
+	const builtIns = NAMES.map((name) => choice("backdrop", t(`scene.${name}`), scenery(name, 96, 72).picture, name === first, (control) => use(builtIn(name, matte.monitor), control)));
+	const choices = thumbs(t("backdrop"), [...builtIns, choice("backdrop", t("camera"), cameraSymbol(), false, (control) => use(camera(), control))]);
 	const take = (files) => {
 		if (files.length > 1) return all([...files]);
 		const [file] = files;

@@ -34,8 +34,9 @@ export class Stage extends LiveGlass {
 
 	fail = (error) => this.signal.aborted || this.problem.replaceChildren(problemBox(error));
 
+	// False if the backdrop cannot be used.
 	async use(promise) {
-		const backdrop = await super.use(promise).catch(this.fail);
+		const backdrop = await super.use(promise).catch((error) => (this.fail(error), false));
 		if (backdrop) this.problem.replaceChildren();
 		return backdrop;
 	}

@@ -1,6 +1,6 @@
 // Records a film.
 import { h, pause, problemBox } from "../lib/dom.js";
-import { setRecording, videoType } from "../lib/recordings.js";
+import { openCamera, setRecording, videoType } from "../lib/recordings.js";
 import { t } from "../lib/words.js";
 import { aiming } from "./aim.js";
 
@@ -36,7 +36,7 @@ export function camera(signal, filmed, ready) {
 		try {
 			close();
 			const wanted = { width: { ideal: 1920 }, height: { ideal: 1080 }, frameRate: { ideal: 30 } };
-			stream = await navigator.mediaDevices.getUserMedia({ audio: false, video: deviceId ? { ...wanted, deviceId: { exact: deviceId } } : { ...wanted, facingMode: "environment" } });
+			stream = await openCamera(deviceId ? { ...wanted, deviceId: { exact: deviceId } } : { ...wanted, facingMode: "environment" });
 			if (signal.aborted) return close();
 			picture.srcObject = stream;
 			frame.hidden = which.hidden = shoot.hidden = false;
@@ -49,8 +49,7 @@ export function camera(signal, filmed, ready) {
 			await picture.play();
 			aim.on = !recorder;
 		} catch (error) {
-			const detail = error.name === "NotAllowedError" ? t("camera.allow") : error.message;
-			if (!signal.aborted) problem.replaceChildren(problemBox({ title: t("camera.failed"), detail }));
+			if (!signal.aborted) problem.replaceChildren(problemBox(error));
 		} finally {
 			open.disabled = false;
 		}

@@ -1,3 +1,7 @@
+// Cameras, and what they record.
+import { Problem } from "./api.js";
+import { known, t } from "./words.js";
+
 // The views that record a film, by their signals. A change is a `recording` event of the window; leaving asks first.
 export const recordings = new Set();
 addEventListener("beforeunload", (event) => recordings.size && event.preventDefault());
@@ -12,3 +16,12 @@ const TYPES = ["video/mp4;codecs=avc1.640034", "video/mp4;codecs=avc1.42E034", "
 
 // The best type of video that this browser records.
 export const videoType = () => TYPES.find((one) => MediaRecorder.isTypeSupported(one));
+
+// Opens a camera that comes closest to the constraints of a video.
+export async function openCamera(video) {
+	try {
+		return await navigator.mediaDevices.getUserMedia({ video });
+	} catch ({ name }) {
+		throw new Problem({ title: t("camera.failed"), detail: known(`camera.${name}`, t("camera.other", { name })) });
+	}
+}

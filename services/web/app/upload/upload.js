@@ -1,5 +1,5 @@
 // Uploads: rows with the progress of each, and the zone where files are dropped or chosen.
-import { Problem, post, saveBlob } from "../lib/api.js";
+import { Problem, ask, newKey, post, saveBlob } from "../lib/api.js";
 import { recordings } from "../lib/recordings.js";
 import { bytes, confirmed, duration, fileField, h, problemBox, when } from "../lib/dom.js";
 import { askForRecord, filmArchive, isFilm } from "./film_bundle.js";
@@ -9,6 +9,7 @@ import { crc32 } from "./zip.js";
 import { parts, t } from "../lib/words.js";
 
 const HEAD = 1 << 20; // bytes of an archive that contain its capture.json
+const MATTE = "zarr.json"; // the first entry of the archive of a matte
 
 // Uploads outlive their view; the element moves to the next view that shows uploads.
 export const running = h("div.uploads");
@@ -31,6 +32,10 @@ export function begin(file, record, { again: view = "#/film", id, at = Date.now(
 	const again = h("button", { type: "button", hidden: true, onclick: () => work() }, t("continue"));
 	const save = h("button", { type: "button", hidden: !id, onclick: () => (saveBlob(file, file.name), (state.unsaved = false), (saved = true)) }, t("film.save"));
 	const end = () => (rows.delete(state), row.remove());
+	const arrived = (view) => {
+		end();
+		if (running.isConnected && !recordings.size) location.hash = view;
+	};
 	const drop = async () => {
 		if (!saved && !(await confirmed(t("film.delete?"), t("film.lost"), t("film.delete")))) return;
 		stop.abort();
@@ -43,6 +48,7 @@ export function begin(file, record, { again: view = "#/film", id, at = Date.now(
 	running.append(row);
 	rows.add(state);
 	let archive = isFilm(file) ? null : file;
+	const once = newKey();
 	let remembered;
 
 	async function work() {
@@ -57,8 +63,14 @@ export function begin(file, record, { again: view = "#/film", id, at = Date.now(
 				record ??= await askForRecord(asked, stop.signal);
 				status.textContent = t("upload.zipping");
 				archive = await filmArchive(file, record, stop.signal);
-			} else if (!(await startsAsZip(archive))) {
-				throw new Problem({ status: 422, title: t("upload.none"), detail: t("upload.neither", { name: file.name }) });
+			} else {
+				const head = await headOf(archive);
+				if (!/^PK[\x03\x05]/.test(head)) throw new Problem({ status: 422, title: t("upload.none"), detail: t("upload.neither", { name: file.name }) });
+				if (head.startsWith(MATTE, 30)) {
+					status.textContent = t("upload.matte");
+					bar.removeAttribute("value");
+					return arrived(`#/mattes/${(await importMatte(file, once, stop.signal)).id}`);
+				}
 			}
 			// A film with another capture.json is another archive.
 			remembered ??= `envmatte-upload ${file.name} ${archive.size} ${file.lastModified} ${record ? await crc32(archive.slice(0, HEAD)) : ""}`;
@@ -77,8 +89,7 @@ export function begin(file, record, { again: view = "#/film", id, at = Date.now(
 			const made = await post("v1/captures", { upload }, `capture-of-${upload}`);
 			localStorage.removeItem(remembered);
 			if (isFilm(file)) await noteCapture(film, made.id);
-			end();
-			if (running.isConnected && !recordings.size) location.hash = `#/captures/${made.id}`;
+			arrived(`#/captures/${made.id}`);
 		} catch (error) {
 			if (stop.signal.aborted) return;
 			const refused = error.status >= 400 && error.status < 500 && error.status !== 401; // another key may be typed
@@ -108,7 +119,14 @@ const unreadable = ({ name }) => ({
 	detail: t("upload.moved", { name }),
 });
 
-const startsAsZip = async (file) => /^PK[\x03\x05]/.test(await file.slice(0, 4).text());
+// The first bytes of a ZIP: its mark, and from byte 30 on the name of its first entry.
+const headOf = async (file) => new TextDecoder("latin1").decode(await file.slice(0, 30 + MATTE.length).arrayBuffer());
+
+async function importMatte(file, once, signal) {
+	const name = new URLSearchParams({ name: file.name.replace(/\.zip$/i, "").slice(0, 200) });
+	const headers = { "Content-Type": "application/zip", "Idempotency-Key": once };
+	return (await ask(`v1/mattes?${name}`, { method: "POST", headers, body: file, signal })).json();
+}
 
 export function upload(files) {
 	[...files].forEach((file) => begin(file));

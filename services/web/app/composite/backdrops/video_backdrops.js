@@ -1,21 +1,16 @@
 // Moving backdrops: the camera of this device, and clips.
 import { Problem } from "../../lib/api.js";
+import { openCamera } from "../../lib/recordings.js";
 import { PREVIEW, still } from "./backdrops.js";
-import { known, t } from "../../lib/words.js";
+import { t } from "../../lib/words.js";
 
 const WHOLE = 1920; // pixels of the longer side of a frame that is sent as a still
 
 export async function camera() {
-	const title = t("camera.failed");
 	if (!navigator.mediaDevices) {
-		throw new Problem({ title, detail: t("camera.https") });
+		throw new Problem({ title: t("camera.failed"), detail: t("camera.https") });
 	}
-	let stream;
-	try {
-		stream = await navigator.mediaDevices.getUserMedia({ video: { width: { ideal: 1280 }, height: { ideal: 720 } } });
-	} catch (error) {
-		throw new Problem({ title, detail: known(`camera.${error.name}`, error.message) });
-	}
+	const stream = await openCamera({ width: { ideal: 1280 }, height: { ideal: 720 } });
 	const stop = () => stream.getTracks().forEach((track) => track.stop());
 	return played(t("camera"), (video) => (video.srcObject = stream), stop).catch((error) => {
 		stop();
