@@ -168,6 +168,10 @@ def test_layers_and_lobes_of_a_pixel(tab: Page, service: Service, ready: tuple[s
     expect(words).to_contain_text(
         re.compile(r"\d+ % of the monitor’s light comes through, \d+ % of it from the \w+")
     )
+    box, picture = words.bounding_box(), stage.bounding_box()
+    assert box
+    assert picture
+    assert picture["y"] <= box["y"] < picture["y"] + picture["height"]  # where the reader looks
     figures = tab.locator(".composite .facts > div")
     pixel = service.http.get(f"/v1/mattes/{ready[1]}/transport?x=49&y=36").json()
     expect(figures).to_have_count(2 + len(pixel["lobes"]))

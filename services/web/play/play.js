@@ -128,7 +128,7 @@ const measure = (element) =>
 const $ = (id) => document.getElementById(id);
 const setStatus = (text) => ($("status").textContent = text);
 const here = new URL(".", location.href);
-const sizeOf = ({ width, height }) => `${width} x ${height}`;
+const sizeOf = ({ width, height }) => `${width} × ${height}`;
 
 async function ask(path, options = {}) {
 	const answer = await fetch(new URL(path, here), { ...options, headers: { ...options.headers, ...authorization() } });

@@ -1,5 +1,5 @@
 """The web app's size, how long its views take in a browser from the click to the first paint, how long a newcomer
-waits from `envmatte serve` for glass that moves, and how often it is drawn while it is dragged.
+waits from `envmatte serve` for glass that moves, and how often it is drawn while its backdrop moves.
 
     python -m tests.benchmarks.service.app [--times 10]
 
@@ -8,7 +8,6 @@ root of the repository.
 """
 
 import argparse
-import math
 import statistics
 import tempfile
 import time
@@ -38,16 +37,27 @@ MOVES = """() => {
     return picture !== first && document.querySelector("main").ariaBusy === "false";
 }"""
 """Whether a second picture of the glass was drawn: by itself at first, as it greets who opens the app."""
-WATCH = """() => {
-    window.painted = [];
-    requestAnimationFrame(function next(now) { painted.push(now); requestAnimationFrame(next); });
-}"""
-DRAGGED = 4.0
-"""Seconds, after a second in which the app finds how many pixels the device keeps up with."""
+KEEP_MOVING = """(seconds) => new Promise((resolve) => {
+    const glass = document.querySelector(".glass-window");
+    const painted = [];
+    requestAnimationFrame(function next(now) {
+        painted.push(now);
+        if (now > painted[0] + 1000 * seconds) return resolve(painted);
+        const key = now % 2000 < 1000 ? "ArrowRight" : "ArrowLeft";
+        glass.dispatchEvent(new KeyboardEvent("keydown", { key }));
+        requestAnimationFrame(next);
+    });
+})"""
+"""Moves the backdrop with each picture; resolves with the times of all pictures."""
 
 
-def _sent_bytes(path: Path) -> int:
-    return len(minified_file(path, 0)[0]) if path.suffix in TYPES else path.stat().st_size
+def _loaded_bytes(folder: Path, language: str) -> int:
+    """Bytes of a folder's files as they are sent, with the words of one language."""
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    loaded = [path for path in files if "words" not in path.parts or path.stem == language]
+    return sum(
+        len(minified_file(path, 0)[0]) if path.suffix in TYPES else path.stat().st_size for path in loaded
+    )
 
 
 def main() -> None:
@@ -56,10 +66,9 @@ def main() -> None:
     )
     parser.add_argument("--times", type=int, default=10)
     times = parser.parse_args().times
-    files = [path for path in WEB.rglob("*") if path.is_file()]
-    samples = [path for path in files if "samples" in path.parts]
-    for name, some in (("the app", set(files) - set(samples)), ("its samples", samples)):
-        print(f"{name}: {len(some)} files, {sum(map(_sent_bytes, some)) / 1000:.0f} kB")
+    for folder in ("app", "samples"):
+        for language in ("en", "de") if folder == "app" else ("any",):
+            print(f"{folder}, language {language}: {_loaded_bytes(WEB / folder, language) / 1000:.0f} kB")
     print("`envmatte serve` listens after, s    glass moves after, s")
     for listens, moves in sorted(_start() for _ in range(3)):
         print(f"{listens:32.1f} {moves:23.1f}")
@@ -68,8 +77,9 @@ def main() -> None:
         service(Path(folder, "data"), 1) as url,
         sync_playwright() as playwright,
     ):
-        print("a sample of 640 x 480 pixels is dragged in software, ms between pictures: median   95 %")
-        print(f"{'':72} {' '.join(f'{one:6.0f}' for one in _drag(playwright, url))}")
+        between = _move(playwright, url)
+        print("a sample of 640 x 480 pixels moves in software: ms between pictures, median and 95 %")
+        print(" ".join(f"{one:.0f}" for one in between))
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         print("view        first paint, ms: median   max    loaded, ms: median    kB received")
         for view in VIEWS:
@@ -98,22 +108,14 @@ def _start() -> tuple[float, float]:
     return listens, moves
 
 
-def _drag(playwright: Playwright, url: str) -> tuple[float, float]:
-    """Milliseconds between two pictures of the first view while its backdrop is dragged, median and 95th percentile."""
+def _move(playwright: Playwright, url: str) -> tuple[float, float]:
+    """Milliseconds between two pictures of the first view while its backdrop moves, median and 95th percentile."""
     browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
     page = browser.new_page(viewport={"width": 1280, "height": 800}, reduced_motion="reduce")
     page.goto(url)
     page.locator("canvas.glass:visible").wait_for()
-    page.mouse.move(640, 300)
-    page.mouse.down()
-    page.evaluate(WATCH)
-    for seconds in (1, DRAGGED):
-        page.evaluate("painted.length = 0")
-        end = time.perf_counter() + seconds
-        while (left := end - time.perf_counter()) > 0:
-            page.mouse.move(640 + 200 * math.sin(3 * left), 300 + 50 * math.cos(2 * left))
-            page.wait_for_timeout(10)
-    painted = page.evaluate("painted")
+    page.evaluate(KEEP_MOVING, 1)  # the app finds how many pixels the device keeps up with
+    painted = page.evaluate(KEEP_MOVING, 5)
     browser.close()
     between = sorted(after - before for before, after in pairwise(painted))
     return statistics.median(between), between[int(0.95 * len(between))]

@@ -72,6 +72,21 @@ def drawn(tab: Page, program: dict[str, Any], number: int, white: bool) -> NDArr
     return np.asarray(image.convert("RGB"))
 
 
+def test_page_looks_like_the_app(tab: Page, service: Service) -> None:
+    def look(name: str) -> list[str]:
+        button = tab.get_by_role("button", name=name)
+        return [
+            button.evaluate("(button, style) => getComputedStyle(button)[style]", style)
+            for style in ("backgroundColor", "borderRadius", "fontFamily", "minHeight")
+        ]
+
+    go(tab, service, posted(service))
+    played = look("full screen")
+    expect(tab.get_by_role("link", name="envmatte")).to_be_visible()
+    tab.goto(f"{service.url}/#/film")
+    assert look("Continue") == played
+
+
 def test_page_has_the_rules_of_the_border(tab: Page, service: Service) -> None:
     go(tab, service, posted(service))
     rules = tab.evaluate(
@@ -230,13 +245,13 @@ def test_leaving_the_page_stops_the_program(tab: Page, service: Service) -> None
 def test_program_of_another_size_is_fitted_to_this_screen(tab: Page, service: Service) -> None:
     first = go(tab, service, posted(service, monitor={"width": 800, "height": 600}))
     expect(
-        tab.get_by_text("made for a screen of 800 x 600 pixels; this screen has 640 x 360")
+        tab.get_by_text("made for a screen of 800 × 600 pixels; this screen has 640 × 360")
     ).to_be_visible()
     with tab.expect_navigation():
         tab.get_by_role("button", name="Fit it to this screen").click()
     expect(tab.get_by_role("status")).to_have_text("Ready.")
     assert tab.url != first
-    expect(tab.get_by_text("37 patterns of 604 x 324 pixels")).to_be_visible()
+    expect(tab.get_by_text("37 patterns of 604 × 324 pixels")).to_be_visible()
     expect(tab.locator("#fit")).to_be_hidden()
 
 

@@ -84,7 +84,7 @@ def test_program_that_a_zoomed_page_would_resample_is_not_started(zoomed: Page, 
     start.click()
     expect(zoomed.get_by_role("status")).to_contain_text("Not started: the patterns do not fit.")
     expect(note).to_contain_text("This page is zoomed to 125 %. Set the zoom to 100 % (Ctrl+0")
-    expect(note).to_contain_text("made for a screen of 800 x 450 pixels; this screen has 640 x 360")
+    expect(note).to_contain_text("made for a screen of 800 × 450 pixels; this screen has 640 × 360")
     expect(stage).to_be_hidden()
     until(
         lambda: (
@@ -98,7 +98,7 @@ def test_program_that_a_zoomed_page_would_resample_is_not_started(zoomed: Page, 
     with zoomed.expect_navigation():
         zoomed.get_by_role("button", name="Fit it to this screen").click()
     expect(zoomed.get_by_role("status")).to_have_text("Ready.")
-    expect(zoomed.get_by_text("patterns of 604 x 324 pixels")).to_be_visible()
+    expect(zoomed.get_by_text("patterns of 604 × 324 pixels")).to_be_visible()
     expect(note).to_be_hidden()
     start.click()
     expect(stage).to_be_visible()

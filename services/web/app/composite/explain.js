@@ -19,7 +19,7 @@ export function explanation(stage, matte, signal) {
 	const [across, down] = [INSET * width, (INSET * width * high) / wide];
 	const inset = h("canvas.inset", { width: 320, height: Math.round((320 * high) / wide), "aria-hidden": "true", hidden: true });
 	const drawing = svg("svg", { viewBox: `0 0 ${width} ${height}`, class: "lobes", "aria-hidden": "true" });
-	const words = h("p", { role: "status" });
+	const words = h("p.explained", { role: "status", hidden: true });
 	const figures = h("div");
 	const problem = h("div");
 	let pixel; // undefined while it is off
@@ -40,10 +40,11 @@ export function explanation(stage, matte, signal) {
 		}
 	});
 
-	// The backdrop stands in the corner that is farthest from the pixel.
+	// The backdrop stands in the corner that is farthest from the pixel, and the words beside it.
 	function draw({ x, y, lobes }) {
 		const [left, top] = [x < width / 2 ? width - across : 0, y < height / 2 ? height - down : 0];
 		Object.assign(inset.style, { left: `${(100 * left) / width}%`, top: `${(100 * top) / height}%`, width: `${100 * INSET}%` });
+		Object.assign(words.style, { [left ? "left" : "right"]: 0, [top ? "bottom" : "top"]: 0, [left ? "right" : "left"]: "auto", [top ? "top" : "bottom"]: "auto" });
 		inset.hidden = !stage.backdrop?.picture;
 		if (!inset.hidden) drawPlaced(inset.getContext("2d"), stage.backdrop.picture, stage.place, matte.monitor);
 		const heaviest = Math.max(...lobes.map(({ weight }) => mean(weight)));
@@ -81,21 +82,21 @@ export function explanation(stage, matte, signal) {
 		onclick: () => {
 			pixel = pixel ? undefined : [width >> 1, height >> 1];
 			button.ariaPressed = String(Boolean(pixel));
-			panel.hidden = !pixel;
+			panel.hidden = words.hidden = !pixel;
 			inset.hidden = true;
 			drawing.replaceChildren();
 			if (pixel) look();
 		},
 	}, t("pixel.explain"));
-	stage.element.append(inset, drawing);
-	const panel = h("div.stack", { hidden: true }, words, figures, problem);
+	stage.element.append(inset, drawing, words);
+	const panel = h("div.stack", { hidden: true }, figures, problem);
 	return { button, panel };
 }
 
 function inWords({ recovered, S, rho, lobes }) {
 	if (!recovered) return t("pixel.masked");
 	const reflected = mean(S) >= 0.005 ? ` ${t("pixel.reflections", { share: percent(mean(S)) })}` : "";
-	if (!lobes.length) return t("pixel.opaque") + reflected;
+	if (!lobes.length) return (mean(rho) < 0.005 ? t("pixel.opaque") : t("pixel.faint", { light: percent(mean(rho)) })) + reflected;
 	const [{ u, v, weight, sigma_u: a, sigma_v: b }] = lobes;
 	const third = (share) => Math.min(2, Math.floor(3 * Math.max(0, share)));
 	const place = t(`place.${PLACES[3 * third(1 - v) + third(u)]}`);

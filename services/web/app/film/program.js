@@ -26,7 +26,7 @@ export async function filming(main, signal) {
 	onZoom(fill, signal);
 	const choices = presets.map(({ name, description }, n) => {
 		const about = h("span.hint", { id: `preset-${name}` }, said(description));
-		return h("p", h("label.choice", h("input", { type: "radio", name: "preset", value: name, checked: n === 0, "aria-describedby": about.id }), name), " ", about);
+		return h("p.preset", h("label.choice", h("input", { type: "radio", name: "preset", value: name, checked: n === 0, "aria-describedby": about.id }), name), about);
 	});
 	const form = h("form.panel", h("h2", t("film.choose")),
 		h("fieldset.stack", h("legend", t("film.shows")), choices),

@@ -247,6 +247,7 @@ export const de = {
 	"pixel": "Pixel ({x}, {y}): {words}",
 	"pixel.S": "Spiegelungen (S)",
 	"pixel.explain": "Pixel erklären",
+	"pixel.faint": "{light} des Lichts vom Monitor kommen durch, zu wenig, um zu sagen, woher.",
 	"pixel.lobe": "{weight} bei {x}, {y}, {a} × {b} breit",
 	"pixel.lobe.n": "Keule {n}",
 	"pixel.masked": "Die Maske hat es ausgelassen.",

@@ -247,6 +247,7 @@ export const en = {
 	"pixel": "Pixel ({x}, {y}): {words}",
 	"pixel.S": "Reflections (S)",
 	"pixel.explain": "Explain a pixel",
+	"pixel.faint": "{light} of the monitor’s light comes through, too little to tell from where.",
 	"pixel.lobe": "{weight} at {x}, {y}, {a} × {b} wide",
 	"pixel.lobe.n": "Lobe {n}",
 	"pixel.masked": "the mask left it out.",
