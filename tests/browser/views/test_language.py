@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from tests.browser.pages import BY_HAND, MINUTE, ZIP, opened, unfold
+from tests.browser.pages import BY_HAND, MINUTE, PHONE, ZIP, is_fitting, opened, unfold
 from tests.docs.test_app_words import WEB, phrases, words
 from tests.end_to_end.conftest import Service
 from tests.parts.waiting import until
@@ -26,11 +26,12 @@ TEXTS = """() => [
         .flatMap((one) => [one.ariaLabel, one.alt, one.placeholder, one.title].filter(Boolean)),
 ].join("\\n")"""
 
+DESK = {"width": 1200, "height": 800}
 SAY = """async (text) => (await import("/web/app/lib/words.js")).said(text)"""
 
 
 def check(page: Page, name: str) -> None:
-    """Check what a view says, folded or not."""
+    """Check what a view says, folded or not, and that its words fit a phone."""
     expect(page.locator("main")).to_have_attribute("aria-busy", "false")
     page.evaluate("document.querySelectorAll('main details').forEach((one) => (one.open = true))")
     text = page.evaluate(TEXTS)
@@ -40,6 +41,9 @@ def check(page: Page, name: str) -> None:
     ] == []
     assert "undefined" not in text, name
     assert not re.search(r"\{\w+\}", text), name
+    page.set_viewport_size(PHONE)
+    assert is_fitting(page), name
+    page.set_viewport_size(DESK)
 
 
 def test_every_view_speaks_german(browser: Browser, service: Service, ready: tuple[str, str]) -> None:
@@ -59,7 +63,7 @@ def test_every_view_speaks_german(browser: Browser, service: Service, ready: tup
         f"mattes/{matte}": "Ebenen",
         "mattes/none": None,
     }
-    with opened(browser, locale="de-DE", viewport={"width": 1200, "height": 800}) as page:
+    with opened(browser, locale="de-DE", viewport=DESK) as page:
         loaded: list[str] = []
         page.on("request", lambda request: loaded.append(request.url) if "/words/" in request.url else None)
         page.goto(f"{service.url}/#/captures")

@@ -51,7 +51,7 @@ export async function matte(main, signal, id) {
 		[t("made")]: when(found.created_at), [t("until")]: found.expires_at && when(found.expires_at),
 		[t("method")]: options.method, [t("quality")]: qualityOf(found),
 		[t("capture")]: capture && h("a", { href: `#/captures/${capture}` }, t("job.capture")),
-		[t("job")]: job && h("a", { href: `#/jobs/${job}` }, t("job.show")),
+		[t("job")]: job && h("a", { href: `#/jobs/${job}` }, t("matte.job")),
 	}));
 	const more = h("div.stack");
 	const complete = () => more.replaceChildren(layers(found, signal), sharing(id, signal));

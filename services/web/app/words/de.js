@@ -201,6 +201,7 @@ export const de = {
 	"made": "Erstellt",
 	"matte.download": "Matte herunterladen",
 	"matte.failed": "Die Berechnung ist fehlgeschlagen; der Auftrag sagt, warum.",
+	"matte.job": "ihre Berechnung",
 	"matte.lost": "Sie lässt sich aus ihrer Aufnahme neu berechnen oder aus einem Archiv einlesen.",
 	"matte.name": "Name der Matte",
 	"matte.page": "Als Webseite speichern",

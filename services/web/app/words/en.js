@@ -201,6 +201,7 @@ export const en = {
 	"made": "Made",
 	"matte.download": "Download the matte",
 	"matte.failed": "The recovery failed; the job says why.",
+	"matte.job": "its recovery",
 	"matte.lost": "You can recover it again from its capture, or import an archive of it.",
 	"matte.name": "Name of the matte",
 	"matte.page": "Save as a web page",
