@@ -9,6 +9,7 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 import pytest
+from axe_playwright_python.sync_playwright import Axe
 from numpy.typing import NDArray
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
@@ -172,6 +173,7 @@ def test_layers_and_lobes_of_a_pixel(tab: Page, service: Service, ready: tuple[s
     assert box
     assert picture
     assert picture["y"] <= box["y"] < picture["y"] + picture["height"]  # where the reader looks
+    assert [one["id"] for one in Axe().run(tab).response["violations"]] == []
     figures = tab.locator(".composite .facts > div")
     pixel = service.http.get(f"/v1/mattes/{ready[1]}/transport?x=49&y=36").json()
     expect(figures).to_have_count(2 + len(pixel["lobes"]))
