@@ -30,6 +30,8 @@ class Sampled(BaseModel):
 _SAMPLE = 4096
 
 Curve = Literal["linear", "srgb"] | Gamma | Sampled
+CameraCurve = Curve | tuple[Curve, Curve, Curve]
+"""The curve of a camera: one for all channels, or one for each."""
 Response = Literal["linear", "srgb", "unknown"] | Gamma
 
 
@@ -80,13 +82,23 @@ def from_light(light: NDArray[np.float32], curve: Literal["linear", "srgb"]) -> 
     return np.where(light <= 0.0031308, low, high)
 
 
-def table(curve: Curve, dtype: np.dtype[np.unsignedinteger], black: int = 0) -> NDArray[np.float32]:
-    """A look-up table from every value of an unsigned integer type to linear light.
+def table(curve: CameraCurve, dtype: np.dtype[np.unsignedinteger], black: int = 0) -> NDArray[np.float32]:
+    """A look-up table from every value of an unsigned integer type to linear light, for `light_of_codes`.
 
-    ``black`` is the value of no light; values below it are negative light.
+    It is (k,), or (k, 3) where each channel has its own curve. ``black`` is the value of no light; values below it are
+    negative light.
     """
+    if isinstance(curve, tuple):
+        return np.stack([table(own, dtype, black) for own in curve], axis=1)
     top = np.iinfo(dtype).max
     return to_light((np.arange(top + 1, dtype=np.float32) - black) / np.float32(top - black), curve)
+
+
+def light_of_codes(codes: NDArray[np.unsignedinteger], look_up: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The light of codes, (..., channels), by a `table`."""
+    light: NDArray[np.float32]
+    light = look_up[codes] if look_up.ndim == 1 else look_up[codes, np.arange(look_up.shape[1])]
+    return light
 
 
 def estimate(

@@ -10,7 +10,7 @@ from pydantic import TypeAdapter
 
 from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
-from workflows.images.tone_curves import Curve, table
+from workflows.images.tone_curves import CameraCurve, light_of_codes, table
 from workflows.ingest.local_gain import Surroundings
 from workflows.programs.border import border_light
 from workflows.programs.program import Program
@@ -51,8 +51,8 @@ def clipped_from(stack: Stack) -> int:
 
 
 def look_up_of(stack: Stack) -> Floats:
-    """A look-up table from the values of a stack to light, (k,) float32."""
-    camera = TypeAdapter[Curve](Curve).validate_python(stack.attributes["camera_curve"])
+    """A look-up table from the values of a stack to light, as of `workflows.images.tone_curves.table`."""
+    camera = TypeAdapter[CameraCurve](CameraCurve).validate_python(stack.attributes["camera_curve"])
     return table(camera, stack.dtype, stack.attributes["storage"]["black"])
 
 
@@ -107,7 +107,7 @@ def read_light(
 
         def at_rest(frame: int) -> tuple[Floats, Bools]:
             return (
-                flatten(look_up[codes[frame]], frame),
+                flatten(light_of_codes(codes[frame], look_up), frame),
                 (codes[frame] > 0) & (codes[frame] < top),
             )
 
@@ -279,7 +279,7 @@ def unclipped_light(
         x and y in pixels: what belongs at (y, x) is at (y + shift[1], x + shift[0]) of the frame.
     margin : int
         Extra pixels of `codes` on each side, at least `margin_of` the shift.
-    look_up : (k,) float32
+    look_up : (k,) or (k, channels) float32
         See `look_up_of`.
     top : int
         See `clipped_from`.
@@ -294,7 +294,7 @@ def unclipped_light(
     The kernel is Lanczos of three lobes, applied along one axis after the other. A value does not depend on the
     rectangle that it is in.
     """
-    values = look_up[codes]
+    values = light_of_codes(codes, look_up)
     clipped = (codes == 0) | (codes >= top)
     share = clipped.astype(np.float32) if clipped.any() else None
     for axis, distance in ((-2, shift[0]), (-3, shift[1])):

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
+from workflows.images.tone_curves import light_of_codes
 from workflows.ingest.local_gain import local_gain
 from workflows.programs.border import border_light
 from workflows.programs.program import Program
@@ -93,7 +94,7 @@ class BorderValues:
 
         Parameters
         ----------
-        look_up : (k,) float32
+        look_up : (k,) or (k, channels) float32
             The light of each code.
 
         Notes
@@ -104,7 +105,7 @@ class BorderValues:
         line in each frame, to the light that they predict. Without d, a frame with a bright pattern would seem to be
         exposed longer. Values that are clipped, or nearly, are filled in by what is predicted.
         """
-        light = look_up[self.codes].mean(axis=2, dtype=np.float64) / self.local
+        light = light_of_codes(self.codes, look_up).mean(axis=2, dtype=np.float64) / self.local
         frames, terms = self.design.shape
         inverse = np.linalg.pinv(self.design)
         exposure, veil = np.ones((frames, 1)), np.zeros((frames, 1))

@@ -10,7 +10,7 @@ from pydantic import TypeAdapter
 
 from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
-from workflows.images.tone_curves import Curve, Response, estimate, table, to_light
+from workflows.images.tone_curves import CameraCurve, Response, estimate, light_of_codes, table, to_light
 from workflows.ingest.camera.border_exposure import TRIFLE, BorderValues, relative_to_white
 from workflows.ingest.camera.curve import HalfTones, Shown, are_scaled, fit_camera_curve
 from workflows.ingest.local_gain import Surroundings, local_gain
@@ -61,19 +61,22 @@ def measure(
     usable = (codes > 0) & (codes < clipped_from(stack))
     grey = np.ptp(sent, axis=1) == 0
     camera, exposed, scaled = _camera(stack, program)
+    known = "linear" if camera == "unknown" else camera
     found = estimate(
         sent[grey, 0],
         exposures[grey],
-        _by_value(table("linear", stack.dtype, black)[codes[:, grey]]),
+        _by_value(light_of_codes(codes[:, grey], table(known, stack.dtype, black))),
         _by_value(usable[:, grey]),
         program.monitor.response,
-        camera,
+        "unknown" if camera == "unknown" else "linear",
     )
+    if camera == "unknown":
+        camera = found.camera
     # Only one exposure, so that all frames have the same noise.
     shortest = np.flatnonzero(exposures == exposures.min())
     codes, usable, sent, grey = codes[:, shortest], usable[:, shortest], sent[shortest], grey[shortest]
-    look_up = table(found.camera, stack.dtype, black)
-    light, shown = look_up[codes], to_light(sent, found.monitor)
+    look_up = table(camera, stack.dtype, black)
+    light, shown = light_of_codes(codes, look_up), to_light(sent, found.monitor)
     if exposed is not None:
         light /= exposed[[frames[at] for at in shortest], np.newaxis].astype(np.float32)
     if gain is not None:
@@ -87,7 +90,7 @@ def measure(
         noise = _compressed(stack, *filmed, look_up, gain, exposed, frames, shown, noise)
     stack.annotate(
         monitor_curve=_as_json(found.monitor),
-        camera_curve=_as_json(found.camera),
+        camera_curve=_as_json(camera),
         assumed_curves=found.assumed,
         scaled=scaled,
         auto_exposure=None if exposed is None else exposed.round(5).tolist(),
@@ -99,13 +102,13 @@ def measure(
 
 def _camera(
     stack: Stack, program: Program
-) -> tuple[Curve | Literal["unknown"], NDArray[np.float64] | None, bool]:
-    """The camera's curve; the exposure of each frame of a film by its border, (frames,), if it varied; whether the
-    monitor showed the patterns at another size.
+) -> tuple[CameraCurve | Literal["unknown"], NDArray[np.float64] | None, bool]:
+    """The camera's curve, or that of each channel; the exposure of each frame of a film by its border, (frames,), if it
+    varied; whether the monitor showed the patterns at another size.
 
     An unknown curve is measured if the program shows half-tones. It and the exposures are found in turn.
     """
-    camera: Curve | Literal["unknown"]
+    camera: CameraCurve | Literal["unknown"]
     camera = TypeAdapter[Response](Response).validate_python(stack.attributes["response"])
     stated = camera != "unknown"
     halftones = _halftones(stack, program)
@@ -122,7 +125,7 @@ def _camera(
         if stated:
             scaled = seen is not None and are_scaled(seen, look_up)
         elif seen:
-            curve, scaled = fit_camera_curve(seen)
+            curve, scaled = fit_camera_curve(seen, stack.channels)
             camera = curve or "unknown"
     if exposed is not None and np.log(exposed).std() < TRIFLE:
         exposed = None
@@ -216,7 +219,7 @@ def _compressed(
 
     Each mean frame counts as one frame, because averaging does not remove compression noise.
     """
-    light = look_up[filmed]
+    light = light_of_codes(filmed, look_up)
     if gain is not None:
         light /= gain.at(*places).T[..., np.newaxis]
     if exposed is not None:
@@ -290,5 +293,5 @@ def _spread(n: int) -> list[slice]:
     return [slice(start, start + length) for start in sorted({n * k // 4 for k in range(4)})]
 
 
-def _as_json(curve: Curve) -> Any:
-    return TypeAdapter(Curve).dump_python(curve, mode="json")
+def _as_json(curve: CameraCurve) -> Any:
+    return TypeAdapter(CameraCurve).dump_python(curve, mode="json")

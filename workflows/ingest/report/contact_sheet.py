@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from storage.layout.captures import Stack
-from workflows.images.tone_curves import from_light
+from workflows.images.tone_curves import from_light, light_of_codes
 from workflows.ingest.measured_light import look_up_of
 from workflows.interruption import checkpoint
 from workflows.programs.program import Program
@@ -128,7 +128,7 @@ def _shrink(
         for number, of_frame in enumerate(codes):
             checkpoint()
             cells = of_frame.reshape(last - first, factor, width, factor, stack.channels)
-            light[number, first:last] = look_up[cells].mean(axis=(1, 3))
+            light[number, first:last] = light_of_codes(cells, look_up).mean(axis=(1, 3))
             high[number, first:last] = (cells == top).any(axis=(1, 3, 4))
             low[number, first:last] = (cells == 0).any(axis=(1, 3, 4))
     return light, high, low

@@ -4,7 +4,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel
 
-from workflows.images.tone_curves import Curve
+from workflows.images.tone_curves import CameraCurve
 
 Level = Literal["good", "warning", "bad"]
 LEVELS: tuple[Level, ...] = ("good", "warning", "bad")
@@ -92,11 +92,12 @@ class Noise(BaseModel):
 class ToneCurve(BaseModel):
     """A tone curve, and whether the capture states it, or it was estimated from constant levels, or is assumed.
 
+    A camera whose channels differ has one for each.
     ``apart`` is the largest difference between the light of half-tones by this curve and what they should have, as a
     share of white's; None if there are none.
     """
 
-    curve: Curve
+    curve: CameraCurve
     source: Literal["given", "estimated", "assumed"]
     apart: float | None = None
 

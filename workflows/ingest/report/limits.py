@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from workflows.images.tone_curves import Curve, Sampled
+from workflows.images.tone_curves import CameraCurve, Sampled, to_light
 from workflows.ingest.report.figures import Figures, Finding, Quality, graded
 from workflows.programs.program import Images, Program
 
@@ -192,7 +192,7 @@ def is_assumed(attributes: dict[str, Any]) -> bool:
     return bool(attributes.get("assumed_noise") and not attributes.get("noise_of_patterns"))
 
 
-def _assumed(name: str, curve: Curve) -> Finding:
+def _assumed(name: str, curve: CameraCurve) -> Finding:
     return Finding(
         name=f"{name}_curve",
         level="warning",
@@ -212,10 +212,16 @@ def _dB(square: float) -> str:
     return f"{-10 * log10(square):.0f}"
 
 
-def _shape(curve: Curve) -> str:
+def _shape(curve: CameraCurve) -> str:
     """A tone curve in words."""
     if isinstance(curve, str):
         return curve
+    if isinstance(curve, tuple):
+        red, green, blue = (100 * float(to_light(np.array(0.5, np.float32), own)) for own in curve)
+        return (
+            f"one of each channel's own: red has {red:.0f}, green {green:.0f} and blue {blue:.0f} % of the light at "
+            "half of the range"
+        )
     if isinstance(curve, Sampled):
         return f"one that gives {100 * curve.light[len(curve.light) // 2]:.0f} % of the light at half of the range"
     return f"a gamma of {curve.gamma:g}"

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
+from workflows.images.tone_curves import light_of_codes
 from workflows.ingest.camera.calibration import constant_frames, measure
 from workflows.ingest.local_gain import Places, local_gain
 from workflows.ingest.measured_light import clipped_from, even_out, exposures_of, look_up_of
@@ -62,7 +63,7 @@ def survey(stack: Stack) -> None:
     pixels = 0
 
     def evened(codes: Codes, frame: int, y: Places, x: Places) -> NDArray[np.float32]:
-        light = even_out(look_up[codes].mean(axis=2), frame, attributes)
+        light = even_out(light_of_codes(codes, look_up).mean(axis=2), frame, attributes)
         return light if gain is None else light / gain.at(y, x, frame).reshape(light.shape)
 
     for rows, columns in _windows(stack):
@@ -82,10 +83,10 @@ def survey(stack: Stack) -> None:
             tone = evened(stack.read(rows, columns, slice(frame, frame + 1))[0], frame, y, x)
             of_tone += [((light - B) * (W - B))[whole].sum(dtype=np.float64) for light in (tone, W)]
         deviations.append(np.sqrt(noise.variance((B + W) / 2))[wanted])
-        brightest.append(look_up[codes_white].max(axis=2)[wanted])
+        brightest.append(light_of_codes(codes_white, look_up).max(axis=2)[wanted])
         if "video" in attributes and stack.channels == 3:
             for frame, codes in zip(coloured, stack.read_frames(coloured, rows, columns), strict=True):
-                detail.add(even_out(look_up[codes], frame, attributes)[np.newaxis], wanted)
+                detail.add(even_out(light_of_codes(codes, look_up), frame, attributes)[np.newaxis], wanted)
         for at, codes in _batches(stack, rows, columns, chosen):
             for end, there in enumerate((codes == 0, codes >= top)):
                 clipped[end, at] += (there.any(axis=3) & wanted).sum(axis=(1, 2))

@@ -97,6 +97,31 @@ def test_pixels_that_do_not_follow_the_half_tones_are_left_out() -> None:
     np.testing.assert_allclose(both.light, alone.light, atol=0.01)
 
 
+def test_channels_have_curves_of_their_own_where_one_does_not_explain_them() -> None:
+    # As raw values of a camera whose red and blue have powers 5 % apart from green's.
+    powers = (1.05, 1.0, 1 / 1.05)
+    codes = seen("contrasty", 0.003)
+    coloured = np.stack([codes**power for power in powers], axis=2).reshape(5, -1).astype(np.float32)
+    found = fit_camera_curve(halftones(coloured), channels=3).curve
+    assert isinstance(found, tuple)
+    light = np.linspace(0.02, 0.8, 50, dtype=np.float32)
+    scales = []
+    for own, power in zip(found, powers, strict=True):
+        back = to_light(encoded(light, "contrasty") ** np.float32(power), own)
+        scales.append((back @ light) / (light @ light))
+        np.testing.assert_allclose(back / scales[-1], light, atol=0.01)
+    assert np.ptp(scales) < 0.02  # so grey stays grey
+    assert not isinstance(fit(coloured), tuple)
+
+
+@pytest.mark.parametrize("tone", ["srgb", "contrasty"])
+def test_channels_that_are_alike_have_one_curve(tone: str) -> None:
+    three = np.stack([seen(tone, 0.003)] * 3, axis=2)
+    three += np.float32(0.002) * np.random.default_rng(7).standard_normal(three.shape, np.float32)
+    coloured = halftones(np.ascontiguousarray(three.reshape(5, -1)))
+    assert fit_camera_curve(coloured, channels=3) == fit_camera_curve(coloured)
+
+
 def test_too_few_or_too_dark_values_tell_nothing() -> None:
     codes = seen("srgb")
     assert fit(codes[:, :300]) is None
