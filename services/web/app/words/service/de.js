@@ -162,6 +162,7 @@ export const de = {
 	"noise of {black} grey levels of 8 bits at black, {full} at full scale; white minus black is {ratio} times that of a pixel between them": "Rauschen von {black} Graustufen (8 Bit) bei Schwarz, {full} bei Weiß; der Abstand von Weiß zu Schwarz ist {ratio}-mal so groß wie das Rauschen dazwischen",
 	"not measured": "nicht gemessen",
 	"nothing changes in the video: film the monitor while it shows the program": "im Video ändert sich nichts: den Monitor filmen, während er das Programm zeigt",
+	"one of each channel's own: red has {red}, green {green} and blue {blue} % of the light at half of the range": "eine je Kanal: Rot hat {red}, Grün {green} und Blau {blue} % des Lichts in der Mitte des Wertebereichs",
 	"one that gives {share} % of the light at half of the range": "eine mit {share} % des Lichts in der Mitte des Wertebereichs",
 	"only assumed": "nur angenommen",
 	"only {share} of the patterns are found": "nur {share} der Muster sind zu finden",
