@@ -13,6 +13,7 @@ from workflows.images.tone_curves import (
     Response,
     estimate,
     from_light,
+    light_of_codes,
     table,
     to_light,
 )
@@ -28,6 +29,16 @@ def test_srgb_is_the_standards() -> None:
     light = to_light(encoded, "srgb")
     np.testing.assert_allclose(light, [0, 0.02 / 12.92, 0.0031308, 0.21404114, 1, 0.50288646], rtol=2e-5)
     assert light.dtype == np.float32
+
+
+def test_each_channel_has_its_curve_where_there_are_three() -> None:
+    codes = np.random.default_rng(2).integers(0, 256, (4, 5, 3), np.uint8)
+    curves: tuple[Curve, Curve, Curve] = ("linear", "srgb", Gamma(gamma=1.8))
+    light = light_of_codes(codes, table(curves, codes.dtype))
+    assert light.dtype == np.float32
+    for channel, curve in enumerate(curves):
+        own = light_of_codes(codes[..., channel], table(curve, codes.dtype))
+        np.testing.assert_array_equal(light[..., channel], own)
 
 
 @pytest.mark.parametrize("curve", ["linear", "srgb"])

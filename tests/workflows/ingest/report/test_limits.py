@@ -9,6 +9,7 @@ import pytest
 from storage.layout.captures import Stack
 from tests.parts.captures import nested_program
 from tests.workflows.ingest.trial.test_unexplained import filmed
+from workflows.images.tone_curves import Gamma
 from workflows.ingest.report.figures import Finding, Quality, ToneCurve
 from workflows.ingest.report.limits import lost_colour, quality, unexplained
 from workflows.ingest.report.report import Report, report
@@ -82,6 +83,13 @@ def test_stated_curve_is_checked_by_half_tones(stack: Stack) -> None:
     assert found["camera_curve"].level == "warning"
     assert "-11 % of white" in found["camera_curve"].message
     assert "unknown" in found["camera_curve"].remedy
+
+
+def test_curves_of_each_channel_are_named(stack: Stack) -> None:
+    curves = ["linear", "srgb", {"gamma": 3.0}]
+    made, found = findings(stack, camera_curve=curves, response="unknown")
+    assert made.camera.curve == ("linear", "srgb", Gamma(gamma=3))
+    assert "red has 50, green 21 and blue 12 % of the light" in found["camera_curve"].message
 
 
 def test_of_one_level_the_costliest_comes_first(stack: Stack) -> None:

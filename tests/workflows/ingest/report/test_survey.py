@@ -127,6 +127,16 @@ def test_a_curve_of_any_shape_is_measured_by_half_tones(ingest: Ingest, capture_
 
 
 @pytest.mark.slow
+def test_channels_with_different_curves_are_measured_apart(ingest: Ingest, capture_archive: bytes) -> None:
+    powers = np.array([0.66, 0.6, 0.54])
+    made, _ = reported(ingest, filmed(capture_archive, curve=lambda x: x**powers, response="unknown"))
+    assert isinstance(made.camera.curve, tuple)
+    for own, power in zip(made.camera.curve, powers, strict=True):
+        half = to_light(np.array([0.4, 0.8], np.float32) ** np.float32(power), own)
+        assert half[0] / half[1] == pytest.approx(0.5, abs=0.02)
+
+
+@pytest.mark.slow
 def test_half_tones_disagree_with_a_curve_that_is_stated_wrongly(
     ingest: Ingest, capture_archive: bytes
 ) -> None:
