@@ -33,6 +33,7 @@ from workflows.composite.preview import enlarge, put_behind, window_of_preview
 from workflows.composite.quantise import encode
 from workflows.composite.strips import Strip
 from workflows.images import float_formats, integer_formats
+from workflows.images.integer_formats import Codes
 from workflows.threads import CORES
 
 router = Router(tags=["mattes"])
@@ -156,14 +157,7 @@ def _answer(
     params: CompositeParams,
     headers: Headers,
 ) -> Response:
-    times: list[str] = []
-
-    def timed(name: str, function: Callable[[], R]) -> R:
-        start = time.perf_counter()
-        result = function()
-        times.append(f"{name};dur={(time.perf_counter() - start) * 1e3:.1f}")
-        return result
-
+    times = _Times()
     body.seek(0)
     inputs = f"{progress.id} {sorted(progress.blocks or ())} {media_type} {params.model_dump_json()} "
     digest = hashlib.blake2b(inputs.encode(), digest_size=16)
@@ -175,26 +169,68 @@ def _answer(
         return answer_problem(
             problem_of(NotNeeded(f"the caller already has this composite: {tag}")), {"ETag": tag}
         )
-    matte = timed("open", lambda: context.cache.matte(progress.id))
+    if media_type == "image/x-exr":
+        picture, _ = _picture(context, progress, body, params, times)
+        answer = times.take("encode", lambda: _exr(picture))
+    else:
+        codes = _codes(context, progress, body, media_type, params, times)
+        answer = times.take("encode", lambda: _packed(codes, media_type, params.quality))
+    return bytes_response(answer, media_type, extra | {"Server-Timing": ", ".join(times)})
+
+
+class _Times(list[str]):
+    """How long the parts of an answer took, for the header Server-Timing."""
+
+    def take(self, name: str, function: Callable[[], R]) -> R:
+        """Call a function, and note how long it took."""
+        start = time.perf_counter()
+        result = function()
+        self.append(f"{name};dur={(time.perf_counter() - start) * 1e3:.1f}")
+        return result
+
+
+def _codes(
+    context: Context,
+    progress: Progress,
+    body: IO[bytes],
+    media_type: str,
+    params: CompositeParams,
+    times: _Times,
+) -> Codes:
+    """The integers of an answer. The picture that they are made of is four times as large, and given up here."""
+    picture, is_deep = _picture(context, progress, body, params, times)
+    dtype: np.dtype[np.unsignedinteger] = np.dtype(
+        np.uint16 if is_deep and media_type == "image/png" else np.uint8
+    )
+    return times.take("codes", lambda: encode(picture, params.transfer, dtype, CORES))
+
+
+def _picture(
+    context: Context, progress: Progress, body: IO[bytes], params: CompositeParams, times: _Times
+) -> tuple[NDArray[np.float32], bool]:
+    """The light and alpha of an answer, and whether the backdrop has more than 8 bits."""
+    matte = times.take("open", lambda: context.cache.matte(progress.id))
     window = Window.of(matte, params.x, params.y, params.width, params.height)
-    pixels = timed("decode", lambda: context.decoders.decode(body, params.transfer))
+    pixels = times.take("decode", lambda: context.decoders.decode(body, params.transfer))
     backdrop = backdrop_of(pixels, params.transfer)
 
     def read(row: int, number: int) -> Strip:
         return context.cache.strip(progress.id, row, number, progress.blocks)
 
-    rays = timed("rays", lambda: _rays(context, progress, params)) if params.depth is not None else None
-    picture = timed(
+    rays = times.take("rays", lambda: _rays(context, progress, params)) if params.depth is not None else None
+    picture = times.take(
         "composite",
         lambda: composite(matte, backdrop, placement=params.placement, rays=rays, window=window, read=read),
     )
     if progress.preview is not None:
         spacing = progress.preview
-        timed("preview", lambda: _add_preview(context, progress, spacing, picture, backdrop, window, params))
+        times.take(
+            "preview", lambda: _add_preview(context, progress, spacing, picture, backdrop, window, params)
+        )
     if params.around == "backdrop":
         wide, high = matte.attributes["monitor"]
         frame = matte.width, matte.height
-        picture = timed(
+        picture = times.take(
             "around",
             lambda: put_around(picture, backdrop, window, frame, (wide, high), params.placement, CORES),
         )
@@ -202,8 +238,7 @@ def _answer(
         picture = shrink(picture, params.size)
     if params.enlarge == 2:
         picture = double(picture)
-    answer = timed("encode", lambda: _encoded(picture, backdrop, media_type, params))
-    return bytes_response(answer, media_type, extra | {"Server-Timing": ", ".join(times)})
+    return picture, backdrop.pixels.dtype != np.uint8
 
 
 def _add_preview(
@@ -252,14 +287,12 @@ def _rays(context: Context, progress: Progress, params: CompositeParams) -> Rays
     return from_two(places, others, (params.distance, params.other_distance), params.depth)
 
 
-def _encoded(
-    picture: NDArray[np.float32], backdrop: Backdrop, media_type: str, params: CompositeParams
-) -> bytes:
-    if media_type == "image/x-exr":
-        opaque = bool((picture[..., 3] == 1).all())
-        return float_formats.encode_exr("RGB" if opaque else "RGBA", picture)
-    deep = media_type == "image/png" and backdrop.pixels.dtype != np.uint8
-    codes = encode(picture, params.transfer, np.dtype(np.uint16 if deep else np.uint8), CORES)
+def _exr(picture: NDArray[np.float32]) -> bytes:
+    opaque = bool((picture[..., 3] == 1).all())
+    return float_formats.encode_exr("RGB" if opaque else "RGBA", picture)
+
+
+def _packed(codes: Codes, media_type: str, quality: int) -> bytes:
     if media_type == "image/png":
         return integer_formats.encode_png(codes)
-    return integer_formats.encode_jpeg(codes[..., :3], params.quality)
+    return integer_formats.encode_jpeg(codes[..., :3], quality)
