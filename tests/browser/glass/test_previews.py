@@ -10,7 +10,7 @@ from tests.end_to_end.conftest import Service, paused
 from tests.end_to_end.mattes.test_previews import HEIGHT, WIDTH, upload_large
 from tests.parts.waiting import until
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.exhaustive
 
 
 def test_glass_is_in_the_hand_before_it_is_recovered(desk: Page, service: Service, tmp_path: Path) -> None:

@@ -72,6 +72,7 @@ def test_whole_frame_is_served_while_it_is_recovered(service: Service, large: st
     assert not (service.data / "store" / "mattes" / matte / "preview").exists()
 
 
+@pytest.mark.exhaustive
 def test_requests_never_fail_while_a_matte_is_completed(service: Service, large: str) -> None:
     job = service.client.recover(large, quality="fast")
     until(lambda: service.client.job(job["id"])["stage"] == "recovering")
