@@ -17,7 +17,7 @@ from typing import IO, Any, cast
 
 from storage.errors import Corrupt
 from storage.layout import mattes
-from storage.layout.mattes import CHANNELS, FRAMES, Matte
+from storage.layout.mattes import FRAMES, Matte, chunk_entry, rows_folder
 from storage.objects.checksums import is_checked, is_intact, unseal
 from storage.objects.store import Objects
 
@@ -33,16 +33,6 @@ ZIP64 = (1 << 31) - 1
 def summary(attributes: dict[str, Any]) -> dict[str, Any]:
     """The part ``matte`` of the manifest of a matte with these attributes."""
     return {name: attributes[name] for name in (*mattes.FIGURES, "options")}
-
-
-def chunk_entry(name: str, row: int, column: int) -> str:
-    """The entry of a block in a frame-shaped array."""
-    return f"{name}/c/{row}/{column}" + ("/0" if name in CHANNELS else "")
-
-
-def rows_folder(row: int, column: int) -> str:
-    """The folder of the rows T of a block."""
-    return f"T/{row}.{column}"
 
 
 def block_entries(row: int, column: int) -> list[str]:

@@ -22,6 +22,7 @@ A block is a square of ``block`` pixels and one chunk of each frame-shaped array
 all of it and nothing else, so blocks can be written in any order, by any worker, and repeatedly.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -34,9 +35,9 @@ from zarr.storage import MemoryStore
 
 from storage.errors import Corrupt
 from storage.layout.blocks import block_edge
-from storage.objects.checksums import CODECS, is_checked
+from storage.objects.checksums import CODECS, damaged, is_checked
 from storage.objects.store import Objects, gather
-from storage.objects.zarr_store import decode_chunk
+from storage.objects.zarr_store import unpack
 
 FORMAT = "envmatte-matte/1"
 FRAMES = ("S", "rho", "error", "recovered", "shared", "count")
@@ -85,6 +86,16 @@ def _no_rows() -> tuple[NDArray[np.uint32], NDArray[np.float32]]:
 def path(matte: str) -> str:
     """Path of a matte in the store."""
     return f"mattes/{matte}"
+
+
+def chunk_entry(name: str, row: int, column: int) -> str:
+    """Path within a matte of the chunk of a block in a frame-shaped array."""
+    return f"{name}/c/{row}/{column}" + ("/0" if name in CHANNELS else "")
+
+
+def rows_folder(row: int, column: int) -> str:
+    """Path within a matte of the rows T of a block."""
+    return f"T/{row}.{column}"
 
 
 def preview_of(matte: str) -> str:
@@ -143,7 +154,7 @@ class Matte:
 
     def write(self, row: int, column: int, block: Block) -> None:
         """Write a block, replacing an earlier one."""
-        span, rows = self.span(row, column), f"{self._path}/T/{row}.{column}"
+        span, rows = self.span(row, column), f"{self._path}/{rows_folder(row, column)}"
 
         async def write(name: str) -> None:
             await self._frames[name].async_array.setitem(span, getattr(block, name))
@@ -180,32 +191,39 @@ class Matte:
         if entries == 0 and not recovered.any():  # most of a frame: the mask leaves it out
             return empty_block(*count.shape[:2])
         S, rho, error, shared = self._chunks(row, column, "S", "rho", "error", "shared")
-        cell, weight = self._rows(row, column) if entries else _no_rows()
-        if not len(cell) == len(weight) == entries:
-            raise self._corrupt(row, column)
+        cell, weight = self._rows(row, column, entries) if entries else _no_rows()
         return Block(S, rho, error, recovered, shared, count, cell, weight)
 
     def _chunks(self, row: int, column: int, *names: str) -> list[NDArray[Any]]:
         """The values of a block in frame-shaped arrays."""
-        arrays = [self._frames[name] for name in names]
         height, width = (span.stop - span.start for span in self.span(row, column))
-        paths = [self._chunk(name, row, column) for name in names]
-        values = self._decoded(paths, [array.dtype for array in arrays])
+        arrays = [self._frames[name] for name in names]
+        entries = [chunk_entry(name, row, column) for name in names]
+        found = self._unpacked(entries, [array.dtype for array in arrays], [array.chunks for array in arrays])
         # Chunks at the edges of the frame are padded to full size.
-        return [
-            np.ascontiguousarray(one.reshape(array.chunks)[:height, :width])
-            for one, array in zip(values, arrays, strict=True)
-        ]
+        return [np.ascontiguousarray(values[:height, :width]) for values in found]
 
-    def _rows(self, row: int, column: int) -> list[NDArray[Any]]:
+    def _rows(self, row: int, column: int, entries: int) -> list[NDArray[Any]]:
         """Cells and weights of the rows T of a block that has some."""
-        rows = f"{self._path}/T/{row}.{column}"
-        types = [np.dtype(np.uint32), np.dtype(np.float32)]
-        return self._decoded([f"{rows}/cell/c/0", f"{rows}/weight/c/0"], types)
+        rows, types = rows_folder(row, column), [np.dtype(np.uint32), np.dtype(np.float32)]
+        try:
+            return self._unpacked([f"{rows}/cell/c/0", f"{rows}/weight/c/0"], types, [(entries,)] * 2)
+        except ValueError as error:
+            raise self._corrupt(row, column) from error
 
-    def _decoded(self, paths: Sequence[str], types: Sequence[np.dtype[Any]]) -> list[NDArray[Any]]:
-        stored = self._objects.get(paths)
-        return [decode_chunk(*one, self._is_checked) for one in zip(paths, stored, types, strict=True)]
+    def _unpacked(
+        self, entries: Sequence[str], types: Sequence[np.dtype[Any]], shapes: Sequence[tuple[int, ...]]
+    ) -> list[NDArray[Any]]:
+        """Chunks of the matte. `Corrupt` if one is damaged, ValueError if it has fewer values than its shape."""
+        paths = [f"{self._path}/{entry}" for entry in entries]
+        found = []
+        for path, packed, kind, shape in zip(paths, self._objects.get(paths), types, shapes, strict=True):
+            try:
+                values = unpack(packed, math.prod(shape) * kind.itemsize, self._is_checked)
+            except ValueError as error:
+                raise damaged(path) from error
+            found.append(np.frombuffer(values, kind).reshape(shape))
+        return found
 
     def layer(self, name: str, rows: slice = slice(None)) -> NDArray[Any]:
         """A frame-shaped array, or some rows of it.
@@ -222,8 +240,8 @@ class Matte:
         stored = self._objects.paths_below(self._path)
 
         def is_complete(row: int, column: int) -> bool:
-            chunks = (self._chunk(name, row, column) for name in FRAMES)
-            rows = [f"{self._path}/T/{row}.{column}/{name}" for name in ("cell", "weight")]
+            chunks = (f"{self._path}/{chunk_entry(name, row, column)}" for name in FRAMES)
+            rows = [f"{self._path}/{rows_folder(row, column)}/{name}" for name in ("cell", "weight")]
             # A block whose rows T are all empty has neither chunk.
             return (
                 all(chunk in stored for chunk in chunks)
@@ -233,10 +251,6 @@ class Matte:
 
         blocks = product(range(self.block_rows), range(self.block_columns))
         return {block for block in blocks if not is_complete(*block)}
-
-    def _chunk(self, name: str, row: int, column: int) -> str:
-        """Path of the chunk of a block in a frame-shaped array."""
-        return f"{self._path}/{name}/c/{row}/{column}" + ("/0" if name in CHANNELS else "")
 
     def _corrupt(self, row: int, column: int) -> Corrupt:
         return Corrupt(f"block {row}.{column} of the matte is missing or damaged; recover the matte again")

@@ -15,7 +15,8 @@ from typing import Any, Literal
 from storage.errors import Corrupt
 from storage.layout import composites, uploads
 from storage.layout.captures import MEASURED
-from storage.layout.matte_archive import GROUPS, rows_folder
+from storage.layout.matte_archive import GROUPS
+from storage.layout.mattes import rows_folder
 from storage.maintenance.inventory import Item
 from storage.objects.checksums import BLOCK, SUFFIX, damaged, is_checked, is_intact, remedy, unseal
 from storage.objects.store import Objects

@@ -6,9 +6,9 @@ from contextlib import contextmanager
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
+import imagecodecs
 import numpy as np
 import zarr
-from numcodecs.zstd import Zstd
 from obstore.store import ObjectStore
 from zarr.buffer import default_buffer_prototype
 from zarr.storage import MemoryStore, StorePath, WrapperStore
@@ -22,14 +22,12 @@ from storage.objects.retries import translate_errors
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from numpy.typing import NDArray
     from zarr.abc.store import ByteRequest
     from zarr.core.array_spec import ArrayConfigParams
     from zarr.core.buffer import Buffer, BufferPrototype
 
 EVERY_CHUNK: ArrayConfigParams = {"write_empty_chunks": True}
 """Configuration of every array: chunks of zeros are stored too, so that a missing chunk means damage."""
-_ZSTD = Zstd()
 METADATA = ("zarr.json", ".zarray", ".zgroup", ".zattrs", ".zmetadata")
 """Objects by which zarr finds out whether there is an array or a group: they may be missing."""
 
@@ -65,39 +63,39 @@ def array_metadata(dtype: np.dtype[Any]) -> dict[str, Any]:
     return array.metadata.to_dict()
 
 
-def decode_chunk(path: str, data: bytes, dtype: np.dtype[Any], checked: bool) -> NDArray[Any]:
-    """The values of a chunk that was encoded with `CODECS`, decoded in the calling thread.
+def unpack(packed: bytes, size: int, checked: bool) -> memoryview:
+    """Unpack a chunk that was packed by `CODECS`, in the calling thread.
 
-    zarr hands each chunk from thread to thread, which takes longer than to decode it.
+    zarr hands each chunk from thread to thread, which takes longer than to unpack it.
 
     Parameters
     ----------
-    path : str
-        Path of the chunk, for the error.
-    data : bytes
+    packed : bytes
         The chunk.
-    dtype : numpy.dtype
-        Type of its array.
+    size : int
+        Most bytes that it may unpack to.
     checked : bool
         Whether its array has checksums.
 
     Returns
     -------
-    (n,) array
-        In the order of the chunk.
+    memoryview
+        Writable, like what zarr reads.
 
     Raises
     ------
-    Corrupt
-        If it is damaged.
+    ValueError
+        If it is damaged; says how.
     """
-    if checked and not checksums.is_intact(data):
-        raise checksums.damaged(path)
+    if checked:
+        if not checksums.is_intact(packed):
+            raise ValueError("its checksum does not match")
+        packed = packed[: -checksums.SUM]
+    values = memoryview(bytearray(size))
     try:
-        plain = _ZSTD.decode(memoryview(data)[: -checksums.SUM] if checked else data)
-        return np.frombuffer(plain, dtype).copy()  # writable, like what zarr reads
+        return values[: len(imagecodecs.zstd_decode(packed, out=values))]
     except (RuntimeError, ValueError) as error:
-        raise checksums.damaged(path) from error
+        raise ValueError(f"it is no chunk of {size} bytes, packed by zstd") from error
 
 
 def missing_chunk(path: str) -> Corrupt:

@@ -9,7 +9,8 @@ LEAST_READ = 2e-11
 """Variance of quantisation to 16 bits, in units of full scale squared: the least noise of a frame."""
 
 _BINS = 12
-_LEAST_SAMPLES = 10 * _BINS
+LEAST_SAMPLES = 10 * _BINS
+"""Least samples that noise is fitted to."""
 # The mean of a chi-square variable of 1 degree of freedom up to its 90th percentile q:
 # P(chi-square of 3 degrees <= q) / 0.9.
 _TRIM, _TRIMMED_CHI_SQUARE = 0.9, 0.623011
@@ -64,7 +65,7 @@ def fit_noise(
     >>> print(f"{noise.shot:.0e}")
     1e-05
     """
-    if level.size < _LEAST_SAMPLES:
+    if level.size < LEAST_SAMPLES:
         return None
     from scipy.optimize import nnls  # takes half a second to import, and compositing does not need it
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from workflows.recovery.noise import LEAST_READ, Noise, fit_noise
+from workflows.recovery.noise import LEAST_READ, LEAST_SAMPLES, Noise, fit_noise
 
 TYPICAL_SHOT = 1 / 20_000
 """Shot noise of a full well of 20,000 electrons."""
@@ -22,8 +22,6 @@ _SAMPLE = 4096
 _MOST_UNUSABLE, _MOST = 0.01, 0.95
 # Dark values are below this share of the brightest.
 _DARK = 0.25
-# Least dark and bright values that tell the noise.
-_LEAST_SAMPLES = 120
 # A camera with a larger row sum of crosstalk is taken as one that does not separate colours.
 _MOST_CROSSTALK = 0.9
 
@@ -295,15 +293,13 @@ def _residuals(
     data = values[fitting].astype(np.float64)
     line = mask[:, :, None] * mask[:, None] / count[:, None]
     line += offset[:, :, None] * offset[:, None] / spread[:, None]
-    fitted = np.einsum("nij,nj->ni", line, data)
+    slope = np.einsum("ni,ni->n", offset, data)[:, None] / spread
+    fitted = (mask * (data - slope * levels)).sum(axis=1, keepdims=True) / count + slope * levels
     squared = (mask[:, :, None] * np.eye(len(levels)) - line) ** 2
     a = squared @ share
     b = np.einsum("nij,nj->ni", squared, fitted * share)
     kept = (mask > 0) & (a > 1e-6)
-    slope = np.einsum("ni,ni->n", offset, data) / spread[:, 0]
-    mean = (mask * (data - slope[:, None] * levels)).sum(axis=1) / count[:, 0]
-    unused = (mean[:, None] + slope[:, None] * levels)[mask == 0]
-    return b[kept] / a[kept], (data - fitted)[kept] ** 2 / a[kept], unused
+    return b[kept] / a[kept], (data - fitted)[kept] ** 2 / a[kept], fitted[mask == 0]
 
 
 def _unclipped(level: NDArray[np.float64], unused: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -321,5 +317,5 @@ def _unclipped(level: NDArray[np.float64], unused: NDArray[np.float64]) -> NDArr
         whole &= level > np.quantile(unused[lost_dark], _MOST)
     if (~lost_dark).sum() > _MOST_UNUSABLE * (~dark).sum():
         whole &= level < np.quantile(unused[~lost_dark], 1 - _MOST)
-    enough = min((whole & dark).sum(), (whole & ~dark).sum()) >= _LEAST_SAMPLES
+    enough = min((whole & dark).sum(), (whole & ~dark).sum()) >= LEAST_SAMPLES
     return whole if enough else np.ones_like(whole)

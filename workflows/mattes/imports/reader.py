@@ -5,7 +5,6 @@ from functools import cache
 from itertools import product
 from typing import Any, BinaryIO
 
-import imagecodecs
 import numpy as np
 import zarr
 from numpy.typing import NDArray
@@ -14,11 +13,12 @@ from zarr.buffer import default_buffer_prototype
 from zarr.storage import MemoryStore
 
 from storage.errors import ArchiveError, Corrupt
-from storage.layout import matte_archive
+from storage.layout import matte_archive, mattes
 from storage.layout.blocks import block_edge
 from storage.layout.matte_archive import GROUPS, MANIFEST
 from storage.layout.mattes import CHANNELS, FRAMES, Block
-from storage.objects.checksums import CODECS, SUM, is_checked, is_intact, unseal
+from storage.objects.checksums import CODECS, is_checked, unseal
+from storage.objects.zarr_store import unpack
 from workflows.mattes.imports.checks import faults
 from workflows.mattes.imports.manifest import Attributes, Manifest, Member, valid
 from workflows.recovery.pyramid import Pyramid
@@ -81,24 +81,20 @@ class Reader:
         count = values["count"]
         entries = int(count.sum(dtype=np.uint64))
         most = most_cells(self._limits)
-        where = matte_archive.chunk_entry("count", row, column)
+        where = mattes.chunk_entry("count", row, column)
         if entries > most:
             raise ArchiveError(
                 f"{where}: the rows T of this block have {entries} cells, more than the {most} allowed",
                 entry=where,
                 limit=most,
             )
-        T = matte_archive.rows_folder(row, column)
+        T = mattes.rows_folder(row, column)
         self.compare(f"{T}/zarr.json", _document_of_group())
         cell = self._rows(f"{T}/cell", entries, np.dtype("<u4"))
         weight = self._rows(f"{T}/weight", entries, np.dtype("<f4"))
         block = Block(**values, cell=cell, weight=weight)
         for name, what in faults(block, self._nodes):
-            entry = (
-                f"{T}/{name}/c/0"
-                if name in ("cell", "weight")
-                else matte_archive.chunk_entry(name, row, column)
-            )
+            entry = f"{T}/{name}/c/0" if name in ("cell", "weight") else mattes.chunk_entry(name, row, column)
             raise refused(entry, what)
         return block
 
@@ -127,7 +123,7 @@ class Reader:
         }
 
     def _frame(self, name: str, row: int, column: int) -> NDArray[Any]:
-        entry = matte_archive.chunk_entry(name, row, column)
+        entry = mattes.chunk_entry(name, row, column)
         dtype = np.dtype({"count": "<u4", "recovered": "u1", "shared": "u1"}.get(name, "<f4"))
         shape = (*self._chunk, 3) if name in CHANNELS else self._chunk
         values = self._decode(entry, int(np.prod(shape)), dtype).reshape(shape)
@@ -155,17 +151,12 @@ class Reader:
                 limit=self._limits.unpacked,
             )
         packed = self._read(name, size + (size >> 7) + 1024)  # what zstd makes of noise
-        if name.partition("/c/")[0] in self._checked:
-            if not is_intact(packed):
-                raise refused(name, "its checksum does not match")
-            packed = packed[:-SUM]
-        values = bytearray(size)
         try:
-            found = len(imagecodecs.zstd_decode(packed, out=values))
-        except (RuntimeError, ValueError) as error:
-            raise refused(name, f"it is no chunk of {size} bytes, packed by zstd") from error
-        if found != size:
-            raise refused(name, f"it unpacks to {found} bytes in place of {size}")
+            values = unpack(packed, size, name.partition("/c/")[0] in self._checked)
+        except ValueError as error:
+            raise refused(name, str(error)) from error
+        if len(values) != size:
+            raise refused(name, f"it unpacks to {len(values)} bytes in place of {size}")
         return np.frombuffer(values, dtype)
 
     def _document(self, name: str, most: int, parts: int = DOCUMENT_BYTES) -> Any:
