@@ -21,6 +21,8 @@ from workflows.ingest.camera.calibration import measure
 from workflows.ingest.manifest import MANIFEST
 from workflows.ingest.report.survey import survey
 from workflows.ingest.trial.recovery_time import core_seconds
+from workflows.ingest.trial.steadiness import find_steadiness
+from workflows.ingest.trial.trial_recovery import take_sample
 from workflows.ingest.video.border_reader import LOOKS
 from workflows.ingest.video.frame_means import Share
 from workflows.ingest.video.matching import MAX_PATTERNS, MatchedFrames, match_frames
@@ -178,14 +180,22 @@ def finish(objects: Objects, task: Task) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``core_seconds`` that its recovery will take, by quality.
+        ``core_seconds`` that its recovery will take, by quality; None if too few pixels can be tried.
     """
     objects.sweep(captures.path(task.capture))
     stack = Stack(objects, task.capture)
     measure(stack)
+    seconds = _try_out(stack)
     survey(stack)
     stack.save()
-    return {"core_seconds": core_seconds(stack)}
+    return {"core_seconds": seconds}
+
+
+def _try_out(stack: Stack) -> dict[str, float] | None:
+    """Find the steadiness of a stack, and how long its recovery will take, from one sample of its pixels."""
+    sample = take_sample(stack)
+    patterns = find_steadiness(stack, sample)
+    return None if sample is None or patterns is None else core_seconds(stack, sample, patterns)
 
 
 STEPS = Steps("ingest", "reading", prepare, work, missing, finish, scattered=False)

@@ -34,6 +34,8 @@ Zip = Callable[..., bytes]
 Ingest = Callable[..., Stack]
 Put = Callable[[str, bytes], None]
 Digests = Callable[[str], dict[str, str]]
+COMPRESSING = 50 << 20
+"""Bytes that compressing a slab takes beside the memory for frames, as services/README.md says."""
 HEIGHT, WIDTH = 21, 37
 
 
@@ -295,7 +297,7 @@ def test_a_stack_larger_than_the_memory_is_ingested_within_it(
     assert stack > 3 * memory
     tiles, grown = peak.of_large_after_small(objects, memory)
     assert tiles > 4
-    assert memory // 3 < grown <= memory
+    assert memory // 3 < grown <= memory + COMPRESSING
     assert Stack(objects, "large").frames == count
 
 

@@ -56,7 +56,7 @@ def measure(
     )
     gain = local_gain(stack)
     frames, sent, exposures = constant_frames(stack, program)
-    codes = np.stack([_sample(stack, frame) for frame in frames], axis=1)
+    codes = np.ascontiguousarray(_sample(stack, frames).transpose(1, 0, 2))
     top, black = np.iinfo(stack.dtype).max, stack.attributes["storage"]["black"]
     usable = (codes > 0) & (codes < clipped_from(stack))
     grey = np.ptp(sent, axis=1) == 0
@@ -163,10 +163,8 @@ def _halftones(stack: Stack, program: Program) -> Callable[[NDArray[np.float64]]
     of_light += [frames for frames, _ in there]
     gain = local_gain(stack)
     local = None if gain is None else np.repeat(gain.at(*_places(stack)), 3, axis=1).astype(np.float64)
-    codes = [
-        np.stack([_sample(stack, int(n)).ravel() for n in frames]).astype(np.float32) / full
-        for frames in of_light
-    ]
+    sample = _sample(stack, np.concatenate(of_light).tolist()).reshape(sum(map(len, of_light)), -1)
+    codes = np.split(sample.astype(np.float32) / full, np.cumsum([len(frames) for frames in of_light])[:-1])
 
     def seen(exposed: NDArray[np.float64]) -> HalfTones | None:
         used = exposed[np.concatenate(of_light)]
@@ -270,14 +268,16 @@ def _by_value(values: NDArray[Any]) -> NDArray[Any]:
     return values.transpose(1, 0, 2).reshape(values.shape[1], -1)
 
 
-def _sample(stack: Stack, frame: int) -> NDArray[Any]:
-    """Values of a frame at pixels spread over it, (n, 3), in short runs so that few chunks are read."""
+def _sample(stack: Stack, frames: list[int]) -> NDArray[Any]:
+    """Values of frames at pixels spread over them, (frames, n, 3), in short runs so that few chunks are read."""
     rows, columns = (_spread(n) for n in (stack.height, stack.width))
     parts = [
-        stack.read(y, x, slice(frame, frame + 1)).reshape(-1, stack.channels) for y in rows for x in columns
+        stack.read_frames(frames, y, x).reshape(len(frames), -1, stack.channels)
+        for y in rows
+        for x in columns
     ]
-    pixels = np.concatenate(parts)
-    return np.broadcast_to(pixels, (len(pixels), 3))
+    pixels = np.concatenate(parts, axis=1)
+    return np.broadcast_to(pixels, (*pixels.shape[:2], 3))
 
 
 def _places(stack: Stack) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

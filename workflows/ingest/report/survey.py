@@ -14,7 +14,6 @@ from workflows.ingest.camera.calibration import constant_frames, measure
 from workflows.ingest.local_gain import Places, local_gain
 from workflows.ingest.measured_light import clipped_from, even_out, exposures_of, look_up_of
 from workflows.ingest.report.colour_detail import ColourDetail
-from workflows.ingest.trial.steadiness import find_steadiness
 from workflows.programs.program import Program
 from workflows.recovery.noise import Noise
 
@@ -31,9 +30,12 @@ BATCH = 32 << 20
 def survey(stack: Stack) -> None:
     """Measure what the report on a capture needs, and annotate the stack with it as ``survey``; it is not saved.
 
-    Steadiness is measured first. If frames flicker, the noise is then measured again, because flicker is not noise.
+    Parameters
+    ----------
+    stack : Stack
+        With its attributes after `find_steadiness`. If its frames flicker, the noise is measured again, because flicker
+        is not noise.
     """
-    find_steadiness(stack)
     if stack.attributes["gains"] is not None:
         noise = stack.attributes["noise"]
         measure(stack, stack.attributes["gains"], stack.attributes["tone_mapping"])
@@ -71,7 +73,8 @@ def survey(stack: Stack) -> None:
         if not wanted.any():
             continue
         y, x = np.mgrid[rows, columns].reshape(2, -1)
-        codes_black, codes_white = (stack.read(rows, columns, slice(n, n + 1))[0] for n in (black, white))
+        once = stack.read_frames([black, white, *(frame for frame, _ in tones)], rows, columns)
+        codes_black, codes_white, *of_tones = once
         B, W = (evened(codes, frame, y, x) for codes, frame in ((codes_black, black), (codes_white, white)))
         top = clipped_from(stack)
         pixels += int(np.count_nonzero(wanted))
@@ -79,8 +82,8 @@ def survey(stack: Stack) -> None:
         ends[1] += [np.count_nonzero((c >= top).any(axis=2) & wanted) for c in (codes_black, codes_white)]
         contrasts.append((W - B)[wanted])
         whole = wanted & ((codes_black > 0) & (codes_white < top)).all(axis=2)
-        for of_tone, (frame, _) in zip(lit.T, tones, strict=True):
-            tone = evened(stack.read(rows, columns, slice(frame, frame + 1))[0], frame, y, x)
+        for of_tone, codes, (frame, _) in zip(lit.T, of_tones, tones, strict=True):
+            tone = evened(codes, frame, y, x)
             of_tone += [((light - B) * (W - B))[whole].sum(dtype=np.float64) for light in (tone, W)]
         deviations.append(np.sqrt(noise.variance((B + W) / 2))[wanted])
         brightest.append(light_of_codes(codes_white, look_up).max(axis=2)[wanted])

@@ -7,22 +7,25 @@ from pydantic import TypeAdapter
 
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import Curve
-from workflows.ingest.trial.trial_recovery import recover_sample, take_sample
+from workflows.ingest.trial.trial_recovery import Sample, recover_sample
 from workflows.programs.program import Program
-from workflows.programs.pyramid_light import lay_out
-from workflows.recovery.glare import filter_patterns, spread_patterns
 from workflows.recovery.lobes.options import FAST, FINE
+from workflows.recovery.sensing import Patterns
 
 QUALITIES = {"fine": FINE, "fast": FAST}
 
 
-def core_seconds(stack: Stack) -> dict[str, float] | None:
-    """Seconds that one core takes to recover all pixels of a stack, by quality; None if too few pixels can be tried.
+def core_seconds(stack: Stack, sample: Sample, patterns: Patterns) -> dict[str, float] | None:
+    """Seconds that one core takes to recover all pixels of a stack, by quality; None if there is too little contrast.
 
     Parameters
     ----------
     stack : Stack
-        With its attributes after `survey`.
+        With its attributes after `find_steadiness`.
+    sample : Sample
+        The pixels that are tried, as from `take_sample`.
+    patterns : Patterns
+        As from `find_steadiness`.
 
     Notes
     -----
@@ -31,15 +34,9 @@ def core_seconds(stack: Stack) -> dict[str, float] | None:
     measured with them. What counts is the time of this thread on its core: a trial takes half a second, in which other
     processes often have half of the core. Reading the frames and writing the matte are left out.
     """
-    sample = take_sample(stack)
-    if sample is None:
-        return None
     attributes = stack.attributes
     program = Program.model_validate(attributes["program"])
     monitor: Curve = TypeAdapter[Curve](Curve).validate_python(attributes["monitor_curve"])
-    patterns = lay_out(program, monitor, stack.images())
-    if attributes["glare"]:
-        patterns = filter_patterns(patterns, spread_patterns(patterns), attributes["glare"])
     state = np.zeros((stack.frames, 3))
     if attributes["shifts"] is not None:
         state[:, :2] = attributes["shifts"]

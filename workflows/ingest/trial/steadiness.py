@@ -20,7 +20,6 @@ from workflows.ingest.trial.trial_recovery import (
     Sample,
     Trial,
     measure_rest,
-    take_sample,
     try_recovery,
 )
 from workflows.ingest.trial.unexplained import Unexplained, find_unexplained
@@ -60,8 +59,20 @@ QUARTERS = 4
 """Parts of the capture whose mean positions are reported."""
 
 
-def find_steadiness(stack: Stack) -> None:
+def find_steadiness(stack: Stack, sample: Sample | None) -> Patterns | None:
     """Find the shift and the gain of each frame, and annotate the stack with them.
+
+    Parameters
+    ----------
+    stack : Stack
+        With its attributes after `measure`.
+    sample : Sample, optional
+        As from `take_sample`.
+
+    Returns
+    -------
+    Patterns or None
+        The program's, with the glare that was found; None if there are too few pixels, or too little contrast.
 
     ``steadiness`` says what was found. It is None if there are too few pixels to measure, and empty if the patterns
     don't explain what the frames show. Its ``drift`` and ``flicker`` are None if they are too large to be either.
@@ -112,12 +123,9 @@ def find_steadiness(stack: Stack) -> None:
         noise_of_patterns=False,
     )
     program = Program.model_validate(stack.attributes["program"])
-    sample = take_sample(stack)
-    if sample is None:
-        return
-    explained = _explain(stack, program, sample)
-    if explained is None:
-        return
+    explained = None if sample is None else _explain(stack, program, sample)
+    if sample is None or explained is None:
+        return None
     monitor, light, unexplained = explained
     at_rest = np.zeros((stack.frames, 3))
     at_first, through, _ = unexplained
@@ -126,7 +134,7 @@ def find_steadiness(stack: Stack) -> None:
     patterns = np.array(stack.attributes["patterns"])
     shown = np.isin(patterns, program.measured)
     if np.count_nonzero(np.isfinite(first.off[shown]).all(axis=1)) < MIN_FRAMES:
-        return
+        return through
     found, last = _fill_gaps(first.off, shown), first
     moves = flickers = False
     believed = np.ones(2, bool)
@@ -148,7 +156,7 @@ def find_steadiness(stack: Stack) -> None:
         and (last.residual > EXPLAINED[0] or (last is not first and not believed.any()))
     ):
         stack.annotate(steadiness={})
-        return
+        return through
     if not moves and not flickers:
         # The first trial underestimates, but later rounds may have diverged.
         found, last = _fill_gaps(first.off, shown), first
@@ -170,8 +178,10 @@ def find_steadiness(stack: Stack) -> None:
             {"gains": (gain / unit_of(gain, stack.attributes, program)).round(5).tolist()} if flickers else {}
         ),
     )
-    if moves or flickers:
-        find_unexplained(stack, program, monitor, light, sample, found * [moves, moves, flickers])
+    if not moves and not flickers:
+        return through
+    again = find_unexplained(stack, program, monitor, light, sample, found * [moves, moves, flickers])
+    return again and again.patterns
 
 
 def unit_of(gain: Doubles, attributes: dict[str, Any], program: Program) -> float:

@@ -48,9 +48,10 @@ class Film:
         light += NOISE * random.standard_normal(light.shape)
         self.codes = np.interp(light, LOOK_UP, np.arange(65536)).round().astype(np.uint16)
 
-    def read(
-        self, rows: slice = slice(None), columns: slice = slice(None), frames: slice = slice(None)
-    ) -> NDArray[np.uint16]:
+    def read(self, rows: slice = slice(None), columns: slice = slice(None)) -> NDArray[np.uint16]:
+        return self.codes[:, rows, columns]
+
+    def read_frames(self, frames: list[int], rows: slice, columns: slice) -> NDArray[np.uint16]:
         return self.codes[frames, rows, columns]
 
     def read_masked(self, rows: slice, columns: slice) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:

@@ -11,7 +11,10 @@ from storage.layout.captures import Stack
 from tests.parts.captures import nested_program
 from workflows.ingest.trial import recovery_time
 from workflows.ingest.trial.recovery_time import core_seconds
+from workflows.ingest.trial.steadiness import find_steadiness
 from workflows.ingest.trial.trial_recovery import take_sample
+from workflows.programs.program import Program
+from workflows.programs.pyramid_light import lay_out
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import write_capture
 
@@ -34,8 +37,12 @@ def test_seconds_of_a_trial_count_for_all_pixels(
     assert share > 1
     clock = count()  # each trial lasts a second
     monkeypatch.setattr(recovery_time.time, "thread_time", lambda: float(next(clock)))
-    assert core_seconds(stack) == {"fine": round(share, 2), "fast": round(share, 2)}
+    program = Program.model_validate(stack.attributes["program"])
+    patterns = lay_out(program, "linear", stack.images())
+    assert core_seconds(stack, sample, patterns) == {"fine": round(share, 2), "fast": round(share, 2)}
 
 
 def test_frame_too_small_for_a_trial_has_none(ingest: Callable[..., Stack]) -> None:
-    assert core_seconds(stack_of(ingest, 36, 28)) is None
+    stack = stack_of(ingest, 36, 28)
+    assert take_sample(stack) is None
+    assert find_steadiness(stack, None) is None
