@@ -15,6 +15,9 @@ logger = logging.getLogger(__name__)
 
 HEAD = 15.0
 """Seconds in which the head of a request must arrive, from the connection or from its first byte on."""
+IDLE = 75
+"""Seconds that a connection stays open between two requests: longer than clients and proxies keep one that they use
+again (httpx 5, nginx 60), else it is closed while their next request is under way, and that fails."""
 MOST_HEAD = 16 << 10
 """Most bytes of the head of a request."""
 CHECK_SECONDS = 30.0
@@ -55,6 +58,7 @@ class Connection(H11Protocol):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self.conn = _Unambiguous(h11.SERVER, MOST_HEAD)
+        self.timeout_keep_alive = IDLE
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(_Counting(transport))  # type: ignore[arg-type]

@@ -188,6 +188,15 @@ def test_client_that_stops_sending_its_body_is_disconnected(
 
 
 @pytest.mark.slow
+def test_connection_stays_open_longer_than_clients_keep_it(served: Served) -> None:
+    with served.connected(get("/healthz")) as connection:
+        connection.recv(1 << 14)
+        time.sleep(6)  # httpx keeps one for 5
+        connection.sendall(get("/healthz"))
+        assert connection.recv(1 << 14).startswith(b"HTTP/1.1 200")
+
+
+@pytest.mark.slow
 def test_trickling_client_is_disconnected(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(slow_clients, "CHECK_SECONDS", 4.0)
     with served.connected(head("POST", "/v1/captures", Content_Type="application/zip")) as one:
