@@ -54,8 +54,21 @@ def composite(
         If a block of the matte is missing.
     """
     given = backdrop if isinstance(backdrop, Backdrop) else Backdrop(backdrop)
-    wide, high = matte.attributes["monitor"] if placement else (1, 1)
-    light = node_light(given, matte.columns, matte.rows, threads, placement, (wide, high))
+    light = light_on(matte, given, placement, threads)
     return compose(
         matte, light, window or Window.of(matte), read or partial(read_strip, matte), threads, rays
     )
+
+
+def light_on(
+    matte: Matte, backdrop: Backdrop, placement: Placement | None, threads: int
+) -> NDArray[np.float32]:
+    """The light of a backdrop on the cells of a matte's monitor, for `compose`.
+
+    Returns
+    -------
+    (nodes + 1, 3) float32
+        See `node_light`.
+    """
+    wide, high = matte.attributes["monitor"] if placement else (1, 1)
+    return node_light(backdrop, matte.columns, matte.rows, threads, placement, (wide, high))

@@ -1,7 +1,7 @@
 """Composite C = S + X (rho T L), strip by strip: eq. 5 with X, the crosstalk from monitor to camera channels."""
 
 from collections.abc import Callable, Iterator
-from itertools import product
+from itertools import pairwise, product
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +18,8 @@ from workflows.interruption import checkpoint
 from workflows.recovery.pyramid import Grids, Pyramid
 from workflows.threads import in_parts
 
+BAND = 1 << 19
+"""Pixels that are composited at once where memory counts: 8 MiB of light and alpha."""
 SCALED_AT_ONCE = 64
 """Rows or columns."""
 CUBIC = np.array([-9, 111, 29, -3], np.float32) / 128
@@ -61,6 +63,13 @@ class Window(NamedTuple):
                     limit=most,
                 )
         return cls(x, y, width, height)
+
+    def bands(self, block: int) -> list["Window"]:
+        """Its bands from top to bottom, of some `BAND` pixels each, cut between rows of blocks."""
+        step = max(BAND // self.width // block, 1) * block
+        cuts = range((self.y // step + 1) * step, self.y + self.height, step)
+        edges = pairwise((self.y, *cuts, self.y + self.height))
+        return [Window(self.x, top, self.width, end - top) for top, end in edges]
 
 
 def compose(

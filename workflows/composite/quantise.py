@@ -21,6 +21,7 @@ def encode(
     transfer: Literal["srgb", "linear"],
     dtype: np.dtype[np.unsignedinteger],
     threads: int,
+    channels: Literal[3, 4] = 4,
 ) -> Codes:
     """Encode a picture as unsigned integers, clipped to 0 to 1 and rounded.
 
@@ -34,14 +35,14 @@ def encode(
         uint8 or uint16.
     threads : int
         Threads to use.
+    channels : int
+        3 leaves alpha out.
 
     Returns
     -------
-    (h, w, 3 or 4) uint8 or uint16
-        Without alpha if it is 1 everywhere.
+    (h, w, channels) uint8 or uint16
     """
     edges, first = _edges(transfer, dtype)
-    channels = 3 if (picture[..., 3] == 1).all() else 4
     codes = np.empty((*picture.shape[:2], channels), dtype)
     in_parts(
         lambda start: _encode(picture[start : start + ROWS], edges, first, codes[start : start + ROWS]),

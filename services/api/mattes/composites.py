@@ -2,9 +2,9 @@
 
 import hashlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
-from typing import IO, Annotated, TypeVar
+from typing import IO, Annotated, Literal, TypeVar
 
 import numpy as np
 from fastapi import Query, Request, Response
@@ -24,11 +24,11 @@ from services.api.mattes.progress import Progress, progress_of, while_there
 from services.runtime.problems import NotAcceptable, NotNeeded, problem_of
 from storage.errors import Conflict, OptionError
 from storage.records import mattes
-from workflows.composite import composite
+from workflows.composite import composite, light_on
 from workflows.composite.around import put_around
 from workflows.composite.backdrop import Backdrop, backdrop_of
 from workflows.composite.depth import Rays, from_one, from_two
-from workflows.composite.engine import Window, double, shrink
+from workflows.composite.engine import Window, compose, double, shrink
 from workflows.composite.preview import enlarge, put_behind, window_of_preview
 from workflows.composite.quantise import encode
 from workflows.composite.strips import Strip
@@ -139,14 +139,17 @@ def _bytes_of_composite(
     with context.stored(mattes.get, progress.id):
         matte = context.cache.matte(progress.id)
     window = Window.of(matte, params.x, params.y, params.width, params.height)
-    of_answer = SHRUNK_BYTES if params.size is not None else params.enlarge**2 * ANSWER_BYTES[media_type]
-    of_pixel = PICTURE_BYTES + of_answer + (DOUBLED_BYTES if params.enlarge > 1 else 0)
+    bands = _bands(window, matte.block, params, media_type, progress.preview is not None)
+    of_band = PICTURE_BYTES * window.width * max(band.height for band in bands)
+    of_pixel = SHRUNK_BYTES if params.size is not None else params.enlarge**2 * ANSWER_BYTES[media_type]
+    if params.enlarge > 1:
+        of_pixel += DOUBLED_BYTES
     of_rays = RAYS_BYTES * matte.width * matte.height if params.depth is not None else 0
     of_frame = AROUND_BYTES * matte.width * matte.height if params.around == "backdrop" else 0
     if progress.preview is not None:
         of_pixel += ENLARGED_BYTES
     of_window = of_pixel * window.width * window.height
-    return LIGHT_BYTES * matte.columns * matte.rows + of_window + of_rays + of_frame
+    return LIGHT_BYTES * matte.columns * matte.rows + of_band + of_window + of_rays + of_frame
 
 
 def _answer(
@@ -169,76 +172,107 @@ def _answer(
         return answer_problem(
             problem_of(NotNeeded(f"the caller already has this composite: {tag}")), {"ETag": tag}
         )
+    pixels = times.take("decode", lambda: context.decoders.decode(body, params.transfer))
+    backdrop = backdrop_of(pixels, params.transfer)
+    pictures = _pictures(context, progress, backdrop, params, media_type, times)
     if media_type == "image/x-exr":
-        picture, _ = _picture(context, progress, body, params, times)
+        (picture,) = pictures
         answer = times.take("encode", lambda: _exr(picture))
     else:
-        codes = _codes(context, progress, body, media_type, params, times)
+        codes = _codes(pictures, backdrop, params, media_type, times)
         answer = times.take("encode", lambda: _packed(codes, media_type, params.quality))
-    return bytes_response(answer, media_type, extra | {"Server-Timing": ", ".join(times)})
+    return bytes_response(answer, media_type, extra | {"Server-Timing": times.header})
 
 
-class _Times(list[str]):
-    """How long the parts of an answer took, for the header Server-Timing."""
+class _Times(dict[str, float]):
+    """Milliseconds that the parts of an answer took."""
 
     def take(self, name: str, function: Callable[[], R]) -> R:
         """Call a function, and note how long it took."""
         start = time.perf_counter()
         result = function()
-        self.append(f"{name};dur={(time.perf_counter() - start) * 1e3:.1f}")
+        self[name] = self.get(name, 0) + (time.perf_counter() - start) * 1e3
         return result
+
+    @property
+    def header(self) -> str:
+        """The value of the header Server-Timing (W3C Server Timing, section 3)."""
+        return ", ".join(f"{name};dur={milliseconds:.1f}" for name, milliseconds in self.items())
 
 
 def _codes(
-    context: Context,
-    progress: Progress,
-    body: IO[bytes],
-    media_type: str,
+    pictures: Iterator[NDArray[np.float32]],
+    backdrop: Backdrop,
     params: CompositeParams,
+    media_type: str,
     times: _Times,
 ) -> Codes:
-    """The integers of an answer. The picture that they are made of is four times as large, and given up here."""
-    picture, is_deep = _picture(context, progress, body, params, times)
-    dtype: np.dtype[np.unsignedinteger] = np.dtype(
-        np.uint16 if is_deep and media_type == "image/png" else np.uint8
+    """The integers of an answer. The pictures that they are made of are four times as large."""
+    is_deep = media_type == "image/png" and backdrop.pixels.dtype != np.uint8
+    dtype: np.dtype[np.unsignedinteger] = np.dtype(np.uint16 if is_deep else np.uint8)
+    channels: Literal[3, 4] = 4 if media_type == "image/png" else 3
+    bands = [
+        times.take("codes", partial(encode, picture, params.transfer, dtype, CORES, channels))
+        for picture in pictures
+    ]
+    codes = np.concatenate(bands)
+    return codes if (codes[..., 3:] < np.iinfo(dtype).max).any() else codes[..., :3]
+
+
+def _bands(
+    window: Window, block: int, params: CompositeParams, media_type: str, has_preview: bool
+) -> list[Window]:
+    """The parts of a window that are composited one after the other, so that few pixels take memory at once.
+
+    It is one part if pixels depend on others, and for an EXR, which holds what was composited.
+    """
+    is_one = (
+        media_type == "image/x-exr"
+        or has_preview
+        or params.depth is not None
+        or params.around == "backdrop"
+        or params.size is not None
+        or params.enlarge > 1
     )
-    return times.take("codes", lambda: encode(picture, params.transfer, dtype, CORES))
+    return [window] if is_one else window.bands(block)
 
 
-def _picture(
-    context: Context, progress: Progress, body: IO[bytes], params: CompositeParams, times: _Times
-) -> tuple[NDArray[np.float32], bool]:
-    """The light and alpha of an answer, and whether the backdrop has more than 8 bits."""
+def _pictures(
+    context: Context,
+    progress: Progress,
+    backdrop: Backdrop,
+    params: CompositeParams,
+    media_type: str,
+    times: _Times,
+) -> Iterator[NDArray[np.float32]]:
+    """Light and alpha of an answer, by bands from top to bottom."""
     matte = times.take("open", lambda: context.cache.matte(progress.id))
     window = Window.of(matte, params.x, params.y, params.width, params.height)
-    pixels = times.take("decode", lambda: context.decoders.decode(body, params.transfer))
-    backdrop = backdrop_of(pixels, params.transfer)
 
     def read(row: int, number: int) -> Strip:
         return context.cache.strip(progress.id, row, number, progress.blocks)
 
     rays = times.take("rays", lambda: _rays(context, progress, params)) if params.depth is not None else None
-    picture = times.take(
-        "composite",
-        lambda: composite(matte, backdrop, placement=params.placement, rays=rays, window=window, read=read),
-    )
-    if progress.preview is not None:
-        spacing = progress.preview
-        times.take(
-            "preview", lambda: _add_preview(context, progress, spacing, picture, backdrop, window, params)
-        )
-    if params.around == "backdrop":
-        wide, high = matte.attributes["monitor"]
-        frame = matte.width, matte.height
-        picture = times.take(
-            "around",
-            lambda: put_around(picture, backdrop, window, frame, (wide, high), params.placement, CORES),
-        )
-    if params.size is not None:
-        picture = shrink(picture, params.size)
-    if params.enlarge == 2:
-        picture = double(picture)
-    return picture, backdrop.pixels.dtype != np.uint8
+    light = times.take("light", lambda: light_on(matte, backdrop, params.placement, CORES))
+    for band in _bands(window, matte.block, params, media_type, progress.preview is not None):
+        picture = times.take("composite", partial(compose, matte, light, band, read, CORES, rays))
+        if progress.preview is not None:
+            add = partial(
+                _add_preview, context, progress, progress.preview, picture, backdrop, window, params
+            )
+            times.take("preview", add)
+        if params.around == "backdrop":
+            wide, high = matte.attributes["monitor"]
+            frame = matte.width, matte.height
+            around = partial(
+                put_around, picture, backdrop, window, frame, (wide, high), params.placement, CORES
+            )
+            picture = times.take("around", around)
+        if params.size is not None:
+            picture = shrink(picture, params.size)
+        if params.enlarge == 2:
+            picture = double(picture)
+        yield picture
 
 
 def _add_preview(

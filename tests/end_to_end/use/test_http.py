@@ -91,7 +91,7 @@ def test_composite_reports_how_long_each_step_took(service: Service, matte: str)
     )
     assert answer.headers["content-type"] == "image/png"
     names = [part.split(";")[0] for part in answer.headers["server-timing"].split(", ")]
-    assert names == ["open", "decode", "composite", "codes", "encode"]
+    assert names == ["decode", "open", "light", "composite", "codes", "encode"]
 
 
 @pytest.mark.slow

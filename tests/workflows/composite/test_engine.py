@@ -11,7 +11,7 @@ from storage.errors import Corrupt, OptionError
 from storage.layout import mattes
 from storage.layout.mattes import Block, Matte
 from storage.objects.store import Objects
-from workflows.composite import composite
+from workflows.composite import composite, engine
 from workflows.composite.engine import Window, double, shrink
 from workflows.composite.strips import read_strip
 from workflows.images.resample import area_mean
@@ -111,6 +111,20 @@ def test_a_window_is_a_piece_of_the_whole(dense: Dense, crop: tuple[int, int, in
         window = Window.of(dense[0], x, y, width, height)
         seen = composite(dense[0], backdrop, window=window, threads=threads)
         np.testing.assert_array_equal(seen, whole[y : y + height, x : x + width])
+
+
+def test_bands_make_up_the_window_and_are_cut_between_blocks(
+    dense: Dense, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    matte = dense[0]
+    backdrop = np.random.default_rng(1).random((ROWS, COLUMNS, 3), np.float32)
+    window = Window(3, 2, 30, 17)
+    whole = composite(matte, backdrop, window=window)
+    assert window.bands(matte.block) == [window]
+    monkeypatch.setattr(engine, "BAND", 30 * 5)
+    bands = window.bands(4)
+    assert [(band.y, band.height) for band in bands] == [(2, 2), (4, 4), (8, 4), (12, 4), (16, 3)]
+    assert np.array_equal(np.concatenate([composite(matte, backdrop, window=band) for band in bands]), whole)
 
 
 @pytest.mark.parametrize(

@@ -128,7 +128,7 @@ def work(objects: Objects, task: Task, tile: int) -> int:
             wide, high = put.attributes["monitor"]
             size = put.width, put.height
             picture = put_around(picture, backdrop, Window.of(put), size, (wide, high), where, threads=1)
-        return encode(picture, transfer, np.dtype(np.uint8), 1)[..., :3].astype(np.uint8, copy=False)
+        return encode(picture, transfer, np.dtype(np.uint8), 1, 3).astype(np.uint8, copy=False)
 
     with _reading(objects, task) as (decoder, file):
         plan = [[Share(tick, TOTAL_WEIGHT)] for tick in ticks.tolist()]
