@@ -70,14 +70,18 @@ def fit_noise(
     from scipy.optimize import nnls  # takes half a second to import, and compositing does not need it
 
     order = np.argsort(level, kind="stable")
-    bins = np.array_split(order, _BINS)
+    cuts = level.size * np.arange(1, _BINS) // _BINS
+    # No bin has both dark and bright values: those that are trimmed would all be bright.
+    half = np.searchsorted(level[order], (level.min() + level.max()) / 2)
+    bins = [b for b in np.split(order, np.union1d(cuts, half)) if b.size >= LEAST_SAMPLES // _BINS]
     middle = np.array([level[b].mean() for b in bins])
     lowest = [np.sort(square[b])[: int(trim * len(b))] for b in bins]
     variance = np.array([least.mean() for least in lowest]) / (_TRIMMED_CHI_SQUARE if trim < 1 else 1)
     variance = np.maximum(variance, floor)
-    # the standard error of a sample variance is proportional to it
-    design = np.stack([np.ones(_BINS), np.maximum(middle, 0)], axis=1) / variance[:, None]
-    (read, shot), _ = nnls(design, np.ones(_BINS))
+    # the standard error of the variance of n samples is proportional to it, and to 1 / sqrt(n)
+    weight = np.sqrt([b.size for b in bins])
+    design = np.stack([np.ones(len(bins)), np.maximum(middle, 0)], axis=1) * (weight / variance)[:, None]
+    (read, shot), _ = nnls(design, weight)
     return Noise(max(float(read), floor), float(shot))
 
 

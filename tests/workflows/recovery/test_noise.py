@@ -16,6 +16,15 @@ def test_line_fits_the_samples(trim):
     assert found.shot == pytest.approx(noise.shot, rel=0.05)
 
 
+@pytest.mark.parametrize("dark", [500, 1500, 2500, 20_000])
+def test_line_fits_however_few_of_the_values_are_dark(dark):
+    rng = np.random.default_rng(0)
+    level = np.concatenate([rng.uniform(0.005, 0.015, dark), rng.uniform(0.8, 0.95, 30_000)])
+    noise = Noise(6e-6, 6e-5)
+    found = fit_noise(level, noise.variance(level) * rng.standard_normal(level.size) ** 2, 1e-12)
+    assert found.read == pytest.approx(noise.read, rel=0.15)
+
+
 def test_variance_is_at_least_the_floor():
     found = fit_noise(np.linspace(0, 1, 1000), np.zeros(1000), 1e-6)
     assert found.read == pytest.approx(1e-6)
