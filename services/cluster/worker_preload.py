@@ -22,7 +22,7 @@ from services.cluster.dask_config import use_steady_clock
 from services.cluster.task import read_key
 from services.runtime import tracing
 from services.runtime.logs import about, configure_worker_logging
-from services.runtime.malloc import limit_arenas
+from services.runtime.malloc import keep_memory, limit_arenas
 from workflows.untrusted import confinement
 
 logger = logging.getLogger(__name__)
@@ -40,6 +40,7 @@ def dask_setup(worker: Worker) -> None:
     use_steady_clock()  # before the worker's callbacks start
     os.nice(NICE)  # of this thread and the ones it starts
     limit_arenas()
+    keep_memory()
     configure_worker_logging()
     # dask logs what a task raised, and `services.cluster.task` has done so.
     logging.getLogger("distributed.worker").addFilter(lambda record: "Compute Failed" not in str(record.msg))

@@ -5,8 +5,11 @@ from contextlib import suppress
 
 ARENAS = 2
 """Pools of memory that the threads of a process share."""
-M_ARENA_MAX = -8
-"""Option of mallopt(3)."""
+KEPT_BYTES = 32 << 20
+"""Arrays up to this size are allocated from memory that the process keeps, of which as much again may lie idle. It is
+the most that glibc comes to by itself."""
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
+"""Options of mallopt(3)."""
 
 
 def limit_arenas() -> None:
@@ -17,3 +20,15 @@ def limit_arenas() -> None:
     """
     with suppress(AttributeError):  # another C library
         ctypes.CDLL(None).mallopt(M_ARENA_MAX, ARENAS)
+
+
+def keep_memory() -> None:
+    """Have glibc keep what tiles allocate and free over and over.
+
+    dask has worker processes return all that is free (`MALLOC_TRIM_THRESHOLD_`), and to set this also ends glibc's own
+    adaptation. Then a fifth of a recovery is spent in the kernel, which clears the same pages again and again.
+    """
+    with suppress(AttributeError):
+        library = ctypes.CDLL(None)
+        library.mallopt(M_MMAP_THRESHOLD, KEPT_BYTES)
+        library.mallopt(M_TRIM_THRESHOLD, 2 * KEPT_BYTES)

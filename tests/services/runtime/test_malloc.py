@@ -1,5 +1,6 @@
-"""Pools of memory that threads of a process share."""
+"""Pools of memory that threads of a process share, and memory that is used again."""
 
+import os
 import subprocess
 import sys
 
@@ -31,7 +32,30 @@ report = os.fdopen(read).read()
 assert len(re.findall("<heap nr", report)) <= ARENAS, report
 """
 
+KEPT = """
+from resource import RUSAGE_SELF, getrusage
+from services.runtime.malloc import keep_memory
+
+def faults() -> int:
+    before = getrusage(RUSAGE_SELF).ru_minflt
+    for _ in range(20):
+        bytes([1]) * (8 << 20)
+    return getrusage(RUSAGE_SELF).ru_minflt - before
+
+returned = faults()
+keep_memory()
+faults()
+kept = faults()
+assert 10 * kept < returned, (kept, returned)
+"""
+
 
 @pytest.mark.skipif(sys.platform != "linux", reason="glibc only")
 def test_threads_share_a_few_pools_of_memory() -> None:
     subprocess.run([sys.executable, "-c", ARENAS], check=True, timeout=120)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="glibc only")
+def test_memory_that_was_freed_is_used_again() -> None:
+    as_dask_sets_it = os.environ | {"MALLOC_TRIM_THRESHOLD_": "65536"}
+    subprocess.run([sys.executable, "-c", KEPT], check=True, timeout=120, env=as_dask_sets_it)
