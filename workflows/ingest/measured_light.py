@@ -169,7 +169,7 @@ def merge(
     """
     exposures = exposures_of(attributes)
     gains = attributes.get("gains")
-    shape = (pixels, count, 3)
+    shape = (count, pixels, 3)  # a frame's values lie together while they are added
     light, worth = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     every, times = np.zeros(shape, np.float32), np.zeros(count, np.float32)
     gain, mean_gain = np.zeros(shape if gains else (0, 0, 0), np.float32), np.zeros(count, np.float32)
@@ -184,22 +184,26 @@ def merge(
             total += values
             whole &= unclipped
         time = np.float32(len(frames) * exposure)
-        light[:, pattern] += np.where(whole, total, 0)
-        worth[:, pattern] += np.where(whole, time, 0)
-        every[:, pattern] += total
+        light[pattern] += np.where(whole, total, 0)
+        worth[pattern] += np.where(whole, time, 0)
+        every[pattern] += total
         times[pattern] += time
         if gains:
             lit = np.float32(sum(gains[frame] for frame in frames) * exposure)
-            gain[:, pattern] += np.where(whole, lit, 0)
+            gain[pattern] += np.where(whole, lit, 0)
             mean_gain[pattern] += lit
     usable = worth > 0
-    np.copyto(worth, np.maximum(times, 1)[:, np.newaxis], where=~usable)
+    np.copyto(worth, np.maximum(times, 1)[:, np.newaxis, np.newaxis], where=~usable)
     np.copyto(light, every, where=~usable)
     light /= worth
     if gains:
-        np.copyto(gain, np.where(times > 0, mean_gain, 1)[:, np.newaxis], where=~usable)
+        np.copyto(gain, np.where(times > 0, mean_gain, 1)[:, np.newaxis, np.newaxis], where=~usable)
         gain /= worth
-    return Light(light, usable, worth), gain if gains else None
+
+    def by_pixel(values: NDArray[Any]) -> NDArray[Any]:
+        return np.ascontiguousarray(values.transpose(1, 0, 2))
+
+    return Light(by_pixel(light), by_pixel(usable), by_pixel(worth)), by_pixel(gain) if gains else None
 
 
 def conditions_of(stack: Stack, program: Program) -> Conditions:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from storage.layout.captures import Stack
-from storage.layout.mattes import Block, Matte
+from storage.layout.mattes import Block, Matte, empty_block
 from storage.objects.store import Objects
 from workflows.images.tone_curves import Curve, to_light
 from workflows.ingest.local_gain import Surroundings, local_gain
@@ -97,9 +97,13 @@ def recover_tile(objects: Objects, capture: str, matte: str, options: RecoveryOp
     """
     target, stack = Matte(objects, matte), Stack(objects, capture)
     rows, columns = cut(target, options.tile or target.block)[index]
-    pixels = 0
+    mask, pixels = mask_of(objects, capture), 0
     for row, column in product(rows, columns):
-        block = recover_block(objects, stack, capture, target.span(row, column), options)
+        span = target.span(row, column)
+        wanted = mask[span]
+        # Of most of a frame the mask leaves everything out: values need not be read.
+        found = recover_block(objects, stack, capture, span, options) if wanted.any() else None
+        block = found or empty_block(*wanted.shape)
         target.write(row, column, block)
         pixels += int(block.recovered.sum())
     return pixels
@@ -201,6 +205,12 @@ def patterns_of(objects: Objects, capture: str) -> Patterns:
     patterns = lay_out(program, monitor, _images_of(objects, capture))
     glare = Stack(objects, capture).attributes.get("glare")
     return filter_patterns(patterns, spread_patterns(patterns), glare) if glare else patterns
+
+
+@lru_cache(maxsize=1)
+def mask_of(objects: Objects, capture: str) -> NDArray[np.bool_]:
+    """Which pixels of a capture are to be recovered."""
+    return Stack(objects, capture).mask()
 
 
 @lru_cache(maxsize=1)

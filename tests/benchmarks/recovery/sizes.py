@@ -6,9 +6,9 @@
 Captures of 140 frames are traced, filmed and kept in FOLDER: that of 1920 x 1080 takes minutes and 410 MB. For each
 size it prints the pixels of glass; the seconds of the ingest; the seconds until a composite first shows the whole
 frame, and until all is recovered, from the request on; the seconds of work for 1,000 pixels; the milliseconds of the
-first composite of a service that was just started; megabytes that composites take; megabytes for the live glass; and
-milliseconds and rates of composites by number of clients. At last, the exponent with which the recovery's time grows
-with the pixels. The plot needs `.[bench]`.
+first composite of a service that was just started; the megabytes by which it grew; megabytes that are sent for the live
+glass; and milliseconds and rates of composites by number of clients. At last, the exponent with which the recovery's
+time grows with the pixels. The plot needs `.[bench]`.
 """
 
 import argparse
@@ -95,9 +95,10 @@ def measure(archive: Path, quality: str, workers: int) -> dict[str, Any]:
             start = time.perf_counter()
             client.composite(ended["matte"], backdrops(1)[0], kind="image/jpeg")
             first = time.perf_counter() - start
-            asked = over_http(url, ended["matte"], SECONDS)
             held = process.memory_info().rss - before
-            live = httpx2.get(f"{url}/v1/mattes/{ended['matte']}/live", timeout=120).content
+            asked = over_http(url, ended["matte"], SECONDS)
+            with httpx2.stream("GET", f"{url}/v1/mattes/{ended['matte']}/live", timeout=120) as answer:
+                live = sum(map(len, answer.iter_raw()))
     return {
         "pixels": ended["pixels"],
         "ingest_s": round(ingested.answer["run_seconds"], 1),
@@ -106,7 +107,7 @@ def measure(archive: Path, quality: str, workers: int) -> dict[str, Any]:
         "s_per_1000": round(seconds / ended["pixels"] * 1000, 3),
         "first_ms": round(1e3 * first),
         "memory_MB": round(held / 1e6),
-        "live_MB": round(len(live) / 1e6, 2),
+        "live_MB": round(live / 1e6, 2),
         **{f"p50_{row['clients']}": row["p50 ms"] for row in asked},
         **{f"rate_{row['clients']}": row["a second"] for row in asked},
     }
