@@ -22,7 +22,7 @@ from workflows.composite import composite
 from workflows.images.integer_formats import decode, encode_png
 from workflows.jobs import Task, run
 from workflows.mattes.steps import STEPS
-from workflows.mattes.tiles import cut, cut_inside
+from workflows.mattes.tiles import cut, cut_inside, mask_of
 from workflows.programs.border import border_light
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import Scene, write_capture
@@ -99,6 +99,7 @@ def recover(objects: Objects, ingest: Ingest) -> Callable[..., tuple[mattes.Matt
         method: str = "lobes",
     ) -> tuple[mattes.Matte, int]:
         ingest("c", data, memory=memory)
+        mask_of.cache_clear()  # "c" may have had another
         objects.delete(mattes.path("m"))
         options = {"method": method, "tile": tile}
         task = Task("j", "c", "m", options, Limits(1 << 30, memory))
