@@ -195,22 +195,22 @@ def _homography(
 
 @njit(nogil=True, cache=True)
 def arrived_along(
-    count: NDArray[np.uint32],
+    rows_of_strip: tuple[NDArray[np.uint32], NDArray[np.uint32], NDArray[np.uint16], NDArray[np.uint16]],
     shared: NDArray[np.bool_],
-    cell: NDArray[np.uint32],
-    weight: NDArray[np.float32],
     light: NDArray[np.float32],
     grids: Grids,
     shift: NDArray[np.float32],
     scale: float,
     arrived: NDArray[np.float32],
 ) -> None:
-    """Compute T L of a strip for a backdrop at another depth.
+    """Compute T L of a strip for a backdrop at another depth, in units of its rows.
 
     Parameters
     ----------
-    count, shared, cell, weight
-        Arrays of the strip.
+    rows_of_strip : tuple
+        Its `count`, `first`, `step` and `code`.
+    shared : (h, w) bool
+        The strip's.
     light : (nodes + 1, 3) float32
         Light of the backdrop as if it stood where the monitor did.
     grids : Grids
@@ -228,14 +228,20 @@ def arrived_along(
     the nodes of each.
     """
     columns, rows, starts = grids
-    entry, levels = 0, len(columns)
+    count, first, step, code = rows_of_strip
+    entry, number, levels = 0, 0, len(columns)
     seen, coarser = np.empty(3, np.float32), np.log2(scale)
     for y in range(shared.shape[0]):
         for x in range(shared.shape[1]):
             arrived[y, x] = 0
             for channel in range(3):
+                cell = 0
+                if count[y, x, channel] > 0:
+                    cell = int(first[number])
+                    number += 1
                 for _ in range(count[y, x, channel]):
-                    node, level = np.int64(cell[entry]), 0
+                    cell += int(step[entry])
+                    node, level = cell, 0
                     while node >= starts[level + 1]:
                         level += 1
                     row, column = divmod(node - starts[level], columns[level])
@@ -249,7 +255,7 @@ def arrived_along(
                         _look_up(light, grids, lower, u, v, 1 - share, seen)
                         if share > 0:
                             _look_up(light, grids, lower + 1, u, v, share, seen)
-                    w = weight[entry]
+                    w = np.float32(code[entry])
                     if shared[y, x]:
                         for c in range(3):
                             arrived[y, x, c] += w * seen[c]

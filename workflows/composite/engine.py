@@ -135,8 +135,9 @@ def compose(
             strip.recovered,
             strip.shared,
             strip.count,
-            strip.cell,
-            strip.weight,
+            strip.first,
+            strip.step,
+            strip.code,
             light,
             crosstalk,
             top,
@@ -158,7 +159,8 @@ def _seen_along(
 ) -> NDArray[np.float32]:
     """Composite a strip over a backdrop at another depth."""
     arrived = np.empty_like(strip.S)
-    arrived_along(strip.count, strip.shared, strip.cell, strip.weight, light, grids, shift, scale, arrived)
+    rows = strip.count, strip.first, strip.step, strip.code
+    arrived_along(rows, strip.shared, light, grids, shift, scale, arrived)
     alpha = strip.recovered[..., np.newaxis]
     return np.concatenate([alpha * (strip.S + (strip.rho * arrived) @ crosstalk.T), alpha], axis=2)
 
@@ -170,8 +172,9 @@ def _compose(
     recovered: NDArray[np.bool_],
     shared: NDArray[np.bool_],
     count: NDArray[np.uint32],
-    cell: NDArray[np.uint32],
-    weight: NDArray[np.float32],
+    first: NDArray[np.uint32],
+    step: NDArray[np.uint16],
+    code: NDArray[np.uint16],
     light: NDArray[np.float32],
     crosstalk: NDArray[np.float32],
     top: int,
@@ -180,18 +183,24 @@ def _compose(
 ) -> None:
     """Composite the part of a strip that lies in the picture; its first pixel is at (top, left)."""
     height, width, _ = picture.shape
-    entry = np.intp(0)
+    row, entry, none = np.intp(0), np.intp(0), np.float32(0)
     for y in range(recovered.shape[0]):
         for x in range(recovered.shape[1]):
+            red = green = blue = none
             end = entry + np.intp(count[y, x, 0])
-            red, green, blue = gather(light, cell, weight, entry, end)
-            entry = end
+            if end > entry:
+                red, green, blue = gather(light, step, code, np.intp(first[row]), entry, end)
+                row, entry = row + 1, end
             if not shared[y, x]:
+                green = blue = none
                 end = entry + np.intp(count[y, x, 1])
-                _, green, _ = gather(light, cell, weight, entry, end)
-                entry, end = end, end + np.intp(count[y, x, 2])
-                _, _, blue = gather(light, cell, weight, entry, end)
-                entry = end
+                if end > entry:
+                    _, green, _ = gather(light, step, code, np.intp(first[row]), entry, end)
+                    row, entry = row + 1, end
+                end = entry + np.intp(count[y, x, 2])
+                if end > entry:
+                    _, _, blue = gather(light, step, code, np.intp(first[row]), entry, end)
+                    row, entry = row + 1, end
             v, u = top + y, left + x
             if recovered[y, x] and 0 <= v < height and 0 <= u < width:
                 red *= rho[y, x, 0]

@@ -104,24 +104,27 @@ def kernel(objects: Objects, id: str) -> dict[str, Any]:
     backdrop = Backdrop(codes, table("srgb", np.dtype(np.uint8)))
     light = node_light(backdrop, matte.columns, matte.rows, CORES)
     # Rows that are equal in all channels are one row for scipy too.
-    count = np.concatenate([strip.count.reshape(-1) for strip in strips]).astype(np.int64)
-    cell = np.concatenate([strip.cell for strip in strips])
-    weight = np.concatenate([strip.weight for strip in strips])
+    blocks = [matte.read(row, column) for row, column in np.ndindex(matte.block_rows, matte.block_columns)]
+    count = np.concatenate([block.count.reshape(-1) for block in blocks]).astype(np.int64)
+    cell, weight = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("cell", "weight"))
     rows = sp.csr_array(
         (weight, cell.astype(np.int32), np.append(0, np.cumsum(count))), (len(count), len(light))
     )
+    packed = [
+        np.concatenate([getattr(strip, name) for strip in strips]) for name in ("first", "step", "code")
+    ]
     window = Window.of(matte)
 
     def run(threads: int) -> float:
         return best(lambda: compose(matte, light, window, partial(cache.strip, id), threads))
 
     one, all_cores = run(1), run(CORES)
-    taken = cell.nbytes + weight.nbytes
+    taken = sum(array.nbytes for array in packed)
     return {
         "pixels": matte.width * matte.height,
         "entries a pixel": round(len(cell) / (matte.width * matte.height), 1),
         "bytes in memory": cache.bytes,
-        "copy of T, ms": round(best(lambda: (cell.copy(), weight.copy())), 2),
+        "copy of T, ms": round(best(lambda: [array.copy() for array in packed]), 2),
         "scipy's product, ms": round(scipy_ms := best(lambda: rows @ light), 2),
         "one thread, ms": round(one, 2),
         f"{CORES} threads, ms": round(all_cores, 2),

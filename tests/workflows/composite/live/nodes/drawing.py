@@ -44,7 +44,7 @@ def few_nodes(objects: Objects, most: int) -> Matte:
         S, rho = (rng.random((2, *shape, 3), np.float32) * recovered[..., np.newaxis]).astype(np.float32)
         count = np.zeros((*shape, 3), np.uint32)
         count[..., 0] = rng.integers(1, most + 1, shape) * recovered
-        cells = [rng.choice(nodes, n, replace=False) for n in count[..., 0].flat]
+        cells = [np.sort(rng.choice(nodes, n, replace=False)) for n in count[..., 0].flat]
         weights = [(w := rng.random(n) + 0.1) / w.sum() for n in count[..., 0].flat]
         cell, weight = np.concatenate(cells).astype(np.uint32), np.concatenate(weights).astype(np.float32)
         made.write(*at, Block(S, rho, np.zeros(shape, np.float32), recovered, recovered, count, cell, weight))
