@@ -70,16 +70,30 @@ class Sample(NamedTuple):
         With `_MARGIN` on each side.
     chosen : three (n,) intp
         Square, row and column of each pixel, counted without the margins.
-    places : two (n,) intp
-        Row and column of each pixel in the frame.
+    every : three (k,) intp
+        All pixels of the squares that are to be recovered, likewise.
+    corners : (squares, 2) intp
+        Row and column in the frame of the first pixel of each square.
     """
 
     codes: Codes
     chosen: tuple[NDArray[np.intp], ...]
-    places: tuple[NDArray[np.intp], NDArray[np.intp]]
+    every: tuple[NDArray[np.intp], ...]
+    corners: NDArray[np.intp]
+
+    @property
+    def places(self) -> NDArray[np.intp]:
+        """Row and column of each pixel in the frame, (2, n)."""
+        return self.corners[self.chosen[0]].T + self.chosen[1:]
+
+    def some_squares(self) -> "Sample":
+        """All pixels of some of the squares, about as many as were chosen."""
+        step = -(-len(self.every[0]) // len(self.chosen[0]))
+        whole = self.every[0] % step == 0
+        return self._replace(chosen=tuple(axis[whole] for axis in self.every))
 
 
-class _Seen(NamedTuple):
+class Seen(NamedTuple):
     """The sample in frames that were shifted back; all arrays are (frames, n, channels)."""
 
     values: Floats
@@ -120,14 +134,13 @@ def take_sample(stack: Stack) -> Sample | None:
     wide = EDGE + _MARGIN
     squares = [stack.read(slice(y - _MARGIN, y + wide), slice(x - _MARGIN, x + wide)) for y, x in corners]
     inside = np.stack([wanted[y : y + EDGE, x : x + EDGE] for y, x in corners])
-    chosen = np.stack(np.nonzero(inside))
+    every = np.nonzero(inside)
     limit = max(min(PIXELS, VALUES // stack.frames), MIN_PIXELS)
-    chosen = chosen[:, :: -(-chosen.shape[1] // limit)]
-    y, x = np.array(corners, np.intp)[chosen[0]].T + chosen[1:]
-    return Sample(np.stack(squares, axis=1), tuple(chosen), (y, x))
+    chosen = tuple(axis[:: -(-len(axis) // limit)] for axis in every)
+    return Sample(np.stack(squares, axis=1), chosen, every, np.array(corners, np.intp))
 
 
-def _see(stack: Stack, sample: Sample, shifts: Doubles) -> _Seen:
+def see_sample(stack: Stack, sample: Sample, shifts: Doubles) -> Seen:
     """The sample in frames that are shifted back."""
     look_up = look_up_of(stack)
     square, y, x = sample.chosen
@@ -149,7 +162,7 @@ def _see(stack: Stack, sample: Sample, shifts: Doubles) -> _Seen:
         local = gain.at(*sample.places)[..., np.newaxis]
         for part in (values, across, down):
             part /= local
-    return _Seen(values, whole, (across, down))
+    return Seen(values, whole, (across, down))
 
 
 class RecoveredSample(NamedTuple):
@@ -166,7 +179,7 @@ class RecoveredSample(NamedTuple):
         As in :class:`~workflows.recovery.normalise.Conditions`.
     alive : (n, 3) bool
         Where there is enough contrast.
-    seen : _Seen
+    seen : Seen
     """
 
     light: Light
@@ -174,23 +187,39 @@ class RecoveredSample(NamedTuple):
     transport: Transport
     strays: Floats
     alive: NDArray[np.bool_]
-    seen: _Seen
+    seen: Seen
 
 
 def recover_sample(
+    stack: Stack, program: Program, monitor: Curve, patterns: Patterns, sample: Sample, state: Doubles
+) -> RecoveredSample | None:
+    """Recover the sample from frames corrected by ``state``, (frames, 3); None if it has too little contrast."""
+    seen = see_sample(stack, sample, state[:, :2])
+    return recover_seen(stack, program, monitor, patterns, seen, state[:, 2])
+
+
+def recover_seen(
     stack: Stack,
     program: Program,
     monitor: Curve,
     patterns: Patterns,
-    sample: Sample,
-    state: Doubles,
+    seen: Seen,
+    gains: Doubles,
     options: LobesOptions = FINE,
+    places: NDArray[np.intp] | None = None,
 ) -> RecoveredSample | None:
-    """Recover the sample from frames corrected by ``state``, (frames, 3); None if it has too little contrast."""
-    seen, gains = _see(stack, sample, state[:, :2]), np.exp(state[:, 2])
-    attributes = stack.attributes | {"gains": gains.tolist() if state[:, 2].any() else None}
+    """Recover what is seen of a sample; None if it has too little contrast.
+
+    Parameters
+    ----------
+    gains : (frames,) float64
+        Logarithms of the gains of the frames.
+    places : (n, 2) int, optional
+        Rows and columns of the pixels, to start from neighbours as in a matte. Default: each pixel is fitted alone.
+    """
+    attributes = stack.attributes | {"gains": np.exp(gains).tolist() if gains.any() else None}
     noise = Noise(**attributes["noise"])
-    found = light_of(lambda n: (seen.values[n], seen.whole[n]), attributes, program, len(sample.chosen[0]))
+    found = light_of(lambda n: (seen.values[n], seen.whole[n]), attributes, program, seen.values.shape[1])
     light, usable, worth = found
     numbers, sent = constants_of(attributes, program)
     levels = to_light(sent, monitor)
@@ -208,6 +237,7 @@ def recover_sample(
         worth[:, shown],
         options,
         conditions,
+        places,
     )
     assert conditions.strays is not None
     return RecoveredSample(found, photometry, transport, conditions.strays, alive, seen)
