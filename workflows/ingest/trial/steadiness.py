@@ -62,6 +62,12 @@ QUARTERS = 4
 def find_steadiness(stack: Stack, sample: Sample | None) -> Patterns | None:
     """Find the shift and the gain of each frame, and annotate the stack with them.
 
+    ``steadiness`` says what was found. It is None if there are too few pixels to measure, and empty if the patterns
+    don't explain what the frames show. Its ``drift`` and ``flicker`` are None if they are too large to be either.
+    ``shifts`` (frames, 2), x and y in pixels, and ``gains`` (frames) are None unless they are to be corrected, which
+    `workflows.ingest.measured_light` does. Shifts are relative to the mean position of the patterns, gains to their
+    median, or to a white frame if the exposure was free.
+
     Parameters
     ----------
     stack : Stack
@@ -73,12 +79,6 @@ def find_steadiness(stack: Stack, sample: Sample | None) -> Patterns | None:
     -------
     Patterns or None
         The program's, with the glare that was found; None if there are too few pixels, or too little contrast.
-
-    ``steadiness`` says what was found. It is None if there are too few pixels to measure, and empty if the patterns
-    don't explain what the frames show. Its ``drift`` and ``flicker`` are None if they are too large to be either.
-    ``shifts`` (frames, 2), x and y in pixels, and ``gains`` (frames) are None unless they are to be corrected, which
-    `workflows.ingest.measured_light` does. Shifts are relative to the mean position of the patterns, gains to their
-    median, or to a white frame if the exposure was free.
 
     Notes
     -----
