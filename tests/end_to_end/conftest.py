@@ -70,6 +70,11 @@ class Service:
         """The ids that files of the store belong to, which do not change while an earlier capture is ingested."""
         return {name.split("/")[1] for name in self.stored()}
 
+    def used(self) -> dict[str, int]:
+        """How much of each limit is used, of those that count."""
+        limits = self.http.get("/v1/limits").json()["limits"]
+        return {one["name"]: one["used"] for one in limits if one["used"] is not None}
+
 
 def log_of(data: Path) -> Path:
     """The file with the log of the services that have served a folder."""

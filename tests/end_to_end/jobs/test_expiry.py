@@ -23,11 +23,6 @@ def disk(service: Service) -> int:
     return used
 
 
-def used(service: Service) -> dict[str, int]:
-    limits = service.http.get("/v1/limits").json()["limits"]
-    return {one["name"]: one["used"] for one in limits if one["used"] is not None}
-
-
 @pytest.mark.slow
 def test_expired_data_is_deleted_unless_a_job_needs_it(capture_archive: Path, tmp_path: Path) -> None:
     """Both expire long before the recovery begins, and it still succeeds."""
@@ -48,10 +43,10 @@ def test_expired_data_is_deleted_unless_a_job_needs_it(capture_archive: Path, tm
             check_problem(service.http.get(url), 404, "not-found")
         until(lambda: disk(service) <= before)
         assert service.client.job(job["id"])["state"] == "succeeded"  # its record stays, and counts
-        assert 2 * ROW <= used(service)["owner_bytes"] < 5 * ROW
+        assert 2 * ROW <= service.used()["owner_bytes"] < 5 * ROW
         for one in (job["id"], capture["job"]):
             assert service.http.delete(f"/v1/jobs/{one}").status_code == 204
-        assert used(service) == {"owner_captures": 0, "owner_jobs": 0, "owner_bytes": 0, "store_bytes": 0}
+        assert service.used() == {"owner_captures": 0, "owner_jobs": 0, "owner_bytes": 0, "store_bytes": 0}
 
 
 @pytest.mark.exhaustive
@@ -63,7 +58,7 @@ def test_deleted_data_leaves_the_disk(capture_archive: Path, tmp_path: Path) -> 
         matte = service.client.wait(service.client.recover(capture["id"])["id"])["matte"]
         deadline = time.monotonic() + 60
         while True:  # until everything is counted, which happens after the job's end
-            stored = used(service)["owner_bytes"]
+            stored = service.used()["owner_bytes"]
             # The rest are rows, and the zarr.json of folders.
             if disk(service) - before - stored in range(-8 * ROW, 2000):
                 break
@@ -72,4 +67,4 @@ def test_deleted_data_leaves_the_disk(capture_archive: Path, tmp_path: Path) -> 
         for url in (f"/v1/mattes/{matte}", f"/v1/captures/{capture['id']}"):
             assert service.http.delete(url).status_code == 204
         assert disk(service) - before in range(2000)
-        assert used(service)["owner_bytes"] < 5 * ROW  # of the jobs
+        assert service.used()["owner_bytes"] < 5 * ROW  # of the jobs
