@@ -1,7 +1,7 @@
 """How the exposure of a film changed from pattern to pattern, by the border, whose light is known."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +19,13 @@ ROWS = 512
 ROUNDS = 8
 """Rounds of fitting the light of the border and the exposures, one given the other: without veils, then with them."""
 FOLLOWS = (0.5, 0.7)
-"""A value sees the border if the bits explain this share of its variance: in the first rounds, and then."""
+"""A value sees the border if the bits explain this share of its variance: of codes and in the first rounds, then."""
 VARIES = 0.01
 """It must vary by this share of what the 99th percentile of all values varies by."""
 MIN_VALUES = 40
 """Values that see the border, at least."""
+MOST_VALUES = 2048
+"""At most so many values are looked at, of those that may see the border."""
 SHOULDER = 0.93
 """Codes from here on are left out: cameras compress what is nearly white."""
 LEAST = 0.01
@@ -32,6 +34,7 @@ TRIFLE = 0.003
 """A standard deviation of the exposures below this is none."""
 
 Doubles = NDArray[np.float64]
+Scalar = TypeVar("Scalar", np.float32, np.float64)
 
 
 class BorderLight(NamedTuple):
@@ -71,18 +74,22 @@ class BorderValues:
 
     def __init__(self, stack: Stack, program: Program) -> None:
         left = [int((n + 0.5) * stack.width / STRIPS) for n in range(STRIPS)]
-        rows = slice(None, None, -(-stack.height // ROWS))
-        strips = [stack.read(columns=slice(x, x + WIDE))[:, rows] for x in left]
-        codes = np.concatenate([strip.reshape(stack.frames, -1, stack.channels) for strip in strips], axis=1)
-        top = np.iinfo(codes.dtype).max
-        self.codes = codes
-        places = [np.mgrid[: stack.height : rows.step, x : x + WIDE].reshape(2, -1) for x in left]
-        self.places = np.concatenate(places, axis=1)
-        gain = local_gain(stack)
-        self.local: NDArray[np.floating] = np.ones((1, 1)) if gain is None else gain.at(*self.places)
-        self.usable = np.asarray(((codes > 0) & (codes < SHOULDER * top)).all(axis=2))
         bits = border_light(range(program.count))[:, stack.attributes["patterns"]]
         self.design = np.concatenate([np.ones((1, stack.frames)), bits]).T
+        rows = np.arange(0, stack.height, -(-stack.height // ROWS))
+        columns = np.add.outer(left, np.arange(WIDE)).ravel()
+        codes = stack.read_some(rows, columns).reshape(stack.frames, -1, stack.channels)
+        grey = codes.mean(axis=2, dtype=np.float32)
+        design = self.design.astype(np.float32)
+        _, _, unexplained = _spread(grey, design @ (np.linalg.pinv(design) @ grey), design.shape[1])
+        kept = np.flatnonzero(unexplained < 1 - FOLLOWS[0])
+        kept = kept[:: max(-(-kept.size // MOST_VALUES), 1)]
+        self.codes = codes[:, kept]
+        self.places = np.stack(np.meshgrid(rows, columns, indexing="ij")).reshape(2, -1)[:, kept]
+        gain = local_gain(stack)
+        self.local: NDArray[np.floating] = np.ones((1, 1)) if gain is None else gain.at(*self.places)
+        top = np.iinfo(stack.dtype).max
+        self.usable = np.asarray(((self.codes > 0) & (self.codes < SHOULDER * top)).all(axis=2))
 
     def exposures(self, look_up: NDArray[np.float32]) -> Doubles | None:
         """The exposure of each frame, as of `fit`."""
@@ -105,6 +112,8 @@ class BorderValues:
         line in each frame, to the light that they predict. Without d, a frame with a bright pattern would seem to be
         exposed longer. Values that are clipped, or nearly, are filled in by what is predicted.
         """
+        if self.codes.shape[1] < MIN_VALUES:
+            return None
         light = light_of_codes(self.codes, look_up).mean(axis=2, dtype=np.float64) / self.local
         frames, terms = self.design.shape
         inverse = np.linalg.pinv(self.design)
@@ -113,8 +122,7 @@ class BorderValues:
         for turn in range(2 * ROUNDS):
             even = np.where(self.usable, light / exposure - veil, predicted)
             predicted = self.design @ (inverse @ even)
-            whole, rest = np.var(even, axis=0), np.var(even - predicted, axis=0)
-            unexplained = rest / np.maximum(whole, 1e-12) * (frames - 1) / (frames - terms)
+            whole, rest, unexplained = _spread(even, predicted, terms)
             varies = whole > VARIES * np.quantile(whole, 0.99)
             follows = unexplained < 1 - (FOLLOWS[0] if turn <= ROUNDS // 3 else FOLLOWS[1])
             border = np.flatnonzero(follows & varies & (predicted.min(axis=0) > -LEAST))
@@ -132,6 +140,18 @@ class BorderValues:
         own = self.design @ (inverse @ even)
         rest = np.where(usable, even - own, 0)
         return BorderLight(exposure[:, 0], own, rest, usable, self.design, self.places[:, border])
+
+
+def _spread(
+    values: NDArray[Scalar], predicted: NDArray[Scalar], terms: int
+) -> tuple[NDArray[Scalar], NDArray[Scalar], NDArray[Scalar]]:
+    """Of values in all frames: their variance, that of what a sum of so many terms leaves, and its share of the former.
+
+    Each is (n,). The share is unbiased: about 1 for values that have nothing to do with the terms.
+    """
+    frames = len(values)
+    whole, rest = np.var(values, axis=0), np.var(values - predicted, axis=0)
+    return whole, rest, rest / np.maximum(whole, 1e-12) * (frames - 1) / (frames - terms)
 
 
 def _lines(predicted: Doubles, light: Doubles, weight: Doubles, veiled: bool) -> tuple[Doubles, Doubles]:

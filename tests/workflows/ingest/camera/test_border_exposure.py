@@ -32,11 +32,14 @@ class Film:
         missing: int = 0,
         veil: NDArray[np.floating] | float = 0.0,
         between: bool = False,
+        clipped: bool = False,
     ) -> None:
         random = np.random.default_rng(2)
         self.frames = PROGRAM.count - missing
         self.attributes: dict[str, Any] = {"patterns": list(range(missing, PROGRAM.count))}
         light = np.repeat(random.uniform(0, 0.6, (self.frames, 60, 80, 1)), 3, axis=3)
+        if clipped:  # what is dark is no light at all to the camera
+            light = np.where(light > 0.3, 0.6, -0.1)
         if border:
             lit = border_light(range(PROGRAM.count))[:, missing:] > 0
             of_column = lit[np.arange(80) // 4 % len(lit)]  # a cell is four pixels wide
@@ -46,10 +49,11 @@ class Film:
         light += np.broadcast_to(veil, PROGRAM.count)[missing:, np.newaxis, np.newaxis, np.newaxis]
         light *= np.asarray(exposures)[: self.frames, np.newaxis, np.newaxis, np.newaxis]
         light += 0.002 * random.standard_normal(light.shape)
+        self.dtype = np.dtype(np.uint16)
         self.codes = np.interp(light, LOOK_UP, np.arange(65536)).round().astype(np.uint16)
 
-    def read(self, columns: slice) -> NDArray[np.uint16]:
-        return self.codes[:, :, columns]
+    def read_some(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.uint16]:
+        return self.codes[:, rows][:, :, columns]
 
 
 @pytest.mark.parametrize("missing", [0, 3])
@@ -87,6 +91,13 @@ def test_light_of_the_border_is_told_apart_from_the_veil() -> None:
         0.002 / np.sqrt(3), rel=0.2
     )  # of three channels, without the bits' part
     assert found.own.max() > 0.29
+
+
+def test_picture_that_is_mostly_clipped_is_no_border() -> None:
+    film = Film(np.ones(PROGRAM.count), clipped=True)
+    found = BorderValues(film, PROGRAM).exposures(LOOK_UP)  # type: ignore[arg-type]
+    assert found is not None
+    assert np.log(found).std() < TRIFLE
 
 
 def test_frames_exposed_half_as_long_and_twice_are_followed() -> None:

@@ -54,6 +54,9 @@ class Film:
     def read_frames(self, frames: list[int], rows: slice, columns: slice) -> NDArray[np.uint16]:
         return self.codes[frames, rows, columns]
 
+    def read_some(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.uint16]:
+        return self.codes[:, rows][:, :, columns]
+
     def read_masked(self, rows: slice, columns: slice) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
         mask = np.zeros((self.height, self.width), bool)
         mask[8:52] = True
