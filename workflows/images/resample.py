@@ -77,7 +77,9 @@ def area_mean(image: NDArray[np.float32], columns: int, rows: int) -> NDArray[np
             continue
         if n % cells == 0:  # the usual case, in which summing a cell's pixels is faster
             whole_pixels = (*image.shape[:axis], cells, n // cells, *image.shape[axis + 1 :])
-            image = image.reshape(whole_pixels).mean(axis=axis + 1)
+            # Over few values, `mean` takes ten times as long.
+            sums = np.einsum(("ykxc->yxc", "yxkc->yxc")[axis], image.reshape(whole_pixels))
+            image = sums / np.float32(n // cells)
             continue
         moved = np.moveaxis(image, axis, 0).astype(np.float64)
         whole = np.concatenate([np.zeros((1, *moved.shape[1:])), np.cumsum(moved, axis=0)])

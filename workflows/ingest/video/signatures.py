@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from av.video.frame import VideoFrame
-from av.video.reformatter import Interpolation
+from av.video.reformatter import Interpolation, VideoReformatter
 from numpy.typing import NDArray
 
 from storage.errors import CaptureError
@@ -56,13 +56,17 @@ def take_signatures(
     (columns, rows), (across, down) = (np.minimum(grid, clip.size).tolist() for grid in (CELLS, LARGE_CELLS))
     found, ticks = [], []
     large: dict[int, NDArray[np.uint8]] = {}
+    # One for all frames: setting it up takes as long as a frame.
+    small, middle = VideoReformatter(), VideoReformatter()
     step, due = every / clip.tick, -math.inf
     for number, frame in enumerate(clip.frames()):
-        found.append(_pixels(frame.reformat(columns, rows, "rgb24", interpolation=Interpolation.AREA)))
+        found.append(_pixels(small.reformat(frame, columns, rows, "rgb24", interpolation=Interpolation.AREA)))
         ticks.append(tick_of(frame))
         if step < math.inf and ticks[-1] >= due:
             due = ticks[-1] + step
-            large[number] = _pixels(frame.reformat(across, down, "gray", interpolation=Interpolation.AREA))
+            large[number] = _pixels(
+                middle.reformat(frame, across, down, "gray", interpolation=Interpolation.AREA)
+            )
         if len(found) * found[0].nbytes + len(large) * across * down > max_bytes:
             raise CaptureError(
                 f"{clip.entry} has more than {len(found)} frames, the most that can be matched to patterns: cut off "
