@@ -193,9 +193,14 @@ class Stack:
         """Like `read`, for any frames in any order."""
         return np.asarray(self._frames.oindex[np.array(frames), rows, columns])
 
-    def read_some(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[Any]:
-        """Like `read`, for any rows and columns, where each chunk is read once: (frame, y, x, channel)."""
-        return np.asarray(self._frames.oindex[:, rows, columns])
+    def read_some(
+        self,
+        rows: NDArray[np.intp],
+        columns: NDArray[np.intp],
+        frames: slice | NDArray[np.intp] = slice(None),
+    ) -> NDArray[Any]:
+        """Like `read`, for any rows, columns and frames; each chunk is read once."""
+        return np.asarray(self._frames.oindex[frames, rows, columns])
 
     def read_masked(
         self, rows: slice = slice(None), columns: slice = slice(None)

@@ -81,7 +81,7 @@ def read_light(
     ----------
     stack : Stack
     span : (slice, slice)
-        Rows and columns; they may have a step if frames are not shifted.
+        Rows and columns. If they have a step, frames that drift are shifted by whole pixels only.
     program : Program
     gain : Surroundings or None
         As from `workflows.ingest.local_gain.local_gain`.
@@ -101,8 +101,8 @@ def read_light(
             light = light / gain.at(y, x, frame)[:, np.newaxis]
         return even_out(light, frame, attributes)
 
-    if shifts is None:
-        codes, recovered = stack.read_masked(*span)
+    if shifts is None or any(part.step for part in span):
+        codes, recovered = stack.read_masked(*span) if shifts is None else _nearest(stack, span, shifts)
         codes = codes[:, recovered]
 
         def at_rest(frame: int) -> tuple[Floats, Bools]:
@@ -330,6 +330,23 @@ def _weighed(values: Floats, taps: Floats, axis: int, first: int, length: int) -
     for place, tap in enumerate(taps, start=first + 1 - LOBES):
         total += tap * neighbours(place)
     return total
+
+
+def _nearest(
+    stack: Stack, span: tuple[slice, slice], shifts: Sequence[Sequence[float]]
+) -> tuple[Codes, Bools]:
+    """What is at some rows and columns, each frame shifted back by whole pixels, and their mask."""
+    rows, columns = (
+        np.arange(size)[part] for part, size in zip(span, (stack.height, stack.width), strict=True)
+    )
+    moved = np.rint(shifts).astype(int)
+    codes = np.empty((stack.frames, rows.size, columns.size, stack.channels), stack.dtype)
+    for x, y in np.unique(moved, axis=0).tolist():
+        frames = np.flatnonzero((moved == (x, y)).all(axis=1))
+        codes[frames] = stack.read_some(
+            np.clip(rows + y, 0, stack.height - 1), np.clip(columns + x, 0, stack.width - 1), frames
+        )
+    return codes, stack.mask(*span)
 
 
 def _around(stack: Stack, span: tuple[slice, slice], margin: int) -> Codes:

@@ -19,12 +19,7 @@ LEAST_SPACING = 4
 
 
 def spacing_of(stack: Stack) -> int | None:
-    """Of how many rows and columns of a capture a preview has one; None if it has no preview.
-
-    Frames that drift have none: shifting them back takes whole frames in memory.
-    """
-    if stack.attributes.get("shifts") is not None:
-        return None
+    """Of how many rows and columns of a capture a preview has one; None if it has no preview."""
     spacing = math.ceil(math.sqrt(int(stack.mask().sum()) / PIXELS))
     return spacing if spacing >= LEAST_SPACING else None
 
@@ -32,7 +27,8 @@ def spacing_of(stack: Stack) -> int | None:
 def recover_preview(objects: Objects, capture: str, matte: Matte, name: str, spacing: int) -> None:
     """Recover the preview of a matte, whatever its method by lobes, and store it.
 
-    It uses all cores: nothing else of the job can be done before, and people wait for it.
+    It uses all cores: nothing else of the job can be done before, and people wait for it. Frames that drift are shifted
+    by whole pixels only, for which few values are read.
 
     Parameters
     ----------

@@ -117,7 +117,7 @@ def recover_block(
     Parameters
     ----------
     span : (slice, slice)
-        Rows and columns of the frame; they may have a step if frames are not shifted.
+        Rows and columns of the frame. If they have a step, frames that drift are shifted by whole pixels only.
     """
     program, monitor = program_of(objects, capture)
     attributes = stack.attributes

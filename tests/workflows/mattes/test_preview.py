@@ -14,9 +14,11 @@ from storage.objects.store import Objects
 from storage.steps import FINISH, PREPARE
 from tests.parts.captures import nested_program
 from workflows.composite import composite
+from workflows.ingest.measured_light import read_light
 from workflows.jobs import Task, run
 from workflows.mattes import preview
 from workflows.mattes.steps import STEPS
+from workflows.programs.program import Program
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import write_capture
 from workflows.untrusted.limits import Limits
@@ -74,7 +76,21 @@ def test_matte_does_not_depend_on_its_preview(
     assert recovered() == first
 
 
-def test_frames_that_drift_have_no_preview(stack: Stack) -> None:
-    assert preview.spacing_of(stack) == SPACING
-    stack.annotate(shifts=[[0.0, 0.5]] * stack.frames)
-    assert preview.spacing_of(stack) is None
+def test_frames_that_drift_are_shifted_by_whole_pixels(stack: Stack) -> None:
+    places = [0.0, 0.0], [3.0, -2.0], [-1.0, 1.0]
+    stack.annotate(shifts=[places[frame % 3] for frame in range(stack.frames)])
+    program = Program.model_validate(stack.attributes["program"])
+    whole, _ = read_light(stack, (slice(None), slice(None)), program, None)
+    at = np.s_[1::SPACING, 2::SPACING]
+    some, recovered = read_light(stack, at, program, None)
+    chosen = np.zeros((HEIGHT, WIDTH), bool)
+    chosen[at] = True
+    for expected, found in zip(whole, some, strict=True):
+        np.testing.assert_allclose(found, expected[chosen[stack.mask()]], atol=1e-6)
+    # Less than half a pixel is left as it is.
+    stack.annotate(shifts=[[0.4, -0.4]] * stack.frames)
+    moved, _ = read_light(stack, at, program, None)
+    stack.annotate(shifts=None)
+    at_rest, _ = read_light(stack, at, program, None)
+    np.testing.assert_array_equal(moved.values, at_rest.values)
+    assert recovered.shape == chosen[at].shape
