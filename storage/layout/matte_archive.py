@@ -10,6 +10,7 @@ to list it with; ``members``, the size and SHA-256 of every other entry.
 import hashlib
 import io
 import json
+import re
 import zipfile
 from collections.abc import Iterator
 from itertools import accumulate, product
@@ -25,6 +26,8 @@ FORMAT = "envmatte-archive/1"
 MANIFEST = "envmatte.json"
 GROUPS = ("zarr.json", "T/zarr.json", *(f"{name}/zarr.json" for name in FRAMES))
 """The entries that do not belong to a block."""
+_OF_BLOCK = re.compile(r"\w+/c/(\d{1,9})/(\d{1,9})|T/(\d{1,9})\.(\d{1,9})/")
+"""How the entry of a block begins: with its row and column."""
 DATE = (1980, 1, 1, 0, 0, 0)
 ZIP64 = (1 << 31) - 1
 """zipfile writes offsets above this in the ZIP64 format."""
@@ -40,6 +43,21 @@ def block_entries(row: int, column: int) -> list[str]:
     T = rows_folder(row, column)
     arrays = (f"{T}/{name}/{part}" for name in ("cell", "weight") for part in ("zarr.json", "c/0"))
     return [*(chunk_entry(name, row, column) for name in FRAMES), f"{T}/zarr.json", *arrays]
+
+
+def may_lack(entry: str) -> bool:
+    """Whether a matte may be without an entry of its blocks: a chunk of rows T that are all empty."""
+    return entry.startswith("T/") and entry.endswith("/c/0")
+
+
+def is_entry(matte: Matte, entry: str) -> bool:
+    """Whether an entry is one that the archive of a matte may have, apart from the manifest."""
+    found = _OF_BLOCK.match(entry)
+    if not found:
+        return entry in GROUPS
+    row, column = (int(number) for number in found.groups() if number)
+    is_block = row < matte.block_rows and column < matte.block_columns
+    return is_block and entry in block_entries(row, column)
 
 
 class Archive:
@@ -65,10 +83,10 @@ class Archive:
         blocks = product(range(opened.block_rows), range(opened.block_columns))
         self._batches = [list(GROUPS), *(block_entries(*block) for block in blocks)]
         for batch in self._batches:
-            may_lack = {name for name in batch if name.startswith("T/") and name.endswith("/c/0")}
+            lacking = {name for name in batch if may_lack(name)}
             missing = {name for name in batch if f"{self._path}/{name}" not in sizes}
-            if missing and missing != may_lack:
-                raise self._corrupt(min(missing - may_lack or missing))
+            if missing and missing != lacking:
+                raise self._corrupt(min(missing - lacking or missing))
             batch[:] = (name for name in batch if name not in missing)
         self._sizes = {name: sizes[f"{self._path}/{name}"] for batch in self._batches for name in batch}
         digest = "0" * hashlib.sha256().digest_size * 2

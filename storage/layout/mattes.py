@@ -194,6 +194,16 @@ class Matte:
         cell, weight = self._rows(row, column, entries) if entries else _no_rows()
         return Block(S, rho, error, recovered, shared, count, cell, weight)
 
+    def chunk(self, name: str, row: int, column: int) -> NDArray[Any]:
+        """The values of a block in one of the frame-shaped arrays.
+
+        Raises
+        ------
+        Corrupt
+            If they are missing or damaged.
+        """
+        return self._chunks(row, column, name)[0]
+
     def _chunks(self, row: int, column: int, *names: str) -> list[NDArray[Any]]:
         """The values of a block in frame-shaped arrays."""
         height, width = (span.stop - span.start for span in self.span(row, column))

@@ -41,7 +41,7 @@ def translate_errors() -> Iterator[None]:
     FileNotFoundError
         If the folder of an object is removed while it is written.
     Unavailable
-        If a bucket does not answer.
+        If a bucket, or a service, does not answer.
     """
     try:
         yield
@@ -51,7 +51,7 @@ def translate_errors() -> Iterator[None]:
             raise NoRoom(DISK_FULL) from error
         if f"(os error {errno.ENOENT})" in str(error):
             raise FileNotFoundError(errno.ENOENT, message) from error
-        if message.startswith("Generic S3 error") and UNREACHABLE.search(message):
+        if message.startswith(("Generic S3 error", "Generic HTTP error")) and UNREACHABLE.search(message):
             raise Unavailable(
                 f"the store cannot be reached; try again later ({message.rpartition(' - ')[2].strip(': ')})"
             ) from error

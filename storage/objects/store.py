@@ -33,6 +33,8 @@ from storage.objects.retries import REQUESTS, RETRIES, translate_errors
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Coroutine, Iterable, Iterator, Sequence
 
+    from obstore.store import ClientConfig
+
 
 TRIES = 20
 """How often a folder is removed that others write into meanwhile, as the live form of a matte that is being viewed."""
@@ -75,14 +77,17 @@ class Objects:
     ----------
     url : str
         ``file:///folder`` (created if it does not exist) or ``s3://bucket/prefix``. The environment variables
-        ``AWS_ENDPOINT_URL``, ``AWS_REGION``, ``AWS_ACCESS_KEY_ID`` and so on configure access to a bucket.
+        ``AWS_ENDPOINT_URL``, ``AWS_REGION``, ``AWS_ACCESS_KEY_ID`` and so on configure access to a bucket. Objects
+        under ``http://`` can only be read, and those in ``memory:///`` end with this.
+    key : str, optional
+        API key that goes with requests to ``http://``.
 
     Notes
     -----
     All methods that access a bucket raise `Unavailable` if it cannot be reached.
     """
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, key: str | None = None) -> None:
         checksums.configure_zarr()
         self.url = url
         self._store: ObjectStore
@@ -92,7 +97,8 @@ class Objects:
             # Deleting the last object of a folder, also by zarr, deletes the folder.
             self._store = LocalStore.from_url(url, mkdir=True, automatic_cleanup=True)
         else:
-            self._store = from_url(url, client_options=REQUESTS, retry_config=RETRIES)
+            headers: ClientConfig = {"default_headers": {"Authorization": f"Bearer {key}"}} if key else {}
+            self._store = from_url(url, client_options=REQUESTS | headers, retry_config=RETRIES)
         self.zarr = zarr_store.StrictStore(ZarrStore(self._store))
         # Each tile reads the metadata of the same ten arrays again, to check that they exist; parsing it takes longer.
         self._array = lru_cache(maxsize=64)(partial(zarr_store.open_array, self.zarr))

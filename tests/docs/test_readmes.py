@@ -53,6 +53,7 @@ RUN_BY = {
         ("workflows/mattes/README.md", "Layers for other tools"),
         ("workflows/mattes/README.md", "Moving a matte elsewhere"),
         ("workflows/mattes/README.md", "Reading a matte without envmatte"),
+        ("services/client/envmatte/README.md", "Open a matte"),
     ],
 }
 """The sections whose commands each test runs."""

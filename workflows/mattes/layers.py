@@ -77,7 +77,7 @@ def confidence(matte: Matte, rows: slice = slice(None)) -> NDArray[np.float32]:
         ``1 / (1 + e / 0.01)``, e the expected error of a composite in camera units: 1/2 at 40 dB. 0 where nothing was
         recovered.
     """
-    return _trust(matte.layer("error", rows), matte.layer("recovered", rows))
+    return trust(matte.layer("error", rows), matte.layer("recovered", rows))
 
 
 def layer(matte: Matte, name: str, rows: slice = slice(None)) -> NDArray[np.float32]:
@@ -170,7 +170,7 @@ def everything(matte: Matte, file: IO[bytes], lobes: int = LOBES) -> None:
                     planes[f"S.{channel}"][at] = block.S[..., c]
                     planes[f"rho.{channel}"][at] = block.rho[..., c]
                 planes["A"][at] = block.recovered
-                planes["confidence.Y"][at] = _trust(block.error, block.recovered)
+                planes["confidence.Y"][at] = trust(block.error, block.recovered)
                 for k in range(lobes):
                     for f, name in enumerate(FIELDS):
                         planes[f"lobe{k}.{name}"][at] = ranked[..., k, f]
@@ -189,7 +189,8 @@ def bytes_of_everything(width: int, height: int, lobes: int) -> int:
     return width * height * (11 * 2 + lobes * (2 * 4 + 6 * 2))
 
 
-def _trust(error: NDArray[np.float32], recovered: NDArray[np.bool_]) -> NDArray[np.float32]:
+def trust(error: NDArray[np.float32], recovered: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """The confidence of pixels from the arrays of a matte."""
     return np.where(recovered, 1 / (1 + error / np.float32(0.01)), np.float32(0))
 
 

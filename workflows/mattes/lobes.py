@@ -1,21 +1,31 @@
 """The lobes of a block of a matte."""
 
+from typing import Any, Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.layout.mattes import Block, Matte
+from storage.layout.mattes import Block
 from workflows.interruption import checkpoint
 from workflows.recovery.clusters.lobe_table import FIELDS, ranked_lobes
 from workflows.recovery.transport import Transport
 
 
-def rows_of(matte: Matte, block: Block) -> Transport:
+class Gridded(Protocol):
+    """A matte, stored or in an archive: what its cells mean."""
+
+    attributes: dict[str, Any]
+    columns: int
+    rows: int
+
+
+def rows_of(matte: Gridded, block: Block) -> Transport:
     """The rows of T of a block's pixels."""
     count, shared = block.count.reshape(-1, 3), block.shared.reshape(-1)
     return Transport(matte.columns, matte.rows, count, block.cell, block.weight, shared)
 
 
-def block_lobes(matte: Matte, block: Block, most: int) -> NDArray[np.float32]:
+def block_lobes(matte: Gridded, block: Block, most: int) -> NDArray[np.float32]:
     """The lobes of a block's pixels, heaviest first.
 
     Returns

@@ -1,4 +1,4 @@
-"""Archives of mattes over HTTP: download a matte, and import it into another service."""
+"""Archives of mattes over HTTP: download a matte, all of it or entry by entry, and import it into another service."""
 
 from functools import partial
 from typing import Annotated, Any
@@ -12,21 +12,25 @@ from services.api.context import Context, OwnerContext
 from services.api.http.bodies import store_as_upload, upload_limit
 from services.api.http.idempotency import IdempotencyKey, find_earlier, idempotent
 from services.api.http.media_types import ZIP, require_media_type
+from services.api.http.responses import bytes_response
 from services.api.http.router import Router
 from services.api.limits.quotas import admit
 from services.api.limits.reservations import reserved
 from services.api.mattes.mattes import Matte
 from storage.database.rows import new_id
-from storage.errors import NoRoom, NotFound
+from storage.errors import Corrupt, NoRoom, NotFound
 from storage.layout import mattes as stored_mattes
 from storage.layout import uploads as stored_uploads
-from storage.layout.matte_archive import Archive
+from storage.layout.matte_archive import Archive, is_entry, may_lack
 from storage.layout.uploads import Part
 from storage.records import bodies, mattes
 from workflows.mattes.imports.importing import bytes_of_import, take_in
 
 router = Router(tags=["mattes"])
 CALL = "POST /v1/mattes"
+BYTES = "application/octet-stream"
+ENTRY_BYTES = 16 << 20
+"""What an entry takes beside other answers: the rows T of a block, above all."""
 ARCHIVE_BYTES = 1 << 30
 """Of an archive, which may take ENVMATTE_REQUEST_SECONDS; a larger one may take as much longer."""
 
@@ -49,6 +53,32 @@ def get_archive(context: OwnerContext, id: str) -> StreamingResponse:
         "Content-Disposition": f'attachment; filename="matte-{id}.zip"',
     }
     return StreamingResponse(context.while_allowed(archive), media_type=ZIP, headers=headers)
+
+
+@router.get(
+    "/mattes/{id}/zarr/{entry:path}",
+    response_class=Response,
+    responses={200: {"content": {BYTES: {}}, "description": "The entry"}},
+)
+async def get_entry(context: OwnerContext, id: str, entry: str, request: Request) -> Response:
+    """One entry of a matte's archive, such as `zarr.json` or `S/c/0/0/0`.
+
+    So `/v1/mattes/{id}/zarr` is a zarr group that readers open where it is, and read chunk by chunk.
+    """
+
+    def read() -> Response:
+        with context.stored(mattes.get_ready, id):
+            if not is_entry(context.cache.matte(id), entry):
+                raise NotFound(f"matte {id} has no entry {entry}")
+            try:
+                (data,) = context.objects.get([f"{stored_mattes.path(id)}/{entry}"])
+            except Corrupt as error:
+                if not may_lack(entry):
+                    raise
+                raise NotFound(f"{entry} of matte {id} is empty") from error
+            return bytes_response(data, BYTES)
+
+    return await context.compute(request, context.memory, read, ENTRY_BYTES)
 
 
 @router.post(

@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import envmatte
 import httpx2
 import numpy as np
 import pytest
 
-from services.client import Client
+from services.client import Client, NotAllowed, NotFound
 from storage.database.engine import open_engine, writing
 from storage.records import api_keys
 from tests.end_to_end.conftest import Service, paused, png, serving
@@ -98,6 +99,7 @@ CALLS = {
     "GET /v1/mattes/{id}": Call("matte"),
     "PATCH /v1/mattes/{id}": Call("matte", needs="write", json={"name": "a name"}),
     "GET /v1/mattes/{id}/archive": Call("matte"),
+    "GET /v1/mattes/{id}/zarr/{entry}": Call("matte"),
     "GET /v1/mattes/{id}/layers/{file}": Call("matte"),
     "GET /v1/mattes/{id}/live": Call("matte"),
     "GET /v1/mattes/{id}/live.html": Call("matte"),
@@ -145,6 +147,7 @@ class Locked:
             ("id", self.ids.get(call.id or "")),
             ("n", "0"),
             ("file", "S.png"),
+            ("entry", "zarr.json"),
             ("link", self.ids["link"]),
             ("token", self.ids["token"]),
         ):
@@ -220,6 +223,16 @@ def test_clip_needs_a_matte_of_the_same_owner(locked: Locked) -> None:
         answer = locked.service.http.post(url, content=b"clip", headers=video | bearer(locked.keys[kind]))
         assert answer.status_code == status
     assert not any(path.startswith("composites/") for path in locked.service.stored())
+
+
+def test_a_dataset_needs_a_key(locked: Locked, monkeypatch: pytest.MonkeyPatch) -> None:
+    url = f"{locked.service.url}/v1/mattes/{locked.ids['matte']}"
+    with pytest.raises(NotAllowed):
+        envmatte.open(url)
+    with pytest.raises(NotFound):
+        envmatte.open(url, key=locked.keys["other"])
+    monkeypatch.setenv("ENVMATTE_KEY", locked.keys["read"])
+    assert envmatte.open(url).alpha.compute().any()
 
 
 def test_every_route_with_every_kind_of_key(locked: Locked) -> None:

@@ -65,6 +65,9 @@ def test_matte_is_exported_imported_and_read(service: Service, matte: str, tmp_p
     assert service.client.matte(imported)["state"] == "ready"
     assert (tmp_path / "layers/all.exr").exists()
 
+    printed = python(block("services/client/envmatte/README.md", "Open a matte", "python"), tmp_path)
+    assert "confidence" in printed
+    assert "lobe: 4" in printed
     reading, compositing = (block(readme, "Reading a matte without envmatte", "python", n) for n in (0, 1))
     printed = python(reading, tmp_path)
     answer = service.http.get(f"/v1/mattes/{matte}/transport?x=40&y=30").json()

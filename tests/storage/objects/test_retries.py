@@ -131,6 +131,13 @@ def test_bucket_that_disconnects_during_read(impatient: None, s3: str) -> None:
                 file.read()
 
 
+def test_service_that_does_not_answer_is_unavailable(impatient: None) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        with pytest.raises(Unavailable, match="cannot be reached"):
+            Objects(f"http://127.0.0.1:{taken.getsockname()[1]}/v1").get(["mattes/m/zarr/zarr.json"])
+
+
 def test_missing_bucket_is_not_reported_as_unavailable(s3: str) -> None:
     objects = Objects(s3.replace("envmatte", "another"))
     with pytest.raises(Exception, match="NoSuchBucket") as caught:

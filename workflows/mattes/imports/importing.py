@@ -50,14 +50,8 @@ def take_in(file: BinaryIO, objects: Objects, matte: str, limits: Limits) -> Mat
         If its frame has more pixels than the limits allow.
     """
     archive = Reader(file, limits)
-    given = archive.attributes
-    attributes = {name: given[name] for name in ("monitor", "crosstalk", "options")}
-    layout = {name: given[name] for name in ("height", "width", "columns", "rows")}
     try:
-        made = mattes.create(objects, matte, **layout, **attributes)
-        for name in GROUPS:
-            with objects.read(f"{mattes.path(matte)}/{name}") as ours:
-                archive.compare(name, unseal(name, ours.read())[0])
+        made = create_like(archive, objects, matte)
         for row, column in product(range(made.block_rows), range(made.block_columns)):
             checkpoint()
             y, x = made.span(row, column)
@@ -66,4 +60,16 @@ def take_in(file: BinaryIO, objects: Objects, matte: str, limits: Limits) -> Mat
     except BaseException:
         objects.delete(mattes.path(matte))
         raise
+    return made
+
+
+def create_like(archive: Reader, objects: Objects, matte: str) -> Matte:
+    """Create the matte of an archive without its blocks; raises `ArchiveError` if its arrays differ from ours."""
+    given = archive.attributes
+    attributes = {name: given[name] for name in ("monitor", "crosstalk", "options")}
+    layout = {name: given[name] for name in ("height", "width", "columns", "rows")}
+    made = mattes.create(objects, matte, **layout, **attributes)
+    for name in GROUPS:
+        with objects.read(f"{mattes.path(matte)}/{name}") as ours:
+            archive.compare(name, unseal(name, ours.read())[0])
     return made

@@ -77,7 +77,7 @@ class Reader:
 
     def block(self, row: int, column: int, height: int, width: int) -> Block:
         """A block of height x width pixels, checked."""
-        values = {name: self._frame(name, row, column)[:height, :width] for name in FRAMES}
+        values = {name: self.chunk(name, row, column)[:height, :width] for name in FRAMES}
         count = values["count"]
         entries = int(count.sum(dtype=np.uint64))
         most = most_cells(self._limits)
@@ -122,7 +122,8 @@ class Reader:
             for name, given in manifest.members.items()
         }
 
-    def _frame(self, name: str, row: int, column: int) -> NDArray[Any]:
+    def chunk(self, name: str, row: int, column: int) -> NDArray[Any]:
+        """The values of a block in a frame-shaped array, as large as a block inside of the frame."""
         entry = mattes.chunk_entry(name, row, column)
         dtype = np.dtype({"count": "<u4", "recovered": "u1", "shared": "u1"}.get(name, "<f4"))
         shape = (*self._chunk, 3) if name in CHANNELS else self._chunk
