@@ -59,6 +59,8 @@ class Context:
     """Composites computed at once: one more than there are cores."""
     captures: Shares = field(default_factory=lambda: Shares(2, 1))
     """Capture archives checked at once."""
+    archives: Shares = field(default_factory=lambda: Shares(8, 4))
+    """Archives of mattes sent at once: of each its entries are kept, 10 MB for a matte of 16 megapixels."""
     imports: Shares = field(default_factory=lambda: Shares(2, 1))
     """Archives of mattes unpacked at once."""
     layers: Shares = field(default_factory=lambda: Shares(2, 1))

@@ -14,6 +14,7 @@ import anyio.to_thread
 from fastapi import Request
 from starlette.requests import ClientDisconnect
 
+from services.runtime.malloc import return_free
 from services.runtime.problems import TooLarge
 from storage.errors import InvalidInput, TooMany
 from workflows.interruption import interruptible
@@ -21,6 +22,8 @@ from workflows.interruption import interruptible
 T = TypeVar("T")
 CHECK_SECONDS = 0.25
 """Seconds between two looks whether the client is still there."""
+LARGE = 128 << 20
+"""Bytes from which on the memory of a request is returned to the machine once its work has ended."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +141,7 @@ async def run(
         If its turn does not come within ``seconds``.
     """
     unwanted = threading.Event()
+    large = any(amount >= LARGE for _, amount in needed)
 
     def interruptibly() -> T:
         end = time.monotonic() + seconds
@@ -153,8 +157,12 @@ async def run(
                     limit=seconds,
                 )
 
-        with interruptible(check):
-            return work()
+        try:
+            with interruptible(check):
+                return work()
+        finally:
+            if large:
+                return_free()
 
     begun = False
     last = time.monotonic() + seconds

@@ -7,6 +7,7 @@ import anyio.to_thread
 from fastapi import Query, Request, Response
 from fastapi.responses import StreamingResponse
 from sqlalchemy import Connection, Row
+from starlette.types import Receive, Scope, Send
 
 from services.api.context import Context, OwnerContext
 from services.api.http.bodies import store_as_upload, upload_limit
@@ -40,19 +41,36 @@ ARCHIVE_BYTES = 1 << 30
     response_class=StreamingResponse,
     responses={200: {"content": {ZIP: {}}, "description": "The archive"}},
 )
-def get_archive(context: OwnerContext, id: str) -> StreamingResponse:
+async def get_archive(context: OwnerContext, id: str) -> Response:
     """A whole matte as one ZIP. Any zarr reader can open it, and `POST /v1/mattes` of another service can import it.
 
     The same matte always gives the same bytes. If the matte is deleted or the key revoked during the download, the
     connection ends early.
     """
-    with context.stored(mattes.get_ready, id):
-        archive = Archive(context.objects, id)
-    headers = {
-        "Content-Length": str(archive.size),
-        "Content-Disposition": f'attachment; filename="matte-{id}.zip"',
-    }
-    return StreamingResponse(context.while_allowed(archive), media_type=ZIP, headers=headers)
+    return _Download(context, id)
+
+
+class _Download(Response):
+    """The archive of a matte, opened and sent once it is its owner's turn."""
+
+    def __init__(self, context: Context, id: str) -> None:
+        super().__init__()
+        self._context, self._id = context, id
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        owner, seconds = self._context.caller.owner, self._context.settings.request_seconds
+        async with self._context.archives.take(owner, seconds):
+            archive = await anyio.to_thread.run_sync(self._open)
+            headers = {
+                "Content-Length": str(archive.size),
+                "Content-Disposition": f'attachment; filename="matte-{self._id}.zip"',
+            }
+            pieces = self._context.while_allowed(archive)
+            await StreamingResponse(pieces, media_type=ZIP, headers=headers)(scope, receive, send)
+
+    def _open(self) -> Archive:
+        with self._context.stored(mattes.get_ready, self._id):
+            return Archive(self._context.objects, self._id)
 
 
 @router.get(

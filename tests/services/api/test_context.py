@@ -144,3 +144,23 @@ def test_archives_are_checked_once_there_is_memory(tmp_path: Path, route: str) -
         assert client.post(f"/v1/{route}", content=sent).status_code == 201
     app.state.context.decoders.close()
     engine.dispose()
+
+
+def test_archives_are_sent_in_turn(tmp_path: Path) -> None:
+    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
+    settings = Settings(data=tmp_path, request_seconds=1)
+    app = build_app(settings, engine, Objects((tmp_path / "store").as_uri()))
+    archives, sent = app.state.context.archives, archive(tmp_path / "made", 8, 8)
+    with TestClient(app, "http://127.0.0.1", headers={"Content-Type": "application/zip"}) as client:
+        assert client.portal is not None
+        matte = client.post("/v1/mattes", content=sent).json()["id"]
+        with ExitStack() as taken:
+            for other in ("alice", "bob"):
+                turn = archives.take(other, 1, archives.each)
+                taken.enter_context(client.portal.wrap_async_context_manager(turn))
+            answer = client.get(f"/v1/mattes/{matte}/archive")
+            assert (answer.status_code, answer.json()["type"]) == (429, "urn:envmatte:problem:too-many")
+        assert client.get(f"/v1/mattes/{matte}/archive").content == sent
+        assert client.get("/v1/mattes/none/archive").status_code == 404
+    app.state.context.decoders.close()
+    engine.dispose()

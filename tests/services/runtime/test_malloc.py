@@ -49,6 +49,20 @@ kept = faults()
 assert 10 * kept < returned, (kept, returned)
 """
 
+RETURNED = """
+import psutil
+from services.runtime.malloc import keep_memory, return_free
+
+keep_memory()
+process = psutil.Process()
+held = [bytes([1]) * (1 << 20) for _ in range(100)]
+last = bytes([1]) * (1 << 20)  # keeps the pool from shrinking at its end
+del held
+before = process.memory_info().rss
+return_free()
+assert before - process.memory_info().rss > 50 << 20
+"""
+
 
 @pytest.mark.skipif(sys.platform != "linux", reason="glibc only")
 def test_threads_share_a_few_pools_of_memory() -> None:
@@ -59,3 +73,8 @@ def test_threads_share_a_few_pools_of_memory() -> None:
 def test_memory_that_was_freed_is_used_again() -> None:
     as_dask_sets_it = os.environ | {"MALLOC_TRIM_THRESHOLD_": "65536"}
     subprocess.run([sys.executable, "-c", KEPT], check=True, timeout=120, env=as_dask_sets_it)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="glibc only")
+def test_free_memory_is_returned_at_once_when_asked() -> None:
+    subprocess.run([sys.executable, "-c", RETURNED], check=True, timeout=120)
