@@ -17,6 +17,7 @@ BACKDROP = 1 / 3
 
 _NOISE = (19.0, 0.040), (5.5, 0.0044)  # k and c at the low and the high end
 _OTHER = 3.0, -5.0  # dB by which composites are worse than patterns at the low end, and at the high end
+_EXPOSED = 1.5, 0.5  # standard deviations of the exposures at the low and the high end
 _FIXED_GRIDS = (0.45, 1.2), (0.00045, 0.35)  # a and b at the low and the high end
 
 
@@ -56,8 +57,8 @@ def expected(
     for n blocks along the monitor's shorter side in the finest grid: it is not known where in a block the light comes
     from, which costs clear glass most and frosted glass least.
 
-    If the exposure was not locked, nobody knows at which one the scene is to be shown: the standard deviation of the
-    exposures, as a share of the light of a backdrop, is added.
+    If the exposure was not locked, nobody knows at which one the scene is to be shown: 1.5 and 0.5 standard deviations
+    of the exposures, as a share of the light of a backdrop, are added.
 
     Without random patterns, as of stripes alone, composites are about as far from the truth as patterns from what T
     predicts: of five captures by a real camera, none was more than 3.4 dB worse, where backdrops are finer than
@@ -72,7 +73,7 @@ def expected(
     """
     rho, s2 = survey["contrast"], survey["deviation"] ** 2
     costs = costs_of(program, survey, model_error, exposures)
-    unexplained = costs["model_error"] + costs["lost_colour"] + costs["auto_exposure"]
+    unexplained = costs["model_error"] + costs["lost_colour"]
     shown = [part for part in program.parts if not isinstance(part, Constant | Halftone)]
     random = [part for part in shown if isinstance(part, Bernoulli)]
     if rho > 0 and not random and pattern_error:
@@ -85,8 +86,9 @@ def expected(
     patterns = sum(part.count for part in (shown if fixed else informative))
     blocks = max(min(part.columns, part.rows) for part in random) if fixed else None
     ends = []
-    for (k, c), (a, b) in zip(_NOISE, _FIXED_GRIDS, strict=True):
+    for (k, c), (a, b), exposed in zip(_NOISE, _FIXED_GRIDS, _EXPOSED, strict=True):
         error = k * s2 / patterns + c * rho**2 / patterns**1.2 + unexplained
+        error += exposed**2 * costs["auto_exposure"]
         ends.append(-10 * log10(error if blocks is None else error + a * rho**2 / blocks**b))
     return Quality(low=ends[0], high=ends[1], blocks=blocks)
 
