@@ -2,7 +2,7 @@
 
 import hashlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import IO, Annotated, Literal, TypeVar
 
@@ -23,6 +23,7 @@ from services.api.mattes.composite_params import CompositeParams
 from services.api.mattes.progress import Progress, progress_of, while_there
 from services.runtime.problems import NotAcceptable, NotNeeded, problem_of
 from storage.errors import Conflict, OptionError
+from storage.layout.mattes import Matte
 from storage.records import mattes
 from workflows.composite import composite, light_on
 from workflows.composite.around import put_around
@@ -174,12 +175,16 @@ def _answer(
         )
     pixels = times.take("decode", lambda: context.decoders.decode(body, params.transfer))
     backdrop = backdrop_of(pixels, params.transfer)
-    pictures = _pictures(context, progress, backdrop, params, media_type, times)
+    matte = times.take("open", lambda: context.cache.matte(progress.id))
+    window = Window.of(matte, params.x, params.y, params.width, params.height)
+    bands = _bands(window, matte.block, params, media_type, progress.preview is not None)
+    pictures = _pictures(context, progress, matte, backdrop, params, bands, times)
     if media_type == "image/x-exr":
         (picture,) = pictures
         answer = times.take("encode", lambda: _exr(picture))
     else:
-        codes = _codes(pictures, backdrop, params, media_type, times)
+        rows = window.height if len(bands) > 1 else None
+        codes = _codes(pictures, rows, backdrop, params, media_type, times)
         answer = times.take("encode", lambda: _packed(codes, media_type, params.quality))
     return bytes_response(answer, media_type, extra | {"Server-Timing": times.header})
 
@@ -202,20 +207,26 @@ class _Times(dict[str, float]):
 
 def _codes(
     pictures: Iterator[NDArray[np.float32]],
+    rows: int | None,
     backdrop: Backdrop,
     params: CompositeParams,
     media_type: str,
     times: _Times,
 ) -> Codes:
-    """The integers of an answer. The pictures that they are made of are four times as large."""
+    """The integers of an answer: of one picture, or of several bands with so many rows together.
+
+    The pictures that they are made of are four times as large.
+    """
     is_deep = media_type == "image/png" and backdrop.pixels.dtype != np.uint8
     dtype: np.dtype[np.unsignedinteger] = np.dtype(np.uint16 if is_deep else np.uint8)
     channels: Literal[3, 4] = 4 if media_type == "image/png" else 3
-    bands = [
-        times.take("codes", partial(encode, picture, params.transfer, dtype, CORES, channels))
-        for picture in pictures
-    ]
-    codes = np.concatenate(bands)
+    codes, done = np.empty(0, dtype), 0
+    for picture in pictures:
+        band = times.take("codes", partial(encode, picture, params.transfer, dtype, CORES, channels))
+        if not done:
+            codes = np.empty((rows or len(band), *band.shape[1:]), dtype)
+        codes[done : done + len(band)] = band
+        done += len(band)
     return codes if (codes[..., 3:] < np.iinfo(dtype).max).any() else codes[..., :3]
 
 
@@ -240,32 +251,29 @@ def _bands(
 def _pictures(
     context: Context,
     progress: Progress,
+    matte: Matte,
     backdrop: Backdrop,
     params: CompositeParams,
-    media_type: str,
+    bands: Sequence[Window],
     times: _Times,
 ) -> Iterator[NDArray[np.float32]]:
     """Light and alpha of an answer, by bands from top to bottom."""
-    matte = times.take("open", lambda: context.cache.matte(progress.id))
-    window = Window.of(matte, params.x, params.y, params.width, params.height)
 
     def read(row: int, number: int) -> Strip:
         return context.cache.strip(progress.id, row, number, progress.blocks)
 
     rays = times.take("rays", lambda: _rays(context, progress, params)) if params.depth is not None else None
     light = times.take("light", lambda: light_on(matte, backdrop, params.placement, CORES))
-    for band in _bands(window, matte.block, params, media_type, progress.preview is not None):
+    for band in bands:
         picture = times.take("composite", partial(compose, matte, light, band, read, CORES, rays))
         if progress.preview is not None:
-            add = partial(
-                _add_preview, context, progress, progress.preview, picture, backdrop, window, params
-            )
+            add = partial(_add_preview, context, progress, progress.preview, picture, backdrop, band, params)
             times.take("preview", add)
         if params.around == "backdrop":
             wide, high = matte.attributes["monitor"]
             frame = matte.width, matte.height
             around = partial(
-                put_around, picture, backdrop, window, frame, (wide, high), params.placement, CORES
+                put_around, picture, backdrop, band, frame, (wide, high), params.placement, CORES
             )
             picture = times.take("around", around)
         if params.size is not None:
