@@ -23,7 +23,7 @@ MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg",
 LAYERS = ("all.exr", "stmap.exr", "S.png", "rho.png", "alpha.png", "confidence.png")
 NODES = {
     "blender": ("lookups.exr", "blender.py"),
-    "nuke": ("lookups.exr", "nuke.nk"),
+    "nuke": ("lookups.exr", "nuke.nk", "nuke_stmap.nk"),
     "glsl": ("matte.live", "envmatte.js", "glass.html"),
 }
 """Files that make a node of a tool."""

@@ -204,7 +204,7 @@ def test_layers_and_lobes_of_a_pixel(tab: Page, service: Service, ready: tuple[s
 def test_layers_for_other_tools_are_downloaded(tab: Page, service: Service, ready: tuple[str, str]) -> None:
     tab.goto(f"{service.url}/#/mattes/{ready[1]}")
     unfold(tab)
-    for name in ("all.exr", "stmap.exr", "lookups.exr", "blender.py", "nuke.nk"):
+    for name in ("all.exr", "stmap.exr", "lookups.exr", "blender.py", "nuke.nk", "nuke_stmap.nk"):
         with tab.expect_download() as download:
             tab.get_by_role("button", name=name).click()
         assert download.value.suggested_filename == name

@@ -125,8 +125,8 @@ async def get_layer(
 ) -> Response:
     """A layer: `S`, `rho`, `alpha` or `confidence`, as `.png` (16 bits, linear, clipped to 0 to 1) or `.exr`;
     `stmap.exr`; `all.exr`, all layers with the lobes of each pixel; or `lookups.exr`, for a node that draws the glass,
-    and the file that makes this node: `blender.py` or `nuke.nk`. `envmatte.js` is a module of JavaScript that draws
-    `matte.live`, and `glass.html` a page that uses it.
+    and the file that makes this node: `blender.py`, `nuke.nk` or `nuke_stmap.nk`. `envmatte.js` is a module of
+    JavaScript that draws `matte.live`, and `glass.html` a page that uses it.
 
     If the matte is still being recovered, they are those of its preview, which is smaller.
     """

@@ -143,17 +143,20 @@ def test_the_command_writes_a_folder_of_layers(service: Service, matte: str, tmp
 
 
 @pytest.mark.parametrize(
-    ("tool", "file", "last"),
-    [("blender", "blender.py", "'lookups': 16"), ("nuke", "nuke.nk", " name add15\n")],
+    ("tool", "files", "last"),
+    [
+        ("blender", {"blender.py"}, "'lookups': 16"),
+        ("nuke", {"nuke.nk", "nuke_stmap.nk"}, " name add15\n"),
+    ],
 )
 def test_the_command_writes_the_node_of_a_tool(
-    service: Service, matte: str, tmp_path: Path, tool: str, file: str, last: str
+    service: Service, matte: str, tmp_path: Path, tool: str, files: set[str], last: str
 ) -> None:
     out = tmp_path / tool
     done = CliRunner().invoke(main, ["layers", matte, str(out), "--for", tool, "--url", service.url])
     assert done.exit_code == 0, done.output
-    assert {path.name for path in out.iterdir()} == {"lookups.exr", file}
-    assert last in (out / file).read_text()
+    assert {path.name for path in out.iterdir()} == {"lookups.exr", *files}
+    assert all(last in (out / file).read_text() for file in files)
     with OpenEXR.File(str(out / "lookups.exr"), separate_channels=True) as held:
         lookups = [name for name in held.channels() if name.startswith("lookup") and name.endswith(".R")]
         assert len(lookups) == 16

@@ -30,7 +30,7 @@ export function layers(matte, signal) {
 		h("label.choice", h("input", { type: "radio", name: "layer", checked: name === FIRST, onchange: () => choose(name) }), t(`layer.label.${name}`))));
 	const file = (name) => button(name, problem, () => save(`v1/mattes/${matte.id}/layers/${name}`, name));
 	const files = ["all.exr", "stmap.exr"].map(file);
-	const nodes = ["lookups.exr", "blender.py", "nuke.nk"].map(file);
+	const nodes = ["lookups.exr", "blender.py", "nuke.nk", "nuke_stmap.nk"].map(file);
 	const panel = h("details.panel", h("summary", h("h2", t("layers"))),
 		h("div.stack", names, frame, about, h("p.row", t("layers.tools"), files), h("p.row", t("layers.nodes"), nodes), problem));
 	panel.addEventListener("toggle", () => image.hidden && choose(FIRST), { once: true });

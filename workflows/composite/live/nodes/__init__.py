@@ -10,9 +10,11 @@ from storage.layout.mattes import Matte
 from workflows.composite.live.nodes.blender import write_blender
 from workflows.composite.live.nodes.exr import write_lookups
 from workflows.composite.live.nodes.nuke import write_nuke
+from workflows.composite.live.nodes.nuke_stmap import write_nuke_stmap
 
 FILES: dict[str, Callable[[Matte, IO[bytes], int], None]] = {
     "lookups.exr": write_lookups,
     "blender.py": write_blender,
     "nuke.nk": write_nuke,
+    "nuke_stmap.nk": write_nuke_stmap,
 }

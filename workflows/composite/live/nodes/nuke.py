@@ -31,12 +31,8 @@ def write_nuke(matte: Matte, file: IO[bytes], lookups: int) -> None:
         max(one["left"] + one["columns"] for one in levels),
         max(one["bottom"] + one["rows"] for one in levels),
     )
-    nodes = _Nodes()
-    backdrop = nodes.add("Input", name="backdrop")
-    backdrop = nodes.add("Crop", (backdrop,), name="whole", box="{0 0 {input.width} {input.height}}")
-    held = nodes.add(
-        "Read", name="lookups", file=_quoted("[file dirname [value root.name]]/lookups.exr"), raw="true"
-    )
+    nodes = Nodes()
+    backdrop, held = nodes.sources()
     light = nodes.add("Constant", name="canvas", format=_format(canvas))
     light = nodes.blink("cells", "cells", (light, backdrop), columns=first["columns"], rows=first["rows"])
     for n, (fine, coarse) in enumerate(pairwise(levels), start=1):
@@ -47,16 +43,8 @@ def write_nuke(matte: Matte, file: IO[bytes], lookups: int) -> None:
         of_lookup = (nodes.layer(held, f"lookup{k}"), nodes.layer(held, f"weight{k}"), arrived, light)
         sizes = {"columns": first["columns"], "rows": first["rows"], "levels": len(levels)}
         arrived = nodes.blink(f"add{k}", "lookup", of_lookup, **sizes)
-    through = nodes.add("Merge2", (arrived, nodes.layer(held, "rho")), name="through", operation="multiply")
-    matrix = " ".join(
-        "{" + " ".join(f"{value:.9g}" for value in row) + "}" for row in matte.attributes["crosstalk"]
-    )
-    mixed = nodes.add("ColorMatrix", (through,), name="crosstalk", matrix=f"{{{matrix}}}")
-    seen = nodes.add("Merge2", (mixed, nodes.layer(held, "S")), name="glass", operation="plus")
-    whole = nodes.add("Copy", (seen, held), name="alpha", from0="rgba.alpha", to0="rgba.alpha")
-    size = f"{{0 0 {matte.width} {matte.height}}}"
-    nodes.add("Output", (nodes.add("Crop", (whole,), name="frame", box=size),), name="image")
-    file.write(nodes.text().encode())
+    nodes.finish(matte, held, arrived)
+    file.write(nodes.text(NAME).encode())
 
 
 def _levels(matte: Matte) -> list[Level]:
@@ -80,7 +68,7 @@ def _quoted(text: str) -> str:
     return f'"{text.translate(_ESCAPED)}"'
 
 
-class _Nodes:
+class Nodes:
     """Nodes as the text of a script, in which each takes its inputs from a stack, the first one from its top."""
 
     def __init__(self) -> None:
@@ -103,5 +91,30 @@ class _Nodes:
         source = Template((_KERNELS / f"{kernel}.blink").read_text()).substitute(params)
         return self.add("BlinkScript", inputs, name=name, kernelSource=_quoted(source))
 
-    def text(self) -> str:
-        return "\n".join(["Group {", f" name {NAME}", " inputs 1", "}", *self._lines, "end_group", ""])
+    def plus(self, name: str, one: str | None, other: str) -> str:
+        """Add the sum of two nodes, the first of which may be missing."""
+        return self.add("Merge2", (one, other), name=name, operation="plus") if one else other
+
+    def sources(self) -> tuple[str, str]:
+        """Add the backdrop, up to the edges of its format and repeated beyond them, and the EXR."""
+        backdrop = self.add("Input", name="backdrop")
+        box = "{0 0 {input.width} {input.height}}"
+        backdrop = self.add("Crop", (backdrop,), name="whole", box=box, crop="false")
+        exr = _quoted("[file dirname [value root.name]]/lookups.exr")
+        return backdrop, self.add("Read", name="lookups", file=exr, raw="true")
+
+    def finish(self, matte: Matte, held: str, arrived: str) -> None:
+        """Add what makes the glass of the light that arrives, and the group's output."""
+        through = self.add("Merge2", (arrived, self.layer(held, "rho")), name="through", operation="multiply")
+        matrix = " ".join(
+            "{" + " ".join(f"{value:.9g}" for value in row) + "}" for row in matte.attributes["crosstalk"]
+        )
+        mixed = self.add("ColorMatrix", (through,), name="crosstalk", matrix=f"{{{matrix}}}")
+        seen = self.add("Merge2", (mixed, self.layer(held, "S")), name="glass", operation="plus")
+        whole = self.add("Copy", (seen, held), name="alpha", from0="rgba.alpha", to0="rgba.alpha")
+        size = f"{{0 0 {matte.width} {matte.height}}}"
+        self.add("Output", (self.add("Crop", (whole,), name="frame", box=size),), name="image")
+
+    def text(self, name: str) -> str:
+        """The group, by its name."""
+        return "\n".join(["Group {", f" name {name}", " inputs 1", "}", *self._lines, "end_group", ""])

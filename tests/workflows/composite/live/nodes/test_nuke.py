@@ -8,22 +8,29 @@ import pytest
 
 from storage.layout.mattes import Matte
 from storage.objects.store import Objects
-from tests.workflows.composite.live.nodes.drawing import draw, few_nodes, read_channels
+from tests.workflows.composite.live.nodes.drawing import (
+    backdrops,
+    draw,
+    few_nodes,
+    psnr,
+    read_channels,
+    recovered,
+)
 from tests.workflows.composite.live.nodes.nuke_script import CLASSES, Node, parse, run
 from workflows.composite import composite
-from workflows.composite.live.nodes.exr import write_lookups
-from workflows.composite.live.nodes.nuke import write_nuke
+from workflows.composite.live.nodes import FILES
+from workflows.composite.live.nodes.exr import LOOKUPS
 
 needs_compiler = pytest.mark.skipif(
     shutil.which("g++") is None, reason="g++, which runs the kernels, is not installed"
 )
 
 
-def written(matte: Matte, folder: Path, lookups: int) -> str:
-    for name, write in (("lookups.exr", write_lookups), ("nuke.nk", write_nuke)):
+def written(matte: Matte, folder: Path, lookups: int, script: str = "nuke.nk") -> str:
+    for name in ("lookups.exr", script):
         with (folder / name).open("wb") as file:
-            write(matte, file, lookups)
-    return (folder / "nuke.nk").read_text()
+            FILES[name](matte, file, lookups)
+    return (folder / script).read_text()
 
 
 def test_nodes_knobs_and_connections(objects: Objects, tmp_path: Path) -> None:
@@ -61,6 +68,49 @@ def test_kernels_draw_the_composite_where_lookups_suffice(objects: Objects, tmp_
     seen = run(nodes, backdrop, channels, tmp_path)
     np.testing.assert_allclose(seen, composite(matte, backdrop), atol=1e-3)  # half floats
     np.testing.assert_allclose(seen[..., :3], draw(tmp_path / "lookups.exr", backdrop), atol=2e-5)
+
+
+def test_nodes_without_kernels(objects: Objects, tmp_path: Path) -> None:
+    group, nodes = parse(written(few_nodes(objects, 3), tmp_path, 2, "nuke_stmap.nk"))
+    assert group.knobs["name"] == "envmatte_glass_stmap"
+    by_name = {node.knobs["name"]: node for node in nodes}
+    assert len(by_name) == len(nodes)
+    assert {node.kind for node in nodes} < CLASSES.keys() - {"BlinkScript", "Group"}
+    assert all(len(node.inputs) == CLASSES[node.kind] for node in nodes)
+
+    def inputs(name: str) -> list[str]:
+        return [one.knobs["name"] for one in by_name[name].inputs]
+
+    levels = [node for node in nodes if node.kind == "Blur"]
+    assert [node.knobs["name"] for node in levels] == ["level0", "level1", "level2"]
+    assert {inputs(node.knobs["name"])[0] for node in levels} == {"whole"}
+    assert by_name["whole"].knobs["crop"] == "false"  # edges repeated, rather than black
+    for k in range(2):
+        for n in range(3):
+            assert inputs(f"look{k}_{n}") == [f"level{n}", f"lookup{k}"]
+            assert inputs(f"share{k}_{n}") == [f"lookup{k}", f"look{k}_{n}"]
+        assert inputs(f"seen{k}_1") == [f"share{k}_0", f"share{k}_1"]
+        assert inputs(f"seen{k}_2") == [f"seen{k}_1", f"share{k}_2"]
+        assert inputs(f"lit{k}") == [f"weight{k}", f"seen{k}_2"]
+    assert inputs("add1") == ["lit0", "lit1"]
+    assert inputs("through") == ["add1", "rho"]
+    assert _unconnected(nodes) == {"image"}
+
+
+@pytest.mark.parametrize(
+    "name", ["lens", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ball", "tumbler"))]
+)
+def test_blurs_draw_nearly_the_composite(objects: Objects, tmp_path: Path, name: str) -> None:
+    matte = recovered(objects, name)
+    _, nodes = parse(written(matte, tmp_path, LOOKUPS, "nuke_stmap.nk"))
+    channels, _ = read_channels(tmp_path / "lookups.exr")
+    found = {}
+    for kind, backdrop in backdrops().items():
+        expected = composite(matte, backdrop)
+        opaque = np.concatenate([backdrop, np.ones_like(backdrop[..., :1])], axis=-1)
+        found[kind] = psnr(run(nodes, opaque, channels, tmp_path), expected, expected[..., 3] > 0)
+    least = {"photo": 44, "strokes": 44, "ramp": 70, "tiles": 37, "checker": 36}
+    assert {kind: value for kind, value in found.items() if value < least[kind]} == {}
 
 
 def _unconnected(nodes: list[Node]) -> set[str]:
