@@ -27,7 +27,7 @@ def decode(data: bytes, transfer: Transfer, *, memory: int) -> Codes | Floats:
         PNG, JPEG, WebP, AVIF, GIF, TIFF, HEIC, EXR or camera RAW. Of a moving picture the first frame is decoded.
     transfer : str
         How integers encode light. Colours with an ICC profile are converted to sRGB, unless this is ``linear``. RAW
-        and floats are linear light in any case.
+        and floats are linear light in any case, and that of an EXR is converted from the primaries that it names.
     memory : int
         Bytes that the decoded picture may take.
 
@@ -43,7 +43,7 @@ def decode(data: bytes, transfer: Transfer, *, memory: int) -> Codes | Floats:
     if raw_files.is_raw(data):
         return camera_raw.develop(data, memory=memory)
     if float_formats.is_float(data):
-        return float_formats.decode(data, memory=memory)
+        return float_formats.in_rec_709(data, float_formats.decode(data, memory=memory))
     pixels = integer_formats.decode(data, memory=memory, alpha=True, formats=FORMATS)
     return _to_srgb(data, pixels) if transfer == "srgb" else pixels
 

@@ -1,6 +1,7 @@
 """EXR and float TIFF to arrays and back: linear light without an upper limit."""
 
 import io
+from contextlib import suppress
 
 import numpy as np
 import OpenEXR
@@ -17,6 +18,12 @@ from workflows.untrusted.limits import check_size
 Floats = NDArray[np.float32]
 EXR = b"v/1\x01"
 """The first bytes of an EXR."""
+REC_709 = np.array([0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290], np.float32)
+"""x and y of red, green, blue and white: the attribute ``chromaticities`` of an EXR whose light has these primaries."""
+MOST = 100
+"""What the conversion of primaries may multiply a channel by: more is no real light's."""
+_CONES = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+"""From XYZ to what adapts to white, by Bradford."""
 
 
 def is_float(data: bytes) -> bool:
@@ -77,8 +84,51 @@ def encode_exr(channels: str, pixels: Floats) -> bytes:
     file = io.BytesIO()
     height, width, _ = pixels.shape
     planes = {name: pixels[..., c] for c, name in enumerate(channels)}
-    write_exr(file, width, height, dict.fromkeys(channels, np.float32), [planes])
+    header = {"chromaticities": REC_709}
+    write_exr(file, width, height, dict.fromkeys(channels, np.float32), [planes], header)
     return file.getvalue()
+
+
+def in_rec_709(data: bytes, pixels: Floats) -> Floats:
+    """The decoded light of an EXR or a float TIFF in the primaries of Rec. 709, white as white.
+
+    An EXR says what its primaries are, such as ACEScg's; without ``chromaticities`` they are those of Rec. 709.
+
+    Raises
+    ------
+    ImageError
+        If no light can have its ``chromaticities``.
+
+    Notes
+    -----
+    ``XYZ = M RGB``, M the primaries' XYZ scaled so that (1, 1, 1) is white of Y = 1 (SMPTE RP 177). Whites are adapted
+    by Bradford's matrix.
+    """
+    if pixels.shape[2] != 3 or not data.startswith(EXR):
+        return pixels
+    with OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0) as file:
+        given = file.header().get("chromaticities")
+    if given is None:
+        return pixels
+    values, matrix = np.asarray(given), np.full((3, 3), np.nan)
+    if values.shape == (8,) and values.dtype.kind == "f":
+        if np.allclose(values, REC_709, atol=1e-4):
+            return pixels
+        with np.errstate(all="ignore"), suppress(np.linalg.LinAlgError):
+            matrix = np.linalg.solve(_adapted(REC_709), _adapted(values))
+    if not (np.abs(matrix) < MOST).all():
+        raise ImageError(
+            "no light has the chromaticities of this EXR: export it as linear Rec. 709 or ACEScg"
+        )
+    return pixels @ matrix.T.astype(np.float32)
+
+
+def _adapted(chromaticities: NDArray[np.floating]) -> NDArray[np.float64]:
+    """From RGB of some primaries to cones that are adapted to their white."""
+    x, y = chromaticities.astype(np.float64).reshape(4, 2).T
+    primaries = np.stack([x / y, np.ones(4), (1 - x - y) / y])
+    to_xyz = primaries[:, :3] * np.linalg.solve(primaries[:, :3], primaries[:, 3])
+    return np.asarray(_CONES @ to_xyz / (_CONES @ primaries[:, 3])[:, np.newaxis])
 
 
 def _exr(data: bytes, memory: int) -> Floats:

@@ -1,6 +1,7 @@
 """A matte as layers that other tools read, as EXR and 16-bit PNG.
 
 They are made in bands, a row of blocks high, so that a large one takes little memory and can end between two of them.
+Light is linear with the primaries of Rec. 709, as the header's ``chromaticities`` say.
 
 Every layer has the frame's size. All values are linear light or plain numbers; a PNG's are clipped to 0 to 1.
 
@@ -50,6 +51,7 @@ from numpy.typing import NDArray
 
 from storage.layout.mattes import Block, Matte
 from workflows.images.exr_writer import Types, write_exr
+from workflows.images.float_formats import REC_709
 from workflows.images.integer_formats import to_integers
 from workflows.images.png_writer import write_png
 from workflows.interruption import checkpoint
@@ -214,6 +216,7 @@ def _blocks(matte: Matte, row: int) -> Iterator[tuple[Block, slice]]:
 
 def _write(file: IO[bytes], matte: Matte, types: Types, bands: Iterator[Planes]) -> None:
     header = {
+        "chromaticities": REC_709,
         "crosstalk": np.array(matte.attributes["crosstalk"], np.float32),
         "monitor": tuple(matte.attributes["monitor"]),
         "comments": _COMMENTS,

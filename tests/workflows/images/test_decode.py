@@ -1,15 +1,19 @@
 """Pictures of every format are decoded upright, as their orientation says."""
 
 import io
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 import tifffile
 from numpy.typing import NDArray
 from PIL import Image, ImageCms, ImageOps
 
+from storage.errors import ImageError
 from storage.layout.captures import Stack
 from workflows.images import camera_raw, decode, float_formats, integer_formats
 
@@ -91,3 +95,60 @@ def test_camera_raw(make_dng: Callable[..., bytes], turn: int, quarters: int) ->
     assert camera_raw.orientation(data) == turn
     upright = camera_raw.decode(data, memory=MEMORY)
     np.testing.assert_array_equal(upright, np.rot90(camera_raw.decode(data, memory=MEMORY, turn=1), quarters))
+
+
+ACES = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
+"""The primaries AP1 and the white of ACEScg."""
+
+
+def exr_of(light: NDArray[np.float32], chromaticities: tuple[float, ...] | None = None) -> bytes:
+    """An EXR that OpenImageIO writes."""
+    height, width, channels = light.shape
+    spec = oiio.ImageSpec(width, height, channels, oiio.FLOAT)
+    if chromaticities:
+        spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), chromaticities)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "light.exr")
+        image = oiio.ImageBuf(spec)
+        image.set_pixels(oiio.ROI(), light)
+        assert image.write(str(path)), image.geterror()
+        return path.read_bytes()
+
+
+def test_light_in_acescg_is_that_in_rec_709() -> None:
+    """OpenImageIO, by OpenColorIO, converts a picture to ACEScg; its chromaticities lead back."""
+    light = np.random.default_rng(2).random((5, 7, 3)).astype(np.float32)
+    light[0, 0] = 1
+    converted = oiio.ImageBufAlgo.colorconvert(oiio.ImageBuf(light), "Linear Rec.709 (sRGB)", "ACEScg")
+    assert not converted.has_error, converted.geterror()
+    aces = converted.get_pixels(oiio.FLOAT)
+    assert np.abs(aces - light).max() > 0.1
+    found = decode.decode(exr_of(aces, ACES), "srgb", memory=MEMORY)
+    np.testing.assert_allclose(found, light, atol=2e-4)
+    as_it_is = decode.decode(exr_of(aces), "srgb", memory=MEMORY)
+    np.testing.assert_array_equal(as_it_is, aces)
+
+
+def test_rec_709_and_grey_are_left_as_they_are() -> None:
+    light = np.random.default_rng(2).random((5, 7, 3)).astype(np.float32)
+    named = exr_of(light, tuple(float_formats.REC_709.tolist()))
+    np.testing.assert_array_equal(decode.decode(named, "srgb", memory=MEMORY), light)
+    grey = light[..., :1].copy()
+    found = decode.decode(float_formats.encode_exr("Y", grey), "srgb", memory=MEMORY)
+    np.testing.assert_array_equal(found, grey)
+
+
+@pytest.mark.parametrize(
+    "wrong", [(0.0,) * 8, (0.3,) * 8, (np.nan,) * 8, (0.64, 0.33, 0.64, 0.33, 0.15, 0.06, 0.3127, 0.329)]
+)
+def test_impossible_chromaticities_are_refused(wrong: tuple[float, ...]) -> None:
+    light = np.ones((5, 7, 3), np.float32)
+    with pytest.raises(ImageError, match="no light has the chromaticities"):
+        decode.decode(exr_of(light, wrong), "srgb", memory=MEMORY)
+
+
+def test_composites_say_their_primaries(tmp_path: Path) -> None:
+    path = tmp_path / "composite.exr"
+    path.write_bytes(float_formats.encode_exr("RGBA", np.ones((5, 7, 4), np.float32)))
+    spec = oiio.ImageBuf(str(path)).spec()
+    np.testing.assert_allclose(spec.getattribute("chromaticities"), float_formats.REC_709, rtol=1e-6)

@@ -18,6 +18,7 @@ from storage.steps import FINISH, PREPARE
 from tests.parts.captures import nested_program
 from workflows.composite import composite
 from workflows.images import integer_formats
+from workflows.images.float_formats import REC_709
 from workflows.jobs import Task, run
 from workflows.mattes import layers
 from workflows.mattes.layers import confidence
@@ -122,6 +123,7 @@ def test_all_layers_are_read_back_from_one_exr(identity: Matte) -> None:
     assert types["lobe0.u"] == types["lobe1.v"] == oiio.FLOAT
     assert types["S.R"] == types["lobe0.sigma_u"] == oiio.HALF
     np.testing.assert_allclose(np.reshape(spec.getattribute("crosstalk"), (3, 3)), CROSSTALK, rtol=1e-6)
+    np.testing.assert_allclose(spec.getattribute("chromaticities"), REC_709, rtol=1e-6)
     assert tuple(spec.getattribute("monitor")) == (50, 30)
     for c, channel in enumerate("RGB"):
         np.testing.assert_allclose(channels[f"S.{channel}"], identity.layer("S")[..., c], atol=3e-4)

@@ -29,10 +29,9 @@ from numpy.typing import NDArray
 from storage.layout.mattes import Block, Matte
 from workflows.composite.live.lookups import block_lookups
 from workflows.images.exr_writer import Types, write_exr
+from workflows.images.float_formats import REC_709
 from workflows.threads import CORES, in_parts
 
-REC_709 = np.array([0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290], np.float32)
-"""x and y of red, green, blue and white."""
 LOOKUPS = 16
 """Lookups of a pixel, unless another number is asked for, and at most: a node is for the best picture."""
 CLUSTERS = 64
