@@ -1,6 +1,7 @@
 """A matte in an archive on this machine, read block by block where it lies: nothing is unpacked beforehand."""
 
 import sys
+import uuid
 import weakref
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -39,6 +40,7 @@ class ArchivedMatte:
 
     def __init__(self, archive: Path | BinaryIO) -> None:
         self._archive = archive
+        self._token = uuid.uuid4().hex
         if isinstance(archive, Path):
             archive = archive.open("rb")
             weakref.finalize(self, archive.close)
@@ -51,6 +53,10 @@ class ArchivedMatte:
     def __reduce__(self) -> tuple[object, ...]:
         """In another process it is opened again."""
         return type(self), (self._archive,)
+
+    def __dask_tokenize__(self) -> str:
+        """A name of its own: dask would make one by pickling the whole file, if that is in memory."""
+        return self._token
 
     def chunk(self, name: str, row: int, column: int) -> NDArray[Any]:
         """The values of a block in one of the frame-shaped arrays; raises `ArchiveError` if they are damaged."""

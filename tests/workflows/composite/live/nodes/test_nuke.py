@@ -33,6 +33,18 @@ def written(matte: Matte, folder: Path, lookups: int, script: str = "nuke.nk") -
     return (folder / script).read_text()
 
 
+def measure_blurs(matte: Matte, folder: Path, lookups: int) -> dict[str, float]:
+    """PSNR of the node without kernels against the service's composite, before each backdrop."""
+    _, nodes = parse(written(matte, folder, lookups, "nuke_stmap.nk"))
+    channels, _ = read_channels(folder / "lookups.exr")
+    found = {}
+    for kind, backdrop in backdrops().items():
+        expected = composite(matte, backdrop)
+        opaque = np.concatenate([backdrop, np.ones_like(backdrop[..., :1])], axis=-1)
+        found[kind] = psnr(run(nodes, opaque, channels, folder), expected, expected[..., 3] > 0)
+    return found
+
+
 def test_nodes_knobs_and_connections(objects: Objects, tmp_path: Path) -> None:
     group, nodes = parse(written(few_nodes(objects, 3), tmp_path, 2))
     assert group.knobs["name"] == "envmatte_glass"
@@ -101,14 +113,7 @@ def test_nodes_without_kernels(objects: Objects, tmp_path: Path) -> None:
     "name", ["lens", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ball", "tumbler"))]
 )
 def test_blurs_draw_nearly_the_composite(objects: Objects, tmp_path: Path, name: str) -> None:
-    matte = recovered(objects, name)
-    _, nodes = parse(written(matte, tmp_path, LOOKUPS, "nuke_stmap.nk"))
-    channels, _ = read_channels(tmp_path / "lookups.exr")
-    found = {}
-    for kind, backdrop in backdrops().items():
-        expected = composite(matte, backdrop)
-        opaque = np.concatenate([backdrop, np.ones_like(backdrop[..., :1])], axis=-1)
-        found[kind] = psnr(run(nodes, opaque, channels, tmp_path), expected, expected[..., 3] > 0)
+    found = measure_blurs(recovered(objects, name), tmp_path, LOOKUPS)
     least = {"photo": 44, "strokes": 44, "ramp": 70, "tiles": 37, "checker": 36}
     assert {kind: value for kind, value in found.items() if value < least[kind]} == {}
 
