@@ -153,7 +153,7 @@ def test_job_cancelled_before_a_kill_leaves_nothing(capture_archive: Path, tmp_p
     (data / "store" / "uploads" / "orphan.zip").write_bytes(b"an upload that was cut off by the kill")
     (data / "store" / "uploads" / "orphan.zip#1").write_bytes(b"and one that was being written")
     with serving(data, "--workers", "1") as second:
-        assert not [name for name in second.stored() if "orphan" in name]
+        until(lambda: not [name for name in second.stored() if "orphan" in name])
         wait_until_deleted(second, job["matte"])
         assert second.client.job(job["id"])["state"] == "cancelled"
         assert second.client.wait(second.client.recover(job["capture"])["id"])["state"] == "succeeded"
