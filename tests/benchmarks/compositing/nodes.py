@@ -16,7 +16,7 @@ from PIL import Image
 
 from storage.objects.store import Objects
 from tests.workflows.composite.live.nodes.drawing import backdrops, draw, psnr, recovered
-from tests.workflows.composite.live.nodes.test_blender import render, write_nodes
+from tests.workflows.composite.live.nodes.test_blender import render, render_material, write_nodes
 from workflows.composite import composite
 from workflows.composite.live.nodes.exr import LOOKUPS
 from workflows.images.tone_curves import from_light
@@ -41,16 +41,19 @@ def _measure(name: str) -> NDArray[np.floating]:
         entries = matte.layer("count").sum(axis=-1)[matte.layer("recovered")]
         print(f"{name}: entries of a pixel, median and 90th percentile: {np.percentile(entries, (50, 90))}")
         write_nodes(matte, Path(folder), LOOKUPS)
-        of_service, of_formula = {}, {}
+        of_service, of_formula, of_material = {}, {}, {}
         for kind, backdrop in backdrops().items():
             seen, service = render(Path(folder), backdrop), composite(matte, backdrop)
             glass = service[..., 3] > 0
             of_service[kind] = round(psnr(seen, service, glass), 1)
             of_formula[kind] = round(psnr(seen, draw(Path(folder, "lookups.exr"), backdrop), glass), 1)
+            material = render_material(Path(folder), (matte.width, matte.height), backdrop)
+            of_material[kind] = round(psnr(material, service, glass), 1)
             if kind in SHOWN:
                 tiles += [*map(_shown, (seen, service)), _difference(seen, service)]
         print(f"{name} against the service: {of_service}")
-        print(f"{name} against the formula: {of_formula}", flush=True)
+        print(f"{name} against the formula: {of_formula}")
+        print(f"{name}, the material against the service: {of_material}", flush=True)
     return np.concatenate(
         [np.pad(tile, ((2, 2), (2, 2), (0, 0)), constant_values=1) for tile in tiles], axis=1
     )

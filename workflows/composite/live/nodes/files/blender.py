@@ -6,11 +6,14 @@ stretches over the monitor that the glass was filmed before. Or without a window
 
     blender -b -P blender.py -- --backdrop sky.exr --output glass.exr --save glass.blend
 
+With ``--material`` it makes a material as well, for a plane of the frame's aspect in front of a still backdrop.
+
 `python` with the package `bpy` does the same as `blender -b -P`. It takes Blender 4.5.
 """
 
 import argparse
 import sys
+import tempfile
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -25,18 +28,25 @@ Value = Any  # a socket, or a number
 
 
 class Nodes:
-    """The nodes of a group, each made by the arithmetic that it does."""
+    """The nodes of a group of the compositor, or of a material, each made by the arithmetic that it does."""
 
-    def __init__(self, name: str, inputs: Sequence[tuple[str, str]]) -> None:
-        self.tree = bpy.data.node_groups.new(name, "CompositorNodeTree")
-        for label, kind in inputs:
-            self.tree.interface.new_socket(label, in_out="INPUT", socket_type=f"NodeSocket{kind}")
-        self.tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+    def __init__(
+        self,
+        name: str,
+        inputs: Sequence[tuple[str, str]],
+        outputs: Sequence[tuple[str, str]] = (("Image", "Color"),),
+        family: str = "Compositor",
+    ) -> None:
+        self.family = family
+        self.tree = bpy.data.node_groups.new(name, f"{family}NodeTree")
+        for direction, sockets in (("INPUT", inputs), ("OUTPUT", outputs)):
+            for label, kind in sockets:
+                self.tree.interface.new_socket(label, in_out=direction, socket_type=f"NodeSocket{kind}")
         self.inputs = self.tree.nodes.new("NodeGroupInput").outputs
 
     def add(self, kind: str, *values: Value, **settings: Any) -> Any:
         """Add a node, with its inputs linked or set; return its outputs."""
-        node = self.tree.nodes.new(f"CompositorNode{kind}")
+        node = self.tree.nodes.new(f"{self.family}Node{kind}")
         for name, value in settings.items():
             setattr(node, name, value)
         for socket, value in zip(node.inputs, values, strict=False):
@@ -63,8 +73,14 @@ class Nodes:
     def between(self, value: Value, low: float, high: float) -> Value:
         return self.math("MAXIMUM", self.math("MINIMUM", value, high), low)
 
-    def finish(self, result: Value) -> Any:
-        self.tree.links.new(result, self.tree.nodes.new("NodeGroupOutput").inputs[0])
+    def texture(self, image: Any, place: Value, interpolation: str = "Closest") -> Value:
+        """What a picture shows at a place; beyond its edges it goes on."""
+        return self.add("TexImage", place, image=image, interpolation=interpolation, extension="EXTEND")[0]
+
+    def finish(self, *results: Value) -> Any:
+        group = self.tree.nodes.new("NodeGroupOutput")
+        for result, socket in zip(results, group.inputs, strict=False):
+            self.tree.links.new(result, socket)
         for n, node in enumerate(self.tree.nodes):
             node.location = 180 * (n // 12), -170 * (n % 12)
         return self.tree
@@ -176,12 +192,121 @@ def glass(exr: Path, taps: int) -> Any:
             weight = nodes.mix("MULTIPLY", 1.0, layers[f"weight{k}"], share)
             seen = nodes.mix("MULTIPLY", 1.0, weight, nodes.group(samplers[n], light, x, y))
             arrived = nodes.mix("ADD", 1.0, arrived, seen)
-    through = nodes.add("SeparateColor", nodes.mix("MULTIPLY", 1.0, layers["rho"], arrived))
-    result = layers["S"]
-    for channel, column in enumerate(zip(*MATTE["crosstalk"], strict=True)):
-        lit = nodes.mix("MULTIPLY", 1.0, through[channel], (*column, 1.0))
-        result = nodes.mix("ADD", 1.0, result, lit)
+    result = crossed(nodes, nodes.mix("MULTIPLY", 1.0, layers["rho"], arrived), layers["S"])
     return nodes.finish(nodes.add("SetAlpha", result, layers["Alpha"], mode="REPLACE_ALPHA")[0])
+
+
+def crossed(nodes: Nodes, through: Value, result: Value) -> Value:
+    """What comes through, as the camera tells its colours apart, on top of the light that the glass adds."""
+    channels = nodes.add("SeparateColor", through)
+    for channel, column in enumerate(zip(*MATTE["crosstalk"], strict=True)):
+        lit = nodes.mix("MULTIPLY", 1.0, channels[channel], (*column, 1.0))
+        result = nodes.mix("ADD", 1.0, result, lit)
+    return result
+
+
+def baked(exr: Path, backdrop: Any, taps: int) -> dict[str, Any]:
+    """The layers of the EXR and the levels of a backdrop, each a picture of its own: textures know no layers."""
+    scene = bpy.data.scenes.new("envmatte bake")
+    scene.use_nodes = True
+    nodes, links = scene.node_tree.nodes, scene.node_tree.links
+    nodes.clear()
+
+    def shown(kind: str, **settings: Any) -> Any:
+        node = nodes.new(f"CompositorNode{kind}")
+        for name, value in settings.items():
+            setattr(node, name, value)
+        return node
+
+    layers = shown("Image", image=bpy.data.images.load(str(exr), check_existing=True)).outputs
+    numbers = range(MATTE["lookups"])
+    sockets = {name: layers[name] for k in numbers for name in (f"lookup{k}", f"weight{k}")}
+    sockets |= {name: layers[name] for name in ("S", "rho", "Alpha")}
+    light = shown("Image", image=backdrop).outputs[0]
+    trees = [
+        first_level(MATTE["levels"][0], taps),
+        *(next_level(*sizes) for sizes in pairwise(MATTE["levels"])),
+    ]
+    for n, tree in enumerate(trees):
+        level = shown("Group", node_tree=tree)
+        links.new(light, level.inputs[0])
+        sockets[f"level{n}"] = light = level.outputs[0]
+    with tempfile.TemporaryDirectory() as place:
+        output = shown("OutputFile", base_path=place)
+        output.format.file_format, output.format.color_mode = "OPEN_EXR", "RGB"
+        output.format.color_depth = "32"
+        output.file_slots.clear()
+        for name, socket in sockets.items():
+            output.file_slots.new(f"{name}_")
+            links.new(socket, output.inputs[-1])
+        scene.render.compositor_device, scene.render.compositor_precision = "CPU", "FULL"
+        scene.render.resolution_x, scene.render.resolution_y = MATTE["size"]
+        scene.render.resolution_percentage = 100
+        bpy.ops.render.render(scene=scene.name)
+        images = {}
+        for name in sockets:
+            (path,) = Path(place).glob(f"{name}_*.exr")
+            images[name] = bpy.data.images.load(str(path))
+            images[name].name = f"envmatte {name}"
+            images[name].colorspace_settings.name = "Non-Color"
+            images[name].pack()
+    bpy.data.scenes.remove(scene)
+    return images
+
+
+def glass_shader(images: dict[str, Any]) -> Any:
+    """The group of the matte for materials, in front of the backdrop of these pictures."""
+    sockets = [("Color", "Color"), ("Alpha", "Float")]
+    nodes = Nodes(f"{MATTE['name']} material", [("Vector", "Vector")], sockets, "Shader")
+    place = nodes.inputs[0]
+    columns, rows = MATTE["levels"][0]
+    arrived: Value = (0.0, 0.0, 0.0, 1.0)
+    # Cycles keeps what a node makes until it is used, and has room for little. So nodes are made in the order of their
+    # use, and colours stay colours: conversions would all come last.
+    for k in range(MATTE["lookups"]):
+        u, v, level = nodes.add("SeparateColor", nodes.texture(images[f"lookup{k}"], place))
+        seen = None
+        for n, (across, down) in enumerate(MATTE["levels"]):
+            wide, high = columns / 2**n / across, rows / 2**n / down
+            x, y = nodes.math("MULTIPLY", u, wide), nodes.math("MULTIPLY_ADD", v, high, 1 - high)
+            there = nodes.add("CombineXYZ", x, y, 0.0)[0]
+            light = nodes.texture(images[f"level{n}"], there, "Linear")
+            if seen is None:
+                seen = light
+            else:
+                share = nodes.add("Math", level, n - 1.0, operation="SUBTRACT", use_clamp=True)[0]
+                seen = nodes.mix("MIX", share, seen, light)
+        lit = nodes.mix("MULTIPLY", 1.0, nodes.texture(images[f"weight{k}"], place), seen)
+        arrived = nodes.mix("ADD", 1.0, arrived, lit)
+    through = nodes.mix("MULTIPLY", 1.0, nodes.texture(images["rho"], place), arrived)
+    result = crossed(nodes, through, nodes.texture(images["S"], place))
+    return nodes.finish(result, nodes.texture(images["Alpha"], place))
+
+
+def material(group: Any) -> Any:
+    """A material for a plane of the frame's aspect: it emits what the glass shows, and is clear elsewhere."""
+    made = bpy.data.materials.new(MATTE["name"])
+    made.use_nodes = True
+    nodes, links = made.node_tree.nodes, made.node_tree.links
+    nodes.clear()
+    place, glass, light, clear, both, output = (
+        nodes.new(f"ShaderNode{kind}")
+        for kind in ("TexCoord", "Group", "Emission", "BsdfTransparent", "MixShader", "OutputMaterial")
+    )
+    glass.node_tree = group
+    for one, other in (
+        (place.outputs["UV"], glass.inputs[0]),
+        (glass.outputs["Color"], light.inputs["Color"]),
+        (glass.outputs["Alpha"], both.inputs[0]),
+        (clear.outputs[0], both.inputs[1]),
+        (light.outputs[0], both.inputs[2]),
+        (both.outputs[0], output.inputs["Surface"]),
+    ):
+        links.new(one, other)
+    for n, node in enumerate((place, glass, light, clear, both, output)):
+        node.location = 200 * n, 0
+    made.use_fake_user = True
+    return made
 
 
 def folder() -> Path:
@@ -195,6 +320,9 @@ def main() -> None:
     parser.add_argument("--backdrop", type=Path, help="A picture; linear light if it is an EXR.")
     parser.add_argument("--output", type=Path, help="An EXR to render.")
     parser.add_argument("--save", type=Path, help="A .blend to write.")
+    parser.add_argument(
+        "--material", action="store_true", help="Make a material of the glass before the backdrop."
+    )
     given = parser.parse_args(sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else [])
     scene = bpy.context.scene
     scene.use_nodes = True
@@ -220,6 +348,10 @@ def main() -> None:
         links.new(group.outputs[0], output.inputs[0])
     if backdrop:
         links.new(backdrop.outputs[0], group.inputs[0])
+    if given.material:
+        if not backdrop:
+            parser.error("--material needs a --backdrop")
+        material(glass_shader(baked(folder() / "lookups.exr", backdrop.image, taps)))
     if given.output:
         scene.render.resolution_x, scene.render.resolution_y = MATTE["size"]
         scene.render.resolution_percentage = 100
