@@ -9,11 +9,7 @@ recovery functions run on a pseudo-random sample of each object's pixels, always
 1. Fig. 4 and 5: with and without the Gaussian prior at 100 to 400 fine images, the channels apart.
 2. Table 2: hierarchical and direct, at 400 images.
 3. Methods at equal frames, libraries' own solvers among them. The rivals get the measurements of each channel in the
-   +-1 form and go from level to level as NN-DGSR does, or solve directly for all cells. Orthogonal matching pursuit
-   ends at the noise's own residual, or at a fifth of the measurements (at a coarse level, as many); the non-negative
-   lasso's penalty is the noise's ``sigma sqrt(2 ln s / m)``; orthogonal matching pursuit and non-negative least
-   squares get a row that asks T to sum to one, as heavy as all measurements together. Negative weights are cut off,
-   and each T is normalised.
+   +-1 form and go from level to level as NN-DGSR does, or solve directly for all cells (`solvers`).
 
 Times are of one core, errors the mean over the backdrops. "grid" is what the true T on the same grid scores.
 Rivals need scikit-learn (``pip install envmatte[bench]``).
@@ -21,7 +17,6 @@ Rivals need scikit-learn (``pip install envmatte[bench]``).
 
 import json
 import time
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
@@ -32,19 +27,15 @@ from typing import Any
 import numpy as np
 from kits import load, parser_of
 from numpy.typing import NDArray
-from scipy.optimize import nnls
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.linear_model import Lasso, orthogonal_mp
+from solvers import Recover, lasso, least_squares, pursuit, rival
 
 from workflows.images.resample import area_mean
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out
 from workflows.recovery.dgsr import recover as dgsr
-from workflows.recovery.dgsr.groups import Rows
 from workflows.recovery.dgsr.options import DgsrOptions
 from workflows.recovery.lobes import recover as lobes
 from workflows.recovery.noise import Noise
-from workflows.recovery.normalise import normalise
 from workflows.recovery.photometry import Photometry, estimate_noise, fit_photometry
 from workflows.recovery.pyramid import Pyramid
 from workflows.recovery.sensing import Patterns, Sensing
@@ -54,9 +45,6 @@ LEVELS, SEED, NOISE, DEPTH = 8, 7, 1.0, 8
 COARSE, FINE = (16, 12, 24), (128, 96)
 IMAGES = (100, 200, 300, 400)
 FRAMES = (132, 282)
-
-Recover = Callable[[NDArray[np.float32], Photometry, Sensing, Noise], Transport]
-Solve = Callable[[NDArray[np.float64], NDArray[np.float64], float, int], NDArray[np.float64]]
 
 
 @dataclass
@@ -144,72 +132,6 @@ def _errors(
 @cache
 def _backdrops(kit: ModuleType) -> list[NDArray[np.float32]]:
     return list(kit.backdrops().values())
-
-
-def rival(solve: Solve, levels: str) -> Recover:
-    """A method that solves for T pixel by pixel and channel by channel."""
-
-    def recover(
-        measurements: NDArray[np.float32], photometry: Photometry, sensing: Sensing, noise: Noise
-    ) -> Transport:
-        measured = normalise(measurements, photometry, noise, 3.0)
-        index = np.arange(3 * len(measurements)).reshape(-1, 3)
-        used = sensing.levels if levels == "hierarchical" else sensing.levels[-1:]
-        rows = Rows.whole(index.size, used[0])
-        for i, level in enumerate(used):
-            if i > 0:
-                rows = rows.split(used[i - 1], level, 0.02, reach=0)
-            limit = level.patterns.size // (5 if level is used[-1] else 1)
-            matrix = 2 * level.light[0].T.astype(np.float64) - 1
-            for (p, c), row in np.ndenumerate(index):
-                own = slice(rows.begin[row], rows.begin[row + 1])
-                sigma = float(np.sqrt(measured.variance[p, c, level.patterns].mean()))
-                if rows.cell[own].size and np.isfinite(sigma):
-                    target = measured.value[p, c, level.patterns].astype(np.float64)
-                    rows.weight[own] = np.maximum(solve(matrix[:, rows.cell[own]], target, sigma, limit), 0)
-        return rows.transport(used[-1], index)
-
-    return recover
-
-
-def _with_sum(matrix: NDArray[np.float64], target: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    heavy = np.sqrt(len(target))
-    return np.vstack([matrix, np.full(matrix.shape[1], heavy)]), np.append(target, heavy)
-
-
-def pursuit(
-    matrix: NDArray[np.float64], target: NDArray[np.float64], sigma: float, limit: int
-) -> NDArray[np.float64]:
-    m = len(target)
-    matrix, target = _with_sum(matrix, target)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # it warns when it stops because of linear dependence
-        path = orthogonal_mp(matrix, target, n_nonzero_coefs=min(limit, matrix.shape[1]), return_path=True)
-    path = path.reshape(matrix.shape[1], -1)
-    left = ((target[:, None] - matrix @ path) ** 2).sum(axis=0)
-    quiet = np.flatnonzero(left <= m * sigma**2)
-    answer: NDArray[np.float64] = path[:, quiet[0] if quiet.size else -1]
-    return answer
-
-
-def lasso(
-    matrix: NDArray[np.float64], target: NDArray[np.float64], sigma: float, limit: int
-) -> NDArray[np.float64]:
-    m, s = matrix.shape
-    model = Lasso(
-        sigma * np.sqrt(2 * np.log(max(s, 2)) / m), fit_intercept=False, positive=True, max_iter=2000
-    )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        answer: NDArray[np.float64] = model.fit(np.asfortranarray(matrix), target).coef_
-    return answer
-
-
-def least_squares(
-    matrix: NDArray[np.float64], target: NDArray[np.float64], sigma: float, limit: int
-) -> NDArray[np.float64]:
-    answer: NDArray[np.float64] = nnls(*_with_sum(matrix, target), maxiter=20 * matrix.shape[1])[0]
-    return answer
 
 
 def figures_4_and_5(kit: ModuleType, scenes: dict[str, Any]) -> list[dict[str, Any]]:
