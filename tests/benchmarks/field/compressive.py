@@ -54,7 +54,7 @@ class CompressiveDual:
 
     Random patterns of the monitor's pixels, and each channel of a pixel as a sparse sum of wavelets, by regularised
     orthogonal matching pursuit (D. Needell and R. Vershynin, Found. Comput. Math., 2009). Both are the publication's.
-    Left open, or chosen anew: Haar's wavelets; 1,000 patterns; 12 wavelets a step; an end at the noise's own residual,
+    Left open or chosen here: Haar's wavelets; 1,000 patterns; 12 wavelets a step; an end at the noise's own residual,
     at 160 wavelets, or where the residual no longer falls.
     """
 
@@ -66,12 +66,18 @@ class CompressiveDual:
         functions = sp.vstack(haar(columns, rows, LEVELS), format="csr")
         # Of length 1, so that correlations compare.
         self.basis = sp.diags_array(np.diff(functions.indptr).astype(np.float32) ** -0.5) @ functions
-        self.matrix = np.ascontiguousarray((self.basis @ (2 * bits.T.astype(np.float32) - 1)).T)
+        signs = 2 * bits.T.astype(np.float32) - 1
+        # The white frame is a measurement too, and as good as all others together.
+        white = np.full((len(signs), 1), self.COUNT**0.5, np.float32)
+        self.matrix = np.ascontiguousarray((self.basis @ np.concatenate([signs, white], axis=1)).T)
         yield with_constants(255 * bits.reshape(-1, rows, columns, 1))
 
     def recover(self, film: Film) -> Matte:
         still, rho, shares = normalised(film)
-        T = [self.solve(2 * values - 1, 2 * sigma, film) for values, sigma in channels(shares, rho)]
+        T = []
+        for values, sigma in channels(shares, rho):
+            white = np.full((len(values), 1), self.COUNT**0.5, np.float32)
+            T.append(self.solve(np.concatenate([2 * values - 1, white], axis=1), 2 * sigma, film))
         return scaled(still, rho, T, self.basis)
 
     def solve(self, target: Floats, sigma: Floats, film: Film) -> sp.csr_array:
@@ -84,12 +90,13 @@ class CompressiveTransport(CompressiveDual):
     transport sensing", ACM Transactions on Graphics 28(1), 2009.
 
     As Sen and Darabi, but hierarchical: the mean of a square of pixels is solved for first, and each quarter of it
-    starts from the wavelets of the whole. It is the publication's idea. Left open, or chosen anew: squares of 4 x 4
-    pixels, quarters of them, and pixels; the patterns are those of the method above, not the publication's, which are
-    made to suit its own projector.
+    starts from the wavelets of the whole. It is the publication's idea. Left open or chosen here: squares of 4 x 4
+    pixels, quarters of them, and pixels; the 40 largest coefficients of the whole are what a part starts from; the
+    patterns are those of the method above, not the publication's, which are made to suit its own projector.
     """
 
     name = "Peers 2009, hierarchical ROMP"
+    KEPT = 40
 
     def solve(self, target: Floats, sigma: Floats, film: Film) -> sp.csr_array:
         n = len(target)
@@ -102,8 +109,14 @@ class CompressiveTransport(CompressiveDual):
             mean = sp.csr_array((1 / size[own], (own, np.arange(n))), shape=(size.size, n))
             noise = mean @ sigma / size**0.5
             found = romp(self.matrix, mean @ target, noise, [start[pixel] for pixel in first])
-            start = [found.indices[slice(*found.indptr[row : row + 2])] for row in own]
+            start = [self._largest(found, row) for row in own]
         return found
+
+    def _largest(self, found: sp.csr_array, row: int) -> NDArray[np.intp]:
+        """The places of a row's largest coefficients."""
+        inside = slice(*found.indptr[row : row + 2])
+        order = np.argsort(-np.abs(found.data[inside]), kind="stable")[: self.KEPT]
+        return np.sort(found.indices[inside][order])
 
 
 def romp(

@@ -58,8 +58,8 @@ class Frequencies:
     """J. Zhu and Y.-H. Yang, "Frequency-based environment matting", Pacific Graphics 2004.
 
     Each of the monitor's columns, then each of its rows, flickers at a frequency of its own, and the spectrum of a
-    camera pixel's signal tells which of them it sees, and how much. All of this is the publication's. Left open, or
-    chosen anew: a frame more than twice as many as frequencies need; the part of the spectrum in phase with the signal,
+    camera pixel's signal tells which of them it sees, and how much. All of this is the publication's. Left open or
+    chosen here: a frame more than twice as many as frequencies need; the part of the spectrum in phase with the signal,
     which is less noisy than its magnitude; shares below three times the noise count as none; where several columns and
     rows are seen, the weight of a crossing is the product of both shares.
     """
@@ -85,7 +85,7 @@ class CompressedFrequencies:
 
     Frequencies and phases tell the columns and rows that a pixel sees, with half as many frames as frequencies alone;
     compressive sensing tells the weights of their crossings from random patterns. Both are the publication's, as its
-    abstract has them. Left open, or chosen anew, the text not being at hand: two phases, a quarter turn apart, for
+    abstract has them. Left open or chosen here, the text not being at hand: two phases, a quarter turn apart, for
     places half a monitor apart; 128 patterns of random pixels; weights by non-negative least squares over the
     crossings, the 1,200 likeliest at most, with the shares of columns and rows as further equations.
     """

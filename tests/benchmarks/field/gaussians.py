@@ -34,8 +34,8 @@ class Swept:
     towards higher accuracy and real-time capture", SIGGRAPH 2000, Sect. 3.
 
     A Gaussian stripe is swept over the monitor, vertical, horizontal and along both diagonals. Each channel of a pixel
-    is a sum of oriented Gaussians, fitted to all frames by Levenberg-Marquardt. Both are the publication's. Left open,
-    or chosen anew: stripes of 2 pixels' deviation in steps of 2; the start, peaks of the vertical and the horizontal
+    is a sum of oriented Gaussians, fitted to all frames by Levenberg-Marquardt. Both are the publication's. Left open
+    or chosen here: stripes of 2 pixels' deviation in steps of 2; the start, peaks of the vertical and the horizontal
     sweep paired as all four sweeps allow, with weights by non-negative least squares; at most four lobes, as many as
     lie above the noise; one fit for all channels where the glass has no colour.
     """
@@ -171,7 +171,7 @@ class OneFrame:
 
     The colours are a plane through the cube of RGB, so that a frame's three values tell the place, u and v, and rho.
     The glass must be colourless and clear, a pixel sees one place, and the room is dark: the publication's own
-    assumptions. Left open, or chosen anew: the plane, ``(u, v, 1 - (u + v) / 2)``; the camera's black level is known,
+    assumptions. Left open or chosen here: the plane, ``(u, v, 1 - (u + v) / 2)``; the camera's black level is known,
     0.02; the highlights, which the publication finds by their brightness, are none here; the matte is not smoothed.
     """
 

@@ -30,7 +30,7 @@ METHODS: list[Callable[[], Method]] = [
     *(partial(Engine, f"NN-DGSR, {frames} frames", grids(frames), JOINT) for frames in (61, 140, 282)),
     partial(Engine, "NN-DGSR, the paper's grids", {(16, 12): 24, (128, 96): 250}, JOINT),
     *(partial(Engine, f"NNLS, {frames} frames", grids(frames), NNLS) for frames in (61, 140, 282)),
-    *(partial(Engine, f"lasso, {frames} frames", grids(frames), LASSO) for frames in (61, 140, 282)),
+    *(partial(Engine, f"lasso, {frames} frames", grids(frames), LASSO) for frames in (140, 282)),
     partial(Engine, "OMP, 282 frames", grids(282), OMP),
     GrayCode,
     Zongker,

@@ -74,7 +74,7 @@ class Wavelets:
 
     Each frame shows one wavelet. A feedback loop chooses the next ones: the children of those whose frames have most
     light, by the norm over all pixels. The matte holds the pixels' responses to the wavelets shown. All of this is the
-    publication's. Left open, or chosen anew: Haar's wavelets, shown about a medium grey, where the publication has
+    publication's. Left open or chosen here: Haar's wavelets, shown about a medium grey, where the publication has
     smoother ones and weighs levels by an exponent, which is 0 here, as suits backdrops like photographs; blocks of 64
     pixels to begin with; 64 wavelets a round, 1,000 in all. Responses below three times the noise count as none.
     """
@@ -127,7 +127,7 @@ class WaveletNoise:
 
     Patterns that do not depend on the scene: each shows all wavelets of one level with random weights. A pixel's
     coefficients are found from coarse to fine: only wavelets whose parents matter can matter, and these are fitted to
-    the level's frames. All of this is the publication's. Left open, or chosen anew: Haar's wavelets; weights of 1 and
+    the level's frames. All of this is the publication's. Left open or chosen here: Haar's wavelets; weights of 1 and
     -1, which are brightest; 32 patterns of blocks of 64 pixels and 80 of each of the six levels; as many blocks are
     split as have over 1 % of the light, a sixth of the level's patterns at most.
     """

@@ -12,8 +12,6 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.linear_model import Lasso, orthogonal_mp
 
 from workflows.recovery.dgsr.groups import Rows
 from workflows.recovery.noise import Noise
@@ -60,6 +58,8 @@ def _with_sum(matrix: NDArray[np.float64], target: NDArray[np.float64]) -> tuple
 def pursuit(
     matrix: NDArray[np.float64], target: NDArray[np.float64], sigma: float, limit: int
 ) -> NDArray[np.float64]:
+    from sklearn.linear_model import orthogonal_mp  # imported where used, as an extra
+
     m = len(target)
     matrix, target = _with_sum(matrix, target)
     with warnings.catch_warnings():
@@ -75,6 +75,9 @@ def pursuit(
 def lasso(
     matrix: NDArray[np.float64], target: NDArray[np.float64], sigma: float, limit: int
 ) -> NDArray[np.float64]:
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.linear_model import Lasso
+
     m, s = matrix.shape
     model = Lasso(
         sigma * np.sqrt(2 * np.log(max(s, 2)) / m), fit_intercept=False, positive=True, max_iter=2000
