@@ -80,22 +80,27 @@ def show(row: dict[str, Any]) -> None:
 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:
-    """A table in Markdown: a row for each method, a column for each scene, and means over the scenes."""
+    """A table in Markdown: a row for each method, best first, a column for each scene, and means over the scenes.
+
+    Methods that were not run on all scenes come last, and have no mean.
+    """
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     columns = ["method", "frames", *scenes, "mean", "fine checker", "s / 1,000", "kB / 1,000"]
-    lines = [" | ".join(columns), "|".join(["---", *["---:"] * (len(columns) - 1)])]
-    means = []
+    lines = []
     for name in dict.fromkeys(row["method"] for row in rows):
-        of = [row for row in rows if row["method"] == name]
+        of = {row["scene"]: row for row in rows if row["method"] == name}
+        complete = len(of) == len(scenes)
         mean = {
-            key: float(np.mean([row[key] for row in of])) for key in of[0] if key not in ("scene", "method")
+            key: float(np.mean([row[key] for row in of.values()]))
+            for key in ("frames", "dB", "fine checker", "s / 1,000", "kB / 1,000")
         }
-        cells = [name, f"{mean['frames']:.0f}", *(f"{row['dB']:.1f}" for row in of)]
-        cells += [f"{mean['dB']:.1f}", f"{mean['fine checker']:.1f}"]
-        cells += [f"{mean['s / 1,000']:.2g}", f"{mean['kB / 1,000']:.0f}"]
-        means.append((mean["dB"], " | ".join(cells)))
-    lines += [cells for _, cells in sorted(means, reverse=True)]
-    return [f"| {line} |" if "---" not in line else f"|{line}|" for line in lines]
+        cells = [name, f"{mean['frames']:.0f}"]
+        cells += [f"{of[scene]['dB']:.1f}" if scene in of else "" for scene in scenes]
+        cells += [f"{mean[key]:.1f}" if complete else "" for key in ("dB", "fine checker")]
+        cells += [f"{mean['s / 1,000']:.2f}", f"{mean['kB / 1,000']:,.0f}"]
+        lines.append((complete, mean["dB"], f"| {' | '.join(cells)} |"))
+    head = [f"| {' | '.join(columns)} |", f"|---|{'---:|' * (len(columns) - 1)}"]
+    return head + [line for *_, line in sorted(lines, reverse=True)]
 
 
 if __name__ == "__main__":

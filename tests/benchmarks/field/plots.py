@@ -13,10 +13,11 @@ OURS = "envmatte"
 
 
 def plot(rows: list[dict[str, Any]], folder: Path) -> None:
-    """Write ``field.png`` and ``field-scenes.png`` of the rows that `__main__` measures."""
+    """Write ``field.png`` and ``field-scenes.png`` of the methods that `__main__` ran on all scenes."""
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     methods = list(dict.fromkeys(row["method"] for row in rows))
     of = {name: [row for row in rows if row["method"] == name] for name in methods}
+    methods = [name for name in methods if len(of[name]) == len(scenes)]
     mean = {name: float(np.mean([row["dB"] for row in of[name]])) for name in methods}
     methods.sort(key=lambda name: -mean[name])
 

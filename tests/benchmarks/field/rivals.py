@@ -12,9 +12,7 @@ from tests.benchmarks.field.ours import Engine
 from tests.benchmarks.field.wavelets import WaveletNoise, Wavelets
 from tests.benchmarks.recovery.solvers import lasso, least_squares, pursuit, rival
 from workflows.recovery.dgsr import recover as dgsr
-from workflows.recovery.dgsr.options import DgsrOptions
 
-JOINT = partial(dgsr.recover, options=DgsrOptions(channels="joint"))
 NNLS, LASSO, OMP = (rival(solve, "hierarchical") for solve in (least_squares, lasso, pursuit))
 
 
@@ -27,8 +25,8 @@ def grids(frames: int) -> dict[tuple[int, int], int]:
 METHODS: list[Callable[[], Method]] = [
     *(partial(Engine, f"envmatte, {name}", name) for name in ("sketch", "quick", "default")),
     partial(Engine, "envmatte, three grids", grids(282)),
-    *(partial(Engine, f"NN-DGSR, {frames} frames", grids(frames), JOINT) for frames in (61, 140, 282)),
-    partial(Engine, "NN-DGSR, the paper's grids", {(16, 12): 24, (128, 96): 250}, JOINT),
+    *(partial(Engine, f"NN-DGSR, {frames} frames", grids(frames), dgsr.recover) for frames in (61, 140, 282)),
+    partial(Engine, "NN-DGSR, the paper's grids", {(16, 12): 24, (128, 96): 250}, dgsr.recover),
     *(partial(Engine, f"NNLS, {frames} frames", grids(frames), NNLS) for frames in (61, 140, 282)),
     *(partial(Engine, f"lasso, {frames} frames", grids(frames), LASSO) for frames in (140, 282)),
     partial(Engine, "OMP, 282 frames", grids(282), OMP),
