@@ -14,7 +14,7 @@ _SHOWN: dict[str, dict[str, Any]] = {
     "alpha": {"contrast_limits": (0, 1), "colormap": "gray"},
     "confidence": {"contrast_limits": (0, 1), "colormap": "viridis"},
 }
-"""Of each layer, what napari is told."""
+"""Of each layer, how napari is to show it."""
 
 
 def get_reader(path: str | list[str]) -> Callable[[str | list[str]], list[LayerData]] | None:

@@ -1,4 +1,4 @@
-"""Columns and rows told apart by their frequencies: Zhu and Yang 2004, and Qian et al. 2015."""
+"""Columns and rows distinguished by their frequencies: Zhu and Yang 2004, and Qian et al. 2015."""
 
 import numpy as np
 from numpy.typing import NDArray

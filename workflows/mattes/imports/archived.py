@@ -15,7 +15,7 @@ from workflows.mattes.imports.reader import Reader
 from workflows.untrusted.limits import Limits
 
 ANY_SIZE = Limits(unpacked=sys.maxsize, memory=sys.maxsize)
-"""Whoever opens a file of theirs has asked for it; damage and lies are refused all the same."""
+"""A file of their own is what people ask to open; damage and lies are refused all the same."""
 
 
 class ArchivedMatte:
