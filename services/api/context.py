@@ -49,8 +49,9 @@ class Context:
     """Bytes that frames, pixels, layers, composites and archives take while they are read, computed and encoded."""
     backdrops: Shares
     """Bytes of backdrops on disk, from their first byte until they are composited."""
-    lists: Shares = field(default_factory=lambda: Shares(4, 2))
-    """Lists, captures and reports made at once: a capture's program may take 60 MB."""
+    lists: Shares = field(default_factory=lambda: Shares(4, 1))
+    """Lists, captures and reports made at once: a capture's program may take 60 MB. One an owner, since they compute
+    all the time, and each thread that does delays all other requests."""
     pictures: Shares = field(default_factory=lambda: Shares(4, 3))
     """Pictures of programs drawn at once. Like the shares below, it bounds the memory that they take."""
     films: Shares = field(default_factory=lambda: Shares(2, 1))

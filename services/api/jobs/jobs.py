@@ -246,6 +246,7 @@ def _queue(context: Context, request: JobRequest, key: str | None) -> Job:
     if earlier is not None:
         return earlier
     with reading(context.engine) as c:
+        admit(c, context.settings, jobs=1)
         program = captures.get(c, request.capture).program
     # Grids that do not nest are refused here, not by the job; and before the transaction, for which others wait.
     Program.model_validate(program).bands()
