@@ -22,8 +22,9 @@ NODES = 1024
 
 # Squared Mahalanobis distance at which a lobe is cut off: 0.7 % of its mass is beyond.
 _REACH = 10.0
-# Least standard deviation of a sampled Gaussian, in spacings of its grid: a narrower one can miss all nodes.
-_LEAST_SIGMA = 0.6
+# Least standard deviation of a sampled Gaussian, in spacings of its grid. Below 0.3 it can miss all nodes. At 0.6 light
+# from a single cell is explained so badly that a second place is not worth a lobe; at 0.4 fits end in wrong places.
+_LEAST_SIGMA = 0.5
 
 
 class PatternCodes(NamedTuple):

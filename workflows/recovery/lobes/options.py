@@ -8,7 +8,7 @@ from workflows.recovery.options import Range
 class LobesOptions(NamedTuple):
     """A few oriented Gaussian lobes and the posterior mean of T about them; any program; one T where channels agree."""
 
-    most_lobes: Annotated[int, Range(1, 16), "Most lobes of a T."] = 3
+    most_lobes: Annotated[int, Range(1, 16), "Most lobes of a T."] = 4
     fit_resolution: Annotated[
         float,
         Range(0.5, 4),

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from workflows.recovery.lobes.fitting.search import find_node, fit
 from workflows.recovery.lobes.footprint import PARAMETERS, PatternCodes, bump_variance
 from workflows.recovery.lobes.mixture import Mixture, make_workspace
-from workflows.recovery.lobes.options import LobesOptions
+from workflows.recovery.lobes.options import FINE, LobesOptions
 
 COLUMNS, ROWS, MOST = 64, 48, 3
 SIGMA = 0.01
@@ -120,6 +120,33 @@ def test_two_lobes_are_recovered(measure, fitted, truth):
         np.testing.assert_allclose(found.lobes[i, 1:3], shape[:2], atol=0.15)
         expected = turned(*shape[2:])
         np.testing.assert_allclose(found.covariance(i), expected, atol=0.2 * np.trace(expected))
+
+
+def test_two_points_far_narrower_than_a_lobe_are_told_apart(patterns_of):
+    patterns = patterns_of([(COLUMNS, ROWS, 100)], 1)
+    strays = np.ones((1, patterns.count + 2), np.float32)
+    shown = PatternCodes(patterns.pyramid.arrays, patterns.code, 0, 1, patterns.count, strays)
+    signed = patterns.code[: COLUMNS * ROWS] / 127.5 - 1
+    told_apart = 0
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        places = np.array([[26, 18], [29, 26]]) + rng.integers(-14, 14, 2)
+        light = np.array([0.63, 0.37]) @ signed[places[:, 1] * COLUMNS + places[:, 0]]
+        y = np.append(light, [-1, 1]) + SIGMA * rng.standard_normal(light.size + 2)
+        mixture = Mixture(np.zeros((MOST, PARAMETERS)), np.zeros(MOST, np.int64), np.zeros(1))
+        k, _, _ = fit(
+            shown,
+            y.astype(np.float32),
+            np.full(y.size, SIGMA**2, np.float32),
+            mixture,
+            0,
+            FINE._replace(most_lobes=MOST),
+            make_workspace(shown.m),
+        )
+        order = np.argsort(-mixture.lobes[:k, 0], kind="stable")[:2]
+        centres = mixture.lobes[order, 1:3]
+        told_apart += k > 1 and np.abs(centres - places - 0.5).max() < 0.6
+    assert told_apart >= 85  # about 28 before, with wider lobes and no search near those that are there
 
 
 def test_the_offset_is_free(measure, fitted, truth):
