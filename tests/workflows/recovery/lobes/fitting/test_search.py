@@ -122,12 +122,12 @@ def test_two_lobes_are_recovered(measure, fitted, truth):
         np.testing.assert_allclose(found.covariance(i), expected, atol=0.2 * np.trace(expected))
 
 
-def test_two_points_far_narrower_than_a_lobe_are_told_apart(patterns_of):
+def test_two_points_far_narrower_than_a_lobe_are_found(patterns_of):
     patterns = patterns_of([(COLUMNS, ROWS, 100)], 1)
     strays = np.ones((1, patterns.count + 2), np.float32)
     shown = PatternCodes(patterns.pyramid.arrays, patterns.code, 0, 1, patterns.count, strays)
     signed = patterns.code[: COLUMNS * ROWS] / 127.5 - 1
-    told_apart = 0
+    both_found = 0
     for seed in range(100):
         rng = np.random.default_rng(seed)
         places = np.array([[26, 18], [29, 26]]) + rng.integers(-14, 14, 2)
@@ -145,8 +145,8 @@ def test_two_points_far_narrower_than_a_lobe_are_told_apart(patterns_of):
         )
         order = np.argsort(-mixture.lobes[:k, 0], kind="stable")[:2]
         centres = mixture.lobes[order, 1:3]
-        told_apart += k > 1 and np.abs(centres - places - 0.5).max() < 0.6
-    assert told_apart >= 85  # about 28 before, with wider lobes and no search near those that are there
+        both_found += k > 1 and np.abs(centres - places - 0.5).max() < 0.6
+    assert both_found >= 85  # about 28 before, with wider lobes and no search near those that are there
 
 
 def test_the_offset_is_free(measure, fitted, truth):
