@@ -7,7 +7,7 @@ import socket
 import subprocess
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -216,6 +216,9 @@ def url_of(service: subprocess.Popen[str]) -> str:
 
 
 def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port: int = taken.getsockname()[1]
-        return port
+    """A port that nothing listens on, and that no connection takes before it is used: below those given to them."""
+    while True:
+        with suppress(OSError):
+            port = random.SystemRandom().randrange(20_000, 32_768)
+            with socket.create_server(("127.0.0.1", port)):
+                return port
