@@ -72,12 +72,12 @@ def make_engine(url: str) -> Engine:
     InvalidInput
         If the URL does not name a SQLite or PostgreSQL database.
     """
-    # Programs may be large: `json.loads` takes three times as long, in which no other thread runs.
     try:
         parsed = make_url(url)
         name = parsed.get_backend_name()
     except (ArgumentError, ValueError):
         name = ""
+    # Programs may be large: `json.loads` takes three times as long, in which no other thread runs.
     if name == "sqlite":
         engine = create_engine(parsed, json_deserializer=from_json)
         event.listen(engine, "connect", _set_up_sqlite)

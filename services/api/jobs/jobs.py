@@ -246,7 +246,7 @@ def _queue(context: Context, request: JobRequest, key: str | None) -> Job:
     if earlier is not None:
         return earlier
     with reading(context.engine) as c:
-        admit(c, context.settings, jobs=1)
+        admit(c, context.settings, jobs=1)  # again below, where it is certain; to read a program takes longer
         program = captures.get(c, request.capture).program
     # Grids that do not nest are refused here, not by the job; and before the transaction, for which others wait.
     Program.model_validate(program).bands()
