@@ -111,7 +111,8 @@ def run(
 @contextmanager
 def service(data: Path, workers: int | None) -> Iterator[str]:
     """A service of its own on a free port; yields its URL."""
-    command = [sys.executable, "-m", "services", "serve", "--data", str(data), "--port", "0"]
+    # -P: not sources in the folder that it is called from, whose kernels `envmatte warm` has not compiled.
+    command = [sys.executable, "-P", "-m", "services", "serve", "--data", str(data), "--port", "0"]
     if workers:
         command += ["--workers", str(workers)]
     with (data.parent / "service.log").open("wb") as log:
