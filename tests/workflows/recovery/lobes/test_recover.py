@@ -159,6 +159,22 @@ def test_channels_that_differ_get_their_own_t(request, colours, truth, observe):
     np.testing.assert_allclose(moments(T_found)[..., :2], moments(T)[..., :2], atol=0.5)
 
 
+def test_channels_that_differ_by_less_than_lobes_miss_get_their_own_t(coloured, truth, observe):
+    """A bend of light, which no lobe resembles, dispersed by half a cell from channel to channel."""
+    draws = np.random.default_rng(3).uniform((15, 12), (45, 34), (20, 2))
+
+    def bend(x, y):
+        around = np.linspace(0, 1.5 * np.pi, 12)
+        return np.mean(
+            [truth((x + 5 * np.cos(a), y + 5 * np.sin(a), 0.5, 0.5))[0, 0] for a in around], axis=0
+        )
+
+    T = np.stack([[bend(x + 0.5 * c, y) for c in range(3)] for x, y in draws])
+    alike = np.repeat(T[:, :1], 3, axis=1)
+    assert recovered(coloured, observe(coloured, T)).transport.shared.mean() < 0.3
+    assert recovered(coloured, observe(coloured, alike)).transport.shared.mean() > 0.7
+
+
 @pytest.mark.parametrize("colours", ["patterns", "coloured"])
 @pytest.mark.parametrize("shape", [(25.3, 18.6, 3.0, 1.0, 0.6), (33.1, 24.8, 7.0, 5.0, 2.0)])
 def test_channels_that_agree_share_a_t(request, colours, shape, truth, observe):

@@ -23,6 +23,7 @@ from workflows.recovery.lobes.likelihood import penalty
 from workflows.recovery.lobes.mixture import Mixture, Workspace, copy_mixture, make_workspace
 from workflows.recovery.lobes.nodes import gather_lobes, node_responses, spread_lobes
 from workflows.recovery.lobes.options import LobesOptions
+from workflows.recovery.lobes.posterior.evidence import log_evidence
 from workflows.recovery.lobes.posterior.mean import update
 
 # A fit that starts from neighbours ends when a step would lower chi-square by less than this for each parameter. Noise
@@ -186,18 +187,53 @@ def fit_pixel(
 
 
 @njit(nogil=True, cache=True, inline="always")
-def prefers_channels(fits: Fits, p: int, size: int) -> bool:
-    """Whether one T for each channel explains a pixel better than one T for all, given `size` measurements.
+def evidence(
+    pixels: Pixels, p: int, c: int, fits: Fits, options: LobesOptions, buffers: NodeBuffers
+) -> float:
+    """-2 ln evidence for fit c of a pixel."""
+    patterns, y, variance = measurements_of(pixels, p, c)
+    fitted, k = fit_of(fits, p, c), fits.k[p, c]
+    moved = Mixture(fitted.lobes.copy(), fitted.level.copy(), fitted.stray)
+    n = spread_lobes(patterns.grids, moved, k, options.resolution, buffers.node, buffers.weight, buffers.end)
+    A = buffers.rows[: n * y.size].reshape(n, y.size)
+    node_responses(patterns, buffers.node, n, A)
+    found: float = log_evidence(A, buffers.weight[:n], y, variance, patterns.strays, fitted.stray)
+    return found
+
+
+@njit(nogil=True, cache=True, inline="always")
+def prefers_channels(
+    pixels: Pixels,
+    p: int,
+    neighbours: NDArray[np.int64],
+    separate: NDArray[np.bool_],
+    options: LobesOptions,
+    fits: Fits,
+    buffers: NodeBuffers,
+) -> bool:
+    """Whether one T for each channel explains a pixel better than one T for all.
 
     Decided by the Bayesian information criterion, with a kappa for each T. Centres are ordinary parameters here, since
-    the channels' lobes are near the common ones.
+    the channels' lobes are near the common ones. The likelihood is that of the lobes, and where neighbours were decided
+    otherwise, or there are none, the evidence for T, which takes longer: under lobes alone, what these cannot represent
+    hides that channels differ.
     """
-    log_size = math.log(size)
-    joint = fits.objective[p, ALL] + log_size * (PARAMETERS * fits.k[p, ALL] + 1)
-    separate = 0.0
+    more, agreed = 2, 0
+    by_lobes = -fits.objective[p, ALL]
     for c in range(3):
-        separate += fits.objective[p, c] + log_size * (PARAMETERS * fits.k[p, c] + 1)
-    better: bool = separate < joint
+        by_lobes += fits.objective[p, c]
+        more += PARAMETERS * fits.k[p, c]
+    penalty_of_more = math.log(pixels.joint.value.shape[1]) * (more - PARAMETERS * fits.k[p, ALL])
+    better: bool = by_lobes + penalty_of_more < 0
+    for q in neighbours:
+        if q >= 0 and fits.k[q, ALL] > 0:
+            agreed += 1 if separate[q] == better else -neighbours.size
+    if agreed <= 0:
+        by_evidence = -evidence(pixels, p, ALL, fits, options, buffers)
+        for c in range(3):
+            if fits.k[p, c] > 0:
+                by_evidence += evidence(pixels, p, c, fits, options, buffers)
+        better = by_evidence + penalty_of_more < 0
     return better
 
 
@@ -233,4 +269,4 @@ def fit_pixels(
         if alive[p]:
             fit_pixel(pixels, p, separate[p], neighbours[p], options, fits, buffers, workspace)
             if groups == 3:
-                separate[p] = prefers_channels(fits, p, size)
+                separate[p] = prefers_channels(pixels, p, neighbours[p], separate, options, fits, buffers)

@@ -1,1 +1,1 @@
-"""The posterior mean of T, and the linear equations that give it."""
+"""The posterior mean of T, the linear equations that give it, and the evidence for it."""
