@@ -13,6 +13,7 @@ from pathlib import Path
 from storage.layout.captures import Stack
 from storage.objects.store import Objects
 from workflows.ingest import steps as ingest_steps
+from workflows.ingest.camera.border_exposure import BorderValues
 from workflows.ingest.camera.calibration import measure
 from workflows.jobs import Task
 from workflows.untrusted.limits import Limits
@@ -31,7 +32,8 @@ def _ingest(objects: Objects, capture: str, memory: int) -> int:
     task = replace(task, plan=ingest_steps.prepare(objects, task))
     for tile in range(task.plan["tiles"]):
         ingest_steps.work(objects, task, tile)
-    measure(Stack(objects, capture))
+    stack = Stack(objects, capture)
+    measure(stack, BorderValues.of(stack))
     return int(task.plan["tiles"])
 
 

@@ -17,6 +17,7 @@ from workflows.images.resample import smallest_grid
 from workflows.images.tone_curves import Response
 from workflows.ingest import films, stills
 from workflows.ingest.archive import CaptureArchive
+from workflows.ingest.camera.border_exposure import BorderValues
 from workflows.ingest.camera.calibration import measure
 from workflows.ingest.manifest import MANIFEST
 from workflows.ingest.report.survey import survey
@@ -184,17 +185,18 @@ def finish(objects: Objects, task: Task) -> dict[str, Any]:
     """
     objects.sweep(captures.path(task.capture))
     stack = Stack(objects, task.capture)
-    measure(stack)
-    seconds = _try_out(stack)
-    survey(stack)
+    border = BorderValues.of(stack)
+    measure(stack, border)
+    seconds = _try_out(stack, border)
+    survey(stack, border)
     stack.save()
     return {"core_seconds": seconds}
 
 
-def _try_out(stack: Stack) -> dict[str, float] | None:
+def _try_out(stack: Stack, border: BorderValues | None) -> dict[str, float] | None:
     """Find the steadiness of a stack, and how long its recovery will take, from one sample of its pixels."""
     sample = take_sample(stack)
-    patterns = find_steadiness(stack, sample)
+    patterns = find_steadiness(stack, sample, border)
     return None if sample is None or patterns is None else core_seconds(stack, sample, patterns)
 
 

@@ -1,14 +1,14 @@
 """How the exposure of a film changed from pattern to pattern, by the border, whose light is known."""
 
 from collections.abc import Sequence
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import light_of_codes
-from workflows.ingest.local_gain import local_gain
+from workflows.ingest.local_gain import Surroundings
 from workflows.programs.border import border_light
 from workflows.programs.program import Program
 
@@ -64,13 +64,20 @@ class BorderLight(NamedTuple):
 
 
 class BorderValues:
-    """Values that may see the border of a film, in all frames.
+    """Values that may see the border of a film, in all frames. To find them, chunks all over the stack are read.
 
     Parameters
     ----------
     stack : Stack
     program : Program
     """
+
+    @classmethod
+    def of(cls, stack: Stack) -> Self | None:
+        """The values of a stack; None if it is not a film with a border."""
+        if not stack.attributes.get("border"):
+            return None
+        return cls(stack, Program.model_validate(stack.attributes["program"]))
 
     def __init__(self, stack: Stack, program: Program) -> None:
         left = [int((n + 0.5) * stack.width / STRIPS) for n in range(STRIPS)]
@@ -86,23 +93,23 @@ class BorderValues:
         kept = kept[:: max(-(-kept.size // MOST_VALUES), 1)]
         self.codes = codes[:, kept]
         self.places = np.stack(np.meshgrid(rows, columns, indexing="ij")).reshape(2, -1)[:, kept]
-        gain = local_gain(stack)
-        self.local: NDArray[np.floating] = np.ones((1, 1)) if gain is None else gain.at(*self.places)
         top = np.iinfo(stack.dtype).max
         self.usable = np.asarray(((self.codes > 0) & (self.codes < SHOULDER * top)).all(axis=2))
 
-    def exposures(self, look_up: NDArray[np.float32]) -> Doubles | None:
+    def exposures(self, look_up: NDArray[np.float32], local: Surroundings | None = None) -> Doubles | None:
         """The exposure of each frame, as of `fit`."""
-        found = self.fit(look_up)
+        found = self.fit(look_up, local)
         return None if found is None else found.exposure
 
-    def fit(self, look_up: NDArray[np.float32]) -> BorderLight | None:
+    def fit(self, look_up: NDArray[np.float32], local: Surroundings | None = None) -> BorderLight | None:
         """The exposure of each frame and the border's light; None if too few values see the border.
 
         Parameters
         ----------
         look_up : (k,) or (k, channels) float32
             The light of each code.
+        local : Surroundings, optional
+            The local gain of tone mapping, as from `workflows.ingest.local_gain.local_gain`.
 
         Notes
         -----
@@ -114,7 +121,9 @@ class BorderValues:
         """
         if self.codes.shape[1] < MIN_VALUES:
             return None
-        light = light_of_codes(self.codes, look_up).mean(axis=2, dtype=np.float64) / self.local
+        light = light_of_codes(self.codes, look_up).mean(axis=2, dtype=np.float64)
+        if local is not None:
+            light /= local.at(*self.places)
         frames, terms = self.design.shape
         inverse = np.linalg.pinv(self.design)
         exposure, veil = np.ones((frames, 1)), np.zeros((frames, 1))

@@ -36,7 +36,10 @@ COMPRESSED_SAMPLES = 4096
 
 
 def measure(
-    stack: Stack, gains: Sequence[float] | None = None, tone_mapping: dict[str, float] | None = None
+    stack: Stack,
+    border: BorderValues | None = None,
+    gains: Sequence[float] | None = None,
+    tone_mapping: dict[str, float] | None = None,
 ) -> None:
     """Measure noise, crosstalk and unknown curves from the constant frames of a stack.
 
@@ -44,6 +47,8 @@ def measure(
     ----------
     stack : Stack
         Annotated with the results, but not saved.
+    border : BorderValues, optional
+        Of a film with a border.
     gains : sequence of float, optional
         Gain of the monitor's light in each frame; 1 by default.
     tone_mapping : dict, optional
@@ -60,7 +65,7 @@ def measure(
     top, black = np.iinfo(stack.dtype).max, stack.attributes["storage"]["black"]
     usable = (codes > 0) & (codes < clipped_from(stack))
     grey = np.ptp(sent, axis=1) == 0
-    camera, exposed, scaled = _camera(stack, program)
+    camera, exposed, scaled = _camera(stack, program, border, gain)
     known = "linear" if camera == "unknown" else camera
     found = estimate(
         sent[grey, 0],
@@ -101,7 +106,7 @@ def measure(
 
 
 def _camera(
-    stack: Stack, program: Program
+    stack: Stack, program: Program, border: BorderValues | None, gain: Surroundings | None
 ) -> tuple[CameraCurve | Literal["unknown"], NDArray[np.float64] | None, bool]:
     """The camera's curve, or that of each channel; the exposure of each frame of a film by its border, (frames,), if it
     varied; whether the monitor showed the patterns at another size.
@@ -112,7 +117,6 @@ def _camera(
     camera = TypeAdapter[Response](Response).validate_python(stack.attributes["response"])
     stated = camera != "unknown"
     halftones = _halftones(stack, program)
-    border = BorderValues(stack, program) if stack.attributes.get("border") else None
     exposed: NDArray[np.float64] | None = None
     scaled = False
     for _ in range(TURNS if border else 1):
@@ -120,7 +124,7 @@ def _camera(
             "srgb" if camera == "unknown" else camera, stack.dtype, stack.attributes["storage"]["black"]
         )
         if border:
-            exposed = border.exposures(look_up)
+            exposed = border.exposures(look_up, gain)
         seen = halftones(np.ones(stack.frames) if exposed is None else exposed) if halftones else None
         if stated:
             scaled = seen is not None and are_scaled(seen, look_up)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import light_of_codes
+from workflows.ingest.camera.border_exposure import BorderValues
 from workflows.ingest.camera.calibration import constant_frames, measure
 from workflows.ingest.local_gain import Places, local_gain
 from workflows.ingest.measured_light import clipped_from, even_out, exposures_of, look_up_of
@@ -27,7 +28,7 @@ BATCH = 32 << 20
 """About how many bytes of a window's frames are read at a time."""
 
 
-def survey(stack: Stack) -> None:
+def survey(stack: Stack, border: BorderValues | None = None) -> None:
     """Measure what the report on a capture needs, and annotate the stack with it as ``survey``; it is not saved.
 
     Parameters
@@ -35,33 +36,38 @@ def survey(stack: Stack) -> None:
     stack : Stack
         With its attributes after `find_steadiness`. If its frames flicker, the noise is measured again, because flicker
         is not noise.
+    border : BorderValues, optional
+        Of a film with a border.
     """
     if stack.attributes["gains"] is not None:
         noise = stack.attributes["noise"]
-        measure(stack, stack.attributes["gains"], stack.attributes["tone_mapping"])
+        measure(stack, border, stack.attributes["gains"], stack.attributes["tone_mapping"])
         if stack.attributes["noise_of_patterns"]:
             stack.annotate(noise=noise)
     attributes = stack.attributes
     program = Program.model_validate(attributes["program"])
     look_up = look_up_of(stack)
     patterns = np.array(attributes["patterns"])
-    chosen = np.unique(np.linspace(0, stack.frames - 1, FRAMES).astype(int))
-    is_pattern = ~np.isin(patterns[chosen], program.constants[0])
-
     frames, sent, times = constant_frames(stack, program)
     level = sent.mean(axis=1) + np.where(times == times.min(), 0, np.nan)
     white, black = frames[int(np.nanargmax(level))], frames[int(np.nanargmin(level))]
     noise = Noise(**attributes["noise"])
+    tones = [] if attributes["scaled"] else _halftone_frames(stack, program)
+    special = [black, white, *(frame for frame, _ in tones)]
+    chosen = np.union1d(np.linspace(0, stack.frames - 1, FRAMES).astype(int), special)
+    is_pattern = ~np.isin(patterns[chosen], program.constants[0])
+    coloured = []
+    if "video" in attributes and stack.channels == 3:
+        coloured = chosen[is_pattern][:: -(-np.count_nonzero(is_pattern) // COLOUR_FRAMES) or 1].tolist()
+    top = clipped_from(stack)
 
     clipped = np.zeros((2, len(chosen)), np.int64)
     ends = np.zeros((2, 2))
     contrasts: list[NDArray[np.float32]] = []
     deviations: list[NDArray[np.float32]] = []
     brightest: list[NDArray[np.float32]] = []
-    tones = [] if attributes["scaled"] else _halftone_frames(stack, program)
     lit = np.zeros((2, len(tones)))  # of half-tones times white, of white squared
     detail, gain = ColourDetail(), local_gain(stack)
-    coloured = chosen[is_pattern][:: -(-np.count_nonzero(is_pattern) // COLOUR_FRAMES) or 1].tolist()
     pixels = 0
 
     def evened(codes: Codes, frame: int, y: Places, x: Places) -> NDArray[np.float32]:
@@ -73,10 +79,14 @@ def survey(stack: Stack) -> None:
         if not wanted.any():
             continue
         y, x = np.mgrid[rows, columns].reshape(2, -1)
-        once = stack.read_frames([black, white, *(frame for frame, _ in tones)], rows, columns)
-        codes_black, codes_white, *of_tones = once
+        kept: dict[int, Codes] = {}
+        for at, codes in _batches(stack, rows, columns, chosen):
+            for end, there in enumerate((codes == 0, codes >= top)):
+                clipped[end, at] += (there.any(axis=3) & wanted).sum(axis=(1, 2))
+            found = dict(zip(chosen[at].tolist(), codes, strict=True))
+            kept |= {frame: found[frame].copy() for frame in (*special, *coloured) if frame in found}
+        codes_black, codes_white, *of_tones = (kept[frame] for frame in special)
         B, W = (evened(codes, frame, y, x) for codes, frame in ((codes_black, black), (codes_white, white)))
-        top = clipped_from(stack)
         pixels += int(np.count_nonzero(wanted))
         ends[0] += [np.count_nonzero((c == 0).any(axis=2) & wanted) for c in (codes_black, codes_white)]
         ends[1] += [np.count_nonzero((c >= top).any(axis=2) & wanted) for c in (codes_black, codes_white)]
@@ -87,12 +97,8 @@ def survey(stack: Stack) -> None:
             of_tone += [((light - B) * (W - B))[whole].sum(dtype=np.float64) for light in (tone, W)]
         deviations.append(np.sqrt(noise.variance((B + W) / 2))[wanted])
         brightest.append(light_of_codes(codes_white, look_up).max(axis=2)[wanted])
-        if "video" in attributes and stack.channels == 3:
-            for frame, codes in zip(coloured, stack.read_frames(coloured, rows, columns), strict=True):
-                detail.add(even_out(light_of_codes(codes, look_up), frame, attributes)[np.newaxis], wanted)
-        for at, codes in _batches(stack, rows, columns, chosen):
-            for end, there in enumerate((codes == 0, codes >= top)):
-                clipped[end, at] += (there.any(axis=3) & wanted).sum(axis=(1, 2))
+        for frame in coloured:
+            detail.add(even_out(light_of_codes(kept[frame], look_up), frame, attributes)[np.newaxis], wanted)
     contrast, middling, bright = (
         _percentile(c, q) for c, q in ((contrasts, 50), (deviations, 50), (brightest, 99))
     )
@@ -147,8 +153,7 @@ def _batches(
 ) -> Iterator[tuple[NDArray[np.intp], NDArray[Any]]]:
     """The chosen frames of a window in batches: their indices among the chosen, and their values."""
     size = (rows.stop - rows.start) * (columns.stop - columns.start) * stack.channels * stack.dtype.itemsize
-    # Values become floats, in several arrays.
-    step = max(1, BATCH // (16 * size))
+    step = max(1, BATCH // size)
     for first in range(0, len(chosen), step):
         at = np.arange(first, min(first + step, len(chosen)))
         yield at, stack.read_frames(chosen[at].tolist(), rows, columns)

@@ -12,6 +12,7 @@ from storage.layout.captures import Stack
 from workflows.images.tone_curves import Curve
 from workflows.ingest.camera.border_exposure import BorderLight, BorderValues, shortest_white
 from workflows.ingest.camera.calibration import is_free, measure
+from workflows.ingest.local_gain import local_gain
 from workflows.ingest.measured_light import black_patterns, look_up_of
 from workflows.ingest.trial.tone_mapping import find_tone_mapping
 from workflows.ingest.trial.trial_recovery import (
@@ -44,6 +45,8 @@ REST = 0.25
 """The last round may leave at most this share of what was found."""
 EXPLAINED = np.array([2.4, 1.5])
 """Largest residuals with which shifts and gains are believed, in standard deviations of the noise."""
+DIVERGED = 3
+"""Rounds end, too, when so many in succession each left more than there was at first: they will not settle."""
 LEFT = 0.4
 """The squared residual may keep this share of its excess over noise. If it keeps more, the frames differ from what is
 predicted in ways that only look like shifts and gains."""
@@ -59,7 +62,9 @@ QUARTERS = 4
 """Parts of the capture whose mean positions are reported."""
 
 
-def find_steadiness(stack: Stack, sample: Sample | None) -> Patterns | None:
+def find_steadiness(
+    stack: Stack, sample: Sample | None, border: BorderValues | None = None
+) -> Patterns | None:
     """Find the shift and the gain of each frame, and annotate the stack with them.
 
     ``steadiness`` says what was found. It is None if there are too few pixels to measure, and empty if the patterns
@@ -74,6 +79,8 @@ def find_steadiness(stack: Stack, sample: Sample | None) -> Patterns | None:
         With its attributes after `measure`.
     sample : Sample, optional
         As from `take_sample`.
+    border : BorderValues, optional
+        Of a film with a border.
 
     Returns
     -------
@@ -123,7 +130,7 @@ def find_steadiness(stack: Stack, sample: Sample | None) -> Patterns | None:
         noise_of_patterns=False,
     )
     program = Program.model_validate(stack.attributes["program"])
-    explained = None if sample is None else _explain(stack, program, sample)
+    explained = None if sample is None else _explain(stack, program, sample, border)
     if sample is None or explained is None:
         return None
     monitor, light, unexplained = explained
@@ -200,7 +207,9 @@ def _believed(before: float, after: float) -> NDArray[np.bool_]:
     return believed
 
 
-def _explain(stack: Stack, program: Program, sample: Sample) -> tuple[Curve, Patterns, Unexplained] | None:
+def _explain(
+    stack: Stack, program: Program, sample: Sample, border: BorderValues | None
+) -> tuple[Curve, Patterns, Unexplained] | None:
     """Find what T leaves unexplained, local tone mapping first; None if the sample has too little contrast.
 
     Returns
@@ -218,35 +227,36 @@ def _explain(stack: Stack, program: Program, sample: Sample) -> tuple[Curve, Pat
             return None
         mapped = None
         if turn < TONE_MAPPING_TURNS:
-            known, border = stack.attributes["tone_mapping"], _border(stack, program)
-            mapped = find_tone_mapping(stack, found.rest, sample, known, border)
+            known = stack.attributes["tone_mapping"]
+            mapped = find_tone_mapping(stack, found.rest, sample, known, _border_light(stack, border))
         if mapped is None:
             return monitor, light, found
-        measure(stack, tone_mapping=mapped)
+        measure(stack, border, tone_mapping=mapped)
         turn += 1
 
 
-def _border(stack: Stack, program: Program) -> BorderLight | None:
+def _border_light(stack: Stack, border: BorderValues | None) -> BorderLight | None:
     """The light of a film's border, if its exposure was locked.
 
     One that was not follows the patterns, as local tone mapping does, and errors of the curve hide the latter.
     """
     exposed = stack.attributes["auto_exposure"]
-    if not stack.attributes.get("border") or (exposed is not None and is_free(np.array(exposed))):
+    if border is None or (exposed is not None and is_free(np.array(exposed))):
         return None
-    return BorderValues(stack, program).fit(look_up_of(stack))
+    return border.fit(look_up_of(stack), local_gain(stack))
 
 
 def _settle(
     try_out: Callable[[Doubles], Trial | None], trial: Trial, shown: NDArray[np.bool_], has_black: bool
 ) -> tuple[Doubles, Trial, Doubles]:
     """Correct and measure again until little is left; returns what was found, the last trial, and what it left."""
-    scale = np.array([1, 1, SETTLED[0] / SETTLED[1]])
+    scale, free = np.array([1, 1, SETTLED[0] / SETTLED[1]]), np.array([1, 1, int(has_black)])
     state = np.zeros_like(trial.off)
     states: list[Doubles] = []
     steps: list[Doubles] = []
+    diverged = 0
     for _ in range(ROUNDS):
-        step = _fill_gaps(trial.off, shown) * ([1, 1, 1] if has_black else [1, 1, 0])
+        step = _fill_gaps(trial.off, shown) * free
         states.append(state * scale)
         steps.append(step * scale)
         ahead = states[-1] + steps[-1]
@@ -266,6 +276,9 @@ def _settle(
         state, trial = ahead, again
         left = _fill_gaps(trial.off, shown)
         if _size(left[shown, :2]) < SETTLED[0] and _size(left[shown, 2:]) < SETTLED[1]:
+            break
+        diverged = diverged + 1 if _size((left * free * scale)[shown]) > _size(steps[0][shown]) else 0
+        if diverged == DIVERGED:
             break
     return state, trial, _fill_gaps(trial.off, shown)
 

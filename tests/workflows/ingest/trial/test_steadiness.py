@@ -186,6 +186,21 @@ def test_flicker_is_found_and_taken_out(
     assert with_it > without + gain
 
 
+@pytest.mark.parametrize(("grows", "rounds"), [(1.3, 3), (0.9, steadiness.ROUNDS), (0.01, 2)])
+def test_rounds_end_when_they_leave_more_than_there_was(grows: float, rounds: int) -> None:
+    off, turns = np.random.default_rng(0).normal(0, 0.1, (20, 3)), 0
+
+    def again(_: NDArray[np.float64]) -> steadiness.Trial:
+        nonlocal turns
+        turns += 1
+        # turned, so that what is left is no multiple of what was found
+        return steadiness.Trial(np.roll(off, turns, axis=0) * grows**turns, np.ones_like(off), 1.0)
+
+    first = steadiness.Trial(off, np.ones_like(off), 1.0)
+    steadiness._settle(again, first, np.ones(20, bool), True)
+    assert turns == rounds
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("ball", ["quick"], indirect=True)
 def test_light_that_follows_the_patterns_is_named_tone_mapping(ingest: Ingest, ball: Ball) -> None:
@@ -228,12 +243,10 @@ def test_border_tells_tone_mapping_if_the_exposure_was_locked(
 ) -> None:
     taken: list[Any] = []
     unexplained = SimpleNamespace(rest=None)
-    values = SimpleNamespace(fit=lambda look_up: "light of the border")
-    monkeypatch.setattr(steadiness, "BorderValues", lambda stack, program: values)
+    values: Any = SimpleNamespace(fit=lambda look_up, local: "light of the border")
     monkeypatch.setattr(steadiness, "find_unexplained", lambda *given: unexplained)
     monkeypatch.setattr(steadiness, "find_tone_mapping", lambda *given: taken.append(given[-1]))
     attributes = {
-        "border": border,
         "auto_exposure": exposed,
         "tone_mapping": None,
         "monitor_curve": "srgb",
@@ -241,7 +254,8 @@ def test_border_tells_tone_mapping_if_the_exposure_was_locked(
         "storage": {"black": 0},
     }
     stack = SimpleNamespace(attributes=attributes, dtype=np.dtype(np.uint8), frames=2, images=list)
-    steadiness._explain(cast(Stack, stack), preset("sketch", 320, 240), cast(Any, None))
+    known = values if border else None
+    steadiness._explain(cast(Stack, stack), preset("sketch", 320, 240), cast(Any, None), known)
     assert taken == ["light of the border" if asked else None]
 
 
