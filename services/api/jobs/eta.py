@@ -12,6 +12,8 @@ from storage.records import leases
 
 TYPICAL = 1.4e-7
 """Seconds per unit of `_report_work` on a 2.5 GHz core."""
+STEPS = 1.0
+"""Seconds that a recovery takes beside those of its pixels: to prepare, and to finish."""
 
 
 def seconds_left(connection: Connection, row: Row[Any], now: float) -> float | None:
@@ -43,7 +45,7 @@ def seconds_to_recover(connection: Connection, capture: Row[Any]) -> dict[str, f
         return None
     edge = block_edge(plan["height"], plan["width"])
     blocks = -(-plan["height"] // edge) * -(-plan["width"] // edge)
-    return {name: seconds / min(workers, blocks) for name, seconds in plan["core_seconds"].items()}
+    return {name: STEPS + seconds / min(workers, blocks) for name, seconds in plan["core_seconds"].items()}
 
 
 def _finishing(connection: Connection, row: Row[Any]) -> float:

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from sqlalchemy import Connection, Engine, update
 
-from services.api.jobs.eta import TYPICAL, seconds_left, seconds_to_recover
+from services.api.jobs.eta import STEPS, TYPICAL, seconds_left, seconds_to_recover
 from storage.database import rows, tables
 from storage.database.engine import writing
 from storage.records import captures, jobs, leases, tiles
@@ -82,6 +82,6 @@ def test_recovery_is_estimated_by_trial_and_workers(engine: Engine) -> None:
         assert token is not None
         for workers, shared in ((3, 3), (1000, 20)):  # a frame of 160 x 120 pixels has 20 blocks
             leases.renew(c, token, {"workers": [{}] * workers, "problem": None})
-            assert seconds_to_recover(c, row) == {"fine": 120 / shared, "fast": 60 / shared}
+            assert seconds_to_recover(c, row) == {"fine": STEPS + 120 / shared, "fast": STEPS + 60 / shared}
         jobs.delete(c, row.job)
         assert seconds_to_recover(c, row) is None
