@@ -213,29 +213,49 @@ def find_near(
     level, column, row, gain, amount
         As from :func:`find_node`. Its level is at most that of the lobe.
     """
-    columns, rows, starts = patterns.grids
     code_of_f, residual, weight = _in_codes(patterns, y, f, precision)
-    best_level, best_column, best_row, gain, amount = -1, 0, 0, -_HUGE, 0.0
+    best = (-1, 0, 0, -_HUGE, 0.0)
     for i in range(k):
-        lobe = mixture.lobes[i]
-        xx, xy, yy = lobe[3] ** 2, lobe[3] * lobe[4], lobe[4] ** 2 + lobe[5] ** 2
-        angle = math.atan2(2 * xy, xx - yy) / 2
-        major = math.sqrt((xx + yy) / 2 + math.hypot((xx - yy) / 2, xy))
         for end in range(-1, 2):
-            across, down = lobe[1] + end * major * math.cos(angle), lobe[2] + end * major * math.sin(angle)
+            across, down = _along(mixture.lobes[i], end)
             for level in range(mixture.level[i] + 1):
-                wide, high = columns[level], rows[level]
-                c, r = int(across / 2.0**level), int(down / 2.0**level)
-                centre = 2 * math.log(wide * high)
-                for row in range(max(r - _NEAR, 0), min(r + _NEAR + 1, high)):
-                    for column in range(max(c - _NEAR, 0), min(c + _NEAR + 1, wide)):
-                        node = starts[level] + row * wide + column
-                        codes = patterns.code[node, patterns.first : patterns.first + residual.size]
-                        z, of_node = score(codes, code_of_f, residual, weight)
-                        if z > 0 and z * z - centre > gain:
-                            best_level, best_column, best_row = level, column, row
-                            gain, amount = z * z - centre, of_node
-    return best_level, best_column, best_row, gain, amount
+                best = _best_about(patterns, level, across, down, code_of_f, residual, weight, best)
+    return best
+
+
+@njit(nogil=True, cache=True)
+def _along(lobe: NDArray[np.float64], deviations: float) -> tuple[float, float]:
+    """The place so many standard deviations from a lobe's centre along its major axis, in cells of the first grid."""
+    xx, xy, yy = lobe[3] ** 2, lobe[3] * lobe[4], lobe[4] ** 2 + lobe[5] ** 2
+    angle = math.atan2(2 * xy, xx - yy) / 2
+    major = math.sqrt((xx + yy) / 2 + math.hypot((xx - yy) / 2, xy))
+    return lobe[1] + deviations * major * math.cos(angle), lobe[2] + deviations * major * math.sin(angle)
+
+
+@njit(nogil=True, cache=True)
+def _best_about(
+    patterns: PatternCodes,
+    level: int,
+    across: float,
+    down: float,
+    code_of_f: NDArray[np.float32],
+    residual: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    best: tuple[int, int, int, float, float],
+) -> tuple[int, int, int, float, float]:
+    """The best of the nodes of a level about a place and of the best so far, both as of `find_near`."""
+    columns, rows, starts = patterns.grids
+    wide, high = columns[level], rows[level]
+    c, r = int(across / 2.0**level), int(down / 2.0**level)
+    centre = 2 * math.log(wide * high)
+    for row in range(max(r - _NEAR, 0), min(r + _NEAR + 1, high)):
+        for column in range(max(c - _NEAR, 0), min(c + _NEAR + 1, wide)):
+            node = starts[level] + row * wide + column
+            codes = patterns.code[node, patterns.first : patterns.first + residual.size]
+            z, amount = score(codes, code_of_f, residual, weight)
+            if z > 0 and z * z - centre > best[3]:
+                best = (level, column, row, z * z - centre, amount)
+    return best
 
 
 @njit(nogil=True, cache=True)
