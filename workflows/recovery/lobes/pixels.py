@@ -14,10 +14,10 @@ from workflows.recovery.lobes.fitting.fits import (
     fit_of,
     make_buffers,
     measurements_of,
+    spread_to,
 )
 from workflows.recovery.lobes.fitting.levenberg_marquardt import fit_amounts
 from workflows.recovery.lobes.mixture import Workspace, make_workspace
-from workflows.recovery.lobes.nodes import node_responses, spread_lobes
 from workflows.recovery.lobes.options import LobesOptions
 from workflows.recovery.lobes.posterior.mean import update
 from workflows.recovery.lobes.strays import subtract_strays, write_strays
@@ -69,12 +69,9 @@ def finish_fit(
         write_strays(patterns.strays, mixture.stray, 1, stray)
         y, variance, offset[:] = y.copy(), variance.copy(), 0
         subtract_strays(y, variance, stray, size)
-    n: int = spread_lobes(
-        patterns.grids, mixture, lobes, options.resolution, buffers.node, buffers.weight, buffers.end
-    )
-    A, weight = buffers.rows[: n * y.size].reshape(n, y.size), buffers.weight[:n]
-    node_responses(patterns, buffers.node, n, A)
-    end = buffers.end[:lobes]
+    A = spread_to(buffers, patterns, mixture, lobes, options.resolution)
+    n: int = len(A)
+    weight, end = buffers.weight[:n], buffers.end[:lobes]
     kappa, misfit = update(
         A, weight, end, y, variance, patterns.strays[:1], offset, options.passes, options.gradients
     )

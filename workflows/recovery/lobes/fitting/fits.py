@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from workflows.recovery.lobes.footprint import NODES, PARAMETERS, PatternCodes
 from workflows.recovery.lobes.mixture import Mixture
+from workflows.recovery.lobes.nodes import node_responses, spread_lobes
 from workflows.recovery.normalise import Measurements
 from workflows.recovery.pyramid import Grids
 
@@ -108,6 +109,18 @@ def make_buffers(most: int, size: int) -> NodeBuffers:
         np.empty(most, np.int64),
         np.empty(most * NODES * size, np.float32),
     )
+
+
+@njit(nogil=True, cache=True, inline="always")
+def spread_to(
+    buffers: NodeBuffers, patterns: PatternCodes, mixture: Mixture, k: int, resolution: float
+) -> NDArray[np.float32]:
+    """Write the nodes under k lobes, which are moved to the levels for this resolution; return their responses."""
+    n = spread_lobes(patterns.grids, mixture, k, resolution, buffers.node, buffers.weight, buffers.end)
+    size = patterns.groups * (patterns.m + 2)
+    A = buffers.rows[: n * size].reshape(n, size)
+    node_responses(patterns, buffers.node, n, A)
+    return A
 
 
 @njit(nogil=True, cache=True)

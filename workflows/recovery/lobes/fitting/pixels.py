@@ -14,6 +14,7 @@ from workflows.recovery.lobes.fitting.fits import (
     fit_of,
     make_buffers,
     measurements_of,
+    spread_to,
 )
 from workflows.recovery.lobes.fitting.levenberg_marquardt import refine
 from workflows.recovery.lobes.fitting.neighbours import MOST_REST, mean_square, start_between, unexplained
@@ -21,7 +22,7 @@ from workflows.recovery.lobes.fitting.search import fit
 from workflows.recovery.lobes.footprint import PARAMETERS, PatternCodes
 from workflows.recovery.lobes.likelihood import penalty
 from workflows.recovery.lobes.mixture import Mixture, Workspace, copy_mixture, make_workspace
-from workflows.recovery.lobes.nodes import gather_lobes, node_responses, spread_lobes
+from workflows.recovery.lobes.nodes import gather_lobes
 from workflows.recovery.lobes.options import LobesOptions
 from workflows.recovery.lobes.posterior.evidence import log_evidence
 from workflows.recovery.lobes.posterior.mean import update
@@ -84,14 +85,12 @@ def refit_from_posterior(
     objective : float
     """
     tried = Mixture(mixture.lobes.copy(), mixture.level.copy(), mixture.stray.copy())
-    n = spread_lobes(patterns.grids, tried, k, options.resolution, buffers.node, buffers.weight, buffers.end)
-    A = buffers.rows[: n * y.size].reshape(n, y.size)
-    node_responses(patterns, buffers.node, n, A)
+    A = spread_to(buffers, patterns, tried, k, options.resolution)
     # with a literal, numba would compile another version of `update`
     passes = np.int64(1)
     update(
         A,
-        buffers.weight[:n],
+        buffers.weight[: len(A)],
         buffers.end[:k],
         y,
         variance,
@@ -194,10 +193,8 @@ def evidence(
     patterns, y, variance = measurements_of(pixels, p, c)
     fitted, k = fit_of(fits, p, c), fits.k[p, c]
     moved = Mixture(fitted.lobes.copy(), fitted.level.copy(), fitted.stray)
-    n = spread_lobes(patterns.grids, moved, k, options.resolution, buffers.node, buffers.weight, buffers.end)
-    A = buffers.rows[: n * y.size].reshape(n, y.size)
-    node_responses(patterns, buffers.node, n, A)
-    found: float = log_evidence(A, buffers.weight[:n], y, variance, patterns.strays, fitted.stray)
+    A = spread_to(buffers, patterns, moved, k, options.resolution)
+    found: float = log_evidence(A, buffers.weight[: len(A)], y, variance, patterns.strays, fitted.stray)
     return found
 
 

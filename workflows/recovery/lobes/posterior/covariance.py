@@ -90,6 +90,18 @@ def stray_variance(s: int) -> float:
     return _OFFSET**2 if s == 0 else STRAY**2
 
 
+@njit(nogil=True, cache=True, inline="always")
+def write_stray_rows(strays: NDArray[np.float32], rows: NDArray[np.float32]) -> None:
+    """Write the stray light of each group times its prior standard deviation, (groups s, groups (m + 2))."""
+    count, size = strays.shape
+    rows[:] = 0
+    for i in range(len(rows)):
+        g, s = divmod(i, count)
+        deviation = np.float32(math.sqrt(stray_variance(s)))
+        for j in range(size):
+            rows[i, g * size + j] = deviation * strays[s, j]
+
+
 @njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})
 def add_products(
     A: NDArray[np.float32],
@@ -157,7 +169,6 @@ def precondition(
     conjugate gradients took 20 steps.
     """
     rows, inverse, factor, _ = approximate
-    count, size = K.strays.shape
     lobes, measurements = of_lobe.shape
     for j in range(measurements):
         within = np.float32(K.kappa) * square[j]
@@ -167,12 +178,7 @@ def precondition(
             within -= rows[i, j] * rows[i, j]
         total = K.noise[j] + max(within, np.float32(0))
         inverse[j] = 1 / total if K.measured[j] else np.float32(0)
-    rows[lobes:] = 0
-    for i in range(lobes, len(rows)):
-        g, s = divmod(i - lobes, count)
-        deviation = np.float32(math.sqrt(stray_variance(s)))
-        for j in range(size):
-            rows[i, g * size + j] = deviation * K.strays[s, j]
+    write_stray_rows(K.strays, rows[lobes:])
     for i in range(len(rows)):
         for j in range(measurements):
             rows[i, j] *= math.sqrt(inverse[j])

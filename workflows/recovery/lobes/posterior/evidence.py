@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from workflows.recovery.lobes.posterior.covariance import stray_variance
+from workflows.recovery.lobes.posterior.covariance import write_stray_rows
 from workflows.recovery.lobes.posterior.mean import add_row_moments, total_variance
 from workflows.recovery.lobes.strays import write_strays
 from workflows.recovery.solvers import inner
@@ -68,16 +68,15 @@ def log_evidence(
             scale[j] = 1 / math.sqrt(total[j])
             residual[j] = (y[j] - f[j]) * scale[j]
             found += math.log(total[j]) + float(residual[j]) ** 2
-    rows = np.zeros((n + groups * count, y.size), np.float32)
+    rows = np.empty((n + groups * count, y.size), np.float32)
+    write_stray_rows(strays, rows[n:])
     for i in range(n):
         deviation = np.float32(math.sqrt(kappa * weight[i]))
         for j in range(y.size):
-            rows[i, j] = deviation * A[i, j] * scale[j]
-    for i in range(groups * count):
-        g, s = divmod(i, count)
-        deviation = np.float32(math.sqrt(stray_variance(s)))
-        for j in range(size):
-            rows[n + i, g * size + j] = deviation * strays[s, j] * scale[g * size + j]
+            rows[i, j] = deviation * A[i, j]
+    for i in range(len(rows)):
+        for j in range(y.size):
+            rows[i, j] *= scale[j]
     by_nodes = len(rows) < y.size
     X = rows if by_nodes else np.ascontiguousarray(rows.T)
     S, b = np.empty((len(X), len(X))), np.empty(len(X))
