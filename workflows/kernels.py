@@ -27,10 +27,10 @@ from storage.layout.mattes import Block, Matte, create
 from storage.objects.store import Objects
 from storage.steps import FINISH, PREPARE
 from workflows.composite import composite
-from workflows.composite.backdrop import backdrop_of
+from workflows.composite.backdrops.backdrop import backdrop_of
+from workflows.composite.backdrops.placement import Placement
 from workflows.composite.depth import from_two, places_of
 from workflows.composite.live.encode import encode_live
-from workflows.composite.placement import Placement
 from workflows.composite.quantise import encode
 from workflows.images import integer_formats
 from workflows.images.decode import decode

@@ -178,6 +178,12 @@ def cancel(job: str, url: str, key: str | None, as_json: bool) -> None:
 @click.option("--down", type=float, help="Move the backdrop down, in monitor heights.")
 @click.option("--scale", type=float, help="Scale the backdrop by this factor.")
 @click.option("--angle", type=float, help="Rotate the backdrop clockwise, in degrees.")
+@click.option(
+    "--interval",
+    is_flag=True,
+    default=None,
+    help="Write half the width of each pixel's 90 % interval instead, in linear light: best as .exr.",
+)
 @click.option("--webhook", metavar="URL", help="For a clip: URL to notify when the job has ended.")
 @_remote
 def composite(

@@ -2,7 +2,8 @@
 
 ``mattes/ID`` is a zarr group with the attributes ``width``, ``height``, ``columns`` and ``rows`` (the first grid of T's
 cells), ``block``, ``crosstalk`` (X of ``C = S + X (rho T L)``: a row for each channel of the camera, a column for each
-of the monitor), and the options that it was recovered with. In it are
+of the monitor), the options that it was recovered with, and ``interval``, see
+`workflows.recovery.interval`, if that was measured. In it are
 
 - ``S``, ``rho`` (y, x, channel) float32;
 - ``count`` (y, x, channel) uint32: the number of cells in the row T of a pixel and channel;

@@ -39,6 +39,8 @@ def number(text: str) -> float | None:
 
 def same(cell: str, value: object) -> bool:
     """Whether a cell of a table shows a default."""
+    if isinstance(value, bool):
+        return cell == str(value).lower()
     if isinstance(value, int | float):
         return number(cell) == value
     return codes(cell) == [str(value)]

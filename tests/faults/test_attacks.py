@@ -33,6 +33,7 @@ from tests.parts.inputs.hostile_mattes import hostile_archive, large_matte
 from tests.parts.processes import running
 from tests.parts.waiting import until
 from workflows.images.integer_formats import encode_png
+from workflows.kernels import use_matte
 from workflows.programs.program import Constant, Program
 from workflows.simulation import glass_ball
 from workflows.simulation.scene import write_capture
@@ -126,6 +127,9 @@ def attacked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Attacked]:
         "ENVMATTE_MATTE_MEMORY": str(MATTE_MEMORY),
         "ENVMATTE_OWNER_JOBS": "1",
     }
+    use_matte(
+        Objects((folder / "warm").as_uri())
+    )  # a service that compiles kernels itself keeps 150 MB for it
     with serving(data, "--workers", "1", **settings) as service:
         yield prepare(service, data, folder)
 

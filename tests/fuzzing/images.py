@@ -10,7 +10,7 @@ from PIL import Image
 from tests.fuzzing import changes, seeds
 from tests.fuzzing.campaign import LIMITS, Refused
 from tests.fuzzing.seeds import Files
-from workflows.composite.backdrop import backdrop_of
+from workflows.composite.backdrops.backdrop import backdrop_of
 from workflows.images import camera_raw, decode, float_formats, integer_formats
 
 BOXES = b"|".join(

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.layout.mattes import Matte
-from workflows.composite.backdrop import Backdrop, node_light
+from workflows.composite.backdrops.backdrop import Backdrop, node_light
+from workflows.composite.backdrops.placement import Placement
 from workflows.composite.depth import Rays
 from workflows.composite.engine import Window, compose
-from workflows.composite.placement import Placement
 from workflows.composite.strips import Strip, read_strip
 from workflows.threads import CORES
 

@@ -21,7 +21,7 @@ from workflows.ingest.camera.border_exposure import BorderValues
 from workflows.ingest.camera.calibration import measure
 from workflows.ingest.manifest import MANIFEST
 from workflows.ingest.report.survey import survey
-from workflows.ingest.trial.recovery_time import core_seconds
+from workflows.ingest.trial.qualities import try_qualities
 from workflows.ingest.trial.steadiness import find_steadiness
 from workflows.ingest.trial.trial_recovery import take_sample
 from workflows.ingest.video.border_reader import LOOKS
@@ -194,10 +194,22 @@ def finish(objects: Objects, task: Task) -> dict[str, Any]:
 
 
 def _try_out(stack: Stack, border: BorderValues | None) -> dict[str, float] | None:
-    """Find the steadiness of a stack, and how long its recovery will take, from one sample of its pixels."""
+    """Find the steadiness of a stack, and what its recovery will take and be worth, from one sample of its pixels.
+
+    Returns
+    -------
+    dict or None
+        Seconds by quality. The stack is annotated with the intervals of composites.
+    """
     sample = take_sample(stack)
     patterns = find_steadiness(stack, sample, border)
-    return None if sample is None or patterns is None else core_seconds(stack, sample, patterns)
+    tried = None if sample is None or patterns is None else try_qualities(stack, sample, patterns)
+    if tried is None:
+        return None
+    stack.annotate(
+        intervals={name: quality.interval and quality.interval._asdict() for name, quality in tried.items()}
+    )
+    return {name: quality.seconds for name, quality in tried.items()}
 
 
 STEPS = Steps("ingest", "reading", prepare, work, missing, finish, scattered=False)

@@ -8,9 +8,10 @@ from storage.layout import mattes
 from storage.layout.captures import Stack
 from storage.layout.mattes import Matte
 from storage.objects.store import Objects
+from workflows.ingest.trial.qualities import QUALITIES
 from workflows.jobs import Steps, Task
 from workflows.mattes import preview, tiles
-from workflows.mattes.options import parse_options
+from workflows.mattes.options import RecoveryOptions, parse_options
 
 
 def prepare(objects: Objects, task: Task) -> dict[str, Any]:
@@ -37,6 +38,7 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
         crosstalk=stack.attributes["crosstalk"],
         # Without the size of tiles, which changes nothing in the matte.
         options=options.model_dump(mode="json", exclude={"tile"}),
+        **_interval(stack, options),
     )
     spacing = preview.spacing_of(stack)
     if spacing is not None:
@@ -45,6 +47,13 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
         "tiles": len(tiles.cut(matte, options.tile or matte.block)),
         "figures": matte.figures | {"preview": spacing},
     }
+
+
+def _interval(stack: Stack, options: RecoveryOptions) -> dict[str, Any]:
+    """The attribute ``interval`` of a matte, if the ingest has tried these options."""
+    quality = next((name for name, tried in QUALITIES.items() if tried == options.of_method), None)
+    found = stack.attributes.get("intervals", {}).get(quality)
+    return {"interval": found} if found else {}
 
 
 def work(objects: Objects, task: Task, tile: int) -> int:

@@ -18,15 +18,15 @@ from workflows.ingest.measured_light import conditions_of, constants_of, places_
 from workflows.mattes.options import RecoveryOptions
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out, pyramid_of
+from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.photometry import fit_photometry
 from workflows.recovery.dgsr import recover as dgsr
 from workflows.recovery.dgsr.glare import filter_sensing
 from workflows.recovery.dgsr.options import DgsrOptions
 from workflows.recovery.glare import add_glare, filter_patterns, spread_patterns
 from workflows.recovery.lobes import recover as lobes
 from workflows.recovery.lobes.options import FAST
-from workflows.recovery.noise import Noise
 from workflows.recovery.normalise import normalise
-from workflows.recovery.photometry import fit_photometry
 from workflows.recovery.sensing import Patterns, Sensing
 from workflows.recovery.transport import LEAST_WEIGHT
 

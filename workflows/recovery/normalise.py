@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from workflows.recovery.noise import Noise
-from workflows.recovery.photometry import Photometry
+from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.photometry import Photometry
 
 # Standard deviations that S and S + rho may change by when they are fitted again.
 _MOST_CHANGE = 2.0

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from storage.errors import OptionError
-from workflows.composite.placement import Placement
+from workflows.composite.backdrops.placement import Placement
 
 Distance = Annotated[float, Field(ge=1e-6, le=1e6)]
 """In any unit. Far beyond these limits rays overflow."""
@@ -44,6 +44,11 @@ class CompositeParams(BaseModel):
         description="What is shown where the mask left pixels out: nothing, so that a PNG is transparent and a JPEG "
         "or a video black there, or the backdrop, as if the frame saw the whole monitor.",
     )
+    interval: bool = Field(
+        False,
+        description="Answer, in place of the composite, half the width of the interval that holds the true light with "
+        "a probability of 90 %, by pixel and channel.",
+    )
     depth: Distance | None = Field(
         None, description="Distance of the backdrop from the object, if it is not where the monitor was."
     )
@@ -77,6 +82,10 @@ class CompositeParams(BaseModel):
             )
         if self.around == "backdrop" and self.depth is not None:
             raise ValueError("a backdrop at another depth is not shown around the glass: omit around")
+        if self.interval and (self.depth is not None or self.around == "backdrop"):
+            raise ValueError(
+                "intervals are those of the glass before a backdrop where the monitor was: omit depth and around"
+            )
         if self.size is not None and self.enlarge > 1:
             raise ValueError("size makes a picture smaller, enlarge larger: omit one of them")
         if self.other_distance is not None and self.other_distance == self.distance:

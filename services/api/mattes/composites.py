@@ -26,15 +26,17 @@ from storage.errors import Conflict, OptionError
 from storage.layout.mattes import Matte
 from storage.records import mattes
 from workflows.composite import composite, light_on
-from workflows.composite.around import put_around
-from workflows.composite.backdrop import Backdrop, backdrop_of
+from workflows.composite.backdrops.around import put_around
+from workflows.composite.backdrops.backdrop import Backdrop, backdrop_of
 from workflows.composite.depth import Rays, from_one, from_two
 from workflows.composite.engine import Window, compose, double, shrink
+from workflows.composite.interval import contrast_on, half_widths
 from workflows.composite.preview import enlarge, put_behind, window_of_preview
 from workflows.composite.quantise import encode
 from workflows.composite.strips import Strip
 from workflows.images import float_formats, integer_formats
 from workflows.images.integer_formats import Codes
+from workflows.recovery.interval import Interval
 from workflows.threads import CORES
 
 router = Router(tags=["mattes"])
@@ -68,6 +70,8 @@ AROUND_BYTES = 48
 """Of a pixel of the matte while the backdrop is put around the glass: its light, what it adds, and blurred alpha."""
 RAYS_BYTES = 160
 """Of a pixel of the matte while rays to a backdrop at another depth are found."""
+INTERVAL_BYTES = 128
+"""Of a pixel while its interval is worked out, and of a cell while its contrast is."""
 
 
 @router.post(
@@ -141,7 +145,9 @@ def _bytes_of_composite(
         matte = context.cache.matte(progress.id)
     window = Window.of(matte, params.x, params.y, params.width, params.height)
     bands = _bands(window, matte.block, params, media_type, progress.preview is not None)
-    of_band = PICTURE_BYTES * window.width * max(band.height for band in bands)
+    of_band = window.width * max(band.height for band in bands)
+    of_band *= INTERVAL_BYTES if params.interval else PICTURE_BYTES
+    of_cell = INTERVAL_BYTES if params.interval else LIGHT_BYTES
     of_pixel = SHRUNK_BYTES if params.size is not None else params.enlarge**2 * ANSWER_BYTES[media_type]
     if params.enlarge > 1:
         of_pixel += DOUBLED_BYTES
@@ -150,7 +156,7 @@ def _bytes_of_composite(
     if progress.preview is not None:
         of_pixel += ENLARGED_BYTES
     of_window = of_pixel * window.width * window.height
-    return LIGHT_BYTES * matte.columns * matte.rows + of_band + of_window + of_rays + of_frame
+    return of_cell * matte.columns * matte.rows + of_band + of_window + of_rays + of_frame
 
 
 def _answer(
@@ -264,8 +270,19 @@ def _pictures(
 
     rays = times.take("rays", lambda: _rays(context, progress, params)) if params.depth is not None else None
     light = times.take("light", lambda: light_on(matte, backdrop, params.placement, CORES))
+    interval, contrast = None, light
+    if params.interval:
+        interval = _interval(progress, matte)
+        contrast = times.take(
+            "contrast", lambda: contrast_on(matte, light, backdrop, params.placement, CORES)
+        )
     for band in bands:
-        picture = times.take("composite", partial(compose, matte, light, band, read, CORES, rays))
+        draw = (
+            partial(compose, matte, light, band, read, CORES, rays)
+            if interval is None
+            else partial(half_widths, matte, interval, light, contrast, band, read, CORES)
+        )
+        picture = times.take("composite", draw)
         if progress.preview is not None:
             add = partial(_add_preview, context, progress, progress.preview, picture, backdrop, band, params)
             times.take("preview", add)
@@ -302,6 +319,21 @@ def _add_preview(
     small = composite(preview, backdrop, placement=params.placement, window=part, read=read)
     block = context.cache.matte(progress.id).block
     put_behind(picture, enlarge(small, part, window, spacing, *size), window, progress.blocks, block)
+
+
+def _interval(progress: Progress, matte: Matte) -> Interval:
+    """The interval of composites of a matte."""
+    if progress.blocks is not None:
+        raise Conflict(
+            f"matte {progress.id} is still being recovered; its intervals are there when it is done"
+        )
+    if "interval" not in matte.attributes:
+        raise Conflict(
+            f"how far composites of matte {progress.id} are from the truth is not known: it was recovered with other "
+            "options than a quality, from a capture of an earlier version, from too few pixels with contrast, or from "
+            "patterns on fixed grids, which do not tell where in a block the light comes from"
+        )
+    return Interval(**matte.attributes["interval"])
 
 
 def _rays(context: Context, progress: Progress, params: CompositeParams) -> Rays:

@@ -29,7 +29,7 @@ from storage.layout.mattes import Matte
 from storage.objects.store import Objects
 from tests.benchmarks.cluster.sharing import enlarge
 from workflows.composite import Backdrop
-from workflows.composite.backdrop import node_light
+from workflows.composite.backdrops.backdrop import node_light
 from workflows.composite.cache import Cache
 from workflows.composite.engine import Window, compose
 from workflows.composite.strips import LENGTH

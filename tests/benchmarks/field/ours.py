@@ -12,8 +12,8 @@ from workflows.images.resample import area_mean
 from workflows.programs.presets import preset
 from workflows.programs.program import Bernoulli, Constant, Monitor, Program
 from workflows.programs.pyramid_light import lay_out
+from workflows.recovery.camera.photometry import Photometry, estimate_noise, fit_photometry
 from workflows.recovery.lobes import recover as lobes
-from workflows.recovery.photometry import Photometry, estimate_noise, fit_photometry
 from workflows.recovery.pyramid import Pyramid
 from workflows.recovery.transport import Transport
 

@@ -7,7 +7,8 @@ KIT is the path of a `kit.py` that makes captures of scenes and scores composite
 (`*.npz`). For each case and scene it films the case's program with a mask, uploads the capture, recovers its matte,
 requests composites over the kit's backdrops, and prints the PSNR over the object's pixels, the share of the squared
 error in the 5 % of least confidence (and in the worst 5 %, the most there can be), the rank correlation of confidence
-and error, and the seconds of work for 1,000 pixels. Options in `--film` go to the kit's `capture`.
+and error, the share of the pixels and channels whose 90 % interval holds the truth, before all backdrops and the least
+before one, and the seconds of work for 1,000 pixels. Options in `--film` go to the kit's `capture`.
 """
 
 import json
@@ -22,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
-from services.client import Client
+from services.client import Client, ServiceError
 from tests.benchmarks.recovery.kits import load, parser_of, served, show
-from workflows.images import integer_formats
+from workflows.images import float_formats, integer_formats
 from workflows.programs.files import write_folder
 from workflows.programs.presets import preset
 
@@ -67,7 +68,7 @@ def measure(
         (seconds,) = ledger.execute("select sum(seconds) from tiles where job = ?", (job["id"],)).fetchone()
     truth = kit.Scene.load(scene)
     crosstalk = float(film[film.index("--crosstalk") + 1]) if "--crosstalk" in film else 0.0
-    scores, squares = {}, []
+    scores, squares, held = {}, [], []
     for name, backdrop in kit.backdrops().items():
         # 16 bits, so that the matte is scored and not the rounding of the response.
         sent = integer_formats.to_integers(backdrop, np.dtype(np.uint16))
@@ -76,7 +77,9 @@ def measure(
         scores[name] = kit.score(truth, integer_formats.to_unit(sent), pixels[..., :3], crosstalk=crosstalk)
         mix = (1 - 3 * crosstalk) * np.eye(3) + crosstalk
         true = 0.02 + 0.9 * truth.composite(integer_formats.to_unit(sent)) @ mix
-        squares.append(((pixels[..., :3] - true)[truth.object_pixels] ** 2).mean(axis=1))
+        error = (pixels[..., :3] - true)[truth.object_pixels]
+        squares.append((error**2).mean(axis=1))
+        held.append(within(client, job["matte"], sent, truth.object_pixels, error))
     error = np.mean(squares, axis=0)
     doubt = -integer_formats.to_unit(
         integer_formats.decode(client.layer(job["matte"], "confidence.png"), memory=1 << 28)
@@ -90,10 +93,30 @@ def measure(
         "mean": round(sum(scores.values()) / len(scores), 2),
         "worst_5_hold": share(error, doubt, worst),
         "at_best": share(error, error, worst),
+        "held": round(float(np.mean(held)), 3),
+        "held_least": round(float(np.min(held)), 3),
         "rank": round(float(spearmanr(doubt, error).statistic), 2),
         "seconds_per_1000_pixels": round(seconds / job["pixels"] * 1000, 2),
         "run_seconds": round(job["run_seconds"], 1),
     }
+
+
+def within(
+    client: Client,
+    matte: str,
+    backdrop: NDArray[np.uint16],
+    seen: NDArray[np.bool_],
+    error: NDArray[np.floating],
+) -> float:
+    """The share of the errors that lie within the intervals of a composite; NaN if the matte has none."""
+    try:
+        answer = client.composite(
+            matte, integer_formats.encode_png(backdrop), kind="image/x-exr", transfer="linear", interval=True
+        )
+    except ServiceError:
+        return float("nan")
+    half = float_formats.decode(answer, memory=1 << 28)[..., :3][seen]
+    return float(np.mean(np.abs(error) <= half))
 
 
 def share(error: NDArray[np.floating], doubt: NDArray[np.floating], worst: int) -> float:

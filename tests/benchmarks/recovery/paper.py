@@ -32,11 +32,11 @@ from solvers import Recover, lasso, least_squares, pursuit, rival
 from workflows.images.resample import area_mean
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out
+from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.photometry import Photometry, estimate_noise, fit_photometry
 from workflows.recovery.dgsr import recover as dgsr
 from workflows.recovery.dgsr.options import DgsrOptions
 from workflows.recovery.lobes import recover as lobes
-from workflows.recovery.noise import Noise
-from workflows.recovery.photometry import Photometry, estimate_noise, fit_photometry
 from workflows.recovery.pyramid import Pyramid
 from workflows.recovery.sensing import Patterns, Sensing
 from workflows.recovery.transport import Transport

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.dgsr.groups import Rows
-from workflows.recovery.noise import Noise
 from workflows.recovery.normalise import normalise
-from workflows.recovery.photometry import Photometry
 from workflows.recovery.sensing import Sensing
 from workflows.recovery.transport import Transport
 

@@ -3,6 +3,7 @@
 import io
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import httpx2
 import imagecodecs
@@ -17,6 +18,8 @@ from tests.end_to_end.problems import check_problem
 from tests.services.cluster.clusters import decoders
 from workflows.images import float_formats, integer_formats
 from workflows.images.tone_curves import from_light
+from workflows.programs.presets import preset
+from workflows.simulation.scene import Scene, write_capture
 
 BACKDROP = np.random.default_rng(0).random((30, 40, 3), np.float32).repeat(4, axis=0).repeat(4, axis=1)
 SENT = png(BACKDROP, "srgb", np.uint8)
@@ -87,6 +90,33 @@ def test_twice_the_size(service: Service, matte: str, kind: str) -> None:
     same = large.reshape(*whole.shape[:1], 2, whole.shape[1], 2, 3).mean(axis=(1, 3))
     assert np.abs(same - whole).mean() < 0.03
     check_problem(post_composite(service, matte, enlarge=2, size=30), 422, "bad-request")
+
+
+def test_intervals_hold_the_truth(service: Service, scene: Scene, tmp_path: Path) -> None:
+    write_capture(scene, preset("sketch", *scene.monitor), tmp_path / "ball.zip")
+    capture = service.client.upload(tmp_path / "ball.zip")
+    matte = str(service.client.wait(service.client.recover(capture["id"])["id"])["matte"])
+
+    def read(**query: bool) -> np.ndarray:
+        answer = post_composite(service, matte, accept="image/x-exr", transfer="linear", **query)
+        assert answer.status_code == 200, answer.text
+        return float_formats.decode(answer.content, memory=1 << 24)[..., :3]
+
+    sent = integer_formats.to_unit(integer_formats.decode(SENT, memory=1 << 24))
+    error = np.abs(read() - scene.truth(sent))
+    half = read(interval=True)
+    seen = scene.object_mask
+    assert 0.8 < (error <= half)[seen].mean() < 0.99
+    assert np.corrcoef(error[seen].ravel(), half[seen].ravel())[0, 1] > 0.2
+    shown = integer_formats.to_unit(decoded(post_composite(service, matte, transfer="linear", interval=True)))
+    assert np.abs(shown - half).max() < 1 / 255
+    for query in ({"depth": 2, "distance": 1, "camera": 1}, {"around": "backdrop"}):
+        check_problem(post_composite(service, matte, interval=True, **query), 422, "bad-request")
+
+
+def test_unknown_interval_is_refused(service: Service, matte: str) -> None:
+    problem = check_problem(post_composite(service, matte, interval=True), 409, "conflict")
+    assert "fixed grids" in problem["detail"]
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from tests.parts.peak import peak
-from workflows.composite.backdrop import backdrop_of, node_light
-from workflows.composite.placement import Placement
+from workflows.composite.backdrops.backdrop import backdrop_of, node_light
+from workflows.composite.backdrops.placement import Placement
 
 PLACEMENTS = (
     None,

@@ -1,5 +1,6 @@
 """Composites against the dense formula, C = S + X (rho T L)."""
 
+from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -11,11 +12,14 @@ from storage.errors import Corrupt, OptionError
 from storage.layout import mattes
 from storage.layout.mattes import Block, Matte
 from storage.objects.store import Objects
-from workflows.composite import composite, engine
+from workflows.composite import composite, engine, light_on
+from workflows.composite.backdrops.backdrop import Backdrop
 from workflows.composite.engine import Window, double, shrink
+from workflows.composite.interval import contrast_on, half_widths
 from workflows.composite.strips import read_strip
 from workflows.images.resample import area_mean
 from workflows.mattes.layers import confidence
+from workflows.recovery.interval import Interval, local_contrast
 
 HEIGHT, WIDTH, COLUMNS, ROWS = 20, 35, 36, 5
 CROSSTALK = [[0.9, 0.1, 0], [0.05, 0.8, 0.15], [0.02, 0.18, 0.8]]
@@ -45,7 +49,14 @@ def dense(objects: Objects) -> Dense:
     stored[shared, 1:] = 0
     T[shared] = T[shared][:, :1]
     matte = mattes.create(
-        objects, "m", height=HEIGHT, width=WIDTH, columns=COLUMNS, rows=ROWS, crosstalk=CROSSTALK
+        objects,
+        "m",
+        height=HEIGHT,
+        width=WIDTH,
+        columns=COLUMNS,
+        rows=ROWS,
+        crosstalk=CROSSTALK,
+        monitor=[COLUMNS, ROWS],
     )
     for row in range(matte.block_rows):
         for column in range(matte.block_columns):
@@ -194,6 +205,29 @@ def test_a_missing_block_is_corrupt(dense: Dense, folder: Path, objects: Objects
     (folder / "mattes/m" / file).unlink()
     with pytest.raises(Corrupt):
         composite(Matte(objects, "m"), np.ones((4, 6, 3), np.float32))
+
+
+def test_half_an_interval_is_the_formula(dense: Dense) -> None:
+    matte, S, rho, T, recovered = dense
+    backdrop = np.random.default_rng(2).random((2 * ROWS, 3 * COLUMNS, 3), np.float32)
+    mean, square = (area_mean(part, COLUMNS, ROWS) for part in (backdrop, backdrop**2))
+    W = nodes(local_contrast(mean, square))
+
+    def arrived(light: NDArray[np.float32]) -> NDArray[np.float64]:
+        return (rho * np.einsum("yxcl,lc->yxc", T.astype(np.float64), light)) @ np.transpose(CROSSTALK)
+
+    C, white = S + arrived(nodes(mean)), arrived(np.ones((NODES, 3), np.float32))
+    variance = 0.3 * white * arrived(W) + 1e-4 + 2e-3 * C + 0.01 * white**2
+    light = light_on(matte, Backdrop(backdrop), None, 1)
+    contrast = contrast_on(matte, light, Backdrop(backdrop.copy()), None, 1)
+    interval = Interval(contrast=0.3, read=1e-4, shot=2e-3, share=0.01)
+    window = Window(3, 2, 20, 15)
+    got = half_widths(matte, interval, light, contrast, window, partial(read_strip, matte), 1)
+    inside = np.s_[2:17, 3:23]
+    np.testing.assert_allclose(
+        got[..., :3][recovered[inside]], 1.6449 * np.sqrt(variance[inside][recovered[inside]]), rtol=1e-3
+    )
+    np.testing.assert_array_equal(got[..., 3], recovered[inside])
 
 
 def test_confidence_is_a_half_where_an_error_of_a_hundredth_is_expected(dense: Dense) -> None:

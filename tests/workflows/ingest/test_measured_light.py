@@ -20,8 +20,8 @@ from workflows.ingest.measured_light import (
 )
 from workflows.programs.border import border_light
 from workflows.programs.presets import preset
-from workflows.recovery.noise import Noise
-from workflows.recovery.photometry import fit_photometry
+from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.photometry import fit_photometry
 
 LOOK_UP = table("linear", np.dtype(np.uint8))
 

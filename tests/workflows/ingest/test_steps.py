@@ -25,7 +25,7 @@ from tests.workflows.ingest.video.films import CAMERA, PROGRAM, IngestFilm, prog
 from workflows.images.integer_formats import encode_png
 from workflows.ingest import steps
 from workflows.jobs import Task
-from workflows.recovery.noise import Noise
+from workflows.recovery.camera.noise import Noise
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import write_capture
 from workflows.untrusted.limits import Limits

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from workflows.recovery.noise import Noise
-from workflows.recovery.photometry import Photometry
+from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.pyramid import Pyramid
 from workflows.recovery.sensing import Level, Patterns, Sensing
 

@@ -5,9 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from workflows.recovery.noise import Noise
-from workflows.recovery.normalise import Measurements, expected_error, normalise, refit_photometry
-from workflows.recovery.photometry import Photometry
+from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.photometry import Photometry
+from workflows.recovery.normalise import (
+    Measurements,
+    expected_error,
+    normalise,
+    refit_photometry,
+)
 
 NOISE = Noise(4e-6, 5e-5)
 

@@ -22,11 +22,11 @@ from storage.layout.mattes import Matte
 from storage.objects.byte_objects import PART
 from storage.objects.store import Objects, gather
 from workflows.composite import composite
-from workflows.composite.around import put_around
-from workflows.composite.backdrop import Backdrop
+from workflows.composite.backdrops.around import put_around
+from workflows.composite.backdrops.backdrop import Backdrop
+from workflows.composite.backdrops.placement import Placement
 from workflows.composite.cache import Cache
 from workflows.composite.engine import Window
-from workflows.composite.placement import Placement
 from workflows.composite.quantise import encode
 from workflows.composite.video import segments
 from workflows.images import tone_curves

@@ -16,8 +16,8 @@ from workflows.ingest.camera.curve import HalfTones, Shown, are_scaled, fit_came
 from workflows.ingest.local_gain import Surroundings, local_gain
 from workflows.ingest.measured_light import clipped_from, exposures_of
 from workflows.programs.program import Program
-from workflows.recovery.noise import Noise, estimate_excess
-from workflows.recovery.photometry import estimate_crosstalk, estimate_noise
+from workflows.recovery.camera.noise import Noise, estimate_excess
+from workflows.recovery.camera.photometry import estimate_crosstalk, estimate_noise
 
 SAMPLES = 20_000
 """About how many pixels the noise and unknown curves are measured from."""

@@ -16,7 +16,7 @@ from workflows.ingest.local_gain import Places, local_gain
 from workflows.ingest.measured_light import clipped_from, even_out, exposures_of, look_up_of
 from workflows.ingest.report.colour_detail import ColourDetail
 from workflows.programs.program import Program
-from workflows.recovery.noise import Noise
+from workflows.recovery.camera.noise import Noise
 
 EDGE = 96
 """Largest side of a window in pixels. Four by four windows are spread over the frame."""

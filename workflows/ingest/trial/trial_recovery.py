@@ -1,5 +1,6 @@
 """Recover some pixels of a capture, and measure how each frame differs from what the recovery predicts."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,10 +24,10 @@ from workflows.ingest.measured_light import (
     unclipped_light,
 )
 from workflows.programs.program import Program
+from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.photometry import Photometry, fit_photometry
 from workflows.recovery.lobes.options import FINE, LobesOptions
 from workflows.recovery.lobes.recover import recover
-from workflows.recovery.noise import Noise
-from workflows.recovery.photometry import Photometry, fit_photometry
 from workflows.recovery.sensing import Patterns
 from workflows.recovery.transport import Transport
 
@@ -86,6 +87,11 @@ class Sample(NamedTuple):
         """Row and column of each pixel in the frame, (2, n)."""
         return self.corners[self.chosen[0]].T + self.chosen[1:]
 
+    def thinned(self, most: int) -> "Sample":
+        """The same squares with at most so many of the chosen pixels, spread over all of them."""
+        step = -(-len(self.chosen[0]) // most)
+        return self._replace(chosen=tuple(axis[::step] for axis in self.chosen))
+
     def some_squares(self) -> "Sample":
         """All pixels of some of the squares, about as many as were chosen."""
         step = -(-len(self.every[0]) // len(self.chosen[0]))
@@ -136,8 +142,8 @@ def take_sample(stack: Stack) -> Sample | None:
     inside = np.stack([wanted[y : y + EDGE, x : x + EDGE] for y, x in corners])
     every = np.nonzero(inside)
     limit = max(min(PIXELS, VALUES // stack.frames), MIN_PIXELS)
-    chosen = tuple(axis[:: -(-len(axis) // limit)] for axis in every)
-    return Sample(np.stack(squares, axis=1), chosen, every, np.array(corners, np.intp))
+    whole = Sample(np.stack(squares, axis=1), every, every, np.array(corners, np.intp))
+    return whole.thinned(limit)
 
 
 def see_sample(stack: Stack, sample: Sample, shifts: Doubles) -> Seen:
@@ -177,6 +183,8 @@ class RecoveredSample(NamedTuple):
         Without glare.
     strays : (s, m + 2) float32
         As in :class:`~workflows.recovery.normalise.Conditions`.
+    stray : (n, m, 3) float32 or None
+        As in :class:`~workflows.recovery.lobes.recover.Recovery`.
     alive : (n, 3) bool
         Where there is enough contrast.
     seen : Seen
@@ -186,6 +194,7 @@ class RecoveredSample(NamedTuple):
     photometry: Photometry
     transport: Transport
     strays: Floats
+    stray: Floats | None
     alive: NDArray[np.bool_]
     seen: Seen
 
@@ -207,6 +216,7 @@ def recover_seen(
     gains: Doubles,
     options: LobesOptions = FINE,
     places: NDArray[np.intp] | None = None,
+    held_out: Sequence[int] | NDArray[np.intp] = (),
 ) -> RecoveredSample | None:
     """Recover what is seen of a sample; None if it has too little contrast.
 
@@ -216,6 +226,8 @@ def recover_seen(
         Logarithms of the gains of the frames.
     places : (n, 2) int, optional
         Rows and columns of the pixels, to start from neighbours as in a matte. Default: each pixel is fitted alone.
+    held_out : sequence of int, optional
+        Patterns, as numbers among those measured, that are not used.
     """
     attributes = stack.attributes | {"gains": np.exp(gains).tolist() if gains.any() else None}
     noise = Noise(**attributes["noise"])
@@ -228,19 +240,21 @@ def recover_seen(
     if np.count_nonzero(alive.any(axis=1)) < MIN_PIXELS:
         return None
     shown, conditions = program.measured, conditions_of(stack, program)
-    transport, photometry, _, _ = recover(
+    used = usable[:, shown]
+    used[:, held_out] = False
+    transport, photometry, _, stray = recover(
         np.ascontiguousarray(light[:, shown]),
         photometry,
         patterns,
         noise,
-        usable[:, shown],
+        used,
         worth[:, shown],
         options,
         conditions,
         places,
     )
     assert conditions.strays is not None
-    return RecoveredSample(found, photometry, transport, conditions.strays, alive, seen)
+    return RecoveredSample(found, photometry, transport, conditions.strays, stray, alive, seen)
 
 
 def try_recovery(
@@ -261,7 +275,7 @@ def measure_rest(
     found: RecoveredSample,
 ) -> Trial:
     """Measure how the frames differ from what the recovery of a sample predicts."""
-    _, photometry, transport, _, alive, seen = found
+    photometry, transport, alive, seen = found.photometry, found.transport, found.alive, found.seen
     attributes, gains = stack.attributes, np.exp(state[:, 2])
     noise, model_error = Noise(**attributes["noise"]), attributes["model_error"]
     numbers, sent = program.constants_among(attributes["patterns"])

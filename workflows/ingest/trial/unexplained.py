@@ -16,8 +16,8 @@ from workflows.ingest.trial.trial_recovery import (
     recover_sample,
 )
 from workflows.programs.program import Program
+from workflows.recovery.camera.noise import Noise, fit_noise
 from workflows.recovery.glare import LEAST, Spread, centres, filter_patterns, fit_shares, spread_patterns
-from workflows.recovery.noise import Noise, fit_noise
 from workflows.recovery.normalise import normalise
 from workflows.recovery.pyramid import Pyramid
 from workflows.recovery.sensing import Patterns

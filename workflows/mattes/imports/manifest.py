@@ -10,12 +10,22 @@ from workflows.untrusted.validation import reason
 Model = TypeVar("Model", bound=BaseModel)
 Side = Annotated[int, Field(ge=1, le=16384)]
 Share = Annotated[float, Field(ge=-100, le=100)]
+Variance = Annotated[float, Field(ge=0, le=1e6)]
 Name = Annotated[str, Field(max_length=64)]
 Text = Annotated[str, Field(max_length=256)]
 
 
 class _Strict(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class IntervalGiven(_Strict):
+    """See `workflows.recovery.interval.Interval`."""
+
+    contrast: Variance
+    read: Variance
+    shot: Variance
+    share: Variance
 
 
 class Attributes(_Strict):
@@ -31,6 +41,7 @@ class Attributes(_Strict):
     crosstalk: Annotated[
         list[Annotated[list[Share], Field(min_length=3, max_length=3)]], Field(min_length=3, max_length=3)
     ]
+    interval: IntervalGiven | None = None
     options: Annotated[dict[Name, bool | int | float | Text | None], Field(max_length=100)]
 
 

@@ -3,11 +3,12 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.dgsr.gaussian_prior import filter_rows
 from workflows.recovery.dgsr.groups import Rows
 from workflows.recovery.dgsr.options import DEFAULT, DgsrOptions
 from workflows.recovery.dgsr.pursuit import System, grow_rows
-from workflows.recovery.noise import Noise
 from workflows.recovery.normalise import (
     PLAIN,
     Conditions,
@@ -16,7 +17,6 @@ from workflows.recovery.normalise import (
     less_certain,
     normalise,
 )
-from workflows.recovery.photometry import Photometry
 from workflows.recovery.sensing import Sensing
 from workflows.recovery.transport import Transport
 

@@ -5,13 +5,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.lobes.fitting.fits import Fits, Pixels
 from workflows.recovery.lobes.fitting.neighbours import FEWEST_COLOURED, coarse_to_fine
 from workflows.recovery.lobes.fitting.pixels import fit_pixels
 from workflows.recovery.lobes.options import FINE, LobesOptions
 from workflows.recovery.lobes.pixels import Diagnostics, finish_pixels
 from workflows.recovery.lobes.strays import find_strong_strays, subtract_strays
-from workflows.recovery.noise import Noise
 from workflows.recovery.normalise import (
     PLAIN,
     Conditions,
@@ -21,7 +22,6 @@ from workflows.recovery.normalise import (
     normalise,
     refit_photometry,
 )
-from workflows.recovery.photometry import Photometry
 from workflows.recovery.sensing import Patterns
 from workflows.recovery.transport import Transport
 

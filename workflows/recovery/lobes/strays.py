@@ -4,7 +4,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from workflows.recovery.photometry import Photometry, solve_least_squares
+from workflows.recovery.camera.photometry import Photometry, solve_least_squares
 
 STRAY = 0.1
 """Prior standard deviation of an amount of stray light that is not constant, in units of T."""

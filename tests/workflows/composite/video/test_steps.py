@@ -22,7 +22,7 @@ from storage.objects.store import Objects
 from storage.steps import FINISH, PREPARE
 from tests.workflows.ingest.video.camera import interlaced
 from workflows.composite import composite
-from workflows.composite.backdrop import Backdrop, frame_light
+from workflows.composite.backdrops.backdrop import Backdrop, frame_light
 from workflows.composite.video import steps as video_steps
 from workflows.composite.video.steps import STEPS
 from workflows.images.tone_curves import from_light, to_light

@@ -11,7 +11,7 @@ from workflows.ingest.camera.border_exposure import BorderValues
 from workflows.ingest.camera.calibration import MOST_APART, measure
 from workflows.programs.border import border_light
 from workflows.programs.presets import preset
-from workflows.recovery.noise import Noise
+from workflows.recovery.camera.noise import Noise
 
 PROGRAM = preset("sketch", 320, 240)
 LOOK_UP = table("srgb", np.dtype(np.uint16))

@@ -21,7 +21,7 @@ from workflows.ingest.trial.tone_mapping import LEAST, find_tone_mapping
 from workflows.ingest.trial.trial_recovery import Sample
 from workflows.ingest.trial.unexplained import Rest
 from workflows.programs.program import Program
-from workflows.recovery.noise import Noise
+from workflows.recovery.camera.noise import Noise
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import Scene
 

@@ -5,10 +5,10 @@ from functools import partial
 import numpy as np
 import pytest
 
+from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.dgsr import recover as dgsr
 from workflows.recovery.dgsr.options import DgsrOptions
 from workflows.recovery.normalise import Conditions
-from workflows.recovery.photometry import Photometry
 from workflows.recovery.sensing import Sensing
 
 METHODS = {

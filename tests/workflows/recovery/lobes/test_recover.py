@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.photometry import Photometry, fit_photometry
 from workflows.recovery.lobes import recover as lobes
 from workflows.recovery.lobes.options import FINE, LobesOptions
-from workflows.recovery.noise import Noise
-from workflows.recovery.photometry import Photometry, fit_photometry
 from workflows.recovery.sensing import Patterns
 
 COLUMNS, ROWS = 64, 48

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.lobes.recover import recover
 from workflows.recovery.lobes.strays import find_strong_strays, subtract_strays, write_strays
 from workflows.recovery.normalise import Conditions
-from workflows.recovery.photometry import Photometry
 
 COLUMNS, ROWS = 64, 48
 BANDS = [(8, 6, 24), (16, 12, 24), (32, 24, 24), (COLUMNS, ROWS, 24)]

@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from workflows.composite.backdrop import Backdrop, frame_light
+from workflows.composite.backdrops.backdrop import Backdrop, frame_light
+from workflows.composite.backdrops.placement import Placement
 from workflows.composite.engine import Window
-from workflows.composite.placement import Placement
 
 
 def put_around(

@@ -12,8 +12,8 @@ from PIL import Image, ImageCms
 
 from storage.errors import ImageError
 from tests.workflows.composite import peak
-from workflows.composite.backdrop import Backdrop, backdrop_of, node_light
-from workflows.composite.placement import Placement
+from workflows.composite.backdrops.backdrop import Backdrop, backdrop_of, node_light
+from workflows.composite.backdrops.placement import Placement
 from workflows.images import decode, float_formats, integer_formats
 from workflows.images.resample import area_mean
 from workflows.images.tone_curves import table, to_light

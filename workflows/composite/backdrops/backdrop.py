@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from workflows.composite.placement import Placement, place
+from workflows.composite.backdrops.placement import Placement, place
 from workflows.images.decode import Transfer
 from workflows.images.float_formats import Floats
 from workflows.images.integer_formats import Codes

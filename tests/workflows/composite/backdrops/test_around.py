@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from workflows.composite.around import put_around
-from workflows.composite.backdrop import Backdrop
+from workflows.composite.backdrops.around import put_around
+from workflows.composite.backdrops.backdrop import Backdrop
+from workflows.composite.backdrops.placement import Placement
 from workflows.composite.engine import Window
-from workflows.composite.placement import Placement
 
 FRAME, MONITOR = (8, 6), (16, 12)
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from workflows.recovery.noise import Noise
-from workflows.recovery.photometry import estimate_crosstalk, estimate_noise, fit_photometry
+from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.photometry import estimate_crosstalk, estimate_noise, fit_photometry
 
 NOISE = Noise(4e-6, 5e-5)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from workflows.recovery.noise import Noise, estimate_excess, fit_noise
+from workflows.recovery.camera.noise import Noise, estimate_excess, fit_noise
 
 
 @pytest.mark.parametrize("trim", [0.9, 1.0])

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from workflows.recovery.noise import LEAST_READ, LEAST_SAMPLES, Noise, fit_noise
+from workflows.recovery.camera.noise import LEAST_READ, LEAST_SAMPLES, Noise, fit_noise
 
 TYPICAL_SHOT = 1 / 20_000
 """Shot noise of a full well of 20,000 electrons."""

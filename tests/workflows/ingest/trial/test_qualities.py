@@ -1,4 +1,4 @@
-"""How long recoveries will take, from trials of an ingest."""
+"""What recoveries will take and how far off they will be, from trials of an ingest."""
 
 import io
 from collections.abc import Callable
@@ -9,8 +9,8 @@ import pytest
 
 from storage.layout.captures import Stack
 from tests.parts.captures import nested_program
-from workflows.ingest.trial import recovery_time
-from workflows.ingest.trial.recovery_time import core_seconds
+from workflows.ingest.trial import qualities
+from workflows.ingest.trial.qualities import try_qualities
 from workflows.ingest.trial.steadiness import find_steadiness
 from workflows.ingest.trial.trial_recovery import take_sample
 from workflows.programs.program import Program
@@ -40,10 +40,15 @@ def test_seconds_of_a_trial_count_for_all_pixels(
     share = np.count_nonzero(stack.mask()) / len(whole)
     assert share > 1
     clock = count()  # each trial lasts a second
-    monkeypatch.setattr(recovery_time.time, "thread_time", lambda: float(next(clock)))
+    monkeypatch.setattr(qualities.time, "thread_time", lambda: float(next(clock)))
     program = Program.model_validate(stack.attributes["program"])
     patterns = lay_out(program, "linear", stack.images())
-    assert core_seconds(stack, sample, patterns) == {"fine": round(share, 2), "fast": round(share, 2)}
+    tried = try_qualities(stack, sample, patterns)
+    assert tried is not None
+    assert {name: quality.seconds for name, quality in tried.items()} == {
+        "fine": round(share, 2),
+        "fast": round(share, 2),
+    }
 
 
 def test_frame_too_small_for_a_trial_has_none(ingest: Callable[..., Stack]) -> None:

@@ -1,0 +1,1 @@
+"""What stands behind the glass and around it: its light, and where it is."""

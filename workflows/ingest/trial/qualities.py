@@ -1,0 +1,140 @@
+"""What a recovery of each quality takes, and how far it will be from the truth, by trials on some pixels."""
+
+import time
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import TypeAdapter
+
+from storage.layout.captures import Stack
+from workflows.images.tone_curves import Curve
+from workflows.ingest.trial.trial_recovery import RecoveredSample, Sample, recover_seen, see_sample
+from workflows.programs.program import Bernoulli, Program
+from workflows.recovery.camera.noise import Noise
+from workflows.recovery.interval import HELD_OUT, Interval, fit_interval, local_contrast
+from workflows.recovery.lobes.options import FAST, FINE
+from workflows.recovery.sensing import Patterns
+
+QUALITIES = {"fine": FINE, "fast": FAST}
+MOST_HELD_OUT = 16
+"""Patterns that are predicted, about: their contrast takes time too."""
+PIXELS = 320
+"""Pixels, at most, that are recovered without them."""
+
+
+class Quality(NamedTuple):
+    """What is to be expected of a recovery.
+
+    Attributes
+    ----------
+    seconds : float
+        That one core takes for all pixels.
+    interval : Interval or None
+        None if the patterns can't tell, or too little was seen of those that are held out.
+    """
+
+    seconds: float
+    interval: Interval | None
+
+
+def try_qualities(stack: Stack, sample: Sample, patterns: Patterns) -> dict[str, Quality] | None:
+    """Recover some pixels by each quality, with all patterns and without some; None if there is too little contrast.
+
+    Parameters
+    ----------
+    stack : Stack
+        With its attributes after `find_steadiness`.
+    sample : Sample
+        As from `take_sample`. Some of its squares are tried.
+    patterns : Patterns
+        As from `find_steadiness`.
+
+    Notes
+    -----
+    The time of a pixel depends on its glass: more lobes take longer, and fits start from those of neighbours. So some
+    of the squares of `take_sample`, which are spread over the frame, are tried, with the shifts and gains that were
+    found. Kernels are compiled by then: steadiness was measured with them. What counts is the time of this thread on
+    its core: a trial takes half a second, in which other processes often have half of the core. Reading the frames and
+    writing the matte are left out.
+    """
+    attributes = stack.attributes
+    program = Program.model_validate(attributes["program"])
+    monitor: Curve = TypeAdapter[Curve](Curve).validate_python(attributes["monitor_curve"])
+    shifts, gains = np.zeros((stack.frames, 2)), np.zeros(stack.frames)
+    if attributes["shifts"] is not None:
+        shifts = np.array(attributes["shifts"])
+    if attributes["gains"] is not None:
+        gains = np.log(attributes["gains"])
+    tried = sample.some_squares()
+    seen, places = see_sample(stack, tried, shifts), tried.places.T
+    # For an interval, pixels from all over the glass count for more than the neighbours that a recovery starts from.
+    spread = see_sample(stack, sample.thinned(PIXELS), shifts)
+    share = float(np.count_nonzero(stack.mask()) / len(places))
+    random = [part for part in program.parts if isinstance(part, Bernoulli)]
+    # Each of a few stripes tells what no other does: without it, predictions would be far worse than with it.
+    step = max(HELD_OUT if random else 1, patterns.count // MOST_HELD_OUT)
+    chosen = np.arange(step // 2, patterns.count, step)
+    held_out = chosen if random else ()
+    # On fixed grids, no pattern tells where in a block the light comes from, but backdrops do.
+    can_tell = not random or any(part.offset for part in random)
+    found = {}
+    for name, options in QUALITIES.items():
+        start = time.thread_time()
+        if recover_seen(stack, program, monitor, patterns, seen, gains, options, places) is None:
+            return None
+        seconds = round(share * (time.thread_time() - start), 2)
+        interval = None
+        if can_tell:
+            without = recover_seen(
+                stack, program, monitor, patterns, spread, gains, options, held_out=held_out
+            )
+            interval = without and _interval(stack, program, patterns, without, chosen)
+        found[name] = Quality(seconds, interval)
+    return found
+
+
+def _interval(
+    stack: Stack, program: Program, patterns: Patterns, found: RecoveredSample, chosen: NDArray[np.intp]
+) -> Interval | None:
+    """The interval by what a recovery predicts of some patterns; None if too little of these was seen."""
+    attributes, channels, photometry = stack.attributes, stack.channels, found.photometry
+    noise, model_error = Noise(**attributes["noise"]), float(attributes["model_error"])
+    shown = program.measured[chosen]
+    light, worth = found.light.values[:, shown], found.light.worth[:, shown]
+    predicted, contrast = _predict(patterns, found, chosen)
+    if found.stray is not None:
+        predicted += found.stray[:, chosen]
+    variance = noise.variance(predicted) / np.maximum(worth, 1e-6)
+    variance += (model_error * photometry.rho[:, np.newaxis]) ** 2
+    known = found.light.usable[:, shown] & found.alive[:, np.newaxis]
+    known[:, :, channels:] = False
+    if not known.any():
+        return None
+    return fit_interval(
+        (light - predicted)[known],
+        contrast[known],
+        variance[known],
+        float(np.median(photometry.rho[found.alive])),
+        noise,
+        float(np.median(found.light.worth[:, program.measured].sum(axis=1))),
+        (model_error, float(attributes["smooth_error"])),
+    )
+
+
+def _predict(
+    patterns: Patterns, found: RecoveredSample, chosen: NDArray[np.intp]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Some patterns as the pixels see them, and rho squared times their contrast as it arrives, (n, k, 3) each."""
+    pyramid, S, rho = patterns.pyramid, found.photometry.S, found.photometry.rho
+    columns, rows = pyramid.grids[0]
+    code = patterns.code.reshape(len(patterns.code), patterns.channels, patterns.count)
+    predicted = np.empty((len(rho), len(chosen), 3), np.float32)
+    contrast = np.empty_like(predicted)
+    for n, pattern in enumerate(chosen):
+        light = np.broadcast_to(code[:, :, pattern], (len(code), 3)).astype(np.float32) / np.float32(255)
+        cells = light[: columns * rows].reshape(rows, columns, 3)
+        around = pyramid.light(local_contrast(cells, cells**2))
+        predicted[:, n] = S + rho * found.transport.apply(light)
+        contrast[:, n] = rho**2 * found.transport.apply(around)
+    return predicted, contrast

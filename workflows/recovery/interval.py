@@ -1,0 +1,144 @@
+"""How far a composite may be from the truth: intervals that hold it with a probability of 90 %.
+
+What a recovery leaves undetermined is where exactly, within a cell or so, the light comes from. Before a backdrop that
+is flat there this makes no error, so it is the backdrop's contrast within the reach of some cells that counts. How much
+it counts is measured for each capture: some of its patterns are held out, and predicted from the others.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from workflows.recovery.camera.noise import Noise
+
+COVERED = 0.9
+"""The probability of an interval."""
+QUANTILE = np.float32(1.6449)
+"""Half its width in standard deviations of a normal distribution."""
+REACH = 2.0
+"""Standard deviation, in cells, of the surroundings within which contrast counts."""
+HELD_OUT = 8
+"""One of so many patterns is held out."""
+PARAMETERS = 2.5
+"""How many values of the noise of the mean of all frames S, rho and the sum of T have, as a variance."""
+CALM = 0.2
+"""Share of the errors where there is least contrast."""
+_SMALLEST, _LARGEST, _HALVINGS = -12.0, 3.0, 40  # powers of ten
+
+Floats = NDArray[np.float32]
+
+
+class Interval(NamedTuple):
+    """The variance of a composite's error, ``contrast rho^2 T W + read + shot C + share rho^2``.
+
+    W is the contrast of the backdrop, see `local_contrast`, and C the composite.
+
+    Attributes
+    ----------
+    contrast : float
+        Of what the recovery leaves undetermined.
+    read, shot : float
+        Of the noise in S and rho, in units of full scale squared, and of full scale.
+    share : float
+        Of light from far away, and of errors of the model.
+    """
+
+    contrast: float
+    read: float
+    shot: float
+    share: float
+
+    def half_width(self, composite: Floats, rho: Floats, arrived: Floats) -> Floats:
+        """Half the width of the interval, in camera units.
+
+        Parameters
+        ----------
+        composite, rho, arrived : (...) float32
+            C, rho, and rho T W.
+        """
+        variance = self.contrast * rho * arrived + self.share * rho**2
+        variance += self.read + self.shot * np.maximum(composite, 0)
+        half: Floats = QUANTILE * np.sqrt(np.maximum(variance, 0)).astype(np.float32)
+        return half
+
+
+def local_contrast(mean: Floats, square: Floats) -> Floats:
+    """The variance of light in the surroundings of each cell.
+
+    Parameters
+    ----------
+    mean, square : (rows, columns, k) float32
+        Means of the light and of its square over the cells of k pictures.
+
+    Returns
+    -------
+    (rows, columns, k) float32
+        Variance within a Gaussian about the cell; light at the edge goes on beyond it.
+    """
+    reach = (REACH, REACH, 0)
+    mean, square = (gaussian_filter(part, reach, mode="nearest") for part in (mean, square))
+    variance: Floats = np.maximum(square - mean**2, 0)
+    return variance
+
+
+def fit_interval(
+    error: NDArray[np.floating],
+    contrast: NDArray[np.floating],
+    variance: NDArray[np.floating],
+    rho: float,
+    noise: Noise,
+    frames: float,
+    errors: tuple[float, float],
+) -> Interval:
+    """Fit an interval to predictions of patterns that a recovery has not seen.
+
+    Parameters
+    ----------
+    error, contrast, variance : (k,) float
+        What was measured less what was predicted; rho squared times T W of the pattern; the variance of the
+        measurement, errors of the model included.
+    rho : float
+        Of a usual pixel.
+    noise : Noise
+        Of a frame.
+    frames : float
+        In which a pixel was seen, all patterns together.
+    errors : (float, float)
+        Standard deviations of errors of the model in a measurement and in a composite, as shares of rho.
+
+    Returns
+    -------
+    Interval
+
+    Notes
+    -----
+    Light from far away is wrong where the backdrop has no contrast, too: the ``share`` is that by which, among the
+    `CALM` fifth of the errors with least contrast, 90 % lie in their interval, the noise of the measurement included.
+    The ``contrast`` is then that by which 90 % of all do; not more than 1, as if light came from anywhere around, and
+    if that is not enough, the share is larger again. Both are those of the capture: which of its pixels are better
+    recovered than others, the contrast that they see tells only in part. Fewer patterns make larger errors, so
+    intervals are a little too wide.
+    """
+    each = PARAMETERS / max(frames, 1.0)
+    known = variance * (1 + each)
+    calm = contrast <= np.quantile(contrast, CALM)
+    further = _least_of(error[calm], np.ones(np.count_nonzero(calm)), known[calm])
+    found = min(_least_of(error, contrast, known + further), 1.0)
+    further += _least_of(error, np.ones(error.size), known + further + found * contrast)
+    in_measurement, in_composite = errors
+    share = each * in_measurement**2 + in_composite**2 + further / rho**2
+    return Interval(found, each * noise.read, each * noise.shot, share)
+
+
+def _least_of(
+    error: NDArray[np.floating], factor: NDArray[np.floating], known: NDArray[np.floating]
+) -> float:
+    """The least number of times a factor is in the variance of errors, beside what is known, by 90 % of them."""
+    low, high = _SMALLEST, _LARGEST
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        inside = error**2 <= QUANTILE**2 * (10**middle * factor + known)
+        low, high = (low, middle) if inside.mean() >= COVERED else (middle, high)
+    return 10**high
