@@ -37,13 +37,11 @@ def contrast_on(
     """
     pixels, table = backdrop.pixels, backdrop.table
     squared = Backdrop(np.square(pixels, out=pixels)) if table is None else Backdrop(pixels, table**2)
-    pyramid = Pyramid.over(matte.columns, matte.rows)
-    shape = (matte.rows, matte.columns, 3)
     square = node_light(
         squared, matte.columns, matte.rows, threads, placement, tuple(matte.attributes["monitor"])
     )
-    mean, square = (part[: matte.columns * matte.rows].reshape(shape) for part in (light, square))
-    return np.concatenate([pyramid.light(local_contrast(mean, square)), np.zeros((1, 3), np.float32)])
+    pyramid = Pyramid.over(matte.columns, matte.rows)
+    return np.concatenate([local_contrast(pyramid, light[:-1], square[:-1]), light[-1:]])
 
 
 def half_widths(

@@ -9,16 +9,16 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
 from workflows.recovery.camera.noise import Noise
+from workflows.recovery.pyramid import Pyramid
 
 COVERED = 0.9
 """The probability of an interval."""
 QUANTILE = np.float32(1.6449)
 """Half its width in standard deviations of a normal distribution."""
-REACH = 2.0
-"""Standard deviation, in cells, of the surroundings within which contrast counts."""
+REACH = 2
+"""Grids from that of a node to the one whose nodes are its surroundings: four times as wide."""
 HELD_OUT = 8
 """One of so many patterns is held out."""
 PARAMETERS = 2.5
@@ -64,23 +64,30 @@ class Interval(NamedTuple):
         return half
 
 
-def local_contrast(mean: Floats, square: Floats) -> Floats:
-    """The variance of light in the surroundings of each cell.
+def local_contrast(pyramid: Pyramid, mean: Floats, square: Floats) -> Floats:
+    """The variance of light in the surroundings of each node.
 
     Parameters
     ----------
-    mean, square : (rows, columns, k) float32
-        Means of the light and of its square over the cells of k pictures.
+    pyramid : Pyramid
+    mean, square : (nodes, k) float32
+        The light of k pictures, and its square, at the nodes.
 
     Returns
     -------
-    (rows, columns, k) float32
-        Variance within a Gaussian about the cell; light at the edge goes on beyond it.
+    (nodes, k) float32
+        Of a cell, the variance within the node two grids further that is about it.
     """
-    reach = (REACH, REACH, 0)
-    mean, square = (gaussian_filter(part, reach, mode="nearest") for part in (mean, square))
-    variance: Floats = np.maximum(square - mean**2, 0)
-    return variance
+    reach = min(REACH, len(pyramid.grids) - 1)
+    around = Pyramid(pyramid.grids[reach:])
+    columns, rows = around.grids[0]
+    at = slice(pyramid.starts[reach], pyramid.starts[reach + 1])
+    variance = np.maximum(square[at] - mean[at] ** 2, 0).reshape(rows, columns, -1)
+    finer = [
+        variance[np.arange(high)[:, np.newaxis] >> by, np.arange(wide) >> by].reshape(wide * high, -1)
+        for by, (wide, high) in zip(range(reach, 0, -1), pyramid.grids, strict=False)
+    ]
+    return np.concatenate([*finer, around.light(variance)])
 
 
 def fit_interval(

@@ -20,6 +20,7 @@ from workflows.composite.strips import read_strip
 from workflows.images.resample import area_mean
 from workflows.mattes.layers import confidence
 from workflows.recovery.interval import Interval, local_contrast
+from workflows.recovery.pyramid import Pyramid
 
 HEIGHT, WIDTH, COLUMNS, ROWS = 20, 35, 36, 5
 CROSSTALK = [[0.9, 0.1, 0], [0.05, 0.8, 0.15], [0.02, 0.18, 0.8]]
@@ -211,7 +212,7 @@ def test_half_an_interval_is_the_formula(dense: Dense) -> None:
     matte, S, rho, T, recovered = dense
     backdrop = np.random.default_rng(2).random((2 * ROWS, 3 * COLUMNS, 3), np.float32)
     mean, square = (area_mean(part, COLUMNS, ROWS) for part in (backdrop, backdrop**2))
-    W = nodes(local_contrast(mean, square))
+    W = local_contrast(Pyramid.over(COLUMNS, ROWS), nodes(mean), nodes(square))
 
     def arrived(light: NDArray[np.float32]) -> NDArray[np.float64]:
         return (rho * np.einsum("yxcl,lc->yxc", T.astype(np.float64), light)) @ np.transpose(CROSSTALK)

@@ -5,23 +5,34 @@ import pytest
 
 from workflows.recovery.camera.noise import Noise
 from workflows.recovery.interval import fit_interval, local_contrast
+from workflows.recovery.pyramid import Pyramid
 
 NOISE = Noise(1e-5, 1e-4)
 
 
-def test_contrast_is_that_around_a_cell() -> None:
-    light = np.full((40, 60, 2), 0.3, np.float32)
-    light[:, 30:, 0] = 0.9
-    contrast = local_contrast(light, light**2)
-    assert contrast[..., 1].max() < 1e-6
-    assert contrast[:, :20, 0].max() < 1e-6
-    np.testing.assert_allclose(contrast[:, 29:31, 0], 0.09, rtol=0.1)  # half of it on either side
-    assert (np.diff(contrast[5, 30:, 0]) <= 1e-7).all()
+def contrast_of(mean: np.ndarray, square: np.ndarray) -> tuple[Pyramid, np.ndarray]:
+    pyramid = Pyramid.over(mean.shape[1], mean.shape[0])
+    return pyramid, local_contrast(pyramid, pyramid.light(mean), pyramid.light(square))
+
+
+def test_contrast_is_that_around_a_node() -> None:
+    light = np.full((80, 128, 2), 0.3, np.float32)
+    light[:, 64:, 0] = 0.9
+    pyramid, contrast = contrast_of(light, light**2)
+    assert contrast.shape == (pyramid.nodes, 2)
+    assert contrast[:, 1].max() < 1e-6
+    for (columns, rows), start in zip(pyramid.grids, pyramid.starts, strict=False):
+        row = contrast[start : start + columns * rows, 0].reshape(rows, columns)[rows // 2]
+        assert row[: columns // 2 - max(columns // 16, 2)].max() < 1e-6
+        assert (
+            row[columns // 2 - 1 : columns // 2 + 1].min() > 0.02
+        )  # 0.09 where half of it is on either side
+        np.testing.assert_allclose(row, row[::-1], atol=1e-5)
 
 
 def test_contrast_within_cells_counts() -> None:
     flat = np.full((9, 12, 1), 0.5, np.float32)
-    np.testing.assert_allclose(local_contrast(flat, flat), 0.25, rtol=1e-5)  # black and white in each cell
+    np.testing.assert_allclose(contrast_of(flat, flat)[1], 0.25, rtol=1e-5)  # black and white in each cell
 
 
 @pytest.mark.parametrize("further", [0.0, 4e-4])

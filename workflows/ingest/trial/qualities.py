@@ -17,7 +17,7 @@ from workflows.recovery.lobes.options import FAST, FINE
 from workflows.recovery.sensing import Patterns
 
 QUALITIES = {"fine": FINE, "fast": FAST}
-MOST_HELD_OUT = 16
+MOST_HELD_OUT = 10
 """Patterns that are predicted, about: their contrast takes time too."""
 PIXELS = 320
 """Pixels, at most, that are recovered without them."""
@@ -132,9 +132,10 @@ def _predict(
     predicted = np.empty((len(rho), len(chosen), 3), np.float32)
     contrast = np.empty_like(predicted)
     for n, pattern in enumerate(chosen):
-        light = np.broadcast_to(code[:, :, pattern], (len(code), 3)).astype(np.float32) / np.float32(255)
-        cells = light[: columns * rows].reshape(rows, columns, 3)
-        around = pyramid.light(local_contrast(cells, cells**2))
+        light = code[:, :, pattern].astype(np.float32) / np.float32(255)
+        square = pyramid.light((light[: columns * rows] ** 2).reshape(rows, columns, -1))
+        around = local_contrast(pyramid, light, square)
+        light, around = (np.broadcast_to(part, (len(code), 3)) for part in (light, around))
         predicted[:, n] = S + rho * found.transport.apply(light)
         contrast[:, n] = rho**2 * found.transport.apply(around)
     return predicted, contrast
