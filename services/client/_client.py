@@ -209,7 +209,8 @@ class Client:
         kind : str
             Media type of the bytes: ``image/png``, ``image/jpeg`` or ``image/x-exr``.
         **wanted
-            Further parameters: ``transfer``, ``x``, ``y``, ``width``, ``height``, ``size``, ``scale`` and so on.
+            Further parameters: ``transfer``, ``x``, ``y``, ``width``, ``height``, ``size``, ``scale``, ``interval`` and
+            so on.
 
         Returns
         -------

@@ -106,6 +106,8 @@ async def post_composite(
     is one, and `Envmatte-Recovered` is the share of the blocks. A composite that the caller already has, by
     `If-None-Match`, is not computed again; the answer is 412.
 
+    With `interval`, the answer is how far the true light may be from the composite, for recoveries by a quality.
+
     If the body is a video, `Content-Type: video/*`, the answer is 202 and the job that composites its frames.
     """
     if clips.is_clip(request):
