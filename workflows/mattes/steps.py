@@ -53,7 +53,11 @@ def _interval(stack: Stack, options: RecoveryOptions) -> dict[str, Any]:
     """The attribute ``interval`` of a matte, if the ingest has tried these options."""
     quality = next((name for name, tried in QUALITIES.items() if tried == options.of_method), None)
     found = stack.attributes.get("intervals", {}).get(quality)
-    return {"interval": found} if found else {}
+    if not found:
+        return {}
+    # A film has lost the detail of colours, of which patterns in black and white show nothing.
+    lost = stack.attributes["survey"].get("lost_colour", 0.0)
+    return {"interval": found | {"read": found["read"] + lost}}
 
 
 def work(objects: Objects, task: Task, tile: int) -> int:

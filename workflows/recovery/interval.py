@@ -40,7 +40,8 @@ class Interval(NamedTuple):
     contrast : float
         Of what the recovery leaves undetermined.
     read, shot : float
-        Of the noise in S and rho, in units of full scale squared, and of full scale.
+        Of the noise in S and rho, in units of full scale squared, and of full scale. The first is also of whatever else
+        is the same for all pixels and backdrops.
     share : float
         Of light from far away, and of errors of the model.
     """
