@@ -78,33 +78,39 @@ def try_qualities(stack: Stack, sample: Sample, patterns: Patterns) -> dict[str,
     held_out = chosen if random else ()
     # On fixed grids, no pattern tells where in a block the light comes from, but backdrops do.
     can_tell = not random or any(part.offset for part in random)
-    found = {}
+    seconds: dict[str, float] = {}
+    without: dict[str, RecoveredSample] = {}
     for name, options in QUALITIES.items():
         start = time.thread_time()
         if recover_seen(stack, program, monitor, patterns, seen, gains, options, places) is None:
             return None
-        seconds = round(share * (time.thread_time() - start), 2)
-        interval = None
+        seconds[name] = round(share * (time.thread_time() - start), 2)
         if can_tell:
-            without = recover_seen(
-                stack, program, monitor, patterns, spread, gains, options, held_out=held_out
-            )
-            interval = without and _interval(stack, program, patterns, without, chosen)
-        found[name] = Quality(seconds, interval)
-    return found
+            found = recover_seen(stack, program, monitor, patterns, spread, gains, options, held_out=held_out)
+            without |= {name: found} if found else {}
+    predictions = _predict(patterns, list(without.values()), chosen) if without else []
+    intervals = {
+        name: _interval(stack, program, found, *prediction, chosen)
+        for (name, found), prediction in zip(without.items(), predictions, strict=True)
+    }
+    return {name: Quality(taken, intervals.get(name)) for name, taken in seconds.items()}
 
 
 def _interval(
-    stack: Stack, program: Program, patterns: Patterns, found: RecoveredSample, chosen: NDArray[np.intp]
+    stack: Stack,
+    program: Program,
+    found: RecoveredSample,
+    predicted: NDArray[np.float32],
+    contrast: NDArray[np.float32],
+    chosen: NDArray[np.intp],
 ) -> Interval | None:
     """The interval by what a recovery predicts of some patterns; None if too little of these was seen."""
     attributes, channels, photometry = stack.attributes, stack.channels, found.photometry
     noise, model_error = Noise(**attributes["noise"]), float(attributes["model_error"])
     shown = program.measured[chosen]
     light, worth = found.light.values[:, shown], found.light.worth[:, shown]
-    predicted, contrast = _predict(patterns, found, chosen)
     if found.stray is not None:
-        predicted += found.stray[:, chosen]
+        predicted = predicted + found.stray[:, chosen]
     variance = noise.variance(predicted) / np.maximum(worth, 1e-6)
     variance += (model_error * photometry.rho[:, np.newaxis]) ** 2
     known = found.light.usable[:, shown] & found.alive[:, np.newaxis]
@@ -123,19 +129,26 @@ def _interval(
 
 
 def _predict(
-    patterns: Patterns, found: RecoveredSample, chosen: NDArray[np.intp]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Some patterns as the pixels see them, and rho squared times their contrast as it arrives, (n, k, 3) each."""
-    pyramid, S, rho = patterns.pyramid, found.photometry.S, found.photometry.rho
+    patterns: Patterns, found: list[RecoveredSample], chosen: NDArray[np.intp]
+) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+    """Some patterns as the pixels see them, and rho squared times their contrast as it arrives, (n, k, 3) each.
+
+    The contrast of a pattern is worked out once for all recoveries.
+    """
+    pyramid = patterns.pyramid
     columns, rows = pyramid.grids[0]
     code = patterns.code.reshape(len(patterns.code), patterns.channels, patterns.count)
-    predicted = np.empty((len(rho), len(chosen), 3), np.float32)
-    contrast = np.empty_like(predicted)
+    made = []
+    for sample in found:
+        shape = len(sample.photometry.rho), len(chosen), 3
+        made.append((np.empty(shape, np.float32), np.empty(shape, np.float32)))
     for n, pattern in enumerate(chosen):
         light = code[:, :, pattern].astype(np.float32) / np.float32(255)
         square = pyramid.light((light[: columns * rows] ** 2).reshape(rows, columns, -1))
         around = local_contrast(pyramid, light, square)
         light, around = (np.broadcast_to(part, (len(code), 3)) for part in (light, around))
-        predicted[:, n] = S + rho * found.transport.apply(light)
-        contrast[:, n] = rho**2 * found.transport.apply(around)
-    return predicted, contrast
+        for sample, (predicted, contrast) in zip(found, made, strict=True):
+            S, rho = sample.photometry.S, sample.photometry.rho
+            predicted[:, n] = S + rho * sample.transport.apply(light)
+            contrast[:, n] = rho**2 * sample.transport.apply(around)
+    return made
