@@ -65,7 +65,7 @@ def fit_to_screen(program: str | Program, screen: Size | None, *, bordered: bool
     screen : (width, height), optional
         In pixels; by default 1280 x 960 for a preset, and a program's own monitor.
     bordered : bool
-        Whether the patterns are shown inside a border (`workflows.programs.border`) on the screen.
+        Whether the patterns are shown inside a border (`workflows.programs.border`) on the screen, to be filmed.
 
     Returns
     -------
@@ -82,7 +82,9 @@ def fit_to_screen(program: str | Program, screen: Size | None, *, bordered: bool
         size = screen or DEFAULT_SCREEN
         if bordered:
             size = Border.on(*size).inner[2:]
-        program = preset(program, *size) if isinstance(program, str) else _resize(program, *size)
+        program = (
+            preset(program, *size, filmed=bordered) if isinstance(program, str) else _resize(program, *size)
+        )
     if any(isinstance(part, Images) for part in program.parts):
         raise OptionError(
             "this program has a part of images, which are files already: leave it out", field="program"

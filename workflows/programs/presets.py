@@ -52,9 +52,15 @@ RECIPES = {
     "paper-250": Recipe({12: 24, 96: 250}, offset=False, calibrated=False),
     "paper-400": Recipe({12: 24, 96: 400}, offset=False, calibrated=False),
 }
+FILMED = {
+    "quick": Recipe({12: 8, 24: 9, 48: 8, 96: 4, 192: 2, 384: 2}, stripes=8),
+    "sketch": Recipe({12: 3, 24: 3, 48: 2, 96: 1}, stripes=8),
+}
+"""What films show in place of presets in colour, with as many frames: a film stores colour at half the resolution, so
+that what a pixel sees of one colour is mixed with its neighbours'."""
 
 
-def preset(name: str, width: int = 1280, height: int = 960) -> Program:
+def preset(name: str, width: int = 1280, height: int = 960, *, filmed: bool = False) -> Program:
     """The program of a preset.
 
     Parameters
@@ -63,6 +69,8 @@ def preset(name: str, width: int = 1280, height: int = 960) -> Program:
         A key of `RECIPES`.
     width, height : int
         Size of the monitor in pixels.
+    filmed : bool
+        Whether a camera films it: then it is in black and white.
 
     Returns
     -------
@@ -81,7 +89,7 @@ def preset(name: str, width: int = 1280, height: int = 960) -> Program:
     """
     if name not in RECIPES:
         raise OptionError(f"there is no preset {name!r}: choose from {', '.join(RECIPES)}", field="preset")
-    recipe = RECIPES[name]
+    recipe = FILMED.get(name, RECIPES[name]) if filmed else RECIPES[name]
     coarsest = min(recipe.grids)
     short, long = sorted((width, height))
     if short < coarsest:

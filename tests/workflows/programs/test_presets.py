@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from storage.errors import OptionError
-from workflows.programs.presets import RECIPES, preset
+from workflows.programs.presets import FILMED, RECIPES, preset
 from workflows.programs.program import Bernoulli
 
 COUNTS = {"default": 140, "quick": 61, "sketch": 37, "paper-250": 282, "paper-400": 432}
@@ -68,6 +68,15 @@ def test_the_grids_are_those_of_the_recipes() -> None:
         parts = grids(name, 1280, 960)
         assert [(part.columns, part.rows, part.count) for part in parts] == [(16, 12, 24), (128, 96, fine)]
         assert not any(part.offset for part in parts)
+
+
+@pytest.mark.parametrize("name", COUNTS)
+def test_films_show_as_many_patterns_in_black_and_white(name: str) -> None:
+    for size in MONITORS:
+        assert preset(name, *size, filmed=True).count == COUNTS[name]
+    made = preset(name, filmed=True)
+    assert {part.colour for part in made.parts if isinstance(part, Bernoulli)} == {"grey"}
+    assert (made == preset(name)) == (name not in FILMED)
 
 
 @pytest.mark.parametrize("name", ["default", "quick", "sketch"])

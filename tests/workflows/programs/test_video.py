@@ -16,6 +16,7 @@ from storage.layout import uploads
 from storage.layout.captures import Stack
 from storage.objects.store import Objects
 from workflows.ingest import steps
+from workflows.ingest.video.matching import MIN_RESEMBLANCE
 from workflows.jobs import Task
 from workflows.programs.border import LEAD_SECONDS, Border, draw_border, schedule
 from workflows.programs.files import fit_to_screen, pictures
@@ -142,15 +143,25 @@ def test_ingest_finds_every_pattern_of_a_film(name: str, size: tuple[int, int], 
     np.testing.assert_array_equal(shown, at)
 
 
-@pytest.mark.parametrize("name", [pytest.param("default", marks=pytest.mark.slow), "quick"])
-def test_ingest_refuses_the_film_of_another_program(name: str, tmp_path: Path) -> None:
+def film_of_another_program(name: str, folder: Path) -> None:
     write_video(
-        fit_to_screen(name, (384, 288), bordered=True), tmp_path / "film.mp4", RATE, lambda done, of: None
+        fit_to_screen(name, (384, 288), bordered=True), folder / "film.mp4", RATE, lambda done, of: None
     )
-    record = json.loads((tmp_path / "film.json").read_text())
+    record = json.loads((folder / "film.json").read_text())
     for part in record["program"]["parts"]:
         if "seed" in part:
             part["seed"] += 100
-    (tmp_path / "film.json").write_text(json.dumps(record))
+    (folder / "film.json").write_text(json.dumps(record))
+
+
+def test_ingest_refuses_the_film_of_another_program(tmp_path: Path) -> None:
+    film_of_another_program("default", tmp_path)
     with pytest.raises(CaptureError, match="does not look like"):
         prepare_film(tmp_path)
+
+
+def test_numbers_in_the_border_count_for_more_than_a_few_random_patterns(tmp_path: Path) -> None:
+    film_of_another_program("quick", tmp_path)
+    video = prepare_film(tmp_path).attributes["video"]
+    assert video["numbered"]
+    assert video["resemblance"] < MIN_RESEMBLANCE

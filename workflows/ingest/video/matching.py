@@ -30,6 +30,9 @@ MIN_SHARE = 0.6
 """A recording with a smaller share of the patterns that are not constant is refusal."""
 MIN_RESEMBLANCE = 2.5
 """A recording with a smaller `resemblance.score` is refusal."""
+MANY = 32
+"""Random patterns from which on the score counts for more than the numbers in a border: the right program's, if it has
+fewer, may be as small as a wrong one's."""
 EDGES: tuple[tuple[tuple[Edge, Edge], ...], ...] = (
     (("seen", "seen"), ("hidden", "seen"), ("seen", "hidden"), ("hidden", "hidden")),
     (("seen", "cut"), ("cut", "seen"), ("hidden", "cut"), ("cut", "hidden")),
@@ -121,7 +124,8 @@ def match_frames(
         reasons[number] = Reason.ODD
         del looks[number]
     wrong = np.isin(program.constants[0], odd).mean() > 0.5
-    if wrong or (score is not None and score < MIN_RESEMBLANCE):
+    unlike = score is not None and score < MIN_RESEMBLANCE
+    if wrong or (unlike and not (numbered and resemblance.compared(program, looks) < MANY)):
         raise refusal(
             "what changes in the video does not look like the patterns of the program: check that capture.json has the "
             "program that was shown, and its patterns_per_second"

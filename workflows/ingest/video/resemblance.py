@@ -82,6 +82,11 @@ def score(program: Program, light: Light, looks: Mapping[int, Doubles]) -> float
     return float(total / np.sqrt(weights)) if weights else None
 
 
+def compared(program: Program, looks: Mapping[int, Doubles]) -> int:
+    """The number of patterns that `score` compares."""
+    return sum(map(len, _parts(program, looks)))
+
+
 def odd_patterns(program: Program, light: Light, looks: Mapping[int, Doubles]) -> list[int]:
     """The patterns that look unlike others of their kind: something was in front, or the program is another one.
 
