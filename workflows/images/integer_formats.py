@@ -1,7 +1,7 @@
 """PNG, JPEG, TIFF, HEIC and web formats of 8 to 16 bits to arrays, and PNG and JPEG back. Files are not trusted."""
 
 import io
-from typing import cast
+from typing import IO, cast
 
 import imagecodecs
 import numpy as np
@@ -205,9 +205,14 @@ def _by_pillow(picture: Image.Image, memory: int) -> NDArray[np.uint8]:
 def encode_png(pixels: Codes) -> bytes:
     """Encode (height, width, 1 to 4) uint8 or uint16 values as PNG."""
     file = io.BytesIO()
+    pack_png(file, pixels)
+    return file.getvalue()
+
+
+def pack_png(file: IO[bytes], pixels: Codes) -> None:
+    """Write (height, width, 1 to 4) uint8 or uint16 values as PNG."""
     height, width, channels = pixels.shape
     write_png(file, width, height, channels, pixels.dtype.type, [pixels])
-    return file.getvalue()
 
 
 def encode_jpeg(pixels: NDArray[np.uint8], quality: int) -> bytes:

@@ -15,7 +15,7 @@ from services.api.context import Context, OwnerContext
 from services.api.http.bodies import BodyLimit, spool_body
 from services.api.http.errors import answer as answer_problem
 from services.api.http.media_types import preferred
-from services.api.http.responses import MEMORY_BYTES, bytes_response, etag_matches
+from services.api.http.responses import MEMORY_BYTES, bytes_response, etag_matches, file_response
 from services.api.http.router import Router
 from services.api.jobs.jobs import Job
 from services.api.mattes import clips
@@ -41,6 +41,8 @@ from workflows.threads import CORES
 
 router = Router(tags=["mattes"])
 R = TypeVar("R")
+Picture = NDArray[np.float32]
+"""(height, width, 4): light and alpha."""
 BACKDROPS = (
     "image/png",
     "image/jpeg",
@@ -181,20 +183,24 @@ def _answer(
         return answer_problem(
             problem_of(NotNeeded(f"the caller already has this composite: {tag}")), {"ETag": tag}
         )
-    pixels = times.take("decode", lambda: context.decoders.decode(body, params.transfer))
-    backdrop = backdrop_of(pixels, params.transfer)
+    backdrop = backdrop_of(
+        times.take("decode", lambda: context.decoders.decode(body, params.transfer)), params.transfer
+    )
+    is_deep = media_type == "image/png" and backdrop.pixels.dtype != np.uint8
     matte = times.take("open", lambda: context.cache.matte(progress.id))
     window = Window.of(matte, params.x, params.y, params.width, params.height)
     bands = _bands(window, matte.block, params, media_type, progress.preview is not None)
     pictures = _pictures(context, progress, matte, backdrop, params, bands, times)
+    del backdrop  # which may be as large as the answer, and which `pictures` forgets as soon as it can
     if media_type == "image/x-exr":
         (picture,) = pictures
-        answer = times.take("encode", lambda: _exr(picture))
+        answer = times.take("encode", lambda: bytes_response(_exr(picture), media_type, extra))
     else:
         rows = window.height if len(bands) > 1 else None
-        codes = _codes(pictures, rows, backdrop, params, media_type, times)
-        answer = times.take("encode", lambda: _packed(codes, media_type, params.quality))
-    return bytes_response(answer, media_type, extra | {"Server-Timing": times.header})
+        codes = _codes(pictures, rows, is_deep, params, media_type, times)
+        answer = times.take("encode", lambda: _packed(codes, media_type, params.quality, extra))
+    answer.headers["Server-Timing"] = times.header
+    return answer
 
 
 class _Times(dict[str, float]):
@@ -214,9 +220,9 @@ class _Times(dict[str, float]):
 
 
 def _codes(
-    pictures: Iterator[NDArray[np.float32]],
+    pictures: Iterator[Picture],
     rows: int | None,
-    backdrop: Backdrop,
+    is_deep: bool,
     params: CompositeParams,
     media_type: str,
     times: _Times,
@@ -225,7 +231,6 @@ def _codes(
 
     The pictures that they are made of are four times as large.
     """
-    is_deep = media_type == "image/png" and backdrop.pixels.dtype != np.uint8
     dtype: np.dtype[np.unsignedinteger] = np.dtype(np.uint16 if is_deep else np.uint8)
     channels: Literal[3, 4] = 4 if media_type == "image/png" else 3
     codes, done = np.empty(0, dtype), 0
@@ -264,53 +269,58 @@ def _pictures(
     params: CompositeParams,
     bands: Sequence[Window],
     times: _Times,
-) -> Iterator[NDArray[np.float32]]:
+) -> Iterator[Picture]:
     """Light and alpha of an answer, by bands from top to bottom."""
+    draw = _drawing(context, progress, matte, backdrop, params, times)
+    steps: dict[str, Callable[[Picture, Window], Picture]] = {}
+    if progress.preview is not None:
+        steps["preview"] = partial(_put_preview, context, progress, progress.preview, backdrop, params)
+    if params.around == "backdrop":
+        steps["around"] = partial(_put_around, matte, backdrop, params)
+    if params.size is not None:
+        size = params.size
+        steps["shrink"] = lambda picture, _: shrink(picture, size)
+    if params.enlarge == 2:
+        steps["double"] = lambda picture, _: double(picture)
+    del backdrop  # which may take as much memory as the answer, and which only some steps need
+    for band in bands:
+        picture = times.take("composite", partial(draw, band))
+        for name, step in steps.items():
+            picture = times.take(name, partial(step, picture, band))
+        yield picture
+
+
+def _drawing(
+    context: Context,
+    progress: Progress,
+    matte: Matte,
+    backdrop: Backdrop,
+    params: CompositeParams,
+    times: _Times,
+) -> Callable[[Window], Picture]:
+    """What draws a window before a backdrop, or how far the light of its pixels may be from that."""
 
     def read(row: int, number: int) -> Strip:
         return context.cache.strip(progress.id, row, number, progress.blocks)
 
-    rays = times.take("rays", lambda: _rays(context, progress, params)) if params.depth is not None else None
-    light = times.take("light", lambda: light_on(matte, backdrop, params.placement, CORES))
-    interval, contrast = None, light
-    if params.interval:
-        interval = _interval(progress, matte)
-        contrast = times.take(
-            "contrast", lambda: contrast_on(matte, light, backdrop, params.placement, CORES)
-        )
-    for band in bands:
-        draw = (
-            partial(compose, matte, light, band, read, CORES, rays)
-            if interval is None
-            else partial(half_widths, matte, interval, light, contrast, band, read, CORES)
-        )
-        picture = times.take("composite", draw)
-        if progress.preview is not None:
-            add = partial(_add_preview, context, progress, progress.preview, picture, backdrop, band, params)
-            times.take("preview", add)
-        if params.around == "backdrop":
-            wide, high = matte.attributes["monitor"]
-            frame = matte.width, matte.height
-            around = partial(
-                put_around, picture, backdrop, band, frame, (wide, high), params.placement, CORES
-            )
-            picture = times.take("around", around)
-        if params.size is not None:
-            picture = shrink(picture, params.size)
-        if params.enlarge == 2:
-            picture = double(picture)
-        yield picture
+    rays = times.take("rays", partial(_rays, context, progress, params)) if params.depth is not None else None
+    light = times.take("light", partial(light_on, matte, backdrop, params.placement, CORES))
+    if not params.interval:
+        return lambda band: compose(matte, light, band, read, CORES, rays)
+    interval = _interval(progress, matte)
+    contrast = times.take("contrast", partial(contrast_on, matte, light, backdrop, params.placement, CORES))
+    return lambda band: half_widths(matte, interval, light, contrast, band, read, CORES)
 
 
-def _add_preview(
+def _put_preview(
     context: Context,
     progress: Progress,
     spacing: int,
-    picture: NDArray[np.float32],
     backdrop: Backdrop,
-    window: Window,
     params: CompositeParams,
-) -> None:
+    picture: Picture,
+    window: Window,
+) -> Picture:
     """Show the preview in a picture of a window where blocks of the matte are not done."""
     assert progress.blocks is not None  # else there is no preview
     name = progress.whole_frame
@@ -321,6 +331,16 @@ def _add_preview(
     small = composite(preview, backdrop, placement=params.placement, window=part, read=read)
     block = context.cache.matte(progress.id).block
     put_behind(picture, enlarge(small, part, window, spacing, *size), window, progress.blocks, block)
+    return picture
+
+
+def _put_around(
+    matte: Matte, backdrop: Backdrop, params: CompositeParams, picture: Picture, window: Window
+) -> Picture:
+    """Put the backdrop around the glass."""
+    wide, high = matte.attributes["monitor"]
+    frame = matte.width, matte.height
+    return put_around(picture, backdrop, window, frame, (wide, high), params.placement, CORES)
 
 
 def _interval(progress: Progress, matte: Matte) -> Interval:
@@ -363,12 +383,14 @@ def _rays(context: Context, progress: Progress, params: CompositeParams) -> Rays
     return from_two(places, others, (params.distance, params.other_distance), params.depth)
 
 
-def _exr(picture: NDArray[np.float32]) -> bytes:
+def _exr(picture: Picture) -> bytes:
     opaque = bool((picture[..., 3] == 1).all())
     return float_formats.encode_exr("RGB" if opaque else "RGBA", picture)
 
 
-def _packed(codes: Codes, media_type: str, quality: int) -> bytes:
+def _packed(codes: Codes, media_type: str, quality: int, headers: dict[str, str]) -> Response:
+    if media_type == "image/png" and codes.nbytes > MEMORY_BYTES:
+        return file_response(partial(integer_formats.pack_png, pixels=codes), media_type, headers)
     if media_type == "image/png":
-        return integer_formats.encode_png(codes)
-    return integer_formats.encode_jpeg(codes[..., :3], quality)
+        return bytes_response(integer_formats.encode_png(codes), media_type, headers)
+    return bytes_response(integer_formats.encode_jpeg(codes[..., :3], quality), media_type, headers)
