@@ -8,10 +8,12 @@ from storage.layout import mattes
 from storage.layout.captures import Stack
 from storage.layout.mattes import Matte
 from storage.objects.store import Objects
+from workflows.ingest.report.expected_psnr import costs_of
 from workflows.ingest.trial.qualities import QUALITIES
 from workflows.jobs import Steps, Task
 from workflows.mattes import preview, tiles
 from workflows.mattes.options import RecoveryOptions, parse_options
+from workflows.programs.program import Program
 
 
 def prepare(objects: Objects, task: Task) -> dict[str, Any]:
@@ -38,7 +40,7 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
         crosstalk=stack.attributes["crosstalk"],
         # Without the size of tiles, which changes nothing in the matte.
         options=options.model_dump(mode="json", exclude={"tile"}),
-        **_interval(stack, options),
+        **_interval(stack, program, options),
     )
     spacing = preview.spacing_of(stack)
     if spacing is not None:
@@ -49,15 +51,21 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
     }
 
 
-def _interval(stack: Stack, options: RecoveryOptions) -> dict[str, Any]:
-    """The attribute ``interval`` of a matte, if the ingest has tried these options."""
+def _interval(stack: Stack, program: Program, options: RecoveryOptions) -> dict[str, Any]:
+    """The attribute ``interval`` of a matte, if the ingest has tried these options.
+
+    To what patterns that are held out show, it adds what they can't: the detail of colours that a film has lost, and
+    the exposure at which the scene is to be shown, if the camera's was not locked.
+    """
     quality = next((name for name, tried in QUALITIES.items() if tried == options.of_method), None)
     found = stack.attributes.get("intervals", {}).get(quality)
     if not found:
         return {}
-    # A film has lost the detail of colours, of which patterns in black and white show nothing.
-    lost = stack.attributes["survey"].get("lost_colour", 0.0)
-    return {"interval": found | {"read": found["read"] + lost}}
+    survey = stack.attributes["survey"]
+    costs = costs_of(program, survey, 0.0, stack.attributes.get("auto_exposure"))
+    share = costs["auto_exposure"] / max(survey["contrast"], 1e-3) ** 2
+    added = {"read": found["read"] + costs["lost_colour"], "share": found["share"] + share}
+    return {"interval": found | added}
 
 
 def work(objects: Objects, task: Task, tile: int) -> int:
