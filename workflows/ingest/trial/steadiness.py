@@ -249,12 +249,15 @@ def _border_light(stack: Stack, border: BorderValues | None) -> BorderLight | No
 def _settle(
     try_out: Callable[[Doubles], Trial | None], trial: Trial, shown: NDArray[np.bool_], has_black: bool
 ) -> tuple[Doubles, Trial, Doubles]:
-    """Correct and measure again until little is left; returns what was found, the last trial, and what it left."""
+    """Correct and measure again until little is left; returns what was found, the trial of it, and what that left.
+
+    Where more is left whatever is done, later rounds wander: then it is the round that explains the frames best.
+    """
     scale, free = np.array([1, 1, SETTLED[0] / SETTLED[1]]), np.array([1, 1, int(has_black)])
     state = np.zeros_like(trial.off)
     states: list[Doubles] = []
     steps: list[Doubles] = []
-    diverged = 0
+    first, best, diverged = trial, (state, trial), 0
     for _ in range(ROUNDS):
         step = _fill_gaps(trial.off, shown) * free
         states.append(state * scale)
@@ -276,10 +279,13 @@ def _settle(
         state, trial = ahead, again
         left = _fill_gaps(trial.off, shown)
         if _size(left[shown, :2]) < SETTLED[0] and _size(left[shown, 2:]) < SETTLED[1]:
-            break
+            return state, trial, left
+        if trial.residual < best[1].residual or best[1] is first:
+            best = state, trial
         diverged = diverged + 1 if _size((left * free * scale)[shown]) > _size(steps[0][shown]) else 0
         if diverged == DIVERGED:
             break
+    state, trial = best
     return state, trial, _fill_gaps(trial.off, shown)
 
 

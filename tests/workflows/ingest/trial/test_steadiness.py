@@ -201,6 +201,23 @@ def test_rounds_end_when_they_leave_more_than_there_was(grows: float, rounds: in
     assert turns == rounds
 
 
+def test_where_nothing_settles_the_round_that_explains_most_counts() -> None:
+    off = np.random.default_rng(0).normal(0, 0.1, (20, 3))
+    left = [1.6, 1.3, 1.2, *[1.4] * (steadiness.ROUNDS - 3)]
+    tried: list[NDArray[np.float64]] = []
+
+    def again(state: NDArray[np.float64]) -> steadiness.Trial:
+        tried.append(state)
+        turned = np.roll(off, len(tried), axis=0) * 0.9
+        return steadiness.Trial(turned, np.ones_like(off), left[len(tried) - 1])
+
+    first = steadiness.Trial(off, np.ones_like(off), 2.0)
+    state, trial, _ = steadiness._settle(again, first, np.ones(20, bool), True)
+    assert len(tried) == steadiness.ROUNDS
+    assert trial.residual == 1.2
+    assert state is tried[2]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("ball", ["quick"], indirect=True)
 def test_light_that_follows_the_patterns_is_named_tone_mapping(ingest: Ingest, ball: Ball) -> None:
