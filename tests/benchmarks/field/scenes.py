@@ -4,20 +4,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
-from tests.benchmarks.field.method import Film, Floats, Matte, Method
+from tests.benchmarks.field.cameras import CAMERAS, Camera, Seen
+from tests.benchmarks.field.methods.method import Film, Floats, Matte, Method
 from workflows.programs.program import Constant, Images, Monitor, Program
+from workflows.simulation import camera as pinhole
 from workflows.simulation import objects
-from workflows.simulation.camera import Camera
 from workflows.simulation.glass_ball import backdrop, glass_ball
-from workflows.simulation.scene import Scene, Transport
+from workflows.simulation.scene import Scene
 from workflows.simulation.tracer import trace
 
 MONITOR = 256, 192
-CAMERA = 80, 60
+SIZE = 80, 60
+"""Of a frame."""
 RAYS = 64
 SIDE = 4
 """Pixels along a side of the squares that are sampled, of which the camera has a whole number."""
@@ -27,78 +27,71 @@ FROST = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Some pixels of a scene's object, as a scene of one column, and the square that each is of."""
+    """Some pixels of a scene, the square that each is of, and the camera."""
 
     scene: Scene
+    chosen: NDArray[np.intp]
     tiles: NDArray[np.intp]
+    camera: Camera = CAMERAS["linear"]
+
+    def of(self, frame: Floats) -> Floats:
+        """The values (n, 3) of a frame (height, width, 3) at the pixels."""
+        return frame.reshape(-1, 3)[self.chosen]
 
 
-def _camera() -> Camera:
-    return Camera(*CAMERA, MONITOR, RAYS)
+def _pinhole() -> pinhole.Camera:
+    return pinhole.Camera(*SIZE, MONITOR, RAYS)
 
 
 def _ball() -> Scene:
-    return glass_ball(*CAMERA, monitor=MONITOR, rays=RAYS)
+    return glass_ball(*SIZE, monitor=MONITOR, rays=RAYS)
 
 
 def _lens() -> Scene:
-    return trace(objects.lens(0.6), _camera())
+    return trace(objects.lens(0.6), _pinhole())
 
 
 def _tinted() -> Scene:
     glass = {"index": (1.48, 1.5, 1.53), "absorption": (0.1, 0.3, 0.6)}
-    return glass_ball(*CAMERA, monitor=MONITOR, rays=RAYS, **glass)  # type: ignore[arg-type]
+    return glass_ball(*SIZE, monitor=MONITOR, rays=RAYS, **glass)  # type: ignore[arg-type]
 
 
 def _two() -> Scene:
     """A ball and, in a half mirror, a lens."""
     ball, lens = _ball(), _lens()
     both = 0.6 * ball.transport[0] + 0.35 * lens.transport[0]
-    return Scene(*CAMERA, MONITOR, (both,) * 3, np.minimum(ball.coverage, lens.coverage))
+    return Scene(*SIZE, MONITOR, (both,) * 3, np.minimum(ball.coverage, lens.coverage))
 
 
 SCENES: dict[str, Callable[[], Scene]] = {
     "ball": _ball,
     "lens": _lens,
-    "tumbler": lambda: trace(objects.tumbler(), _camera(), index=1.52),
+    "tumbler": lambda: trace(objects.tumbler(), _pinhole(), index=1.52),
     "tinted": _tinted,
     "frosted": _ball,
     "two layers": _two,
     "stone": lambda: trace(
-        objects.stone(), _camera(), index=(1.50, 1.52, 1.55), absorption=(0.45, 0.12, 0.04)
+        objects.stone(), _pinhole(), index=(1.50, 1.52, 1.55), absorption=(0.45, 0.12, 0.04)
     ),
 }
 
 
-def sample(name: str, pixels: int) -> Sample:
+def sample(name: str, pixels: int, camera: Camera = CAMERAS["linear"]) -> Sample:
     """Trace a scene, and take squares of about as many pixels of its object, always the same ones."""
-    whole = SCENES[name]()
-    wide, high = CAMERA
-    inside = whole.object_mask.reshape(high // SIDE, SIDE, wide // SIDE, SIDE).all(axis=(1, 3))
+    traced = SCENES[name]()
+    wide, high = SIZE
+    inside = traced.object_mask.reshape(high // SIDE, SIDE, wide // SIDE, SIDE).all(axis=(1, 3))
     squares = np.random.default_rng(0).permutation(np.argwhere(inside))[: max(pixels // SIDE**2, 1)]
     within = np.stack(np.divmod(np.arange(SIDE**2), SIDE), axis=1)
     y, x = np.moveaxis(SIDE * squares[:, None] + within, 2, 0).reshape(2, -1)
-    chosen = y * wide + x
-    rows = {id(channel): channel[chosen] for channel in whole.transport}
-    if name == "frosted":
-        rows = {channel: _scattered(T) for channel, T in rows.items()}
-    red, green, blue = (rows[id(channel)] for channel in whole.transport)
-    coverage = whole.coverage.reshape(-1, 1)[chosen]
-    scene = Scene(1, len(chosen), MONITOR, (red, green, blue), coverage)
-    return Sample(scene, np.arange(len(squares)).repeat(SIDE**2))
-
-
-def _scattered(T: Transport) -> Transport:
-    """Transport through a ground surface: each ray becomes a Gaussian of the same light."""
-    columns, rows = MONITOR
-    pictures = T.toarray().reshape(-1, rows, columns)
-    blurred = gaussian_filter(pictures, (0, FROST, FROST), mode="constant").reshape(len(pictures), -1)
-    blurred[blurred < 1e-4 * blurred.max(axis=1, keepdims=True)] = 0
-    return sp.csr_array(blurred)
+    frost = FROST if name == "frosted" else 0.0
+    seen = Seen(*SIZE, MONITOR, traced.transport, traced.coverage, frost=frost, lens=camera)
+    return Sample(seen, y * wide + x, np.arange(len(squares)).repeat(SIDE**2), camera)
 
 
 def film(taken: Sample, method: Method, seed: int = 7) -> Film:
-    """Show a method's patterns on a linear monitor, and film the sample with `Scene.film`: 8 bits, noise 1."""
+    """Show a method's patterns on a linear monitor, and film the sample."""
+    camera = taken.camera
     rounds = method.program(*MONITOR)
     shown, frames = [], []
     pictures = next(rounds)
@@ -108,12 +101,20 @@ def film(taken: Sample, method: Method, seed: int = 7) -> Film:
         parts = (Constant(kind="constant", levels=(0, 1)), Images(kind="images", files=names))
         program = Program(monitor=Monitor(width=MONITOR[0], height=MONITOR[1]), parts=parts)
         images = [picture.astype(np.float32) / 255 for picture in pictures]
-        filmed = list(taken.scene.film(program, images=images, seed=seed + len(frames)))[2:]
-        frames.append(np.stack([frame[:, 0] for frame in filmed], axis=1).astype(np.float32) / 255)
+        filmed = taken.scene.film(
+            program,
+            noise=camera.noise,
+            depth=camera.depth,
+            response=camera.response,
+            images=images,
+            seed=seed + len(frames),
+        )
+        values = [taken.of(camera.values(frame)) for frame in filmed]
+        frames.append(np.stack(values[2:], axis=1))  # without the constants
         try:
             pictures = rounds.send(frames[-1])
         except StopIteration:
-            return Film(shown, np.concatenate(frames, axis=1), taken.tiles)
+            return Film(shown, np.concatenate(frames, axis=1), taken.tiles, camera.deviation, camera.step)
 
 
 def backdrops() -> dict[str, Floats]:
@@ -160,6 +161,6 @@ def score(taken: Sample, matte: Matte) -> dict[str, float]:
     """PSNR in dB before each backdrop, over the pixels and channels, against the exact light."""
     found = {}
     for name, light in backdrops().items():
-        error = matte.composite(light) - taken.scene.truth(light)[:, 0]
+        error = matte.composite(light) - taken.of(taken.scene.truth(light))
         found[name] = float(-10 * np.log10(np.mean(error.astype(np.float64) ** 2)))
     return found

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares, nnls
 from scipy.signal import find_peaks
 
-from tests.benchmarks.field.method import (
+from tests.benchmarks.field.methods.method import (
     Film,
     Floats,
     Matte,
@@ -70,7 +70,7 @@ class Swept:
                 ),
                 columns * rows,
             )
-            for values, sigma in channels(shares, rho)
+            for values, sigma in channels(shares, rho, film.noise)
         ]
         return scaled(still, rho, T)
 
@@ -160,9 +160,12 @@ def _drawn(lobes: Doubles, columns: int, rows: int) -> tuple[NDArray[np.intp], F
         y, x = np.mgrid[top:bottom, left:right]
         away = np.stack([x.ravel() + 0.5 - cx, y.ravel() + 0.5 - cy])
         density = np.exp(-(away * np.linalg.solve(covariance, away)).sum(axis=0) / 2)
-        if density.sum() > 0:
+        inside = (centre - reach >= 0).all() and (centre + reach <= [columns, rows]).all()
+        # What lies beyond the monitor gives no light.
+        total = density.sum() if inside else 2 * np.pi * np.sqrt(np.linalg.det(covariance))
+        if total > 0:
             places.append((y * columns + x).ravel())
-            weights.append(w * density / density.sum())
+            weights.append(w * density / total)
     return np.concatenate(places), np.concatenate(weights)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from tests.benchmarks.field.method import (
+from tests.benchmarks.field.methods.method import (
     Film,
     Floats,
     Matte,
@@ -19,7 +19,7 @@ from tests.benchmarks.field.method import (
     spread,
     with_constants,
 )
-from tests.benchmarks.field.wavelets import LEVELS, haar
+from tests.benchmarks.field.methods.wavelets import LEVELS, haar
 
 
 @dataclass
@@ -75,7 +75,7 @@ class CompressiveDual:
     def recover(self, film: Film) -> Matte:
         still, rho, shares = normalised(film)
         T = []
-        for values, sigma in channels(shares, rho):
+        for values, sigma in channels(shares, rho, film.noise):
             white = np.full((len(values), 1), self.COUNT**0.5, np.float32)
             T.append(self.solve(np.concatenate([2 * values - 1, white], axis=1), 2 * sigma, film))
         return scaled(still, rho, T, self.basis)

@@ -4,7 +4,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from tests.benchmarks.field.method import (
+from tests.benchmarks.field.methods.method import (
     CONSTANTS,
     Film,
     Floats,
@@ -114,7 +114,7 @@ class Wavelets:
     def recover(self, film: Film) -> Matte:
         still, rho, shares = normalised(film)
         T = []
-        for values, sigma in channels(shares, rho):
+        for values, sigma in channels(shares, rho, film.noise):
             response = _responses(values)
             response[np.abs(response) < 3 * 255 / GREY * sigma[:, None]] = 0
             T.append(sp.csr_array(response))
@@ -150,7 +150,10 @@ class WaveletNoise:
     def recover(self, film: Film) -> Matte:
         still, rho, shares = normalised(film)
         columns, _ = film.size
-        T = [self._solve(_responses(values), columns >> LEVELS) for values, _ in channels(shares, rho)]
+        T = [
+            self._solve(_responses(values), columns >> LEVELS)
+            for values, _ in channels(shares, rho, film.noise)
+        ]
         functions = sp.vstack(self.levels, format="csr")
         return scaled(still, rho, T, sp.diags_array(1 / np.diff(functions.indptr)) @ functions)
 

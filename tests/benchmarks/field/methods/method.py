@@ -54,11 +54,17 @@ class Film:
         Of n pixels of the object, 1 where the camera clips.
     tiles : (n,) int
         The square of neighbouring pixels that each is of.
+    noise : float
+        About its standard deviation in a frame: what the rivals take it to be.
+    step : float
+        The distance of two values that the camera tells apart.
     """
 
     pictures: Sequence[Pictures]
     values: Floats
     tiles: NDArray[np.intp]
+    noise: float
+    step: float
 
     @property
     def size(self) -> tuple[int, int]:
@@ -103,8 +109,6 @@ CONSTANTS = 4
 """Constant frames that the rivals' programs begin with."""
 
 
-NOISE = 0.006
-"""Of a frame: what the rivals take it to be. It is 0.002 to 0.008, by the light."""
 COLOURLESS = 0.05
 """Glass whose rho differs less than this between the channels has one T for all of them."""
 
@@ -128,12 +132,12 @@ def grey(shares: Floats, rho: Floats) -> Floats:
     return np.einsum("nmc,nc->nm", shares, weight)
 
 
-def channels(shares: Floats, rho: Floats) -> list[tuple[Floats, Floats]]:
+def channels(shares: Floats, rho: Floats, noise: float) -> list[tuple[Floats, Floats]]:
     """The values (n, m) that tell T, and their noise (n,): of all channels together where the glass has no colour,
     else of each."""
     if np.ptp(rho, axis=1).max() < COLOURLESS:
-        return [(grey(shares, rho), NOISE / rho.mean(axis=1) / 3**0.5)]
-    return [(shares[..., c], NOISE / rho[:, c]) for c in range(3)]
+        return [(grey(shares, rho), noise / rho.mean(axis=1) / 3**0.5)]
+    return [(shares[..., c], noise / rho[:, c]) for c in range(3)]
 
 
 def scaled(still: Floats, rho: Floats, T: Sequence[sp.csr_array], basis: sp.csr_array | None = None) -> Rows:

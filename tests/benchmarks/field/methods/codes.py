@@ -1,9 +1,11 @@
 """Stripes that code places: Gray code with one correspondence, and Zongker et al. 1999."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.benchmarks.field.method import (
+from tests.benchmarks.field.methods.method import (
     Film,
     Floats,
     Matte,
@@ -87,12 +89,39 @@ class Zongker:
     def recover(self, film: Film) -> Matte:
         still, rho, shares = normalised(film)
         shares[..., 1] = 1 - shares[..., 1]
-        value = grey(shares, rho)
         columns, rows = film.size
+        stripes = _on_monitor(*(_stripes(np.arange(size), _bits(size)) for size in (columns, rows)))
+        return Stripes(stripes.astype(np.float32)).recover(shares, still, rho)
+
+
+class Stripes:
+    """The rectangle that explains stripes best, by a search of all intervals of each axis on its own.
+
+    Parameters
+    ----------
+    pictures : sequence of (rows, columns, 1) float32
+        Vertical or horizontal stripes, 0 to 1.
+    widest : int, optional
+        Of a rectangle; as wide as the monitor if left out.
+    """
+
+    def __init__(self, pictures: Sequence[Floats], widest: int | None = None) -> None:
+        self._size = pictures[0].shape[:2]
+        lines = [picture[..., 0] for picture in pictures]
+        vertical = [bool((line[0] != line[0, 0]).any()) for line in lines]
+        self._use = [np.flatnonzero(vertical), np.flatnonzero(np.logical_not(vertical))]
+        across, down = ([lines[i] for i in use] for use in self._use)
+        self._lines = [np.stack([one[0] for one in across]), np.stack([one[:, 0] for one in down])]
+        self._widest = widest
+
+    def recover(self, shares: Floats, still: Floats, rho: Floats) -> Matte:
+        """One rectangle for all channels, from the patterns' values (n, m, 3) as shares of white."""
+        value = grey(shares, rho)
         across, down = (
-            _interval(part, size)
-            for part, size in zip(np.split(value, [_bits(columns)], axis=1), (columns, rows), strict=True)
+            _interval(value[:, use], lines, self._widest)
+            for use, lines in zip(self._use, self._lines, strict=True)
         )
+        rows, columns = self._size
         rectangles = []
         for left, right, top, bottom in np.concatenate([across, down], axis=1):
             y, x = np.mgrid[top:bottom, left:right]
@@ -100,12 +129,14 @@ class Zongker:
         return scaled(still, rho, [sparse_rows(rectangles, columns * rows)])
 
 
-def _interval(value: Floats, size: int) -> NDArray[np.intp]:
-    """First places of the best intervals, and the places after their last, (n, 2)."""
-    bits = _stripes(np.arange(size), _bits(size)).T.astype(np.float64)
-    total = np.concatenate([np.zeros((1, bits.shape[1])), np.cumsum(bits, axis=0)])
+def _interval(value: Floats, lines: Floats, widest: int | None) -> NDArray[np.intp]:
+    """First places of the best intervals, and the places after their last, (n, 2), of lines (m, places)."""
+    size = lines.shape[1]
+    total = np.concatenate([np.zeros((1, len(lines))), np.cumsum(lines.T, axis=0, dtype=np.float64)])
     first, last = np.triu_indices(size + 1, 1)
+    if widest is not None:
+        first, last = (end[last - first <= widest] for end in (first, last))
     mean = (total[last] - total[first]) / (last - first)[:, None]
-    distance = (mean**2).sum(axis=1) - 2 * value @ mean.T
-    best = distance.argmin(axis=1)
+    square = (mean**2).sum(axis=1)
+    best = np.array([(square - 2 * mean @ one).argmin() for one in value.astype(np.float64)])
     return np.stack([first[best], last[best]], axis=1)

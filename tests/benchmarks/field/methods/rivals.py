@@ -3,13 +3,13 @@
 from collections.abc import Callable
 from functools import partial
 
-from tests.benchmarks.field.codes import GrayCode, Zongker
-from tests.benchmarks.field.compressive import CompressiveDual, CompressiveTransport, PseudoInverse
-from tests.benchmarks.field.frequency import CompressedFrequencies, Frequencies
-from tests.benchmarks.field.gaussians import OneFrame, Swept
-from tests.benchmarks.field.method import Method
-from tests.benchmarks.field.ours import Engine
-from tests.benchmarks.field.wavelets import WaveletNoise, Wavelets
+from tests.benchmarks.field.methods.codes import GrayCode, Zongker
+from tests.benchmarks.field.methods.compressive import CompressiveDual, CompressiveTransport, PseudoInverse
+from tests.benchmarks.field.methods.frequency import CompressedFrequencies, Frequencies
+from tests.benchmarks.field.methods.gaussians import OneFrame, Swept
+from tests.benchmarks.field.methods.method import Method
+from tests.benchmarks.field.methods.ours import Engine
+from tests.benchmarks.field.methods.wavelets import WaveletNoise, Wavelets
 from tests.benchmarks.recovery.solvers import lasso, least_squares, pursuit, rival
 from workflows.recovery.dgsr import recover as dgsr
 
@@ -24,6 +24,7 @@ def grids(frames: int) -> dict[tuple[int, int], int]:
 
 METHODS: list[Callable[[], Method]] = [
     *(partial(Engine, f"envmatte, {name}", name) for name in ("sketch", "quick", "default")),
+    *(partial(Engine, f"envmatte, {name} as filmed", name, filmed=True) for name in ("sketch", "quick")),
     partial(Engine, "envmatte, three grids", grids(282)),
     *(partial(Engine, f"NN-DGSR, {frames} frames", grids(frames), dgsr.recover) for frames in (61, 140, 282)),
     partial(Engine, "NN-DGSR, the paper's grids", {(16, 12): 24, (128, 96): 250}, dgsr.recover),

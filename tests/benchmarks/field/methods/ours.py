@@ -5,8 +5,8 @@ from typing import cast
 
 import numpy as np
 
-from tests.benchmarks.field.method import Film, Floats, Matte
-from tests.benchmarks.field.method import Program as Patterns
+from tests.benchmarks.field.methods.method import Film, Floats, Matte
+from tests.benchmarks.field.methods.method import Program as Patterns
 from tests.benchmarks.recovery.solvers import Recover
 from workflows.images.resample import area_mean
 from workflows.programs.presets import preset
@@ -44,12 +44,16 @@ class Engine:
     wanted: str | dict[tuple[int, int], int]
     """A preset, or the number of patterns on each grid, after eight grey levels."""
     solve: Recover | None = None
+    filmed: bool = False
+    """Whether the preset is shown as it is to cameras that film."""
     shown: Program = field(init=False)
 
     def program(self, columns: int, rows: int) -> Patterns:
         monitor = Monitor(width=columns, height=rows)
         if isinstance(self.wanted, str):
-            self.shown = preset(self.wanted, columns, rows).model_copy(update={"monitor": monitor})
+            self.shown = preset(self.wanted, columns, rows, filmed=self.filmed).model_copy(
+                update={"monitor": monitor}
+            )
         else:
             levels = Constant(kind="constant", levels=tuple(i / 7 for i in range(8)))
             grids = [
@@ -66,7 +70,7 @@ class Engine:
         usable = (film.values > 0) & (film.values < 1)
         numbers, levels = self.shown.constants
         constant, clear = film.values[:, numbers], usable[:, numbers]
-        noise = estimate_noise(constant, levels, clear, 1 / 255)
+        noise = estimate_noise(constant, levels, clear, film.step)
         photometry = fit_photometry(constant, levels, clear, noise, np.ones(len(numbers), int))
         measured = np.ascontiguousarray(film.values[:, self.shown.measured])
         if self.solve is None:

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from tests.benchmarks.field.method import (
+from tests.benchmarks.field.methods.method import (
     Film,
     Floats,
     Matte,
@@ -73,7 +73,7 @@ class Frequencies:
     def recover(self, film: Film) -> Matte:
         still, rho, shares = normalised(film)
         T = []
-        for values, sigma in channels(shares, rho):
+        for values, sigma in channels(shares, rho, film.noise):
             across, down = np.split(values, [len(self.across)], axis=1)
             x, y = _marginal(across, self.across, sigma)[0], _marginal(down, self.down, sigma)[0]
             T.append(sparse_rows(map(_outer, x, y), x.shape[1] * y.shape[1]))
@@ -103,7 +103,7 @@ class CompressedFrequencies:
         still, rho, shares = normalised(film)
         ends = np.cumsum([len(self.across), len(self.down)])
         T = []
-        for values, sigma in channels(shares, rho):
+        for values, sigma in channels(shares, rho, film.noise):
             across, down, random = np.split(values, ends, axis=1)
             x, of_x = _marginal(across, self.across, sigma)
             y, of_y = _marginal(down, self.down, sigma)
