@@ -130,16 +130,18 @@ def test_restarted_service_with_keys(
     with serving(folder, *settings, ENVMATTE_KEYS="secret") as locked:
         capture = locked.client.upload(ball)
         locked.client.wait(capture["job"])
-        job = locked.client.recover(capture["id"])["id"]
+        # Paused, lest it ends before the service does.
+        job = locked.client.pause(locked.client.recover(capture["id"]))["id"]
         page = browser.new_page()
         page.goto(f"{locked.url}/#/jobs/{job}")
         for key in ("wrong", "secret"):
             page.get_by_label("Key of the service").fill(key)
             page.keyboard.press("Enter")
-        expect(page.get_by_text(re.compile("running|queued")).first).to_be_visible()
+        expect(page.get_by_text("paused").first).to_be_visible()
         locked.kill()
         expect(page.get_by_text("The service does not answer")).to_be_visible(timeout=MINUTE)
-    with serving(folder, *settings, ENVMATTE_KEYS="secret"):
+    with serving(folder, *settings, ENVMATTE_KEYS="secret") as again:
+        again.client.resume(job)
         page.get_by_role("link", name="Open the matte").click(timeout=2 * MINUTE)
         expect(page.get_by_text("exact")).to_be_visible(timeout=MINUTE)
     assert page.evaluate("Object.keys(localStorage)") == []

@@ -326,6 +326,6 @@ def test_service_restarts_with_another_key_during_upload(
                 [],
                 ["envmatte-key"],
             ]
-            page.get_by_role("link", name="Film").click()
+            page.get_by_role("link", name="Film", exact=True).click()
             address = re.compile(rf"^http://[\d.]+:{port}/#/film$|This machine is not on a network")
             expect(page.get_by_text(address)).to_be_visible()
