@@ -73,7 +73,14 @@ def _forked(process: subprocess.Popen[str], server: str) -> list[psutil.Process]
 
 def running(processes: list[psutil.Process]) -> list[psutil.Process]:
     """Those that have not ended; zombies have."""
-    return [one for one in processes if one.is_running() and one.status() != psutil.STATUS_ZOMBIE]
+    return [one for one in processes if _runs(one)]
+
+
+def _runs(one: psutil.Process) -> bool:
+    try:
+        return one.is_running() and one.status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:  # it has ended between the two
+        return False
 
 
 def listening(process: psutil.Process) -> list[tuple[str, int]]:
