@@ -256,9 +256,8 @@ def test_expiry_dates_are_shown(
             expires = forgetful.http.get(f"/v1/{kind}/{id}").json()["expires_at"]
             local = datetime.fromisoformat(expires).astimezone(ZoneInfo(zone))
             page.goto(f"{forgetful.url}/#/{kind}/{id}")
-            kept_until = page.locator("dt", has_text="Kept until").locator(
-                "+ dd"
-            )  # of a matte, in its details
+            # Of a matte, it is in its details, which are closed.
+            kept_until = page.locator("dt", has_text="Kept until").locator("+ dd")
             expect(kept_until).to_have_text(re.compile(rf"^{local.day} .* {local.year}, {local:%H:%M}$"))
     for kind, id in zip(("captures", "mattes"), ready, strict=True):
         tab.goto(f"{service.url}/#/{kind}/{id}")

@@ -8,12 +8,11 @@ from storage.layout import mattes
 from storage.layout.captures import Stack
 from storage.layout.mattes import Matte
 from storage.objects.store import Objects
-from workflows.ingest.report.expected_psnr import costs_of
+from workflows.ingest.report.expected_psnr import exposure_error
 from workflows.ingest.trial.qualities import QUALITIES
 from workflows.jobs import Steps, Task
 from workflows.mattes import preview, tiles
 from workflows.mattes.options import RecoveryOptions, parse_options
-from workflows.programs.program import Program
 
 
 def prepare(objects: Objects, task: Task) -> dict[str, Any]:
@@ -40,7 +39,7 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
         crosstalk=stack.attributes["crosstalk"],
         # Without the size of tiles, which changes nothing in the matte.
         options=options.model_dump(mode="json", exclude={"tile"}),
-        **_interval(stack, program, options),
+        **_interval(stack, options),
     )
     spacing = preview.spacing_of(stack)
     if spacing is not None:
@@ -51,7 +50,7 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
     }
 
 
-def _interval(stack: Stack, program: Program, options: RecoveryOptions) -> dict[str, Any]:
+def _interval(stack: Stack, options: RecoveryOptions) -> dict[str, Any]:
     """The attribute ``interval`` of a matte, if the ingest has tried these options.
 
     To what patterns that are held out show, it adds what they can't: the detail of colours that a film has lost, and
@@ -61,11 +60,9 @@ def _interval(stack: Stack, program: Program, options: RecoveryOptions) -> dict[
     found = stack.attributes.get("intervals", {}).get(quality)
     if not found:
         return {}
-    survey = stack.attributes["survey"]
-    costs = costs_of(program, survey, 0.0, stack.attributes.get("auto_exposure"))
-    share = costs["auto_exposure"] / max(survey["contrast"], 1e-3) ** 2
-    added = {"read": found["read"] + costs["lost_colour"], "share": found["share"] + share}
-    return {"interval": found | added}
+    read = found["read"] + stack.attributes["survey"].get("lost_colour", 0.0)
+    share = found["share"] + exposure_error(stack.attributes.get("auto_exposure"))
+    return {"interval": found | {"read": read, "share": share}}
 
 
 def work(objects: Objects, task: Task, tile: int) -> int:

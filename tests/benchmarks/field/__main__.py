@@ -13,6 +13,7 @@ import argparse
 import json
 import time
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -42,17 +43,12 @@ def main() -> None:
     args = parser.parse_args()
     rows: list[dict[str, Any]] = []
     measured = traced(args.scenes, args.cameras, args.pixels, args.only)
-    for row in measured:
+    taken = photographs.measure(args.photographs, args.pixels) if args.photographs else ()
+    for row in chain(measured, taken):
         rows.append(row)
         show(row)
         if args.json:  # after each, so that a run that is stopped leaves what it has
             args.json.write_text(json.dumps(rows, indent=1) + "\n")
-    if args.photographs:
-        for row in photographs.measure(args.photographs, args.pixels):
-            rows.append({"camera": "photographs"} | row)
-            show(rows[-1])
-    if args.json:
-        args.json.write_text(json.dumps(rows, indent=1) + "\n")
     for line in report(rows):
         print(line)
     if args.plots:

@@ -21,6 +21,7 @@ from tests.benchmarks.field.methods.method import Floats, Matte
 from tests.benchmarks.field.methods.ours import EngineMatte
 from tests.benchmarks.field.methods.rivals import LASSO, NNLS, OMP
 from tests.benchmarks.recovery.kits import load, served
+from tests.benchmarks.recovery.solvers import Recover
 from workflows.images.tone_curves import to_light
 from workflows.ingest.measured_light import constants_of, read_light
 from workflows.mattes import tiles
@@ -67,6 +68,7 @@ def _measure(
     def row(method: str, predict: Predict, seconds: float, pixels: int) -> dict[str, Any]:
         found = photographs.scored(predict, photo.reshape(len(photo), -1)[:, chosen], shown)
         return {
+            "camera": "photographs",
             "scene": name,
             "method": method,
             "frames": frames,
@@ -141,7 +143,7 @@ def _methods(
     measurements = np.ascontiguousarray(light[:, program.measured])
     glare = attributes.get("glare")
 
-    def solved(solve: Any) -> EngineMatte:
+    def solved(solve: Recover) -> EngineMatte:
         transport = solve(measurements, photometry, tiles.sensing_of(objects, capture), noise)
         return EngineMatte(photometry, add_glare(transport, glare) if glare else transport)
 

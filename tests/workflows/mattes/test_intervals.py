@@ -9,18 +9,15 @@ import pytest
 from storage.layout.captures import Stack
 from workflows.mattes.options import parse_options
 from workflows.mattes.steps import _interval
-from workflows.programs.presets import preset
 
-PROGRAM = preset("sketch", 320, 240)
 FOUND = {"contrast": 0.1, "read": 1e-5, "shot": 1e-4, "share": 1e-3}
 LOCKED = [1.0, 1.01, 0.99] * 20
 FREE = [0.8, 1.0, 1.25] * 20
 
 
 def interval(options: dict[str, Any] | None = None, **attributes: Any) -> dict[str, float]:
-    survey = {"contrast": 0.8, "deviation": 0.01} | attributes.pop("survey", {})
-    stack = SimpleNamespace(attributes={"intervals": {"fine": FOUND}, "survey": survey} | attributes)
-    return cast(dict[str, float], _interval(cast(Stack, stack), PROGRAM, parse_options(options or {}))).get(
+    stack = SimpleNamespace(attributes={"intervals": {"fine": FOUND}, "survey": {}} | attributes)
+    return cast(dict[str, float], _interval(cast(Stack, stack), parse_options(options or {}))).get(
         "interval", {}
     )
 

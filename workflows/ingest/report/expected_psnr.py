@@ -112,10 +112,15 @@ def costs_of(
         ``noise``, at the low end; ``model_error``, ``lost_colour``, ``auto_exposure``.
     """
     rho = survey["contrast"]
-    spread = float(np.log(exposures).std()) if exposures else 0.0
     return {
         "noise": _NOISE[0][0] * survey["deviation"] ** 2 / max(program.measured.size, 1),
         "model_error": (model_error * rho) ** 2,
         "lost_colour": survey.get("lost_colour", 0.0),
-        "auto_exposure": BACKDROP * (spread * rho) ** 2 if spread > UNLOCKED else 0.0,
+        "auto_exposure": exposure_error(exposures) * rho**2,
     }
+
+
+def exposure_error(exposures: Sequence[float] | None) -> float:
+    """The mean square error of composites for exposures that were not locked, as a share of rho squared."""
+    spread = float(np.log(exposures).std()) if exposures else 0.0
+    return BACKDROP * spread**2 if spread > UNLOCKED else 0.0

@@ -257,7 +257,8 @@ def _settle(
     state = np.zeros_like(trial.off)
     states: list[Doubles] = []
     steps: list[Doubles] = []
-    first, best, diverged = trial, (state, trial), 0
+    tried: list[tuple[Doubles, Trial]] = []
+    diverged = 0
     for _ in range(ROUNDS):
         step = _fill_gaps(trial.off, shown) * free
         states.append(state * scale)
@@ -280,12 +281,11 @@ def _settle(
         left = _fill_gaps(trial.off, shown)
         if _size(left[shown, :2]) < SETTLED[0] and _size(left[shown, 2:]) < SETTLED[1]:
             return state, trial, left
-        if trial.residual < best[1].residual or best[1] is first:
-            best = state, trial
+        tried.append((state, trial))
         diverged = diverged + 1 if _size((left * free * scale)[shown]) > _size(steps[0][shown]) else 0
         if diverged == DIVERGED:
             break
-    state, trial = best
+    state, trial = min(tried, key=lambda one: one[1].residual, default=(state, trial))
     return state, trial, _fill_gaps(trial.off, shown)
 
 
