@@ -1,5 +1,6 @@
 """Addresses that a process listens on."""
 
+import asyncio
 import socket
 
 import pytest
@@ -24,3 +25,22 @@ def test_an_address_that_is_not_this_machines_is_reported() -> None:
         Conflict, match=r"can't listen on 192\.0\.2\.1, port 0: Cannot assign requested address"
     ):
         bind("192.0.2.1", 0)
+
+
+def test_connections_send_without_delay() -> None:
+    """The body of an answer, sent after its head, must not wait for the client to acknowledge the head."""
+
+    async def option() -> int:
+        accepted = asyncio.get_running_loop().create_future()
+        server = await asyncio.start_server(
+            lambda _, writer: accepted.set_result(writer), sock=bind("127.0.0.1", 0)
+        )
+        async with server:
+            _, client = await asyncio.open_connection(*server.sockets[0].getsockname())
+            writer = await accepted
+            found: int = writer.get_extra_info("socket").getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+            for one in (client, writer):
+                one.close()
+            return found
+
+    assert asyncio.run(option())
