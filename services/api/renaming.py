@@ -9,7 +9,6 @@ from sqlalchemy import Connection, Row
 
 from services.api.context import Context
 from services.api.http.bodies import read_json, schema_of
-from services.api.http.responses import json_response
 from storage.database.engine import reading, writing
 
 CHANGE_BYTES = 1 << 12
@@ -41,9 +40,9 @@ async def rename(
     request: Request,
     id: str,
     records: Records,
-    read: Callable[[Connection, str], BaseModel],
+    respond: Callable[[Connection, str], Response],
 ) -> Response:
-    """Rename something, and answer with what ``read`` reads of it then.
+    """Rename something, and answer as ``respond`` does with its id then.
 
     Raises
     ------
@@ -59,7 +58,7 @@ async def rename(
         with writing(context.engine) as c:
             records.get(c, id)  # it may have been deleted meanwhile
             records.change(c, id, name=change.name)
-            return json_response(read(c, id))
+            return respond(c, id)
 
     await context.call(require)
     change = await read_json(request, Change, CHANGE_BYTES)

@@ -6,7 +6,7 @@ import time
 from collections.abc import Container, Iterator
 from typing import Any
 
-from sqlalchemy import Connection, Row, Table, select
+from sqlalchemy import Column, Connection, Row, Table, select
 
 from storage.errors import NotFound
 
@@ -30,15 +30,20 @@ def json_bytes(document: Any) -> int:
     return len(json.dumps(document))
 
 
-def find(connection: Connection, table: Table, id: str) -> Row[Any]:
+def find(connection: Connection, table: Table, id: str, without: Container[str] = ()) -> Row[Any]:
     """The row of a capture, a job or a matte.
+
+    Parameters
+    ----------
+    without : container of str
+        Columns that are not read.
 
     Raises
     ------
     NotFound
         If there is none.
     """
-    row = connection.execute(select(table).where(table.c.id == id)).one_or_none()
+    row = connection.execute(select(*_columns(table, without)).where(table.c.id == id)).one_or_none()
     if row is None:
         one = table.name.removesuffix("s")
         raise NotFound(f"there is no {one} {id!r}; GET /v1/{table.name} lists them")
@@ -72,8 +77,7 @@ def page(
     NotFound
         If there is no row with the id ``after``.
     """
-    columns = [column for column in table.c if column.name not in without]
-    query = select(*columns).order_by(table.c.number.desc()).limit(limit)
+    query = select(*_columns(table, without)).order_by(table.c.number.desc()).limit(limit)
     for column, value in equal.items():
         if value is not None:
             query = query.where(table.c[column] == value)
@@ -89,3 +93,7 @@ def page(
         query = query.where(table.c.number < number)
     # Few rows are in memory at a time: a program takes up to a megabyte once it is read.
     return iter(connection.execute(query.execution_options(yield_per=20)))
+
+
+def _columns(table: Table, without: Container[str]) -> list[Column[Any]]:
+    return [column for column in table.c if column.name not in without]

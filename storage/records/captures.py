@@ -2,10 +2,13 @@
 
 from typing import Any
 
-from sqlalchemy import Connection, Row, insert, select, update
+from sqlalchemy import Connection, Row, Text, cast, insert, select, update
 
 from storage.database.rows import find, json_bytes, lifetime
 from storage.database.tables import captures
+
+WITHOUT = ("program",)
+"""What is not read with a row: it may have megabytes, and while JSON is parsed all threads wait."""
 
 
 def add(
@@ -18,14 +21,21 @@ def add(
 
 
 def get(connection: Connection, capture: str) -> Row[Any]:
-    """A capture's row.
+    """A capture's row, without its program.
 
     Raises
     ------
     NotFound
         If there is none.
     """
-    return find(connection, captures, capture)
+    return find(connection, captures, capture, without=WITHOUT)
+
+
+def program_json(connection: Connection, capture: str) -> str:
+    """The program of a capture that exists, as JSON. It may have megabytes."""
+    return str(
+        connection.scalars(select(cast(captures.c.program, Text)).where(captures.c.id == capture)).one()
+    )
 
 
 def exists(connection: Connection, capture: str) -> bool:

@@ -1,5 +1,6 @@
 """Captures over HTTP: list, read and delete them."""
 
+import json
 from datetime import UTC, datetime
 from typing import Any, Literal, Self
 
@@ -67,16 +68,19 @@ class Capture(ListedCapture):
         "some pixels; null until it is measured, without workers, and once the ingest job is deleted."
     )
 
-    @classmethod
-    def of(cls, row: Row[Any], recovery_seconds: dict[str, float] | None = None) -> Self:
-        listed = ListedCapture.of(row).model_dump()
-        return cls(**listed, program=row.program, recovery_seconds=recovery_seconds)
 
-    @classmethod
-    def read(cls, connection: Connection, id: str) -> "Capture":
-        """A capture by its id; `NotFound` if there is none."""
-        row = captures.get(connection, id)
-        return cls.of(row, seconds_to_recover(connection, row))
+def capture_response(
+    connection: Connection, id: str, status: int = 200, headers: dict[str, str] | None = None
+) -> Response:
+    """A `Capture` by its id as a response; `NotFound` if there is none. Don't call it in the event loop.
+
+    Its program is passed on as it is stored: while JSON of megabytes is parsed or written, all threads wait.
+    """
+    row = captures.get(connection, id)
+    known = ListedCapture.of(row).model_dump(mode="json")
+    known["recovery_seconds"] = seconds_to_recover(connection, row)
+    document = f'{json.dumps(known)[:-1]}, "program": {captures.program_json(connection, id)}}}'
+    return bytes_response(document.encode(), "application/json", headers, status)
 
 
 class Captures(BaseModel):
@@ -98,7 +102,7 @@ async def list_captures(
 
     def make() -> Response:
         with reading(context.engine) as c:
-            rows = page(c, table, limit, after, without=("program",), name=name, state=state)
+            rows = page(c, table, limit, after, without=captures.WITHOUT, name=name, state=state)
             return json_response(Captures(captures=[ListedCapture.of(row) for row in rows]))
 
     return await context.compute(request, context.lists, make)
@@ -110,7 +114,7 @@ async def get_capture(context: OwnerContext, id: str, request: Request) -> Respo
 
     def make() -> Response:
         with reading(context.engine) as c:
-            return json_response(Capture.read(c, id))
+            return capture_response(c, id)
 
     return await context.compute(request, context.lists, make)
 
@@ -118,7 +122,7 @@ async def get_capture(context: OwnerContext, id: str, request: Request) -> Respo
 @router.patch("/captures/{id}", response_model=Capture, openapi_extra=CHANGE)
 async def change_capture(context: OwnerContext, id: str, request: Request) -> Response:
     """Rename a capture."""
-    return await rename(context, request, id, captures, Capture.read)
+    return await rename(context, request, id, captures, capture_response)
 
 
 @router.delete("/captures/{id}", status_code=204)

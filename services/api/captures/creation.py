@@ -8,7 +8,7 @@ from fastapi import Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection, Row
 
-from services.api.captures.captures import Capture
+from services.api.captures.captures import Capture, capture_response
 from services.api.captures.tus import file_name
 from services.api.context import Context, OwnerContext
 from services.api.http.bodies import read_json, schema_of, store_as_upload, upload_limit
@@ -50,6 +50,7 @@ class FromUpload(BaseModel):
 @router.post(
     "/captures",
     status_code=201,
+    response_model=Capture,
     openapi_extra={
         "requestBody": {
             "content": {
@@ -62,13 +63,12 @@ class FromUpload(BaseModel):
 async def upload(
     context: OwnerContext,
     request: Request,
-    response: Response,
     name: Annotated[str, Query(max_length=200, description="A name for people.")] = "",
     webhook: Annotated[
         str | None, Query(description="URL, https, that is notified when the capture is ingested.")
     ] = None,
     idempotency_key: IdempotencyKey = None,
-) -> Capture:
+) -> Response:
     """Create a capture. The body is its ZIP, in the format envmatte-capture/1, or names the upload that holds the ZIP.
 
     `name` and `webhook` of the query are for a ZIP; JSON has its own.
@@ -85,8 +85,12 @@ async def upload(
             f"send the ZIP of a capture as {ZIP}, not as {media_type or 'nothing'}, or the id of a finished upload "
             f"as {JSON}"
         )
-    response.headers["Location"] = f"/v1/captures/{row.id}"
-    return Capture.of(row)
+
+    def respond() -> Response:
+        with reading(context.engine) as c:
+            return capture_response(c, row.id, 201, {"Location": f"/v1/captures/{row.id}"})
+
+    return await context.call(respond)
 
 
 async def _from_body(

@@ -247,9 +247,10 @@ def _queue(context: Context, request: JobRequest, key: str | None) -> Job:
         return earlier
     with reading(context.engine) as c:
         admit(c, context.settings, jobs=1)  # again below, where it is certain; to read a program takes longer
-        program = captures.get(c, request.capture).program
+        captures.get(c, request.capture)
+        program = captures.program_json(c, request.capture)
     # Grids that do not nest are refused here, not by the job; and before the transaction, for which others wait.
-    Program.model_validate(program).bands()
+    Program.model_validate_json(program).bands()
 
     def create(c: Connection) -> str:
         capture = captures.get(c, request.capture)

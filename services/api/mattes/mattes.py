@@ -98,7 +98,7 @@ def get_matte(context: OwnerContext, id: str) -> Matte:
 @router.patch("/mattes/{id}", response_model=Matte, openapi_extra=CHANGE)
 async def change_matte(context: OwnerContext, id: str, request: Request) -> Response:
     """Rename a matte."""
-    return await rename(context, request, id, mattes, Matte.read)
+    return await rename(context, request, id, mattes, lambda c, id: json_response(Matte.read(c, id)))
 
 
 @router.delete("/mattes/{id}", status_code=204)

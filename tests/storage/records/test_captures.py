@@ -1,5 +1,7 @@
 """Rows of captures."""
 
+import json
+
 import pytest
 from sqlalchemy import Engine
 
@@ -14,7 +16,8 @@ def test_rows_are_added_changed_and_deleted(engine: Engine) -> None:
         captures.add(connection, "c2", "j2", name="", bytes=8, frames=4, program={})
         row = captures.get(connection, "c1")
         assert (row.state, row.job, row.name, row.bytes, row.frames) == ("ingesting", "j1", "ball", 7, 3)
-        assert (row.program, row.width, row.problem) == ({"parts": []}, None, None)
+        assert (row.width, row.problem) == (None, None)
+        assert json.loads(captures.program_json(connection, "c1")) == {"parts": []}
         captures.change(connection, "c1", state="ready", width=20, height=10)
     with writing(engine) as connection:
         row = captures.get(connection, "c1")
