@@ -4,6 +4,7 @@ What a method's own options are, their defaults, ranges and descriptions are dec
 `workflows.recovery.lobes.options` and `workflows.recovery.dgsr.options`. The models here are made from that.
 """
 
+from functools import cache
 from typing import Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
@@ -129,8 +130,15 @@ def _own(method: type[RecoveryOptions]) -> list[str]:
     return [name for name in method.model_fields if name not in RecoveryOptions.model_fields]
 
 
+@cache
+def _schemas(method: type[RecoveryOptions]) -> dict[str, Any]:
+    """The JSON schema of each option of a method."""
+    schemas: dict[str, Any] = method.model_json_schema()["properties"]
+    return schemas
+
+
 def _describe(method: type[RecoveryOptions], name: str) -> dict[str, Any]:
-    schema = method.model_json_schema()["properties"][name]
+    schema = _schemas(method)[name]
     # an option that may be null has two schemas, one of them null's
     value = next(value for value in schema.get("anyOf", [schema]) if value["type"] != "null")
     return {
