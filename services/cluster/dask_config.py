@@ -21,6 +21,7 @@ CONFIG: dict[str, Any] = {
     "distributed.worker.memory.spill": False,
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": 0.95,
+    "distributed.scheduler.active-memory-manager.start": False,
     "distributed.worker.multiprocessing-method": "forkserver",
     # The last messages of every connection and the last bursts of tasks, which nothing reads; a thousand by default.
     "distributed.admin.low-level-log-length": 100,
@@ -58,8 +59,11 @@ class _NoSpans:
         """Ignore what a worker has counted."""
 
 
-SCHEDULER: dict[str, Any] = NO_DASHBOARD | {"extensions": DEFAULT_EXTENSIONS | {"spans": _NoSpans}}
-"""Arguments of every scheduler."""
+_EXTENSIONS = {name: one for name, one in DEFAULT_EXTENSIONS.items() if name != "stealing"} | {
+    "spans": _NoSpans
+}
+SCHEDULER: dict[str, Any] = NO_DASHBOARD | {"extensions": _EXTENSIONS}
+"""Arguments of every scheduler. No worker has a tile that waits, which another could steal."""
 
 
 def configure_dask() -> None:

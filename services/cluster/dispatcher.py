@@ -7,7 +7,8 @@ reported as gone. dask's own callbacks are only hints to look.
 
 import logging
 import threading
-from collections.abc import Callable, Container, Iterable
+import time
+from collections.abc import Callable, Container, Iterable, Sequence
 from concurrent.futures import CancelledError
 from contextlib import suppress
 from dataclasses import dataclass
@@ -27,7 +28,9 @@ logger = logging.getLogger(__name__)
 LOOK = 1.0
 """Seconds between two polls of the cluster."""
 ANSWER = 5.0
-"""Seconds that the scheduler has to answer, and a worker to send the small result of a tile."""
+"""Seconds that the scheduler has to answer."""
+LOOKING, SELDOM = 0.05, 5.0
+"""The share of its time for which it looks at most, since a thousand workers take long, and yet after these seconds."""
 MEMORY = "worker-restart-memory"
 """The topic under which a nanny reports to the scheduler that it ends its worker for taking too much memory."""
 
@@ -62,13 +65,19 @@ class Outcome:
     starved: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass
 class Flight:
-    """A tile under way; ``number`` is its place in the order of submission."""
+    """A tile under way; ``number`` is its place in the order of submission. Its result comes before its future ends."""
 
     job: str
     tile: int
     number: int
+    future: Future | None = None
+    done: tuple[float, Any] | None = None
+
+    @property
+    def ended(self) -> bool:
+        return self.future is not None and self.future.done()
 
 
 class Dispatcher:
@@ -91,7 +100,8 @@ class Dispatcher:
         self._store = store
         self._scale = scale
         self._client: Client | None = None
-        self._flights: dict[Future, Flight] = {}
+        self._flights: dict[str, Flight] = {}
+        """By the keys of their dask tasks."""
         self._number = count()
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="dispatcher")
@@ -124,28 +134,40 @@ class Dispatcher:
         No tile waits there. So the next job is chosen when a thread is free, and a worker that dies had just the tile
         that it worked on.
         """
-        return self.threads - sum(not future.done() for future in self._flights) if self._usable() else 0
+        return (
+            self.threads - sum(not flight.ended for flight in self._flights.values()) if self._usable() else 0
+        )
 
-    def submit(self, steps: Steps, task: Task, tile: int, trace: str | None = None) -> bool:
-        """Submit a tile, and the trace that it is part of; `collect` returns its outcome.
+    def submit(self, steps: Steps, task: Task, tiles: Sequence[int], trace: str | None = None) -> bool:
+        """Submit tiles of a job, and the trace that they are part of; `collect` returns their outcomes.
 
         Returns False if the connection to the scheduler is being lost.
         """
-        client, number = self._usable(), next(self._number)
-        flight = Flight(task.job, tile, number)
+        client = self._usable()
         if client is None:
             return False
-        key = key_of(steps.kind, task.job, tile)
-        # By default tasks submitted within 100 ms run in any order; `_blamed` relies on the order of submission.
+        flights = {
+            key_of(steps.kind, task.job, tile): Flight(task.job, tile, next(self._number)) for tile in tiles
+        }
+        self._flights |= flights  # before a result may come
+        what = {
+            "steps": steps,
+            "store": self._store,
+            "task": task,
+            "trace": trace,
+            "topic": _topic_of(client),
+        }
         try:
-            future = client.submit(
-                run, steps, self._store, task, tile, trace, key=key, pure=False, fifo_timeout="0 ms"
-            )
+            # By default tasks submitted within 100 ms run in any order; `_blamed` relies on the order of submission.
+            futures = client.map(run, tiles, key=list(flights), pure=False, fifo_timeout="0 ms", **what)
         except Exception as error:
-            logger.warning("can't submit a tile: %r", error)
+            logger.warning("can't submit tiles: %r", error)
+            for key in flights:
+                del self._flights[key]
             return False
-        self._flights[future] = flight
-        future.add_done_callback(lambda _: self.news.set())
+        for flight, future in zip(flights.values(), futures, strict=True):
+            flight.future = future
+            future.add_done_callback(lambda _: self.news.set())
         return True
 
     def under_way(self, job: str) -> int:
@@ -154,30 +176,24 @@ class Dispatcher:
 
     def drop(self, job: str) -> None:
         """Cancel the tasks of a job; workers end those that run (`services.cluster.worker_preload`)."""
-        dropped = [future for future, flight in self._flights.items() if flight.job == job]
-        for future in dropped:
-            del self._flights[future]
+        dropped = [key for key, flight in self._flights.items() if flight.job == job]
+        futures = [self._flights.pop(key).future for key in dropped]
         client = self._usable()
-        if client is not None and dropped:
+        if client is not None and futures:
             with suppress(Exception):  # if the client is being lost, they are released with it
-                client.cancel(dropped, force=True)
+                client.cancel(futures, force=True)
 
     def collect(self) -> list[Outcome]:
         """The outcomes of tiles since the last call."""
-        ended = {future: self._flights.pop(future) for future in list(self._flights) if future.done()}
-        if not ended:
-            return []
-        results = self._results([future for future in ended if future.status == "finished"])
+        ended = [self._flights.pop(key) for key, flight in list(self._flights.items()) if flight.ended]
         outcomes, dead = [], []
-        for future, flight in ended.items():
-            if future in results:
-                outcomes.append(Outcome(flight.job, flight.tile, done=results[future]))
-                continue
-            error = _error_of(future)
+        for flight in ended:
+            error = _error_of(flight.future)
             if isinstance(error, KilledWorker):
                 dead.append((flight, error.last_worker.address))
             else:
-                outcomes.append(Outcome(flight.job, flight.tile, error=error))
+                done = None if error else flight.done
+                outcomes.append(Outcome(flight.job, flight.tile, done=done, error=error))
         return outcomes + _blamed(dead, self._starved() if dead else ())
 
     def want(self, tiles: int) -> None:
@@ -185,18 +201,12 @@ class Dispatcher:
         if self._scale is not None:
             self._scale(tiles)
 
-    def _results(self, finished: list[Future]) -> dict[Future, tuple[float, Any]]:
-        """The results of tasks that are finished, as far as they can still be fetched."""
-        client = self._usable()
-        if client is None or not finished:
-            return {}
-        try:
-            return dict(
-                zip(finished, client.sync(client._gather, finished, callback_timeout=ANSWER), strict=True)
-            )
-        except Exception as error:  # a worker is gone, or frozen: its tiles are done again
-            logger.warning("can't fetch %d results: %r", len(finished), error)
-            return {}
+    def _take(self, event: tuple[float, dict[str, Any]]) -> None:
+        """Keep the result of a tile that is still under way. Called in the client's thread."""
+        _, sent = event
+        flight = self._flights.get(sent["key"])
+        if flight is not None:
+            flight.done = sent["seconds"], sent["result"]
 
     def _starved(self) -> set[str]:
         """The workers that were ended for their memory, as reported by their nannies to the scheduler."""
@@ -216,7 +226,9 @@ class Dispatcher:
 
     def _watch(self) -> None:
         while True:
+            start = time.monotonic()
             cluster = self._look()
+            took = time.monotonic() - start
             changed = cluster["problem"] != self.cluster["problem"] or self.threads != sum(
                 worker["threads"] for worker in cluster["workers"]
             )
@@ -225,7 +237,7 @@ class Dispatcher:
             self.cluster = cluster
             if changed:
                 self.news.set()
-            if self._stopped.wait(LOOK):
+            if self._stopped.wait(min(max(LOOK, took / LOOKING), SELDOM)):
                 return
 
     def _look(self) -> dict[str, Any]:
@@ -236,6 +248,7 @@ class Dispatcher:
                 if old is not None:
                     _close(old)
                 self._client = self._connect()
+                self._client.subscribe_topic(_topic_of(self._client), self._take)
             client = self._client
             info = client.sync(client.scheduler.identity, n_workers=-1, callback_timeout=ANSWER)
         except EnvmatteError as error:
@@ -249,6 +262,11 @@ class Dispatcher:
         return {"workers": workers, "under_way": len(self._flights), "problem": problem}
 
 
+def _topic_of(client: Client) -> str:
+    """Of the events with the results of what a client submits."""
+    return f"tiles-{client.id}"
+
+
 def _worker(address: str, found: dict[str, Any]) -> dict[str, Any]:
     return {
         "address": address,
@@ -260,9 +278,9 @@ def _worker(address: str, found: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _error_of(future: Future) -> Exception | None:
-    """What a tile raised; None if it is gone without an error."""
-    if future.status != "error":
+def _error_of(future: Future | None) -> Exception | None:
+    """What a tile raised; None if it is done, or gone without an error."""
+    if future is None or future.status != "error":
         return None
     try:
         error = future.exception(timeout=ANSWER)

@@ -1,10 +1,15 @@
-"""The function that a dask task runs: one step of a job, with its ids in the worker's log and in the trace."""
+"""The function that a dask task runs: one step of a job, with its ids in the worker's log and in the trace.
+
+It sends its result as an event, which takes the way of the worker's other messages and comes before that of its end: to
+fetch a result, the scheduler would open a connection to its worker.
+"""
 
 import logging
 import re
 from functools import lru_cache
-from typing import Any
 from uuid import uuid4
+
+from distributed import get_worker
 
 from services.runtime import tracing
 from services.runtime.logs import about
@@ -31,8 +36,8 @@ def read_key(key: str) -> tuple[str, int] | None:
     return (found[1], int(found[2])) if found else None
 
 
-def run(steps: Steps, store: str, task: Task, tile: int, trace: str | None) -> tuple[float, Any]:
-    """Run one step of a job in a worker; returns what `workflows.jobs.run` does.
+def run(tile: int, steps: Steps, store: str, task: Task, trace: str | None, topic: str) -> None:
+    """Run one step of a job in a worker.
 
     Parameters
     ----------
@@ -40,6 +45,8 @@ def run(steps: Steps, store: str, task: Task, tile: int, trace: str | None) -> t
         URL of the object store, which a worker process opens once.
     trace : str, optional
         The ``traceparent`` of the request that asked for the job.
+    topic : str
+        Of the event with the ``key`` of the dask task, and what `workflows.jobs.run` returns: ``seconds``, ``result``.
     """
     attributes = {"tile": tile} if tile >= 0 else {}
     name = f"{steps.kind} {NAMES.get(tile, 'tile')}"
@@ -56,7 +63,8 @@ def run(steps: Steps, store: str, task: Task, tile: int, trace: str | None) -> t
             logger.exception("failed")
             raise
         logger.debug("done in %.3f s", seconds)
-        return seconds, result
+        worker = get_worker()
+        worker.log_event(topic, {"key": worker.get_current_task(), "seconds": seconds, "result": result})
 
 
 @lru_cache(maxsize=1)

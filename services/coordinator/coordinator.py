@@ -10,7 +10,7 @@ import os
 import socket
 import threading
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -327,16 +327,19 @@ class Coordinator:
         under_way = {job: dispatcher.under_way(job) for job in self._runs}
         waiting = [run for run in self._runs.values() if run.to_do and not run.paused]
         dispatcher.want(sum(under_way.values()) + sum(len(run.to_do) for run in waiting))
+        chosen: defaultdict[str, list[int]] = defaultdict(list)
         for _ in range(dispatcher.free):
             if not waiting:
-                return
+                break
             run = min(waiting, key=lambda run: (run.used(under_way[run.job]), under_way[run.job]))
-            if not dispatcher.submit(run.kind.steps, run.task, run.to_do[0], run.trace):
-                return
-            run.to_do.popleft()
+            chosen[run.job].append(run.to_do.popleft())
             under_way[run.job] += 1
             if not run.to_do:
                 waiting.remove(run)
+        for job, some in chosen.items():
+            run = self._runs[job]
+            if not dispatcher.submit(run.kind.steps, run.task, some, run.trace):
+                run.to_do.extendleft(reversed(some))
 
 
 def _logged(act: Callable[..., None], *arguments: Any) -> None:

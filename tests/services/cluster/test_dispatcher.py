@@ -58,7 +58,7 @@ def outcomes(dispatcher: Dispatcher, count: int) -> list[Outcome]:
 def test_errors_and_dead_workers_are_reported(cluster: LocalCluster, tmp_path: Path) -> None:
     with Dispatcher(lambda: Client(cluster, set_as_default=False), tmp_path.as_uri()) as dispatcher:
         until(lambda: dispatcher.free == 1)
-        dispatcher.submit(STEPS, task("a"), 3)
+        dispatcher.submit(STEPS, task("a"), [3])
         assert dispatcher.under_way("a") == 1
         (outcome,) = outcomes(dispatcher, 1)
         assert (outcome.job, outcome.tile, outcome.done, outcome.died) == ("a", 3, None, None)
@@ -67,8 +67,7 @@ def test_errors_and_dead_workers_are_reported(cluster: LocalCluster, tmp_path: P
 
         (pid,) = (worker.pid for worker in cluster.workers.values())
         os.kill(pid, signal.SIGSTOP)  # so that it has both when it dies
-        for tile in (1, 2):
-            dispatcher.submit(STEPS, task("b"), tile)
+        dispatcher.submit(STEPS, task("b"), [1, 2])
         time.sleep(0.5)
         os.kill(pid, signal.SIGKILL)
         found = sorted(outcomes(dispatcher, 2), key=lambda outcome: outcome.tile)

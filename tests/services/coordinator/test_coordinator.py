@@ -41,8 +41,8 @@ class Idle:
     def under_way(self, job: str) -> int:
         return sum(one == job for one, _ in self.submitted)
 
-    def submit(self, steps: Any, task: Any, tile: int, trace: str | None = None) -> bool:
-        self.submitted.append((task.job, tile))
+    def submit(self, steps: Any, task: Any, tiles: list[int], trace: str | None = None) -> bool:
+        self.submitted += [(task.job, tile) for tile in tiles]
         return True
 
     def collect(self) -> list[Any]:
@@ -119,7 +119,7 @@ def test_files_that_cannot_be_removed_are_removed_later(
 
 @pytest.mark.exhaustive
 def test_progress_takes_a_few_writes_a_second() -> None:
-    row = measure(tiles=1500, seconds=0.0, workers=1, threads=4)
+    row = measure(tiles=1500, seconds=0.0, workers=4)
     writes = row["writes a second"] * row["seconds"]
     assert 2 < writes <= row["seconds"] * (1 / WRITE + 0.5) + OTHERS
     assert row["tiles"] > 5 * writes
