@@ -11,8 +11,10 @@
 =====================================  =================================================================
 
 All are float32, in linear light or plain numbers. A chunk is a block of the matte. The attributes are ``monitor``, its
-width and height in pixels; ``crosstalk``, X, its rows one after another; and ``columns`` and ``rows``, the grid of T.
-`workflows.mattes.layers` says how a composite is made of them.
+width and height in pixels; ``crosstalk``, X, its rows one after another; ``columns`` and ``rows``, the grid of T; and,
+if they were measured, the ``contrast``, ``read``, ``shot`` and ``share`` of `workflows.recovery.interval.Interval` one
+after another as ``interval``: how far a composite may be from the truth. `workflows.mattes.layers` says how a composite
+is made of them.
 """
 
 from functools import partial
@@ -27,6 +29,7 @@ from storage.layout.mattes import Block
 from workflows.mattes.layers import LOBES, MOST_LOBES, trust
 from workflows.mattes.lobes import Gridded, block_lobes
 from workflows.recovery.clusters.lobe_table import FIELDS
+from workflows.recovery.interval import Interval
 
 _WEIGHT = FIELDS.index("weight.R")
 _CHANNELS = 3
@@ -96,8 +99,14 @@ def dataset_of(matte: Source, lobes: int = LOBES) -> xr.Dataset:
             "crosstalk": np.ravel(matte.attributes["crosstalk"]).tolist(),
             "columns": matte.columns,
             "rows": matte.rows,
+            **_interval(matte),
         },
     )
+
+
+def _interval(matte: Source) -> dict[str, list[float]]:
+    found = matte.attributes.get("interval")
+    return {"interval": list(Interval(**found))} if found else {}
 
 
 def _chunks(size: int, edge: int) -> tuple[int, ...]:

@@ -78,6 +78,13 @@ def test_dataset_has_the_layers_and_lobes_of_the_service(matte: Matte, archive: 
             np.testing.assert_array_equal(values.to_numpy()[at], lobes[..., k])
     assert found.attrs["monitor"] == matte.attributes["monitor"]
     np.testing.assert_array_equal(np.reshape(found.attrs["crosstalk"], (3, 3)), matte.attributes["crosstalk"])
+    assert "interval" not in found.attrs  # no ingest has measured it
+
+
+def test_dataset_has_the_interval_in_its_attributes(matte: Matte, archive: bytes) -> None:
+    read = ArchivedMatte(io.BytesIO(archive))
+    read.attributes["interval"] = {"share": 4.0, "read": 2.0, "contrast": 1.0, "shot": 3.0}
+    assert dataset_of(read).attrs["interval"] == [1.0, 2.0, 3.0, 4.0]
 
 
 @pytest.mark.parametrize(
