@@ -243,13 +243,15 @@ class Dispatcher:
     def _look(self) -> dict[str, Any]:
         client: Any
         try:
-            if self._usable() is None:
+            client = self._usable()
+            if client is None:
                 old, self._client = self._client, None
                 if old is not None:
                     _close(old)
-                self._client = self._connect()
-                self._client.subscribe_topic(_topic_of(self._client), self._take)
-            client = self._client
+                client = self._connect()
+            # Each time, since a client that has connected again by itself has lost it.
+            client.subscribe_topic(_topic_of(client), self._take)
+            self._client = client
             info = client.sync(client.scheduler.identity, n_workers=-1, callback_timeout=ANSWER)
         except EnvmatteError as error:
             return {"workers": [], "problem": error.detail}
