@@ -21,6 +21,7 @@ CONFIG: dict[str, Any] = {
     "distributed.worker.memory.spill": False,
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": 0.95,
+    # Nor are there copies of results to balance between workers.
     "distributed.scheduler.active-memory-manager.start": False,
     "distributed.worker.multiprocessing-method": "forkserver",
     # The last messages of every connection and the last bursts of tasks, which nothing reads; a thousand by default.

@@ -69,9 +69,7 @@ class Capture(ListedCapture):
     )
 
 
-def capture_response(
-    connection: Connection, id: str, status: int = 200, headers: dict[str, str] | None = None
-) -> Response:
+def capture_response(connection: Connection, id: str) -> Response:
     """A `Capture` by its id as a response; `NotFound` if there is none. Don't call it in the event loop.
 
     Its program is passed on as it is stored: while JSON of megabytes is parsed or written, all threads wait.
@@ -80,7 +78,7 @@ def capture_response(
     known = ListedCapture.of(row).model_dump(mode="json")
     known["recovery_seconds"] = seconds_to_recover(connection, row)
     document = f'{json.dumps(known)[:-1]}, "program": {captures.program_json(connection, id)}}}'
-    return bytes_response(document.encode(), "application/json", headers, status)
+    return bytes_response(document.encode(), "application/json")
 
 
 class Captures(BaseModel):

@@ -88,9 +88,12 @@ async def upload(
 
     def respond() -> Response:
         with reading(context.engine) as c:
-            return capture_response(c, row.id, 201, {"Location": f"/v1/captures/{row.id}"})
+            return capture_response(c, row.id)
 
-    return await context.call(respond)
+    response = await context.call(respond)
+    response.status_code = 201
+    response.headers["Location"] = f"/v1/captures/{row.id}"
+    return response
 
 
 async def _from_body(

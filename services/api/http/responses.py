@@ -18,23 +18,18 @@ MEMORY_BYTES = 1 << 18
 """The largest answer kept in memory while it is sent, and the size of the pieces read from a file."""
 
 
-def bytes_response(
-    data: bytes, media_type: str, headers: dict[str, str] | None = None, status: int = 200
-) -> Response:
+def bytes_response(data: bytes, media_type: str, headers: dict[str, str] | None = None) -> Response:
     """A response from bytes. Large ones go through a temporary file, so that many slow clients take little memory.
 
     It may write to a disk, so don't call it in the event loop.
     """
     if len(data) <= MEMORY_BYTES:
-        return Response(data, status, headers, media_type)
-    return file_response(lambda file: file.write(data), media_type, headers, status)
+        return Response(data, headers=headers, media_type=media_type)
+    return file_response(lambda file: file.write(data), media_type, headers)
 
 
 def file_response(
-    write: Callable[[IO[bytes]], object],
-    media_type: str,
-    headers: dict[str, str] | None = None,
-    status: int = 200,
+    write: Callable[[IO[bytes]], object], media_type: str, headers: dict[str, str] | None = None
 ) -> Response:
     """A response that a function writes to a temporary file. Don't call it in the event loop."""
     with ExitStack() as stack:
@@ -43,7 +38,7 @@ def file_response(
         size = file.seek(0, os.SEEK_END)
         file.seek(0)
         stack.pop_all()  # the response closes it
-    return FileStreamResponse(file, size, media_type, headers, status)
+    return FileStreamResponse(file, size, media_type, headers)
 
 
 def json_response(model: BaseModel) -> Response:
@@ -55,17 +50,11 @@ class FileStreamResponse(StreamingResponse):
     """A response that streams a file and closes it, also when the connection breaks."""
 
     def __init__(
-        self,
-        file: IO[bytes],
-        size: int,
-        media_type: str,
-        headers: dict[str, str] | None = None,
-        status: int = 200,
+        self, file: IO[bytes], size: int, media_type: str, headers: dict[str, str] | None = None
     ) -> None:
         length = {"Content-Length": str(size)}
         super().__init__(
             iter(partial(file.read, MEMORY_BYTES), b""),
-            status,
             headers=(headers or {}) | length,
             media_type=media_type,
         )

@@ -2,7 +2,8 @@
 
 Scheduler and workers run in processes of their own, the coordinator and the database in this one; a tile only sleeps.
 There are always three large jobs, and every now and then a small one. Prints a table, and writes JSON to a file if one
-is named. A thousand workers that sleep take six cores, the scheduler and the coordinator one each.
+is named. Workers that sleep take more of the machine than scheduler and coordinator do: for a thousand, two cores are
+too few.
 """
 
 import argparse
