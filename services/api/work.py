@@ -140,6 +140,8 @@ async def run(
     TooMany
         If its turn does not come within ``seconds``.
     """
+    if await request.is_disconnected():
+        raise ClientDisconnect
     unwanted = threading.Event()
     large = any(amount >= LARGE for _, amount in needed)
 

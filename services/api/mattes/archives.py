@@ -58,14 +58,15 @@ class _Download(Response):
         self._context, self._id = context, id
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        owner, seconds = self._context.caller.owner, self._context.settings.request_seconds
-        async with self._context.archives.take(owner, seconds):
-            archive = await anyio.to_thread.run_sync(self._open)
+        context = self._context
+        async with context.archives.take(context.caller.owner, context.settings.request_seconds):
+            # To open it is to make a list of its entries, which ends if nobody waits for the archive any more.
+            archive = await context.compute(Request(scope, receive), context.lists, self._open)
             headers = {
                 "Content-Length": str(archive.size),
                 "Content-Disposition": f'attachment; filename="matte-{self._id}.zip"',
             }
-            pieces = self._context.while_allowed(archive)
+            pieces = context.while_allowed(archive)
             await StreamingResponse(pieces, media_type=ZIP, headers=headers)(scope, receive, send)
 
     def _open(self) -> Archive:

@@ -11,6 +11,8 @@ import httpx2
 import pytest
 import uvicorn
 from fastapi import FastAPI, Request
+from starlette.requests import ClientDisconnect
+from starlette.types import Message
 
 from services.api.http import errors
 from services.api.work import Shares, run
@@ -80,6 +82,18 @@ def test_work_ends_with_its_client_and_leaves_room_for_the_next(works: Works) ->
     for one in (*asking, bob):
         one.join()
     until(lambda: not works.working, SECONDS / 2)
+
+
+def test_work_of_a_client_that_has_gone_does_not_begin() -> None:
+    begun = threading.Event()
+
+    async def gone() -> Message:
+        return {"type": "http.disconnect"}
+
+    request = Request({"type": "http"}, gone)
+    with pytest.raises(ClientDisconnect):
+        asyncio.run(run(request, "alice", SECONDS, [(Shares(1, 1), 1)], begun.set))
+    assert not begun.is_set()
 
 
 def test_work_ends_at_its_deadline_with_a_remedy(works: Works) -> None:
