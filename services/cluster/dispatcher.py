@@ -1,4 +1,4 @@
-"""The dispatcher: submits tiles of jobs to dask, and collects their outcomes.
+"""The dispatcher: submits tiles of jobs to dask, one or several a task, and collects their outcomes.
 
 Its methods never wait for the cluster, except for results that are already there. A thread of its own holds the
 connection, reconnects whenever it is lost, and watches the workers. Tiles that were under way on a lost connection are
@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Container, Iterable, Sequence
 from concurrent.futures import CancelledError
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import count
 from types import TracebackType
 from typing import Any, Self
@@ -67,17 +67,25 @@ class Outcome:
 
 @dataclass
 class Flight:
-    """A tile under way; ``number`` is its place in the order of submission. Its result comes before its future ends."""
+    """A task under way, of tiles done one after another; ``number`` is its place in the order of submission.
+
+    The results of its tiles come before its future ends.
+    """
 
     job: str
-    tile: int
+    tiles: Sequence[int]
     number: int
     future: Future | None = None
-    done: tuple[float, Any] | None = None
+    done: dict[int, tuple[float, Any]] = field(default_factory=dict)
 
     @property
     def ended(self) -> bool:
         return self.future is not None and self.future.done()
+
+    @property
+    def left(self) -> list[int]:
+        """Tiles without a result; the first of them runs, or was the last to run."""
+        return [tile for tile in self.tiles if tile not in self.done]
 
 
 class Dispatcher:
@@ -129,25 +137,36 @@ class Dispatcher:
 
     @property
     def free(self) -> int:
-        """How many more tiles the cluster can take: it gets one for each thread.
+        """How many more tasks the cluster can take: it gets one for each thread.
 
-        No tile waits there. So the next job is chosen when a thread is free, and a worker that dies had just the tile
+        No task waits there. So the next job is chosen when a thread is free, and a worker that dies had just the task
         that it worked on.
         """
         return (
             self.threads - sum(not flight.ended for flight in self._flights.values()) if self._usable() else 0
         )
 
-    def submit(self, steps: Steps, task: Task, tiles: Sequence[int], trace: str | None = None) -> bool:
-        """Submit tiles of a job, and the trace that they are part of; `collect` returns their outcomes.
+    def submit(
+        self, steps: Steps, task: Task, tiles: Sequence[Sequence[int]], trace: str | None = None
+    ) -> bool:
+        """Submit tiles of a job, by the task that does them; `collect` returns their outcomes.
 
-        Returns False if the connection to the scheduler is being lost.
+        Parameters
+        ----------
+        trace : str, optional
+            What they are part of.
+
+        Returns
+        -------
+        bool
+            False if the connection to the scheduler is being lost.
         """
         client = self._usable()
         if client is None:
             return False
         flights = {
-            key_of(steps.kind, task.job, tile): Flight(task.job, tile, next(self._number)) for tile in tiles
+            key_of(steps.kind, task.job, some[0]): Flight(task.job, some, next(self._number))
+            for some in tiles
         }
         self._flights |= flights  # before a result may come
         what = {
@@ -172,7 +191,7 @@ class Dispatcher:
 
     def under_way(self, job: str) -> int:
         """How many tiles of a job the cluster works on."""
-        return sum(flight.job == job for flight in self._flights.values())
+        return sum(len(flight.tiles) for flight in self._flights.values() if flight.job == job)
 
     def drop(self, job: str) -> None:
         """Cancel the tasks of a job; workers end those that run (`services.cluster.worker_preload`)."""
@@ -188,12 +207,12 @@ class Dispatcher:
         ended = [self._flights.pop(key) for key, flight in list(self._flights.items()) if flight.ended]
         outcomes, dead = [], []
         for flight in ended:
+            outcomes += [Outcome(flight.job, tile, done=done) for tile, done in flight.done.items()]
             error = _error_of(flight.future)
             if isinstance(error, KilledWorker):
                 dead.append((flight, error.last_worker.address))
             else:
-                done = None if error else flight.done
-                outcomes.append(Outcome(flight.job, flight.tile, done=done, error=error))
+                outcomes += _failed(flight, error=error)
         return outcomes + _blamed(dead, self._starved() if dead else ())
 
     def want(self, tiles: int) -> None:
@@ -206,7 +225,7 @@ class Dispatcher:
         _, sent = event
         flight = self._flights.get(sent["key"])
         if flight is not None:
-            flight.done = sent["seconds"], sent["result"]
+            flight.done[sent["tile"]] = sent["seconds"], sent["result"]
 
     def _starved(self) -> set[str]:
         """The workers that were ended for their memory, as reported by their nannies to the scheduler."""
@@ -261,7 +280,8 @@ class Dispatcher:
         problem = (
             None if workers else "no worker is connected to the scheduler; start some with `envmatte worker`"
         )
-        return {"workers": workers, "under_way": len(self._flights), "problem": problem}
+        under_way = sum(len(flight.tiles) for flight in list(self._flights.values()))
+        return {"workers": workers, "under_way": under_way, "problem": problem}
 
 
 def _topic_of(client: Client) -> str:
@@ -293,20 +313,25 @@ def _error_of(future: Future | None) -> Exception | None:
     return error if isinstance(error, Exception) else None
 
 
+def _failed(flight: Flight, **why: Any) -> list[Outcome]:
+    """Outcomes of the tiles of a task that have no result: the first of them is why it ended, the others are gone."""
+    return [Outcome(flight.job, tile, **(why if at == 0 else {})) for at, tile in enumerate(flight.left)]
+
+
 def _blamed(dead: Iterable[tuple[Flight, str]], starved: Container[str] = ()) -> list[Outcome]:
     """Outcomes of the tiles of dead workers: each blames the tile that it worked on.
 
-    While workers come and go, one may have two tiles for a moment. Then the one submitted first ran.
+    While workers come and go, one may have two tasks for a moment. Then the one submitted first ran.
     """
     ran: dict[str, int] = {}
     for flight, address in dead:
-        ran[address] = min(flight.number, ran.get(address, flight.number))
-    return [
-        Outcome(flight.job, flight.tile, died=address, starved=address in starved)
-        if ran[address] == flight.number
-        else Outcome(flight.job, flight.tile)
-        for flight, address in dead
-    ]
+        if flight.left:
+            ran[address] = min(flight.number, ran.get(address, flight.number))
+    outcomes = []
+    for flight, address in dead:
+        blame = ran.get(address) == flight.number
+        outcomes += _failed(flight, **({"died": address, "starved": address in starved} if blame else {}))
+    return outcomes
 
 
 def _close(client: Client) -> None:

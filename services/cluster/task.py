@@ -1,12 +1,14 @@
-"""The function that a dask task runs: one step of a job, with its ids in the worker's log and in the trace.
+"""The function that a dask task runs: steps of a job, with their ids in the worker's log and in the trace.
 
-It sends its result as an event, which takes the way of the worker's other messages and comes before that of its end: to
-fetch a result, the scheduler would open a connection to its worker.
+It sends each result as an event, which takes the way of the worker's other messages and comes before that of its end:
+to fetch a result, the scheduler would open a connection to its worker.
 """
 
 import logging
 import re
+from collections.abc import Sequence
 from functools import lru_cache
+from typing import Any
 from uuid import uuid4
 
 from distributed import get_worker
@@ -26,18 +28,18 @@ KEY = re.compile(r"[a-z]+-([0-9a-f]+)-(-?\d+)-[0-9a-f]+")
 
 
 def key_of(kind: str, job: str, tile: int) -> str:
-    """A key for a dask task, a different one each time."""
+    """A key for a dask task that begins with a tile, a different one each time."""
     return f"{kind}-{job}-{tile}-{uuid4().hex[:8]}"
 
 
 def read_key(key: str) -> tuple[str, int] | None:
-    """The job and the tile of a dask task, from its key; None for a key that `key_of` did not make."""
+    """The job and the first tile of a dask task, from its key; None for a key that `key_of` did not make."""
     found = KEY.fullmatch(key)
     return (found[1], int(found[2])) if found else None
 
 
-def run(tile: int, steps: Steps, store: str, task: Task, trace: str | None, topic: str) -> None:
-    """Run one step of a job in a worker.
+def run(tiles: Sequence[int], steps: Steps, store: str, task: Task, trace: str | None, topic: str) -> None:
+    """Run steps of a job in a worker, one after another.
 
     Parameters
     ----------
@@ -46,8 +48,17 @@ def run(tile: int, steps: Steps, store: str, task: Task, trace: str | None, topi
     trace : str, optional
         The ``traceparent`` of the request that asked for the job.
     topic : str
-        Of the event with the ``key`` of the dask task, and what `workflows.jobs.run` returns: ``seconds``, ``result``.
+        Of an event for each step: the ``key`` of the dask task, the ``tile``, and what `workflows.jobs.run` returns,
+        ``seconds`` and ``result``.
     """
+    worker = get_worker()
+    for tile in tiles:
+        seconds, result = _run(tile, steps, store, task, trace)
+        event = {"key": worker.get_current_task(), "tile": tile, "seconds": seconds, "result": result}
+        worker.log_event(topic, event)
+
+
+def _run(tile: int, steps: Steps, store: str, task: Task, trace: str | None) -> tuple[float, Any]:
     attributes = {"tile": tile} if tile >= 0 else {}
     name = f"{steps.kind} {NAMES.get(tile, 'tile')}"
     with about(task.job, tile), tracing.span(name, trace, job=task.job, kind=steps.kind, **attributes):
@@ -63,8 +74,7 @@ def run(tile: int, steps: Steps, store: str, task: Task, trace: str | None, topi
             logger.exception("failed")
             raise
         logger.debug("done in %.3f s", seconds)
-        worker = get_worker()
-        worker.log_event(topic, {"key": worker.get_current_task(), "seconds": seconds, "result": result})
+        return seconds, result
 
 
 @lru_cache(maxsize=1)

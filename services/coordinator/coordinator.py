@@ -14,6 +14,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from itertools import chain
 from typing import Any
 
 from sqlalchemy import Connection, Engine, Row
@@ -327,19 +328,20 @@ class Coordinator:
         under_way = {job: dispatcher.under_way(job) for job in self._runs}
         waiting = [run for run in self._runs.values() if run.to_do and not run.paused]
         dispatcher.want(sum(under_way.values()) + sum(len(run.to_do) for run in waiting))
-        chosen: defaultdict[str, list[int]] = defaultdict(list)
+        chosen: defaultdict[str, list[list[int]]] = defaultdict(list)
         for _ in range(dispatcher.free):
             if not waiting:
                 break
             run = min(waiting, key=lambda run: (run.used(under_way[run.job]), under_way[run.job]))
-            chosen[run.job].append(run.to_do.popleft())
-            under_way[run.job] += 1
+            some = run.next_tiles(dispatcher.threads)
+            chosen[run.job].append(some)
+            under_way[run.job] += len(some)
             if not run.to_do:
                 waiting.remove(run)
-        for job, some in chosen.items():
+        for job, each in chosen.items():
             run = self._runs[job]
-            if not dispatcher.submit(run.kind.steps, run.task, some, run.trace):
-                run.to_do.extendleft(reversed(some))
+            if not dispatcher.submit(run.kind.steps, run.task, each, run.trace):
+                run.to_do.extendleft(reversed([*chain.from_iterable(each)]))
 
 
 def _logged(act: Callable[..., None], *arguments: Any) -> None:

@@ -5,6 +5,7 @@ import time
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from math import ceil
 from typing import Any
 
 from sqlalchemy import Connection, Row
@@ -24,6 +25,8 @@ from workflows.untrusted.limits import Limits
 
 logger = logging.getLogger(__name__)
 
+TASKS = 250
+"""How many tasks a second a scheduler is given at most. Each takes a millisecond of its only core, or two."""
 LOSSES = 8
 """How often a tile may be lost before its job fails. Most workers die of something else, such as being turned off."""
 REMEDY = "give workers more memory (ENVMATTE_WORKER_MEMORY) or have them use less (ENVMATTE_INGEST_MEMORY), and retry"
@@ -137,6 +140,18 @@ class JobRun:
         if outcome.done is not None:
             self.spent += outcome.done[0]
             self.counted += 1
+
+    def next_tiles(self, threads: int) -> list[int]:
+        """Take the next tiles for a task.
+
+        It is one tile, or several where all ``threads`` of the cluster would end more than `TASKS` a second otherwise;
+        but towards the end of a job few enough that all threads have some.
+        """
+        count = 1
+        if self.spent:
+            mean = self.spent / self.counted
+            count = max(1, min(ceil(threads / (TASKS * mean)), len(self.to_do) // (2 * threads + 1)))
+        return [self.to_do.popleft() for _ in range(count)]
 
     def used(self, under_way: int = 0) -> float:
         """Worker seconds that the job will have used once the tiles under way are done."""

@@ -4,6 +4,7 @@ import os
 import signal
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from services.cluster.embedded import embedded
 from services.cluster.task import key_of, read_key
 from services.settings import Settings
 from storage.errors import Unavailable
+from storage.objects.store import Objects
 from tests.parts.waiting import until
 from workflows.jobs import Task
 from workflows.mattes.steps import STEPS
@@ -22,10 +24,11 @@ from workflows.untrusted.limits import Limits
 
 def test_the_first_tile_of_a_dead_worker_is_blamed() -> None:
     dead = [
-        (Flight("a", 1, 5), "one"),
-        (Flight("b", 2, 3), "one"),
-        (Flight("a", 3, 4), "two"),
-        (Flight("b", 4, 6), "one"),
+        (Flight("a", [1], 5), "one"),
+        (Flight("b", [2], 3), "one"),
+        (Flight("a", [3], 4), "two"),
+        (Flight("b", [4], 6), "one"),
+        (Flight("b", [5], 2, done={5: (0.1, 10)}), "one"),  # its end was not reported any more
     ]
     assert _blamed(dead, {"two"}) == [
         Outcome("a", 1),
@@ -58,7 +61,7 @@ def outcomes(dispatcher: Dispatcher, count: int) -> list[Outcome]:
 def test_errors_and_dead_workers_are_reported(cluster: LocalCluster, tmp_path: Path) -> None:
     with Dispatcher(lambda: Client(cluster, set_as_default=False), tmp_path.as_uri()) as dispatcher:
         until(lambda: dispatcher.free == 1)
-        dispatcher.submit(STEPS, task("a"), [3])
+        dispatcher.submit(STEPS, task("a"), [[3]])
         assert dispatcher.under_way("a") == 1
         (outcome,) = outcomes(dispatcher, 1)
         assert (outcome.job, outcome.tile, outcome.done, outcome.died) == ("a", 3, None, None)
@@ -67,12 +70,40 @@ def test_errors_and_dead_workers_are_reported(cluster: LocalCluster, tmp_path: P
 
         (pid,) = (worker.pid for worker in cluster.workers.values())
         os.kill(pid, signal.SIGSTOP)  # so that it has both when it dies
-        dispatcher.submit(STEPS, task("b"), [1, 2])
+        dispatcher.submit(STEPS, task("b"), [[1], [2]])
         time.sleep(0.5)
         os.kill(pid, signal.SIGKILL)
         found = sorted(outcomes(dispatcher, 2), key=lambda outcome: outcome.tile)
         assert found[0].died is not None
         assert found[1] == Outcome("b", 2)
+
+
+def test_of_a_task_of_several_tiles_the_one_that_ended_it_is_blamed(
+    cluster: LocalCluster, tmp_path: Path
+) -> None:
+    def work(objects: Objects, task: Task, tile: int) -> int:
+        if tile == 2:
+            time.sleep(0.2)
+            os.kill(os.getpid(), signal.SIGKILL)
+        if tile == 5:
+            raise ValueError("odd")
+        return 10
+
+    steps = replace(STEPS, work=work)
+    with Dispatcher(lambda: Client(cluster, set_as_default=False), tmp_path.as_uri()) as dispatcher:
+        until(lambda: dispatcher.free == 1)
+        dispatcher.submit(steps, task("a"), [[1, 2, 3]])
+        assert dispatcher.under_way("a") == 3
+        done, killed, gone = outcomes(dispatcher, 3)
+        assert done.done is not None
+        assert (done.tile, killed.tile, gone) == (1, 2, Outcome("a", 3))
+        assert killed.died is not None
+        until(lambda: dispatcher.free == 1)
+        dispatcher.submit(steps, task("a"), [[4, 5, 6], [7]])
+        found = {outcome.tile: outcome for outcome in outcomes(dispatcher, 4)}
+        assert [found[tile].done is not None for tile in range(4, 8)] == [True, False, False, True]
+        assert repr(found[5].error) == repr(ValueError("odd"))
+        assert found[6] == Outcome("a", 6)
 
 
 def test_a_missing_scheduler_is_reported_as_a_problem() -> None:

@@ -41,8 +41,8 @@ class Idle:
     def under_way(self, job: str) -> int:
         return sum(one == job for one, _ in self.submitted)
 
-    def submit(self, steps: Any, task: Any, tiles: list[int], trace: str | None = None) -> bool:
-        self.submitted += [(task.job, tile) for tile in tiles]
+    def submit(self, steps: Any, task: Any, tiles: list[list[int]], trace: str | None = None) -> bool:
+        self.submitted += [(task.job, tile) for some in tiles for tile in some]
         return True
 
     def collect(self) -> list[Any]:

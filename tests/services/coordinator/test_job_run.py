@@ -1,5 +1,6 @@
 """How a job advances with the outcomes of its tiles, with a real database."""
 
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -82,6 +83,19 @@ def test_steps_run_in_order(connection: Connection, job: str) -> None:
     seconds = dict(connection.execute(select(tiles.c.tile, tiles.c.seconds).where(tiles.c.job == job)).all())
     assert seconds == dict.fromkeys((PREPARE, FINISH, 0, 1, 2), 0.1)
     assert connection.scalar(select(totals.c.seconds)) == pytest.approx(0.3)  # of tiles only
+
+
+def test_a_task_has_several_tiles_where_many_threads_do_short_ones(connection: Connection, job: str) -> None:
+    run = working(connection, job, tiles=9_000)
+    run.spent, run.counted = 500.0, 1000
+    first = list(run.to_do)
+    assert [len(run.next_tiles(threads)) for threads in (2, 125, 126, 1000)] == [1, 1, 2, 4]
+    assert list(run.to_do) == first[8:]
+    run.to_do = deque(first[:3000])
+    assert len(run.next_tiles(1000)) == 1  # all threads are to have some to the end
+    run.spent = run.counted = 0  # nobody knows how long they are
+    run.to_do = deque(first)
+    assert len(run.next_tiles(1000)) == 1
 
 
 def test_used_seconds_include_tiles_under_way(connection: Connection, job: str) -> None:
