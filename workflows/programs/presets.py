@@ -1,5 +1,6 @@
 """Programs by name, for a monitor of any size."""
 
+from itertools import accumulate
 from typing import Literal, NamedTuple
 
 from storage.errors import OptionError
@@ -19,6 +20,8 @@ AGAIN = Constant(kind="constant", levels=(1, 0))
 """Shown again in the middle, because exposure and the light of the room may change meanwhile."""
 AT_LAST = Constant(kind="constant", levels=(0, 1))
 """And at the end: white is last, because black follows in a film."""
+AT_ONCE = 4
+"""Stripes along one axis before those along the other: so few patterns tell the place along both, if coarsely."""
 EIGHT_LEVELS = Constant(kind="constant", levels=tuple(round(255 * i / 7) / 255 for i in range(8)))
 
 
@@ -108,10 +111,12 @@ def preset(name: str, width: int = 1280, height: int = 960, *, filmed: bool = Fa
         counts[grid] += count
     stripes = []
     axes: tuple[tuple[Literal["x", "y"], int], ...] = (("x", width), ("y", height))
-    for axis, size in axes if recipe.stripes else ():
-        fitting = min(recipe.stripes, size.bit_length() - 1)
-        stripes.append(Stripes(kind="stripes", axis=axis, count=fitting))
-        counts[grid] += recipe.stripes - fitting
+    for first in range(0, recipe.stripes, AT_ONCE):
+        for axis, size in axes:
+            fitting = max(min(AT_ONCE, size.bit_length() - 1 - first), 0)
+            if fitting:
+                stripes.append(Stripes(kind="stripes", axis=axis, count=fitting, first=first))
+            counts[grid] += AT_ONCE - fitting
     grids = [
         Bernoulli(
             kind="bernoulli",
@@ -125,7 +130,8 @@ def preset(name: str, width: int = 1280, height: int = 960, *, filmed: bool = Fa
         for i, ((columns, rows), count) in enumerate(counts.items())
     ]
     patterns: tuple[Part, ...] = (*stripes, *grids)
-    middle = (len(patterns) + 1) // 2
+    shown = list(accumulate(part.count for part in patterns))
+    middle = 1 + min(range(len(shown)), key=lambda n: abs(shown[n] - shown[-1] / 2))
     parts: tuple[Part, ...] = (EIGHT_LEVELS, *patterns)
     if recipe.calibrated:
         parts = (AT_FIRST, HALFTONES, *patterns[:middle], AGAIN, *patterns[middle:], AT_LAST)
