@@ -127,12 +127,19 @@ class CaptureArchive:
                 )
         if manifest.video is not None:
             return
-        shown = np.zeros(count, bool)
-        shown[[frame.pattern for frame in manifest.frames]] = True
-        if not shown.all():
-            missing = np.flatnonzero(~shown)
+        shown = sorted({frame.pattern for frame in manifest.frames})
+        missing = np.setdiff1d(np.arange(count), shown)
+        if len(missing) and not manifest.unfinished:
             raise CaptureError(
-                f"{len(missing)} of {count} patterns have no frame, the first of them pattern {missing[0]}",
+                f"{len(missing)} of {count} patterns have no frame, the first of them pattern {missing[0]}; if the "
+                "program has not been shown to its end, the capture is `unfinished`",
+                entry=MANIFEST,
+                field="frames",
+            )
+        if len(missing) and not manifest.program.tells(shown):
+            raise CaptureError(
+                "an unfinished capture needs frames of two different constant levels, and of a pattern that is neither "
+                "constant nor half-tone",
                 entry=MANIFEST,
                 field="frames",
             )

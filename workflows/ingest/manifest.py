@@ -109,8 +109,13 @@ class Manifest(BaseModel):
     # FailFast: only the first error is reported, because a list of all of them takes a kilobyte each.
     frames: Annotated[tuple[Frame, ...], FailFast()] = Field(
         default=(),
-        description="The frames, in any order. Every pattern needs one; frames of one pattern are averaged. Leave "
-        "them out if there is a video.",
+        description="The frames, in any order. Every pattern needs one, unless the capture is `unfinished`; frames of "
+        "one pattern are averaged. Leave them out if there is a video.",
+    )
+    unfinished: bool = Field(
+        default=False,
+        description="Whether the program has not been shown to its end yet: then patterns may lack frames, but for two "
+        "different constant levels and one other pattern.",
     )
     video: Video | None = Field(default=None, description="A recording of the program, in place of frames.")
     mask: str | None = Field(

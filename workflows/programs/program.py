@@ -121,6 +121,12 @@ class Program(Record):
         present = np.isin(numbers, patterns)
         return numbers[present], sent[present]
 
+    def tells(self, patterns: Sequence[int]) -> bool:
+        """Whether these patterns suffice for S, rho and T: two different constant levels and one that is not."""
+        numbers, sent = self.constants_among(patterns)
+        others = np.setdiff1d(patterns, np.concatenate([numbers, self.halftones[0]]))
+        return len(numbers) > 0 and bool(np.all(np.ptp(sent, axis=0) > 0)) and len(others) > 0
+
     def values(
         self, first: int, last: int, images: Sequence[NDArray[np.float32]] = ()
     ) -> list[NDArray[np.float32]]:

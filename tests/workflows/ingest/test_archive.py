@@ -72,6 +72,11 @@ def test_archive_is_read(make_zip: Zip, pack: int) -> None:
         assert archive.read(name) == data
 
 
+def test_patterns_of_an_unfinished_capture_may_lack_frames(make_zip: Zip) -> None:
+    record = changed(lambda r: r.update(frames=r["frames"][:3], unfinished=True))
+    assert [frame.pattern for frame in open_archive(make_zip(record, FILES)).manifest.frames] == [2, 0, 1]
+
+
 def test_unknown_fields_and_files_are_accepted(make_zip: Zip) -> None:
     def extend(record: dict[str, Any]) -> None:
         record["made_by"] = {"tool": "x", "at": [1, 2]}
@@ -120,6 +125,12 @@ def test_archive_without_a_record_is_refused(make_zip: Zip) -> None:
             "frames",
             "1 of 5 patterns have no frame, the first of them pattern 2",
         ),
+        (
+            lambda r: r.update(frames=r["frames"][:1], unfinished=True),
+            "frames",
+            "two different constant levels",
+        ),
+        (lambda r: r.update(frames=r["frames"][1:3], unfinished=True), "frames", "neither constant"),
         (lambda r: r.update(frames=[]), "frames", "no frames"),
         (lambda r: r.update(mask="masks.png"), "mask", "masks.png"),
         (lambda r: r["program"]["parts"][2].update(files=["b.png"]), "program.parts.2.files.0", "b.png"),

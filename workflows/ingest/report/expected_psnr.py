@@ -23,6 +23,7 @@ _FIXED_GRIDS = (0.45, 1.2), (0.00045, 0.35)  # a and b at the low and the high e
 
 def expected(
     program: Program,
+    patterns: Sequence[int],
     survey: dict[str, Any],
     model_error: float,
     pattern_error: float | None = None,
@@ -33,6 +34,8 @@ def expected(
     Parameters
     ----------
     program : Program
+    patterns : sequence of int
+        The patterns that have frames.
     survey : dict
         See `workflows.ingest.report.survey`.
     model_error : float
@@ -45,7 +48,8 @@ def expected(
     Returns
     -------
     Quality or None
-        None if no pixel sees light, or the program has no random patterns and they could not be recovered on trial.
+        None if no pixel sees light, if random patterns are still to be shown, or if the program has none and its
+        patterns could not be recovered on trial.
 
     Notes
     -----
@@ -72,22 +76,26 @@ def expected(
     warnings in their report, may be below.
     """
     rho, s2 = survey["contrast"], survey["deviation"] ** 2
-    costs = costs_of(program, survey, model_error, exposures)
+    costs = costs_of(program, patterns, survey, model_error, exposures)
     unexplained = costs["model_error"] + costs["lost_colour"]
-    shown = [part for part in program.parts if not isinstance(part, Constant | Halftone)]
-    random = [part for part in shown if isinstance(part, Bernoulli)]
-    if rho > 0 and not random and pattern_error:
+    counts, _ = np.histogram(np.unique(patterns), program.starts)
+    shown = [
+        (part, int(count))
+        for part, count in zip(program.parts, counts, strict=True)
+        if count and not isinstance(part, Constant | Halftone)
+    ]
+    random = [part for part, _ in shown if isinstance(part, Bernoulli)]
+    if rho > 0 and pattern_error and not any(isinstance(part, Bernoulli) for part in program.parts):
         low, high = (-20 * log10(pattern_error) - worse for worse in _OTHER)
         return Quality(low=low, high=high, blocks=None)
     if rho <= 0 or not random:
         return None
-    informative = [part for part in shown if not isinstance(part, Bernoulli) or part.offset]
     fixed = not any(part.offset for part in random)
-    patterns = sum(part.count for part in (shown if fixed else informative))
+    measured = sum(count for part, count in shown if fixed or not isinstance(part, Bernoulli) or part.offset)
     blocks = max(min(part.columns, part.rows) for part in random) if fixed else None
     ends = []
     for (k, c), (a, b), exposed in zip(_NOISE, _FIXED_GRIDS, _EXPOSED, strict=True):
-        error = k * s2 / patterns + c * rho**2 / patterns**1.2 + unexplained
+        error = k * s2 / measured + c * rho**2 / measured**1.2 + unexplained
         error += exposed**2 * costs["auto_exposure"]
         ends.append(-10 * log10(error if blocks is None else error + a * rho**2 / blocks**b))
     return Quality(low=ends[0], high=ends[1], blocks=blocks)
@@ -102,7 +110,11 @@ def error_of(attributes: dict[str, Any]) -> float:
 
 
 def costs_of(
-    program: Program, survey: dict[str, Any], model_error: float, exposures: Sequence[float] | None = None
+    program: Program,
+    patterns: Sequence[int],
+    survey: dict[str, Any],
+    model_error: float,
+    exposures: Sequence[float] | None = None,
 ) -> dict[str, float]:
     """The mean square errors of composites by their causes, as far as these are known; see :func:`expected`.
 
@@ -113,7 +125,7 @@ def costs_of(
     """
     rho = survey["contrast"]
     return {
-        "noise": _NOISE[0][0] * survey["deviation"] ** 2 / max(program.measured.size, 1),
+        "noise": _NOISE[0][0] * survey["deviation"] ** 2 / max(np.isin(program.measured, patterns).sum(), 1),
         "model_error": (model_error * rho) ** 2,
         "lost_colour": survey.get("lost_colour", 0.0),
         "auto_exposure": exposure_error(exposures) * rho**2,

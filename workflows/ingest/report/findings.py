@@ -32,7 +32,9 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
     scaled patterns, curves, glare, colours.
     """
     survey = attributes["survey"]
-    costs = costs_of(program, survey, error_of(attributes), attributes.get("auto_exposure"))
+    costs = costs_of(
+        program, attributes["patterns"], survey, error_of(attributes), attributes.get("auto_exposure")
+    )
     found = [
         *_exposure(figures, attributes["storage"]),
         *_auto_exposure(attributes.get("auto_exposure"), costs["auto_exposure"]),
@@ -55,8 +57,14 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
 
 
 def _frames(figures: Figures) -> Finding:
-    # Only patterns of a video can be missing.
     missing = {int(number): why for number, why in figures.video["missing"].items()} if figures.video else {}
+    if not missing and figures.frames.missing:
+        return Finding(
+            name="frames",
+            level="good",
+            message=f"{figures.frames.kept} frames of the {figures.frames.patterns - len(figures.frames.missing)} "
+            f"patterns shown so far; the program has {figures.frames.patterns}",
+        )
     if missing:
         which = "; ".join(f"{ranges(numbers)} ({why})" for numbers, why in by_reason(missing))
         return Finding(

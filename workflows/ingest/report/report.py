@@ -77,6 +77,7 @@ def report(attributes: dict[str, Any], frames: int) -> Report:
         **curves,
         quality=expected(
             program,
+            attributes["patterns"],
             survey,
             error_of(attributes),
             attributes.get("pattern_error"),

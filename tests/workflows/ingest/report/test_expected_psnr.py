@@ -8,6 +8,7 @@ import pytest
 
 from tests.parts.captures import nested_program
 from workflows.ingest.report.expected_psnr import expected
+from workflows.ingest.report.figures import Quality
 from workflows.programs.presets import preset
 from workflows.programs.program import Constant, Monitor, Program, Stripes
 
@@ -16,8 +17,15 @@ SURVEY = {"contrast": 0.81, "deviation": 0.0058}
 NESTED = tuple((16 << n, 12 << n, 20) for n in range(6))
 
 
+def expect(
+    program: Program, survey: dict[str, Any], model_error: float, *other: Any, **more: Any
+) -> Quality | None:
+    """What is expected of a capture of all patterns of a program."""
+    return expected(program, range(program.count), survey, model_error, *other, **more)
+
+
 def ends(program: Program, **other: float) -> tuple[float, float]:
-    quality = expected(program, SURVEY | other, 0.0)
+    quality = expect(program, SURVEY | other, 0.0)
     assert quality is not None
     assert quality.low < quality.high
     return quality.low, quality.high
@@ -53,10 +61,10 @@ def test_no_more_is_promised_than_was_measured(program: Program, measured: tuple
 
 
 def test_grids_without_offsets_are_rated_by_their_finest_blocks() -> None:
-    quality = expected(still(96), SURVEY, 0.0)
+    quality = expect(still(96), SURVEY, 0.0)
     assert quality is not None
     assert quality.blocks == 96
-    assert expected(preset("default"), SURVEY, 0.0).blocks is None  # type: ignore[union-attr]
+    assert expect(preset("default"), SURVEY, 0.0).blocks is None  # type: ignore[union-attr]
     coarse, fine = ends(still(24)), ends(still(384))
     assert coarse[0] < fine[0] - 8
     assert coarse[1] < fine[1]
@@ -68,23 +76,36 @@ def test_without_random_patterns_as_much_is_expected_as_patterns_show() -> None:
     monitor = Monitor(width=64, height=48)
     stripes = Stripes(kind="stripes", axis="x", count=6)
     program = Program(monitor=monitor, parts=(Constant(kind="constant", levels=(0, 1)), stripes))
-    assert expected(program, SURVEY, 0.0) is None
-    assert expected(program, SURVEY | {"contrast": 0.0}, 0.0, 0.01) is None
-    found = expected(program, SURVEY, 0.0, 0.01)
+    assert expect(program, SURVEY, 0.0) is None
+    assert expect(program, SURVEY | {"contrast": 0.0}, 0.0, 0.01) is None
+    found = expect(program, SURVEY, 0.0, 0.01)
     assert found is not None
     assert found.low == pytest.approx(37)
     assert found.high == pytest.approx(45)
-    assert expected(preset("default"), SURVEY, 0.0, 0.1) == expected(preset("default"), SURVEY, 0.0)
+    assert expect(preset("default"), SURVEY, 0.0, 0.1) == expect(preset("default"), SURVEY, 0.0)
 
 
 def test_little_is_expected_of_a_camera_whose_exposure_was_free() -> None:
     program = preset("default")
-    locked = expected(program, SURVEY, 0.0, exposures=np.linspace(0.97, 1.03, 140).tolist())
-    assert locked == expected(program, SURVEY, 0.0)
-    free = expected(program, SURVEY, 0.0, exposures=np.linspace(0.8, 1.25, 140).tolist())
+    locked = expect(program, SURVEY, 0.0, exposures=np.linspace(0.97, 1.03, 140).tolist())
+    assert locked == expect(program, SURVEY, 0.0)
+    free = expect(program, SURVEY, 0.0, exposures=np.linspace(0.8, 1.25, 140).tolist())
     assert free is not None
     assert 18 < free.low < 25
     assert free.high - free.low == pytest.approx(20 * np.log10(3), abs=1)
+
+
+def test_of_a_program_that_is_not_shown_to_its_end_only_what_was_shown_counts() -> None:
+    program = preset("default")
+    assert (
+        expected(program, range(24), SURVEY, 0.0, 0.01) is None
+    )  # stripes alone say little of what they split
+    found = [expected(program, range(shown), SURVEY, 0.0) for shown in (32, 64, 140)]
+    lows = [one.low for one in found if one is not None]
+    assert lows == sorted(lows)
+    assert len(lows) == 3
+    assert lows[-1] > lows[0] + 5
+    assert found[-1] == expect(program, SURVEY, 0.0)
 
 
 def test_patterns_without_offsets_beside_others_are_not_counted() -> None:
@@ -100,13 +121,13 @@ def parts(*parts: dict[str, Any]) -> Program:
 
 def test_nothing_is_promised_without_a_measurement() -> None:
     for part in ({"kind": "images", "files": ["a.png"]}, {"kind": "stripes", "axis": "x", "count": 5}):
-        assert expected(parts(part), SURVEY, 0.0) is None
-    assert expected(preset("default"), SURVEY | {"contrast": 0.0}, 0.0) is None
+        assert expect(parts(part), SURVEY, 0.0) is None
+    assert expect(preset("default"), SURVEY | {"contrast": 0.0}, 0.0) is None
 
 
 def test_what_no_t_explains_is_not_promised() -> None:
     program = preset("default")
-    ideal, real = (expected(program, SURVEY, error) for error in (0.0, 0.02))
+    ideal, real = (expect(program, SURVEY, error) for error in (0.0, 0.02))
     assert ideal is not None
     assert real is not None
     assert real.high < -20 * log10(0.02 * SURVEY["contrast"]) < ideal.high
@@ -115,6 +136,6 @@ def test_what_no_t_explains_is_not_promised() -> None:
 
 def test_colours_that_a_film_has_lost_are_not_promised() -> None:
     program = preset("default")
-    found = expected(program, SURVEY | {"lost_colour": 1e-3}, 0.0)
+    found = expect(program, SURVEY | {"lost_colour": 1e-3}, 0.0)
     assert found is not None
     assert 29 < found.low < found.high < 30

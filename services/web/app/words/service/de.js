@@ -288,6 +288,7 @@ export const de = {
 	"{frames} frames of {size} pixels take {taken} bytes, more than the {limit} allowed: use fewer or smaller ones": "{frames} Bilder mit {size} Pixeln brauchen {taken} Byte, mehr als die erlaubten {limit}: weniger oder kleinere nehmen",
 	"{kept} frames of all {all} patterns": "{kept} Bilder von allen {all} Mustern",
 	"{kept} frames of all {all} patterns, in {exposures} exposures": "{kept} Bilder von allen {all} Mustern, mit {exposures} Belichtungen",
+	"{kept} frames of the {shown} patterns shown so far; the program has {all}": "{kept} Bilder der {shown} bisher gezeigten Muster; das Programm hat {all}",
 	"{mask} is {size}, the frames are {other}": "{mask} hat {size} Pixel, die Bilder haben {other}",
 	"{missing} of {all} patterns have no frame that can be used": "{missing} von {all} Mustern haben kein brauchbares Bild",
 	"{missing} of {all} patterns have no frame, the first of them pattern {first}": "{missing} von {all} Mustern haben kein Bild, das erste davon ist Muster {first}",
