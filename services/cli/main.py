@@ -6,10 +6,12 @@ from typing import Any
 import click
 from click.shell_completion import get_completion_class
 
-from services.cli import maintenance, patterns, processes, remote, setup
+from services.cli import maintenance, patterns, processes, setup
 from services.cli.demo import demo
 from services.cli.keys import keys
 from services.cli.output import example
+from services.cli.remote import jobs, mattes
+from services.cli.remote.tether import tether
 from services.client import Busy, ServiceError, Unreachable
 from services.runtime.addresses import PortTaken
 from storage.errors import EnvmatteError
@@ -66,9 +68,11 @@ for command in (
     *setup.COMMANDS,
     keys,
     *maintenance.COMMANDS,
-    *remote.COMMANDS,
+    *jobs.COMMANDS,
+    *mattes.COMMANDS,
     demo,
     patterns.patterns,
+    tether,
 ):
     main.add_command(command)
 

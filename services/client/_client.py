@@ -156,6 +156,10 @@ class Client:
         """Get the current state of a capture."""
         return Capture.of(self._http.json("GET", _path(Capture, capture)))
 
+    def report(self, capture: Capture | str) -> dict[str, Any]:
+        """Get the report on a capture that is ready: its ``level``, its ``findings``, and the figures behind them."""
+        return self._http.json("GET", f"{_path(Capture, capture)}/report")
+
     def matte(self, matte: Matte | Job | str) -> Matte:
         """Get the current state of a matte, or of the matte that a job makes."""
         which = (matte.matte or "") if isinstance(matte, Job) else matte

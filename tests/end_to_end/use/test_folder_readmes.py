@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import time
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +18,14 @@ from services.settings import Settings
 from storage.layout.mattes import Matte
 from storage.objects.store import Objects
 from tests.docs.readmes import block, codes, table
-from tests.end_to_end.conftest import Service
+from tests.end_to_end.conftest import HEIGHT, WIDTH, Service
 from tests.end_to_end.use.test_readme import URL, environment
 from workflows.composite import composite
 from workflows.images.resample import area_mean
+from workflows.programs.files import load_program
+from workflows.programs.program import Program
 from workflows.simulation import glass_ball
+from workflows.simulation.scene import Scene, write_capture
 
 
 def run(script: str, folder: Path, **settings: str) -> str:
@@ -45,6 +49,21 @@ def test_patterns_are_written_as_video_and_as_pictures(tmp_path: Path) -> None:
         run(block("workflows/programs/README.md", section).replace("1920x1080", "320x240"), tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"patterns", "patterns.mp4", "patterns.json"}
     assert {"00000.png", "program.json"} < {path.name for path in (tmp_path / "patterns").iterdir()}
+
+
+@pytest.mark.slow
+def test_stills_of_a_tethered_camera_are_recovered(service: Service, scene: Scene, tmp_path: Path) -> None:
+    run(block("workflows/programs/README.md", "As pictures").replace("1920x1080", "1280x960"), tmp_path)
+    program = load_program(str(tmp_path / "patterns/program.json"))
+    assert isinstance(program, Program)
+    write_capture(scene, program, tmp_path / "ball.zip")
+    with zipfile.ZipFile(tmp_path / "ball.zip") as source:
+        for frame in json.loads(source.read("capture.json"))["frames"][:64]:
+            (tmp_path / "stills").mkdir(exist_ok=True)
+            (tmp_path / f"stills/{frame['pattern']:05}.png").write_bytes(source.read(frame["file"]))
+    script = block("workflows/programs/README.md", "With a tethered camera").replace("40", "20")
+    matte = service.client.matte(run(script, tmp_path, ENVMATTE_URL=service.url).strip())
+    assert (matte.state, matte.width, matte.height) == ("ready", WIDTH, HEIGHT)
 
 
 @pytest.mark.skipif(

@@ -16,8 +16,8 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from services.cli import remote
 from services.cli.main import main
+from services.cli.remote import jobs, mattes
 from services.settings import (
     ClusterSettings,
     CoordinatorSettings,
@@ -66,7 +66,7 @@ REMOTE = {
     "import": ["matte.zip"],
     "layers": ["m", "layers"],
 }
-"""Arguments of every command that talks to a service."""
+"""Arguments of every command that does nothing but talk to a service."""
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -77,7 +77,8 @@ def test_help_of_every_command_has_a_valid_example(
     lines = re.search(r"Example:\n((?:    .*\n)+)", text)
     assert lines, text
     monkeypatch.chdir(tmp_path)
-    for file in ("film.zip", "matte.zip", "backdrop.png"):
+    (tmp_path / "stills").mkdir()
+    for file in ("film.zip", "matte.zip", "backdrop.png", "program.json"):
         (tmp_path / file).write_bytes(b"any")
     if name == "completion":
         assert 'eval "$(envmatte completion bash)"' in lines[1]
@@ -292,7 +293,7 @@ def test_clips_and_stills_differ_by_their_first_bytes(tmp_path: Path, start: byt
     assert ("must end in .mp4" in " ".join(answer.output.split())) == (kind == "clip")
 
 
-@pytest.mark.parametrize("name", [str(command.name) for command in remote.COMMANDS])
+@pytest.mark.parametrize("name", [str(command.name) for command in (*jobs.COMMANDS, *mattes.COMMANDS)])
 def test_commands_that_talk_to_a_service_import_nothing_heavy(name: str, tmp_path: Path) -> None:
     for file in ("film.zip", "matte.zip", "backdrop.png"):
         (tmp_path / file).write_bytes(b"any")

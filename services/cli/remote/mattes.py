@@ -1,10 +1,8 @@
-"""The commands of `envmatte` that talk to a service, through `services.client`."""
+"""Commands for mattes: composite, write layers, export, share, import."""
 
-import json
 import os
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import click
 
@@ -13,7 +11,6 @@ from services.cli.output import example, open_whole, print_result, write
 from services.cli.progress import Progress
 from services.client import Client
 
-F = TypeVar("F", bound=Callable[..., Any])
 STILLS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1", b"avif", b"crx ")
 """What pictures call themselves that are kept as MP4 is."""
 SYNC = b"\x47"
@@ -27,145 +24,12 @@ NODES = {
     "glsl": ("matte.live", "envmatte.js", "glass.html"),
 }
 """Files that make a node of a tool."""
-InputFile = click.Path(exists=True, dir_okay=False, path_type=Path)
 OutputFile = click.Path(dir_okay=False, path_type=Path)
-
-
-def _remote(command: F) -> F:
-    """Add the options of every command that talks to a service."""
-    url = click.option(
-        "--url",
-        envvar="ENVMATTE_URL",
-        default="http://127.0.0.1:8000",
-        show_default=True,
-        help="URL of the service.",
-    )
-    key = click.option("--key", envvar="ENVMATTE_KEY", help="API key, if the service requires one.")
-    return url(key(options.as_json(command)))
-
-
-def _webhook(command: F) -> F:
-    return click.option("--webhook", metavar="URL", help="URL to notify when the job has ended.")(command)
-
-
-def _client(url: str, key: str | None) -> Client:
-    try:
-        return Client(url, key)
-    except ValueError as error:
-        raise click.BadParameter(str(error), param_hint="--url") from error
-
-
-@click.command(epilog=example("envmatte upload film.zip --name 'glass ball'"))
-@click.argument("file", type=InputFile)
-@click.option("--name", default="", help="Name of the capture in lists.")
-@_webhook
-@_remote
-def upload(file: Path, name: str, webhook: str | None, url: str, key: str | None, as_json: bool) -> None:
-    """Upload a capture and wait until it is ingested. Prints the capture's id.
-
-    After an interrupt, the same command resumes the upload.
-    """
-    with _client(url, key) as client:
-        with Progress("upload") as bar:
-            capture = client.upload(
-                file, name=name, webhook=webhook, progress=lambda sent, size: bar.show(sent / size)
-            )
-        with Progress("ingest") as bar:
-            client.wait(capture, progress=bar.job)
-        print_result(client.capture(capture).answer, as_json, "id")
-
-
-@click.command(epilog=example("envmatte recover CAPTURE --option quality=fast"))
-@click.argument("capture")
-@click.option("--method", help="Recovery method: lobes or nn-dgsr.")
-@click.option(
-    "--option",
-    "pairs",
-    multiple=True,
-    metavar="NAME=VALUE",
-    help="Recovery option, see GET /v1/options. May be repeated.",
-)
-@click.option("--detach", is_flag=True, help="Print the job's id and do not wait.")
-@_webhook
-@_remote
-def recover(
-    capture: str,
-    method: str | None,
-    pairs: tuple[str, ...],
-    detach: bool,
-    webhook: str | None,
-    url: str,
-    key: str | None,
-    as_json: bool,
-) -> None:
-    """Recover the matte of a capture and wait for it. Prints the matte's id.
-
-    An interrupt ends the waiting, but not the job.
-    """
-    chosen = dict(_parse_option(pair) for pair in pairs) | ({"method": method} if method else {})
-    with _client(url, key) as client:
-        job = client.recover(capture, webhook=webhook, **chosen)
-        if not detach:
-            try:
-                with Progress("recovery") as bar:
-                    job = client.wait(job, progress=bar.job)
-            except KeyboardInterrupt:
-                click.echo(
-                    f"The job continues: envmatte wait {job.id}, or envmatte cancel {job.id}",
-                    err=True,
-                )
-                raise
-    print_result(job.answer, as_json, "id" if detach else "matte")
-
-
-@click.command(epilog=example("envmatte status JOB"))
-@click.argument("job")
-@_remote
-def status(job: str, url: str, key: str | None, as_json: bool) -> None:
-    """Show a job: its state, stage and progress."""
-    with _client(url, key) as client:
-        print_result(client.job(job).answer, as_json, "state", "stage", "progress")
-
-
-@click.command(epilog=example("envmatte wait JOB"))
-@click.argument("job")
-@_remote
-def wait(job: str, url: str, key: str | None, as_json: bool) -> None:
-    """Wait until a job has ended. Prints its state."""
-    with _client(url, key) as client, Progress("job") as bar:
-        print_result(client.wait(job, progress=bar.job).answer, as_json, "state")
-
-
-@click.command(epilog=example("envmatte pause JOB"))
-@click.argument("job")
-@_remote
-def pause(job: str, url: str, key: str | None, as_json: bool) -> None:
-    """Pause a job; what is under way is done. Prints its state."""
-    with _client(url, key) as client:
-        print_result(client.pause(job).answer, as_json, "state")
-
-
-@click.command(epilog=example("envmatte resume JOB"))
-@click.argument("job")
-@_remote
-def resume(job: str, url: str, key: str | None, as_json: bool) -> None:
-    """Continue a job that is paused. Prints its state."""
-    with _client(url, key) as client:
-        print_result(client.resume(job).answer, as_json, "state")
-
-
-@click.command(epilog=example("envmatte cancel JOB"))
-@click.argument("job")
-@_remote
-def cancel(job: str, url: str, key: str | None, as_json: bool) -> None:
-    """Cancel a job. Prints its state."""
-    with _client(url, key) as client:
-        print_result(client.cancel(job).answer, as_json, "state")
 
 
 @click.command(epilog=example("envmatte composite MATTE backdrop.png -o composite.png"))
 @click.argument("matte")
-@click.argument("backdrop", type=InputFile)
+@click.argument("backdrop", type=options.InputFile)
 @click.option(
     "-o",
     "--output",
@@ -185,7 +49,7 @@ def cancel(job: str, url: str, key: str | None, as_json: bool) -> None:
     help="Write half the width of each pixel's 90 % interval instead, in linear light: best as .exr.",
 )
 @click.option("--webhook", metavar="URL", help="For a clip: URL to notify when the job has ended.")
-@_remote
+@options.remote
 def composite(
     matte: str, backdrop: Path, output: Path, url: str, key: str | None, as_json: bool, **params: Any
 ) -> None:
@@ -197,7 +61,7 @@ def composite(
     ends = [".mp4"] if _is_clip(backdrop) else list(MEDIA_TYPES)
     if output.suffix.lower() not in ends:
         raise click.BadParameter(f"{output}: the name must end in {', '.join(ends)}", param_hint="--output")
-    with _client(url, key) as client:
+    with options.client(url, key) as client:
         if _is_clip(backdrop):
             _composite_clip(client, matte, backdrop, output, given)
         else:
@@ -239,10 +103,10 @@ def _is_clip(file: Path) -> bool:
 @click.argument("matte")
 @click.option("-o", "--output", type=OutputFile, required=True, help="File to write.")
 @click.option("--html", is_flag=True, help="Write a web page that draws the glass without a service.")
-@_remote
+@options.remote
 def export(matte: str, output: Path, html: bool, url: str, key: str | None, as_json: bool) -> None:
     """Write a matte to a file, a ZIP for `envmatte import` elsewhere or any zarr reader."""
-    with _client(url, key) as client:
+    with options.client(url, key) as client:
         if html:
             write(output, client.live_page(matte))
         else:
@@ -254,20 +118,20 @@ def export(matte: str, output: Path, html: bool, url: str, key: str | None, as_j
 @click.command(epilog=example("envmatte share MATTE", "envmatte share MATTE --days 365"))
 @click.argument("matte")
 @click.option("--days", type=click.FloatRange(0, 3650, min_open=True), default=30, show_default=True)
-@_remote
+@options.remote
 def share(matte: str, days: float, url: str, key: str | None, as_json: bool) -> None:
     """Make a link by which anyone can see a matte, live, without a key. Prints its URL."""
-    with _client(url, key) as client:
+    with options.client(url, key) as client:
         print_result({"url": client.share(matte, days)}, as_json, "url")
 
 
 @click.command("import", epilog=example("envmatte import matte.zip --name 'glass ball'"))
-@click.argument("file", type=InputFile)
+@click.argument("file", type=options.InputFile)
 @click.option("--name", default="", help="Name of the matte in lists; by default that of the file.")
-@_remote
+@options.remote
 def import_(file: Path, name: str, url: str, key: str | None, as_json: bool) -> None:
     """Import a matte that `envmatte export` wrote. Prints its new id."""
-    with _client(url, key) as client, Progress("import") as bar:
+    with options.client(url, key) as client, Progress("import") as bar:
         matte = client.import_matte(file, name=name, progress=lambda sent, size: bar.show(sent / size))
     print_result(matte.answer, as_json, "id")
 
@@ -278,7 +142,7 @@ def import_(file: Path, name: str, url: str, key: str | None, as_json: bool) -> 
 @click.option(
     "--for", "tool", type=click.Choice(list(NODES)), help="Write what makes a node of this tool instead."
 )
-@_remote
+@options.remote
 def layers(matte: str, folder: Path, tool: str | None, url: str, key: str | None, as_json: bool) -> None:
     """Write the layers of a matte for other tools to FOLDER: all.exr, stmap.exr, and 16-bit PNGs.
 
@@ -288,7 +152,7 @@ def layers(matte: str, folder: Path, tool: str | None, url: str, key: str | None
     import tempfile
 
     names = NODES[tool] if tool else LAYERS
-    with _client(url, key) as client:
+    with options.client(url, key) as client:
         client.matte(matte)  # fails before a folder is made
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as part:
@@ -300,14 +164,4 @@ def layers(matte: str, folder: Path, tool: str | None, url: str, key: str | None
     print_result({"folder": str(folder), "layers": names}, as_json, "folder")
 
 
-def _parse_option(option: str) -> tuple[str, Any]:
-    name, equals, value = option.partition("=")
-    if not equals:
-        raise click.UsageError(f"--option {option}: give it as NAME=VALUE")
-    try:
-        return name, json.loads(value)
-    except json.JSONDecodeError:
-        return name, value
-
-
-COMMANDS = (upload, recover, status, wait, pause, resume, cancel, composite, export, share, import_, layers)
+COMMANDS = (composite, export, share, import_, layers)

@@ -1,0 +1,139 @@
+"""Commands for captures and jobs: upload, recover, follow."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from services.cli import options
+from services.cli.output import example, print_result
+from services.cli.progress import Progress
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def _webhook(command: F) -> F:
+    return click.option("--webhook", metavar="URL", help="URL to notify when the job has ended.")(command)
+
+
+@click.command(epilog=example("envmatte upload film.zip --name 'glass ball'"))
+@click.argument("file", type=options.InputFile)
+@click.option("--name", default="", help="Name of the capture in lists.")
+@_webhook
+@options.remote
+def upload(file: Path, name: str, webhook: str | None, url: str, key: str | None, as_json: bool) -> None:
+    """Upload a capture and wait until it is ingested. Prints the capture's id.
+
+    After an interrupt, the same command resumes the upload.
+    """
+    with options.client(url, key) as client:
+        with Progress("upload") as bar:
+            capture = client.upload(
+                file, name=name, webhook=webhook, progress=lambda sent, size: bar.show(sent / size)
+            )
+        with Progress("ingest") as bar:
+            client.wait(capture, progress=bar.job)
+        print_result(client.capture(capture).answer, as_json, "id")
+
+
+@click.command(epilog=example("envmatte recover CAPTURE --option quality=fast"))
+@click.argument("capture")
+@click.option("--method", help="Recovery method: lobes or nn-dgsr.")
+@click.option(
+    "--option",
+    "pairs",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="Recovery option, see GET /v1/options. May be repeated.",
+)
+@click.option("--detach", is_flag=True, help="Print the job's id and do not wait.")
+@_webhook
+@options.remote
+def recover(
+    capture: str,
+    method: str | None,
+    pairs: tuple[str, ...],
+    detach: bool,
+    webhook: str | None,
+    url: str,
+    key: str | None,
+    as_json: bool,
+) -> None:
+    """Recover the matte of a capture and wait for it. Prints the matte's id.
+
+    An interrupt ends the waiting, but not the job.
+    """
+    chosen = dict(_parse_option(pair) for pair in pairs) | ({"method": method} if method else {})
+    with options.client(url, key) as client:
+        job = client.recover(capture, webhook=webhook, **chosen)
+        if not detach:
+            try:
+                with Progress("recovery") as bar:
+                    job = client.wait(job, progress=bar.job)
+            except KeyboardInterrupt:
+                click.echo(
+                    f"The job continues: envmatte wait {job.id}, or envmatte cancel {job.id}",
+                    err=True,
+                )
+                raise
+    print_result(job.answer, as_json, "id" if detach else "matte")
+
+
+@click.command(epilog=example("envmatte status JOB"))
+@click.argument("job")
+@options.remote
+def status(job: str, url: str, key: str | None, as_json: bool) -> None:
+    """Show a job: its state, stage and progress."""
+    with options.client(url, key) as client:
+        print_result(client.job(job).answer, as_json, "state", "stage", "progress")
+
+
+@click.command(epilog=example("envmatte wait JOB"))
+@click.argument("job")
+@options.remote
+def wait(job: str, url: str, key: str | None, as_json: bool) -> None:
+    """Wait until a job has ended. Prints its state."""
+    with options.client(url, key) as client, Progress("job") as bar:
+        print_result(client.wait(job, progress=bar.job).answer, as_json, "state")
+
+
+@click.command(epilog=example("envmatte pause JOB"))
+@click.argument("job")
+@options.remote
+def pause(job: str, url: str, key: str | None, as_json: bool) -> None:
+    """Pause a job; what is under way is done. Prints its state."""
+    with options.client(url, key) as client:
+        print_result(client.pause(job).answer, as_json, "state")
+
+
+@click.command(epilog=example("envmatte resume JOB"))
+@click.argument("job")
+@options.remote
+def resume(job: str, url: str, key: str | None, as_json: bool) -> None:
+    """Continue a job that is paused. Prints its state."""
+    with options.client(url, key) as client:
+        print_result(client.resume(job).answer, as_json, "state")
+
+
+@click.command(epilog=example("envmatte cancel JOB"))
+@click.argument("job")
+@options.remote
+def cancel(job: str, url: str, key: str | None, as_json: bool) -> None:
+    """Cancel a job. Prints its state."""
+    with options.client(url, key) as client:
+        print_result(client.cancel(job).answer, as_json, "state")
+
+
+def _parse_option(option: str) -> tuple[str, Any]:
+    name, equals, value = option.partition("=")
+    if not equals:
+        raise click.UsageError(f"--option {option}: give it as NAME=VALUE")
+    try:
+        return name, json.loads(value)
+    except json.JSONDecodeError:
+        return name, value
+
+
+COMMANDS = (upload, recover, status, wait, pause, resume, cancel)
