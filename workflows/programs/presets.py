@@ -131,7 +131,7 @@ def preset(name: str, width: int = 1280, height: int = 960, *, filmed: bool = Fa
     ]
     patterns: tuple[Part, ...] = (*stripes, *grids)
     shown = list(accumulate(part.count for part in patterns))
-    middle = 1 + min(range(len(shown)), key=lambda n: abs(shown[n] - shown[-1] / 2))
+    middle = 1 + min(range(len(shown)), key=lambda n: (abs(shown[n] - shown[-1] / 2), -n))
     parts: tuple[Part, ...] = (EIGHT_LEVELS, *patterns)
     if recipe.calibrated:
         parts = (AT_FIRST, HALFTONES, *patterns[:middle], AGAIN, *patterns[middle:], AT_LAST)
