@@ -51,6 +51,10 @@ class Interval(NamedTuple):
     shot: float
     share: float
 
+    def wider(self, factor: float) -> "Interval":
+        """The interval that is a number of times as wide."""
+        return Interval(*(factor**2 * part for part in self))
+
     def half_width(self, composite: Floats, rho: Floats, arrived: Floats) -> Floats:
         """Half the width of the interval, in camera units.
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from workflows.recovery.camera.noise import Noise
-from workflows.recovery.interval import fit_interval, local_contrast
+from workflows.recovery.interval import Interval, fit_interval, local_contrast
 from workflows.recovery.pyramid import Pyramid
 
 NOISE = Noise(1e-5, 1e-4)
@@ -70,3 +70,11 @@ def test_errors_without_contrast_do_not_make_it_count_for_more_than_all() -> Non
     assert found.contrast == 1
     half = found.half_width(np.zeros(5000, np.float32), np.float32(0.5), contrast.astype(np.float32))
     assert np.mean(np.abs(error) <= half) == pytest.approx(0.9, abs=0.02)
+
+
+def test_a_wider_interval_is_wider_by_the_factor() -> None:
+    interval = Interval(0.5, 1e-6, 1e-5, 1e-4)
+    values = [np.full(3, value, np.float32) for value in (0.4, 0.8, 0.01)]
+    np.testing.assert_allclose(
+        interval.wider(1.5).half_width(*values), 1.5 * interval.half_width(*values), rtol=1e-5
+    )

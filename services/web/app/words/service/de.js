@@ -108,6 +108,7 @@ export const de = {
 	"give workers more memory (ENVMATTE_WORKER_MEMORY) or have them use less (ENVMATTE_INGEST_MEMORY), and retry": "den Workern mehr Speicher geben (ENVMATTE_WORKER_MEMORY) oder sie weniger nutzen lassen (ENVMATTE_INGEST_MEMORY) und erneut versuchen",
 	"glare and what else the patterns don't explain": "Streulicht und was die Muster sonst nicht erklären",
 	"half a stop": "eine halbe Blende",
+	"if the program has not been shown to its end, the capture is `unfinished`": "wurde das Programm nicht zu Ende gezeigt, ist die Aufnahme `unfinished`",
 	"ingesting": "Einlesen",
 	"is not JSON ({error})": "ist kein JSON ({error})",
 	"is not a known field": "ist kein bekanntes Feld",
