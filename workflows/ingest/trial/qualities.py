@@ -21,7 +21,7 @@ MOST_HELD_OUT = 10
 """Patterns that are predicted, about: their contrast takes time too."""
 PIXELS = 320
 """Pixels, at most, that are recovered without them."""
-SHARPENED = 1.3
+SHARPENED = 1.35
 """How much wider a film's intervals are: cameras sharpen films by an amount that can't be measured, since patterns are
 sharpened as the glass is."""
 
