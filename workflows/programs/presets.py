@@ -1,6 +1,5 @@
 """Programs by name, for a monitor of any size."""
 
-from itertools import accumulate
 from typing import Literal, NamedTuple
 
 from storage.errors import OptionError
@@ -130,8 +129,8 @@ def preset(name: str, width: int = 1280, height: int = 960, *, filmed: bool = Fa
         for i, ((columns, rows), count) in enumerate(counts.items())
     ]
     patterns: tuple[Part, ...] = (*stripes, *grids)
-    shown = list(accumulate(part.count for part in patterns))
-    middle = 1 + min(range(len(shown)), key=lambda n: (abs(shown[n] - shown[-1] / 2), -n))
+    # Stripes come before: with them, half of the patterns have been shown after one grid less.
+    middle = len(stripes) + (len(grids) - 1 if stripes else len(grids) + 1) // 2
     parts: tuple[Part, ...] = (EIGHT_LEVELS, *patterns)
     if recipe.calibrated:
         parts = (AT_FIRST, HALFTONES, *patterns[:middle], AGAIN, *patterns[middle:], AT_LAST)

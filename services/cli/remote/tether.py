@@ -93,7 +93,7 @@ def _more(folder: Path, before: int, program: "Program") -> Sequence[Path]:
                 complete.append(path)
             count = len(complete)
             bar.show(count / program.count, f"{count} of {program.count}")
-            enough = program.tells(range(count)) and sum(program.measured < count) >= FEWEST
+            enough = program.tells(range(count)) and (program.measured < count).sum() >= FEWEST
             if count > before and (enough or count == program.count):
                 return complete
             sizes = now
