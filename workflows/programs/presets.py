@@ -35,7 +35,7 @@ class Recipe(NamedTuple):
     colour, offset
         As in `Bernoulli`.
     stripes : int
-        Gray-code stripes along each axis.
+        Gray-code stripes along each axis, a multiple of `AT_ONCE`.
     calibrated : bool
         Whether the patterns that calibrate the camera are shown; if not, `EIGHT_LEVELS`, as in the paper.
     """

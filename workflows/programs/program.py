@@ -123,9 +123,8 @@ class Program(Record):
 
     def tells(self, patterns: Sequence[int]) -> bool:
         """Whether these patterns suffice for S, rho and T: two different constant levels and one that is not."""
-        numbers, sent = self.constants_among(patterns)
-        others = np.setdiff1d(patterns, np.concatenate([numbers, self.halftones[0]]))
-        return len(numbers) > 0 and bool(np.all(np.ptp(sent, axis=0) > 0)) and len(others) > 0
+        _, sent = self.constants_among(patterns)
+        return bool(len(sent) and np.ptp(sent, axis=0).all() and np.isin(self.measured, patterns).any())
 
     def values(
         self, first: int, last: int, images: Sequence[NDArray[np.float32]] = ()

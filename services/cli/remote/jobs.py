@@ -1,21 +1,28 @@
 """Commands for captures and jobs: upload, recover, follow."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import click
 
 from services.cli import options
 from services.cli.output import example, print_result
 from services.cli.progress import Progress
+from services.client import Capture, Client
 
-F = TypeVar("F", bound=Callable[..., Any])
+_webhook = click.option("--webhook", metavar="URL", help="URL to notify when the job has ended.")
 
 
-def _webhook(command: F) -> F:
-    return click.option("--webhook", metavar="URL", help="URL to notify when the job has ended.")(command)
+def ingest(client: Client, file: Path, name: str, webhook: str | None = None) -> Capture:
+    """Upload a capture and wait until it is ingested, with bars of progress."""
+    with Progress("upload") as bar:
+        capture = client.upload(
+            file, name=name, webhook=webhook, progress=lambda sent, size: bar.show(sent / size)
+        )
+    with Progress("ingest") as bar:
+        client.wait(capture, progress=bar.job)
+    return client.capture(capture)
 
 
 @click.command(epilog=example("envmatte upload film.zip --name 'glass ball'"))
@@ -29,13 +36,7 @@ def upload(file: Path, name: str, webhook: str | None, url: str, key: str | None
     After an interrupt, the same command resumes the upload.
     """
     with options.client(url, key) as client:
-        with Progress("upload") as bar:
-            capture = client.upload(
-                file, name=name, webhook=webhook, progress=lambda sent, size: bar.show(sent / size)
-            )
-        with Progress("ingest") as bar:
-            client.wait(capture, progress=bar.job)
-        print_result(client.capture(capture).answer, as_json, "id")
+        print_result(ingest(client, file, name, webhook).answer, as_json, "id")
 
 
 @click.command(epilog=example("envmatte recover CAPTURE --option quality=fast"))

@@ -13,6 +13,7 @@ import click
 from services.cli import options
 from services.cli.output import example, print_result
 from services.cli.progress import Progress
+from services.cli.remote.jobs import ingest
 from services.client import Capture, Client, Matte
 
 if TYPE_CHECKING:
@@ -44,10 +45,9 @@ def tether(
     that is done another one, of all stills that there are by then. The last matte is the best that they give; drafts
     are deleted once there is a better one.
     """
-    from workflows.programs.files import load_program
+    from workflows.programs.files import fit_to_screen, load_program
 
-    shown = load_program(str(program))
-    assert not isinstance(shown, str)  # it is a file
+    shown = fit_to_screen(load_program(str(program)), None, bordered=False)
     taken: Sequence[Path] = ()
     made: list[Capture | Matte] = []
     last = False
@@ -118,8 +118,4 @@ def _upload(client: Client, program: "Program", stills: Sequence[Path], name: st
             target.writestr("capture.json", json.dumps(manifest))
             for file, still in zip(files, stills, strict=True):
                 target.write(still, file)
-        with Progress("upload") as bar:
-            capture = client.upload(archive, name=name, progress=lambda sent, size: bar.show(sent / size))
-    with Progress("ingest") as bar:
-        client.wait(capture, progress=bar.job)
-    return client.capture(capture)
+        return ingest(client, archive, name)

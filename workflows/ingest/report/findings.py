@@ -58,13 +58,6 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
 
 def _frames(figures: Figures) -> Finding:
     missing = {int(number): why for number, why in figures.video["missing"].items()} if figures.video else {}
-    if not missing and figures.frames.missing:
-        return Finding(
-            name="frames",
-            level="good",
-            message=f"{figures.frames.kept} frames of the {figures.frames.patterns - len(figures.frames.missing)} "
-            f"patterns shown so far; the program has {figures.frames.patterns}",
-        )
     if missing:
         which = "; ".join(f"{ranges(numbers)} ({why})" for numbers, why in by_reason(missing))
         return Finding(
@@ -72,6 +65,13 @@ def _frames(figures: Figures) -> Finding:
             level=graded(len(missing) / figures.frames.patterns, 0, 0.1),
             message=f"{len(missing)} of {figures.frames.patterns} patterns have no frame that can be used: {which}",
             remedy=remedy(missing.values()),
+        )
+    if figures.frames.missing:
+        return Finding(
+            name="frames",
+            level="good",
+            message=f"{figures.frames.kept} frames of the {figures.frames.patterns - len(figures.frames.missing)} "
+            f"patterns shown so far; the program has {figures.frames.patterns}",
         )
     several = f", in {figures.frames.exposures} exposures" if figures.frames.exposures > 1 else ""
     return Finding(

@@ -97,9 +97,8 @@ def test_little_is_expected_of_a_camera_whose_exposure_was_free() -> None:
 
 def test_of_a_program_that_is_not_shown_to_its_end_only_what_was_shown_counts() -> None:
     program = preset("default")
-    assert (
-        expected(program, range(24), SURVEY, 0.0, 0.01) is None
-    )  # stripes alone say little of what they split
+    # Stripes alone say little of what they do not split.
+    assert expected(program, range(24), SURVEY, 0.0, 0.01) is None
     found = [expected(program, range(shown), SURVEY, 0.0) for shown in (32, 64, 140)]
     lows = [one.low for one in found if one is not None]
     assert lows == sorted(lows)
