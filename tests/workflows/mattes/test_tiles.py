@@ -157,10 +157,11 @@ def test_pixels_outside_the_mask_are_empty(
         unmasked = whole.read(*place)
         assert unmasked.recovered.all()
         assert unmasked.rho[~inside].min() > 0
-        # Fits start from those of neighbours, so what is inside depends a little on what is left out.
+        # Fits start from those of neighbours and are averaged with them, so what is inside depends a little on
+        # what is left out.
         for one, other in ((block.S, unmasked.S), (block.rho, unmasked.rho)):
             difference = (one - other)[inside]
-            assert not difference.size or np.sqrt(np.mean(difference**2)) < 1e-3
+            assert not difference.size or np.sqrt(np.mean(difference**2)) < 2e-3
 
 
 @pytest.mark.parametrize("colours", ["grey", "rgb"])

@@ -12,12 +12,11 @@ from workflows.recovery.lobes.fitting.fits import (
     NodeBuffers,
     Pixels,
     fit_of,
+    fits_of_transport,
     make_buffers,
     measurements_of,
     spread_to,
 )
-from workflows.recovery.lobes.fitting.levenberg_marquardt import fit_amounts
-from workflows.recovery.lobes.mixture import Workspace, make_workspace
 from workflows.recovery.lobes.options import LobesOptions
 from workflows.recovery.lobes.posterior.mean import update
 from workflows.recovery.lobes.strays import subtract_strays, write_strays
@@ -55,7 +54,6 @@ def finish_fit(
     options: LobesOptions,
     fits: Fits,
     buffers: NodeBuffers,
-    workspace: Workspace,
     diagnostics: Diagnostics,
 ) -> int:
     """Write the posterior mean for the lobes of a fit to `buffers`, and its diagnostics; return its number of nodes."""
@@ -65,7 +63,6 @@ def finish_fit(
     count, size = patterns.strays.shape
     offset = mixture.stray[::count].copy()
     if count > 1:
-        fit_amounts(patterns, y, variance, mixture, lobes, workspace)
         write_strays(patterns.strays, mixture.stray, 1, stray)
         y, variance, offset[:] = y.copy(), variance.copy(), 0
         subtract_strays(y, variance, stray, size)
@@ -120,13 +117,13 @@ def finish_pixels(
         The entries of all rows, row after row.
     """
     size = pixels.joint.value.shape[1]
-    buffers, workspace = make_buffers(options.most_lobes, size), make_workspace(size)
+    buffers = make_buffers(fits.level.shape[2], size)
     node, weight, end = np.empty(_CAPACITY, np.int64), np.empty(_CAPACITY, np.float32), 0
     for p in range(first, last):
-        for c in range(0 if separate[p] else ALL, ALL if separate[p] else ALL + 1):
+        for c in fits_of_transport(separate[p]):
             if fits.k[p, c] == 0:
                 continue
-            found = finish_fit(pixels, p, c, options, fits, buffers, workspace, diagnostics)
+            found = finish_fit(pixels, p, c, options, fits, buffers, diagnostics)
             while end + found > node.size:
                 node = np.concatenate((node, np.empty_like(node)))
                 weight = np.concatenate((weight, np.empty_like(weight)))

@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from workflows.recovery.camera.noise import Noise
 from workflows.recovery.camera.photometry import Photometry
+from workflows.recovery.lobes.fitting.averages import KEPT, adjacent, average_fits
 from workflows.recovery.lobes.fitting.fits import Fits, Pixels
-from workflows.recovery.lobes.fitting.neighbours import FEWEST_COLOURED, coarse_to_fine
+from workflows.recovery.lobes.fitting.neighbours import coarse_to_fine
 from workflows.recovery.lobes.fitting.pixels import fit_pixels
 from workflows.recovery.lobes.options import FINE, LobesOptions
 from workflows.recovery.lobes.pixels import Diagnostics, finish_pixels
@@ -143,9 +144,10 @@ def recover(
         np.zeros((n, 3)),
         counts,
     )
-    alone = patterns.channels > 1 and m < FEWEST_COLOURED
-    order = coarse_to_fine(None if alone else places, n)
-    transport = _recover_measured(patterns, measured, options, conditions.model_error, strays, order, found)
+    order, near = coarse_to_fine(places, n), adjacent(places, n)
+    transport = _recover_measured(
+        patterns, measured, options, conditions.model_error, strays, order, near, found
+    )
     if stray is not None:
         known = _are_known(measured, found.stray)
         weak = photometry.rho[..., np.newaxis] / 2 * found.stray[:, :, :-2]
@@ -167,6 +169,7 @@ def _recover_measured(
     model_error: float,
     strays: NDArray[np.float32],
     coarse_to_fine: tuple[NDArray[np.int64], NDArray[np.int64]],
+    near: NDArray[np.int64],
     found: Diagnostics,
 ) -> Transport:
     """Recover T from measurements in +-1 form, and write `found`."""
@@ -185,10 +188,12 @@ def _recover_measured(
     pixels = Pixels(patterns.pyramid.arrays, patterns.code, joint, own, strays)
     fits = Fits.of(n, options.most_lobes, len(strays))
     fit_pixels(pixels, alive, *coarse_to_fine, separate, options, fits)
+    averages = Fits.of(n, options.most_lobes * KEPT, len(strays))
+    average_fits(pixels, near, separate, fits, averages)
     shared, parts = alive & ~separate, []
     for first in range(0, max(n, 1), _BLOCK):
         last = min(first + _BLOCK, n)
-        node, weight = finish_pixels(pixels, first, last, separate, fits, options, found)
+        node, weight = finish_pixels(pixels, first, last, separate, averages, options, found)
         # A node under two lobes occurs twice.
         parts.append(
             Transport.from_entries(

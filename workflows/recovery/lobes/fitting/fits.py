@@ -82,6 +82,12 @@ def fit_of(fits: Fits, p: int, c: int) -> Mixture:
     return Mixture(fits.lobes[p, c], fits.level[p, c], fits.stray[p, c])
 
 
+@njit(nogil=True, cache=True, inline="always")
+def fits_of_transport(separate: bool) -> range:
+    """The fits that T is made of: one for each channel if these are separate, or one for all."""
+    return range(0 if separate else ALL, ALL if separate else ALL + 1)
+
+
 class NodeBuffers(NamedTuple):
     """Working space for the nodes under all lobes of a fit.
 

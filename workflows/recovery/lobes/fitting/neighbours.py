@@ -25,10 +25,6 @@ from workflows.recovery.lobes.options import LobesOptions
 MOST_REST = 1.7
 """Lobes are searched again where the squared residual is this many times that of the neighbours. Of 128 measurements,
 noise alone makes it 1.4 in one pixel of a hundred."""
-FEWEST_COLOURED = 40
-"""Of fewer coloured patterns, several sets of lobes explain a pixel as well, and a search finds better ones than
-neighbours have: with the 25 of `sketch`, by 0.2 dB on a bunny and 0.1 dB on a frosted lens. The 49 of `quick` gain 0.3
-dB from neighbours on the lens and lose 0.1 dB on the bunny. Grey ones show no such rule down to 20."""
 
 # Distance of the pixels that are fitted first, a power of two.
 _STRIDE = 8

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from workflows.recovery.lobes import recover as lobes
-from workflows.recovery.lobes.fitting.neighbours import FEWEST_COLOURED, coarse_to_fine
+from workflows.recovery.lobes.fitting.neighbours import coarse_to_fine
 
 COLUMNS, ROWS = 64, 48
 BANDS = [(8, 6, 20), (16, 12, 20), (32, 24, 20), (COLUMNS, ROWS, 20)]
@@ -79,22 +79,3 @@ def test_one_step_suffices_beside_neighbours_that_took_theirs(scene, patterns, p
     together = lobes.recover(measurements, photometry, patterns, noise, options=options, places=places)
     apart, shared = (error(T, found.transport, patterns) for found in (alone, together))
     assert np.mean(shared) < np.mean(apart)
-
-
-@pytest.mark.parametrize("count", [FEWEST_COLOURED - 1, FEWEST_COLOURED])
-def test_few_coloured_patterns_are_searched_for_each_pixel_alone(
-    gaussian, observe, patterns_of, places, count
-):
-    coloured = patterns_of([(8, 6, 13), (COLUMNS, ROWS, count - 13)], 1, 3)
-    T = np.stack(
-        [
-            gaussian(COLUMNS, ROWS, 20 + 0.6 * column, 20 + row, 2, 1.5, 0.3)[0]
-            for row, column in places - places[0]
-        ]
-    )
-    measurements, photometry, noise = observe(coloured, T)
-    alone = lobes.recover(measurements, photometry, coloured, noise).transport
-    together = lobes.recover(measurements, photometry, coloured, noise, places=places).transport
-    light = coloured.pyramid.light(np.random.default_rng(2).random((ROWS, COLUMNS, 3), np.float32))
-    same = np.array_equal(alone.apply(light), together.apply(light))
-    assert same == (count < FEWEST_COLOURED)

@@ -1,0 +1,180 @@
+"""Averages of the fits of a pixel and of those about it, moved to its place: where the posterior mean of T starts.
+
+Several sets of lobes explain the measurements of a pixel about as well, the more so the fewer patterns there are, and
+the best of them has fitted their noise too. Bayesian model averaging (Hoeting et al., Statistical Science, 1999) takes
+the mean of T over all of them, each with its share of the likelihood. The fits of the pixels about it are such sets,
+found from other measurements.
+"""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from workflows.recovery.lobes.fitting.fits import (
+    Fits,
+    Pixels,
+    fit_of,
+    fits_of_transport,
+    measurements_of,
+)
+from workflows.recovery.lobes.fitting.levenberg_marquardt import fit_amounts
+from workflows.recovery.lobes.footprint import PARAMETERS
+from workflows.recovery.lobes.likelihood import penalty, weigh
+from workflows.recovery.lobes.mixture import (
+    Mixture,
+    Workspace,
+    copy_mixture,
+    make_workspace,
+    predict,
+    without_derivatives,
+)
+
+KEPT = 4
+"""Fits that are averaged, at most: the likeliest."""
+
+# Rows and columns from a pixel to the eight about it.
+_OFFSETS = np.array([(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1) if down or right])
+# Another pixel's fit may leave -2 ln likelihood higher by this for each parameter: its own noise is not fitted.
+_ALLOWED = 5.0
+# The likelihood is raised to one over this, since errors of the model are not independent as those of noise are.
+_TEMPERATURE = 30.0
+# Least share of a fit in an average.
+_LEAST_SHARE = 0.02
+
+
+def adjacent(places: NDArray[np.integer] | None, pixels: int) -> NDArray[np.int64]:
+    """The numbers of the pixels about each pixel.
+
+    Parameters
+    ----------
+    places : (n, 2) int or None
+        Rows and columns of the pixels in their frame. None if none is another's neighbour.
+    pixels : int
+        n.
+
+    Returns
+    -------
+    (n, 8) int64
+        Row by row; -1 for none.
+
+    Examples
+    --------
+    >>> adjacent(np.array([[0, 6], [0, 7], [1, 6]]), 3).tolist()[0]
+    [-1, -1, -1, -1, 1, -1, 2, -1]
+    """
+    if places is None or not pixels:
+        return np.full((pixels, len(_OFFSETS)), -1)
+    width = places[:, 1].max() + 3
+    key = (places[:, 0] + 1) * width + places[:, 1] + 1
+    order = np.argsort(key)
+    wanted = key[:, np.newaxis] + _OFFSETS @ [width, 1]
+    at = order[np.minimum(np.searchsorted(key, wanted, sorter=order), pixels - 1)]
+    return np.where(key[at] == wanted, at, -1)
+
+
+@njit(nogil=True, cache=True)
+def _slope(fits: Fits, p: int, c: int, near: NDArray[np.int64], axis: int) -> tuple[float, float]:
+    """How far the heaviest lobe moves to the next pixel along rows (0) or columns (1): the medians of x and y.
+
+    A median, since some of the pixels may have another heaviest lobe.
+    """
+    centre = np.full((3, 3, 2), np.nan)
+    for e in range(-1, near.size):
+        q = p if e < 0 else near[e]
+        if q >= 0 and fits.k[q, c] > 0:
+            row, column = (1, 1) if e < 0 else (1 + _OFFSETS[e, 0], 1 + _OFFSETS[e, 1])
+            heaviest = np.argmax(fits.lobes[q, c, : fits.k[q, c], 0])
+            centre[row, column] = fits.lobes[q, c, heaviest, 1:3]
+    moved, n = np.empty((2, 6)), 0
+    for i in range(3):
+        for j in range(2):
+            by = centre[j + 1, i] - centre[j, i] if axis == 0 else centre[i, j + 1] - centre[i, j]
+            if not np.isnan(by[0]):
+                moved[:, n] = by
+                n += 1
+    if n == 0:
+        return 0.0, 0.0
+    return float(np.median(moved[0, :n])), float(np.median(moved[1, :n]))
+
+
+@njit(nogil=True, cache=True)
+def _average(
+    pixels: Pixels,
+    p: int,
+    c: int,
+    near: NDArray[np.int64],
+    fits: Fits,
+    averages: Fits,
+    workspace: Workspace,
+) -> None:
+    """Write the average for fit c of a pixel."""
+    patterns, y, variance = measurements_of(pixels, p, c)
+    (x_down, y_down), (x_right, y_right) = _slope(fits, p, c, near, 0), _slope(fits, p, c, near, 1)
+    most, n = fits.level.shape[2], near.size + 1
+    count, objective = np.zeros(n, np.int64), np.full(n, np.inf)
+    lobes, level = np.empty((n, most, PARAMETERS)), np.empty((n, most), np.int64)
+    f, precision = np.empty_like(y), np.empty_like(y)
+    response = np.empty((most, 1, y.size), np.float32)
+    for e in range(n):
+        q = p if e == 0 else near[e - 1]
+        if q < 0 or fits.k[q, c] == 0:
+            continue
+        k = fits.k[q, c]
+        tried = Mixture(lobes[e], level[e], fits.stray[p, c])
+        copy_mixture(k, np.int64(0), fit_of(fits, q, c), tried)
+        if e > 0:
+            down, right = _OFFSETS[e - 1]
+            lobes[e, :k, 1] -= down * x_down + right * x_right
+            lobes[e, :k, 2] -= down * y_down + right * y_right
+        predict(patterns, tried, k, without_derivatives(workspace), response, f)
+        _, explained = weigh(y, f, variance, patterns.groups, PARAMETERS * k, precision)
+        allowed = _ALLOWED * PARAMETERS * k if e > 0 else 0.0
+        count[e], objective[e] = k, explained + penalty(patterns.grids, tried.level, k) - allowed
+    best = np.argsort(objective)[:KEPT]
+    share = np.exp((objective[best[0]] - objective[best]) / (2 * _TEMPERATURE))
+    share[share < _LEAST_SHARE * share.sum()] = 0
+    share /= share.sum()
+    written, end = fit_of(averages, p, c), 0
+    for i in range(best.size):
+        if share[i] > 0:
+            for j in range(count[best[i]]):
+                written.lobes[end] = lobes[best[i], j]
+                written.lobes[end, 0] *= share[i]
+                written.level[end] = level[best[i], j]
+                end += 1
+    written.stray[:] = fits.stray[p, c]
+    averages.k[p, c] = end
+
+
+@njit(nogil=True, cache=True)
+def average_fits(
+    pixels: Pixels,
+    near: NDArray[np.int64],
+    separate: NDArray[np.bool_],
+    fits: Fits,
+    averages: Fits,
+) -> None:
+    """Average the fits of n pixels that T is made of with those of the pixels about them.
+
+    Parameters
+    ----------
+    pixels : Pixels
+    near : (n, 8) int64
+        As from :func:`adjacent`.
+    separate : (n,) bool
+        Whether each channel has its own T.
+    fits : Fits
+        The amounts of what changes from frame to frame are fitted again.
+    averages : Fits
+        With room for `KEPT` times as many lobes. Lobes, levels, stray light and numbers of lobes are written.
+    """
+    workspace = make_workspace(pixels.joint.value.shape[1])
+    for p in range(separate.size if len(pixels.strays) > 1 else 0):
+        for c in fits_of_transport(separate[p]):
+            if fits.k[p, c] > 0:
+                patterns, y, variance = measurements_of(pixels, p, c)
+                fit_amounts(patterns, y, variance, fit_of(fits, p, c), fits.k[p, c], workspace)
+    for p in range(separate.size):
+        for c in fits_of_transport(separate[p]):
+            if fits.k[p, c] > 0:
+                _average(pixels, p, c, near[p], fits, averages, workspace)
