@@ -38,7 +38,7 @@ def settled(page: Page, since: NDArray[np.float64] | None = None) -> NDArray[np.
         before, last = last, drawn(page)
         return (
             last.shape == before.shape
-            and min(last.shape[:2]) >= 240
+            and min(last.shape[:2]) >= 480  # while much is drawn, it is coarser
             and bool(last.any())
             and bool(np.all(last == before))
             and (since is None or not np.array_equal(last, since))
