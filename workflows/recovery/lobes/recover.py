@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from workflows.recovery.camera.noise import Noise
 from workflows.recovery.camera.photometry import Photometry
-from workflows.recovery.lobes.fitting.averages import KEPT, adjacent, average_fits
+from workflows.recovery.lobes.fitting.averages import FEW, KEPT, adjacent, average_fits
 from workflows.recovery.lobes.fitting.fits import Fits, Pixels
 from workflows.recovery.lobes.fitting.neighbours import coarse_to_fine
 from workflows.recovery.lobes.fitting.pixels import fit_pixels
@@ -144,7 +144,8 @@ def recover(
         np.zeros((n, 3)),
         counts,
     )
-    order, near = coarse_to_fine(places, n), adjacent(places, n)
+    order = coarse_to_fine(places, n)
+    near = adjacent(places) if places is not None and m < FEW else None
     transport = _recover_measured(
         patterns, measured, options, conditions.model_error, strays, order, near, found
     )
@@ -169,7 +170,7 @@ def _recover_measured(
     model_error: float,
     strays: NDArray[np.float32],
     coarse_to_fine: tuple[NDArray[np.int64], NDArray[np.int64]],
-    near: NDArray[np.int64],
+    near: NDArray[np.int64] | None,
     found: Diagnostics,
 ) -> Transport:
     """Recover T from measurements in +-1 form, and write `found`."""
@@ -188,12 +189,14 @@ def _recover_measured(
     pixels = Pixels(patterns.pyramid.arrays, patterns.code, joint, own, strays)
     fits = Fits.of(n, options.most_lobes, len(strays))
     fit_pixels(pixels, alive, *coarse_to_fine, separate, options, fits)
-    averages = Fits.of(n, options.most_lobes * KEPT, len(strays))
-    average_fits(pixels, near, separate, fits, averages)
+    if near is not None:
+        averages = Fits.of(n, options.most_lobes * KEPT, len(strays))
+        average_fits(pixels, near, separate, fits, averages)
+        fits = averages
     shared, parts = alive & ~separate, []
     for first in range(0, max(n, 1), _BLOCK):
         last = min(first + _BLOCK, n)
-        node, weight = finish_pixels(pixels, first, last, separate, averages, options, found)
+        node, weight = finish_pixels(pixels, first, last, separate, fits, options, found)
         # A node under two lobes occurs twice.
         parts.append(
             Transport.from_entries(

@@ -17,7 +17,6 @@ from workflows.recovery.lobes.fitting.fits import (
     fits_of_transport,
     measurements_of,
 )
-from workflows.recovery.lobes.fitting.levenberg_marquardt import fit_amounts
 from workflows.recovery.lobes.footprint import PARAMETERS
 from workflows.recovery.lobes.likelihood import penalty, weigh
 from workflows.recovery.lobes.mixture import (
@@ -29,6 +28,9 @@ from workflows.recovery.lobes.mixture import (
     without_derivatives,
 )
 
+FEW = 100
+"""Fits are averaged if there are fewer patterns. With the 128 of the preset `default`, 0.3 dB would cost twice the
+time, and RAW stills of a clear ball would lose 0.6 dB."""
 KEPT = 4
 """Fits that are averaged, at most: the likeliest."""
 
@@ -42,15 +44,13 @@ _TEMPERATURE = 30.0
 _LEAST_SHARE = 0.02
 
 
-def adjacent(places: NDArray[np.integer] | None, pixels: int) -> NDArray[np.int64]:
+def adjacent(places: NDArray[np.integer]) -> NDArray[np.int64]:
     """The numbers of the pixels about each pixel.
 
     Parameters
     ----------
-    places : (n, 2) int or None
-        Rows and columns of the pixels in their frame. None if none is another's neighbour.
-    pixels : int
-        n.
+    places : (n, 2) int
+        Rows and columns of the pixels in their frame.
 
     Returns
     -------
@@ -59,16 +59,16 @@ def adjacent(places: NDArray[np.integer] | None, pixels: int) -> NDArray[np.int6
 
     Examples
     --------
-    >>> adjacent(np.array([[0, 6], [0, 7], [1, 6]]), 3).tolist()[0]
+    >>> adjacent(np.array([[0, 6], [0, 7], [1, 6]])).tolist()[0]
     [-1, -1, -1, -1, 1, -1, 2, -1]
     """
-    if places is None or not pixels:
-        return np.full((pixels, len(_OFFSETS)), -1)
+    if not len(places):
+        return np.empty((0, len(_OFFSETS)), np.int64)
     width = places[:, 1].max() + 3
     key = (places[:, 0] + 1) * width + places[:, 1] + 1
     order = np.argsort(key)
     wanted = key[:, np.newaxis] + _OFFSETS @ [width, 1]
-    at = order[np.minimum(np.searchsorted(key, wanted, sorter=order), pixels - 1)]
+    at = order[np.minimum(np.searchsorted(key, wanted, sorter=order), len(places) - 1)]
     return np.where(key[at] == wanted, at, -1)
 
 
@@ -164,16 +164,10 @@ def average_fits(
     separate : (n,) bool
         Whether each channel has its own T.
     fits : Fits
-        The amounts of what changes from frame to frame are fitted again.
     averages : Fits
         With room for `KEPT` times as many lobes. Lobes, levels, stray light and numbers of lobes are written.
     """
     workspace = make_workspace(pixels.joint.value.shape[1])
-    for p in range(separate.size if len(pixels.strays) > 1 else 0):
-        for c in fits_of_transport(separate[p]):
-            if fits.k[p, c] > 0:
-                patterns, y, variance = measurements_of(pixels, p, c)
-                fit_amounts(patterns, y, variance, fit_of(fits, p, c), fits.k[p, c], workspace)
     for p in range(separate.size):
         for c in fits_of_transport(separate[p]):
             if fits.k[p, c] > 0:

@@ -12,11 +12,12 @@ from workflows.recovery.lobes.fitting.fits import (
     NodeBuffers,
     Pixels,
     fit_of,
+    fits_of_transport,
     make_buffers,
     measurements_of,
     spread_to,
 )
-from workflows.recovery.lobes.fitting.levenberg_marquardt import refine
+from workflows.recovery.lobes.fitting.levenberg_marquardt import fit_amounts, refine
 from workflows.recovery.lobes.fitting.neighbours import MOST_REST, mean_square, start_between, unexplained
 from workflows.recovery.lobes.fitting.search import fit
 from workflows.recovery.lobes.footprint import PARAMETERS, PatternCodes
@@ -267,3 +268,8 @@ def fit_pixels(
             fit_pixel(pixels, p, separate[p], neighbours[p], options, fits, buffers, workspace)
             if groups == 3:
                 separate[p] = prefers_channels(pixels, p, neighbours[p], separate, options, fits, buffers)
+    for p in range(alive.size if len(pixels.strays) > 1 else 0):
+        for c in fits_of_transport(separate[p]):
+            if fits.k[p, c] > 0:
+                patterns, y, variance = measurements_of(pixels, p, c)
+                fit_amounts(patterns, y, variance, fit_of(fits, p, c), fits.k[p, c], workspace)

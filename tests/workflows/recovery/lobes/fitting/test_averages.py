@@ -45,7 +45,7 @@ def errors(scene, patterns, places, monkeypatch):
         return np.mean((found.transport.apply(patterns.pyramid.light(light)) - expected) ** 2, axis=1)
 
     of_averages = error()
-    monkeypatch.setattr(lobes, "adjacent", lambda _, n: np.full((n, 8), -1))
+    monkeypatch.setattr(lobes, "FEW", 0)
     return error(), of_averages
 
 
@@ -57,12 +57,11 @@ def test_each_pixel_has_those_about_it(share):
     expected = [
         [number.get((row + r, column + c), -1) for r, c in OFFSETS] for row, column in chosen.tolist()
     ]
-    assert adjacent(chosen, len(chosen)).tolist() == expected
+    assert adjacent(chosen).tolist() == expected
 
 
-def test_pixels_without_places_have_none_about_them():
-    assert (adjacent(None, 3) == -1).all()
-    assert adjacent(np.empty((0, 2), int), 0).shape == (0, 8)
+def test_no_pixels_have_none_about_them():
+    assert adjacent(np.empty((0, 2), int)).shape == (0, 8)
 
 
 def test_few_patterns_tell_more_together(errors):
