@@ -144,11 +144,7 @@ def recover(
         np.zeros((n, 3)),
         counts,
     )
-    order = coarse_to_fine(places, n)
-    near = adjacent(places) if places is not None and m < FEW else None
-    transport = _recover_measured(
-        patterns, measured, options, conditions.model_error, strays, order, near, found
-    )
+    transport = _recover_measured(patterns, measured, options, conditions.model_error, strays, places, found)
     if stray is not None:
         known = _are_known(measured, found.stray)
         weak = photometry.rho[..., np.newaxis] / 2 * found.stray[:, :, :-2]
@@ -169,8 +165,7 @@ def _recover_measured(
     options: LobesOptions,
     model_error: float,
     strays: NDArray[np.float32],
-    coarse_to_fine: tuple[NDArray[np.int64], NDArray[np.int64]],
-    near: NDArray[np.int64] | None,
+    places: NDArray[np.integer] | None,
     found: Diagnostics,
 ) -> Transport:
     """Recover T from measurements in +-1 form, and write `found`."""
@@ -188,10 +183,10 @@ def _recover_measured(
         separate = np.zeros(n, bool)
     pixels = Pixels(patterns.pyramid.arrays, patterns.code, joint, own, strays)
     fits = Fits.of(n, options.most_lobes, len(strays))
-    fit_pixels(pixels, alive, *coarse_to_fine, separate, options, fits)
-    if near is not None:
+    fit_pixels(pixels, alive, *coarse_to_fine(places, n), separate, options, fits)
+    if places is not None and patterns.count < FEW:
         averages = Fits.of(n, options.most_lobes * KEPT, len(strays))
-        average_fits(pixels, near, separate, fits, averages)
+        average_fits(pixels, adjacent(places), separate, fits, averages)
         fits = averages
     shared, parts = alive & ~separate, []
     for first in range(0, max(n, 1), _BLOCK):

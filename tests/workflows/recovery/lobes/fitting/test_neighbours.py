@@ -8,36 +8,11 @@ from workflows.recovery.lobes.fitting.neighbours import coarse_to_fine
 
 COLUMNS, ROWS = 64, 48
 BANDS = [(8, 6, 20), (16, 12, 20), (32, 24, 20), (COLUMNS, ROWS, 20)]
-HEIGHT, WIDTH = 8, 20
 
 
 @pytest.fixture(scope="module")
 def patterns(patterns_of):
     return patterns_of(BANDS, 1)
-
-
-@pytest.fixture
-def places():
-    return np.argwhere(np.ones((HEIGHT, WIDTH), bool)) + np.array([24, 40])
-
-
-@pytest.fixture
-def scene(gaussian, observe, patterns, places):
-    """A picture of glass with an edge: right of column 9 its light comes from elsewhere; and its true T."""
-    pixels = []
-    for row, column in places - places[0]:
-        x, y = (12 + 0.6 * column, 10 + 0.5 * row) if column < 10 else (50 - 0.5 * column, 36 - 0.4 * row)
-        pixels.append(gaussian(COLUMNS, ROWS, x, y, 2 + 0.05 * row, 1.5, 0.3)[0])
-    T = np.stack(pixels)
-    return observe(patterns, T), T
-
-
-def error(T, transport, patterns):
-    """Root mean square error of predictions of random backdrops, a pixel each."""
-    light = np.random.default_rng(1).random((ROWS, COLUMNS, 3), np.float32)
-    smooth = patterns.pyramid.light(light)
-    expected = T.reshape(len(T), -1, ROWS * COLUMNS)[:, 0] @ light.reshape(-1, 3)
-    return np.sqrt(np.mean((transport.apply(smooth) - expected) ** 2, axis=1))
 
 
 @pytest.mark.parametrize("seed", [None, 0])
@@ -62,20 +37,20 @@ def test_pixels_without_places_have_no_neighbours():
     assert (neighbours == -1).all()
 
 
-def test_neighbours_lose_nothing_and_edges_stay(scene, patterns, places):
-    (measurements, photometry, noise), T = scene
+def test_neighbours_lose_nothing_and_edges_stay(scene, error, patterns, places):
+    (measurements, photometry, noise), _ = scene
     alone = lobes.recover(measurements, photometry, patterns, noise)
     together = lobes.recover(measurements, photometry, patterns, noise, places=places)
-    apart, shared = (error(T, found.transport, patterns) for found in (alone, together))
+    apart, shared = (error(found.transport) for found in (alone, together))
     assert np.sqrt(np.mean(shared**2)) < 1.05 * np.sqrt(np.mean(apart**2))
     edge = np.isin(places[:, 1] - 40, (9, 10))
     assert np.sqrt(np.mean(shared[edge] ** 2)) < 1.1 * np.sqrt(np.mean(apart[edge] ** 2))
 
 
-def test_one_step_suffices_beside_neighbours_that_took_theirs(scene, patterns, places):
-    (measurements, photometry, noise), T = scene
+def test_one_step_suffices_beside_neighbours_that_took_theirs(scene, error, patterns, places):
+    (measurements, photometry, noise), _ = scene
     options = lobes.FINE._replace(steps=1, most_lobes=1, doubt=1.0)
     alone = lobes.recover(measurements, photometry, patterns, noise, options=options)
     together = lobes.recover(measurements, photometry, patterns, noise, options=options, places=places)
-    apart, shared = (error(T, found.transport, patterns) for found in (alone, together))
+    apart, shared = (error(found.transport) for found in (alone, together))
     assert np.mean(shared) < np.mean(apart)
