@@ -57,6 +57,51 @@ def spread_lobes(
 
 
 @njit(nogil=True, cache=True)
+def merge_nodes(
+    node: NDArray[np.int64],
+    weight: NDArray[np.float32],
+    end: NDArray[np.int64],
+    k: int,
+    seen: NDArray[np.int32],
+) -> int:
+    """Leave a node under several lobes to the first of them, with the sum of the weights.
+
+    Parameters
+    ----------
+    node, weight, end
+        As from :func:`spread_lobes`; changed in place.
+    k : int
+        Number of lobes.
+    seen : (nodes,) int32
+        Zeros, one for each node of the pyramid, and again afterwards.
+
+    Returns
+    -------
+    int
+        The number of nodes left.
+
+    Notes
+    -----
+    The posterior mean of T is the same: such nodes have the same row of A, and the variances of the prior add up as the
+    weights do.
+    """
+    n, begin = 0, 0
+    for i in range(k):
+        for j in range(begin, end[i]):
+            at = seen[node[j]]
+            if at > 0:
+                weight[at - 1] += weight[j]
+            else:
+                node[n], weight[n] = node[j], weight[j]
+                n += 1
+                seen[node[n - 1]] = n
+        begin, end[i] = end[i], n
+    for j in range(n):
+        seen[node[j]] = 0
+    return n
+
+
+@njit(nogil=True, cache=True)
 def gather_lobes(
     grids: Grids,
     node: NDArray[np.int64],

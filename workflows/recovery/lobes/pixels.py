@@ -13,7 +13,6 @@ from workflows.recovery.lobes.fitting.fits import (
     Pixels,
     fit_of,
     fits_of_transport,
-    make_buffers,
     measurements_of,
     spread_to,
 )
@@ -66,7 +65,7 @@ def finish_fit(
         write_strays(patterns.strays, mixture.stray, 1, stray)
         y, variance, offset[:] = y.copy(), variance.copy(), 0
         subtract_strays(y, variance, stray, size)
-    A = spread_to(buffers, patterns, mixture, lobes, options.resolution)
+    A = spread_to(buffers, patterns, mixture, lobes, options.resolution, merged=True)
     n: int = len(A)
     weight, end = buffers.weight[:n], buffers.end[:lobes]
     kappa, misfit = update(
@@ -93,6 +92,7 @@ def finish_pixels(
     separate: NDArray[np.bool_],
     fits: Fits,
     options: LobesOptions,
+    buffers: NodeBuffers,
     diagnostics: Diagnostics,
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Compute T of some pixels in succession, one for all channels or one for each.
@@ -107,6 +107,7 @@ def finish_pixels(
     fits : Fits
         Lobes are moved to the levels for `options.resolution`.
     options : LobesOptions
+    buffers : NodeBuffers
     diagnostics : Diagnostics
         Written.
 
@@ -114,10 +115,8 @@ def finish_pixels(
     -------
     node : (diagnostics.nodes[first:last].sum(),) int64
     weight : (diagnostics.nodes[first:last].sum(),) float32
-        The entries of all rows, row after row.
+        The entries of all rows, row after row; nodes ascend within a row.
     """
-    size = pixels.joint.value.shape[1]
-    buffers = make_buffers(fits.level.shape[2], size)
     node, weight, end = np.empty(_CAPACITY, np.int64), np.empty(_CAPACITY, np.float32), 0
     for p in range(first, last):
         for c in fits_of_transport(separate[p]):
@@ -127,7 +126,7 @@ def finish_pixels(
             while end + found > node.size:
                 node = np.concatenate((node, np.empty_like(node)))
                 weight = np.concatenate((weight, np.empty_like(weight)))
-            for i in range(found):
+            for i in np.argsort(buffers.node[:found]):
                 if buffers.weight[i] >= options.least_weight:
                     node[end], weight[end] = buffers.node[i], buffers.weight[i]
                     diagnostics.nodes[p, c % 3] += 1

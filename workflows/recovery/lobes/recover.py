@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from workflows.recovery.camera.noise import Noise
 from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.lobes.fitting.averages import FEW, KEPT, adjacent, average_fits
-from workflows.recovery.lobes.fitting.fits import Fits, Pixels
+from workflows.recovery.lobes.fitting.fits import Fits, Pixels, make_buffers
 from workflows.recovery.lobes.fitting.neighbours import coarse_to_fine
 from workflows.recovery.lobes.fitting.pixels import fit_pixels
 from workflows.recovery.lobes.options import FINE, LobesOptions
@@ -26,7 +26,7 @@ from workflows.recovery.normalise import (
 from workflows.recovery.sensing import Patterns
 from workflows.recovery.transport import Transport
 
-# Pixels whose entries of T are sorted at once: limits the working arrays.
+# Pixels whose rows of T are normalised at once: limits the working arrays.
 _BLOCK = 256
 # Least difference of white and black without stray light, of 2 with it, for which S and rho are corrected.
 _LEAST_CONTRAST = 0.5
@@ -189,12 +189,12 @@ def _recover_measured(
         average_fits(pixels, adjacent(places), separate, fits, averages)
         fits = averages
     shared, parts = alive & ~separate, []
+    buffers = make_buffers(fits.level.shape[2], joint.value.shape[1], patterns.pyramid.nodes)
     for first in range(0, max(n, 1), _BLOCK):
         last = min(first + _BLOCK, n)
-        node, weight = finish_pixels(pixels, first, last, separate, fits, options, found)
-        # A node under two lobes occurs twice.
+        node, weight = finish_pixels(pixels, first, last, separate, fits, options, buffers, found)
         parts.append(
-            Transport.from_entries(
+            Transport.from_rows(
                 columns,
                 rows,
                 found.nodes[first:last],

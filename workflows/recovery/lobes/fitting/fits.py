@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from workflows.recovery.lobes.footprint import NODES, PARAMETERS, PatternCodes
 from workflows.recovery.lobes.mixture import Mixture
-from workflows.recovery.lobes.nodes import node_responses, spread_lobes
+from workflows.recovery.lobes.nodes import merge_nodes, node_responses, spread_lobes
 from workflows.recovery.normalise import Measurements
 from workflows.recovery.pyramid import Grids
 
@@ -97,32 +97,42 @@ class NodeBuffers(NamedTuple):
     weight : (most NODES,) float32
     end : (most,) int64
         As from :func:`~workflows.recovery.lobes.nodes.spread_lobes`.
+    seen : (nodes,) int32
+        As in :func:`~workflows.recovery.lobes.nodes.merge_nodes`.
     rows : (most NODES channels (m + 2),) float32
     """
 
     node: NDArray[np.int64]
     weight: NDArray[np.float32]
     end: NDArray[np.int64]
+    seen: NDArray[np.int32]
     rows: NDArray[np.float32]
 
 
-@njit(nogil=True, cache=True, inline="always")
-def make_buffers(most: int, size: int) -> NodeBuffers:
-    """Make working space for up to `most` lobes of a pixel of `size` measurements."""
+@njit(nogil=True, cache=True)
+def make_buffers(most: int, size: int, nodes: int) -> NodeBuffers:
+    """Make working space for up to `most` lobes of a pixel of `size` measurements, on a pyramid of so many nodes."""
     return NodeBuffers(
         np.empty(most * NODES, np.int64),
         np.empty(most * NODES, np.float32),
         np.empty(most, np.int64),
+        np.zeros(nodes, np.int32),
         np.empty(most * NODES * size, np.float32),
     )
 
 
 @njit(nogil=True, cache=True, inline="always")
 def spread_to(
-    buffers: NodeBuffers, patterns: PatternCodes, mixture: Mixture, k: int, resolution: float
+    buffers: NodeBuffers, patterns: PatternCodes, mixture: Mixture, k: int, resolution: float, merged: bool
 ) -> NDArray[np.float32]:
-    """Write the nodes under k lobes, which are moved to the levels for this resolution; return their responses."""
-    n = spread_lobes(patterns.grids, mixture, k, resolution, buffers.node, buffers.weight, buffers.end)
+    """Write the nodes under k lobes, which are moved to the levels for this resolution; return their responses.
+
+    If `merged`, a node under several lobes is there only once.
+    """
+    node, weight, end = buffers.node, buffers.weight, buffers.end
+    n = spread_lobes(patterns.grids, mixture, k, resolution, node, weight, end)
+    if merged:
+        n = merge_nodes(node, weight, end, k, buffers.seen)
     size = patterns.groups * (patterns.m + 2)
     A = buffers.rows[: n * size].reshape(n, size)
     node_responses(patterns, buffers.node, n, A)

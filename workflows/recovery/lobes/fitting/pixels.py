@@ -86,7 +86,7 @@ def refit_from_posterior(
     objective : float
     """
     tried = Mixture(mixture.lobes.copy(), mixture.level.copy(), mixture.stray.copy())
-    A = spread_to(buffers, patterns, tried, k, options.resolution)
+    A = spread_to(buffers, patterns, tried, k, options.resolution, merged=False)
     # with a literal, numba would compile another version of `update`
     passes = np.int64(1)
     update(
@@ -194,7 +194,7 @@ def evidence(
     patterns, y, variance = measurements_of(pixels, p, c)
     fitted, k = fit_of(fits, p, c), fits.k[p, c]
     moved = Mixture(fitted.lobes.copy(), fitted.level.copy(), fitted.stray)
-    A = spread_to(buffers, patterns, moved, k, options.resolution)
+    A = spread_to(buffers, patterns, moved, k, options.resolution, merged=True)
     found: float = log_evidence(A, buffers.weight[: len(A)], y, variance, patterns.strays, fitted.stray)
     return found
 
@@ -262,7 +262,7 @@ def fit_pixels(
     """
     size = pixels.joint.value.shape[1]
     groups = size // pixels.own.value.shape[2]
-    buffers, workspace = make_buffers(options.most_lobes, size), make_workspace(size)
+    buffers, workspace = make_buffers(options.most_lobes, size, len(pixels.code)), make_workspace(size)
     for p in order:
         if alive[p]:
             fit_pixel(pixels, p, separate[p], neighbours[p], options, fits, buffers, workspace)

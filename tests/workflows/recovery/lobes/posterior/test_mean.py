@@ -68,6 +68,18 @@ def test_posterior_mean_does_not_depend_on_which_lobe_a_node_is_of():
     assert np.abs(one - three).sum() < 0.01 * np.abs(one - weight).sum()
 
 
+def test_posterior_mean_of_a_node_does_not_depend_on_how_often_it_is_there():
+    A, weight, y, variance, _ = problem(1)
+    twice = np.append(weight, weight[:10])
+    twice[:10], twice[-10:] = 0.3 * weight[:10], 0.7 * weight[:10]
+    ends = np.array([40, 50])
+    once = weight.copy()
+    update(A, once, END, y, variance, CONSTANT, np.zeros(1), 2, 500)
+    update(np.vstack((A, A[:10])), twice, ends, y, variance, CONSTANT, np.zeros(1), 2, 500)
+    twice[:10] += twice[-10:]
+    assert np.abs(once - twice[:40]).sum() < 0.01 * np.abs(once - weight).sum()
+
+
 def test_more_passes_come_closer_to_the_truth():
     A, weight, y, variance, truth = problem(1, seed=3)
     errors = []
