@@ -10,6 +10,10 @@ from workflows.recovery.lobes.footprint import NODES, PatternCodes, fit_level, s
 from workflows.recovery.lobes.mixture import Mixture
 from workflows.recovery.pyramid import Grids
 
+# Nodes with a smaller share of T are dropped: the rims of lobes have many. From 2e-5 to 5e-5 this gains 0.05 dB and a
+# tenth of the time, 2e-4 costs 0.1 dB.
+_LEAST_WEIGHT = 3e-5
+
 
 @njit(nogil=True, cache=True)
 def spread_lobes(
@@ -64,7 +68,7 @@ def merge_nodes(
     k: int,
     seen: NDArray[np.int32],
 ) -> int:
-    """Leave a node under several lobes to the first of them, with the sum of the weights.
+    """Leave each node to the first of the lobes that it is under, with the sum of its weights; drop those of little.
 
     Parameters
     ----------
@@ -82,8 +86,8 @@ def merge_nodes(
 
     Notes
     -----
-    The posterior mean of T is the same: such nodes have the same row of A, and the variances of the prior add up as the
-    weights do.
+    But for what is dropped the posterior mean of T is the same: a node that is there twice has one row of A, and the
+    variances of its prior add up as the weights do.
     """
     n, begin = 0, 0
     for i in range(k):
@@ -96,8 +100,14 @@ def merge_nodes(
                 n += 1
                 seen[node[n - 1]] = n
         begin, end[i] = end[i], n
-    for j in range(n):
-        seen[node[j]] = 0
+    n, begin = 0, 0
+    for i in range(k):
+        for j in range(begin, end[i]):
+            seen[node[j]] = 0
+            if weight[j] >= _LEAST_WEIGHT:
+                node[n], weight[n] = node[j], weight[j]
+                n += 1
+        begin, end[i] = end[i], n
     return n
 
 

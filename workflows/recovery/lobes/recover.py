@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from workflows.recovery.camera.noise import Noise
 from workflows.recovery.camera.photometry import Photometry
-from workflows.recovery.lobes.fitting.averages import FEW, KEPT, adjacent, average_fits
+from workflows.recovery.lobes.fitting.averages import KEPT, adjacent, average_fits
 from workflows.recovery.lobes.fitting.fits import Fits, Pixels, make_buffers
 from workflows.recovery.lobes.fitting.neighbours import coarse_to_fine
 from workflows.recovery.lobes.fitting.pixels import fit_pixels
@@ -184,7 +184,7 @@ def _recover_measured(
     pixels = Pixels(patterns.pyramid.arrays, patterns.code, joint, own, strays)
     fits = Fits.of(n, options.most_lobes, len(strays))
     fit_pixels(pixels, alive, *coarse_to_fine(places, n), separate, options, fits)
-    if places is not None and patterns.count < FEW:
+    if places is not None:
         averages = Fits.of(n, options.most_lobes * KEPT, len(strays))
         average_fits(pixels, adjacent(places), separate, fits, averages)
         fits = averages

@@ -28,9 +28,6 @@ from workflows.recovery.lobes.mixture import (
     without_derivatives,
 )
 
-FEW = 100
-"""Fits are averaged if there are fewer patterns. With the 128 of the preset `default`, 0.3 dB would cost twice the
-time, and RAW stills of a clear ball would lose 0.6 dB."""
 KEPT = 4
 """Fits that are averaged, at most: the likeliest."""
 

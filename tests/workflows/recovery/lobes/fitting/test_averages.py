@@ -25,7 +25,7 @@ def errors(scene, error, patterns, places, monkeypatch):
         return error(lobes.recover(measurements, photometry, patterns, noise, places=places).transport) ** 2
 
     of_averages = square()
-    monkeypatch.setattr(lobes, "FEW", 0)
+    monkeypatch.setattr(lobes, "adjacent", lambda places: np.full((len(places), 8), -1))
     return square(), of_averages
 
 
