@@ -84,8 +84,8 @@ def recover(
     options : LobesOptions
     conditions : Conditions
     places : (n, 2) int, optional
-        Rows and columns of the pixels in their frame. Fits then start from those of neighbours, unless there are only
-        few coloured patterns. Default: each pixel is recovered alone.
+        Rows and columns of the pixels in their frame. Fits then start from those of neighbours, and are averaged
+        with those of the pixels about them. Default: each pixel is recovered alone.
 
     Returns
     -------
