@@ -127,7 +127,8 @@ def spread_to(
 ) -> NDArray[np.float32]:
     """Write the nodes under k lobes, which are moved to the levels for this resolution; return their responses.
 
-    If `merged`, a node under several lobes is there only once.
+    If `merged`, a node under several lobes is there only once, and nodes of little weight are not. The moments of each
+    lobe are then not to be had from its nodes.
     """
     node, weight, end = buffers.node, buffers.weight, buffers.end
     n = spread_lobes(patterns.grids, mixture, k, resolution, node, weight, end)
@@ -135,7 +136,7 @@ def spread_to(
         n = merge_nodes(node, weight, end, k, buffers.seen)
     size = patterns.groups * (patterns.m + 2)
     A = buffers.rows[: n * size].reshape(n, size)
-    node_responses(patterns, buffers.node, n, A)
+    node_responses(patterns, node, n, A)
     return A
 
 
