@@ -69,7 +69,9 @@ def make_film(archive: Path, size: tuple[int, int], fps: int, megabits: float) -
         shown, filmed, part = Path(name, "shown.mp4"), Path(name, "film.mp4"), Path(name, "part.zip")
         write_video(fit_to_screen("default", size, bordered=True), shown, RATE, lambda done, of: None)
         with av.open(str(filmed), "w") as target:
-            stream = target.add_stream("libx264", rate=fps, options={"preset": "ultrafast"})
+            # A key frame each second, as in films of phones: a slab is decoded from the last one before it.
+            options = {"preset": "ultrafast", "g": str(fps)}
+            stream = target.add_stream("libx264", rate=fps, options=options)
             stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
             stream.bit_rate = round(megabits * 1e6)
             for number, picture in enumerate(seen(shown, fps)):

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from av.video.frame import VideoFrame
+from av.video.plane import VideoPlane
 from av.video.reformatter import ColorRange, Colorspace, Interpolation
 from numpy.typing import NDArray
 
@@ -92,12 +93,13 @@ def _planar(frame: VideoFrame) -> VideoFrame:
 def _planes(frame: VideoFrame) -> list[NDArray[Any]]:
     """The planes of a frame in a `PLANAR` format, each (rows, columns)."""
     kind: np.dtype[Any] = np.dtype("u1" if frame.format.components[0].bits == 8 else "<u2")
-    return [
-        np.frombuffer(memoryview(plane), kind).reshape(plane.height, plane.line_size // kind.itemsize)[
-            :, : plane.width
-        ]
-        for plane in frame.planes
-    ]
+    return [_values(plane, kind) for plane in frame.planes]
+
+
+def _values(plane: VideoPlane, kind: np.dtype[Any]) -> NDArray[Any]:
+    """The values of a plane, (rows, columns), in its own memory."""
+    rows = np.frombuffer(memoryview(plane), kind).reshape(plane.height, plane.line_size // kind.itemsize)
+    return rows[:, : plane.width]
 
 
 def _to_rgb(sums: Sequence[NDArray[Any]], like: VideoFrame) -> NDArray[np.uint16]:
@@ -117,10 +119,11 @@ def _to_rgb(sums: Sequence[NDArray[Any]], like: VideoFrame) -> NDArray[np.uint16
         zero, span, level = (128 * step, 224 * step, 32768) if at else (16 * step, 219 * step, 0)
         if full:
             zero, span = (128 * step if at else 0, 2.0**bits - 1)
-        scaled = (total / np.float32(TOTAL_WEIGHT) - np.float32(zero)) * np.float32(
-            65535 / span
-        ) + np.float32(level)
-        planes.append(np.rint(np.clip(scaled, 0, 65535)).astype("<u2"))
+        scale = 65535 / span
+        scaled = np.multiply(total, np.float32(scale / TOTAL_WEIGHT), dtype=np.float32)
+        scaled += np.float32(level - zero * scale)
+        # In place: new memory costs as much as the sums.
+        planes.append(np.rint(np.clip(scaled, 0, 65535, out=scaled), out=scaled).astype("<u2"))
     if not like.interlaced_frame or like.height % 4:
         return _convert(planes, like)
     # Each field has the colours of its own rows.
@@ -135,8 +138,6 @@ def _convert(planes: Sequence[NDArray[np.uint16]], like: VideoFrame) -> NDArray[
     mean = VideoFrame(like.width, len(planes[0]), PLANAR[like.format.name])
     mean.colorspace, mean.color_range = like.colorspace, ColorRange.JPEG
     for pixels, plane in zip(planes, mean.planes, strict=True):
-        rows = np.zeros((plane.height, plane.line_size // 2), "<u2")
-        rows[:, : plane.width] = pixels
-        plane.update(rows.tobytes())
+        _values(plane, np.dtype("<u2"))[:] = pixels
     rgb = mean.reformat(format="rgb48le", interpolation=ACCURATE)
     return np.asarray(rgb.to_ndarray(), np.uint16)
