@@ -33,7 +33,7 @@ RECORD: dict[str, Any] = {
             {"kind": "constant", "colours": [[0, 0, 0], [1, 0, 0.5]]},
             {"kind": "bernoulli", "columns": 4, "rows": 3, "count": 2, "seed": 1, "offset": True},
             {"kind": "bernoulli", "columns": 8, "rows": 3, "count": 1, "seed": 2, "colour": "rgb"},
-            {"kind": "stripes", "axis": "x", "count": 2},
+            {"kind": "stripes", "axis": "x", "count": 2, "colour": "rgb"},
             {"kind": "images", "files": ["a.png"]},
         ],
     },

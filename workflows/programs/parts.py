@@ -169,26 +169,41 @@ class Stripes(Record):
     count: Annotated[int, Field(ge=1, le=14, description="Number of patterns.", examples=[8])]
     first: Annotated[int, Field(ge=0, le=13)] = Field(
         default=0,
-        description="The Gray-code pattern to start with: larger numbers leave out the coarsest ones.",
+        description="The stripes to start with: larger numbers leave out the coarsest ones.",
     )
+    colour: Literal["grey", "rgb"] = Field(
+        default="grey",
+        description="`rgb` shows three stripes at once, one in each channel, red the coarsest.",
+    )
+
+    @property
+    def channels(self) -> int:
+        return 3 if self.colour == "rgb" else 1
+
+    @property
+    def finest(self) -> int:
+        """K: the finest pattern has 2**K stripes."""
+        return self.first + self.count * self.channels
 
     def grid(self, index: int) -> tuple[int, int]:
         """Columns and rows of the grid that pattern ``index`` of this part lies on."""
-        cells = 2 ** (self.first + index + 1)
+        cells = 2 ** (self.first + (index + 1) * self.channels)
         return (cells, 1) if self.axis == "x" else (1, cells)
 
     def values(self, index: int) -> NDArray[np.float32]:
-        """Pattern ``index`` of this part, (rows, columns, 1) float32; 1 is lit.
+        """Pattern ``index`` of this part, (rows, columns, 1 or 3) float32; 1 is lit.
 
         Notes
         -----
-        Of K = first + count patterns, those from ``first`` on are shown. Stripe s = position * 2**K // size along the
-        axis is lit in pattern i where bit K - 1 - i of s ^ (s >> 1) is set. That bit depends on the first i + 1 bits
-        of s alone, so pattern i lies on a grid of 2**(i + 1) cells.
+        Of the K stripes, those from ``first`` on are shown, three at a time in colour. Cell s = position * 2**K //
+        size along the axis is lit by stripes i where bit K - 1 - i of s ^ (s >> 1) is set. That bit depends on the
+        first i + 1 bits of s alone, so stripes i lie on a grid of 2**(i + 1) cells.
         """
         columns, rows = self.grid(index)
         s = np.arange(columns * rows)
-        return ((s ^ (s >> 1)) & 1).astype(np.float32).reshape(rows, columns, 1)
+        finer = np.arange(self.channels)[::-1]  # bits that the stripes of a channel do not depend on
+        bits = (s ^ (s >> 1))[:, np.newaxis] >> finer & 1
+        return bits.astype(np.float32).reshape(rows, columns, self.channels)
 
 
 class Halftone(Record):

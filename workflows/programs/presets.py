@@ -20,7 +20,7 @@ AGAIN = Constant(kind="constant", levels=(1, 0))
 AT_LAST = Constant(kind="constant", levels=(0, 1))
 """And at the end: white is last, because black follows in a film."""
 AT_ONCE = 4
-"""Stripes along one axis before those along the other: so few patterns tell the place along both, if coarsely."""
+"""Patterns of stripes along one axis before those along the other: so few tell the place along both, if coarsely."""
 EIGHT_LEVELS = Constant(kind="constant", levels=tuple(round(255 * i / 7) / 255 for i in range(8)))
 
 
@@ -35,7 +35,7 @@ class Recipe(NamedTuple):
     colour, offset
         As in `Bernoulli`.
     stripes : int
-        Gray-code stripes along each axis, a multiple of `AT_ONCE`.
+        Patterns of Gray-code stripes along each axis.
     calibrated : bool
         Whether the patterns that calibrate the camera are shown; if not, `EIGHT_LEVELS`, as in the paper.
     """
@@ -49,8 +49,8 @@ class Recipe(NamedTuple):
 
 RECIPES = {
     "default": Recipe({6: 10, 12: 20, 24: 26, 48: 22, 96: 14, 192: 12, 384: 8}, stripes=8),
-    "quick": Recipe({6: 6, 12: 10, 24: 10, 48: 9, 96: 7, 192: 5, 384: 2}, "rgb"),
-    "sketch": Recipe({6: 4, 12: 6, 24: 5, 48: 4, 96: 3, 192: 3}, "rgb"),
+    "quick": Recipe({6: 5, 12: 8, 24: 9, 48: 8, 96: 6, 192: 5, 384: 2}, "rgb", stripes=3),
+    "sketch": Recipe({6: 3, 12: 4, 24: 4, 48: 3, 96: 3, 192: 2}, "rgb", stripes=3),
     "paper-250": Recipe({12: 24, 96: 250}, offset=False, calibrated=False),
     "paper-400": Recipe({12: 24, 96: 400}, offset=False, calibrated=False),
 }
@@ -110,12 +110,22 @@ def preset(name: str, width: int = 1280, height: int = 960, *, filmed: bool = Fa
         counts[grid] += count
     stripes = []
     axes: tuple[tuple[Literal["x", "y"], int], ...] = (("x", width), ("y", height))
+    channels = 3 if recipe.colour == "rgb" else 1
     for first in range(0, recipe.stripes, AT_ONCE):
         for axis, size in axes:
-            fitting = max(min(AT_ONCE, size.bit_length() - 1 - first), 0)
+            wanted = min(AT_ONCE, recipe.stripes - first)
+            fitting = max(min(wanted, (size.bit_length() - 1) // channels - first), 0)
             if fitting:
-                stripes.append(Stripes(kind="stripes", axis=axis, count=fitting, first=first))
-            counts[grid] += AT_ONCE - fitting
+                stripes.append(
+                    Stripes(
+                        kind="stripes",
+                        axis=axis,
+                        count=fitting,
+                        first=first * channels,
+                        colour=recipe.colour,
+                    )
+                )
+            counts[grid] += wanted - fitting
     grids = [
         Bernoulli(
             kind="bernoulli",

@@ -61,10 +61,10 @@ class Program(Record):
             if isinstance(part, Stripes):
                 size = self.monitor.width if part.axis == "x" else self.monitor.height
                 most = size.bit_length() - 1
-                if part.first + part.count > most:
+                if part.finest > most:
                     raise ValueError(
-                        f"{2 ** (part.first + part.count)} stripes are finer than the monitor's {size} pixels along "
-                        f"{part.axis}: first and count may add up to {most}"
+                        f"{2**part.finest} stripes are finer than the monitor's {size} pixels along {part.axis}: "
+                        f"first and {'count' if part.channels == 1 else 'three times count'} may add up to {most}"
                     )
         constants = [part.values for part in self.parts if isinstance(part, Constant)]
         if not constants or np.any(np.ptp(np.concatenate(constants), axis=0) == 0):
@@ -301,7 +301,7 @@ class Program(Record):
             if isinstance(part, Bernoulli):
                 shapes += [Shape(part.columns, part.rows, part.channels, part.offset)] * part.count
             elif isinstance(part, Stripes):
-                shapes += [Shape(*part.grid(i), 1) for i in range(part.count)]
+                shapes += [Shape(*part.grid(i), part.channels) for i in range(part.count)]
             elif isinstance(part, Images):
                 sizes = [next(given).shape for _ in part.files]
                 shapes += [Shape(columns, rows, channels) for rows, columns, channels in sizes]

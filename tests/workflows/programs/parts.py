@@ -28,8 +28,8 @@ def grid(
     }
 
 
-def stripes(axis: str, count: int, first: int = 0) -> dict[str, Any]:
-    return {"kind": "stripes", "axis": axis, "count": count, "first": first}
+def stripes(axis: str, count: int, first: int = 0, colour: str = "grey") -> dict[str, Any]:
+    return {"kind": "stripes", "axis": axis, "count": count, "first": first, "colour": colour}
 
 
 def shown(values: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:

@@ -158,6 +158,16 @@ def test_stripes_join_the_levels_that_hold_them() -> None:
         np.testing.assert_allclose(fine.light[0, :, n], cells, atol=1e-6)
 
 
+def test_coloured_stripes_are_on_the_grid_of_their_finest() -> None:
+    made = program(grid(4, 4, 1), stripes("x", 1, 0, "rgb"), grid(8, 8, 1, colour="rgb"))
+    coarse, fine = made.sensing("linear").levels
+    assert (coarse.patterns.tolist(), fine.patterns.tolist()) == ([0], [0, 1, 2])
+    stripe = list(made.pictures(2, made.count))[1]
+    for channel in range(3):
+        cells = stripe[..., channel].reshape(8, 9, 8, 12).mean(axis=(1, 3)).ravel()
+        np.testing.assert_array_equal(fine.light[channel, :, 1], cells)
+
+
 def test_stripes_alone_make_levels_that_hold_both_axes() -> None:
     made = program(stripes("x", 5), stripes("y", 2, first=2))
     levels = made.sensing("linear").levels

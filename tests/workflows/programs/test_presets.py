@@ -7,7 +7,7 @@ import pytest
 
 from storage.errors import OptionError
 from workflows.programs.presets import FILMED, RECIPES, preset
-from workflows.programs.program import Bernoulli
+from workflows.programs.program import Bernoulli, Stripes
 
 COUNTS = {"default": 140, "quick": 61, "sketch": 37, "paper-250": 282, "paper-400": 432}
 MONITORS = [
@@ -63,7 +63,16 @@ def test_the_grids_are_those_of_the_recipes() -> None:
         parts = grids(name, 1280, 960)
         assert [(part.columns, part.rows) for part in parts] == every[:bands]
         assert all(part.offset for part in parts)
-        assert {part.colour for part in parts} == {"grey" if name == "default" else "rgb"}
+        colour, stripes = ("grey", 8) if name == "default" else ("rgb", 9)
+        assert {part.colour for part in parts} == {colour}
+        for axis in ("x", "y"):
+            shown = [
+                (part.first + n * part.channels, part.colour)
+                for part in preset(name).parts
+                if isinstance(part, Stripes) and part.axis == axis
+                for n in range(part.count)
+            ]
+            assert shown == [(first, colour) for first in range(0, stripes, 3 if colour == "rgb" else 1)]
     for name, fine in (("paper-250", 250), ("paper-400", 400)):
         parts = grids(name, 1280, 960)
         assert [(part.columns, part.rows, part.count) for part in parts] == [(16, 12, 24), (128, 96, fine)]
@@ -75,7 +84,7 @@ def test_films_show_as_many_patterns_in_black_and_white(name: str) -> None:
     for size in MONITORS:
         assert preset(name, *size, filmed=True).count == COUNTS[name]
     made = preset(name, filmed=True)
-    assert {part.colour for part in made.parts if isinstance(part, Bernoulli)} == {"grey"}
+    assert {part.colour for part in made.parts if isinstance(part, Bernoulli | Stripes)} == {"grey"}
     assert (made == preset(name)) == (name not in FILMED)
 
 

@@ -102,6 +102,10 @@ def test_patterns_are_numbered_through_the_parts() -> None:
             [{"kind": "constant", "levels": [0, 1]}, stripes("y", 3, 4)],
             "finer than the monitor's 72 .* up to 6",
         ),
+        (
+            [{"kind": "constant", "levels": [0, 1]}, stripes("x", 2, 1, "rgb")],
+            "finer than the monitor's 96 .* first and three times count may add up to 6",
+        ),
         ([{"kind": "constant", "levels": [0, 1]}, {"kind": "images", "files": []}], "at least 1 item"),
         ([{"kind": "constant", "levels": [0, 1]}, *[grid(1, 1)] * 1000], "at most 1000 items"),
         ([{"kind": "constant", "levels": [0] * 100_001}, grid(4, 3)], "at most 100000 items"),
