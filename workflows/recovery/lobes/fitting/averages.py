@@ -2,8 +2,8 @@
 
 Several sets of lobes explain the measurements of a pixel about as well, the more so the fewer patterns there are, and
 the best of them has fitted their noise too. Bayesian model averaging (Hoeting et al., Statistical Science, 1999) takes
-the mean of T over all of them, each with its share of the likelihood. The fits of the pixels about it are such sets,
-found from other measurements.
+the mean of T over all of them, each with its share of the likelihood. The fits of the pixels about it, and of its other
+channels, are such sets, found from other measurements.
 """
 
 import numpy as np
@@ -11,6 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from workflows.recovery.lobes.fitting.fits import (
+    ALL,
     Fits,
     Pixels,
     fit_of,
@@ -33,7 +34,7 @@ KEPT = 4
 
 # Rows and columns from a pixel to the eight about it.
 _OFFSETS = np.array([(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1) if down or right])
-# Another pixel's fit may leave -2 ln likelihood higher by this for each parameter: its own noise is not fitted.
+# Another fit may leave -2 ln likelihood higher by this for each parameter: its own noise is not fitted.
 _ALLOWED = 5.0
 # The likelihood is raised to one over this, since errors of the model are not independent as those of noise are.
 _TEMPERATURE = 30.0
@@ -70,18 +71,29 @@ def adjacent(places: NDArray[np.integer]) -> NDArray[np.int64]:
 
 
 @njit(nogil=True, cache=True)
-def _slope(fits: Fits, p: int, c: int, near: NDArray[np.int64], axis: int) -> tuple[float, float]:
-    """How far the heaviest lobe moves to the next pixel along rows (0) or columns (1): the medians of x and y.
+def _centre(fits: Fits, p: int, c: int) -> NDArray[np.float64]:
+    """The centre x, y of the heaviest lobe of fit c of a pixel."""
+    return fits.lobes[p, c, np.argmax(fits.lobes[p, c, : fits.k[p, c], 0]), 1:3]
 
-    A median, since some of the pixels may have another heaviest lobe.
-    """
+
+@njit(nogil=True, cache=True)
+def _median(moved: NDArray[np.float64]) -> tuple[float, float]:
+    """The medians of x and y, (2, n), 0 if there are none: some of the pixels may have another heaviest lobe."""
+    x, y = 0.0, 0.0
+    if moved.shape[1] > 0:
+        x, y = float(np.median(moved[0])), float(np.median(moved[1]))
+    return x, y
+
+
+@njit(nogil=True, cache=True)
+def _slope(fits: Fits, p: int, c: int, near: NDArray[np.int64], axis: int) -> tuple[float, float]:
+    """How far the heaviest lobe moves to the next pixel along rows (0) or columns (1), x and y."""
     centre = np.full((3, 3, 2), np.nan)
     for e in range(-1, near.size):
         q = p if e < 0 else near[e]
         if q >= 0 and fits.k[q, c] > 0:
             row, column = (1, 1) if e < 0 else (1 + _OFFSETS[e, 0], 1 + _OFFSETS[e, 1])
-            heaviest = np.argmax(fits.lobes[q, c, : fits.k[q, c], 0])
-            centre[row, column] = fits.lobes[q, c, heaviest, 1:3]
+            centre[row, column] = _centre(fits, q, c)
     moved, n = np.empty((2, 6)), 0
     for i in range(3):
         for j in range(2):
@@ -89,9 +101,21 @@ def _slope(fits: Fits, p: int, c: int, near: NDArray[np.int64], axis: int) -> tu
             if not np.isnan(by[0]):
                 moved[:, n] = by
                 n += 1
-    if n == 0:
-        return 0.0, 0.0
-    return float(np.median(moved[0, :n])), float(np.median(moved[1, :n]))
+    x, y = _median(moved[:, :n])
+    return x, y
+
+
+@njit(nogil=True, cache=True)
+def _dispersion(fits: Fits, p: int, c: int, other: int, near: NDArray[np.int64]) -> tuple[float, float]:
+    """How far the heaviest lobe of channel c lies from that of another channel, x and y."""
+    moved, n = np.empty((2, near.size + 1)), 0
+    for e in range(-1, near.size):
+        q = p if e < 0 else near[e]
+        if q >= 0 and fits.k[q, c] > 0 and fits.k[q, other] > 0:
+            moved[:, n] = _centre(fits, q, c) - _centre(fits, q, other)
+            n += 1
+    x, y = _median(moved[:, :n])
+    return x, y
 
 
 @njit(nogil=True, cache=True)
@@ -107,22 +131,29 @@ def _average(
     """Write the average for fit c of a pixel."""
     patterns, y, variance = measurements_of(pixels, p, c)
     (x_down, y_down), (x_right, y_right) = _slope(fits, p, c, near, 0), _slope(fits, p, c, near, 1)
-    most, n = fits.level.shape[2], near.size + 1
+    about = near.size + 1  # with the pixel itself
+    most, n = fits.level.shape[2], about if c == ALL else about + 2
     count, objective = np.zeros(n, np.int64), np.full(n, np.inf)
     lobes, level = np.empty((n, most, PARAMETERS)), np.empty((n, most), np.int64)
     f, precision = np.empty_like(y), np.empty_like(y)
     response = np.empty((most, 1, y.size), np.float32)
     for e in range(n):
-        q = p if e == 0 else near[e - 1]
-        if q < 0 or fits.k[q, c] == 0:
+        q = near[e - 1] if 0 < e < about else p
+        d = c if e < about else (c + 1 + e - about) % 3
+        if q < 0 or fits.k[q, d] == 0:
             continue
-        k = fits.k[q, c]
+        k = fits.k[q, d]
         tried = Mixture(lobes[e], level[e], fits.stray[p, c])
-        copy_mixture(k, np.int64(0), fit_of(fits, q, c), tried)
-        if e > 0:
+        copy_mixture(k, np.int64(0), fit_of(fits, q, d), tried)
+        if e >= about:
+            across, along = _dispersion(fits, p, c, d, near)
+        elif e > 0:
             down, right = _OFFSETS[e - 1]
-            lobes[e, :k, 1] -= down * x_down + right * x_right
-            lobes[e, :k, 2] -= down * y_down + right * y_right
+            across, along = -down * x_down - right * x_right, -down * y_down - right * y_right
+        else:
+            across, along = 0.0, 0.0
+        lobes[e, :k, 1] += across
+        lobes[e, :k, 2] += along
         predict(patterns, tried, k, without_derivatives(workspace), response, f)
         _, explained = weigh(y, f, variance, patterns.groups, PARAMETERS * k, precision)
         allowed = _ALLOWED * PARAMETERS * k if e > 0 else 0.0
@@ -151,7 +182,7 @@ def average_fits(
     fits: Fits,
     averages: Fits,
 ) -> None:
-    """Average the fits of n pixels that T is made of with those of the pixels about them.
+    """Average the fits of n pixels that T is made of with those of the pixels about them, and of their other channels.
 
     Parameters
     ----------

@@ -60,3 +60,24 @@ def test_shares_of_an_average_sum_to_one(scene, patterns, places):
     found = lobes.recover(measurements, photometry, patterns, noise, places=places)
     ones = np.ones((patterns.pyramid.nodes, 3), np.float32)
     np.testing.assert_allclose(found.transport.apply(ones), 1, atol=2e-3)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_channels_of_dispersing_glass_tell_more_together(patterns_of, gaussian, observe, channels):
+    patterns = patterns_of([(8, 6, 8), (16, 12, 8), (COLUMNS, ROWS, 8)], 1, channels)
+    rng = np.random.default_rng(5)
+    pixels = []
+    for x, y, angle in rng.uniform((12, 10, 0), (52, 38, 3), (60, 3)):
+        each = [gaussian(COLUMNS, ROWS, x + 2 * c, y + c, 3, 1.5, angle)[:, 0] for c in (-1, 0, 1)]
+        pixels.append(np.stack(each, axis=1))
+    T = np.concatenate(pixels)
+    measurements, photometry, noise = observe(patterns, T)
+    light = rng.random((ROWS, COLUMNS, 3), np.float32)
+    expected = np.einsum("nci,ic->nc", T, light.reshape(-1, 3))
+
+    def error(places):
+        found = lobes.recover(measurements, photometry, patterns, noise, places=places).transport
+        return np.mean((found.apply(patterns.pyramid.light(light)) - expected) ** 2)
+
+    far_apart = 1000 * np.stack([np.arange(len(T)), np.zeros(len(T), int)], axis=1)
+    assert error(far_apart) < 0.9 * error(None)
