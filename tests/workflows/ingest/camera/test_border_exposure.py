@@ -113,12 +113,13 @@ def test_without_a_border_in_the_picture_nothing_is_said() -> None:
 
 
 def test_white_is_the_unit_of_a_camera_that_was_not_locked() -> None:
-    """Patterns 0, 23 and 36 of the program are white."""
+    numbers, sent = PROGRAM.constants
+    first, middle, last = numbers[(sent == 1).all(axis=1)]
     exposures = np.full(PROGRAM.count, 1.5)
-    exposures[[0, 23, 36]] = 0.6, 0.5, 0.5
+    exposures[[first, middle, last]] = 0.6, 0.5, 0.5
     found = relative_to_white(exposures, range(PROGRAM.count), PROGRAM)
-    np.testing.assert_allclose(found[[0, 1, 23]], [1.2, 3, 1])
-    assert shortest_white(exposures, range(PROGRAM.count), PROGRAM) == 23
-    assert shortest_white(exposures[1:23], range(1, 23), PROGRAM) is None
-    without = relative_to_white(exposures[1:23], range(1, 23), PROGRAM)
-    np.testing.assert_array_equal(without, exposures[1:23])
+    np.testing.assert_allclose(found[[first, 1, middle]], [1.2, 3, 1])
+    assert shortest_white(exposures, range(PROGRAM.count), PROGRAM) == middle
+    some = range(first + 1, middle)
+    assert shortest_white(exposures[some], some, PROGRAM) is None
+    np.testing.assert_array_equal(relative_to_white(exposures[some], some, PROGRAM), exposures[some])

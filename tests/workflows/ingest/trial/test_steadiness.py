@@ -242,10 +242,11 @@ def test_too_small_a_frame_tells_nothing(ingest: Ingest) -> None:
 
 @pytest.mark.parametrize(("shortest", "unit"), [(1.0, 0.85), (1.9, 1.0)])
 def test_gains_are_in_units_of_the_white_that_a_free_exposure_is(shortest: float, unit: float) -> None:
-    """Patterns 0, 23 and 36 of the program are white."""
     shown = preset("sketch", 320, 240)
+    numbers, sent = shown.constants
+    white = numbers[(sent == 1).all(axis=1)]
     exposures, gains = np.full(shown.count, 2.0), np.ones(shown.count)
-    exposures[23], gains[[0, 23, 36]] = shortest, (0.6, 0.85, 0.6)
+    exposures[white[1]], gains[white] = shortest, (0.6, 0.85, 0.6)
     attributes = {"auto_exposure": exposures.tolist(), "patterns": list(range(shown.count))}
     assert unit_of(gains, attributes, shown) == unit
     assert unit_of(gains, attributes | {"auto_exposure": None}, shown) == 1
