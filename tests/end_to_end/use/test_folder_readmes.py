@@ -98,8 +98,9 @@ def test_matte_is_exported_imported_and_read(service: Service, matte: str, tmp_p
     backdrop = glass_ball.backdrop(160, 120)
     np.save(tmp_path / "light.npy", area_mean(backdrop, stored.columns, stored.rows))
     python(compositing, tmp_path)
+    # The service rounds the weights of a row to 16 bits of its largest, and their errors add up.
     np.testing.assert_allclose(
-        np.load(tmp_path / "composite.npy"), composite(stored, backdrop)[..., :3], atol=1e-5
+        np.load(tmp_path / "composite.npy"), composite(stored, backdrop)[..., :3], atol=2e-5
     )
 
 
