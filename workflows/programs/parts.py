@@ -18,6 +18,10 @@ MAX_PATTERNS = 100_000
 DOT = 2
 """Side in pixels of the dots of half-tones. Smaller ones suffer more from a page that is not shown at 100 %."""
 
+Colour = Literal["grey", "rgb"]
+CHANNELS: dict[Colour, int] = {"grey": 1, "rgb": 3}
+"""Pictures that a pattern shows at once, one in each channel."""
+
 Unit = Annotated[float, Field(ge=0, le=1)]
 Quarter = Annotated[float, Field(gt=0, lt=1, multiple_of=0.25)]
 
@@ -98,7 +102,7 @@ class Bernoulli(Record):
             examples=[7],
         ),
     ]
-    colour: Literal["grey", "rgb"] = Field(
+    colour: Colour = Field(
         default="grey", description="`rgb` shows three independent grids at once, one in each channel."
     )
     offset: bool = Field(
@@ -109,7 +113,7 @@ class Bernoulli(Record):
 
     @property
     def channels(self) -> int:
-        return 3 if self.colour == "rgb" else 1
+        return CHANNELS[self.colour]
 
     @property
     def bits(self) -> NDArray[np.uint8]:
@@ -171,14 +175,14 @@ class Stripes(Record):
         default=0,
         description="The stripes to start with: larger numbers leave out the coarsest ones.",
     )
-    colour: Literal["grey", "rgb"] = Field(
+    colour: Colour = Field(
         default="grey",
         description="`rgb` shows three stripes at once, one in each channel, red the coarsest.",
     )
 
     @property
     def channels(self) -> int:
-        return 3 if self.colour == "rgb" else 1
+        return CHANNELS[self.colour]
 
     @property
     def finest(self) -> int:

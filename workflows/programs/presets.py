@@ -3,7 +3,7 @@
 from typing import Literal, NamedTuple
 
 from storage.errors import OptionError
-from workflows.programs.parts import MAX_BLOCKS, Part
+from workflows.programs.parts import CHANNELS, MAX_BLOCKS, Colour, Part
 from workflows.programs.program import Bernoulli, Constant, Halftone, Monitor, Program, Stripes
 
 SEED = 7
@@ -41,7 +41,7 @@ class Recipe(NamedTuple):
     """
 
     grids: dict[int, int]
-    colour: Literal["grey", "rgb"] = "grey"
+    colour: Colour = "grey"
     offset: bool = True
     stripes: int = 0
     calibrated: bool = True
@@ -110,7 +110,7 @@ def preset(name: str, width: int = 1280, height: int = 960, *, filmed: bool = Fa
         counts[grid] += count
     stripes = []
     axes: tuple[tuple[Literal["x", "y"], int], ...] = (("x", width), ("y", height))
-    channels = 3 if recipe.colour == "rgb" else 1
+    channels = CHANNELS[recipe.colour]
     for first in range(0, recipe.stripes, AT_ONCE):
         for axis, size in axes:
             wanted = min(AT_ONCE, recipe.stripes - first)

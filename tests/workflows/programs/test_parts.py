@@ -111,6 +111,18 @@ def test_stripes_may_start_from_a_finer_one() -> None:
     assert Stripes.model_validate(stripes("y", 2, first=3)).values(1).shape == (32, 1, 1)
 
 
+@pytest.mark.parametrize(("count", "first"), [(2, 0), (1, 2)])
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_coloured_stripes_are_three_at_once_with_the_coarsest_in_red(
+    axis: str, count: int, first: int
+) -> None:
+    grey = list(program(stripes(axis, 6)).pictures(2, 8))
+    coloured = list(program(stripes(axis, count, first, "rgb")).pictures(2, 2 + count))
+    for n, picture in enumerate(coloured):
+        at = first + 3 * n
+        np.testing.assert_array_equal(picture, np.concatenate(grey[at : at + 3], axis=2))
+
+
 @pytest.mark.parametrize("level", [0.25, 0.5, 0.75])
 def test_half_tones_are_dots_of_two_pixels(level: float) -> None:
     part = Halftone(kind="halftone", levels=(level,))
@@ -125,15 +137,3 @@ def test_half_tones_are_dots_of_two_pixels(level: float) -> None:
 def test_half_tones_of_other_levels_are_refused() -> None:
     with pytest.raises(ValidationError, match="multiple of"):
         Halftone.model_validate({"kind": "halftone", "levels": [0.3]})
-
-
-@pytest.mark.parametrize(("count", "first"), [(2, 0), (1, 2)])
-@pytest.mark.parametrize("axis", ["x", "y"])
-def test_coloured_stripes_are_three_at_once_with_the_coarsest_in_red(
-    axis: str, count: int, first: int
-) -> None:
-    grey = list(program(stripes(axis, 6)).pictures(2, 8))
-    coloured = list(program(stripes(axis, count, first, "rgb")).pictures(2, 2 + count))
-    for n, picture in enumerate(coloured):
-        at = first + 3 * n
-        np.testing.assert_array_equal(picture, np.concatenate(grey[at : at + 3], axis=2))
