@@ -16,6 +16,7 @@ import shlex
 import sqlite3
 from contextlib import redirect_stdout
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -27,22 +28,53 @@ from services.client import Client, ServiceError
 from tests.benchmarks.recovery.kits import load, parser_of, served, show
 from workflows.images import float_formats, integer_formats
 from workflows.programs.files import write_folder
-from workflows.programs.presets import preset
+from workflows.programs.presets import BLACK, BLUE, GREEN, RED, SEED, WHITE, preset
+from workflows.programs.program import Bernoulli, Constant, Monitor, Program, Stripes
 
 
 class Case(NamedTuple):
-    """A program, a preset's or the kit's bands, and the options of recovery."""
+    """A program, or the kit's bands, and the options of recovery."""
 
-    program: str
+    program: Program | str
     options: dict[str, Any]
+
+
+def few(constant: tuple[tuple[float, float, float], ...], grids: dict[int, int]) -> Program:
+    """These constant colours, stripes and grids in colour, for linear cameras; `grids` is as in a `Recipe`."""
+    patterns = [
+        Bernoulli(
+            kind="bernoulli",
+            columns=blocks * 4 // 3,
+            rows=blocks,
+            count=count,
+            seed=SEED + i,
+            colour="rgb",
+            offset=True,
+        )
+        for i, (blocks, count) in enumerate(grids.items())
+    ]
+    return Program(
+        monitor=Monitor(width=1280, height=960, response="linear"),
+        parts=(
+            Constant(kind="constant", colours=constant),
+            Stripes(kind="stripes", axis="x", count=3, colour="rgb"),
+            Stripes(kind="stripes", axis="y", count=3, colour="rgb"),
+            *patterns,
+        ),
+    )
 
 
 NESTED = "16x12:24,32x24:20,64x48:20,128x96:20,256x192:20,512x384:20"
 CASES = {
-    "default": Case("default", {}),
-    "fast": Case("default", {"quality": "fast"}),
-    "quick": Case("quick", {}),
-    "sketch": Case("sketch", {}),
+    "default": Case(preset("default"), {}),
+    "fast": Case(preset("default"), {"quality": "fast"}),
+    "quick": Case(preset("quick"), {}),
+    "sketch": Case(preset("sketch"), {}),
+    "32-frames": Case(
+        few((WHITE, RED, GREEN, BLUE, BLACK), {6: 2, 12: 3, 24: 4, 48: 3, 96: 3, 192: 3, 384: 3}), {}
+    ),
+    "32-frames-alike": Case(few((WHITE, BLACK), {6: 3, 12: 5, 24: 4, 48: 4, 96: 4, 192: 2, 384: 2}), {}),
+    "16-frames-alike": Case(few((WHITE, BLACK), {12: 2, 24: 2, 48: 2, 96: 1, 192: 1}), {}),
     "nested": Case(NESTED, {}),
     "nn-dgsr": Case("16x12:24,128x96:250", {"method": "nn-dgsr"}),
 }
@@ -53,14 +85,13 @@ def measure(
 ) -> dict[str, Any]:
     """Film, upload, recover, composite, score."""
     capture_archive = folder / "capture.zip"
-    if ":" in case.program:
-        program = ["--bands", case.program]
-    else:
-        patterns = folder / case.program
-        if not patterns.exists():
-            write_folder(preset(case.program), patterns, lambda *_: None)
-        program = ["--program", str(patterns)]
-    with redirect_stdout(None):
+    with TemporaryDirectory(dir=folder) as made, redirect_stdout(None):
+        if isinstance(case.program, str):
+            program = ["--bands", case.program]
+        else:
+            patterns = Path(made) / "patterns"
+            write_folder(case.program, patterns, lambda *_: None)
+            program = ["--program", str(patterns)]
         kit.main(["capture", str(scene), str(capture_archive), *program, "--mask", *film])
     uploaded = client.upload(capture_archive, name=scene.stem)
     job = client.wait(client.recover(uploaded["id"], **case.options)["id"])
