@@ -83,23 +83,49 @@ def preset(name: str, width: int = 1280, height: int = 960, *, filmed: bool = Fa
     ------
     OptionError
         If there is no such preset, or the monitor has fewer pixels than the coarsest grid has blocks.
+    """
+    if name not in RECIPES:
+        raise OptionError(f"there is no preset {name!r}: choose from {', '.join(RECIPES)}", field="preset")
+    recipe = FILMED.get(name, RECIPES[name]) if filmed else RECIPES[name]
+    coarsest = min(recipe.grids)
+    if min(width, height) < coarsest:
+        raise OptionError(
+            f"a monitor of {width} x {height} pixels is too small for the preset {name!r}: it needs {coarsest} "
+            "pixels along the shorter side",
+            field="monitor",
+        )
+    stripes, grids = stripes_and_grids(recipe, width, height)
+    patterns: tuple[Part, ...] = (*stripes, *grids)
+    # Stripes come before: with them, half of the patterns have been shown after one grid less.
+    middle = len(stripes) + (len(grids) - 1 if stripes else len(grids) + 1) // 2
+    parts: tuple[Part, ...] = (EIGHT_LEVELS, *patterns)
+    if recipe.calibrated:
+        parts = (AT_FIRST, HALFTONES, *patterns[:middle], AGAIN, *patterns[middle:], AT_LAST)
+    return Program(monitor=Monitor(width=width, height=height, response="unknown"), parts=parts)
+
+
+def stripes_and_grids(recipe: Recipe, width: int, height: int) -> tuple[list[Stripes], list[Bernoulli]]:
+    """The patterns of a recipe that tell T, without those that calibrate the camera.
+
+    Parameters
+    ----------
+    recipe : Recipe
+    width, height : int
+        Size of the monitor in pixels, the shorter side at least the number of blocks of the coarsest grid.
+
+    Returns
+    -------
+    stripes : list of Stripes
+    grids : list of Bernoulli
+        From coarse to fine.
 
     Notes
     -----
     The blocks of the coarsest grid are as square as whole numbers of them allow; finer grids split them. Grids finer
     than the pixels give their patterns to the finest grid that is not, and so do stripes finer than the pixels.
     """
-    if name not in RECIPES:
-        raise OptionError(f"there is no preset {name!r}: choose from {', '.join(RECIPES)}", field="preset")
-    recipe = FILMED.get(name, RECIPES[name]) if filmed else RECIPES[name]
     coarsest = min(recipe.grids)
     short, long = sorted((width, height))
-    if short < coarsest:
-        raise OptionError(
-            f"a monitor of {width} x {height} pixels is too small for the preset {name!r}: it needs {coarsest} "
-            "pixels along the shorter side",
-            field="monitor",
-        )
     along = min(round(coarsest * long / short), MAX_BLOCKS)
     counts: dict[tuple[int, int], int] = {}
     for blocks, count in recipe.grids.items():
@@ -138,10 +164,4 @@ def preset(name: str, width: int = 1280, height: int = 960, *, filmed: bool = Fa
         )
         for i, ((columns, rows), count) in enumerate(counts.items())
     ]
-    patterns: tuple[Part, ...] = (*stripes, *grids)
-    # Stripes come before: with them, half of the patterns have been shown after one grid less.
-    middle = len(stripes) + (len(grids) - 1 if stripes else len(grids) + 1) // 2
-    parts: tuple[Part, ...] = (EIGHT_LEVELS, *patterns)
-    if recipe.calibrated:
-        parts = (AT_FIRST, HALFTONES, *patterns[:middle], AGAIN, *patterns[middle:], AT_LAST)
-    return Program(monitor=Monitor(width=width, height=height, response="unknown"), parts=parts)
+    return stripes, grids

@@ -16,7 +16,6 @@ import shlex
 import sqlite3
 from contextlib import redirect_stdout
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -28,8 +27,8 @@ from services.client import Client, ServiceError
 from tests.benchmarks.recovery.kits import load, parser_of, served, show
 from workflows.images import float_formats, integer_formats
 from workflows.programs.files import write_folder
-from workflows.programs.presets import BLACK, BLUE, GREEN, RED, SEED, WHITE, preset
-from workflows.programs.program import Bernoulli, Constant, Monitor, Program, Stripes
+from workflows.programs.presets import BLACK, BLUE, GREEN, RED, WHITE, Recipe, preset, stripes_and_grids
+from workflows.programs.program import Constant, Monitor, Program
 
 
 class Case(NamedTuple):
@@ -41,26 +40,10 @@ class Case(NamedTuple):
 
 def few(constant: tuple[tuple[float, float, float], ...], grids: dict[int, int]) -> Program:
     """These constant colours, stripes and grids in colour, for linear cameras; `grids` is as in a `Recipe`."""
-    patterns = [
-        Bernoulli(
-            kind="bernoulli",
-            columns=blocks * 4 // 3,
-            rows=blocks,
-            count=count,
-            seed=SEED + i,
-            colour="rgb",
-            offset=True,
-        )
-        for i, (blocks, count) in enumerate(grids.items())
-    ]
+    stripes, random = stripes_and_grids(Recipe(grids, "rgb", stripes=3), 1280, 960)
     return Program(
         monitor=Monitor(width=1280, height=960, response="linear"),
-        parts=(
-            Constant(kind="constant", colours=constant),
-            Stripes(kind="stripes", axis="x", count=3, colour="rgb"),
-            Stripes(kind="stripes", axis="y", count=3, colour="rgb"),
-            *patterns,
-        ),
+        parts=(Constant(kind="constant", colours=constant), *stripes, *random),
     )
 
 
@@ -81,17 +64,19 @@ CASES = {
 
 
 def measure(
-    kit: ModuleType, scene: Path, case: Case, film: list[str], client: Client, folder: Path
+    kit: ModuleType, scene: Path, name: str, film: list[str], client: Client, folder: Path
 ) -> dict[str, Any]:
-    """Film, upload, recover, composite, score."""
+    """Film, upload, recover, composite, score a case."""
+    case = CASES[name]
     capture_archive = folder / "capture.zip"
-    with TemporaryDirectory(dir=folder) as made, redirect_stdout(None):
-        if isinstance(case.program, str):
-            program = ["--bands", case.program]
-        else:
-            patterns = Path(made) / "patterns"
+    if isinstance(case.program, str):
+        program = ["--bands", case.program]
+    else:
+        patterns = folder / name
+        if not patterns.exists():
             write_folder(case.program, patterns, lambda *_: None)
-            program = ["--program", str(patterns)]
+        program = ["--program", str(patterns)]
+    with redirect_stdout(None):
         kit.main(["capture", str(scene), str(capture_archive), *program, "--mask", *film])
     uploaded = client.upload(capture_archive, name=scene.stem)
     job = client.wait(client.recover(uploaded["id"], **case.options)["id"])
@@ -100,12 +85,12 @@ def measure(
     truth = kit.Scene.load(scene)
     crosstalk = float(film[film.index("--crosstalk") + 1]) if "--crosstalk" in film else 0.0
     scores, squares, held = {}, [], []
-    for name, backdrop in kit.backdrops().items():
+    for shown, backdrop in kit.backdrops().items():
         # 16 bits, so that the matte is scored and not the rounding of the response.
         sent = integer_formats.to_integers(backdrop, np.dtype(np.uint16))
         answer = client.composite(job["matte"], integer_formats.encode_png(sent), transfer="linear")
         pixels = integer_formats.to_unit(integer_formats.decode(answer, memory=1 << 28))
-        scores[name] = kit.score(truth, integer_formats.to_unit(sent), pixels[..., :3], crosstalk=crosstalk)
+        scores[shown] = kit.score(truth, integer_formats.to_unit(sent), pixels[..., :3], crosstalk=crosstalk)
         mix = (1 - 3 * crosstalk) * np.eye(3) + crosstalk
         true = 0.02 + 0.9 * truth.composite(integer_formats.to_unit(sent)) @ mix
         error = (pixels[..., :3] - true)[truth.object_pixels]
@@ -117,10 +102,11 @@ def measure(
     )[truth.object_pixels, 0]
     worst = -(len(error) // -20)
     return {
+        "case": name,
         "scene": scene.stem,
         "frames": uploaded["frames"],
         "pixels": job["pixels"],
-        **{name: round(score, 2) for name, score in scores.items()},
+        **{shown: round(score, 2) for shown, score in scores.items()},
         "mean": round(sum(scores.values()) / len(scores), 2),
         "worst_5_hold": share(error, doubt, worst),
         "at_best": share(error, error, worst),
@@ -168,8 +154,7 @@ def main() -> None:
         for case in args.case or CASES:
             found = []
             for scene in sorted(args.scenes.glob("*.npz")):
-                row = measure(kit, scene, CASES[case], shlex.split(args.film), client, folder)
-                found.append({"case": case, **row})
+                found.append(measure(kit, scene, case, shlex.split(args.film), client, folder))
                 if not rows and len(found) == 1:
                     print("  ".join(f"{name:>8}" for name in found[0]))
                 show(found[-1])
