@@ -43,6 +43,8 @@ class PatternCodes(NamedTuple):
     strays : (s, m + 2) float32
         Light that does not come from the patterns, as it would be measured: first a constant, 1, then what else changes
         from frame to frame, as the border of a film does.
+    dispersed : bool
+        Whether red's and blue's lobes lie apart from green's; there are three groups then.
     """
 
     grids: Grids
@@ -51,6 +53,13 @@ class PatternCodes(NamedTuple):
     groups: int
     m: int
     strays: NDArray[np.float32]
+    dispersed: bool
+
+
+@njit(nogil=True, cache=True, inline="always")
+def parts_of(patterns: PatternCodes) -> tuple[int, int]:
+    """Into how many parts the groups fall that see lobes at the same places, and how many groups are in each."""
+    return (patterns.groups, 1) if patterns.dispersed else (1, patterns.groups)
 
 
 @njit(nogil=True, cache=True)

@@ -18,7 +18,9 @@ def test_rows_are_the_signed_codes_between_black_and_white(groups):
     code = np.random.default_rng(0).integers(0, 256, (9, 2 + groups * M), np.uint8)
     node = np.array([7, 0, 3, 3])
     A = np.full((4, groups * (M + 2)), np.nan, np.float32)
-    node_responses(PatternCodes(GRIDS, code, 2, groups, M, np.ones((1, M + 2), np.float32)), node, 3, A)
+    node_responses(
+        PatternCodes(GRIDS, code, 2, groups, M, np.ones((1, M + 2), np.float32), False), node, 3, A
+    )
     assert np.isnan(A[3]).all()
     A = A[:3]
     for g in range(groups):
@@ -33,7 +35,7 @@ def test_lobes_are_spread_by_their_weights():
     node, weight = np.empty(3 * NODES, np.int64), np.empty(3 * NODES, np.float32)
     assert lobes.shape[1] == PARAMETERS
     end = np.zeros(3, np.int64)
-    n = spread_lobes(GRIDS, Mixture(lobes, level, np.zeros(1)), 2, 0.8, node, weight, end)
+    n = spread_lobes(GRIDS, Mixture(lobes, level, np.zeros(1), np.zeros(2)), 2, 0.8, node, weight, end)
     assert n == end[1]
     assert weight[:n].sum() == pytest.approx(1, abs=1e-5)
     y, x = np.mgrid[:48, :64] + 0.5
@@ -47,7 +49,9 @@ def test_a_node_is_left_to_the_first_of_its_lobes_unless_it_has_little():
     lobes = np.array([[0.5, 20, 15, 1.5, 0, 1.5], [0.001, 50, 40, 1.2, 0, 1.2], [0.3, 21, 16, 1.4, 0.3, 1.4]])
     end, seen = np.zeros(3, np.int64), np.zeros(PYRAMID.nodes, np.int32)
     node, weight = np.empty(3 * NODES, np.int64), np.empty(3 * NODES, np.float32)
-    n = spread_lobes(GRIDS, Mixture(lobes, np.zeros(3, np.int64), np.zeros(1)), 3, 0.8, node, weight, end)
+    n = spread_lobes(
+        GRIDS, Mixture(lobes, np.zeros(3, np.int64), np.zeros(1), np.zeros(2)), 3, 0.8, node, weight, end
+    )
     total = np.bincount(node[:n], weight[:n], PYRAMID.nodes)
     first = {}
     for lobe, nodes in enumerate(np.split(node[:n], end[:2])):
@@ -67,8 +71,8 @@ def test_gathered_lobes_are_those_that_were_spread():
     lobes = np.array([[0.7, 20, 15, 2.5, 1, 1.8], [0.3, 41, 30, 3, -2, 2.2]])
     level, end = np.zeros(2, np.int64), np.zeros(2, np.int64)
     node, weight = np.empty(2 * NODES, np.int64), np.empty(2 * NODES, np.float32)
-    n = spread_lobes(GRIDS, Mixture(lobes, level, np.zeros(1)), 2, 1.1, node, weight, end)
-    found = Mixture(lobes + 1.0, level.copy(), np.zeros(1))
+    n = spread_lobes(GRIDS, Mixture(lobes, level, np.zeros(1), np.zeros(2)), 2, 1.1, node, weight, end)
+    found = Mixture(lobes + 1.0, level.copy(), np.zeros(1), np.zeros(2))
     gather_lobes(GRIDS, node, weight, end, found, 2, 1.1)
     np.testing.assert_array_equal(found.level, level)
     # what is beyond the reach of a lobe is a few per cent of its covariance

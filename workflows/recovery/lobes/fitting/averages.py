@@ -143,7 +143,7 @@ def _average(
         if q < 0 or fits.k[q, d] == 0:
             continue
         k = fits.k[q, d]
-        tried = Mixture(lobes[e], level[e], fits.stray[p, c])
+        tried = Mixture(lobes[e], level[e], fits.stray[p, c], np.zeros(2))
         copy_mixture(k, np.int64(0), fit_of(fits, q, d), tried)
         if e >= about:
             across, along = _dispersion(fits, p, c, d, near)

@@ -12,8 +12,9 @@ from workflows.recovery.lobes.nodes import merge_nodes, node_responses, spread_l
 from workflows.recovery.normalise import Measurements
 from workflows.recovery.pyramid import Grids
 
-ALL = 3
-"""A pixel has four fits: 0 to 2 are those of its channels, and this is the one of all channels together."""
+ALL, DISPERSED = 3, 4
+"""A pixel has up to five fits: 0 to 2 are those of its channels, these are of all channels together, the second with
+their lobes apart."""
 
 
 class Pixels(NamedTuple):
@@ -40,25 +41,27 @@ class Pixels(NamedTuple):
 
 
 class Fits(NamedTuple):
-    """The four fits of each of n pixels.
+    """The fits of each of n pixels.
 
     Attributes
     ----------
-    lobes : (n, 4, most, 6) float64
-    level : (n, 4, most) int64
-    stray : (n, 4, 3 s) float64
+    lobes : (n, 5, most, 6) float64
+    level : (n, 5, most) int64
+    stray : (n, 5, 3 s) float64
+    dispersion : (n, 5, 2) float64
         As in :class:`~workflows.recovery.lobes.mixture.Mixture`.
-    k : (n, 4) int64
+    k : (n, 5) int64
         Number of lobes of each fit; 0 where there is no fit.
-    objective : (n, 4) float64
+    objective : (n, 5) float64
         -2 ln likelihood.
-    rest : (n, 4) float64
+    rest : (n, 5) float64
         Mean squared residual of the patterns.
     """
 
     lobes: NDArray[np.float64]
     level: NDArray[np.int64]
     stray: NDArray[np.float64]
+    dispersion: NDArray[np.float64]
     k: NDArray[np.int64]
     objective: NDArray[np.float64]
     rest: NDArray[np.float64]
@@ -67,19 +70,20 @@ class Fits(NamedTuple):
     def of(cls, pixels: int, most: int, strays: int) -> Self:
         """No fits yet, of up to `most` lobes and with `strays` kinds of stray light."""
         return cls(
-            np.zeros((pixels, 4, most, PARAMETERS)),
-            np.zeros((pixels, 4, most), np.int64),
-            np.zeros((pixels, 4, 3 * strays)),
-            np.zeros((pixels, 4), np.int64),
-            np.zeros((pixels, 4)),
-            np.zeros((pixels, 4)),
+            np.zeros((pixels, 5, most, PARAMETERS)),
+            np.zeros((pixels, 5, most), np.int64),
+            np.zeros((pixels, 5, 3 * strays)),
+            np.zeros((pixels, 5, 2)),
+            np.zeros((pixels, 5), np.int64),
+            np.zeros((pixels, 5)),
+            np.zeros((pixels, 5)),
         )
 
 
 @njit(nogil=True, cache=True, inline="always")
 def fit_of(fits: Fits, p: int, c: int) -> Mixture:
     """Fit c of pixel p."""
-    return Mixture(fits.lobes[p, c], fits.level[p, c], fits.stray[p, c])
+    return Mixture(fits.lobes[p, c], fits.level[p, c], fits.stray[p, c], fits.dispersion[p, c])
 
 
 @njit(nogil=True, cache=True, inline="always")
@@ -148,7 +152,8 @@ def measurements_of(
     grids, code, joint, own, _ = pixels
     m = own.value.shape[2] - 2
     groups = code.shape[1] // m
-    if c == ALL:
-        return PatternCodes(grids, code, 0, groups, m, pixels.strays), joint.value[p], joint.variance[p]
+    if c >= ALL:
+        patterns = PatternCodes(grids, code, 0, groups, m, pixels.strays, c == DISPERSED)
+        return patterns, joint.value[p], joint.variance[p]
     first = c * m if groups == 3 else 0
-    return PatternCodes(grids, code, first, 1, m, pixels.strays), own.value[p, c], own.variance[p, c]
+    return PatternCodes(grids, code, first, 1, m, pixels.strays, False), own.value[p, c], own.variance[p, c]

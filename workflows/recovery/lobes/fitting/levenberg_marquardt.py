@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from workflows.recovery.lobes.footprint import PARAMETERS, PatternCodes, fit_level
 from workflows.recovery.lobes.likelihood import penalty, weigh
 from workflows.recovery.lobes.mixture import (
+    RATES,
     Mixture,
     Workspace,
+    clone,
     copy_mixture,
     predict,
     without_derivatives,
@@ -23,6 +25,8 @@ from workflows.recovery.solvers import inner
 
 # Initial damping, its factors after a failed and a successful step, and the most attempts per step.
 _DAMPING, _INCREASE, _DECREASE, _ATTEMPTS = 1e-2, 8.0, 0.15, 4
+# Standard deviation of the dispersion along an axis, in cells, before anything is known of it.
+_DISPERSION = 30.0
 # Bounds of a lobe's weight.
 _LEAST_WEIGHT, _MOST_WEIGHT = 1e-3, 1.2
 
@@ -71,6 +75,15 @@ def apply_step(mixture: Mixture, change: NDArray[np.float64], grids: Grids, reso
         level[i] = fit_level(lobe, level[i], columns, resolution)
 
 
+@njit(nogil=True, cache=True, inline="always")
+def disperse(mixture: Mixture, change: NDArray[np.float64]) -> None:
+    """Add a solved step to the dispersion, limited as that of the first lobe's centre is."""
+    lobe = mixture.lobes[0]
+    far = 2 * max(lobe[3], lobe[5], abs(lobe[4])) + 2.0 ** mixture.level[0]
+    for axis in range(2):
+        mixture.dispersion[axis] += min(max(change[axis], -far), far)
+
+
 @njit(nogil=True, cache=True)
 def chi_square(
     y: NDArray[np.float32],
@@ -85,7 +98,8 @@ def chi_square(
 
 
 class Equations(NamedTuple):
-    """Working space of the steps for n parameters: stray light of each group, then the parameters of each lobe.
+    """Working space of the steps for n parameters: stray light of each group, a dispersion where the
+    patterns have one, then the parameters of each lobe.
 
     Attributes
     ----------
@@ -128,10 +142,21 @@ def linearise(
             slope[:] = 0
             for j in range(size):
                 slope[g * size + j] = strays[s, j] * math.sqrt(precision[g * size + j])
+    before = groups * count
+    for axis in range(2 if patterns.dispersed else 0):
+        slope = slopes[before]
+        slope[:] = 0
+        for i in range(k):
+            of_lobe = response[i, 1 + axis]
+            for g in range(groups):
+                weight = np.float32(RATES[g] * mixture.lobes[i, 0])
+                for j in range(g * size, (g + 1) * size):
+                    slope[j] += weight * of_lobe[j] * math.sqrt(precision[j])
+        before += 1
     for i in range(k):
         for t in range(PARAMETERS):
             weight = np.float32(1.0 if t == 0 else mixture.lobes[i, 0])
-            slope, of_lobe = slopes[groups * count + PARAMETERS * i + t], response[i, t]
+            slope, of_lobe = slopes[before + PARAMETERS * i + t], response[i, t]
             for j in range(precision.size):
                 slope[j] = weight * of_lobe[j] * math.sqrt(precision[j])
     for i in range(b.size):
@@ -142,6 +167,9 @@ def linearise(
         if i % count > 0:
             A[i, i] += 1 / STRAY**2
             b[i] -= mixture.stray[i] / STRAY**2
+    for i in range(groups * count, groups * count + (2 if patterns.dispersed else 0)):
+        A[i, i] += 1 / _DISPERSION**2
+        b[i] -= mixture.dispersion[i - groups * count] / _DISPERSION**2
 
 
 @njit(nogil=True, cache=True, inline="always")
@@ -177,6 +205,7 @@ def refine_round(
     The linear model expects a step to lower chi-square by about ``change b``. To try one takes longer than to solve it.
     """
     damping, strays = _DAMPING, patterns.groups * len(patterns.strays)
+    extra = 2 if patterns.dispersed else 0
     chi = chi_square(y, f, precision, equations.residual)
     for _ in range(options.steps):
         linearise(patterns, mixture, k, response, precision, equations)
@@ -192,7 +221,9 @@ def refine_round(
                 copy_mixture(k, strays, mixture, new)
                 for s in range(strays):
                     new.stray[s] += equations.change[s]
-                apply_step(new, equations.change[strays:], patterns.grids, options.fit_resolution)
+                if patterns.dispersed:
+                    disperse(new, equations.change[strays : strays + 2])
+                apply_step(new, equations.change[strays + extra :], patterns.grids, options.fit_resolution)
                 predict(patterns, new, k, workspace, response, f)
                 new_chi = chi_square(y, f, precision, equations.residual)
                 better = new_chi < chi
@@ -296,7 +327,7 @@ def refine(
         Prediction and precisions.
     """
     groups = patterns.groups
-    M, n = y.size, groups * len(patterns.strays) + PARAMETERS * k
+    M, n = y.size, groups * len(patterns.strays) + PARAMETERS * k + (2 if patterns.dispersed else 0)
     response = np.empty((k, PARAMETERS, M), np.float32)
     f, precision = np.empty_like(y), np.empty_like(y)
     equations = Equations(
@@ -307,7 +338,7 @@ def refine(
         np.empty(n),
         np.empty((n, n)),
     )
-    new = Mixture(mixture.lobes.copy(), mixture.level.copy(), mixture.stray.copy())
+    new = clone(mixture)
     predict(patterns, mixture, k, workspace, response, f)
     kappa, objective = weigh(y, f, variance, groups, n, precision)
     for _ in range(options.rounds):

@@ -16,6 +16,7 @@ from workflows.recovery.lobes.footprint import PatternCodes, bump_variance, fit_
 from workflows.recovery.lobes.mixture import (
     Mixture,
     Workspace,
+    clone,
     copy_mixture,
     predict,
     without_derivatives,
@@ -138,6 +139,9 @@ def _average(
         mixture.stray[s] = 0
         for e in range(n):
             mixture.stray[s] += fits.stray[neighbours[e], c, s] / n
+    mixture.dispersion[:] = 0
+    for e in range(n):
+        mixture.dispersion[:] += fits.dispersion[neighbours[e], c] / n
     for i in range(k):
         mean, xx, xy, yy = mixture.lobes[i], 0.0, 0.0, 0.0
         mean[:3] = 0
@@ -183,7 +187,7 @@ def start_between(
     neighbours : (4,) int64
         Of the pixel, as from :func:`coarse_to_fine`.
     c : int
-        Which of the four fits.
+        Which of the fits.
     mixture : Mixture
         Written.
     options : LobesOptions
@@ -211,7 +215,7 @@ def start_between(
     least = unexplained(patterns, y, variance, mixture, k, workspace) if k > 0 else np.inf
     if least > MOST_REST * rest:
         strays = patterns.groups * len(patterns.strays)
-        tried = Mixture(mixture.lobes.copy(), mixture.level.copy(), mixture.stray.copy())
+        tried = clone(mixture)
         for e in range(n):
             of_one = fits.k[near[e], c]
             copy_mixture(of_one, strays, fit_of(fits, near[e], c), tried)

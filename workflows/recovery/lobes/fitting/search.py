@@ -7,9 +7,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from workflows.recovery.lobes.fitting.levenberg_marquardt import refine
-from workflows.recovery.lobes.footprint import PARAMETERS, PatternCodes, fit_level
+from workflows.recovery.lobes.footprint import PARAMETERS, PatternCodes, fit_level, parts_of
 from workflows.recovery.lobes.likelihood import penalty, weigh
-from workflows.recovery.lobes.mixture import Mixture, Workspace, copy_mixture
+from workflows.recovery.lobes.mixture import RATES, Mixture, Workspace, clone, copy_mixture
 from workflows.recovery.lobes.options import LobesOptions
 from workflows.recovery.pyramid import Grids
 
@@ -21,6 +21,8 @@ _ANY = 0.0
 # How many times as many nodes are examined for the first lobe. Most of the light comes from it, and a wrong one
 # is not found out.
 _FIRST = 4
+# Farthest that the search for a first lobe moves blue from green along an axis, in cells.
+_MOST_DISPERSION = 24.0
 # Nodes to each side of a lobe's centre and ends that are examined for another one.
 _NEAR = 8
 # They are examined where lobes leave more than this variance of a black-and-white pattern (-1 to 1) unexplained.
@@ -34,7 +36,9 @@ _LEAST_LEFT = 1e-6
 
 @njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})
 def score(
-    row: NDArray[np.uint8],
+    code: NDArray[np.uint8],
+    nodes: NDArray[np.int64],
+    first: int,
     f: NDArray[np.float32],
     residual: NDArray[np.float32],
     precision: NDArray[np.float32],
@@ -43,8 +47,11 @@ def score(
 
     Parameters
     ----------
-    row : (groups m,) uint8
-        The patterns' codes on the node.
+    code : (nodes, first + groups m or more) uint8
+    nodes : (parts,) int64
+        The node that each part of the groups sees, as from :func:`_see`.
+    first : int
+        The column of `code` with the first pattern.
     f, residual, precision : (groups m,) float32
         As from :func:`_in_codes`.
 
@@ -60,11 +67,36 @@ def score(
     ``z = sum d r / v / sqrt(sum d^2 / v)``, d the node's row less the prediction, r the residual and v its variance.
     """
     along, across = np.float32(0), np.float32(1e-9)
-    for j in range(row.size):
-        d = np.float32(row[j]) - f[j]
-        along += d * residual[j]
-        across += d * d * precision[j]
+    size = f.size // nodes.size
+    for part in range(nodes.size):
+        # An unsigned index can't count from the end, so the loop has no branches; slices would be counted references.
+        node, start = np.uint64(nodes[part]), np.uint64(part * size)
+        row = start + np.uint64(first)
+        for j in range(size):
+            at = start + np.uint64(j)
+            d = np.float32(code[node, row + np.uint64(j)]) - f[at]
+            along += d * residual[at]
+            across += d * d * precision[at]
     return float(along / math.sqrt(across)), float(along / across)
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _see(
+    patterns: PatternCodes, level: int, column: int, row: int, x: float, y: float, nodes: NDArray[np.int64]
+) -> None:
+    """Write the node that each part of the groups sees, for a node of green's and a dispersion x, y."""
+    wide, high, start = (
+        patterns.grids.columns[level],
+        patterns.grids.rows[level],
+        patterns.grids.starts[level],
+    )
+    if patterns.dispersed:
+        for part in range(nodes.size):
+            c = column + int(np.rint(RATES[part] * x / 2.0**level))
+            r = row + int(np.rint(RATES[part] * y / 2.0**level))
+            nodes[part] = start + min(max(r, 0), high - 1) * wide + min(max(c, 0), wide - 1)
+    else:
+        nodes[0] = start + row * wide + column
 
 
 @njit(nogil=True, cache=True)
@@ -87,7 +119,11 @@ def _in_codes(
 
 @njit(nogil=True, cache=True)
 def _insert(
-    z: float, column: int, row: int, scores: NDArray[np.float64], nodes: NDArray[np.int64], count: int
+    z: float,
+    node: tuple[int, int, int, int],
+    scores: NDArray[np.float64],
+    nodes: NDArray[np.int64],
+    count: int,
 ) -> int:
     """Insert a node into a list in descending order of scores, which drops its last if full; return the new length."""
     if count == scores.size and not z > scores[count - 1]:
@@ -96,10 +132,11 @@ def _insert(
     length = at + 1
     while at > 0 and scores[at - 1] < z:
         scores[at] = scores[at - 1]
-        nodes[at, 0], nodes[at, 1] = nodes[at - 1, 0], nodes[at - 1, 1]
+        for i in range(4):
+            nodes[at, i] = nodes[at - 1, i]
         at -= 1
     scores[at] = z
-    nodes[at, 0], nodes[at, 1] = column, row
+    nodes[at, 0], nodes[at, 1], nodes[at, 2], nodes[at, 3] = node
     return length
 
 
@@ -111,6 +148,7 @@ def find_node(
     precision: NDArray[np.float32],
     beam: int,
     first: bool,
+    dispersion: NDArray[np.float64],
 ) -> tuple[int, int, int, float, float]:
     """Find the node where more light would improve the fit most, by a beam search from the coarsest grid to finer ones.
 
@@ -124,6 +162,9 @@ def find_node(
     first : bool
         Whether there is no lobe yet. The precisions are then those of measurements that nothing explains, so their
         scale is unknown.
+    dispersion : (2,) float64
+        As of :class:`~workflows.recovery.lobes.mixture.Mixture`. Written for the first lobe, if the patterns are
+        dispersed: each child of a node then has nine values of it, one spacing of the grid apart.
 
     Returns
     -------
@@ -141,13 +182,16 @@ def find_node(
     a node explains of all there is to explain. A node of the finest grid that explains everything then outweighs the
     wide one about it, which the fit could not make narrow.
     """
-    columns, rows, starts = patterns.grids
+    columns, rows, _ = patterns.grids
     code_of_f, residual, weight = _in_codes(patterns, y, f, precision)
     best_level, best_column, best_row, gain, best_z = -1, 0, 0, -_HUGE, 0.0
+    nodes = np.empty(parts_of(patterns)[0], np.int64)
+    ways = 9 if first and patterns.dispersed else 1
     if first:
         beam *= _FIRST
-    parents, scores = np.empty((beam, 2), np.int64), np.empty(beam)
-    children = np.empty((beam, 2), np.int64)
+    # column and row, and the dispersion in spacings of the grid
+    parents, scores = np.empty((beam, 4), np.int64), np.empty(beam)
+    children = np.empty((beam, 4), np.int64)
     count = 0
     chi, used = 0.0, 0
     for j in range(weight.size):
@@ -155,35 +199,42 @@ def find_node(
             chi += residual[j] ** 2 / weight[j]
             used += 1
     for level in range(columns.size - 1, -1, -1):
-        wide, high = columns[level], rows[level]
+        wide, high, spacing = columns[level], rows[level], 2.0**level
         whole = level == columns.size - 1
         found = 0
-        for p in range(wide * high if whole else 4 * count):
+        for p in range(wide * high if whole else 4 * ways * count):
+            across, down = 0, 0
             if whole:
                 column, row = p % wide, p // wide
             else:
-                column, row = 2 * parents[p // 4, 0] + p % 2, 2 * parents[p // 4, 1] + p % 4 // 2
-            if column >= wide or row >= high:
+                parent, way = p // (4 * ways), p // 4 % ways
+                column, row = 2 * parents[parent, 0] + p % 2, 2 * parents[parent, 1] + p % 4 // 2
+                if ways > 1:
+                    across, down = 2 * parents[parent, 2] + way % 3 - 1, 2 * parents[parent, 3] + way // 3 - 1
+            if column >= wide or row >= high or max(abs(across), abs(down)) * spacing > _MOST_DISPERSION:
                 continue
-            node = starts[level] + row * wide + column
-            codes = patterns.code[node, patterns.first : patterns.first + residual.size]
-            z, _ = score(codes, code_of_f, residual, weight)
-            found = _insert(z, column, row, scores, children, found)
+            if ways > 1:
+                _see(patterns, level, column, row, across * spacing, down * spacing, nodes)
+            else:
+                _see(patterns, level, column, row, dispersion[0], dispersion[1], nodes)
+            z, _ = score(patterns.code, nodes, patterns.first, code_of_f, residual, weight)
+            found = _insert(z, (column, row, across, down), scores, children, found)
         z = scores[0]
         if z > 0:
             explained = used * math.log(chi / max(chi - z * z, _LEAST_LEFT * chi)) if first else z * z
             if explained - 2 * math.log(wide * high) > gain:
                 best_level, best_column, best_row = level, children[0, 0], children[0, 1]
                 gain, best_z = explained - 2 * math.log(wide * high), z
+                if ways > 1:
+                    dispersion[0], dispersion[1] = children[0, 2] * spacing, children[0, 3] * spacing
         if z < 0.7 * best_z:
             break
         count = found
         parents, children = children, parents
     amount = 0.0
     if best_level >= 0:
-        node = starts[best_level] + best_row * columns[best_level] + best_column
-        codes = patterns.code[node, patterns.first : patterns.first + residual.size]
-        _, amount = score(codes, code_of_f, residual, weight)
+        _see(patterns, best_level, best_column, best_row, dispersion[0], dispersion[1], nodes)
+        _, amount = score(patterns.code, nodes, patterns.first, code_of_f, residual, weight)
     return best_level, best_column, best_row, gain, amount
 
 
@@ -219,7 +270,9 @@ def find_near(
         for end in range(-1, 2):
             across, down = _along(mixture.lobes[i], end)
             for level in range(mixture.level[i] + 1):
-                best = _best_about(patterns, level, across, down, code_of_f, residual, weight, best)
+                best = _best_about(
+                    patterns, level, across, down, mixture.dispersion, code_of_f, residual, weight, best
+                )
     return best
 
 
@@ -238,21 +291,21 @@ def _best_about(
     level: int,
     across: float,
     down: float,
+    dispersion: NDArray[np.float64],
     code_of_f: NDArray[np.float32],
     residual: NDArray[np.float32],
     weight: NDArray[np.float32],
     best: tuple[int, int, int, float, float],
 ) -> tuple[int, int, int, float, float]:
     """The best of the nodes of a level about a place and of the best so far, both as of `find_near`."""
-    columns, rows, starts = patterns.grids
-    wide, high = columns[level], rows[level]
+    wide, high = patterns.grids.columns[level], patterns.grids.rows[level]
     c, r = int(across / 2.0**level), int(down / 2.0**level)
     centre = 2 * math.log(wide * high)
+    nodes = np.empty(parts_of(patterns)[0], np.int64)
     for row in range(max(r - _NEAR, 0), min(r + _NEAR + 1, high)):
         for column in range(max(c - _NEAR, 0), min(c + _NEAR + 1, wide)):
-            node = starts[level] + row * wide + column
-            codes = patterns.code[node, patterns.first : patterns.first + residual.size]
-            z, amount = score(codes, code_of_f, residual, weight)
+            _see(patterns, level, column, row, dispersion[0], dispersion[1], nodes)
+            z, amount = score(patterns.code, nodes, patterns.first, code_of_f, residual, weight)
             if z > 0 and z * z - centre > best[3]:
                 best = (level, column, row, z * z - centre, amount)
     return best
@@ -325,13 +378,15 @@ def fit(
     else:
         kappa, objective = weigh(y, f, variance, groups, groups, precision)
         objective = _HUGE
-    tried = Mixture(mixture.lobes.copy(), mixture.level.copy(), mixture.stray.copy())
+    tried = clone(mixture)
     near = False
     while k < options.most_lobes:
         if near:
             level, column, row, gain, amount = find_near(patterns, y, f, precision, mixture, k)
         else:
-            level, column, row, gain, amount = find_node(patterns, y, f, precision, options.beam, k == 0)
+            level, column, row, gain, amount = find_node(
+                patterns, y, f, precision, options.beam, k == 0, mixture.dispersion
+            )
         better = k == 0 or gain >= 2 * (PARAMETERS - 2)
         if better:
             copy_mixture(k, strays, mixture, tried)

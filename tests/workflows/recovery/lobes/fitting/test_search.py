@@ -13,6 +13,7 @@ from workflows.recovery.lobes.options import FINE, LobesOptions
 
 COLUMNS, ROWS, MOST = 64, 48, 3
 SIGMA = 0.01
+STILL = np.zeros(2)
 OPTIONS = LobesOptions(
     most_lobes=MOST,
     fit_resolution=0.8,
@@ -57,6 +58,7 @@ def shown(patterns):
         1,
         patterns.count,
         np.ones((1, patterns.count + 2), np.float32),
+        False,
     )
 
 
@@ -77,7 +79,7 @@ def measure(patterns):
 @pytest.fixture(scope="module")
 def fitted(shown):
     def run(y, variance, most=MOST):
-        mixture = Mixture(np.zeros((MOST, PARAMETERS)), np.zeros(MOST, np.int64), np.zeros(1))
+        mixture = Mixture(np.zeros((MOST, PARAMETERS)), np.zeros(MOST, np.int64), np.zeros(1), np.zeros(2))
         k, kappa, objective = fit(
             shown, y, variance, mixture, 0, OPTIONS._replace(most_lobes=most), make_workspace(shown.m)
         )
@@ -125,7 +127,7 @@ def test_two_lobes_are_recovered(measure, fitted, truth):
 def test_two_points_far_narrower_than_a_lobe_are_found(patterns_of):
     patterns = patterns_of([(COLUMNS, ROWS, 100)], 1)
     strays = np.ones((1, patterns.count + 2), np.float32)
-    shown = PatternCodes(patterns.pyramid.arrays, patterns.code, 0, 1, patterns.count, strays)
+    shown = PatternCodes(patterns.pyramid.arrays, patterns.code, 0, 1, patterns.count, strays, False)
     signed = patterns.code[: COLUMNS * ROWS] / 127.5 - 1
     both_found = 0
     for seed in range(100):
@@ -133,7 +135,7 @@ def test_two_points_far_narrower_than_a_lobe_are_found(patterns_of):
         places = np.array([[26, 18], [29, 26]]) + rng.integers(-14, 14, 2)
         light = np.array([0.63, 0.37]) @ signed[places[:, 1] * COLUMNS + places[:, 0]]
         y = np.append(light, [-1, 1]) + SIGMA * rng.standard_normal(light.size + 2)
-        mixture = Mixture(np.zeros((MOST, PARAMETERS)), np.zeros(MOST, np.int64), np.zeros(1))
+        mixture = Mixture(np.zeros((MOST, PARAMETERS)), np.zeros(MOST, np.int64), np.zeros(1), np.zeros(2))
         k, _, _ = fit(
             shown,
             y.astype(np.float32),
@@ -201,22 +203,22 @@ def test_find_node_finds_the_node_that_is_missing(patterns, shown):
         f = np.append(np.zeros(m), [-1, 1]).astype(np.float32)
         y = np.append(0.2 * (patterns.code[node] / 127.5 - 1), [-1, 1]).astype(np.float32)
         precision = np.full(m + 2, SIGMA**-2, np.float32)
-        found = find_node(shown, y, f, precision, 6, False)
+        found = find_node(shown, y, f, precision, 6, False, STILL)
         assert found[:3] == (level, column, row)
         assert found[4] == pytest.approx(0.2, rel=1e-4)
         d = patterns.code[node] / 127.5 - 1
         z_squared = 0.04 * (d @ d) / SIGMA**2
         places = grids.columns[level] * grids.rows[level]
         assert found[3] == pytest.approx(z_squared - 2 * np.log(places), rel=1e-4)
-    assert find_node(shown, f, f, precision, 6, False)[0] == -1
+    assert find_node(shown, f, f, precision, 6, False, STILL)[0] == -1
 
 
 def test_first_node_that_explains_all_outweighs_the_wide_one_about_it(patterns_of):
     patterns = patterns_of([(8, 6, 5), (16, 12, 5), (32, 24, 5), (COLUMNS, ROWS, 5)], 1)
-    few = PatternCodes(patterns.pyramid.arrays, patterns.code, 0, 1, 20, np.ones((1, 22), np.float32))
+    few = PatternCodes(patterns.pyramid.arrays, patterns.code, 0, 1, 20, np.ones((1, 22), np.float32), False)
     y = np.append(patterns.code[17 * COLUMNS + 41] / 127.5 - 1, [-1, 1]).astype(np.float32)
     f = np.append(np.zeros(20), [-1, 1]).astype(np.float32)
     precision = np.ones(22, np.float32)  # as if nothing were explained
-    level, column, row, gain, _ = find_node(few, y, f, precision, 6, True)
+    level, column, row, gain, _ = find_node(few, y, f, precision, 6, True, STILL)
     assert (level, column, row) == (0, 41, 17)
     assert gain > 100  # not 20, the chi-square of 20 measurements

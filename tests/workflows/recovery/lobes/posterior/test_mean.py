@@ -23,7 +23,7 @@ def problem(groups, n=40, seed=0, sigma=0.02):
     rng = np.random.default_rng(seed)
     code = rng.integers(0, 256, (n, groups * M), np.uint8)
     A = np.empty((n, groups * (M + 2)), np.float32)
-    node_responses(PatternCodes(GRIDS, code, 0, groups, M, CONSTANT), np.arange(n), n, A)
+    node_responses(PatternCodes(GRIDS, code, 0, groups, M, CONSTANT, False), np.arange(n), n, A)
     weight, truth = rng.dirichlet(np.full(n, 5.0), 2)
     variance = np.full(groups * (M + 2), sigma**2, np.float32)
     y = truth @ A + sigma * rng.standard_normal(variance.size)
@@ -123,7 +123,7 @@ def test_total_variance_finds_the_variance_about_a_first_estimate():
     m, kappa = 20_000, 0.05
     code = 255 * rng.integers(0, 2, (6, m)).astype(np.uint8)
     A = np.empty((6, m + 2), np.float32)
-    node_responses(PatternCodes(GRIDS, code, 0, 1, m, CONSTANT), np.arange(6), 6, A)
+    node_responses(PatternCodes(GRIDS, code, 0, 1, m, CONSTANT, False), np.arange(6), 6, A)
     weight = rng.dirichlet(np.full(6, 5.0)).astype(np.float32)
     f, variance = weight @ A, rng.uniform(1e-4, 2e-3, m + 2).astype(np.float32)
     spread = variance + kappa * np.maximum(1 - f**2, 0)
@@ -143,7 +143,9 @@ def test_few_steps_suffice_where_patterns_differ_little():
         rng = np.random.default_rng(seed)
         code = np.where(rng.random(M) < 0.5, 0, 255) ^ np.where(rng.random((16, M)) < 0.15, 255, 0)
         A = np.empty((16, M + 2), np.float32)
-        node_responses(PatternCodes(GRIDS, code.astype(np.uint8), 0, 1, M, CONSTANT), np.arange(16), 16, A)
+        node_responses(
+            PatternCodes(GRIDS, code.astype(np.uint8), 0, 1, M, CONSTANT, False), np.arange(16), 16, A
+        )
         start, truth = rng.dirichlet(np.full(16, 0.5), 2)
         y = truth @ A
         variance = np.where(y < 0, 1e-5, 2e-4)
