@@ -76,6 +76,12 @@ def apply_step(mixture: Mixture, change: NDArray[np.float64], grids: Grids, reso
 
 
 @njit(nogil=True, cache=True, inline="always")
+def axes_of(patterns: PatternCodes) -> int:
+    """Along how many axes lobes may lie apart in red, green and blue: the parameters of the dispersion."""
+    return 2 if patterns.dispersed else 0
+
+
+@njit(nogil=True, cache=True, inline="always")
 def disperse(mixture: Mixture, change: NDArray[np.float64]) -> None:
     """Add a solved step to the dispersion, limited as that of the first lobe's centre is."""
     lobe = mixture.lobes[0]
@@ -143,7 +149,7 @@ def linearise(
             for j in range(size):
                 slope[g * size + j] = strays[s, j] * math.sqrt(precision[g * size + j])
     before = groups * count
-    for axis in range(2 if patterns.dispersed else 0):
+    for axis in range(axes_of(patterns)):
         slope = slopes[before]
         slope[:] = 0
         for i in range(k):
@@ -167,9 +173,10 @@ def linearise(
         if i % count > 0:
             A[i, i] += 1 / STRAY**2
             b[i] -= mixture.stray[i] / STRAY**2
-    for i in range(groups * count, groups * count + (2 if patterns.dispersed else 0)):
+    for axis in range(axes_of(patterns)):
+        i = groups * count + axis
         A[i, i] += 1 / _DISPERSION**2
-        b[i] -= mixture.dispersion[i - groups * count] / _DISPERSION**2
+        b[i] -= mixture.dispersion[axis] / _DISPERSION**2
 
 
 @njit(nogil=True, cache=True, inline="always")
@@ -205,7 +212,7 @@ def refine_round(
     The linear model expects a step to lower chi-square by about ``change b``. To try one takes longer than to solve it.
     """
     damping, strays = _DAMPING, patterns.groups * len(patterns.strays)
-    extra = 2 if patterns.dispersed else 0
+    lobes = strays + axes_of(patterns)
     chi = chi_square(y, f, precision, equations.residual)
     for _ in range(options.steps):
         linearise(patterns, mixture, k, response, precision, equations)
@@ -222,8 +229,8 @@ def refine_round(
                 for s in range(strays):
                     new.stray[s] += equations.change[s]
                 if patterns.dispersed:
-                    disperse(new, equations.change[strays : strays + 2])
-                apply_step(new, equations.change[strays + extra :], patterns.grids, options.fit_resolution)
+                    disperse(new, equations.change[strays:lobes])
+                apply_step(new, equations.change[lobes:], patterns.grids, options.fit_resolution)
                 predict(patterns, new, k, workspace, response, f)
                 new_chi = chi_square(y, f, precision, equations.residual)
                 better = new_chi < chi
@@ -327,7 +334,7 @@ def refine(
         Prediction and precisions.
     """
     groups = patterns.groups
-    M, n = y.size, groups * len(patterns.strays) + PARAMETERS * k + (2 if patterns.dispersed else 0)
+    M, n = y.size, groups * len(patterns.strays) + axes_of(patterns) + PARAMETERS * k
     response = np.empty((k, PARAMETERS, M), np.float32)
     f, precision = np.empty_like(y), np.empty_like(y)
     equations = Equations(

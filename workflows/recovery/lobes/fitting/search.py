@@ -7,9 +7,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from workflows.recovery.lobes.fitting.levenberg_marquardt import refine
+from workflows.recovery.lobes.fitting.scores import in_codes, insert, score, see
 from workflows.recovery.lobes.footprint import PARAMETERS, PatternCodes, fit_level, parts_of
 from workflows.recovery.lobes.likelihood import penalty, weigh
-from workflows.recovery.lobes.mixture import RATES, Mixture, Workspace, clone, copy_mixture
+from workflows.recovery.lobes.mixture import Mixture, Workspace, clone, copy_mixture
 from workflows.recovery.lobes.options import LobesOptions
 from workflows.recovery.pyramid import Grids
 
@@ -19,7 +20,7 @@ _HUGE = 1e30
 # All steps are tried: far from the solution they may lower chi-square by more than expected.
 _ANY = 0.0
 # How many times as many nodes are examined for the first lobe. Most of the light comes from it, and a wrong one
-# is not found out.
+# is not found out. Where lobes are dispersed, each node is examined in more ways instead.
 _FIRST = 4
 # Farthest that the search for a first lobe moves blue from green along an axis, in cells.
 _MOST_DISPERSION = 24.0
@@ -32,112 +33,6 @@ _MUCH = 0.03
 _DOUBT = 12.0
 # Least share of chi-square that counts as left unexplained by a first node.
 _LEAST_LEFT = 1e-6
-
-
-@njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})
-def score(
-    code: NDArray[np.uint8],
-    nodes: NDArray[np.int64],
-    first: int,
-    f: NDArray[np.float32],
-    residual: NDArray[np.float32],
-    precision: NDArray[np.float32],
-) -> tuple[float, float]:
-    """Score a node: the gain of moving light to it from the prediction.
-
-    Parameters
-    ----------
-    code : (nodes, first + groups m or more) uint8
-    nodes : (parts,) int64
-        The node that each part of the groups sees, as from :func:`_see`.
-    first : int
-        The column of `code` with the first pattern.
-    f, residual, precision : (groups m,) float32
-        As from :func:`_in_codes`.
-
-    Returns
-    -------
-    z : float
-        Score in standard deviations.
-    amount : float
-        Light to move, as a share.
-
-    Notes
-    -----
-    ``z = sum d r / v / sqrt(sum d^2 / v)``, d the node's row less the prediction, r the residual and v its variance.
-    """
-    along, across = np.float32(0), np.float32(1e-9)
-    size = f.size // nodes.size
-    for part in range(nodes.size):
-        # An unsigned index can't count from the end, so the loop has no branches; slices would be counted references.
-        node, start = np.uint64(nodes[part]), np.uint64(part * size)
-        row = start + np.uint64(first)
-        for j in range(size):
-            at = start + np.uint64(j)
-            d = np.float32(code[node, row + np.uint64(j)]) - f[at]
-            along += d * residual[at]
-            across += d * d * precision[at]
-    return float(along / math.sqrt(across)), float(along / across)
-
-
-@njit(nogil=True, cache=True, inline="always")
-def _see(
-    patterns: PatternCodes, level: int, column: int, row: int, x: float, y: float, nodes: NDArray[np.int64]
-) -> None:
-    """Write the node that each part of the groups sees, for a node of green's and a dispersion x, y."""
-    wide, high, start = (
-        patterns.grids.columns[level],
-        patterns.grids.rows[level],
-        patterns.grids.starts[level],
-    )
-    if patterns.dispersed:
-        for part in range(nodes.size):
-            c = column + int(np.rint(RATES[part] * x / 2.0**level))
-            r = row + int(np.rint(RATES[part] * y / 2.0**level))
-            nodes[part] = start + min(max(r, 0), high - 1) * wide + min(max(c, 0), wide - 1)
-    else:
-        nodes[0] = start + row * wide + column
-
-
-@njit(nogil=True, cache=True)
-def _in_codes(
-    patterns: PatternCodes, y: NDArray[np.float32], f: NDArray[np.float32], precision: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Convert to units of the patterns' codes: prediction, residual times precision, and precision, (groups m,)."""
-    groups, m = patterns.groups, patterns.m
-    code_of_f, residual = np.empty(groups * m, np.float32), np.empty(groups * m, np.float32)
-    weight = np.empty(groups * m, np.float32)
-    unit = np.float32(2 / 255)
-    for g in range(groups):
-        for j in range(m):
-            at = g * (m + 2) + j
-            code_of_f[g * m + j] = (f[at] + 1) / unit
-            residual[g * m + j] = unit * (y[at] - f[at]) * precision[at]
-            weight[g * m + j] = unit**2 * precision[at]
-    return code_of_f, residual, weight
-
-
-@njit(nogil=True, cache=True)
-def _insert(
-    z: float,
-    node: tuple[int, int, int, int],
-    scores: NDArray[np.float64],
-    nodes: NDArray[np.int64],
-    count: int,
-) -> int:
-    """Insert a node into a list in descending order of scores, which drops its last if full; return the new length."""
-    if count == scores.size and not z > scores[count - 1]:
-        return count
-    at = min(count, scores.size - 1)
-    length = at + 1
-    while at > 0 and scores[at - 1] < z:
-        scores[at] = scores[at - 1]
-        for i in range(4):
-            nodes[at, i] = nodes[at - 1, i]
-        at -= 1
-    scores[at] = z
-    nodes[at, 0], nodes[at, 1], nodes[at, 2], nodes[at, 3] = node
-    return length
 
 
 @njit(nogil=True, cache=True)
@@ -183,11 +78,11 @@ def find_node(
     wide one about it, which the fit could not make narrow.
     """
     columns, rows, _ = patterns.grids
-    code_of_f, residual, weight = _in_codes(patterns, y, f, precision)
+    code_of_f, residual, weight = in_codes(patterns, y, f, precision)
     best_level, best_column, best_row, gain, best_z = -1, 0, 0, -_HUGE, 0.0
     nodes = np.empty(parts_of(patterns)[0], np.int64)
     ways = 9 if first and patterns.dispersed else 1
-    if first:
+    if first and ways == 1:
         beam *= _FIRST
     # column and row, and the dispersion in spacings of the grid
     parents, scores = np.empty((beam, 4), np.int64), np.empty(beam)
@@ -213,12 +108,10 @@ def find_node(
                     across, down = 2 * parents[parent, 2] + way % 3 - 1, 2 * parents[parent, 3] + way // 3 - 1
             if column >= wide or row >= high or max(abs(across), abs(down)) * spacing > _MOST_DISPERSION:
                 continue
-            if ways > 1:
-                _see(patterns, level, column, row, across * spacing, down * spacing, nodes)
-            else:
-                _see(patterns, level, column, row, dispersion[0], dispersion[1], nodes)
+            apart = (across * spacing, down * spacing) if ways > 1 else (dispersion[0], dispersion[1])
+            see(patterns, level, column, row, apart, nodes)
             z, _ = score(patterns.code, nodes, patterns.first, code_of_f, residual, weight)
-            found = _insert(z, (column, row, across, down), scores, children, found)
+            found = insert(z, (column, row, across, down), scores, children, found)
         z = scores[0]
         if z > 0:
             explained = used * math.log(chi / max(chi - z * z, _LEAST_LEFT * chi)) if first else z * z
@@ -233,7 +126,7 @@ def find_node(
         parents, children = children, parents
     amount = 0.0
     if best_level >= 0:
-        _see(patterns, best_level, best_column, best_row, dispersion[0], dispersion[1], nodes)
+        see(patterns, best_level, best_column, best_row, (dispersion[0], dispersion[1]), nodes)
         _, amount = score(patterns.code, nodes, patterns.first, code_of_f, residual, weight)
     return best_level, best_column, best_row, gain, amount
 
@@ -264,7 +157,7 @@ def find_near(
     level, column, row, gain, amount
         As from :func:`find_node`. Its level is at most that of the lobe.
     """
-    code_of_f, residual, weight = _in_codes(patterns, y, f, precision)
+    code_of_f, residual, weight = in_codes(patterns, y, f, precision)
     best = (-1, 0, 0, -_HUGE, 0.0)
     for i in range(k):
         for end in range(-1, 2):
@@ -304,7 +197,7 @@ def _best_about(
     nodes = np.empty(parts_of(patterns)[0], np.int64)
     for row in range(max(r - _NEAR, 0), min(r + _NEAR + 1, high)):
         for column in range(max(c - _NEAR, 0), min(c + _NEAR + 1, wide)):
-            _see(patterns, level, column, row, dispersion[0], dispersion[1], nodes)
+            see(patterns, level, column, row, (dispersion[0], dispersion[1]), nodes)
             z, amount = score(patterns.code, nodes, patterns.first, code_of_f, residual, weight)
             if z > 0 and z * z - centre > best[3]:
                 best = (level, column, row, z * z - centre, amount)
