@@ -248,18 +248,17 @@ def prefers_channels(
 ) -> bool:
     """Whether one T for each channel explains a pixel better than one T for all.
 
-    Decided by the Bayesian information criterion, with a kappa for each T. Centres are ordinary parameters here, since
-    the channels' lobes are near the common ones. The likelihood is that of the lobes, and where neighbours were decided
-    otherwise, or there are none, the evidence for T, which takes longer: under lobes alone, what these cannot represent
-    hides that channels differ.
+    Decided by the likelihood of the lobes, and where neighbours were decided otherwise, or there are none, by the
+    evidence for T, which takes longer. There is a kappa for each T. Centres are ordinary parameters here, since the
+    channels' lobes are near the common ones. Each costs what the Bayesian information criterion says with the evidence,
+    and what Akaike's says, less, with lobes alone: what these cannot represent hides that channels differ.
     """
-    more, agreed = 2, 0
+    more, agreed = 2 - PARAMETERS * fits.k[p, ALL], 0
     by_lobes = -fits.objective[p, ALL]
     for c in range(3):
         by_lobes += fits.objective[p, c]
         more += PARAMETERS * fits.k[p, c]
-    penalty_of_more = math.log(pixels.joint.value.shape[1]) * (more - PARAMETERS * fits.k[p, ALL])
-    better: bool = by_lobes + penalty_of_more < 0
+    better: bool = by_lobes + 2 * more < 0
     for q in neighbours:
         if q >= 0 and fits.k[q, ALL] > 0:
             agreed += 1 if separate[q] == better else -neighbours.size
@@ -268,7 +267,7 @@ def prefers_channels(
         for c in range(3):
             if fits.k[p, c] > 0:
                 by_evidence += evidence(pixels, p, c, fits, options, buffers)
-        better = by_evidence + penalty_of_more < 0
+        better = by_evidence + math.log(pixels.joint.value.shape[1]) * more < 0
     return better
 
 
