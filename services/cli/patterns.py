@@ -42,8 +42,16 @@ def _size(context: click.Context, parameter: click.Parameter, text: str | None) 
     show_default=True,
     help="Patterns per second of a video.",
 )
+@click.option(
+    "--grey",
+    is_flag=True,
+    help="Pictures of `quick` and `sketch` in black and white, as in videos: for a camera that stores JPEG or HEIC, "
+    "which have colour at half the resolution.",
+)
 @as_json
-def patterns(program: str, out: Path, monitor: tuple[int, int] | None, rate: float, as_json: bool) -> None:
+def patterns(
+    program: str, out: Path, monitor: tuple[int, int] | None, rate: float, grey: bool, as_json: bool
+) -> None:
     """Write the patterns of PROGRAM, a preset or a JSON file with a program, to OUT.
 
     If OUT ends in .mp4 or .mkv, it is a video, with a border and a lead-in by which a film of it can be read, and the
@@ -55,9 +63,11 @@ def patterns(program: str, out: Path, monitor: tuple[int, int] | None, rate: flo
     from workflows.programs.files import fit_to_screen, load_program, write_folder
     from workflows.programs.video import FORMATS, write_video
 
+    if grey and program not in PRESETS:
+        raise click.UsageError("--grey is for presets: a program in a file has the colours that it names")
     video = out.suffix.lower() in FORMATS
     try:
-        shown = fit_to_screen(load_program(program), monitor, bordered=video)
+        shown = fit_to_screen(load_program(program), monitor, bordered=video, grey=grey)
         with Progress("patterns") as bar:
 
             def progress(done: int, of: int) -> None:

@@ -36,6 +36,14 @@ def is_heif(data: bytes) -> bool:
     return data[4:8] == b"ftyp" and data[8:12] in BRANDS and b"avif" not in also
 
 
+def halves_colour(data: bytes) -> bool:
+    """Whether the main picture stores colour at half the resolution; false if it can't be read."""
+    try:
+        return pillow_heif.open_heif(data).info["chroma"] in (420, 422)
+    except Exception:  # damaged bytes raise many kinds of errors
+        return False
+
+
 def decode(data: bytes, *, memory: int, turn: int | None = None) -> NDArray[np.unsignedinteger]:
     """Decode the main picture of a HEIF.
 

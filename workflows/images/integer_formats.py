@@ -7,7 +7,7 @@ import imagecodecs
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, JpegImagePlugin
 
 from storage.errors import ImageError
 from workflows.images import heif, web_formats
@@ -55,6 +55,20 @@ def orientation(data: bytes) -> int:
     except Exception:  # damaged bytes raise many kinds of errors
         return 1
     return int(found) if found in range(1, 9) else 1
+
+
+def halves_colour(data: bytes) -> bool:
+    """Whether an image stores colour at a lower resolution than brightness, as most JPEG and HEIC do.
+
+    It is false if the image can't be read.
+    """
+    if heif.is_heif(data):
+        return heif.halves_colour(data)
+    try:
+        with Image.open(io.BytesIO(data), formats=FORMATS) as picture:
+            return JpegImagePlugin.get_sampling(picture) > 0
+    except Exception:  # damaged bytes raise many kinds of errors
+        return False
 
 
 def decode(

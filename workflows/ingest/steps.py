@@ -66,9 +66,10 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
                     limit=limits.memory // 2,
                 )
         # One orientation for all frames: a camera that looks down detects its orientation at random.
-        turn = 1
+        turn, half_colour = 1, False
         if manifest.video is None:
-            turn = stills.header(decoder, archive, manifest.frames[0].file).orientation
+            header = stills.header(decoder, archive, manifest.frames[0].file)
+            turn, half_colour = header.orientation, header.half_colour
         shape, storage, filmed = _examine(decoder, archive, patterns, limits)
         mask = None
         if manifest.mask is not None:
@@ -109,6 +110,7 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
             else list(filmed.shares),
             "exposures": [frame.exposure for frame in manifest.frames] or [1.0] * frames,
             **({"orientation": turn} if filmed is None else {"video": filmed.record}),
+            "half_colour": half_colour,
             "border": manifest.video is not None and manifest.video.border is not None,
         },
         mask=mask,

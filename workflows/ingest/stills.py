@@ -70,12 +70,15 @@ class Header(BaseModel):
         Whether it is camera RAW.
     orientation : int
         For `workflows.images.orientation.upright`.
+    half_colour : bool
+        Whether it stores colour at half the resolution, as most JPEG and HEIC do.
     """
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
 
     raw: bool
     orientation: Annotated[int, Field(ge=1, le=8)]
+    half_colour: bool
 
 
 def header(decoder: Decoder, archive: CaptureArchive, entry: str) -> Header:
@@ -173,7 +176,7 @@ def _header(file: BinaryIO, entry: str) -> Iterator[dict[str, Any]]:
     data = file.read()
     raw = raw_files.is_raw(data, entry)
     turn = camera_raw.orientation(data) if raw else integer_formats.orientation(data)
-    yield {"raw": raw, "orientation": turn}
+    yield {"raw": raw, "orientation": turn, "half_colour": not raw and integer_formats.halves_colour(data)}
 
 
 def _decode(file: BinaryIO, entry: str, memory: int, turn: int | None) -> Iterator[Codes | Floats]:

@@ -55,7 +55,9 @@ def load_program(name: str) -> str | Program:
     return Program.model_validate(found.get("program", found) if isinstance(found, dict) else found)
 
 
-def fit_to_screen(program: str | Program, screen: Size | None, *, bordered: bool) -> Program:
+def fit_to_screen(
+    program: str | Program, screen: Size | None, *, bordered: bool, grey: bool = False
+) -> Program:
     """Make a preset or a program for a screen.
 
     Parameters
@@ -66,6 +68,8 @@ def fit_to_screen(program: str | Program, screen: Size | None, *, bordered: bool
         In pixels; by default 1280 x 960 for a preset, and a program's own monitor.
     bordered : bool
         Whether the patterns are shown inside a border (`workflows.programs.border`) on the screen, to be filmed.
+    grey : bool
+        Whether a preset must be in black and white, as bordered ones are.
 
     Returns
     -------
@@ -83,7 +87,9 @@ def fit_to_screen(program: str | Program, screen: Size | None, *, bordered: bool
         if bordered:
             size = Border.on(*size).inner[2:]
         program = (
-            preset(program, *size, filmed=bordered) if isinstance(program, str) else _resize(program, *size)
+            preset(program, *size, grey=grey or bordered)
+            if isinstance(program, str)
+            else _resize(program, *size)
         )
     if any(isinstance(part, Images) for part in program.parts):
         raise OptionError(

@@ -54,15 +54,15 @@ RECIPES = {
     "paper-250": Recipe({12: 24, 96: 250}, offset=False, calibrated=False),
     "paper-400": Recipe({12: 24, 96: 400}, offset=False, calibrated=False),
 }
-FILMED = {
+IN_GREY = {
     "quick": Recipe({12: 8, 24: 9, 48: 8, 96: 4, 192: 2, 384: 2}, stripes=8),
     "sketch": Recipe({12: 3, 24: 3, 48: 2, 96: 1}, stripes=8),
 }
-"""What films show in place of presets in colour, with as many frames: a film stores colour at half the resolution, so
-that what a pixel sees of one colour is mixed with its neighbours'."""
+"""What films and JPEG stills show in place of presets in colour, with as many frames: both store colour at half the
+resolution, so that what a pixel sees of one colour is mixed with its neighbours'."""
 
 
-def preset(name: str, width: int = 1280, height: int = 960, *, filmed: bool = False) -> Program:
+def preset(name: str, width: int = 1280, height: int = 960, *, grey: bool = False) -> Program:
     """The program of a preset.
 
     Parameters
@@ -71,8 +71,8 @@ def preset(name: str, width: int = 1280, height: int = 960, *, filmed: bool = Fa
         A key of `RECIPES`.
     width, height : int
         Size of the monitor in pixels.
-    filmed : bool
-        Whether a camera films it: then it is in black and white.
+    grey : bool
+        Whether it must be in black and white.
 
     Returns
     -------
@@ -86,7 +86,7 @@ def preset(name: str, width: int = 1280, height: int = 960, *, filmed: bool = Fa
     """
     if name not in RECIPES:
         raise OptionError(f"there is no preset {name!r}: choose from {', '.join(RECIPES)}", field="preset")
-    recipe = FILMED.get(name, RECIPES[name]) if filmed else RECIPES[name]
+    recipe = IN_GREY.get(name, RECIPES[name]) if grey else RECIPES[name]
     coarsest = min(recipe.grids)
     if min(width, height) < coarsest:
         raise OptionError(

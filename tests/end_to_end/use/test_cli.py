@@ -121,6 +121,13 @@ def test_patterns_of_a_preset_are_written(preset: str, tmp_path: Path) -> None:
         np.testing.assert_array_equal(values, picture)
 
 
+def test_patterns_for_cameras_that_store_jpeg_are_in_black_and_white(tmp_path: Path) -> None:
+    done = patterns("sketch", str(tmp_path), "--monitor", "160x120", "--grey")
+    assert done.returncode == 0, done.stderr
+    program = Program.model_validate_json((tmp_path / "program.json").read_text())
+    assert program == presets.preset("sketch", 160, 120, grey=True)
+
+
 def test_every_preset_is_described_in_the_help() -> None:
     assert set(PRESETS) == set(presets.RECIPES)
     help_text = patterns("--help").stdout
@@ -148,6 +155,7 @@ def test_patterns_need_a_new_or_empty_folder(tmp_path: Path) -> None:
         (["quick", "x", "--monitor", "1280"], "WIDTHxHEIGHT"),
         (["quick", "x", "--monitor", "2x2"], "too small"),
         (["quick", "x", "--monitor", "99999x960"], "must be at most 16384"),
+        (["program.json", "x", "--grey"], "--grey is for presets"),
     ],
 )
 def test_invalid_patterns_are_refused(

@@ -16,7 +16,7 @@ from PIL import Image
 
 from storage.errors import ImageError
 from tests.parts.inputs.heics import heic
-from workflows.images.integer_formats import decode, encode_png, to_integers, to_unit
+from workflows.images.integer_formats import decode, encode_png, halves_colour, to_integers, to_unit
 
 MEMORY = 1 << 20
 
@@ -119,6 +119,17 @@ def test_a_jpeg_is_read(mode: str) -> None:
     expected = np.asarray(picture if mode == "L" else picture.convert("RGB")).reshape(24, 32, -1)
     assert got.dtype == np.uint8
     np.testing.assert_allclose(got.astype(int), expected.astype(int), atol=6)
+
+
+@pytest.mark.parametrize(("subsampling", "halved"), [("4:4:4", False), ("4:2:2", True), ("4:2:0", True)])
+def test_colour_at_half_the_resolution_is_noticed(subsampling: str, halved: bool) -> None:
+    pixels = noise((32, 48, 3), "uint8")
+    picture = Image.fromarray(pixels)
+    assert halves_colour(saved(picture, "JPEG", subsampling=subsampling)) == halved
+    chroma = int(subsampling.replace(":", ""))
+    assert halves_colour(heic(pixels, chroma=chroma, matrix_coefficients=1)) == halved
+    for whole in (saved(picture.convert("L"), "JPEG"), saved(picture, "PNG"), tiff(pixels), b"no image"):
+        assert not halves_colour(whole)
 
 
 def test_a_tiff_that_holds_a_jpeg_is_read() -> None:

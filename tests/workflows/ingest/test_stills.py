@@ -15,6 +15,7 @@ from storage.layout.captures import Stack
 from tests.parts.inputs.heics import heic
 from workflows.images.integer_formats import encode_jpeg, encode_png
 from workflows.images.tone_curves import BLACK, table
+from workflows.ingest.report.report import report
 
 Zip = Callable[..., bytes]
 Ingest = Callable[..., Stack]
@@ -143,6 +144,21 @@ def test_heic_frames_are_turned_as_the_first(make_zip: Zip, ingest: Ingest) -> N
     files = {f"{n}.HEIC": heic(c, turn) for n, (c, turn) in enumerate(zip(codes, turns, strict=True))}
     stack = ingest("c", make_zip(record("HEIC"), files))
     np.testing.assert_array_equal(stack.read(), np.rot90(codes, -1, axes=(1, 2)))
+
+
+@pytest.mark.parametrize(
+    ("colour", "chroma", "told"), [("rgb", 420, True), ("rgb", 444, False), ("grey", 420, False)]
+)
+def test_patterns_in_colour_are_warned_of_where_frames_halve_it(
+    colour: str, chroma: int, told: bool, make_zip: Zip, ingest: Ingest
+) -> None:
+    made = record("heic")
+    made["program"]["parts"][1]["colour"] = colour
+    frames = (255 * light(0.9)).clip(0, 255).astype(np.uint8)
+    files = {f"{n}.heic": heic(f, chroma=chroma, matrix_coefficients=1) for n, f in enumerate(frames)}
+    stack = ingest("c", make_zip(made, files))
+    names = {finding.name for finding in report(stack.attributes, stack.frames).findings}
+    assert ("coloured_patterns" in names) == told
 
 
 def test_raw_is_recognised_whatever_its_name(make_zip: Zip, ingest: Ingest, make_dng: Dng) -> None:

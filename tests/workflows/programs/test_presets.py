@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from storage.errors import OptionError
-from workflows.programs.presets import FILMED, RECIPES, preset
+from workflows.programs.presets import IN_GREY, RECIPES, preset
 from workflows.programs.program import Bernoulli, Stripes
 
 COUNTS = {"default": 140, "quick": 61, "sketch": 37, "paper-250": 282, "paper-400": 432}
@@ -80,12 +80,12 @@ def test_the_grids_are_those_of_the_recipes() -> None:
 
 
 @pytest.mark.parametrize("name", COUNTS)
-def test_films_show_as_many_patterns_in_black_and_white(name: str) -> None:
+def test_a_preset_has_as_many_patterns_in_black_and_white(name: str) -> None:
     for size in MONITORS:
-        assert preset(name, *size, filmed=True).count == COUNTS[name]
-    made = preset(name, filmed=True)
+        assert preset(name, *size, grey=True).count == COUNTS[name]
+    made = preset(name, grey=True)
     assert {part.colour for part in made.parts if isinstance(part, Bernoulli | Stripes)} == {"grey"}
-    assert (made == preset(name)) == (name not in FILMED)
+    assert (made == preset(name)) == (name not in IN_GREY)
 
 
 @pytest.mark.parametrize("name", ["default", "quick", "sketch"])

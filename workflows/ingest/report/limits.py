@@ -7,7 +7,7 @@ import numpy as np
 
 from workflows.images.tone_curves import CameraCurve, Sampled, to_light
 from workflows.ingest.report.figures import Figures, Finding, Quality, graded
-from workflows.programs.program import Images, Program
+from workflows.programs.program import Bernoulli, Images, Program, Stripes
 
 SHOWS, SPOILS = 1e-4, 6e-3
 """Mean squares of errors, of full scale, from which on they show (40 dB), and spoil composites (22 dB)."""
@@ -61,6 +61,23 @@ def unexplained(cost: float, share: float) -> list[Finding]:
             remedy="switch HDR, sharpening and noise reduction of the camera off, shoot RAW, or film at a higher bit "
             "rate",
             cost=cost,
+        )
+    ]
+
+
+def coloured_patterns(program: Program, *, half_colour: bool) -> list[Finding]:
+    """Patterns in colour that the frames have at half the resolution."""
+    shown = [part for part in program.parts if isinstance(part, Bernoulli | Stripes)]
+    if not half_colour or all(part.channels == 1 for part in shown):
+        return []
+    return [
+        Finding(
+            name="coloured_patterns",
+            level="warning",
+            message="the patterns are in colour, which the frames store at half the resolution, as most JPEG and HEIC "
+            "do: that costs composites up to 6 dB",
+            remedy="shoot RAW, or show patterns in black and white: the preset `default`, or another one by `envmatte "
+            "patterns --grey`",
         )
     ]
 

@@ -51,7 +51,7 @@ class Engine:
     def program(self, columns: int, rows: int) -> Patterns:
         monitor = Monitor(width=columns, height=rows)
         if isinstance(self.wanted, str):
-            self.shown = preset(self.wanted, columns, rows, filmed=self.filmed).model_copy(
+            self.shown = preset(self.wanted, columns, rows, grey=self.filmed).model_copy(
                 update={"monitor": monitor}
             )
         else:
