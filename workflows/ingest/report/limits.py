@@ -74,10 +74,9 @@ def coloured_patterns(program: Program, *, half_colour: bool) -> list[Finding]:
         Finding(
             name="coloured_patterns",
             level="warning",
-            message="the patterns are in colour, which the frames store at half the resolution, as most JPEG and HEIC "
-            "do: that costs composites up to 6 dB",
-            remedy="shoot RAW, or show patterns in black and white: the preset `default`, or another one by `envmatte "
-            "patterns --grey`",
+            message="the patterns are in colour, which these frames store at half the resolution: that costs "
+            "composites up to 6 dB",
+            remedy="shoot RAW, or show patterns in black and white: `envmatte patterns --grey`",
         )
     ]
 
