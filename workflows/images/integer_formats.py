@@ -62,9 +62,9 @@ def halves_colour(data: bytes) -> bool:
 
     It is false if the image can't be read.
     """
-    if heif.is_heif(data):
-        return heif.halves_colour(data)
     try:
+        if heif.is_heif(data):
+            return heif.halves_colour(data)
         with Image.open(io.BytesIO(data), formats=FORMATS) as picture:
             return JpegImagePlugin.get_sampling(picture) > 0
     except Exception:  # damaged bytes raise many kinds of errors

@@ -109,8 +109,11 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
             if filmed is None
             else list(filmed.shares),
             "exposures": [frame.exposure for frame in manifest.frames] or [1.0] * frames,
-            **({"orientation": turn} if filmed is None else {"video": filmed.record}),
-            "half_colour": half_colour,
+            **(
+                {"orientation": turn, "half_colour": half_colour}
+                if filmed is None
+                else {"video": filmed.record}
+            ),
             "border": manifest.video is not None and manifest.video.border is not None,
         },
         mask=mask,

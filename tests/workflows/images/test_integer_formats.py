@@ -130,6 +130,7 @@ def test_colour_at_half_the_resolution_is_noticed(subsampling: str, halved: bool
     assert halves_colour(heic(pixels, chroma=chroma, matrix_coefficients=1)) == halved
     for whole in (saved(picture.convert("L"), "JPEG"), saved(picture, "PNG"), tiff(pixels), b"no image"):
         assert not halves_colour(whole)
+    assert not halves_colour(heic(pixels, chroma=420, matrix_coefficients=1)[:64])
 
 
 def test_a_tiff_that_holds_a_jpeg_is_read() -> None:

@@ -147,10 +147,10 @@ def test_heic_frames_are_turned_as_the_first(make_zip: Zip, ingest: Ingest) -> N
 
 
 @pytest.mark.parametrize(
-    ("colour", "chroma", "told"), [("rgb", 420, True), ("rgb", 444, False), ("grey", 420, False)]
+    ("colour", "chroma", "warned"), [("rgb", 420, True), ("rgb", 444, False), ("grey", 420, False)]
 )
 def test_patterns_in_colour_are_warned_of_where_frames_halve_it(
-    colour: str, chroma: int, told: bool, make_zip: Zip, ingest: Ingest
+    colour: str, chroma: int, warned: bool, make_zip: Zip, ingest: Ingest
 ) -> None:
     made = record("heic")
     made["program"]["parts"][1]["colour"] = colour
@@ -158,7 +158,7 @@ def test_patterns_in_colour_are_warned_of_where_frames_halve_it(
     files = {f"{n}.heic": heic(f, chroma=chroma, matrix_coefficients=1) for n, f in enumerate(frames)}
     stack = ingest("c", make_zip(made, files))
     names = {finding.name for finding in report(stack.attributes, stack.frames).findings}
-    assert ("coloured_patterns" in names) == told
+    assert ("coloured_patterns" in names) == warned
 
 
 def test_raw_is_recognised_whatever_its_name(make_zip: Zip, ingest: Ingest, make_dng: Dng) -> None:

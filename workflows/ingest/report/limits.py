@@ -67,8 +67,8 @@ def unexplained(cost: float, share: float) -> list[Finding]:
 
 def coloured_patterns(program: Program, *, half_colour: bool) -> list[Finding]:
     """Patterns in colour that the frames have at half the resolution."""
-    shown = [part for part in program.parts if isinstance(part, Bernoulli | Stripes)]
-    if not half_colour or all(part.channels == 1 for part in shown):
+    coloured = any(isinstance(part, Bernoulli | Stripes) and part.channels > 1 for part in program.parts)
+    if not (half_colour and coloured):
         return []
     return [
         Finding(
