@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from multiprocessing import forkserver
 from urllib.parse import urlsplit
 
@@ -76,8 +77,12 @@ def test_another_user_of_this_machine_cannot_join(
 
 def processes_of(module: str) -> list[psutil.Process]:
     """The children of this process that run a module of multiprocessing."""
-    mine = psutil.Process().children()
-    return [one for one in mine if one.status() != psutil.STATUS_ZOMBIE and module in " ".join(one.cmdline())]
+    found = []
+    for one in psutil.Process().children():
+        with suppress(psutil.NoSuchProcess):  # it has ended since it was listed
+            if one.status() != psutil.STATUS_ZOMBIE and module in " ".join(one.cmdline()):
+                found.append(one)
+    return found
 
 
 def test_resource_tracker_is_replaced_although_nothing_needs_it(cluster: LocalCluster) -> None:
