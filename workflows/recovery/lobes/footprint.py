@@ -13,7 +13,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from workflows.recovery.pyramid import Grids
-from workflows.recovery.solvers import inner
 
 PARAMETERS = 6
 """Parameters of a lobe."""
@@ -142,14 +141,14 @@ def sample(
     With z = L^-1 (node - centre), ln share = -z'z / 2 + const, and d ln share = z' L^-1 (d centre + dL z). Along a row
     ln share is a parabola, so the ratio of a share to the one before changes by a constant factor from node to node.
     """
-    columns, rows, starts = grids
+    columns, rows, start = grids.columns[level], grids.rows[level], grids.starts[level]
     spacing = 2.0**level
     x, y, l00, l10, l11 = lobe[1], lobe[2], lobe[3], lobe[4], lobe[5]
     yy = l10**2 + l11**2
     slope, across = l00 * l10 / yy, l00 * l11 / math.sqrt(yy)
     tall = math.sqrt(_REACH * yy)
     top = max(0, math.ceil((y - tall) / spacing - 0.5))
-    bottom = min(rows[level] - 1, math.floor((y + tall) / spacing - 0.5))
+    bottom = min(rows - 1, math.floor((y + tall) / spacing - 0.5))
     inverse0, inverse1 = 1 / l00, 1 / l11
     # from a node to the next of its row
     step0 = spacing / l00
@@ -160,13 +159,13 @@ def sample(
         dy = (row + 0.5) * spacing - y
         wide = across * math.sqrt(max(_REACH - dy * dy / yy, 0.0))
         left = max(0, math.ceil((x + slope * dy - wide) / spacing - 0.5))
-        right = min(columns[level] - 1, math.floor((x + slope * dy + wide) / spacing - 0.5))
+        right = min(columns - 1, math.floor((x + slope * dy + wide) / spacing - 0.5))
         z0 = ((left + 0.5) * spacing - x) / l00
         z1 = (dy - l10 * z0) / l11
         share = math.exp(-(z0 * z0 + z1 * z1) / 2)
         ratio = math.exp(-(z0 * step0 + z1 * step1)) * math.sqrt(bend)
         for column in range(left, min(right + 1, left + NODES - n)):
-            node[n] = starts[level] + row * columns[level] + column
+            node[n] = start + row * columns + column
             terms[0, n] = share
             if terms.shape[0] > 1:
                 g1 = z1 * inverse1
@@ -179,9 +178,9 @@ def sample(
             share *= ratio
             ratio *= bend
     if n == 0:
-        column = min(max(math.floor(x / spacing), 0), columns[level] - 1)
-        row = min(max(math.floor(y / spacing), 0), rows[level] - 1)
-        node[0] = starts[level] + row * columns[level] + column
+        column = min(max(math.floor(x / spacing), 0), columns - 1)
+        row = min(max(math.floor(y / spacing), 0), rows - 1)
+        node[0] = start + row * columns + column
         for k in range(terms.shape[0]):
             terms[k, 0] = 1.0 if k == 0 else 0.0
         return 1
@@ -189,13 +188,15 @@ def sample(
     return n
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc"})
 def _normalise(terms: NDArray[np.float32], n: int, total: float) -> None:
     """Divide n shares by their sum `total`, and turn derivatives of their logarithms into derivatives of the shares."""
     for i in range(n):
         terms[0, i] /= total
     for k in range(1, terms.shape[0]):
-        mean = inner(terms[0, :n], terms[k, :n])
+        mean = np.float32(0)
+        for i in range(n):
+            mean += terms[0, i] * terms[k, i]
         for i in range(n):
             terms[k, i] = terms[0, i] * (terms[k, i] - mean)
 
@@ -233,28 +234,53 @@ def signed_codes(
 
 # "contract" allows fused multiply-add: fewer roundings, and the same results on every machine that has it.
 @njit(nogil=True, cache=True, fastmath={"contract"})
-def combine(terms: NDArray[np.float32], rows: NDArray[np.float32], n: int, out: NDArray[np.float32]) -> None:
-    """Write ``terms[:, :n] @ rows[:n]``.
+def combine(
+    code: NDArray[np.uint8],
+    first: int,
+    m: int,
+    node: NDArray[np.int64],
+    n: int,
+    terms: NDArray[np.float32],
+    out: NDArray[np.float32],
+) -> None:
+    """Write the patterns' light on some nodes, -1 (black) to 1 (white), times their shares and summed.
 
     Parameters
     ----------
-    terms : (t, n or more) float32
-    rows : (n or more, m) float32
-    n : int
-    out : (t, m or more) float32
+    code, first, m, node, n
+        As in :func:`signed_codes`.
+    terms : (1 or 6, n or more) float32
+        As from :func:`sample`: shares of sum 1, and derivatives of sum 0.
+    out : (1 or 6, m or more) float32
         Written.
+
+    Notes
+    -----
+    With these sums, the light ``c 2 / 255 - 1`` of codes c gives the sum of ``terms c 2 / 255``, less 1 for the shares.
+    To write the light of each node first took as long as its sums.
     """
-    m = rows.shape[1]
+    unit, whole = np.float32(2 / 255), n - n % 4
     for t in range(terms.shape[0]):
-        written = out[t]
         for k in range(m):
-            written[k] = 0
-        for i in range(0, n - 3, 4):
-            a, b, c, d = terms[t, i], terms[t, i + 1], terms[t, i + 2], terms[t, i + 3]
-            r0, r1, r2, r3 = rows[i], rows[i + 1], rows[i + 2], rows[i + 3]
+            out[t, k] = -1.0 if t == 0 else 0.0
+    # Four nodes at a time, so that sums are read and written a fourth as often. Unsigned indices can't count from the
+    # end: signed ones take five times as long.
+    for i in range(0, whole, 4):
+        p, q, r, s = (
+            np.uint64(node[i]),
+            np.uint64(node[i + 1]),
+            np.uint64(node[i + 2]),
+            np.uint64(node[i + 3]),
+        )
+        for t in range(terms.shape[0]):
+            a, b = unit * terms[t, i], unit * terms[t, i + 1]
+            c, d = unit * terms[t, i + 2], unit * terms[t, i + 3]
             for k in range(m):
-                written[k] += a * r0[k] + b * r1[k] + c * r2[k] + d * r3[k]
-        for i in range(n - n % 4, n):
-            a, r0 = terms[t, i], rows[i]
+                at, to = np.uint64(first + k), np.uint64(k)
+                both = a * np.float32(code[p, at]) + b * np.float32(code[q, at])
+                out[t, to] += both + c * np.float32(code[r, at]) + d * np.float32(code[s, at])
+    for i in range(whole, n):
+        for t in range(terms.shape[0]):
+            a = unit * terms[t, i]
             for k in range(m):
-                written[k] += a * r0[k]
+                out[t, np.uint64(k)] += a * np.float32(code[np.uint64(node[i]), np.uint64(first + k)])

@@ -15,9 +15,12 @@ from workflows.recovery.pyramid import Grids
 
 # Least contrast of a pattern within T, 1 - f^2.
 _LEAST_CONTRAST = 0.02
+# Variances are multiplied until their product leaves this range, and then one logarithm is taken of all.
+_SMALL, _LARGE = 1e-100, 1e100
 
 
-@njit(nogil=True, cache=True)
+# Without a branch for a division by zero or for what was not measured, the loop over the patterns is one of vectors.
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
 def estimate_kappa(
     y: NDArray[np.float32],
     f: NDArray[np.float32],
@@ -54,18 +57,19 @@ def estimate_kappa(
     If T has the mean t and the covariance kappa diag(t), a pattern of +-1 has the additional variance
     kappa (1 - mean^2). kappa starts at its moment estimate and takes a few Fisher scoring steps.
     """
-    m = y.size // groups - 2
+    size = y.size // groups
     kappa, misfit, freedom = 0.0, 0.0, 1.0
     for scoring in range(5):
-        excess, contrast, used = 0.0, 1e-9, 0
+        excess, contrast, used = 0.0, 1e-9, 0.0
         for g in range(groups):
-            for j in range(g * (m + 2), g * (m + 2) + m):
-                if variance[j] < np.inf:
-                    share = max(1 - mean[j] * mean[j], _LEAST_CONTRAST)
-                    weight = share / (variance[j] + kappa * share) ** 2 if scoring > 0 else 1.0
-                    excess += weight * (freedom * (y[j] - f[j]) ** 2 - variance[j])
-                    contrast += weight * share
-                    used += 1
+            for i in range(size - 2):
+                j = np.uint64(g * size + i)
+                there = variance[j] < np.inf
+                share = max(1 - mean[j] * mean[j], _LEAST_CONTRAST)
+                weight = share / (variance[j] + kappa * share) ** 2 if scoring > 0 else 1.0
+                excess += weight * (freedom * (y[j] - f[j]) ** 2 - variance[j]) if there else 0.0
+                contrast += weight * share if there else 0.0
+                used += 1.0 if there else 0.0
         kappa = min(max(excess / contrast, least), 1.0)
         if scoring == 0:
             misfit = excess / max(used, 1)
@@ -73,7 +77,7 @@ def estimate_kappa(
     return kappa, misfit
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def weigh(
     y: NDArray[np.float32],
     f: NDArray[np.float32],
@@ -100,15 +104,19 @@ def weigh(
     """
     m = y.size // groups - 2
     kappa, _ = estimate_kappa(y, f, f, variance, groups, parameters, 0.0)
-    objective = 0.0
+    objective, product = 0.0, 1.0
     for g in range(groups):
         for j in range(g * (m + 2), (g + 1) * (m + 2)):
             share = max(1 - f[j] * f[j], _LEAST_CONTRAST) if j < g * (m + 2) + m else 0.0
             total = variance[j] + kappa * share
             precision[j] = 1 / total
             if total < np.inf:
-                objective += (y[j] - f[j]) ** 2 / total + math.log(total)
-    return kappa, objective
+                objective += (y[j] - f[j]) ** 2 / total
+                product *= total
+                if not _SMALL < product < _LARGE:
+                    objective += math.log(product)
+                    product = 1.0
+    return kappa, objective + math.log(product)
 
 
 @njit(nogil=True, cache=True)

@@ -23,7 +23,6 @@ from workflows.recovery.lobes.footprint import (
     combine,
     parts_of,
     sample,
-    signed_codes,
 )
 from workflows.recovery.lobes.strays import write_strays
 
@@ -60,13 +59,13 @@ class Workspace(NamedTuple):
     ----------
     node : (NODES,) int64
     terms : (t, NODES) float32
-    light : (NODES groups m or more,) float32
+    lobe : (6,) float64
     sums : (t, groups m or more) float32
     """
 
     node: NDArray[np.int64]
     terms: NDArray[np.float32]
-    light: NDArray[np.float32]
+    lobe: NDArray[np.float64]
     sums: NDArray[np.float32]
 
 
@@ -76,7 +75,7 @@ def make_workspace(light: int) -> Workspace:
     return Workspace(
         np.empty(NODES, np.int64),
         np.empty((PARAMETERS, NODES), np.float32),
-        np.empty(NODES * light, np.float32),
+        np.empty(PARAMETERS),
         np.empty((PARAMETERS, light), np.float32),
     )
 
@@ -84,7 +83,7 @@ def make_workspace(light: int) -> Workspace:
 @njit(nogil=True, cache=True, inline="always")
 def without_derivatives(workspace: Workspace) -> Workspace:
     """The same working space, for predictions alone."""
-    return Workspace(workspace.node, workspace.terms[:1], workspace.light, workspace.sums[:1])
+    return Workspace(workspace.node, workspace.terms[:1], workspace.lobe, workspace.sums[:1])
 
 
 @njit(nogil=True, cache=True, inline="always")
@@ -117,32 +116,30 @@ def predict(
     f : (groups (m + 2),) float32
         Written: the prediction.
     """
-    node, terms, _, sums = workspace
-    first = np.int64(0)  # with a literal, numba would compile another version of `signed_codes`
+    node, terms, lobe, sums = workspace
+    # Once, not for each lobe: what is taken out of a tuple is counted as a reference.
+    grids, code, lobes, level = patterns.grids, patterns.code, mixture.lobes, mixture.level
     m = patterns.m
     parts, groups = parts_of(patterns)
-    light = workspace.light[: NODES * groups * m].reshape(NODES, groups * m)
-    lobe = np.empty(PARAMETERS)
     write_strays(patterns.strays, mixture.stray, 0, f)
     for i in range(k):
         for part in range(parts):
-            lobe[:] = mixture.lobes[i]
+            for t in range(PARAMETERS):
+                lobe[t] = lobes[i, t]
             if patterns.dispersed:
                 move(lobe, mixture.dispersion, part)
-            n = sample(lobe, mixture.level[i], patterns.grids, node, terms)
-            signed_codes(patterns.code, patterns.first + part * groups * m, groups * m, node, n, light, first)
-            combine(terms, light, n, sums)
+            n = sample(lobe, level[i], grids, node, terms)
+            combine(code, patterns.first + part * groups * m, groups * m, node, n, terms, sums)
             for t in range(terms.shape[0]):
-                of_lobe = response[i, t]
                 for g in range(groups):
                     to = (part * groups + g) * (m + 2)
                     for j in range(m):
-                        of_lobe[to + j] = sums[t, g * m + j]
-                    of_lobe[to + m] = -1.0 if t == 0 else 0.0
-                    of_lobe[to + m + 1] = 1.0 if t == 0 else 0.0
-        weight, of_lobe = np.float32(mixture.lobes[i, 0]), response[i, 0]
+                        response[i, t, to + j] = sums[t, g * m + j]
+                    response[i, t, to + m] = -1.0 if t == 0 else 0.0
+                    response[i, t, to + m + 1] = 1.0 if t == 0 else 0.0
+        weight = np.float32(lobes[i, 0])
         for j in range(f.size):
-            f[j] += weight * of_lobe[j]
+            f[j] += weight * response[i, 0, j]
 
 
 @njit(nogil=True, cache=True)

@@ -17,9 +17,8 @@ from workflows.recovery.lobes.fitting.fits import (
     spread_to,
 )
 from workflows.recovery.lobes.options import LobesOptions
-from workflows.recovery.lobes.posterior.mean import update
+from workflows.recovery.lobes.posterior.mean import add_row_moments, update
 from workflows.recovery.lobes.strays import subtract_strays, write_strays
-from workflows.recovery.solvers import subtract
 
 # Initial capacity for the entries of rows.
 _CAPACITY = 1 << 16
@@ -72,8 +71,7 @@ def finish_fit(
         A, weight, end, y, variance, patterns.strays[:1], offset, options.passes, options.gradients
     )
     f = np.zeros_like(y)
-    for i in range(n):
-        subtract(f, -weight[i], A[i])
+    add_row_moments(A, weight, f, np.zeros_like(f))
     for d in range(3):
         if c in (ALL, d):
             diagnostics.kappa[p, d], diagnostics.misfit[p, d] = kappa, misfit
@@ -126,9 +124,10 @@ def finish_pixels(
             while end + found > node.size:
                 node = np.concatenate((node, np.empty_like(node)))
                 weight = np.concatenate((weight, np.empty_like(weight)))
-            for i in np.argsort(buffers.node[:found]):
-                if buffers.weight[i] >= options.least_weight:
-                    node[end], weight[end] = buffers.node[i], buffers.weight[i]
-                    diagnostics.nodes[p, c % 3] += 1
+            of_row, weights, begin = buffers.node, buffers.weight, end
+            for i in np.argsort(of_row[:found]):
+                if weights[i] >= options.least_weight:
+                    node[end], weight[end] = of_row[i], weights[i]
                     end += 1
+            diagnostics.nodes[p, c % 3] += end - begin
     return node[:end], weight[:end]

@@ -180,6 +180,9 @@ def test_load_and_combine_are_a_product_of_matrices():
     signed_codes(code, 5, 33, node, n, rows, 0)
     signed = code[node, 5:38] / 127.5 - 1
     np.testing.assert_allclose(rows[:n], signed, atol=1e-6)
-    for kept in (n, n - 1, 3, 0):
-        combine(terms, rows, kept, out)
-        np.testing.assert_allclose(out, terms[:, :kept].astype(float) @ signed[:kept], atol=1e-5)
+    for kept in (n, n - 1, n - 2, 3, 1):
+        shares = terms[:, :kept] - terms[:, :kept].mean(axis=1, keepdims=True)
+        shares[0] += 1 / kept
+        for count in (PARAMETERS, 1):
+            combine(code, 5, 33, node, kept, shares[:count], out[:count])
+            np.testing.assert_allclose(out[:count], shares[:count].astype(float) @ signed[:kept], atol=1e-5)

@@ -6,6 +6,8 @@ the mean of T over all of them, each with its share of the likelihood. The fits 
 channels, are such sets, found from other measurements.
 """
 
+import math
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -71,9 +73,13 @@ def adjacent(places: NDArray[np.integer]) -> NDArray[np.int64]:
 
 
 @njit(nogil=True, cache=True)
-def _centre(fits: Fits, p: int, c: int) -> NDArray[np.float64]:
-    """The centre x, y of the heaviest lobe of fit c of a pixel."""
-    return fits.lobes[p, c, np.argmax(fits.lobes[p, c, : fits.k[p, c], 0]), 1:3]
+def _centre(lobes: NDArray[np.float64], k: NDArray[np.int64], p: int, c: int) -> tuple[float, float]:
+    """The centre x, y of the heaviest lobe of fit c of a pixel, from `lobes` and `k` of `Fits`."""
+    heaviest = 0
+    for i in range(1, k[p, c]):
+        if lobes[p, c, i, 0] > lobes[p, c, heaviest, 0]:
+            heaviest = i
+    return lobes[p, c, heaviest, 1], lobes[p, c, heaviest, 2]
 
 
 @njit(nogil=True, cache=True)
@@ -88,18 +94,22 @@ def _median(moved: NDArray[np.float64]) -> tuple[float, float]:
 @njit(nogil=True, cache=True)
 def _slope(fits: Fits, p: int, c: int, near: NDArray[np.int64], axis: int) -> tuple[float, float]:
     """How far the heaviest lobe moves to the next pixel along rows (0) or columns (1), x and y."""
-    centre = np.full((3, 3, 2), np.nan)
+    centre, lobes, k = np.full((2, 3, 3), np.nan), fits.lobes, fits.k
     for e in range(-1, near.size):
         q = p if e < 0 else near[e]
-        if q >= 0 and fits.k[q, c] > 0:
+        if q >= 0 and k[q, c] > 0:
             row, column = (1, 1) if e < 0 else (1 + _OFFSETS[e, 0], 1 + _OFFSETS[e, 1])
-            centre[row, column] = _centre(fits, q, c)
+            centre[0, row, column], centre[1, row, column] = _centre(lobes, k, q, c)
     moved, n = np.empty((2, 6)), 0
     for i in range(3):
         for j in range(2):
-            by = centre[j + 1, i] - centre[j, i] if axis == 0 else centre[i, j + 1] - centre[i, j]
-            if not np.isnan(by[0]):
-                moved[:, n] = by
+            (row, column), (next_row, next_column) = (
+                ((j, i), (j + 1, i)) if axis == 0 else ((i, j), (i, j + 1))
+            )
+            x = centre[0, next_row, next_column] - centre[0, row, column]
+            if not math.isnan(x):
+                moved[0, n] = x
+                moved[1, n] = centre[1, next_row, next_column] - centre[1, row, column]
                 n += 1
     x, y = _median(moved[:, :n])
     return x, y
@@ -108,11 +118,12 @@ def _slope(fits: Fits, p: int, c: int, near: NDArray[np.int64], axis: int) -> tu
 @njit(nogil=True, cache=True)
 def _dispersion(fits: Fits, p: int, c: int, other: int, near: NDArray[np.int64]) -> tuple[float, float]:
     """How far the heaviest lobe of channel c lies from that of another channel, x and y."""
-    moved, n = np.empty((2, near.size + 1)), 0
+    moved, n, lobes, k = np.empty((2, near.size + 1)), 0, fits.lobes, fits.k
     for e in range(-1, near.size):
         q = p if e < 0 else near[e]
-        if q >= 0 and fits.k[q, c] > 0 and fits.k[q, other] > 0:
-            moved[:, n] = _centre(fits, q, c) - _centre(fits, q, other)
+        if q >= 0 and k[q, c] > 0 and k[q, other] > 0:
+            (x, y), (other_x, other_y) = _centre(lobes, k, q, c), _centre(lobes, k, q, other)
+            moved[0, n], moved[1, n] = x - other_x, y - other_y
             n += 1
     x, y = _median(moved[:, :n])
     return x, y
@@ -136,14 +147,14 @@ def _average(
     count, objective = np.zeros(n, np.int64), np.full(n, np.inf)
     lobes, level = np.empty((n, most, PARAMETERS)), np.empty((n, most), np.int64)
     f, precision = np.empty_like(y), np.empty_like(y)
-    response = np.empty((most, 1, y.size), np.float32)
+    response, together = np.empty((most, 1, y.size), np.float32), np.zeros(2)
     for e in range(n):
         q = near[e - 1] if 0 < e < about else p
         d = c if e < about else (c + 1 + e - about) % 3
         if q < 0 or fits.k[q, d] == 0:
             continue
         k = fits.k[q, d]
-        tried = Mixture(lobes[e], level[e], fits.stray[p, c], np.zeros(2))
+        tried = Mixture(lobes[e], level[e], fits.stray[p, c], together)
         copy_mixture(k, np.int64(0), fit_of(fits, q, d), tried)
         if e >= about:
             across, along = _dispersion(fits, p, c, d, near)

@@ -94,12 +94,12 @@ def disperse(mixture: Mixture, change: NDArray[np.float64]) -> None:
 def chi_square(
     y: NDArray[np.float32],
     f: NDArray[np.float32],
-    precision: NDArray[np.float32],
+    root: NDArray[np.float32],
     residual: NDArray[np.float32],
 ) -> float:
     """Return chi-square, the sum of squared residuals times their precisions; write the weighted residuals."""
     for j in range(y.size):
-        residual[j] = (y[j] - f[j]) * math.sqrt(precision[j])
+        residual[j] = (y[j] - f[j]) * root[j]
     return float(inner(residual, residual))
 
 
@@ -109,6 +109,8 @@ class Equations(NamedTuple):
 
     Attributes
     ----------
+    root : (groups (m + 2),) float32
+        Square root of the precision.
     residual : (groups (m + 2),) float32
         Measurements less prediction, times the square root of the precision.
     slopes : (n, groups (m + 2)) float32
@@ -121,6 +123,7 @@ class Equations(NamedTuple):
         A plus the damping, then its Cholesky factor.
     """
 
+    root: NDArray[np.float32]
     residual: NDArray[np.float32]
     slopes: NDArray[np.float32]
     A: NDArray[np.float64]
@@ -129,25 +132,44 @@ class Equations(NamedTuple):
     damped: NDArray[np.float64]
 
 
+@njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})
+def write_normal(
+    slopes: NDArray[np.float32],
+    residual: NDArray[np.float32],
+    A: NDArray[np.float64],
+    b: NDArray[np.float64],
+) -> None:
+    """Write the lower triangle of ``A = slopes slopes'`` and ``b = slopes residual``."""
+    for i in range(b.size):
+        along = np.float32(0)
+        for j in range(residual.size):
+            along += slopes[i, j] * residual[j]
+        b[i] = along
+        for k in range(i + 1):
+            product = np.float32(0)
+            for j in range(residual.size):
+                product += slopes[i, j] * slopes[k, j]
+            A[i, k] = product
+
+
 @njit(nogil=True, cache=True, inline="always")
 def linearise(
     patterns: PatternCodes,
     mixture: Mixture,
     k: int,
     response: NDArray[np.float32],
-    precision: NDArray[np.float32],
     equations: Equations,
 ) -> None:
     """Write the derivatives by stray light and k lobes, and the normal equations ``A change = b``."""
-    slopes, residual, A, b = equations.slopes, equations.residual, equations.A, equations.b
-    strays, groups = patterns.strays, patterns.groups
+    root, residual, slopes, A, b, _, _ = equations
+    strays, groups, lobes = patterns.strays, patterns.groups, mixture.lobes
     count, size = strays.shape
     for g in range(groups):
         for s in range(count):
             slope = slopes[g * count + s]
             slope[:] = 0
             for j in range(size):
-                slope[g * size + j] = strays[s, j] * math.sqrt(precision[g * size + j])
+                slope[g * size + j] = strays[s, j] * root[g * size + j]
     before = groups * count
     for axis in range(axes_of(patterns)):
         slope = slopes[before]
@@ -155,20 +177,17 @@ def linearise(
         for i in range(k):
             of_lobe = response[i, 1 + axis]
             for g in range(groups):
-                weight = np.float32(RATES[g] * mixture.lobes[i, 0])
+                weight = np.float32(RATES[g] * lobes[i, 0])
                 for j in range(g * size, (g + 1) * size):
-                    slope[j] += weight * of_lobe[j] * math.sqrt(precision[j])
+                    slope[j] += weight * of_lobe[j] * root[j]
         before += 1
     for i in range(k):
         for t in range(PARAMETERS):
-            weight = np.float32(1.0 if t == 0 else mixture.lobes[i, 0])
+            weight = np.float32(1.0 if t == 0 else lobes[i, 0])
             slope, of_lobe = slopes[before + PARAMETERS * i + t], response[i, t]
-            for j in range(precision.size):
-                slope[j] = weight * of_lobe[j] * math.sqrt(precision[j])
-    for i in range(b.size):
-        b[i] = inner(slopes[i], residual)
-        for j in range(i + 1):
-            A[i, j] = inner(slopes[i], slopes[j])
+            for j in range(root.size):
+                slope[j] = weight * of_lobe[j] * root[j]
+    write_normal(slopes, residual, A, b)
     for i in range(groups * count):
         if i % count > 0:
             A[i, i] += 1 / STRAY**2
@@ -212,10 +231,12 @@ def refine_round(
     The linear model expects a step to lower chi-square by about ``change b``. To try one takes longer than to solve it.
     """
     damping, strays = _DAMPING, patterns.groups * len(patterns.strays)
-    lobes = strays + axes_of(patterns)
-    chi = chi_square(y, f, precision, equations.residual)
+    lobes, root, residual = strays + axes_of(patterns), equations.root, equations.residual
+    for j in range(root.size):
+        root[j] = math.sqrt(precision[j])
+    chi = chi_square(y, f, root, residual)
     for _ in range(options.steps):
-        linearise(patterns, mixture, k, response, precision, equations)
+        linearise(patterns, mixture, k, response, equations)
         better, new_chi, tried = False, chi, False
         for _ in range(_ATTEMPTS):
             if solve_damped(equations, damping):
@@ -232,7 +253,7 @@ def refine_round(
                     disperse(new, equations.change[strays:lobes])
                 apply_step(new, equations.change[lobes:], patterns.grids, options.fit_resolution)
                 predict(patterns, new, k, workspace, response, f)
-                new_chi = chi_square(y, f, precision, equations.residual)
+                new_chi = chi_square(y, f, root, residual)
                 better = new_chi < chi
                 if better:
                     break
@@ -338,6 +359,7 @@ def refine(
     response = np.empty((k, PARAMETERS, M), np.float32)
     f, precision = np.empty_like(y), np.empty_like(y)
     equations = Equations(
+        np.empty_like(y),
         np.empty_like(y),
         np.empty((n, M), np.float32),
         np.empty((n, n)),

@@ -58,26 +58,33 @@ def score(
 
 @njit(nogil=True, cache=True, inline="always")
 def see(
-    patterns: PatternCodes,
-    level: int,
+    grid: tuple[int, int, int],
     column: int,
     row: int,
     dispersion: tuple[float, float],
     nodes: NDArray[np.int64],
 ) -> None:
-    """Write the node that each part of the groups sees, for a node of green's and a dispersion in cells."""
-    wide, high, start = (
-        patterns.grids.columns[level],
-        patterns.grids.rows[level],
-        patterns.grids.starts[level],
-    )
-    if patterns.dispersed:
-        for part in range(nodes.size):
-            c = column + int(np.rint(RATES[part] * dispersion[0] / 2.0**level))
-            r = row + int(np.rint(RATES[part] * dispersion[1] / 2.0**level))
-            nodes[part] = start + min(max(r, 0), high - 1) * wide + min(max(c, 0), wide - 1)
-    else:
+    """Write the node that each part of the groups sees.
+
+    Parameters
+    ----------
+    grid : (int, int, int)
+        Columns, rows and the first node of a grid.
+    column, row : int
+        The node that green sees.
+    dispersion : (float, float)
+        In spacings of the grid.
+    nodes : (parts,) int64
+        Written. A single part sees the same as green.
+    """
+    wide, high, start = grid
+    if nodes.size == 1:
         nodes[0] = start + row * wide + column
+        return
+    for part in range(nodes.size):
+        c = column + int(np.rint(RATES[part] * dispersion[0]))
+        r = row + int(np.rint(RATES[part] * dispersion[1]))
+        nodes[part] = start + min(max(r, 0), high - 1) * wide + min(max(c, 0), wide - 1)
 
 
 @njit(nogil=True, cache=True)

@@ -77,7 +77,8 @@ def find_node(
     a node explains of all there is to explain. A node of the finest grid that explains everything then outweighs the
     wide one about it, which the fit could not make narrow.
     """
-    columns, rows, _ = patterns.grids
+    columns, rows, starts = patterns.grids
+    code = patterns.code  # once, not for each node: what is taken out of a tuple is counted as a reference
     code_of_f, residual, weight = in_codes(patterns, y, f, precision)
     best_level, best_column, best_row, gain, best_z = -1, 0, 0, -_HUGE, 0.0
     nodes = np.empty(parts_of(patterns)[0], np.int64)
@@ -95,6 +96,7 @@ def find_node(
             used += 1
     for level in range(columns.size - 1, -1, -1):
         wide, high, spacing = columns[level], rows[level], 2.0**level
+        grid = wide, high, starts[level]
         whole = level == columns.size - 1
         found = 0
         for p in range(wide * high if whole else 4 * ways * count):
@@ -108,9 +110,11 @@ def find_node(
                     across, down = 2 * parents[parent, 2] + way % 3 - 1, 2 * parents[parent, 3] + way // 3 - 1
             if column >= wide or row >= high or max(abs(across), abs(down)) * spacing > _MOST_DISPERSION:
                 continue
-            apart = (across * spacing, down * spacing) if ways > 1 else (dispersion[0], dispersion[1])
-            see(patterns, level, column, row, apart, nodes)
-            z, _ = score(patterns.code, nodes, patterns.first, code_of_f, residual, weight)
+            apart = dispersion[0] / spacing, dispersion[1] / spacing
+            if ways > 1:
+                apart = float(across), float(down)
+            see(grid, column, row, apart, nodes)
+            z, _ = score(code, nodes, patterns.first, code_of_f, residual, weight)
             found = insert(z, (column, row, across, down), scores, children, found)
         z = scores[0]
         if z > 0:
@@ -126,8 +130,10 @@ def find_node(
         parents, children = children, parents
     amount = 0.0
     if best_level >= 0:
-        see(patterns, best_level, best_column, best_row, (dispersion[0], dispersion[1]), nodes)
-        _, amount = score(patterns.code, nodes, patterns.first, code_of_f, residual, weight)
+        spacing = 2.0**best_level
+        grid = columns[best_level], rows[best_level], starts[best_level]
+        see(grid, best_column, best_row, (dispersion[0] / spacing, dispersion[1] / spacing), nodes)
+        _, amount = score(code, nodes, patterns.first, code_of_f, residual, weight)
     return best_level, best_column, best_row, gain, amount
 
 
@@ -191,14 +197,16 @@ def _best_about(
     best: tuple[int, int, int, float, float],
 ) -> tuple[int, int, int, float, float]:
     """The best of the nodes of a level about a place and of the best so far, both as of `find_near`."""
-    wide, high = patterns.grids.columns[level], patterns.grids.rows[level]
-    c, r = int(across / 2.0**level), int(down / 2.0**level)
+    wide, high, spacing = patterns.grids.columns[level], patterns.grids.rows[level], 2.0**level
+    grid, code = (wide, high, patterns.grids.starts[level]), patterns.code
+    apart = dispersion[0] / spacing, dispersion[1] / spacing
+    c, r = int(across / spacing), int(down / spacing)
     centre = 2 * math.log(wide * high)
     nodes = np.empty(parts_of(patterns)[0], np.int64)
     for row in range(max(r - _NEAR, 0), min(r + _NEAR + 1, high)):
         for column in range(max(c - _NEAR, 0), min(c + _NEAR + 1, wide)):
-            see(patterns, level, column, row, (dispersion[0], dispersion[1]), nodes)
-            z, amount = score(patterns.code, nodes, patterns.first, code_of_f, residual, weight)
+            see(grid, column, row, apart, nodes)
+            z, amount = score(code, nodes, patterns.first, code_of_f, residual, weight)
             if z > 0 and z * z - centre > best[3]:
                 best = (level, column, row, z * z - centre, amount)
     return best

@@ -112,26 +112,33 @@ def add_products(
 ) -> None:
     """Add ``scale A' diag(weight) A p`` to `out`."""
     n = A.shape[0]
-    # four rows at a time, while they are in the processor's cache
+    # Four rows at a time, while they are in the processor's cache. Of slices, references would be counted.
     for i in range(0, n - 3, 4):
-        a, b, c, d = A[i], A[i + 1], A[i + 2], A[i + 3]
+        a, b, c, d = np.uint64(i), np.uint64(i + 1), np.uint64(i + 2), np.uint64(i + 3)
         s, t, u, v = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
-        for j in range(p.size):
-            s += a[j] * p[j]
-            t += b[j] * p[j]
-            u += c[j] * p[j]
-            v += d[j] * p[j]
-        s *= scale * weight[i]
-        t *= scale * weight[i + 1]
-        u *= scale * weight[i + 2]
-        v *= scale * weight[i + 3]
-        for j in range(p.size):
-            out[j] += s * a[j] + t * b[j] + u * c[j] + v * d[j]
+        for k in range(p.size):
+            j = np.uint64(k)
+            s += A[a, j] * p[j]
+            t += A[b, j] * p[j]
+            u += A[c, j] * p[j]
+            v += A[d, j] * p[j]
+        s *= scale * weight[a]
+        t *= scale * weight[b]
+        u *= scale * weight[c]
+        v *= scale * weight[d]
+        for k in range(p.size):
+            j = np.uint64(k)
+            out[j] += s * A[a, j] + t * A[b, j] + u * A[c, j] + v * A[d, j]
     for i in range(n - n % 4, n):
-        subtract(out, -scale * weight[i] * inner(A[i], p), A[i])
+        a, s = np.uint64(i), np.float32(0)
+        for k in range(p.size):
+            s += A[a, np.uint64(k)] * p[np.uint64(k)]
+        s *= scale * weight[a]
+        for k in range(p.size):
+            out[np.uint64(k)] += s * A[a, np.uint64(k)]
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def precondition(
     K: Covariance,
     of_lobe: NDArray[np.float32],
@@ -199,29 +206,18 @@ def precondition(
             rows[i, j] *= math.sqrt(inverse[j])
 
 
-@njit(nogil=True, cache=True, inline="always")
-def apply_inverse(approximate: Preconditioner, r: NDArray[np.float32], z: NDArray[np.float32]) -> None:
-    """Write the approximate inverse of K times r to z."""
-    rows, inverse, _, ones = approximate
-    for j in range(r.size):
-        z[j] = inverse[j] * r[j]
-    add_products(rows, np.float32(-1), ones, r, z)
-
-
-@njit(nogil=True, cache=True, inline="always")
-def apply_covariance(K: Covariance, p: NDArray[np.float32], Kp: NDArray[np.float32]) -> None:
-    """Write K p."""
-    A, weight, kappa, noise, strays, measured = K
+@njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})
+def add_stray_products(strays: NDArray[np.float32], p: NDArray[np.float32], out: NDArray[np.float32]) -> None:
+    """Add the covariance of the stray light times p to `out`."""
     count, size = strays.shape
-    for j in range(p.size):
-        Kp[j] = noise[j] * p[j]
-    for g in range(p.size // size):
-        of_group, to = p[g * size : (g + 1) * size], Kp[g * size : (g + 1) * size]
+    for start in range(0, p.size, size):
         for s in range(count):
-            subtract(to, -np.float32(stray_variance(s)) * inner(strays[s], of_group), strays[s])
-    add_products(A, np.float32(kappa), weight, p, Kp)
-    for j in range(p.size):
-        Kp[j] = Kp[j] if measured[j] else 0.0
+            total = np.float32(0)
+            for j in range(size):
+                total += strays[s, j] * p[np.uint64(start + j)]
+            total *= np.float32(stray_variance(s))
+            for j in range(size):
+                out[np.uint64(start + j)] += total * strays[s, j]
 
 
 @njit(nogil=True, cache=True)
@@ -246,19 +242,30 @@ def solve_covariance(
     int
         The number of steps.
     """
-    r, z, p, Kp = steps
-    apply_inverse(approximate, r, z)
+    # all at once: what is taken out of a tuple is counted as a reference
+    (r, z, p, Kp), (rows, inverse, _, ones) = steps, approximate
+    A, weight, kappa, noise, strays, measured = K
+    for j in range(r.size):
+        z[j] = inverse[j] * r[j]
+    add_products(rows, np.float32(-1), ones, r, z)
     for j in range(r.size):
         x[j], p[j] = 0.0, z[j]
     left = inner(r, z)
     goal, far = left * np.float32(_PRECISION), left * np.float32(_UNSOLVED)
     taken = 0
     while taken < _MOST_STEPS * most and left > (goal if taken < most else far):
-        apply_covariance(K, p, Kp)
+        for j in range(r.size):
+            Kp[j] = noise[j] * p[j]
+        add_stray_products(strays, p, Kp)
+        add_products(A, np.float32(kappa), weight, p, Kp)
+        for j in range(r.size):
+            Kp[j] = Kp[j] if measured[j] else 0.0
         length = left / inner(p, Kp)
         subtract(x, -length, p)
         subtract(r, length, Kp)
-        apply_inverse(approximate, r, z)
+        for j in range(r.size):
+            z[j] = inverse[j] * r[j]
+        add_products(rows, np.float32(-1), ones, r, z)
         new = inner(r, z)
         for j in range(r.size):
             p[j] = z[j] + new / left * p[j]

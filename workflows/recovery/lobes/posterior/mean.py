@@ -28,17 +28,19 @@ def add_row_moments(
 ) -> None:
     """Add the weighted sums of the rows of A, and of their squares, to `mean` and `square`."""
     n = A.shape[0]
-    # two rows at a time, so that the sums are read and written half as often
+    # Two rows at a time, so that the sums are read and written half as often. Of slices, references would be counted.
     for i in range(0, n - 1, 2):
-        a, b, v, w = A[i], A[i + 1], weight[i], weight[i + 1]
-        for j in range(mean.size):
-            mean[j] += v * a[j] + w * b[j]
-            square[j] += v * a[j] * a[j] + w * b[j] * b[j]
+        a, b, v, w = np.uint64(i), np.uint64(i + 1), weight[i], weight[i + 1]
+        for k in range(mean.size):
+            j = np.uint64(k)
+            mean[j] += v * A[a, j] + w * A[b, j]
+            square[j] += v * A[a, j] * A[a, j] + w * A[b, j] * A[b, j]
     if n % 2:
-        a, v = A[n - 1], weight[n - 1]
-        for j in range(mean.size):
-            mean[j] += v * a[j]
-            square[j] += v * a[j] * a[j]
+        a, v = np.uint64(n - 1), weight[n - 1]
+        for k in range(mean.size):
+            j = np.uint64(k)
+            mean[j] += v * A[a, j]
+            square[j] += v * A[a, j] * A[a, j]
 
 
 @njit(nogil=True, cache=True)
