@@ -98,18 +98,15 @@ def _slope(fits: Fits, p: int, c: int, near: NDArray[np.int64], axis: int) -> tu
     for e in range(-1, near.size):
         q = p if e < 0 else near[e]
         if q >= 0 and k[q, c] > 0:
-            row, column = (1, 1) if e < 0 else (1 + _OFFSETS[e, 0], 1 + _OFFSETS[e, 1])
-            centre[0, row, column], centre[1, row, column] = _centre(lobes, k, q, c)
+            down, right = (0, 0) if e < 0 else (_OFFSETS[e, 0], _OFFSETS[e, 1])
+            along, across = (1 + down, 1 + right) if axis == 0 else (1 + right, 1 + down)
+            centre[0, along, across], centre[1, along, across] = _centre(lobes, k, q, c)
     moved, n = np.empty((2, 6)), 0
     for i in range(3):
         for j in range(2):
-            (row, column), (next_row, next_column) = (
-                ((j, i), (j + 1, i)) if axis == 0 else ((i, j), (i, j + 1))
-            )
-            x = centre[0, next_row, next_column] - centre[0, row, column]
+            x, y = centre[0, j + 1, i] - centre[0, j, i], centre[1, j + 1, i] - centre[1, j, i]
             if not math.isnan(x):
-                moved[0, n] = x
-                moved[1, n] = centre[1, next_row, next_column] - centre[1, row, column]
+                moved[0, n], moved[1, n] = x, y
                 n += 1
     x, y = _median(moved[:, :n])
     return x, y

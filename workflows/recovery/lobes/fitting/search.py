@@ -96,7 +96,7 @@ def find_node(
             used += 1
     for level in range(columns.size - 1, -1, -1):
         wide, high, spacing = columns[level], rows[level], 2.0**level
-        grid = wide, high, starts[level]
+        grid, apart = (wide, high, starts[level]), (dispersion[0] / spacing, dispersion[1] / spacing)
         whole = level == columns.size - 1
         found = 0
         for p in range(wide * high if whole else 4 * ways * count):
@@ -110,7 +110,6 @@ def find_node(
                     across, down = 2 * parents[parent, 2] + way % 3 - 1, 2 * parents[parent, 3] + way // 3 - 1
             if column >= wide or row >= high or max(abs(across), abs(down)) * spacing > _MOST_DISPERSION:
                 continue
-            apart = dispersion[0] / spacing, dispersion[1] / spacing
             if ways > 1:
                 apart = float(across), float(down)
             see(grid, column, row, apart, nodes)

@@ -112,7 +112,7 @@ def add_products(
 ) -> None:
     """Add ``scale A' diag(weight) A p`` to `out`."""
     n = A.shape[0]
-    # Four rows at a time, while they are in the processor's cache. Of slices, references would be counted.
+    # Four rows at a time, while they are in the processor's cache. Slices would be counted references.
     for i in range(0, n - 3, 4):
         a, b, c, d = np.uint64(i), np.uint64(i + 1), np.uint64(i + 2), np.uint64(i + 3)
         s, t, u, v = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
@@ -206,6 +206,20 @@ def precondition(
             rows[i, j] *= math.sqrt(inverse[j])
 
 
+@njit(nogil=True, cache=True, inline="always")
+def apply_inverse(
+    rows: NDArray[np.float32],
+    inverse: NDArray[np.float32],
+    ones: NDArray[np.float32],
+    r: NDArray[np.float32],
+    z: NDArray[np.float32],
+) -> None:
+    """Write the approximate inverse of K, from the fields of `Preconditioner`, times r to z."""
+    for j in range(r.size):
+        z[j] = inverse[j] * r[j]
+    add_products(rows, np.float32(-1), ones, r, z)
+
+
 @njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})
 def add_stray_products(strays: NDArray[np.float32], p: NDArray[np.float32], out: NDArray[np.float32]) -> None:
     """Add the covariance of the stray light times p to `out`."""
@@ -245,9 +259,7 @@ def solve_covariance(
     # all at once: what is taken out of a tuple is counted as a reference
     (r, z, p, Kp), (rows, inverse, _, ones) = steps, approximate
     A, weight, kappa, noise, strays, measured = K
-    for j in range(r.size):
-        z[j] = inverse[j] * r[j]
-    add_products(rows, np.float32(-1), ones, r, z)
+    apply_inverse(rows, inverse, ones, r, z)
     for j in range(r.size):
         x[j], p[j] = 0.0, z[j]
     left = inner(r, z)
@@ -263,9 +275,7 @@ def solve_covariance(
         length = left / inner(p, Kp)
         subtract(x, -length, p)
         subtract(r, length, Kp)
-        for j in range(r.size):
-            z[j] = inverse[j] * r[j]
-        add_products(rows, np.float32(-1), ones, r, z)
+        apply_inverse(rows, inverse, ones, r, z)
         new = inner(r, z)
         for j in range(r.size):
             p[j] = z[j] + new / left * p[j]

@@ -28,7 +28,7 @@ def add_row_moments(
 ) -> None:
     """Add the weighted sums of the rows of A, and of their squares, to `mean` and `square`."""
     n = A.shape[0]
-    # Two rows at a time, so that the sums are read and written half as often. Of slices, references would be counted.
+    # Two rows at a time, so that the sums are read and written half as often. Slices would be counted references.
     for i in range(0, n - 1, 2):
         a, b, v, w = np.uint64(i), np.uint64(i + 1), weight[i], weight[i + 1]
         for k in range(mean.size):
