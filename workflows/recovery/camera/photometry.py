@@ -22,6 +22,8 @@ _SAMPLE = 4096
 _MOST_UNUSABLE, _MOST = 0.01, 0.95
 # Dark values are below this share of the brightest.
 _DARK = 0.25
+# What white counts beside colours.
+_WHITE = 1e-4
 # A camera with a larger row sum of crosstalk is taken as one that does not separate colours.
 _MOST_CROSSTALK = 0.9
 
@@ -205,19 +207,21 @@ def estimate_crosstalk(
     -----
     ``s + G b`` is fitted to each pixel's values; X_cd is the slope of G_cd over G_dd through zero. A camera that
     separates colours more than its filters do makes negative light, and clips it. Black, white and the channel's own
-    colour then still tell what the other two colours give together, and the solution of least norm shares it.
+    colour then still tell what the other two colours give together, and the solution of least norm shares it. White
+    counts for little else: where the light flickers it is no sum of the colours, while G_cd and G_dd are of one frame.
     """
     _check_shapes(values, levels, usable)
     design = np.concatenate([np.ones((len(levels), 1)), levels], axis=1)
     if np.linalg.matrix_rank(design) < 4:
         return np.eye(3)
+    worth = np.where((levels > 0).all(axis=1), _WHITE, 1.0)
     gain = np.zeros((len(values), 3, 3))
     whole, own_known = np.zeros((len(values), 3), bool), np.zeros((len(values), 3), bool)
     for c in range(3):
         alone = (levels[:, c] > 0) & (np.delete(levels, c, axis=1) == 0).all(axis=1)
         needed = alone, (levels == 0).all(axis=1), (levels > 0).all(axis=1)
         own_known[:, c] = np.all([usable[:, frames, c].any(axis=1) for frames in needed], axis=0)
-        seen = usable[:, :, c].astype(np.float64)
+        seen = np.where(usable[:, :, c], worth, 0.0)
         fitted, covariance = solve_least_squares(design, seen, np.where(usable[:, :, c], values[:, :, c], 0))
         gain[:, c] = fitted[:, 1:]
         whole[:, c] = np.linalg.matrix_rank(covariance, hermitian=True) == 4

@@ -144,11 +144,13 @@ def test_noise_is_never_below_the_quantisation():
 COLOURS = np.concatenate([np.eye(3), np.ones((1, 3)), np.zeros((1, 3))]).astype(np.float32)
 
 
-def test_crosstalk_is_recovered():
+@pytest.mark.parametrize("flicker", [0, 0.2])
+def test_crosstalk_is_recovered(flicker: float) -> None:
     rng = np.random.default_rng(0)
+    lit = COLOURS * (1 + flicker * np.linspace(-1, 1, len(COLOURS))[:, np.newaxis])
     crosstalk = np.array([[1, 0.1, 0.02], [0.05, 1, 0.2], [0, 0.15, 1]])
     rho = rng.uniform(0.1, 0.9, (40, 1, 3))
-    values = 0.02 + (rho * COLOURS) @ crosstalk.T + rng.normal(0, 0.002, (40, 5, 3))
+    values = 0.02 + (rho * lit) @ crosstalk.T + rng.normal(0, 0.002, (40, 5, 3))
     usable = np.ones(values.shape, bool)
     values[3, 2, 1], usable[3, 2, 1] = 1, False
     found = estimate_crosstalk(values.astype(np.float32), COLOURS, usable)
