@@ -47,7 +47,7 @@ RUN_BY = {
         ("workflows/programs/README.md", "As pictures"),
     ],
     "tests/end_to_end/use/test_folder_readmes.py::test_stills_of_a_tethered_camera_are_recovered": [
-        ("workflows/programs/README.md", "With a tethered camera"),
+        ("workflows/programs/README.md", "While the camera takes it"),
     ],
     "tests/end_to_end/use/test_folder_readmes.py::test_program_is_created_with_curl": [
         ("workflows/programs/README.md", "In the browser")

@@ -61,7 +61,7 @@ class Frame(BaseModel):
 
 
 class Video(BaseModel):
-    """A recording of the whole program, from before its start until after its end."""
+    """A recording of the program, from before its start until after its end; or until now, if it is `unfinished`."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
     file: str = Field(
@@ -114,8 +114,8 @@ class Manifest(BaseModel):
     )
     unfinished: bool = Field(
         default=False,
-        description="Whether the program has not been shown to its end yet: then patterns may lack frames, but for two "
-        "different constant levels and one other pattern.",
+        description="Whether the program has not been shown to its end yet: then patterns may lack frames, and a video "
+        "may end early, but for two different constant levels and one other pattern.",
     )
     video: Video | None = Field(default=None, description="A recording of the program, in place of frames.")
     mask: str | None = Field(

@@ -135,7 +135,8 @@ def _examine(
         height, width, channels = first.shape
         shape = len(manifest.frames), height, width, channels
         return shape, stills.storage_of(decoder, archive, first), None
-    program, entry = manifest.program, manifest.video.file
+    program, video = manifest.program, manifest.video
+    entry = video.file
     if program.count > MAX_PATTERNS:
         raise CaptureError(
             f"{entry} shows {program.count} patterns, more than the {MAX_PATTERNS} that are found in a video: "
@@ -145,13 +146,13 @@ def _examine(
         )
     curve = "srgb" if program.monitor.response == "unknown" else program.monitor.response
     light = lay_out(program, curve, patterns)
-    border, rate = manifest.video.border, manifest.video.patterns_per_second
+    every = None if video.border is None else 1 / (LOOKS * video.patterns_per_second)
     with archive.open(entry) as file:
-        film, signatures, ticks, large = films.scan(
-            decoder, file, entry, limits.memory // 4, None if border is None else 1 / (LOOKS * rate)
-        )
+        film, signatures, ticks, large = films.scan(decoder, file, entry, limits.memory // 4, every)
     tick = float(film.time_base)
-    filmed = match_frames(signatures, ticks, tick, program, light, rate, entry, large, border)
+    filmed = match_frames(
+        signatures, ticks, tick, program, light, large, video, unfinished=manifest.unfinished
+    )
     shape = len(filmed.shares), film.height, film.width, 3
     return shape, stills.Storage(np.dtype(np.uint16), 0, 1.0, True), filmed
 

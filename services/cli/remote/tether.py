@@ -1,12 +1,13 @@
-"""`envmatte tether`: recovers a matte while a tethered camera takes the stills of a capture."""
+"""`envmatte tether`: recovers a matte while a camera takes the stills of a capture, or records its film."""
 
 import json
 import tempfile
 import time
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from http import HTTPStatus
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
@@ -14,20 +15,34 @@ from services.cli import options
 from services.cli.output import example, print_result
 from services.cli.progress import Progress
 from services.cli.remote.jobs import ingest
-from services.client import Capture, Client, Matte
+from services.client import Capture, Client, Job, JobFailed, ServiceError
 
 if TYPE_CHECKING:
     from workflows.programs.program import Program
 
 FEWEST = 8
-"""Patterns that tell T in the first draft."""
+"""Patterns that tell T in the first draft, and more of a film at least in the next."""
 LOOK = 0.5
-"""Seconds between two looks at the folder. A still counts once it is as large as at the look before."""
+"""Seconds between two looks at what the camera has taken. A still counts once it is as large as at the look before."""
+OVER = 10.0
+"""Seconds after which a film that has not grown is taken as ended: recorders write every five, or more often."""
 
 
-@click.command(epilog=example("envmatte tether program.json stills --until 40"))
+class Taken(NamedTuple):
+    """What the camera has taken by now: the capture's record, its files by name, and whether there will be more."""
+
+    manifest: Mapping[str, Any]
+    files: Mapping[str, Path]
+    last: bool
+
+
+@click.command(
+    epilog=example(
+        "envmatte tether program.json stills --until 40", "envmatte tether patterns.json film.mkv --until 40"
+    )
+)
 @click.argument("program", type=options.InputFile, metavar="PROGRAM")
-@click.argument("stills", type=click.Path(exists=True, file_okay=False, path_type=Path), metavar="STILLS")
+@click.argument("source", type=click.Path(exists=True, path_type=Path), metavar="STILLS|FILM")
 @click.option(
     "--until",
     type=float,
@@ -37,40 +52,62 @@ LOOK = 0.5
 @click.option("--name", default="", help="Name of the capture in lists.")
 @options.remote
 def tether(
-    program: Path, stills: Path, until: float | None, name: str, url: str, key: str | None, as_json: bool
+    program: Path, source: Path, until: float | None, name: str, url: str, key: str | None, as_json: bool
 ) -> None:
-    """Recover a matte while a camera takes the stills of PROGRAM into the folder STILLS. Prints the matte's id.
+    """Recover a matte while a camera takes the stills of PROGRAM into a folder, or records the film of it. Prints the
+    matte's id.
 
-    The first still by name shows the first pattern, and so on. From eight patterns on there is a draft, and as soon as
-    that is done another one, of all stills that there are by then. The last matte is the best that they give; drafts
-    are deleted once there is a better one.
+    The first of the STILLS by name shows the first pattern, and so on. A FILM must be of a kind that can be read while
+    it grows, .mkv or .webm; its PROGRAM is the capture.json beside the video of the patterns.
+
+    From eight patterns on there is a draft, and as soon as that is done another one, of all that has been taken by
+    then. The last matte is the best that it gives; drafts are deleted once there is a better one.
     """
     from workflows.programs.files import fit_to_screen, load_program
 
     shown = fit_to_screen(load_program(str(program)), None, bordered=False)
-    taken: Sequence[Path] = ()
-    made: list[Capture | Matte] = []
+    takes = _stills(source, shown, name) if source.is_dir() else _film(source, program, name)
+    draft: Job | None = None
     last = False
     with options.client(url, key) as client:
         while not last:
-            taken = _more(stills, len(taken), shown)
-            capture = _upload(client, shown, taken, name)
-            quality = client.report(capture)["quality"]
+            capture, over = _ingest(client, takes, draft)
+            report = client.report(capture)
+            quality, missing = report["quality"], report["frames"]["missing"]
             good = until is not None and quality is not None and quality["low"] >= until
-            last = good or len(taken) == shown.count
-            job = client.recover(capture, quality="fine" if last else "fast")
-            with Progress("recovery") as bar:
-                matte = client.matte(client.wait(job, progress=bar.job))
-            for record in made:
-                client.delete(record)
-            made = [matte, capture]
+            last = over or good or shown.count - 1 not in missing
+            if last:
+                with Progress("recovery") as bar:
+                    job = client.wait(client.recover(capture, quality="fine"), progress=bar.job)
+            else:
+                job = _recover_draft(client, capture)
+            if draft is not None:
+                _discard(client, draft)
+            draft = job
+            found = shown.count - len(missing)
             expected = f"{quality['low']:.0f} to {quality['high']:.0f} dB" if quality else "not known yet"
-            place = f"{url.rstrip('/')}/#/mattes/{matte.id}"
-            click.echo(
-                f"{len(taken)} of {shown.count} stills, expected quality {expected}: {place}", err=True
-            )
-    result = {"matte": matte.id, "capture": capture.id, "stills": len(taken), "quality": quality}
+            place = f"{url.rstrip('/')}/#/mattes/{job.matte}"
+            click.echo(f"{found} of {shown.count} patterns, expected quality {expected}: {place}", err=True)
+    result = {"matte": job.matte, "capture": capture.id, "patterns": found, "quality": quality}
     print_result(result, as_json, "matte")
+
+
+def _stills(folder: Path, program: "Program", name: str) -> Iterator[Taken]:
+    """All stills in the folder, each time that there are more of them."""
+    from workflows.programs.files import program_json
+
+    stills: Sequence[Path] = ()
+    while True:
+        stills = _more(folder, len(stills), program)
+        files = {f"{pattern:05}{still.suffix}": still for pattern, still in enumerate(stills)}
+        manifest = {
+            "format": "envmatte-capture/1",
+            "name": name,
+            "program": program_json(program),
+            "frames": [{"file": file, "pattern": pattern} for pattern, file in enumerate(files)],
+            "unfinished": True,
+        }
+        yield Taken(manifest, files, len(stills) == program.count)
 
 
 def _more(folder: Path, before: int, program: "Program") -> Sequence[Path]:
@@ -100,22 +137,80 @@ def _more(folder: Path, before: int, program: "Program") -> Sequence[Path]:
             time.sleep(LOOK)
 
 
-def _upload(client: Client, program: "Program", stills: Sequence[Path], name: str) -> Capture:
-    """Upload the stills of the first patterns as a capture, and wait until it is ingested."""
-    from workflows.programs.files import program_json
+def _film(file: Path, record: Path, name: str) -> Iterator[Taken]:
+    """The film each time that it has grown by some patterns, and once more when it has ended."""
+    manifest, entry = json.loads(record.read_bytes()), f"film{file.suffix}"
+    rate = (manifest.get("video") or {}).get("patterns_per_second")
+    if not rate:
+        raise click.UsageError(
+            f"{record} describes no film: name the .json that `envmatte patterns` wrote beside the video it made"
+        )
+    manifest |= {"name": name, "unfinished": True, "video": manifest["video"] | {"file": entry}}
+    pause = FEWEST / rate
+    size, grew, taken, due = 0, time.monotonic(), 0, 0.0
+    while True:
+        now = file.stat().st_size
+        if now != size:
+            size, grew = now, time.monotonic()
+        over = time.monotonic() - grew > OVER
+        if over or (size > taken and time.monotonic() >= due):
+            taken, due = size, time.monotonic() + pause
+            yield Taken(manifest, {entry: file}, over)
+        time.sleep(LOOK)
 
-    files = [f"{pattern:05}{still.suffix}" for pattern, still in enumerate(stills)]
-    manifest = {
-        "format": "envmatte-capture/1",
-        "name": name,
-        "program": program_json(program),
-        "frames": [{"file": file, "pattern": pattern} for pattern, file in enumerate(files)],
-        "unfinished": len(stills) < program.count,
-    }
-    with tempfile.TemporaryDirectory(prefix="envmatte-tether-") as folder:
-        archive = Path(folder, "capture.zip")
-        with zipfile.ZipFile(archive, "w") as target:
-            target.writestr("capture.json", json.dumps(manifest))
-            for file, still in zip(files, stills, strict=True):
-                target.write(still, file)
-        return ingest(client, archive, name)
+
+def _ingest(client: Client, takes: Iterator[Taken], draft: Job | None) -> tuple[Capture, bool]:
+    """Upload what has been taken, once it suffices for a matte; the capture, and whether nothing will follow.
+
+    A draft that is still being recovered pauses meanwhile.
+    """
+    while True:
+        taken = next(takes)
+        if draft is not None:
+            _if_active(client.pause, draft)
+        with tempfile.TemporaryDirectory(prefix="envmatte-tether-") as folder:
+            archive = Path(folder, "capture.zip")
+            with zipfile.ZipFile(archive, "w") as target:
+                target.writestr("capture.json", json.dumps(taken.manifest))
+                for file, path in taken.files.items():
+                    target.write(path, file)
+            try:
+                return ingest(client, archive, taken.manifest["name"]), taken.last
+            except JobFailed as error:
+                if taken.last or "video" not in taken.manifest:
+                    raise
+                click.echo(f"not yet: {error}", err=True)
+                client.delete(client.capture(str(error.job.capture)))
+
+
+def _recover_draft(client: Client, capture: Capture) -> Job:
+    """Recover a capture until all of its frame can be composited: a large one has a preview long before its end."""
+    job = client.recover(capture, quality="fast")
+    with Progress("recovery") as bar:
+        while job.state != "succeeded":
+            if job.ended:
+                raise JobFailed(job)
+            if job.stage == "recovering" and client.matte(job)["preview"]:
+                break
+            time.sleep(LOOK)
+            job = client.job(job)
+            bar.job(job)
+    return job
+
+
+def _discard(client: Client, draft: Job) -> None:
+    """Delete the matte of a draft, and its capture."""
+    if not _if_active(client.cancel, draft):
+        client.delete(client.matte(draft))
+    client.delete(client.capture(str(draft.capture)))
+
+
+def _if_active(change: Callable[[Job], Job], job: Job) -> bool:
+    """Change a job unless it has ended; whether it was."""
+    try:
+        change(job)
+    except ServiceError as error:
+        if error.status != HTTPStatus.CONFLICT:
+            raise
+        return False
+    return True

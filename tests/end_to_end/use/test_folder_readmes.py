@@ -61,7 +61,7 @@ def test_stills_of_a_tethered_camera_are_recovered(service: Service, scene: Scen
         for frame in json.loads(source.read("capture.json"))["frames"][:64]:
             (tmp_path / "stills").mkdir(exist_ok=True)
             (tmp_path / f"stills/{frame['pattern']:05}.png").write_bytes(source.read(frame["file"]))
-    script = block("workflows/programs/README.md", "With a tethered camera").replace("40", "20")
+    script = block("workflows/programs/README.md", "While the camera takes it").replace("40", "20")
     matte = service.client.matte(run(script, tmp_path, ENVMATTE_URL=service.url).strip())
     assert (matte.state, matte.width, matte.height) == ("ready", WIDTH, HEIGHT)
 

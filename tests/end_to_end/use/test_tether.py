@@ -1,21 +1,27 @@
-"""Mattes while a tethered camera takes stills, by the command line against a real service."""
+"""Mattes while a camera takes stills or records a film, by the command line against a real service."""
 
 import json
 import re
 import shutil
+import subprocess
 import sys
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from services.client import NotFound
+from services.client import Matte, NotFound
 from tests.end_to_end.command_line import envmatte
 from tests.end_to_end.conftest import Service
 from tests.parts.processes import running
+from tests.workflows.ingest.video.camera import Camera, film, lights
+from tests.workflows.ingest.video.camera import capture as capture_json
 from workflows.programs.program import Program
+from workflows.simulation.scene import Scene
 
 FEW = 16
 """Stills of five levels and eleven patterns."""
@@ -37,31 +43,62 @@ def session(capture_archive: Path, tmp_path: Path) -> tuple[str, list[Path], Pat
     return str(program), stills, camera
 
 
+@contextmanager
+def tethered(service: Service, program: str, source: Path) -> "Iterator[subprocess.Popen[str]]":
+    """The command, beside the test."""
+    command = [sys.executable, "-m", "services", "tether", program, str(source), "--name", "tethered"]
+    with running([*command, "--url", service.url]) as process:
+        yield process
+
+
+def draft_of(service: Service, process: "subprocess.Popen[str]", patterns: str) -> Matte:
+    """The draft that is printed next, which can be composited."""
+    assert process.stderr is not None
+    for line in process.stderr:
+        if found := re.match(rf"{patterns} patterns, .*#/mattes/(\w+)$", line):
+            break
+    assert found
+    draft = service.client.matte(found[1])
+    assert draft.options["quality"] == "fast"
+    assert service.client.composite(draft, np.full((4, 4, 3), 0.5, np.float32)).shape[2] == 3
+    return draft
+
+
+def last_of(service: Service, process: "subprocess.Popen[str]", draft: Matte) -> Matte:
+    """The last matte, for which the draft has been deleted."""
+    last = process.communicate(timeout=100)[0].strip()
+    assert process.returncode == 0
+    with pytest.raises(NotFound):
+        service.client.matte(draft)
+    return service.client.matte(last)
+
+
+@pytest.fixture(scope="module")
+def recording(scene: Scene, program: Program) -> bytes:
+    """A film of the program."""
+    return film(lights(scene, program), Camera(container="matroska")).data
+
+
+@pytest.fixture
+def film_json(program: Program, tmp_path: Path) -> str:
+    """A file with the capture.json of the film."""
+    path = tmp_path / "patterns.json"
+    path.write_text(json.dumps(capture_json(program, b"", 1 / Camera().hold)[0]))
+    return str(path)
+
+
 def test_there_is_a_draft_while_stills_come_and_at_last_the_matte_of_all(
     service: Service, matte: str, program: Program, session: tuple[str, list[Path], Path]
 ) -> None:
     file, stills, camera = session
-    command = [sys.executable, "-m", "services", "tether", file, str(camera), "--name", "tethered"]
-    with running([*command, "--url", service.url]) as process:
-        assert process.stderr is not None
-        assert process.stdout is not None
-        for line in process.stderr:
-            if found := re.match(rf"{FEW} of {program.count} stills, .*#/mattes/(\w+)$", line):
-                break
-        assert found
-        draft = service.client.matte(found[1])
-        assert draft.options["quality"] == "fast"
-        backdrop = np.full((4, 4, 3), 0.5, np.float32)
-        assert service.client.composite(draft, backdrop).shape[2] == 3
+    with tethered(service, file, camera) as process:
+        draft = draft_of(service, process, rf"{FEW} of {program.count}")
         for still in stills[FEW:]:
             shutil.copy(still, camera)
-        last = process.communicate(timeout=100)[0].strip()
-        assert process.returncode == 0
-    with pytest.raises(NotFound):
-        service.client.matte(draft)
-    made = service.client.matte(last)
+        made = last_of(service, process, draft)
     capture = service.client.capture(str(made.capture))
     assert (capture.frames, capture.name) == (program.count, "tethered")
+    backdrop = np.full((4, 4, 3), 0.5, np.float32)
     np.testing.assert_array_equal(
         service.client.composite(made, backdrop), service.client.composite(matte, backdrop)
     )
@@ -74,11 +111,53 @@ def test_it_stops_at_the_quality_that_was_asked_for(
     done = envmatte(service, "tether", file, str(camera), "--until", "1", "--json")
     assert done.returncode == 0, done.stderr
     answer = json.loads(done.stdout)
-    assert answer["stills"] == FEW
+    assert answer["patterns"] == FEW
     assert answer["quality"]["low"] >= 1
     report = service.client.report(answer["capture"])
     (frames,) = (one for one in report["findings"] if one["name"] == "frames")
     assert (frames["level"], str(program.count) in frames["message"]) == ("good", True)
+
+
+def test_there_is_a_draft_while_a_film_is_recorded(
+    service: Service, program: Program, recording: bytes, film_json: str, tmp_path: Path
+) -> None:
+    growing = tmp_path / "film.mkv"
+    growing.write_bytes(recording[:1000])
+    with tethered(service, film_json, growing) as process:
+        assert process.stderr is not None
+        assert any(line.startswith("not yet: ") for line in process.stderr)
+        with growing.open("ab") as target:
+            target.write(recording[1000 : len(recording) // 2])
+        draft = draft_of(service, process, rf"\d+ of {program.count}")
+        with growing.open("ab") as target:
+            target.write(recording[len(recording) // 2 :])
+        made = last_of(service, process, draft)
+    capture = service.client.capture(str(made.capture))
+    assert (capture.frames, capture.name, made.options["quality"]) == (program.count, "tethered", "fine")
+    listed = service.http.get("/v1/captures", params={"limit": 1000}).json()["captures"]
+    assert not [one for one in listed if (one["name"], one["state"]) == ("tethered", "failed")]
+
+
+@pytest.mark.slow
+def test_a_film_that_ends_early_is_recovered_as_far_as_it_goes(
+    service: Service, program: Program, recording: bytes, film_json: str, tmp_path: Path
+) -> None:
+    short = tmp_path / "film.mkv"
+    short.write_bytes(recording[: len(recording) // 2])
+    done = envmatte(service, "tether", film_json, str(short), "--json")
+    assert done.returncode == 0, done.stderr
+    answer = json.loads(done.stdout)
+    assert 8 < answer["patterns"] < program.count
+    assert service.client.matte(answer["matte"]).options["quality"] == "fine"
+
+
+def test_a_program_that_was_not_made_for_a_film_is_refused(
+    service: Service, session: tuple[str, list[Path], Path], tmp_path: Path
+) -> None:
+    (tmp_path / "film.mkv").write_bytes(b"film")
+    refused = envmatte(service, "tether", session[0], str(tmp_path / "film.mkv"))
+    assert refused.returncode == 2
+    assert "describes no film" in refused.stderr
 
 
 def test_a_folder_with_files_of_two_kinds_is_refused(

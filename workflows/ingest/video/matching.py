@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.errors import CaptureError
+from workflows.ingest.manifest import Video
 from workflows.ingest.video import lead_in, resemblance
 from workflows.ingest.video.border_reader import find_by_numbers
 from workflows.ingest.video.border_spill import without_border
@@ -17,7 +18,6 @@ from workflows.ingest.video.missing_patterns import Reason, by_reason, ranges
 from workflows.ingest.video.recording import Recording
 from workflows.ingest.video.signatures import LargeFrames, Signatures
 from workflows.ingest.video.timing import FoundPatterns, find_by_timing
-from workflows.programs.border import Border
 from workflows.programs.program import Program
 
 Doubles = NDArray[np.float64]
@@ -77,10 +77,9 @@ def match_frames(
     tick: float,
     program: Program,
     light: resemblance.Light,
-    rate: float,
-    entry: str,
     large: LargeFrames,
-    border: Border | None,
+    video: Video,
+    unfinished: bool,
 ) -> MatchedFrames:
     """Match the frames of a recording to the patterns of a program.
 
@@ -94,15 +93,13 @@ def match_frames(
     program : Program
     light : (patterns, rows, columns, 3) float32
         Of its patterns, see `resemblance.lay_out`.
-    rate : float
-        About how many patterns were shown in a second.
-    entry : str
-        The video's name, for errors.
     large : LargeFrames
         Used with a border only.
-    border : Border or None
-        The border that the patterns were shown in, between a lead-in and a lead-out; see
+    video : Video
+        If it has a border, the patterns were shown in it, between a lead-in and a lead-out; see
         `workflows.programs.border.schedule`.
+    unfinished : bool
+        Whether the program need not have been shown to its end: what was not is not missing.
 
     Raises
     ------
@@ -111,8 +108,9 @@ def match_frames(
     """
 
     def refusal(reason: str) -> CaptureError:
-        return CaptureError(f"{entry}: {reason}", entry=entry)
+        return CaptureError(f"{video.file}: {reason}", entry=video.file)
 
+    rate, border = video.patterns_per_second, video.border
     recording = Recording(signatures, (ticks - ticks[0]) * tick, 1 / rate)
     found = find_by_numbers(recording, large, border, program.count) if border is not None else None
     numbered = found is not None
@@ -130,7 +128,9 @@ def match_frames(
             "what changes in the video does not look like the patterns of the program: check that capture.json has the "
             "program that was shown, and its patterns_per_second"
         )
-    _require_enough(program, looks, reasons, rate, refusal)
+    shown = max(looks, default=-1) + 1 if unfinished else program.count
+    _require_enough(program, shown, looks, reasons, rate, refusal)
+    reasons = {number: reason for number, reason in sorted(reasons.items()) if number < shown}
     kept = sorted(looks)
     shares = {number: _shares(ticks[found.frames[number]], found.weights[number]) for number in kept}
     record = {
@@ -141,9 +141,9 @@ def match_frames(
         "first_pattern_seconds": round(found.start, 3),
         "patterns_per_second": round(found.rate, 4),
         "resemblance": None if score is None else round(score, 1),
-        "missing": {str(number): reason for number, reason in sorted(reasons.items())},
+        "missing": {str(number): reason for number, reason in reasons.items()},
     }
-    notes = [_summary(record, len(kept), program.count), *_by_reason(reasons)]
+    notes = [_summary(record, len(kept), shown), *_by_reason(reasons)]
     if border is not None and not numbered:
         notes.append(
             "the numbers in the border can't be read: patterns are found by the times of the changes"
@@ -238,18 +238,20 @@ def _compare(
 
 def _require_enough(
     program: Program,
+    shown: int,
     looks: Mapping[int, Doubles],
     reasons: Mapping[int, Reason],
     rate: float,
     refusal: Refusal,
 ) -> None:
-    """Require black, white, and most of the other patterns."""
+    """Require black, white, and most of the other patterns, of the first that were ``shown``."""
     numbers, sent = program.constants
     there = np.isin(numbers, list(looks))
     why = "; ".join(_by_reason(reasons))
     if not there.any() or (np.ptp(sent[there], axis=0) < np.ptp(sent, axis=0) / 2).any():
         raise refusal(f"the dark and bright constant patterns are not both found: {why}. Record it again")
-    share = float(np.isin(program.measured, list(looks)).mean())
+    measured = program.measured[program.measured < shown]
+    share = float(np.isin(measured, list(looks)).mean()) if measured.size else 0.0
     if share < MIN_SHARE:
         raise refusal(
             f"only {share:.0%} of the patterns are found: {why}. Record it again, at more frames a second, or show "

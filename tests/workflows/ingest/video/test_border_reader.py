@@ -54,7 +54,9 @@ def ingest_film(make_zip: Callable[..., bytes], ingest: Callable[..., Any]) -> C
     ball = glass_ball(WIDTH // 2, HEIGHT // 2, monitor=(width, height), rays=1)
     pictures = list(program.pictures(0, program.count))
 
-    def run(camera: Camera, corners: Any = ASKEW, border: Border = BORDER) -> tuple[Stack, Film, list[int]]:
+    def run(
+        camera: Camera, corners: Any = ASKEW, border: Border = BORDER, **more: Any
+    ) -> tuple[Stack, Film, list[int]]:
         view, numbers, shown = through(corners), [], []
         for step in schedule(program.count, 1 / HOLD):
             picture = np.full((height, width, 1), float(step.white), np.float32)
@@ -70,7 +72,7 @@ def ingest_film(make_zip: Callable[..., bytes], ingest: Callable[..., Any]) -> C
         made = film(shown, camera)
         record, files = capture(program, made.data, 1 / camera.hold)
         record["video"]["border"] = border.model_dump(mode="json")
-        return ingest("c", make_zip(record, files)), made, numbers
+        return ingest("c", make_zip(record | more, files)), made, numbers
 
     return run
 
@@ -126,6 +128,16 @@ def test_every_number_is_read(ingest_film: Callable[..., Any], camera: Camera, c
     assert stack.attributes["video"]["first_pattern_seconds"] == pytest.approx(
         made.starts[numbers.index(0)], abs=0.5 * camera.hold
     )
+
+
+def test_unfinished_film_has_the_patterns_that_were_shown(ingest_film: Callable[..., Any]) -> None:
+    stack, made, numbers = ingest_film(Camera(hold=HOLD, tail=-8.0), unfinished=True)
+    shown = max(np.array(numbers)[: (made.starts < made.starts[-1] - 8).sum()]) + 1
+    assert stack.attributes["video"]["numbered"]
+    assert shown - 1 <= stack.frames <= shown < 20
+    assert stack.attributes["patterns"] == list(range(stack.frames))
+    assert stack.attributes["video"]["missing"] == {}
+    assert misplaced(stack, made, numbers) == []
 
 
 @pytest.mark.exhaustive

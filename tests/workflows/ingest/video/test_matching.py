@@ -83,6 +83,28 @@ def test_recording_of_a_part_of_the_program(
     assert stack.attributes["video"]["missing"][str(PROGRAM.count - 1)] == "the recording ends before it"
 
 
+def test_film_of_an_unfinished_program_lacks_nothing(
+    ingest_film: IngestFilm, light: list[np.ndarray]
+) -> None:
+    made = film(light, Camera(tail=-6.0))
+    with pytest.raises(CaptureError, match=r"are found: .* ends before it"):
+        ingest_film(made.data)
+    stack = ingest_film(made.data, unfinished=True)
+    shown = int((made.starts < made.starts[-1] - 6).sum())
+    assert shown - 1 <= stack.frames <= shown < PROGRAM.count - 15
+    assert stack.attributes["patterns"] == list(range(stack.frames))
+    assert stack.attributes["video"]["missing"] == {}
+    assert misplaced(stack, made) == []
+
+
+def test_film_of_an_unfinished_program_without_patterns_is_refused(
+    ingest_film: IngestFilm, light: list[np.ndarray]
+) -> None:
+    made = film(light, Camera(tail=0.5 - 0.3 * (PROGRAM.count - 3)))
+    with pytest.raises(CaptureError, match=r"patterns are (not both )?found: .* ends before it"):
+        ingest_film(made.data, unfinished=True)
+
+
 REFUSED: dict[str, tuple[Camera, Program, str]] = {
     "of another program": (CAMERA, program_with(seed=1), "does not look like the patterns"),
     "of fewer patterns": (CAMERA, program_with(count=30), "do not fit|begins after|are found"),
