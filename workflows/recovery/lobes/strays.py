@@ -3,14 +3,15 @@
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.special import betaincinv
 
 from workflows.recovery.camera.photometry import Photometry, solve_least_squares
 
 STRAY = 0.1
 """Prior standard deviation of an amount of stray light that is not constant, in units of T."""
-STRONG = 0.17
-"""Stray light that explains this share of the variance of a pixel is taken out before recovery. In chance it explains a
-tenth."""
+STRONG = 0.993
+"""Stray light is taken out before recovery where it explains more of a pixel's variance than it would by chance of
+this share of the pixels."""
 
 
 def find_strong_strays(
@@ -43,7 +44,8 @@ def find_strong_strays(
     -----
     ``C = S + rho / 2 + sum_s a_s B_s`` is fitted to the patterns, and ``S + sum a_s B_s`` and ``S + rho + sum a_s B_s``
     to black and white, whose weight is the inverse of their variances. What patterns show besides is like noise here,
-    of the variance that is left.
+    of the variance that is left. By chance, p rows of stray light explain a share of the variance of k values that is
+    distributed as Beta(p / 2, (k - p - 1) / 2) (Seber and Lee, Linear Regression Analysis, 2003, ch. 4).
     """
     m = measurements.shape[1]
     light = np.stack([photometry.S, photometry.S + photometry.rho], axis=2)
@@ -61,7 +63,11 @@ def find_strong_strays(
     alone = np.delete(design, 1, axis=1)
     amount = solve_least_squares(alone, weight, values)[0]
     after = (weight * (values - amount @ alone.T) ** 2).sum(axis=2)
-    strong = before - after > STRONG * before
+    rank = np.linalg.matrix_rank(alone[:m][known[:, :, :m].any(axis=(0, 1))]) - 1
+    values_of, which = np.unique(count[..., 0], return_inverse=True)
+    free = np.maximum(values_of - rank - 1, 0)
+    by_chance = np.where(free * rank, betaincinv(np.maximum(rank, 1) / 2, np.maximum(free, 1) / 2, STRONG), 1)
+    strong = before - after > by_chance[which].reshape(before.shape) * before
     left = np.maximum(after / count[..., 0], 1e-12)
     weight /= left[..., np.newaxis]
     weight[:, :, m:] = 1 / np.stack([photometry.black, photometry.white], axis=2)

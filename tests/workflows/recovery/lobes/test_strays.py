@@ -101,3 +101,15 @@ def test_a_pixel_that_sees_the_border_keeps_its_mean_light() -> None:
     assert found.S[2, 0] == given.S[2, 0]  # what sees the patterns is left to the fit of its lobes
     np.testing.assert_array_equal(left[2], values[2])
     assert abs(given.S[0, 0] - S[0]) > 0.02
+
+
+@pytest.mark.parametrize("m", [16, 24, 49, 128])
+def test_what_explains_a_pixel_by_chance_is_left_to_its_lobes(m: int) -> None:
+    random = np.random.default_rng(2)
+    bits = np.where(random.random((6, m + 2)) < 0.5, 1, -1).astype(np.float32)
+    rows = np.concatenate([np.ones((1, m + 2), np.float32), bits])
+    n = 2000
+    values = (0.1 + 0.5 * (random.random((n, m, 1)) < 0.5) * np.ones(3)).astype(np.float32)
+    S, rho, variance = (np.full((n, 3), value, np.float32) for value in (0.1, 0.5, 1e-6))
+    stray, _ = find_strong_strays(values, Photometry(S, rho, variance, variance), rows, None)
+    assert stray.any(axis=(1, 2)).mean() < 0.02
