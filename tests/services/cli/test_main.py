@@ -78,7 +78,7 @@ def test_help_of_every_command_has_a_valid_example(
     assert lines, text
     monkeypatch.chdir(tmp_path)
     (tmp_path / "stills").mkdir()
-    for file in ("film.zip", "matte.zip", "backdrop.png", "program.json"):
+    for file in ("film.zip", "matte.zip", "backdrop.png", "program.json", "patterns.json", "film.mkv"):
         (tmp_path / file).write_bytes(b"any")
     if name == "completion":
         assert 'eval "$(envmatte completion bash)"' in lines[1]
