@@ -29,7 +29,7 @@ OVER = 10.0
 
 
 class Taken(NamedTuple):
-    """What the camera has taken by now: the capture's record, its files by name, and whether there will be more."""
+    """What the camera has taken by now: the capture's record, its files by name, and whether this is all."""
 
     manifest: Mapping[str, Any]
     files: Mapping[str, Path]
@@ -71,7 +71,7 @@ def tether(
     last = False
     with options.client(url, key) as client:
         while not last:
-            capture, over = _ingest(client, takes, draft)
+            capture, over = _next_capture(client, takes, draft)
             report = client.report(capture)
             quality, missing = report["quality"], report["frames"]["missing"]
             good = until is not None and quality is not None and quality["low"] >= until
@@ -159,8 +159,8 @@ def _film(file: Path, record: Path, name: str) -> Iterator[Taken]:
         time.sleep(LOOK)
 
 
-def _ingest(client: Client, takes: Iterator[Taken], draft: Job | None) -> tuple[Capture, bool]:
-    """Upload what has been taken, once it suffices for a matte; the capture, and whether nothing will follow.
+def _next_capture(client: Client, takes: Iterator[Taken], draft: Job | None) -> tuple[Capture, bool]:
+    """Upload what has been taken, once it suffices for a matte; the capture, and whether that is all.
 
     A draft that is still being recovered pauses meanwhile.
     """

@@ -44,8 +44,7 @@ def find_strong_strays(
     -----
     ``C = S + rho / 2 + sum_s a_s B_s`` is fitted to the patterns, and ``S + sum a_s B_s`` and ``S + rho + sum a_s B_s``
     to black and white, whose weight is the inverse of their variances. What patterns show besides is like noise here,
-    of the variance that is left. By chance, p rows of stray light explain a share of the variance of k values that is
-    distributed as Beta(p / 2, (k - p - 1) / 2) (Seber and Lee, Linear Regression Analysis, 2003, ch. 4).
+    of the variance that is left.
     """
     m = measurements.shape[1]
     light = np.stack([photometry.S, photometry.S + photometry.rho], axis=2)
@@ -63,11 +62,9 @@ def find_strong_strays(
     alone = np.delete(design, 1, axis=1)
     amount = solve_least_squares(alone, weight, values)[0]
     after = (weight * (values - amount @ alone.T) ** 2).sum(axis=2)
-    rank = np.linalg.matrix_rank(alone[:m][known[:, :, :m].any(axis=(0, 1))]) - 1
-    values_of, which = np.unique(count[..., 0], return_inverse=True)
-    free = np.maximum(values_of - rank - 1, 0)
-    by_chance = np.where(free * rank, betaincinv(np.maximum(rank, 1) / 2, np.maximum(free, 1) / 2, STRONG), 1)
-    strong = before - after > by_chance[which].reshape(before.shape) * before
+    masks, which = np.unique(known[:, :, :m].reshape(-1, m), axis=0, return_inverse=True)
+    by_chance = np.array([_share_by_chance(alone[:m][mask]) for mask in masks])[which]
+    strong = before - after > by_chance.reshape(before.shape) * before
     left = np.maximum(after / count[..., 0], 1e-12)
     weight /= left[..., np.newaxis]
     weight[:, :, m:] = 1 / np.stack([photometry.black, photometry.white], axis=2)
@@ -88,6 +85,22 @@ def find_strong_strays(
         )
     )
     return stray.transpose(0, 2, 1).astype(np.float32), better
+
+
+def _share_by_chance(light: NDArray[np.float64]) -> float:
+    """The share of the variance of values that stray light explains by chance of `STRONG` of the pixels, or less.
+
+    Of k values, p rows of light explain a share that is distributed as Beta(p / 2, (k - p - 1) / 2) (Seber and Lee,
+    Linear Regression Analysis, 2003, ch. 4). Of fewer than 2 p + 2 they explain black and white ones exactly too often.
+
+    Parameters
+    ----------
+    light : (k, p + 1) float64
+        Of which the first column is constant.
+    """
+    rank = np.linalg.matrix_rank(light) - 1 if len(light) else 0
+    free = len(light) - 1 - rank
+    return float(betaincinv(rank / 2, free / 2, STRONG)) if free > rank > 0 else 1.0
 
 
 @njit(nogil=True, cache=True)

@@ -110,6 +110,12 @@ def test_what_explains_a_pixel_by_chance_is_left_to_its_lobes(m: int) -> None:
     rows = np.concatenate([np.ones((1, m + 2), np.float32), bits])
     n = 2000
     values = (0.1 + 0.5 * (random.random((n, m, 1)) < 0.5) * np.ones(3)).astype(np.float32)
+    usable = np.ones(values.shape, bool)
+    usable[: n // 2, m // 2 :] = False
     S, rho, variance = (np.full((n, 3), value, np.float32) for value in (0.1, 0.5, 1e-6))
-    stray, _ = find_strong_strays(values, Photometry(S, rho, variance, variance), rows, None)
-    assert stray.any(axis=(1, 2)).mean() < 0.02
+    stray, _ = find_strong_strays(values, Photometry(S, rho, variance, variance), rows, usable)
+    assert stray[: n // 2].any(axis=(1, 2)).mean() < 0.02
+    assert stray[n // 2 :].any(axis=(1, 2)).mean() < 0.02
+    half = Photometry(*(part[: n // 2] for part in (S, rho, variance, variance)))
+    alone, _ = find_strong_strays(values[: n // 2], half, rows, usable[: n // 2])
+    np.testing.assert_array_equal(alone, stray[: n // 2])
