@@ -9,9 +9,10 @@ from workflows.recovery.camera.photometry import Photometry, solve_least_squares
 
 STRAY = 0.1
 """Prior standard deviation of an amount of stray light that is not constant, in units of T."""
-STRONG = 0.993
-"""Stray light is taken out before recovery where it explains more of a pixel's variance than it would by chance of
-this share of the pixels."""
+STRONG = 0.17
+"""Stray light that explains this share of the variance of a pixel is taken out before recovery,"""
+SURE = 0.993
+"""if in this share of the pixels chance explains less."""
 
 
 def find_strong_strays(
@@ -64,7 +65,7 @@ def find_strong_strays(
     after = (weight * (values - amount @ alone.T) ** 2).sum(axis=2)
     masks, which = np.unique(known[:, :, :m].reshape(-1, m), axis=0, return_inverse=True)
     by_chance = np.array([_share_by_chance(alone[:m][mask]) for mask in masks])[which]
-    strong = before - after > by_chance.reshape(before.shape) * before
+    strong = before - after > np.maximum(STRONG, by_chance.reshape(before.shape)) * before
     left = np.maximum(after / count[..., 0], 1e-12)
     weight /= left[..., np.newaxis]
     weight[:, :, m:] = 1 / np.stack([photometry.black, photometry.white], axis=2)
@@ -88,7 +89,7 @@ def find_strong_strays(
 
 
 def _share_by_chance(light: NDArray[np.float64]) -> float:
-    """The share of the variance of values that stray light explains by chance of `STRONG` of the pixels, or less.
+    """The share of the variance of values that stray light explains by chance of `SURE` of the pixels, or less.
 
     Of k values, p rows of light explain a share that is distributed as Beta(p / 2, (k - p - 1) / 2) (Seber and Lee,
     Linear Regression Analysis, 2003, ch. 4). Of fewer than 2 p + 2 they explain black and white ones exactly too often.
@@ -100,7 +101,7 @@ def _share_by_chance(light: NDArray[np.float64]) -> float:
     """
     rank = np.linalg.matrix_rank(light) - 1 if len(light) else 0
     free = len(light) - 1 - rank
-    return float(betaincinv(rank / 2, free / 2, STRONG)) if free > rank > 0 else 1.0
+    return float(betaincinv(rank / 2, free / 2, SURE)) if free > rank > 0 else 1.0
 
 
 @njit(nogil=True, cache=True)
