@@ -61,11 +61,11 @@ def find_strong_strays(
     count = np.maximum(weight.sum(axis=2, keepdims=True), 1)
     before = (weight * (values - (weight * values).sum(axis=2, keepdims=True) / count) ** 2).sum(axis=2)
     alone = np.delete(design, 1, axis=1)
-    amount = solve_least_squares(alone, weight, values)[0]
+    amount, inverse = solve_least_squares(alone, weight, values)
     after = (weight * (values - amount @ alone.T) ** 2).sum(axis=2)
-    masks, which = np.unique(known[:, :, :m].reshape(-1, m), axis=0, return_inverse=True)
-    by_chance = np.array([_share_by_chance(alone[:m][mask]) for mask in masks])[which]
-    strong = before - after > np.maximum(STRONG, by_chance.reshape(before.shape)) * before
+    gram = np.einsum("kp,nck,kq->ncpq", alone, weight, alone, optimize=True)
+    rows = np.rint(np.einsum("ncpq,ncqp->nc", inverse, gram)) - 1
+    strong = before - after > np.maximum(STRONG, _share_by_chance(rows, count[..., 0])) * before
     left = np.maximum(after / count[..., 0], 1e-12)
     weight /= left[..., np.newaxis]
     weight[:, :, m:] = 1 / np.stack([photometry.black, photometry.white], axis=2)
@@ -88,20 +88,16 @@ def find_strong_strays(
     return stray.transpose(0, 2, 1).astype(np.float32), better
 
 
-def _share_by_chance(light: NDArray[np.float64]) -> float:
+def _share_by_chance(rows: NDArray[np.float64], count: NDArray[np.float64]) -> NDArray[np.float64]:
     """The share of the variance of values that stray light explains by chance of `SURE` of the pixels, or less.
 
-    Of k values, p rows of light explain a share that is distributed as Beta(p / 2, (k - p - 1) / 2) (Seber and Lee,
-    Linear Regression Analysis, 2003, ch. 4). Of fewer than 2 p + 2 they explain black and white ones exactly too often.
-
-    Parameters
-    ----------
-    light : (k, p + 1) float64
-        Of which the first column is constant.
+    Of k values, p independent rows of light explain a share that is distributed as Beta(p / 2, (k - p - 1) / 2) (Seber
+    and Lee, Linear Regression Analysis, 2003, ch. 4). Of fewer than 2 p + 2 they explain black and white ones exactly
+    too often.
     """
-    rank = np.linalg.matrix_rank(light) - 1 if len(light) else 0
-    free = len(light) - 1 - rank
-    return float(betaincinv(rank / 2, free / 2, SURE)) if free > rank > 0 else 1.0
+    free = count - rows - 1
+    share = betaincinv(np.maximum(rows, 1) / 2, np.maximum(free, 1) / 2, SURE)
+    return np.where((free > rows) & (rows > 0), share, 1)
 
 
 @njit(nogil=True, cache=True)
