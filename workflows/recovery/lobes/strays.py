@@ -63,6 +63,7 @@ def find_strong_strays(
     alone = np.delete(design, 1, axis=1)
     amount, inverse = solve_least_squares(alone, weight, values)
     after = (weight * (values - amount @ alone.T) ** 2).sum(axis=2)
+    # The rank as a trace: to decompose the matrices once more takes five times as long.
     gram = np.einsum("kp,nck,kq->ncpq", alone, weight, alone, optimize=True)
     rows = np.rint(np.einsum("ncpq,ncqp->nc", inverse, gram)) - 1
     strong = before - after > np.maximum(STRONG, _share_by_chance(rows, count[..., 0])) * before
