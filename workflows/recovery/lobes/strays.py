@@ -67,26 +67,25 @@ def find_strong_strays(
     gram = np.einsum("kp,nck,kq->ncpq", alone, weight, alone, optimize=True)
     rows = np.rint(np.einsum("ncpq,ncqp->nc", inverse, gram)) - 1
     strong = before - after > np.maximum(STRONG, _share_by_chance(rows, count[..., 0])) * before
-    left = np.maximum(after / count[..., 0], 1e-12)
-    weight /= left[..., np.newaxis]
-    weight[:, :, m:] = 1 / np.stack([photometry.black, photometry.white], axis=2)
+    # From here on strong values alone, few of n times 3.
+    values, weight = values[strong], weight[strong]
+    weight /= np.maximum(after / count[..., 0], 1e-12)[strong, np.newaxis]
+    weight[:, m:] = 1 / np.stack([photometry.black[strong], photometry.white[strong]], axis=1)
     found, covariance = solve_least_squares(design, weight, values)
-    stray = np.where(strong[..., np.newaxis], found[..., 2:] @ design[:m, 2:].T, 0)
-    S, rho = found[..., 0], found[..., 1]
+    stray = np.zeros(measurements.transpose(0, 2, 1).shape, np.float32)
+    stray[strong] = found[:, 2:] @ design[:m, 2:].T
+    S, rho = found[:, 0], found[:, 1]
     white = np.array([1.0, 1.0])
     fitted = (
         np.where(rho > 0, S, S + rho / 2),
         np.maximum(rho, 0),
-        covariance[..., 0, 0],
-        np.einsum("i,ncij,j->nc", white, covariance[..., :2, :2], white),
+        covariance[:, 0, 0],
+        np.einsum("i,nij,j->n", white, covariance[:, :2, :2], white),
     )
-    better = Photometry(
-        *(
-            np.where(strong, new, old).astype(np.float32)
-            for new, old in zip(fitted, vars(photometry).values(), strict=True)
-        )
-    )
-    return stray.transpose(0, 2, 1).astype(np.float32), better
+    better = Photometry(*(old.astype(np.float32) for old in vars(photometry).values()))
+    for of_all, of_strong in zip(vars(better).values(), fitted, strict=True):
+        of_all[strong] = of_strong
+    return stray.transpose(0, 2, 1), better
 
 
 def _share_by_chance(rows: NDArray[np.float64], count: NDArray[np.float64]) -> NDArray[np.float64]:
