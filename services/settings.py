@@ -15,7 +15,7 @@ from services.runtime.addresses import is_loopback
 from services.runtime.environment import DATA, PREFIX, database_url, read_environment
 from services.runtime.webhook_signature import signing_key
 from storage.errors import InvalidInput
-from workflows.untrusted.limits import Limits
+from workflows.untrusted.limits import MAX_FRAMES, Limits
 
 if TYPE_CHECKING:
     from distributed.security import Security
@@ -159,7 +159,7 @@ class CoordinatorSettings(ClusterSettings):
         ge=1 << 20,
     )
     unpacked_bytes: int = _setting(64 << 30, "Bytes that a capture archive may unpack to.", ge=1)
-    capture_frames: int = _setting(20_000, "Frames of a capture, at most.", ge=1)
+    capture_frames: int = _setting(MAX_FRAMES, "Frames of a capture, at most.", ge=1, le=MAX_FRAMES)
     capture_pixels: int = _setting(100_000_000, "Pixels of a frame, at most.", ge=1)
     job_seconds: int | None = _setting(
         None,

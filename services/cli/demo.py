@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from services.cli.options import as_json
+from services.cli.options import as_json, key
 from services.cli.output import example, print_result, write
 
 
@@ -24,7 +24,7 @@ from services.cli.output import example, print_result, write
 )
 @click.option("--workers", type=int, help="Worker processes of the demo's service. Default: one per core.")
 @click.option("--url", help="URL of a running service to use instead of starting one.")
-@click.option("--key", envvar="ENVMATTE_KEY", help="API key of that service.")
+@key
 @as_json
 def demo(
     output: Path, keep: Path | None, workers: int | None, url: str | None, key: str | None, as_json: bool

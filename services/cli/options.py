@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 import click
 
 from services.client import Client
+from services.runtime.environment import read_environment
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -23,6 +24,20 @@ store = click.option(
 )
 
 
+LOCAL = "http://127.0.0.1:8000"
+
+
+def _url() -> str:
+    return read_environment(("url",)).get("url", LOCAL)
+
+
+def _key() -> str | None:
+    return read_environment(("key",)).get("key")
+
+
+key = click.option("--key", default=_key, help="API key, if the service requires one. Default: ENVMATTE_KEY.")
+
+
 def drop_unset(options: dict[str, Any]) -> dict[str, Any]:
     """The options that were given; the environment decides about all others."""
     return {name: value for name, value in options.items() if value is not None}
@@ -30,14 +45,7 @@ def drop_unset(options: dict[str, Any]) -> dict[str, Any]:
 
 def remote(command: F) -> F:
     """Add the options of every command that talks to a service."""
-    url = click.option(
-        "--url",
-        envvar="ENVMATTE_URL",
-        default="http://127.0.0.1:8000",
-        show_default=True,
-        help="URL of the service.",
-    )
-    key = click.option("--key", envvar="ENVMATTE_KEY", help="API key, if the service requires one.")
+    url = click.option("--url", default=_url, help=f"URL of the service. Default: ENVMATTE_URL, or {LOCAL}.")
     return url(key(as_json(command)))
 
 

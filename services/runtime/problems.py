@@ -45,6 +45,10 @@ class BadHeader(InvalidInput):
     """A header that is missing or malformed."""
 
 
+class BadRange(InvalidInput):
+    """A Range header that asks for no byte of what there is."""
+
+
 class WrongVersion(InvalidInput):
     """Another version of the upload protocol than the service speaks."""
 
@@ -77,6 +81,7 @@ PROBLEMS: dict[type[Exception], tuple[int, str, str]] = {
     NotAcceptable: (HTTPStatus.NOT_ACCEPTABLE, "not-acceptable", "Not acceptable"),
     NotNeeded: (HTTPStatus.PRECONDITION_FAILED, "not-needed", "Not needed"),
     BadHeader: (HTTPStatus.BAD_REQUEST, "bad-header", "Bad header"),
+    BadRange: (HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, "bad-range", "No such bytes"),
     WrongVersion: (HTTPStatus.PRECONDITION_FAILED, "wrong-version", "Wrong protocol version"),
     ChecksumMismatch: (460, "checksum-mismatch", "Checksum mismatch"),  # the status is of tus
     InvalidInput: (HTTPStatus.UNPROCESSABLE_ENTITY, "bad-request", "The request can't be used"),

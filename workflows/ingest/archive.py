@@ -13,9 +13,10 @@ from storage.errors import CaptureError
 from workflows.ingest.manifest import MANIFEST, MANIFEST_BYTES, Manifest, parse_manifest
 from workflows.programs.program import Images
 from workflows.untrusted import zip_files
-from workflows.untrusted.limits import Limits
+from workflows.untrusted.limits import MAX_FRAMES, Limits
 
-MAX_ENTRIES = 20_000
+MAX_ENTRIES = 2 * MAX_FRAMES + 2
+"""A picture of each pattern besides, the mask, and capture.json."""
 NAME_LENGTH_AT = 26
 """Where a local file header has the lengths of the name and of the extra field (APPNOTE, sect. 4.3.7)."""
 PIECE = 1 << 20

@@ -15,10 +15,10 @@ from workflows.untrusted.validation import reason
 
 MANIFEST = "capture.json"
 MANIFEST_BYTES = 4 << 20
-"""The largest manifest: about 200 bytes for each of 20,000 frames."""
+"""The largest manifest: about 200 bytes for each of `MAX_FRAMES`."""
 MANIFEST_NODES = 150_000
 """The most objects and lists in it: an empty one takes 2 bytes of text, but 300 bytes of memory while parsing."""
-UNION_TAGS = {"constant", "bernoulli", "stripes", "images", "Gamma"}
+UNION_TAGS = {"constant", "halftone", "bernoulli", "stripes", "images", "Gamma"}
 """Names that pydantic inserts in an error's location to say which member of a union it tried."""
 
 EXAMPLE: dict[str, Any] = {

@@ -4,6 +4,9 @@ from dataclasses import dataclass
 
 from storage.errors import ImageError, OverLimit
 
+MAX_FRAMES = 20_000
+"""Frames of a capture, whatever is allowed."""
+
 
 @dataclass(frozen=True)
 class Limits:

@@ -9,7 +9,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
-from starlette.routing import Match, Route
+from starlette.routing import Match, Mount
 
 from services.runtime.problems import MEDIA_TYPE, Unauthorized, problem_detail, problem_of
 from storage.errors import EnvmatteError, InvalidInput, TooMany, Unavailable
@@ -45,6 +45,7 @@ HEADERS: dict[type[EnvmatteError], dict[str, str]] = {
     Unavailable: {"Retry-After": "2"},  # seconds
     TooMany: {"Retry-After": "10"},
 }
+METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
 logger = logging.getLogger(__name__)
 
 
@@ -88,8 +89,13 @@ def register(app: FastAPI) -> None:
 
 
 def _methods(request: Request) -> set[str]:
-    """The methods of all routes of a path; the framework names only those of the first route that matches."""
-    matching = [
-        r for r in request.app.routes if isinstance(r, Route) and r.matches(request.scope)[0] != Match.NONE
-    ]
-    return {method for route in matching for method in route.methods or ()}
+    """The methods of all routes of a path, those of files if there is none.
+
+    The framework names only those of the first route that matches.
+    """
+    routes = [route for route in request.app.routes if not isinstance(route, Mount)]
+    return {
+        method
+        for method in METHODS
+        if any(route.matches({**request.scope, "method": method})[0] == Match.FULL for route in routes)
+    } or {"GET", "HEAD"}

@@ -11,6 +11,7 @@ from sqlalchemy import Connection
 
 from services.api.context import Context, OwnerContext
 from services.api.http.bodies import store_body, upload_limit
+from services.api.http.errors import answer
 from services.api.http.idempotency import find_earlier, idempotent
 from services.api.http.media_types import JSON, media_type_of
 from services.api.http.router import Router
@@ -18,6 +19,7 @@ from services.api.jobs.jobs import Job
 from services.api.limits.quotas import admit
 from services.api.limits.reservations import reserved
 from services.runtime import tracing
+from services.runtime.problems import BadRange, problem_of
 from services.webhooks.sender import check_webhook
 from storage.database.engine import reading
 from storage.database.rows import new_id
@@ -26,7 +28,6 @@ from storage.layout import composites
 from storage.records import bodies, jobs, mattes
 
 router = Router(tags=["jobs"])
-CALL = "POST /v1/mattes/{id}/composite"
 PIECE = 1 << 20
 """Bytes of a video that are read from the store at once."""
 RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
@@ -65,7 +66,7 @@ async def composite_clip(
     limit = upload_limit(context.settings, "a clip")
     length = limit.check_announced(request)
     key = request.headers.get("idempotency-key", "")[:256]
-    job = await context.call(find_earlier, context.engine, key, CALL, Job.read)
+    job = await context.call(find_earlier, context.engine, key, _call(matte), Job.read)
     if job is None:
         await context.call(_require_ready, context, matte)
         id = new_id()
@@ -108,7 +109,8 @@ def get_video(context: OwnerContext, id: str, request: Request) -> Response:
     start, end = _span(request.headers.get("range", ""), size)
     if start >= size:
         file.close()
-        return Response(status_code=416, headers={"Content-Range": f"bytes */{size}"})
+        problem = problem_of(BadRange(f"the video of job {id} has {size} bytes, and none of these"))
+        return answer(problem, {"Content-Range": f"bytes */{size}"})
     headers = {"Accept-Ranges": "bytes", "Content-Length": str(end - start)}
     part = end - start < size
     if part:
@@ -144,7 +146,12 @@ def _queue(
         jobs.add(c, "composite", capture, options, matte, trace, job, size, webhook)
         return job
 
-    return idempotent(context.engine, key, CALL, Job.read, create, job)
+    return idempotent(context.engine, key, _call(matte), Job.read, create, job)
+
+
+def _call(matte: str) -> str:
+    """What an Idempotency-Key belongs to: one clip may be composited with several mattes."""
+    return f"POST /v1/mattes/{matte}/composite"
 
 
 def _span(text: str, size: int) -> tuple[int, int]:

@@ -193,7 +193,14 @@ def test_unknown_ids_are_not_found(service: Service) -> None:
     check_problem(service.http.post("/v1/jobs", json={"capture": "no-such-id"}), 404, "not-found")
     check_problem(service.http.get("/v1/captures?after=no-such-id"), 404, "not-found")
     check_problem(service.http.get("/v2/nothing"), 404, "not-found")
-    check_problem(service.http.put("/v1/jobs"), 405, "method-not-allowed")
+    for path, methods in {
+        "/v1/jobs": "GET, POST",
+        "/v1/mattes/m": "DELETE, GET, PATCH",
+        "/": "GET, HEAD",
+    }.items():
+        refused = service.http.put(path)
+        check_problem(refused, 405, "method-not-allowed")
+        assert refused.headers["allow"] == methods
     check_problem(service.http.get("/v1/jobs?limit=many"), 422, "bad-request")
 
 

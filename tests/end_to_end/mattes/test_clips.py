@@ -12,6 +12,7 @@ import pytest
 from services.client import ServiceError
 from tests.end_to_end.command_line import envmatte
 from tests.end_to_end.conftest import HEIGHT, WIDTH, Service, serving
+from tests.end_to_end.problems import check_problem
 from tests.parts.waiting import until
 from tests.services.cluster.clusters import workers
 from tests.workflows.composite.video.test_steps import TICK, clip, even, frames_of, pictures
@@ -44,6 +45,9 @@ def test_clip_becomes_a_video_with_its_timestamps(service: Service, matte: str) 
     data = clip(shown, ticks, crf="4")
     job = post(service, matte, data, **{"Idempotency-Key": "once"})
     assert post(service, matte, data, **{"Idempotency-Key": "once"})["id"] == job["id"]
+    of_another = {**VIDEO, "Idempotency-Key": "once"}
+    other = service.http.post("/v1/mattes/no-such-id/composite", content=data, headers=of_another)
+    check_problem(other, 404, "not-found")
     assert (job["kind"], job["matte"], job["options"]) == ("composite", matte, OPTIONS)
     done = service.client.wait(job["id"])
     assert done["pixels"] == 40 * WIDTH * HEIGHT
@@ -63,7 +67,9 @@ def test_clip_becomes_a_video_with_its_timestamps(service: Service, matte: str) 
         part = service.http.get(url, headers={"Range": f"bytes={requested}"})
         assert (part.status_code, part.content) == (206, whole[slice(*span)])
     assert part.headers["content-range"] == f"bytes {len(whole) - 7}-{len(whole) - 1}/{len(whole)}"
-    assert service.http.get(url, headers={"Range": f"bytes={len(whole)}-"}).status_code == 416
+    beyond = service.http.get(url, headers={"Range": f"bytes={len(whole)}-"})
+    assert beyond.headers["content-range"] == f"bytes */{len(whole)}"
+    check_problem(beyond, 416, "bad-range")
     assert service.http.get(url, headers={"Range": "lines=1-2"}).content == whole
 
     only = f"composites/{job['id']}/video.mp4"

@@ -145,6 +145,23 @@ def test_exit_code_2_for_a_wrong_command_line(arguments: list[str]) -> None:
     assert "python -m" not in found.stderr
 
 
+def test_url_and_key_come_from_the_environment_or_its_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with scripted_server(lambda n: ok()) as (url, calls):
+        Path(".env").write_text(f"ENVMATTE_URL={url}\nENVMATTE_KEY=of-the-file\n")
+        for environment, options in (
+            ({}, []),
+            ({"ENVMATTE_KEY": "of-the-environment"}, []),
+            ({"ENVMATTE_KEY": "of-the-environment"}, ["--key", "given"]),
+        ):
+            where = os.environ | {"PYTHONPATH": str(ROOT)} | environment
+            subprocess.run([*COMMAND, "status", "j", *options], check=True, timeout=300, env=where)
+        keys = [call["Authorization"].removeprefix("Bearer ") for call in calls]
+    assert keys == ["of-the-file", "of-the-environment", "given"]
+
+
 def test_exit_code_3_if_unreachable_or_busy() -> None:
     found = envmatte("status", "j", "--url", "http://127.0.0.1:9")
     assert (found.returncode, found.stdout) == (3, "")

@@ -16,8 +16,8 @@ import pytest
 from storage.errors import CaptureError
 from storage.layout import uploads
 from storage.objects.store import Objects
-from workflows.ingest.archive import CaptureArchive
-from workflows.untrusted.limits import Limits
+from workflows.ingest.archive import MAX_ENTRIES, CaptureArchive
+from workflows.untrusted.limits import MAX_FRAMES, Limits
 
 Zip = Callable[..., bytes]
 LIMITS = Limits(unpacked=1 << 20, memory=1 << 20)
@@ -88,6 +88,13 @@ def test_unknown_fields_and_files_are_accepted(make_zip: Zip) -> None:
     files = FILES | {"README.txt": b"hello", "empty/": b"", "ünï.png": b""}
     archive = open_archive(make_zip(changed(extend), files))
     assert archive.manifest == open_archive(make_zip(RECORD, FILES)).manifest
+
+
+def test_as_many_frames_as_a_capture_may_have_fit_into_an_archive(make_zip: Zip) -> None:
+    frames = [{"file": f"{n}.png", "pattern": n % 5} for n in range(MAX_FRAMES)]
+    data = make_zip(RECORD | {"frames": frames}, FILES | {frame["file"]: b"" for frame in frames})
+    archive = open_archive(data, Limits(unpacked=1 << 24, memory=1 << 24))
+    assert len(archive.manifest.frames) == MAX_FRAMES
 
 
 def test_archive_without_a_record_is_refused(make_zip: Zip) -> None:
@@ -334,8 +341,8 @@ def test_a_damaged_archive_is_a_capture_error_or_read(
 
 
 def test_a_directory_of_too_many_entries_is_refused(make_zip: Zip) -> None:
-    files = FILES | {f"more/{n}": b"" for n in range(20_000)}
-    with pytest.raises(CaptureError, match="more than 20000"):
+    files = FILES | {f"more/{n}": b"" for n in range(MAX_ENTRIES)}
+    with pytest.raises(CaptureError, match=f"more than {MAX_ENTRIES}"):
         open_archive(make_zip(RECORD, files))
 
 

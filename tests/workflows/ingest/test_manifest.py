@@ -64,6 +64,11 @@ def test_malformed_text_is_refused(text: bytes) -> None:
             "program.parts.3.count",
             "must be at most 14",
         ),
+        (
+            lambda r: r["program"]["parts"].append({"kind": "halftone", "levels": [0.3]}),
+            f"program.parts.{len(RECORD['program']['parts'])}.levels.0",
+            "multiple of 0.25",
+        ),
     ],
 )
 def test_error_names_the_field_and_its_range(

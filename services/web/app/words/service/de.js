@@ -31,6 +31,7 @@ export const de = {
 	"Most rounds of choosing and pruning cells at one sparsity.": "Höchstzahl der Runden, in denen bei einer Sparsity Zellen gewählt und gestrichen werden.",
 	"Most sweeps of coordinate descent in a least-squares solve.": "Höchstzahl der Durchläufe des Koordinatenabstiegs beim Lösen der kleinsten Quadrate.",
 	"Most times that Gaussians are fitted to T and T is filtered by them.": "Wie oft höchstens Gauß-Keulen an T angepasst werden und T damit gefiltert wird.",
+	"No such bytes": "Diese Bytes gibt es nicht",
 	"Nodes of each grid whose children are examined in the search for another lobe.": "Knoten jedes Gitters, deren Kinder bei der Suche nach einer weiteren Keule untersucht werden.",
 	"Not acceptable": "So nicht lieferbar",
 	"Not found": "Nicht gefunden",
