@@ -1,9 +1,9 @@
 """A matte in the store: S, rho and T in zarr arrays that any zarr reader can read.
 
-``mattes/ID`` is a zarr group with the attributes ``width``, ``height``, ``columns`` and ``rows`` (the first grid of T's
-cells), ``block``, ``crosstalk`` (X of ``C = S + X (rho T L)``: a row for each channel of the camera, a column for each
-of the monitor), the options that it was recovered with, and ``interval``, see
-`workflows.recovery.interval`, if that was measured. In it are
+``mattes/ID`` is a zarr group with the attributes ``format``, ``width``, ``height``, ``monitor`` (its width and
+height), ``columns`` and ``rows`` (the first grid of T's cells), ``block``, ``crosstalk`` (X of
+``C = S + X (rho T L)``: a row for each channel of the camera, a column for each of the monitor), the options that it
+was recovered with, and ``interval``, see `workflows.recovery.interval`, if that was measured. In it are
 
 - ``S``, ``rho`` (y, x, channel) float32;
 - ``count`` (y, x, channel) uint32: the number of cells in the row T of a pixel and channel;

@@ -20,7 +20,8 @@ from workflows.untrusted.decoder import Decoder, blaming
 HEADROOM = 1.05
 """Full scale relative to the largest value of the white frame: leaves room for noise."""
 HIGHLIGHT = 4.0
-"""The most that full scale may be, relative to the white frame's 99th percentile: a glint must not cost precision."""
+"""The largest value that full scale makes room for, relative to the white frame's 99th percentile: a glint must not
+cost precision."""
 
 
 class Storage(NamedTuple):

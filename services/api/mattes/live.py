@@ -101,7 +101,9 @@ def _bytes_of(matte: Matte) -> int:
 
 
 def _title(context: Context, row: Row[Any]) -> str:
-    """What people call a matte: the name of its capture, as long as that exists."""
+    """What people call a matte: its name, or that of its capture as long as that exists."""
+    if row.name:
+        return str(row.name)
     with suppress(NotFound), reading(context.engine) as c:
         if name := captures.get(c, row.capture or "").name:
             return str(name)

@@ -44,7 +44,7 @@ def open(matte: str | Path | BinaryIO, *, lobes: int = 4, key: str | None = None
     ImportError
         If xarray is not installed.
     ValueError
-        If the URL is not that of a matte, or `lobes` is out of range.
+        If the URL is not that of a matte, the matte is not ready, or `lobes` is out of range.
     storage.errors.ArchiveError
         If the file is not the archive of a matte, or damaged.
     services.client.ServiceError

@@ -199,6 +199,8 @@ def test_name_that_looks_like_html_is_shown_as_text(
         expect(glass.get_by_role("heading")).to_have_text(name)
         expect(glass).to_have_title(name)
         assert glass.evaluate("window.ran") is None
+    service.http.patch(f"/v1/mattes/{job['matte']}", json={"name": "a tumbler"})
+    assert b"<title>a tumbler</title>" in service.client.live_page(str(job["matte"]))
 
 
 def test_page_has_a_strict_policy_and_one_copy_of_each_module(saved: Path) -> None:

@@ -101,6 +101,9 @@ def recover(
     ([21, 21, 21], [1.0, 1.0, 1.0])
     """
     constants = options.constants
+    needed = 1 + max(int(level.patterns.max()) for level in sensing.levels)
+    if measurements.shape[1] < needed:
+        raise ValueError(f"measurements are of {measurements.shape[1]} patterns, the levels have {needed}")
     measured = normalise(measurements, photometry, noise, constants.least_contrast, usable, frames)
     measured = less_certain(measured, conditions.model_error)
     value, weight = _weight_measurements(measured.value[..., :-2], measured.variance[..., :-2])

@@ -127,10 +127,14 @@ def recover(
     n, m = len(measurements), patterns.count
     if measurements.shape != (n, m, 3):
         raise ValueError(f"measurements must be (n, {m}, 3), not {measurements.shape}")
+    if len(patterns.code) != patterns.pyramid.nodes:
+        raise ValueError(f"patterns have {len(patterns.code)} nodes, their pyramid {patterns.pyramid.nodes}")
+    strays = np.ones((1, m + 2), np.float32) if conditions.strays is None else conditions.strays
+    if strays.ndim != 2 or strays.shape[1] != m + 2:
+        raise ValueError(f"strays must be (s, {m + 2}), not {strays.shape}")
     if conditions.grey:
         usable = np.ones(measurements.shape, bool) if usable is None else usable.copy()
         usable[:, :, 1:] = False
-    strays = np.ones((1, m + 2), np.float32) if conditions.strays is None else conditions.strays
     stray: NDArray[np.float32] | None = None
     if len(strays) > 1:
         stray, photometry = find_strong_strays(measurements, photometry, strays, usable)

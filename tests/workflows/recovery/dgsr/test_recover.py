@@ -185,11 +185,13 @@ def test_one_level_serves(recover, sensing_of, observe):
     assert np.abs(found - truth).sum(2).max() < 0.1
 
 
-def test_measurements_of_another_number_of_pixels_are_refused(recover, sensing_of, observe):
+def test_measurements_of_another_number_of_pixels_or_patterns_are_refused(recover, sensing_of, observe):
     sensing = sensing_of(BANDS, 11)
     measurements, photometry, noise = observe(sensing, mixture(3))
     with pytest.raises(ValueError, match="measurements"):
         recover(measurements[:2], photometry, sensing, noise)
+    with pytest.raises(ValueError, match="patterns"):
+        recover(measurements[:, 1:], photometry, sensing, noise)
 
 
 def args(scene, sensing):

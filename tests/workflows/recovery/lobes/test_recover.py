@@ -1,5 +1,7 @@
 """The default recovery: known scenes, channels that differ or do not, S and rho, any batch, and bad input."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -401,3 +403,8 @@ def test_shapes_that_do_not_fit_are_refused(patterns, truth, observe):
             lobes.recover(wrong, photometry, patterns, noise)
     with pytest.raises(ValueError, match="measurements"):
         lobes.recover(np.repeat(measurements, 2, axis=0), photometry, patterns, noise)
+    short = lobes.Conditions(strays=np.ones((2, patterns.count), np.float32))
+    with pytest.raises(ValueError, match="strays"):
+        lobes.recover(measurements, photometry, patterns, noise, conditions=short)
+    with pytest.raises(ValueError, match="nodes"):
+        lobes.recover(measurements, photometry, replace(patterns, code=patterns.code[:5]), noise)
