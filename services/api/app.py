@@ -4,6 +4,7 @@ from typing import Any
 
 from fastapi import Depends, FastAPI
 from sqlalchemy import Engine
+from starlette.types import Receive, Scope, Send
 
 from services.api.captures import captures, creation, manifest_schema, reports, tus, uploads
 from services.api.context import Context, authorized
@@ -24,7 +25,13 @@ BACKDROPS = 16
 
 
 class App(FastAPI):
-    """A FastAPI app whose OpenAPI document also has the schema of capture.json."""
+    """A FastAPI app that answers HEAD wherever it answers GET, and whose OpenAPI document has capture.json's schema."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        # The server leaves out the body (RFC 9110, sect. 9.3.2). Uploads have a HEAD of their own.
+        if scope["type"] == "http" and scope["method"] == "HEAD" and not scope["path"].startswith(tus.PATH):
+            scope = {**scope, "method": "GET"}
+        await super().__call__(scope, receive, send)
 
     def openapi(self) -> dict[str, Any]:
         document = super().openapi()

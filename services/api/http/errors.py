@@ -94,8 +94,9 @@ def _methods(request: Request) -> set[str]:
     The framework names only those of the first route that matches.
     """
     routes = [route for route in request.app.routes if not isinstance(route, Mount)]
-    return {
+    found = {
         method
         for method in METHODS
         if any(route.matches({**request.scope, "method": method})[0] == Match.FULL for route in routes)
-    } or {"GET", "HEAD"}
+    }
+    return found | {"HEAD"} if "GET" in found else found or {"GET", "HEAD"}

@@ -194,8 +194,8 @@ def test_unknown_ids_are_not_found(service: Service) -> None:
     check_problem(service.http.get("/v1/captures?after=no-such-id"), 404, "not-found")
     check_problem(service.http.get("/v2/nothing"), 404, "not-found")
     for path, methods in {
-        "/v1/jobs": "GET, POST",
-        "/v1/mattes/m": "DELETE, GET, PATCH",
+        "/v1/jobs": "GET, HEAD, POST",
+        "/v1/mattes/m": "DELETE, GET, HEAD, PATCH",
         "/": "GET, HEAD",
     }.items():
         refused = service.http.put(path)

@@ -43,6 +43,16 @@ def test_frames_are_stored_unchanged(service: Service, capture: str, scene: Scen
         np.testing.assert_array_equal(integer_formats.decode(answer.content, memory=1 << 24), filmed[n])
 
 
+def test_head_is_get_without_the_body(service: Service, matte: str) -> None:
+    paths = ("/", "/healthz", "/v1/captures", f"/v1/mattes/{matte}/layers/S.png", "/v1/jobs/no-such-id")
+    for path in paths:  # on one connection: a body would be taken for the next answer
+        whole, head = service.http.get(path), service.http.head(path)
+        assert (head.status_code, head.content) == (whole.status_code, b"")
+        assert whole.content
+        for name in ("content-type", "content-length", "etag"):
+            assert head.headers.get(name) == whole.headers.get(name), (path, name)
+
+
 def test_a_recovery_goes_from_queued_to_succeeded(service: Service, capture: str) -> None:
     answer = service.http.post(
         "/v1/jobs", json={"capture": capture, "options": {"method": "lobes", "tile": 32}}
