@@ -1,5 +1,6 @@
 """Creating captures over HTTP: from a capture archive as the body, or from a finished upload."""
 
+import logging
 from functools import partial
 from typing import Annotated, Any
 
@@ -22,13 +23,14 @@ from services.runtime.problems import WrongMediaType
 from services.webhooks.sender import check_webhook
 from storage.database.engine import reading, writing
 from storage.database.rows import new_id
-from storage.errors import CaptureError, Conflict, NotFound, Unavailable
+from storage.errors import CaptureError, Conflict, Corrupt, NotFound, Unavailable
 from storage.layout import uploads as stored_uploads
 from storage.layout.uploads import Part
 from storage.records import bodies, captures, jobs, uploads
 from workflows.ingest.archive import CaptureArchive
 from workflows.interruption import checkpoint
 
+logger = logging.getLogger(__name__)
 router = Router(tags=["captures"])
 CALL = "POST /v1/captures"
 FROM_UPLOAD_BYTES = 1 << 16
@@ -145,15 +147,21 @@ def _from_upload(context: Context, given: FromUpload, key: str | None) -> Row[An
         return _register(
             context, upload, parts, given.name, key, True, given.webhook, otherwise=file_name(row.metadata)
         )
-    except (CaptureError, NotFound, FileNotFoundError) as error:
+    except (CaptureError, Corrupt, FileNotFoundError, NotFound) as error:
+        is_useless = not isinstance(error, NotFound)  # it would be refused again
         with writing(context.engine) as c:
             if captures.exists(c, upload):  # a concurrent request was quicker
                 return captures.get(c, upload)
             uploads.get(c, upload)
-            if isinstance(error, CaptureError):  # it would be refused again
+            if is_useless:
                 uploads.delete(c, upload)
-        if isinstance(error, CaptureError):
+        if is_useless:
             stored_uploads.remove(context.objects, upload)
+        if isinstance(error, (Corrupt, FileNotFoundError)):
+            logger.error("deleted upload %s, which cannot be read: %s", upload, error)
+            raise NotFound(
+                f"bytes of upload {upload} are missing or damaged in the store, so it was deleted; start a new upload"
+            ) from error
         raise
 
 

@@ -225,16 +225,19 @@ def _advance(
 
 def _remove_unrecorded(context: Context, upload: str, stored: list[Part]) -> None:
     """Remove parts that were stored but not recorded, and all other parts too if the upload has been deleted."""
-    for part in stored:
-        context.objects.delete(stored_uploads.part_path(upload, part.name))
     try:
-        _get(context, upload)
+        # A commit that the database has not acknowledged may have recorded them: it is over once another can begin.
+        with writing(context.engine) as c:
+            uploads.get(c, upload)
+            recorded = uploads.parts_of(c, upload)
     except NotFound:
         with reading(context.engine) as c:
             is_capture = captures.exists(c, upload)
         if not is_capture:
             stored_uploads.remove(context.objects, upload)
         raise
+    for part in set(stored) - set(recorded):
+        context.objects.delete(stored_uploads.part_path(upload, part.name))
 
 
 def _get(context: Context, upload: str) -> Row[Any]:

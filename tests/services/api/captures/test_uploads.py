@@ -1,0 +1,117 @@
+"""Uploads whose rows and bytes could part: the app with a real database and store."""
+
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy import Engine, PoolProxiedConnection, event
+
+from services.api.app import build_app
+from services.settings import Settings
+from storage.database.engine import open_engine
+from storage.objects.store import Objects
+from tests.parts.captures import nested_program
+from tests.parts.postgres import Server
+from workflows.simulation import glass_ball
+from workflows.simulation.scene import write_capture
+
+TUS = {"Tus-Resumable": "1.0.0"}
+CHUNK = TUS | {"Content-Type": "application/offset+octet-stream", "Upload-Offset": "0"}
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def engine(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Engine]:
+    sqlite = f"sqlite:///{tmp_path / 'ledger.db'}"
+    opened = open_engine(sqlite if request.param == "sqlite" else request.getfixturevalue("postgresql"))
+    yield opened
+    opened.dispose()
+
+
+@pytest.fixture
+def client(engine: Engine, objects: Objects, tmp_path: Path) -> Iterator[TestClient]:
+    app = build_app(Settings(data=tmp_path), engine, objects)
+    with TestClient(app, "http://127.0.0.1") as client:
+        yield client
+    app.state.context.decoders.close()
+
+
+def create(client: TestClient, length: int) -> str:
+    headers = TUS | {"Upload-Length": str(length), "Idempotency-Key": "a file"}
+    return str(client.post("/v1/uploads", headers=headers).headers["location"])
+
+
+def offset_of(client: TestClient, where: str) -> str:
+    return str(client.head(where, headers=TUS).headers["upload-offset"])
+
+
+def break_commit(
+    engine: Engine, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, committed: bool
+) -> list[str]:
+    """Break the connection at the commit that records a part, before it or before its answer; returns what broke."""
+    commit, statements, broken = engine.dialect.do_commit, [], []
+
+    @event.listens_for(engine, "after_cursor_execute")
+    def executed(connection: object, cursor: object, sql: str, *more: object) -> None:
+        statements.append(sql)
+
+    def do_commit(connection: PoolProxiedConnection) -> None:
+        breaks = not broken and any(sql.startswith("INSERT INTO upload_parts") for sql in statements)
+        if committed or not breaks:
+            commit(connection)
+        if not breaks:
+            return
+        broken.append("commit")
+        if engine.dialect.name == "postgresql":
+            server: Server = request.getfixturevalue("postgresql_server")
+            assert connection.dbapi_connection is not None
+            server.execute(f"SELECT pg_terminate_backend({connection.dbapi_connection.info.backend_pid})")
+            connection.cursor().execute("SELECT 1")
+        error = sqlite3.OperationalError()
+        error.sqlite_errorcode = sqlite3.SQLITE_IOERR
+        raise error
+
+    monkeypatch.setattr(engine.dialect, "do_commit", do_commit)
+    return broken
+
+
+@pytest.mark.parametrize("committed", [False, True])
+def test_part_is_kept_if_it_was_recorded_although_the_connection_broke(
+    client: TestClient,
+    engine: Engine,
+    objects: Objects,
+    request: pytest.FixtureRequest,
+    monkeypatch: pytest.MonkeyPatch,
+    committed: bool,
+) -> None:
+    where = create(client, 5)
+    broken = break_commit(engine, request, monkeypatch, committed)
+    assert client.patch(where, headers=CHUNK, content=b"first").status_code == 503
+    assert broken == ["commit"]
+    names = objects.names(f"uploads/{where.rsplit('/', 1)[1]}")
+    assert (offset_of(client, where), len(names)) == (("5", 1) if committed else ("0", 0))
+
+
+def test_upload_whose_bytes_are_gone_is_started_again(
+    client: TestClient, objects: Objects, tmp_path: Path
+) -> None:
+    file = tmp_path / "ball.zip"
+    write_capture(
+        glass_ball.glass_ball(24, 16, rays=1), nested_program(bands=((8, 6, 16),), levels=2), file, name="b"
+    )
+    data = file.read_bytes()
+    where = create(client, len(data))
+    assert client.patch(where, headers=CHUNK, content=data).status_code == 204
+    (name,) = objects.names(folder := f"uploads/{where.rsplit('/', 1)[1]}")
+    objects.delete(f"{folder}/{name}")
+    body = {"upload": where.rsplit("/", 1)[1]}
+    answer = client.post("/v1/captures", json=body)
+    assert (answer.status_code, answer.json()["type"]) == (404, "urn:envmatte:problem:not-found")
+    assert "missing or damaged in the store" in answer.json()["detail"]
+    assert objects.names("uploads") == []
+    again = create(client, len(data))
+    assert (again != where, offset_of(client, again)) == (True, "0")
+    assert client.patch(again, headers=CHUNK, content=data).status_code == 204
+    answer = client.post("/v1/captures", json={"upload": again.rsplit("/", 1)[1]})
+    assert answer.status_code == 201, answer.text
