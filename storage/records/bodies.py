@@ -8,7 +8,7 @@ seconds counts no more: its process has died, or the database was away or the cl
 import time
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Row, delete, insert, select, update
+from sqlalchemy import ColumnElement, Connection, Row, case, delete, insert, select, update
 
 from storage.database.tables import bodies, uploads
 from storage.errors import Conflict
@@ -99,7 +99,10 @@ def record(connection: Connection, body: str, size: int) -> None:
 
 
 def _move(connection: Connection, upload: str) -> None:
-    connection.execute(update(uploads).where(uploads.c.id == upload).values(moved_at=time.time()))
+    """Note that an upload is being written: it does not expire before its writer lapses."""
+    now, expiry = time.time(), uploads.c.expires_at
+    times = {"moved_at": now, "expires_at": case((expiry < now + LAPSE, now + LAPSE), else_=expiry)}
+    connection.execute(update(uploads).where(uploads.c.id == upload).values(times))
 
 
 def release(connection: Connection, body: str) -> None:

@@ -13,7 +13,7 @@ from storage.database.tables import uploads as uploads_table
 from storage.errors import Conflict
 from storage.layout.uploads import Part
 from storage.records import bodies, uploads
-from storage.records.bodies import LAPSE
+from storage.records.bodies import LAPSE, RENEW
 from storage.statistics import PART, PROMISE, coming_bytes, promised_bytes, stored_bytes
 
 
@@ -91,6 +91,26 @@ def test_writer_that_died_is_replaced(engine: Engine) -> None:
         assert bodies.claim(c, "next", "u", 10)
         with pytest.raises(Conflict):
             bodies.renew(c, "dead", 10)
+
+
+def test_upload_does_not_expire_while_it_is_written(engine: Engine) -> None:
+    made(engine)
+
+    def expire() -> list[str]:
+        c.execute(update(uploads_table).values(expires_at=uploads_table.c.expires_at - RENEW))
+        return uploads.delete_expired(c)
+
+    with writing(engine) as c:
+        c.execute(update(uploads_table).values(expires_at=time.time() + 1))
+        bodies.claim(c, "b", "u", 60)
+        assert expire() == []
+        bodies.renew(c, "b", 50)
+        assert [expire() for _ in range(4)] == [[], [], ["u"], []]
+    made(engine)
+    with writing(engine) as c:
+        before = uploads.get(c, "u").expires_at
+        bodies.claim(c, "b", "u", 60)
+        assert uploads.get(c, "u").expires_at == before
 
 
 def test_promise_decays_until_bytes_follow(engine: Engine) -> None:
