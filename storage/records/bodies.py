@@ -17,6 +17,8 @@ RENEW = 10.0
 """Seconds between two renewals."""
 LAPSE = 30.0
 """Seconds after which a row counts no more unless it is renewed."""
+PATIENCE = 5.0
+"""Seconds that a request waits for the writer of its upload to end."""
 FORGET = 86400.0
 """Seconds after which it is deleted. A clock may jump by hours."""
 
@@ -43,7 +45,7 @@ def has_writer(connection: Connection, upload: str) -> bool:
 
 
 def ask_for(connection: Connection, upload: str) -> None:
-    """Ask the writer of an upload to leave it to another request."""
+    """Ask the writer of an upload to leave it to another request, which waits for `PATIENCE`."""
     connection.execute(update(bodies).where(bodies.c.upload == upload).values(wanted_at=time.time()))
 
 
@@ -52,14 +54,15 @@ def _row(body: str, size: int) -> dict[str, Any]:
 
 
 def is_wanted(connection: Connection, body: str) -> bool:
-    """Whether another request asks for the upload of a body.
+    """Whether another request waits for the upload of a body.
 
     Raises
     ------
     Conflict
         If the row is gone: the upload was deleted, or the row has lapsed.
     """
-    return _get(connection, body).wanted_at is not None
+    wanted_at = _get(connection, body).wanted_at
+    return wanted_at is not None and abs(time.time() - wanted_at) < PATIENCE
 
 
 def renew(connection: Connection, body: str, stored: int, more: int = 0) -> None:

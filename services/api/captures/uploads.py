@@ -41,8 +41,6 @@ PART = 64 << 20
 """Bytes after which a part is recorded: the most that a killed server loses of one PATCH."""
 LOOK = 1.0
 """Seconds between two looks of a writer whether another request wants its upload."""
-PATIENCE = 5.0
-"""Seconds that a request waits for the writer of its upload to end."""
 
 router = Router(prefix="/uploads", tags=["uploads"])
 Versioned = Depends(require_version)
@@ -199,7 +197,7 @@ async def _claim(context: Context, row: Row[Any], writer: str, size: int) -> Non
     if await context.call(claim):
         return
     await context.call(ask)
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + bodies.PATIENCE
     while time.monotonic() < deadline:
         await anyio.sleep(LOOK / 4)
         if await context.call(claim):

@@ -13,7 +13,7 @@ from storage.database.tables import uploads as uploads_table
 from storage.errors import Conflict
 from storage.layout.uploads import Part
 from storage.records import bodies, uploads
-from storage.records.bodies import LAPSE, RENEW
+from storage.records.bodies import LAPSE, PATIENCE, RENEW
 from storage.statistics import PART, PROMISE, coming_bytes, promised_bytes, stored_bytes
 
 
@@ -30,6 +30,8 @@ def test_upload_has_one_writer(engine: Engine) -> None:
         assert not bodies.is_wanted(c, "first")
         bodies.ask_for(c, "u")
         assert bodies.is_wanted(c, "first")
+        c.execute(update(table).values(wanted_at=table.c.wanted_at - PATIENCE))
+        assert not bodies.is_wanted(c, "first")  # the other has given up
         assert not bodies.claim(c, "second", "u", 100)  # until the first has ended
         bodies.release(c, "first")
         assert bodies.claim(c, "second", "u", 100)
