@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from sqlalchemy import Connection, Table, select
 
-from storage.database.tables import metadata
+from storage.database.tables import bodies, metadata
 from storage.layout import captures, composites, mattes, uploads
 from storage.records.jobs import is_retryable
 
@@ -85,9 +85,11 @@ def items(
 
 
 def known_names(connection: Connection, folder: str, names: Collection[str]) -> set[str]:
-    """Those of some names in a top folder that belong to an item."""
+    """Those of some names in a top folder that belong to an item, or to a request that may make one of its body."""
     found = {item.folder for table in FOLDERS[folder] for item in items(connection, only=table, ids=names)}
-    return {name for name in names if f"{folder}/{name}" in found}
+    # A bucket dates an object by when its upload began. A row that has lapsed counts too, as its request may go on.
+    coming = connection.scalars(select(bodies.c.id).where(bodies.c.id.in_(names)))
+    return {name for name in names if f"{folder}/{name}" in found}.union(coming)
 
 
 def family_of(table: str, row: Mapping[str, Any]) -> str | None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from sqlalchemy import Engine, select, update
 
-from services.coordinator.retention import count_bytes, delete_expired, delete_old_jobs
+from services.coordinator.retention import count_bytes, delete_expired, delete_old_jobs, sweep
 from storage import statistics
 from storage.database import tables
 from storage.database.engine import open_engine, reading, writing
@@ -19,7 +19,7 @@ from storage.layout import mattes as stored_mattes
 from storage.layout import uploads as stored_uploads
 from storage.objects.checksums import SUFFIX
 from storage.objects.store import Objects
-from storage.records import captures, idempotency, jobs, mattes, tiles, uploads
+from storage.records import bodies, captures, idempotency, jobs, mattes, tiles, uploads
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
@@ -197,3 +197,25 @@ def test_bytes_are_counted_once_complete(engine: Engine, objects: Objects) -> No
     assert stored("alice") == 7 + 999 + 20_000 + 64 + 5 * each + rows
     with reading(for_owner(engine, "bob")) as c:
         assert statistics.stored_bytes(c, all_owners=True) == 7 + 999 + 20_000 + 64 + 5 * each + rows + of_bob
+
+
+def test_sweep_leaves_what_a_request_has_uploaded(engine: Engine, objects: Objects) -> None:
+    """However old it looks: a bucket dates an object by when its upload began."""
+    add(engine, "alice", "kept")
+    objects.put(f"{stored_mattes.path('kept')}/z", b"matte")
+    coming = {stored_uploads.part_path("a", "all"), composites.clip_path("b")}
+    for path in coming:
+        objects.put(path, b"body")
+    with writing(for_owner(engine, "alice")) as c:
+        bodies.add(c, "a", 4, 4)
+        bodies.add(c, "b", 4, 4)
+        # Its process may only be cut off, or check what has come.
+        c.execute(update(tables.bodies).values(renewed_at=time.time() - 2 * bodies.LAPSE))
+    sweep(engine, objects, objects.clock() + 60)
+    assert objects.paths_below("uploads") | objects.paths_below("composites") == coming
+    with writing(engine) as c:
+        bodies.release(c, "a")
+        bodies.release(c, "b")
+    sweep(engine, objects, objects.clock() + 60)
+    assert objects.paths_below("uploads") | objects.paths_below("composites") == set()
+    assert objects.paths_below("mattes") == {f"{stored_mattes.path('kept')}/z"}
