@@ -1,11 +1,11 @@
 """Counts and sums for metrics, limits and estimates; none of them reads all tiles."""
 
-import time
 from collections.abc import Sequence
 from typing import Any
 
 from sqlalchemy import Connection, Row, Select, Text, cast, func, select
 
+from storage.database.dialects import clock
 from storage.database.owners import across_owners
 from storage.database.rows import ROW
 from storage.database.tables import bodies, captures, jobs, mattes, programs, tiles, totals, uploads
@@ -108,7 +108,7 @@ def received_bytes(connection: Connection, *, all_owners: bool = False) -> int:
 
 def promised_bytes(connection: Connection, *, all_owners: bool = False) -> int:
     """Bytes that are expected and not reserved yet: of bodies under way, and of uploads to which bytes came lately."""
-    lately = uploads.c.moved_at > time.time() - PROMISE
+    lately = uploads.c.moved_at > clock() - PROMISE
     sums = [
         select(func.sum(uploads.c.length - uploads.c.offset)).where(lately),
         select(-func.sum(bodies.c.bytes)).where(under_way(), bodies.c.upload.is_not(None)),

@@ -3,13 +3,14 @@
 Limits count what is reserved, so that bytes count before they are there, and in every process. A body that belongs to
 an upload is its only writer. A request renews its row while it goes on. A row that nobody has renewed for `LAPSE`
 seconds counts no more: its process has died, or the database was away or the clock jumped, and a renewal revives it.
+Times are by the database's clock, as the clocks of hosts may differ.
 """
 
-import time
 from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, Row, case, delete, insert, select, update
 
+from storage.database.dialects import clock
 from storage.database.tables import bodies, uploads
 from storage.errors import Conflict
 
@@ -46,11 +47,11 @@ def has_writer(connection: Connection, upload: str) -> bool:
 
 def ask_for(connection: Connection, upload: str) -> None:
     """Ask the writer of an upload to leave it to another request, which waits for `PATIENCE`."""
-    connection.execute(update(bodies).where(bodies.c.upload == upload).values(wanted_at=time.time()))
+    connection.execute(update(bodies).where(bodies.c.upload == upload).values(wanted_at=clock()))
 
 
 def _row(body: str, size: int) -> dict[str, Any]:
-    return {"id": body, "length": size, "bytes": size, "stored": 0, "renewed_at": time.time()}
+    return {"id": body, "length": size, "bytes": size, "stored": 0, "renewed_at": clock()}
 
 
 def is_wanted(connection: Connection, body: str) -> bool:
@@ -61,8 +62,8 @@ def is_wanted(connection: Connection, body: str) -> bool:
     Conflict
         If the row is gone: the upload was deleted, or the row has lapsed.
     """
-    wanted_at = _get(connection, body).wanted_at
-    return wanted_at is not None and abs(time.time() - wanted_at) < PATIENCE
+    row = _get(connection, body)
+    return row.wanted_at is not None and abs(row.now - row.wanted_at) < PATIENCE
 
 
 def renew(connection: Connection, body: str, stored: int, more: int = 0) -> None:
@@ -82,14 +83,14 @@ def renew(connection: Connection, body: str, stored: int, more: int = 0) -> None
     """
     row = _get(connection, body)
     size = row.bytes + more
-    values = {"renewed_at": time.time(), "stored": stored, "bytes": size, "length": max(size, row.length)}
+    values = {"renewed_at": clock(), "stored": stored, "bytes": size, "length": max(size, row.length)}
     connection.execute(update(bodies).where(bodies.c.id == body).values(values))
     if row.upload is not None:
         _move(connection, row.upload)
 
 
 def _get(connection: Connection, body: str) -> Row[Any]:
-    row = connection.execute(select(bodies).where(bodies.c.id == body)).one_or_none()
+    row = connection.execute(select(bodies, clock().label("now")).where(bodies.c.id == body)).one_or_none()
     if row is None:
         raise Conflict("what this request was sending has been deleted, or it took too long; start again")
     return row
@@ -103,7 +104,7 @@ def record(connection: Connection, body: str, size: int) -> None:
 
 def _move(connection: Connection, upload: str) -> None:
     """Note that an upload is being written: it does not expire before its writer lapses."""
-    now, expiry = time.time(), uploads.c.expires_at
+    now, expiry = clock(), uploads.c.expires_at
     times = {"moved_at": now, "expires_at": case((expiry < now + LAPSE, now + LAPSE), else_=expiry)}
     connection.execute(update(uploads).where(uploads.c.id == upload).values(times))
 
@@ -115,10 +116,10 @@ def release(connection: Connection, body: str) -> None:
 
 def delete_lapsed(connection: Connection, seconds: float = FORGET) -> None:
     """Delete the rows that were not renewed for some time; pass 0 only if no request is under way."""
-    connection.execute(delete(bodies).where(bodies.c.renewed_at <= time.time() - seconds))
+    connection.execute(delete(bodies).where(bodies.c.renewed_at <= clock() - seconds))
 
 
 def under_way() -> ColumnElement[bool]:
     """The condition that selects rows that have not lapsed."""
-    now = time.time()
+    now = clock()
     return bodies.c.renewed_at.between(now - LAPSE, now + LAPSE)  # later: the clock has gone back since

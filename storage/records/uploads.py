@@ -1,14 +1,14 @@
-"""Rows of resumable uploads: their offsets, parts and expiry."""
+"""Rows of resumable uploads: their offsets, parts and expiry, by the database's clock."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from itertools import accumulate
 from typing import Any
 
 from sqlalchemy import Connection, Row, insert, select, update
 
+from storage.database.dialects import clock
 from storage.database.tables import upload_parts as table
 from storage.database.tables import uploads
 from storage.errors import Conflict, NotFound
@@ -34,7 +34,7 @@ def add(
     key : str, optional
         The client's Idempotency-Key; a key has at most one upload.
     """
-    now = time.time()
+    now = clock()
     row = {"id": upload, "key": key, "offset": 0, "parts": 0, "length": length, "metadata": metadata}
     times = {"created_at": now, "moved_at": now, "expires_at": now + seconds}
     connection.execute(insert(uploads).values(row | times))
@@ -49,7 +49,7 @@ def get(connection: Connection, upload: str) -> Row[Any]:
         If there is none, or it has expired. tus would allow to tell the two apart, but that would need a record of
         every expired upload.
     """
-    query = select(uploads).where(uploads.c.id == upload, uploads.c.expires_at > time.time())
+    query = select(uploads).where(uploads.c.id == upload, uploads.c.expires_at > clock())
     row = connection.execute(query).one_or_none()
     if row is None:
         raise NotFound(
@@ -77,7 +77,7 @@ def advance(connection: Connection, upload: str, offset: int, parts: Sequence[Pa
     result = connection.execute(
         update(uploads)
         .where(uploads.c.id == upload, uploads.c.offset == offset)
-        .values(offset=starts[-1], parts=uploads.c.parts + len(parts), expires_at=time.time() + seconds)
+        .values(offset=starts[-1], parts=uploads.c.parts + len(parts), expires_at=clock() + seconds)
     )
     if not result.rowcount:
         check_offset(get(connection, upload), offset)
@@ -114,5 +114,5 @@ def delete(connection: Connection, upload: str) -> bool:
 
 def delete_expired(connection: Connection) -> list[str]:
     """Delete the rows of expired uploads; returns their ids."""
-    query = uploads.delete().where(uploads.c.expires_at <= time.time()).returning(uploads.c.id)
+    query = uploads.delete().where(uploads.c.expires_at <= clock()).returning(uploads.c.id)
     return list(connection.scalars(query))

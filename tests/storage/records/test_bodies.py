@@ -76,7 +76,7 @@ def test_what_is_reserved_counts_for_its_owner_and_lapses(engine: Engine) -> Non
         assert (stored_bytes(c), promised_bytes(c), coming_bytes(c)) == (1700, 0, 800)
         assert stored_bytes(c, all_owners=True) == 1700 + ROW + 100
     with writing(engine) as c:
-        c.execute(update(table).values(renewed_at=time.time() - LAPSE))
+        c.execute(update(table).values(renewed_at=time.time() - LAPSE - 1))
         assert stored_bytes(c) == ROW + 100
         bodies.renew(c, "whole", 900)  # its process was only cut off
         assert stored_bytes(c) == ROW + 100 + 1700
@@ -89,7 +89,7 @@ def test_writer_that_died_is_replaced(engine: Engine) -> None:
     made(engine)
     with writing(engine) as c:
         bodies.claim(c, "dead", "u", 10)
-        c.execute(update(table).values(renewed_at=time.time() - LAPSE))
+        c.execute(update(table).values(renewed_at=time.time() - LAPSE - 1))
         assert bodies.claim(c, "next", "u", 10)
         with pytest.raises(Conflict):
             bodies.renew(c, "dead", 10)
@@ -115,11 +115,31 @@ def test_upload_does_not_expire_while_it_is_written(engine: Engine) -> None:
         assert uploads.get(c, "u").expires_at == before
 
 
+@pytest.mark.parametrize("ahead", [-100, 100])
+def test_clocks_of_hosts_may_differ(engine: Engine, monkeypatch: pytest.MonkeyPatch, ahead: float) -> None:
+    made(engine)
+    with writing(engine) as c:
+        c.execute(update(uploads_table).values(expires_at=time.time() + 1))
+        bodies.claim(c, "here", "u", 60)
+    now = time.time
+    monkeypatch.setattr(time, "time", lambda: now() + ahead)
+    with writing(engine) as c:
+        assert not bodies.claim(c, "there", "u", 60)
+        assert uploads.delete_expired(c) == []
+        assert coming_bytes(c) == 60
+        bodies.ask_for(c, "u")
+        bodies.add(c, "there", 60, 60)
+    monkeypatch.undo()
+    with writing(engine) as c:
+        assert bodies.is_wanted(c, "here")
+        assert coming_bytes(c) == 120
+
+
 def test_promise_decays_until_bytes_follow(engine: Engine) -> None:
     made(engine)
     with writing(engine) as c:
         uploads.advance(c, "u", 0, [Part("a", 30)], 1e6)
-        c.execute(update(uploads_table).values(moved_at=time.time() - PROMISE))
+        c.execute(update(uploads_table).values(moved_at=time.time() - PROMISE - 1))
         assert (stored_bytes(c), promised_bytes(c)) == (ROW + PART + 30, 0)
     with writing(engine) as c:
         bodies.claim(c, "b", "u", 50)
