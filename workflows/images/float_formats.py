@@ -54,6 +54,7 @@ def decode(data: bytes, *, memory: int, turn: int | None = None) -> Floats:
     -------
     (height, width, 1 or 3) float32
         Grey or RGB, as stored: values may be large, negative or not finite. Alpha and all other channels are dropped.
+        Of an EXR the display window: black where the data window leaves it out, without what lies beyond it.
 
     Raises
     ------
@@ -139,22 +140,31 @@ def _exr(data: bytes, memory: int) -> Floats:
         header = file.header()
         channels = {channel.name: channel for channel in header["channels"]}
         tiles = header.get("tiles")
-        low, high = (corner.astype(np.int64) for corner in header["dataWindow"])
+        data_low, data_high = (corner.astype(np.int64) for corner in header["dataWindow"])
+        low, high = (corner.astype(np.int64) for corner in header["displayWindow"])
     names = ["R", "G", "B"] if {"R", "G", "B"} <= channels.keys() else ["Y"]
     if not channels.keys() >= set(names):
         raise ImageError(f"this EXR has the channels {', '.join(channels)}: R, G and B, or Y are needed")
     if any((channel.xSampling, channel.ySampling) != (1, 1) for channel in channels.values()):
         raise ImageError("this EXR has subsampled channels: export it as RGB")
     width, height = (high - low + 1).tolist()
-    # All channels are decoded, at up to 4 bytes a value, before those that are needed are copied.
-    check_size(width, height, 4 * (len(channels) + len(names)), memory, "float pixels")
+    if width < 1 or height < 1:
+        raise ImageError("the display window of this EXR is empty: export it again")
+    # All channels of the data window are decoded, at up to 4 bytes a value, before those that are needed are copied.
+    across, down = np.maximum(high - low, data_high - data_low).tolist()
+    check_size(across + 1, down + 1, 4 * (len(channels) + len(names)), memory, "float pixels")
     if tiles is not None:  # which the library decodes whole, however little of one the image fills
         check_size(tiles.xSize, tiles.ySize, 4 * len(channels), memory, "float pixels")
     with OpenEXR.File(io.BytesIO(data), separate_channels=True, num_threads=0) as file:
         planes = file.channels()
-        pixels = np.empty((height, width, len(names)), np.float32)
+        pixels = np.zeros((height, width, len(names)), np.float32)
+        # Where the windows overlap; both corners are (x, y).
+        first = np.maximum(low, data_low)
+        end = np.maximum(np.minimum(high, data_high) + 1, first)
+        columns, rows = map(slice, first - low, end - low)
+        stored_columns, stored_rows = map(slice, first - data_low, end - data_low)
         for c, name in enumerate(names):
-            pixels[:, :, c] = planes[name].pixels
+            pixels[rows, columns, c] = planes[name].pixels[stored_rows, stored_columns]
     return pixels
 
 

@@ -20,9 +20,12 @@ VALUES[0, 0, :3] = np.nan, np.inf, -np.inf
 
 
 def exr(
-    channels: dict[str, NDArray[Any]], kind: Any = OpenEXR.scanlineimage, pack: Any = OpenEXR.ZIP_COMPRESSION
+    channels: dict[str, NDArray[Any]],
+    kind: Any = OpenEXR.scanlineimage,
+    pack: Any = OpenEXR.ZIP_COMPRESSION,
+    header: dict[str, Any] | None = None,
 ) -> bytes:
-    header = {"compression": pack, "type": kind}
+    header = {"compression": pack, "type": kind} | (header or {})
     if kind == OpenEXR.tiledimage:
         header["tiles"] = OpenEXR.TileDescription()
         header["tiles"].xSize = header["tiles"].ySize = 16
@@ -125,12 +128,43 @@ def test_the_limit_is_checked_in_the_header() -> None:
     packed = tiff(np.zeros((200, 300, 3), np.float32), photometric="rgb", compression="zlib")
     with pytest.raises(ImageError, match="300 x 200 float pixels"):
         decode(packed, memory=200 * 300 * 24 - 1)
-    box = data.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4
-    for corner in (2**30, 2**31 - 1, -5):
-        lying = bytearray(data)
-        struct.pack_into("<ii", lying, box + 8, corner, corner)
-        with pytest.raises(ImageError):
-            decode(bytes(lying), memory=MEMORY)
+    for name in (b"dataWindow\0box2i\0", b"displayWindow\0box2i\0"):
+        box = data.index(name) + len(name) + 4
+        for corner in (2**30, 2**31 - 1, -5):
+            lying = bytearray(data)
+            struct.pack_into("<ii", lying, box + 8, corner, corner)
+            with pytest.raises(ImageError):
+                decode(bytes(lying), memory=MEMORY)
+
+
+@pytest.mark.parametrize(
+    ("left", "top", "width", "height"),
+    [(0, 0, 23, 19), (5, 3, 23, 19), (-4, 6, 30, 30), (7, 7, 4, 5), (40, 40, 8, 9), (-9, 30, 4, 60)],
+)
+@pytest.mark.parametrize("kind", [OpenEXR.scanlineimage, OpenEXR.tiledimage])
+def test_an_exr_is_placed_in_its_display_window(
+    left: int, top: int, width: int, height: int, kind: Any
+) -> None:
+    """What lies outside of the data window is black; what lies outside of the display window is cut off."""
+    windows = {"dataWindow": (-2, 10, 23, 19), "displayWindow": (left - 2, top + 10, width, height)}
+    header = {
+        name: (np.array([x, y], np.int32), np.array([x + w - 1, y + h - 1], np.int32))
+        for name, (x, y, w, h) in windows.items()
+    }
+    data = exr({name: VALUES[:, :, c] for c, name in enumerate("RGB")}, kind, header=header)
+    surroundings = np.zeros((200, 200, 3), np.float32)
+    surroundings[80:99, 80:103] = VALUES[:, :, :3]
+    expected = surroundings[80 + top :, 80 + left :][:height, :width]
+    np.testing.assert_array_equal(decode(data, memory=MEMORY), expected)
+
+
+def test_the_limit_holds_for_a_display_window_larger_than_the_data() -> None:
+    planes = {name: np.zeros((2, 3), np.float32) for name in "RGB"}
+    box = tuple(np.array(end, np.int32) for end in ((0, 0), (299, 199)))
+    data = exr(planes, header={"displayWindow": box})
+    with pytest.raises(ImageError, match="300 x 200 float pixels"):
+        decode(data, memory=200 * 300 * 24 - 1)
+    assert decode(data, memory=200 * 300 * 24).shape == (200, 300, 3)
 
 
 def test_tiles_much_larger_than_the_image_are_refused() -> None:
