@@ -18,6 +18,8 @@ from workflows.threads import in_parts
 
 ROWS = 64
 """Rows of cells that a thread computes at a time."""
+MOST = np.float32(np.finfo(np.float16).max)
+"""The largest light, of either sign: what pictures of 16-bit floats hold. Sums of much larger values would overflow."""
 
 
 @dataclass(frozen=True)
@@ -50,11 +52,12 @@ def backdrop_of(pixels: Codes | Floats, transfer: Transfer) -> Backdrop:
     -------
     Backdrop
         Transparent pixels are black, in proportion, because there is no light behind them. Infinite values and NaN are
-        black.
+        black, and larger values than `MOST` become it.
     """
     if pixels.dtype == np.float32:
         light = cast("Floats", pixels)
         light[~np.isfinite(light)] = 0
+        np.clip(light, -MOST, MOST, out=light)
         return Backdrop(light)
     codes = cast("Codes", pixels)
     return Backdrop(codes, table(transfer, codes.dtype))

@@ -186,6 +186,12 @@ def test_float_values_are_light_and_nan_is_black() -> None:
     assert light_of(float_formats.encode_exr("RGB", picture)).tolist() == [[[0.5, 2, 4], [0, 0, 0]]]
 
 
+def test_float_values_are_clipped_to_what_half_floats_hold() -> None:
+    picture = np.array([[[1e38, -3e38, 65504], [6e4, 65505, -1]]], np.float32)
+    expected = [[[65504, -65504, 65504], [6e4, 65504, -1]]]
+    assert light_of(float_formats.encode_exr("RGB", picture)).tolist() == expected
+
+
 @pytest.mark.parametrize("depth", [np.uint8, np.uint16])
 def test_transparent_pixels_are_darkened_in_proportion(codes: np.ndarray, depth: type) -> None:
     top = np.iinfo(depth).max
