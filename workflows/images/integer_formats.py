@@ -97,7 +97,8 @@ def decode(
     Returns
     -------
     (height, width, 1 or 3) uint8 or uint16
-        Upright, grey or RGB; a palette is looked up. With alpha if it is kept and exists; that of a palette is dropped.
+        Upright, grey or RGB; a palette is looked up. With alpha if it is kept and exists; that of a palette is dropped,
+        and alpha that colours are multiplied with already.
 
     Raises
     ------
@@ -170,17 +171,26 @@ def _tiff(data: bytes, picture: Image.Image, memory: int) -> NDArray[np.generic]
         check_tiles(page, memory)
         if page.compression not in LOSSLESS or page.photometric not in PLAIN or page.bitspersample == 1:
             return _by_pillow(picture, memory)  # supports them all, but reduces 16 bits to 8
-        if page.bitspersample not in (8, 16) or page.axes not in ("YX", "YXS", "SYX"):
+        if (
+            page.bitspersample not in (8, 16)
+            or page.axes not in ("YX", "YXS", "SYX")
+            or page.samplesperpixel > 4
+        ):
             raise ImageError(
-                f"this TIFF has {page.bitspersample} bits and the axes {page.axes}: "
+                f"this TIFF has {page.samplesperpixel} channels of {page.bitspersample} bits and the axes {page.axes}: "
                 "save it as grey or RGB with 8 or 16 bits a channel"
             )
         check_size(*picture.size, -(-page.nbytes // (picture.width * picture.height)), memory)
         tiff_lzw.check_lzw(data, page)
         array = np.asarray(page.asarray())
+        array = array[..., np.newaxis] if page.axes == "YX" else array
+        array = np.moveaxis(array, 0, -1) if page.axes == "SYX" else array
+        # TIFF 6.0, ExtraSamples: associated alpha is in the colours already, and unspecified samples are no alpha.
+        colours = 3 if page.photometric == tifffile.PHOTOMETRIC.RGB else 1
+        has_alpha = page.extrasamples[:1] == (tifffile.EXTRASAMPLE.UNASSALPHA,)
         if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
             array = np.invert(array)
-        return np.moveaxis(array, 0, -1) if page.axes == "SYX" else array
+        return array[..., : colours + has_alpha]
 
 
 def check_tiles(page: tifffile.TiffPage, memory: int) -> None:

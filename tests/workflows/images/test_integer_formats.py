@@ -86,6 +86,27 @@ def test_a_tiff_is_read_exactly(dtype: str, byteorder: str, compression: str | N
             np.testing.assert_array_equal(got, expected[:, :, :3])
 
 
+@pytest.mark.parametrize("dtype", ["uint8", "uint16"])
+@pytest.mark.parametrize("compression", [None, "zlib"])
+@pytest.mark.parametrize(
+    ("extra", "kept"), [("unassalpha", 4), ("assocalpha", 3), ("unspecified", 3), (None, 3)]
+)
+def test_tiff_keeps_alpha_that_is_not_in_its_colours(
+    dtype: str, compression: str | None, extra: str | None, kept: int
+) -> None:
+    pixels = noise((13, 17, 4), dtype)
+    kind = {"photometric": "rgb", "compression": compression, "extrasamples": [extra or "unspecified"]}
+    files = [bytearray(tiff(pixels, **kind))]
+    if kept == 4 or dtype == "uint16":  # Pillow, which looks at files first, does not know the others
+        files.append(bytearray(tiff(np.moveaxis(pixels, -1, 0), planarconfig="separate", **kind)))
+    for data in files:
+        if extra is None:  # without the tag, as some programs write it
+            struct.pack_into("<H", data, data.index(struct.pack("<HHI", 338, 3, 1)), 65000)
+        for alpha, channels in ((True, kept), (False, 3)):
+            got = decode(bytes(data), memory=MEMORY, alpha=alpha)
+            np.testing.assert_array_equal(got, pixels[:, :, :channels])
+
+
 def test_palettes_are_looked_up() -> None:
     index = noise((9, 11), "uint8") % 16
     palette = noise((256, 3), "uint8")
