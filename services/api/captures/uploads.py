@@ -8,7 +8,6 @@ from typing import Any
 import anyio.to_thread
 from fastapi import Depends, Request, Response
 from sqlalchemy import Row
-from sqlalchemy.exc import IntegrityError
 from starlette.requests import ClientDisconnect
 
 from services.api.captures.tus import (
@@ -252,21 +251,14 @@ def _create(context: Context, length: int, metadata: str, key: str | None) -> tu
         expired = uploads.delete_expired(c)
     for upload in expired:
         stored_uploads.remove(context.objects, upload)
-    try:
-        with writing(context.engine) as c:
-            row = uploads.by_key(c, key) if key else None
-            if row is not None:
-                return row, False
-            admit_upload(c, context.settings, context.objects, length, captures=1)
-            upload = new_id()
-            uploads.add(c, upload, length, metadata, context.settings.upload_seconds, key)
-            return uploads.get(c, upload), True
-    except IntegrityError:  # a concurrent request with the same key was quicker
-        with reading(context.engine) as c:
-            row = uploads.by_key(c, key) if key else None
-        if row is None:
-            raise
-        return row, False
+    with writing(context.engine) as c:
+        row = uploads.by_key(c, key) if key else None
+        if row is not None:
+            return row, False
+        admit_upload(c, context.settings, context.objects, length, captures=1)
+        upload = new_id()
+        uploads.add(c, upload, length, metadata, context.settings.upload_seconds, key or None)
+        return uploads.get(c, upload), True
 
 
 def _headers(row: Row[Any]) -> dict[str, str]:

@@ -6,7 +6,6 @@ from typing import Annotated, TypeVar
 
 from fastapi import Header
 from sqlalchemy import Connection, Engine
-from sqlalchemy.exc import IntegrityError
 
 from storage.database.engine import reading, writing
 from storage.errors import NotFound, Unavailable
@@ -82,21 +81,16 @@ def _once(
     create: Callable[[Connection], str],
     new: str | None,
 ) -> T:
-    try:
-        with writing(engine) as c:
-            created = find(c, key, call) if key else None
-            if created is None and new and _exists(c, new, read):  # committed, before the connection broke
-                created = new
-            if created is None:
-                created = create(c)
-                if key:
-                    add(c, key, call, created)
-            return read(c, created)
-    except IntegrityError:  # a concurrent request with the same key was quicker
-        earlier = find_earlier(engine, key, call, read)
-        if earlier is None:
-            raise
-        return earlier
+    # All writers wait for each other, so no concurrent request adds the key after it is looked up.
+    with writing(engine) as c:
+        created = find(c, key, call) if key else None
+        if created is None and new and _exists(c, new, read):  # committed, before the connection broke
+            created = new
+        if created is None:
+            created = create(c)
+            if key:
+                add(c, key, call, created)
+        return read(c, created)
 
 
 def _exists(connection: Connection, id: str, read: Read[T]) -> bool:

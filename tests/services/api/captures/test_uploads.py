@@ -1,4 +1,4 @@
-"""Uploads whose rows and bytes could part: the app with a real database and store."""
+"""Uploads whose rows and bytes must agree, and their keys: the app with a real database and store."""
 
 import sqlite3
 from collections.abc import Iterator
@@ -115,3 +115,10 @@ def test_upload_whose_bytes_are_gone_is_started_again(
     assert client.patch(again, headers=CHUNK, content=data).status_code == 204
     answer = client.post("/v1/captures", json={"upload": again.rsplit("/", 1)[1]})
     assert answer.status_code == 201, answer.text
+
+
+def test_empty_key_creates_in_any_case(client: TestClient) -> None:
+    headers = TUS | {"Upload-Length": "5", "Idempotency-Key": ""}
+    answers = [client.post("/v1/uploads", headers=headers) for _ in range(2)]
+    assert [answer.status_code for answer in answers] == [201, 201]
+    assert answers[0].headers["location"] != answers[1].headers["location"]

@@ -1,13 +1,17 @@
 """Repeated requests with one Idempotency-Key: one thing is created, and every answer is about it."""
 
 import sqlite3
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 from sqlalchemy import Connection, Engine, PoolProxiedConnection
 
 from services.api.http import idempotency
 from services.api.http.idempotency import find_earlier, idempotent
-from storage.database.engine import reading, writing
+from storage.database.engine import open_engine, reading, writing
 from storage.errors import NotFound, Unavailable
 from storage.records import jobs
 
@@ -58,19 +62,27 @@ def test_repeat_after_deletion_is_not_found(engine: Engine) -> None:
     assert count(engine) == 0
 
 
-def test_concurrent_repeat_answers_with_quicker_one(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As with PostgreSQL, where two transactions may both find the key unused."""
-    first = idempotent(engine, "a", CALL, jobs.get, create)
-    real, keys = idempotency.find, []
+@pytest.mark.parametrize("database", ["sqlite", "postgresql"])
+def test_concurrent_repeats_create_once(
+    request: pytest.FixtureRequest, tmp_path: Path, database: str
+) -> None:
+    sqlite = f"sqlite:///{tmp_path}/ledger.db"
+    engine = open_engine(sqlite if database == "sqlite" else request.getfixturevalue("postgresql"))
+    begun = threading.Barrier(4)
 
-    def blind_at_first(connection: Connection, key: str, call: str) -> str | None:
-        keys.append(key)
-        return None if len(keys) == 1 else real(connection, key, call)
+    def create_slowly(connection: Connection) -> str:
+        time.sleep(0.2)  # the others begin meanwhile
+        return create(connection)
 
-    monkeypatch.setattr(idempotency, "find", blind_at_first)
-    assert idempotent(engine, "a", CALL, jobs.get, create).id == first.id
-    assert len(keys) == 2
+    def repeat() -> str:
+        begun.wait()
+        return str(idempotent(engine, "a", CALL, jobs.get, create_slowly).id)
+
+    with ThreadPoolExecutor(4) as pool:
+        answers = [pool.submit(repeat) for _ in range(4)]
+    assert len({answer.result() for answer in answers}) == 1
     assert count(engine) == 1
+    engine.dispose()
 
 
 @pytest.mark.parametrize("committed", [False, True])
