@@ -21,7 +21,7 @@ from sqlalchemy import Connection, Engine, Row
 
 from services.cluster.dispatcher import Dispatcher
 from services.coordinator.job_kinds import JOB_KINDS
-from services.coordinator.job_run import JobRun, write_failure
+from services.coordinator.job_run import JobRun, task_of, write_failure
 from services.coordinator.retention import (
     count_bytes,
     delete_expired,
@@ -199,13 +199,14 @@ class Coordinator:
             cancelled = jobs.cancelled_with_leftovers(c)
         for row in active.values():
             if row.id in self._runs:
-                self._runs[row.id].follow(row)
+                self._guarded(row.id, self._runs[row.id].follow, row)
             elif not row.paused:
                 self._guarded(row.id, self._start, row)
         for job in self._runs.keys() - active.keys():
             self._drop(job)
         for row in cancelled:
-            self._clean_up(row)
+            if row.kind in JOB_KINDS:  # otherwise a newer coordinator knows what is left of it
+                self._guarded(row.id, self._clean_up, row)
 
     def _guarded(self, job: str, act: Any, *arguments: Any) -> None:
         """Do something about a job, whose errors must not hold up other jobs."""
@@ -224,7 +225,13 @@ class Coordinator:
                 self._drop(job)
             self._troubles[job] += 1
             if self._troubles[job] >= self._settings.attempts:
-                self._fail(job, GaveUp(f"the coordinator failed on this job, last with {error!r}"))
+                self._fail(
+                    job,
+                    GaveUp(
+                        f"the coordinator failed {self._troubles[job]} times on this job, last with {error!r}; retry "
+                        "it, or if that fails too, start a new one"
+                    ),
+                )
 
     def _start(self, row: Row[Any]) -> None:
         """Start a job if what it needs is there; raises if it never will be."""
@@ -232,16 +239,13 @@ class Coordinator:
             if not JOB_KINDS[row.kind].is_due(c, row):
                 return
         with self._writing() as c:
-            run = self._run_of(c, row)
+            run = JobRun.of(row, tiles.remaining(c, row.id), self._settings.limits)
             if not jobs.enter_stage(c, row.id, run.stage):
                 return  # it was cancelled after it was read
             tiles.add_steps(c, row.id)
         run.start = min((other.used() for other in self._runs.values()), default=0.0)
         self._runs[row.id] = run
         logger.info("%s, from the stage %s on", row.kind, run.stage)
-
-    def _run_of(self, connection: Connection, row: Row[Any]) -> JobRun:
-        return JobRun.of(row, tiles.remaining(connection, row.id), self._settings.limits)
 
     def _due(self) -> list[JobRun]:
         """The jobs whose outcomes are written now.
@@ -280,7 +284,8 @@ class Coordinator:
         """End a job that can't be run."""
         with self._writing() as c:
             row = jobs.get(c, job)
-            write_failure(c, JOB_KINDS[row.kind], self._run_of(c, row).task, error)
+            write_failure(c, JOB_KINDS[row.kind], task_of(row, self._settings.limits), error)
+            jobs.change(c, job, leftovers=False)  # of a cancelled job that can't be cleaned up
         if job in self._runs:
             self._drop(job)
         self._tidy(job)

@@ -5,7 +5,7 @@ from typing import Any
 from sqlalchemy import Connection, Row
 
 from services.runtime.problems import problem_of
-from storage.errors import Conflict
+from storage.errors import Conflict, GaveUp
 from storage.layout import captures as stored_captures
 from storage.layout import composites, uploads
 from storage.layout import mattes as stored_mattes
@@ -183,4 +183,19 @@ class Composite(JobKind):
         return not is_retryable(problem)
 
 
-JOB_KINDS = {kind.steps.kind: kind for kind in (Ingest(), Recovery(), Composite())}
+class Unknown(JobKind):
+    """A kind that this coordinator is too old to know."""
+
+    def is_due(self, connection: Connection, row: Row[Any]) -> bool:
+        raise GaveUp(
+            f"this coordinator does not know jobs of the kind {row.kind!r}: it is older than the service that queued "
+            "the job. Upgrade it, and retry the job"
+        )
+
+
+class _JobKinds(dict[str, JobKind]):
+    def __missing__(self, name: str) -> JobKind:
+        return Unknown()
+
+
+JOB_KINDS = _JobKinds((kind.steps.kind, kind) for kind in (Ingest(), Recovery(), Composite()))

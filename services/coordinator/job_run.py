@@ -105,15 +105,7 @@ class JobRun:
             Its tiles that are still to do.
         limits : Limits
         """
-        task = Task(
-            job=row.id,
-            capture=row.capture,
-            matte=row.matte or "",
-            options=row.options,
-            limits=limits,
-            plan=row.plan or {},
-        )
-        kind = JOB_KINDS[row.kind]
+        kind, task = JOB_KINDS[row.kind], task_of(row, limits)
         if row.plan is None:
             stage, to_do = "preparing", [PREPARE]
         elif tiles:
@@ -276,6 +268,18 @@ class JobRun:
             logger.info("succeeded")
             self.kind.succeeded(connection, self.task, figures)
         return Next(self.stage, (), self.task, ended=True)
+
+
+def task_of(row: Row[Any], limits: Limits) -> Task:
+    """What the steps of a job need to know, from its row."""
+    return Task(
+        job=row.id,
+        capture=row.capture,
+        matte=row.matte or "",
+        options=row.options,
+        limits=limits,
+        plan=row.plan or {},
+    )
 
 
 def _ordered(kind: JobKind, task: Task, region: list[int] | None, tiles: Iterable[int]) -> list[int]:

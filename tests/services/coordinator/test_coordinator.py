@@ -1,5 +1,6 @@
 """Jobs that end before they start, files that are still written when they are removed, and the cost of progress."""
 
+import re
 import threading
 import time
 from pathlib import Path
@@ -16,7 +17,7 @@ from storage.database.engine import reading, writing
 from storage.errors import Unavailable
 from storage.layout import uploads
 from storage.objects.store import Objects
-from storage.records import captures, jobs
+from storage.records import captures, jobs, mattes, tiles
 from storage.steps import PREPARE
 from tests.benchmarks.cluster.overhead import measure
 from tests.parts.waiting import until
@@ -95,6 +96,61 @@ def test_paused_job_is_not_run_until_it_is_continued(
             jobs.pause(c, job, True)  # what is submitted stays
         time.sleep(3 * POLL)
     assert dispatcher.submitted == [(job, PREPARE)]
+
+
+@pytest.mark.parametrize(
+    ("trouble", "problem"),
+    [
+        ("kind", "does not know jobs of the kind 'newer': .* Upgrade it, and retry"),
+        ("plan", "the coordinator failed 3 times on this job"),
+        ("region", "the coordinator failed 3 times on this job"),
+        ("leftovers", None),
+    ],
+)
+def test_job_that_cannot_be_run_holds_up_no_other(
+    engine: Engine,
+    objects: Objects,
+    job: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    trouble: str,
+    problem: str | None,
+) -> None:
+    def confused(connection: Connection, row: Row[Any]) -> None:
+        raise KeyError(row.id)
+
+    whole = [0, 0, 9, 9]
+    with writing(engine) as c:
+        captures.add(c, "ready", "", name="", bytes=3, frames=1, program={})
+        captures.change(c, "ready", state="ready")
+        region = whole if trouble == "plan" else None
+        bad = jobs.add(c, "newer" if trouble == "kind" else "recover", "ready", {}, "m", region=region)
+        tiles.add_plan(c, bad, {"tiles": 3, "figures": {}})
+        mattes.add(c, "m", "ready", bad, {})
+        if trouble == "leftovers":
+            monkeypatch.setattr(JOB_KINDS["recover"], "cancelled", confused)
+            jobs.cancel(c, bad)
+        newer = jobs.add(c, "newer", "ready", {})
+        jobs.cancel(c, newer)
+    dispatcher = Idle()
+    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, dispatcher):  # type: ignore[arg-type]
+        if trouble == "region":
+            until(lambda: (bad, 0) in dispatcher.submitted)
+            with writing(engine) as c:
+                jobs.change(c, bad, region=whole)
+        until(lambda: (job, PREPARE) in dispatcher.submitted, 10)
+        with writing(engine) as c:
+            jobs.cancel(c, job)
+        until(lambda: not objects.paths_below("uploads"), 10)
+    with reading(engine) as c:
+        row = jobs.get(c, bad)
+        assert jobs.get(c, newer).leftovers  # for a newer coordinator
+    if problem is None:
+        assert (row.state, row.leftovers) == ("cancelled", False)
+    else:
+        assert row.state == "failed"
+        assert re.search(problem, row.problem["detail"])
+        assert jobs.is_retryable(row.problem)
 
 
 def test_files_that_cannot_be_removed_are_removed_later(
