@@ -139,9 +139,6 @@ class Coordinator:
             logger.info("%s runs the jobs from now on", self._name)
         with self._writing() as c:
             leases.renew(c, self._token, self._dispatcher.cluster)
-            expired = delete_expired(c)
-        for path in expired:
-            self._housekeeping.submit(_logged, remove, self._objects, path)
         if now - self._deleted_at > DELETE:
             self._deleted_at = now
             self._housekeeping.submit(_logged, keep_reserve, self._engine)
@@ -149,7 +146,15 @@ class Coordinator:
             self._housekeeping.submit(_logged, delete_old_jobs, self._engine, self._objects, kept)
         if now - self._swept_at > SWEEP:
             self._tidy_store()
+        _logged(self._expire)
         return True
+
+    def _expire(self) -> None:
+        """Delete what has expired, apart from the renewal of the lease: it may fail or take long."""
+        with self._writing() as c:
+            expired = delete_expired(c)
+        for path in expired:
+            self._housekeeping.submit(_logged, remove, self._objects, path)
 
     def _tidy_store(self, before: float | None = None) -> None:
         """Sweep the store, by default of what is older than the time of grace, and count what is there."""
@@ -350,8 +355,8 @@ class Coordinator:
 
 
 def _logged(act: Callable[..., None], *arguments: Any) -> None:
-    """Run something in the background and log its errors; the next sweep does what it could not."""
+    """Run something whose errors are logged and stop nothing else; it is tried again later."""
     try:
         act(*arguments)
     except Exception:
-        logger.exception("housekeeping failed; the next sweep tries again")
+        logger.exception("housekeeping failed; it is tried again later")

@@ -23,10 +23,10 @@ MOST = 1000
 
 
 def delete_expired(connection: Connection) -> list[str]:
-    """Delete the rows of expired uploads, captures and mattes; returns their folders in the store.
+    """Delete the rows of some expired uploads, captures and mattes; returns their folders in the store.
 
-    What an active job works on is kept until the job has ended. Rows of dead processes' requests, and links that have
-    expired, are deleted too.
+    Of a large backlog the next call deletes more. What an active job works on is kept until the job has ended. Rows of
+    dead processes' requests, and links that have expired, are deleted too.
     """
     bodies.delete_lapsed(connection)
     links.delete_expired(connection)
@@ -35,13 +35,12 @@ def delete_expired(connection: Connection) -> list[str]:
         (tables.captures, "ingesting", (captures.path, stored_uploads.path)),
         (tables.mattes, "recovering", (mattes.path,)),
     ):
-        over = (table.c.expires_at <= time.time(), table.c.state != making)
-        found = set(connection.scalars(select(table.c.id).where(*over)))
-        if found:
-            busy = tables.jobs.c["capture" if table is tables.captures else "matte"]
-            found -= set(connection.scalars(select(busy).where(tables.jobs.c.state.in_(jobs.ACTIVE))))
-            connection.execute(delete(table).where(table.c.id.in_(found)))
-            gone += [path(one) for one in sorted(found) for path in where]
+        used = tables.jobs.c["capture" if table is tables.captures else "matte"]
+        busy = select(used).where(tables.jobs.c.state.in_(jobs.ACTIVE), used.is_not(None))
+        over = (table.c.expires_at <= time.time(), table.c.state != making, table.c.id.not_in(busy))
+        some = select(table.c.id).where(*over).limit(MOST)
+        found = connection.scalars(delete(table).where(table.c.id.in_(some)).returning(table.c.id))
+        gone += [path(one) for one in sorted(found) for path in where]
     return gone
 
 

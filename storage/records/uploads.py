@@ -14,6 +14,9 @@ from storage.database.tables import uploads
 from storage.errors import Conflict, NotFound
 from storage.layout.uploads import Part
 
+MOST = 1000
+"""Expired rows that are deleted in one transaction, while other writers wait."""
+
 MAX_PARTS = 10_000
 """Most parts of an upload: keeps its index below a megabyte."""
 
@@ -113,6 +116,9 @@ def delete(connection: Connection, upload: str) -> bool:
 
 
 def delete_expired(connection: Connection) -> list[str]:
-    """Delete the rows of expired uploads; returns their ids."""
-    query = uploads.delete().where(uploads.c.expires_at <= clock()).returning(uploads.c.id)
-    return list(connection.scalars(query))
+    """Delete the rows of expired uploads, `MOST` at most; returns their ids."""
+    query = select(uploads.c.id).where(uploads.c.expires_at <= clock()).limit(MOST)
+    expired = list(connection.scalars(query))
+    if expired:
+        connection.execute(uploads.delete().where(uploads.c.id.in_(expired)))
+    return expired

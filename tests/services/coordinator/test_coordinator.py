@@ -17,7 +17,7 @@ from storage.database.engine import reading, writing
 from storage.errors import Unavailable
 from storage.layout import uploads
 from storage.objects.store import Objects
-from storage.records import captures, jobs, mattes, tiles
+from storage.records import captures, jobs, leases, mattes, tiles
 from storage.steps import PREPARE
 from tests.benchmarks.cluster.overhead import measure
 from tests.parts.waiting import until
@@ -151,6 +151,33 @@ def test_job_that_cannot_be_run_holds_up_no_other(
         assert row.state == "failed"
         assert re.search(problem, row.problem["detail"])
         assert jobs.is_retryable(row.problem)
+
+
+@pytest.mark.parametrize("error", [Unavailable("the database is busy"), KeyError("odd")])
+def test_what_cannot_expire_neither_costs_the_lease_nor_holds_up_jobs(
+    engine: Engine,
+    objects: Objects,
+    job: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    error: Exception,
+) -> None:
+    def failing(connection: Connection) -> list[str]:
+        raise error
+
+    monkeypatch.setattr(coordinator, "delete_expired", failing)
+    monkeypatch.setattr(coordinator, "BEAT", 0.1)
+    dispatcher = Idle()
+    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, dispatcher):  # type: ignore[arg-type]
+        until(lambda: dispatcher.submitted, 30)
+        with reading(engine) as c:
+            first = leases.last_heartbeat(c)
+        assert first
+        time.sleep(1.5)
+        with reading(engine) as c:
+            last = leases.last_heartbeat(c)
+    assert last
+    assert last.seconds < 1.4
 
 
 def test_files_that_cannot_be_removed_are_removed_later(

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from sqlalchemy import Engine, select, update
 
+from services.coordinator import retention
 from services.coordinator.retention import count_bytes, delete_expired, delete_old_jobs, sweep
 from storage import statistics
 from storage.database import tables
@@ -98,6 +99,29 @@ def test_leftovers_of_cancelled_jobs_do_not_expire(engine: Engine) -> None:
         for row in jobs.active(c):
             jobs.cancel(c, row.id)
         assert delete_expired(c) == []
+
+
+def test_large_backlog_expires_in_parts(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (retention, uploads):
+        monkeypatch.setattr(module, "MOST", 2)
+    for n in range(3):
+        add(engine, "alice", f"old{n}", seconds=60.0)
+    expire(engine)
+    with writing(engine) as c:
+        for n in range(3):
+            uploads.add(c, f"u{n}", 5, "", -1, None)
+        jobs.add(c, "recover", "old1", {}, "other")
+    parts = []
+    for _ in range(3):
+        with writing(engine) as c:
+            parts.append(delete_expired(c))
+    folders = ("captures", "mattes", "uploads/old", "uploads/u")
+    assert [[sum(path.startswith(folder) for path in part) for folder in folders] for part in parts] == [
+        [2, 2, 2, 2],
+        [0, 1, 0, 1],
+        [0, 0, 0, 0],
+    ]
+    assert existing(engine) == {"captures": {"old1"}, "mattes": set()}
 
 
 def age_jobs(engine: Engine) -> None:

@@ -8,6 +8,7 @@ from sqlalchemy import Engine, select
 from sqlalchemy.exc import IntegrityError
 
 from storage.database.engine import writing
+from storage.database.owners import DEFAULT, for_owner
 from storage.database.tables import upload_parts
 from storage.errors import Conflict, NotFound
 from storage.layout.uploads import Part
@@ -90,7 +91,7 @@ def test_expired_upload_is_not_found(engine: Engine) -> None:
     made(engine, "short", seconds=0.05)
     made(engine, "long")
     time.sleep(0.1)
-    with writing(engine) as c:
+    with writing(for_owner(engine, DEFAULT)) as c:
         with pytest.raises(NotFound):
             uploads.get(c, "short")
         assert uploads.delete_expired(c) == ["short"]
