@@ -15,6 +15,7 @@
     ├── NoRoom                  the store is full, or the owner has used up their share
     ├── TooMany                 too many uploads, jobs or requests at the same time
     ├── Unavailable             something that the service needs cannot be reached now
+    │   └── StoreUnavailable    the object store
     ├── Corrupt                 stored data is missing or damaged
     └── GaveUp                  work that failed in all of its attempts
 
@@ -103,6 +104,10 @@ class TooMany(EnvmatteError):
 
 class Unavailable(EnvmatteError):
     """Something that the service needs cannot be reached now; a later attempt may succeed."""
+
+
+class StoreUnavailable(Unavailable):
+    """The object store cannot be reached now."""
 
 
 class Corrupt(EnvmatteError):

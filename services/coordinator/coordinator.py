@@ -137,8 +137,9 @@ class Coordinator:
             if self._token is None:
                 return False
             logger.info("%s runs the jobs from now on", self._name)
+        without_store = [run.job for run in self._runs.values() if run.without_store]
         with self._writing() as c:
-            leases.renew(c, self._token, self._dispatcher.cluster)
+            leases.renew(c, self._token, self._dispatcher.cluster | {"without_store": without_store})
         if now - self._deleted_at > DELETE:
             self._deleted_at = now
             self._housekeeping.submit(_logged, keep_reserve, self._engine)
@@ -336,7 +337,7 @@ class Coordinator:
         """
         dispatcher = self._dispatcher
         under_way = {job: dispatcher.under_way(job) for job in self._runs}
-        waiting = [run for run in self._runs.values() if run.to_do and not run.paused]
+        waiting = [run for run in self._runs.values() if run.to_do and not run.held]
         dispatcher.want(sum(under_way.values()) + sum(len(run.to_do) for run in waiting))
         chosen: defaultdict[str, list[list[int]]] = defaultdict(list)
         for _ in range(dispatcher.free):

@@ -16,7 +16,7 @@ from services.runtime import tracing
 from services.runtime.logs import about
 from services.runtime.problems import problem_of
 from storage import steps as job_steps
-from storage.errors import EnvmatteError, GaveUp, Unavailable
+from storage.errors import EnvmatteError, GaveUp, StoreUnavailable, Unavailable
 from storage.records import jobs
 from storage.records import tiles as tile_records
 from storage.steps import FINISH, PREPARE
@@ -29,6 +29,8 @@ TASKS = 250
 """How many tasks a second a scheduler is given at most. Each takes a millisecond of its only core, or two."""
 LOSSES = 8
 """How often a tile may be lost before its job fails. Most workers die of something else, such as being turned off."""
+HOLD = 5.0
+"""Seconds until the next tiles of a job are submitted after one could not reach the store."""
 REMEDY = "give workers more memory (ENVMATTE_WORKER_MEMORY) or have them use less (ENVMATTE_INGEST_MEMORY), and retry"
 
 
@@ -44,12 +46,15 @@ class Next:
     task : Task
     ended : bool
         Whether the job has ended.
+    without_store : bool
+        Whether its tiles can't reach the store.
     """
 
     stage: str
     to_do: Sequence[int]
     task: Task
     ended: bool = False
+    without_store: bool = False
 
 
 @dataclass
@@ -69,13 +74,17 @@ class JobRun:
     trace : str, optional
         The ``traceparent`` of the request that asked for the job.
     paused : bool
-        Whether none of its tiles are to be submitted now.
+        Whether none of its tiles are to be submitted until it is continued.
     region : list of int, optional
         x, y, width and height of the part of the frame whose tiles are done first.
     start, spent : float
         Worker seconds that the job is credited with at its start, and those it has used since.
     counted : int
         Tiles that used the latter.
+    without_store : bool
+        Whether a tile could not reach the store, and none has been done since.
+    hold_until : float
+        When the next tiles may be submitted.
     """
 
     job: str
@@ -92,6 +101,8 @@ class JobRun:
     start: float = 0.0
     spent: float = 0.0
     counted: int = 0
+    without_store: bool = False
+    hold_until: float = 0.0
 
     @classmethod
     def of(cls, row: Row[Any], tiles: Sequence[int], limits: Limits) -> "JobRun":
@@ -115,6 +126,11 @@ class JobRun:
         return cls(
             row.id, kind, stage, task, deque(to_do), trace=row.trace, paused=row.paused, region=row.region
         )
+
+    @property
+    def held(self) -> bool:
+        """Whether none of its tiles are to be submitted now."""
+        return self.paused or time.monotonic() < self.hold_until
 
     def follow(self, row: Row[Any]) -> None:
         """Do what was asked for since the job was last read: pause or continue, or do a region first."""
@@ -174,8 +190,15 @@ class JobRun:
         if tiles and self.paced != threads:
             # Not from the first tiles: their workers load what later ones find loaded.
             self.paced = threads if tile_records.start_pace(connection, self.job, after=threads) else 0
+        without_store = self.without_store and not results
         for outcome in self.outcomes:
             if outcome.done is not None:
+                continue
+            if isinstance(outcome.error, StoreUnavailable):  # no fault of the tile, so it is no attempt
+                if not without_store:
+                    jobs.log(connection, self.job, f"waiting for the store: {outcome.error.detail}")
+                without_store = True
+                again.append(outcome.tile)
                 continue
             try:
                 if self._is_to_repeat(connection, outcome, attempts):
@@ -191,12 +214,14 @@ class JobRun:
             return self._finished(connection, results[FINISH][1])
         if self.stage == self.kind.steps.stage and not (again or self.to_do or under_way):
             return self._enter(connection, "finishing", [FINISH])
-        return Next(self.stage, again, self.task)
+        return Next(self.stage, again, self.task, without_store=without_store)
 
     def advance(self, following: Next) -> None:
         """Continue as `write` returned; call it after that is committed."""
-        if following.stage != self.stage:
+        if following.stage != self.stage or following.without_store:
             self.paced = 0
+        self.without_store = following.without_store
+        self.hold_until = time.monotonic() + HOLD if self.without_store else 0.0
         self.stage, self.task = following.stage, following.task
         self.to_do.extend(following.to_do)
         self.outcomes.clear()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from obstore.exceptions import BaseError
 
-from storage.errors import DISK_FULL, NoRoom, Unavailable
+from storage.errors import DISK_FULL, NoRoom, StoreUnavailable
 
 if TYPE_CHECKING:
     from obstore.store import ClientConfig, RetryConfig
@@ -40,7 +40,7 @@ def translate_errors() -> Iterator[None]:
         If the disk is full.
     FileNotFoundError
         If the folder of an object is removed while it is written.
-    Unavailable
+    StoreUnavailable
         If a bucket, or a service, does not answer.
     """
     try:
@@ -52,7 +52,7 @@ def translate_errors() -> Iterator[None]:
         if f"(os error {errno.ENOENT})" in str(error):
             raise FileNotFoundError(errno.ENOENT, message) from error
         if message.startswith(("Generic S3 error", "Generic HTTP error")) and UNREACHABLE.search(message):
-            raise Unavailable(
+            raise StoreUnavailable(
                 f"the store cannot be reached; try again later ({message.rpartition(' - ')[2].strip(': ')})"
             ) from error
         raise

@@ -84,7 +84,7 @@ class Objects:
 
     Notes
     -----
-    All methods that access a bucket raise `Unavailable` if it cannot be reached.
+    All methods that access a bucket raise `StoreUnavailable` if it cannot be reached.
     """
 
     def __init__(self, url: str, key: str | None = None) -> None:

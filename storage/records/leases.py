@@ -34,7 +34,8 @@ class Heartbeat:
     seconds : float
         Its age; for a moment more if the clock has jumped.
     cluster : dict
-        The cluster as the coordinator saw it: ``workers``, and ``problem``, a text or None.
+        The cluster as the coordinator saw it: ``workers``, ``problem``, a text or None, and ``without_store``, the jobs
+        whose tiles cannot reach the store.
     """
 
     holder: str | None

@@ -16,6 +16,7 @@ from storage import errors
         errors.NotFound,
         errors.Conflict,
         errors.Unavailable,
+        errors.StoreUnavailable,
         errors.Corrupt,
     ],
 )

@@ -12,7 +12,7 @@ from starlette.requests import ClientDisconnect
 from starlette.routing import Match, Mount
 
 from services.runtime.problems import MEDIA_TYPE, Unauthorized, problem_detail, problem_of
-from storage.errors import EnvmatteError, InvalidInput, TooMany, Unavailable
+from storage.errors import EnvmatteError, InvalidInput, StoreUnavailable, TooMany, Unavailable
 from workflows.untrusted.validation import reason
 
 RESPONSES: dict[int | str, dict[str, Any]] = {
@@ -43,6 +43,7 @@ RESPONSES: dict[int | str, dict[str, Any]] = {
 HEADERS: dict[type[EnvmatteError], dict[str, str]] = {
     Unauthorized: {"WWW-Authenticate": "Bearer"},
     Unavailable: {"Retry-After": "2"},  # seconds
+    StoreUnavailable: {"Retry-After": "2"},
     TooMany: {"Retry-After": "10"},
 }
 METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")

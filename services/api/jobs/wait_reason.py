@@ -41,6 +41,8 @@ def reason(connection: Connection, row: Row[Any], sign: Heartbeat | None) -> str
     trouble = trouble_of(sign)
     if trouble is not None:
         return trouble
+    if sign is not None and row.id in sign.cluster.get("without_store", ()):
+        return "its tiles cannot reach the store, and try again every few seconds"
     if row.kind == "recover":
         state = connection.scalar(select(captures.c.state).where(captures.c.id == row.capture))
         if state == "ingesting":

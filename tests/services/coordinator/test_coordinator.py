@@ -9,12 +9,14 @@ from typing import Any
 import pytest
 from sqlalchemy import Connection, Engine, Row
 
-from services.coordinator import coordinator
+from services.api.jobs.wait_reason import reason
+from services.cluster.dispatcher import Outcome
+from services.coordinator import coordinator, job_run
 from services.coordinator.coordinator import POLL, WRITE, Coordinator
 from services.coordinator.job_kinds import JOB_KINDS
 from services.settings import CoordinatorSettings
 from storage.database.engine import reading, writing
-from storage.errors import Unavailable
+from storage.errors import StoreUnavailable, Unavailable
 from storage.layout import uploads
 from storage.objects.store import Objects
 from storage.records import captures, jobs, leases, mattes, tiles
@@ -51,6 +53,20 @@ class Idle:
 
     def drop(self, job: str) -> None:
         pass
+
+
+class Away(Idle):
+    """A dispatcher whose worker cannot reach the store."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.cluster = {"workers": [], "problem": None}
+        self.tried: list[tuple[str, int]] = []
+
+    def collect(self) -> list[Outcome]:
+        tried, self.submitted = self.submitted, []
+        self.tried += tried
+        return [Outcome(job, tile, error=StoreUnavailable("it is away")) for job, tile in tried]
 
 
 @pytest.fixture
@@ -178,6 +194,22 @@ def test_what_cannot_expire_neither_costs_the_lease_nor_holds_up_jobs(
             last = leases.last_heartbeat(c)
     assert last
     assert last.seconds < 1.4
+
+
+def test_job_without_the_store_is_tried_again_and_says_so(
+    engine: Engine, objects: Objects, job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(job_run, "HOLD", 0.5)
+    monkeypatch.setattr(coordinator, "BEAT", 0.1)
+    dispatcher, begin = Away(), time.monotonic()
+    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, dispatcher):  # type: ignore[arg-type]
+        until(lambda: len(dispatcher.tried) == 4)
+        assert time.monotonic() - begin > 3 * job_run.HOLD
+        time.sleep(3 * coordinator.BEAT)
+        with reading(engine) as c:
+            waits_for = reason(c, jobs.get(c, job), leases.last_heartbeat(c))
+    assert waits_for is not None
+    assert "cannot reach the store" in waits_for
 
 
 def test_files_that_cannot_be_removed_are_removed_later(

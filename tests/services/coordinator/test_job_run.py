@@ -1,5 +1,6 @@
 """How a job advances with the outcomes of its tiles, with a real database."""
 
+import time
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,10 +9,11 @@ import pytest
 from sqlalchemy import Connection, select
 
 from services.cluster.dispatcher import Outcome
+from services.coordinator import job_run
 from services.coordinator.job_run import LOSSES, JobRun
 from storage.database.engine import open_engine, writing
 from storage.database.tables import tiles, totals
-from storage.errors import Corrupt, Unavailable
+from storage.errors import Corrupt, StoreUnavailable, Unavailable
 from storage.records import captures, jobs, mattes
 from storage.records import tiles as tile_records
 from storage.steps import FINISH, PREPARE
@@ -138,9 +140,28 @@ def test_a_step_is_tried_three_times(connection: Connection, job: str, tile: int
     assert mattes.get(connection, "mat").state == "failed"
 
 
+def test_outage_of_the_store_is_waited_for(
+    connection: Connection, job: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(job_run, "HOLD", 0.1)
+    run = working(connection, job)
+    away = Outcome(job, 1, error=StoreUnavailable("the store cannot be reached"))
+    for _ in range(20):
+        assert advance(connection, run, away, Outcome(job, 2))
+        assert sorted(run.to_do) == [0, 1, 2]
+    assert (run.held, run.without_store) == (True, True)
+    assert lines(connection, job)[-2:] == ["recovering", "waiting for the store: the store cannot be reached"]
+    time.sleep(0.1)
+    assert (run.held, run.without_store) == (False, True)
+    assert advance(connection, run, done(run, 0), under_way=1)
+    assert (run.held, run.without_store) == (False, False)
+    assert advance(connection, run, away)
+    assert lines(connection, job).count(lines(connection, job)[-1]) == 2  # it is another outage
+
+
 def test_only_transient_errors_are_retried(connection: Connection, job: str) -> None:
     run = working(connection, job)
-    assert advance(connection, run, Outcome(job, 0, error=Unavailable("the store is away")))
+    assert advance(connection, run, Outcome(job, 0, error=Unavailable("its decoder has ended")))
     assert not advance(connection, run, Outcome(job, 0, error=Corrupt("it is damaged")))
     assert jobs.get(connection, job).problem["detail"] == "it is damaged"
 

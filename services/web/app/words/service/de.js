@@ -126,6 +126,7 @@ export const de = {
 	"its capture {id} is being ingested": "seine Aufnahme {id} wird eingelesen",
 	"its checksum does not match": "die Prüfsumme stimmt nicht",
 	"its checksum in {manifest} does not match": "die Prüfsumme in {manifest} stimmt nicht",
+	"its tiles cannot reach the store, and try again every few seconds": "seine Kacheln erreichen den Speicher nicht und versuchen es alle paar Sekunden erneut",
 	"job {job} has already {state} and cannot be cancelled": "Auftrag {job} ist schon beendet und lässt sich nicht abbrechen",
 	"job {job} is using capture {id}; cancel it first, or wait for it": "Auftrag {job} nutzt Aufnahme {id}; erst abbrechen oder abwarten",
 	"job {job} is using matte {id}; cancel it first, or wait for it": "Auftrag {job} nutzt Matte {id}; erst abbrechen oder abwarten",
