@@ -201,7 +201,7 @@ class Coordinator:
     def _read(self) -> None:
         """Read from the ledger which jobs to run, and which to run no longer."""
         with reading(self._engine) as c:
-            active = {row.id: row for row in jobs.active(c)}
+            active = {row.id: row for row in jobs.to_run(c)}
             cancelled = jobs.cancelled_with_leftovers(c)
         for row in active.values():
             if row.id in self._runs:

@@ -78,10 +78,18 @@ def get(connection: Connection, job: str) -> Row[Any]:
     return find(connection, jobs, job)
 
 
-def active(connection: Connection) -> Sequence[Row[Any]]:
-    """Jobs that are queued or running, oldest first."""
-    query = select(jobs).where(jobs.c.state.in_(ACTIVE)).order_by(jobs.c.number)
+def to_run(connection: Connection) -> Sequence[Row[Any]]:
+    """Active jobs, oldest first, apart from recoveries that wait for the ingest of their capture."""
+    ingesting = select(captures.c.id).where(captures.c.state == "ingesting")
+    waits = (jobs.c.state == "queued") & (jobs.c.kind == "recover") & jobs.c.capture.in_(ingesting)
+    query = select(jobs).where(jobs.c.state.in_(ACTIVE), ~waits).order_by(jobs.c.number)
     return connection.execute(query).all()
+
+
+def active_job(connection: Connection, **about: str) -> str | None:
+    """The oldest active job of a ``capture`` or a ``matte``; None if there is none."""
+    query = select(jobs.c.id).filter_by(**about).where(jobs.c.state.in_(ACTIVE))
+    return connection.scalar(query.order_by(jobs.c.number).limit(1))
 
 
 def names(connection: Connection, rows: Sequence[Row[Any]]) -> dict[str, str]:

@@ -128,9 +128,8 @@ def delete_capture(context: OwnerContext, id: str) -> None:
     """Delete a capture and its frames; mattes that were recovered from it stay."""
     with writing(context.engine) as c:
         captures.get(c, id)
-        busy = [row.id for row in jobs.active(c) if row.capture == id]
-        if busy:
-            raise Conflict(f"job {busy[0]} is using capture {id}; cancel it first, or wait for it")
+        if busy := jobs.active_job(c, capture=id):
+            raise Conflict(f"job {busy} is using capture {id}; cancel it first, or wait for it")
         captures.delete(c, id)
     context.objects.delete(stored_captures.path(id))
     stored_uploads.remove(context.objects, id)

@@ -105,10 +105,9 @@ async def change_matte(context: OwnerContext, id: str, request: Request) -> Resp
 def delete_matte(context: OwnerContext, id: str) -> None:
     """Delete a matte."""
     with writing(context.engine) as c:
-        row = mattes.get(c, id)
-        busy = [job.id for job in jobs.active(c) if job.matte == row.id]
-        if busy:
-            raise Conflict(f"job {busy[0]} is using matte {id}; cancel it first, or wait for it")
+        mattes.get(c, id)
+        if busy := jobs.active_job(c, matte=id):
+            raise Conflict(f"job {busy} is using matte {id}; cancel it first, or wait for it")
         mattes.delete(c, id)
     context.cache.forget(id)
     context.objects.delete(stored_mattes.path(id))

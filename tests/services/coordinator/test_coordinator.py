@@ -196,6 +196,31 @@ def test_what_cannot_expire_neither_costs_the_lease_nor_holds_up_jobs(
     assert last.seconds < 1.4
 
 
+def test_recovery_takes_no_transaction_while_its_capture_is_ingested(
+    engine: Engine, objects: Objects, job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked: list[str] = []
+    is_due = JOB_KINDS["recover"].is_due
+
+    def observed(connection: Connection, row: Row[Any]) -> bool:
+        looked.append(row.id)
+        return is_due(connection, row)
+
+    monkeypatch.setattr(JOB_KINDS["recover"], "is_due", observed)
+    with writing(engine) as c:
+        recovery = jobs.add(c, "recover", "c", {}, "m")
+        mattes.add(c, "m", "c", recovery, {})
+    dispatcher = Idle()
+    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, dispatcher):  # type: ignore[arg-type]
+        until(lambda: dispatcher.submitted)
+        time.sleep(3 * POLL)
+        assert looked == []
+        with writing(engine) as c:
+            captures.change(c, "c", state="ready")
+        until(lambda: (recovery, PREPARE) in dispatcher.submitted)
+    assert looked == [recovery]
+
+
 def test_job_without_the_store_is_tried_again_and_says_so(
     engine: Engine, objects: Objects, job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -32,7 +32,7 @@ def test_exception_rolls_back(engine: Engine) -> None:
         jobs.add(connection, "ingest", "c", {})
         raise ZeroDivisionError
     with reading(engine) as connection:
-        assert jobs.active(connection) == []
+        assert jobs.to_run(connection) == []
 
 
 def test_log_line_needs_its_job(engine: Engine) -> None:
@@ -77,20 +77,20 @@ def test_reader_does_not_wait_for_writer(engine: Engine) -> None:
         job = jobs.add(writer, "ingest", "c", {})
         start = time.monotonic()
         with reading(engine) as reader:
-            assert jobs.active(reader) == []
+            assert jobs.to_run(reader) == []
         assert time.monotonic() - start < 5
     with reading(engine) as reader:
-        assert [row.id for row in jobs.active(reader)] == [job]
+        assert [row.id for row in jobs.to_run(reader)] == [job]
 
 
 def test_reader_sees_one_snapshot(engine: Engine) -> None:
     with reading(engine) as reader:
-        assert jobs.active(reader) == []
+        assert jobs.to_run(reader) == []
         with writing(engine) as writer:
             jobs.add(writer, "ingest", "c", {})
-        assert jobs.active(reader) == []
+        assert jobs.to_run(reader) == []
     with reading(engine) as reader:
-        assert len(jobs.active(reader)) == 1
+        assert len(jobs.to_run(reader)) == 1
 
 
 @pytest.mark.parametrize("wait", ["sqlite", "postgresql"])
@@ -105,7 +105,7 @@ def test_writer_that_waits_too_long_gets_unavailable(wait: str, request: pytest.
         with pytest.raises(Unavailable, match="try again"), writing(other):
             pass
         with reading(other) as connection:
-            assert jobs.active(connection) == []
+            assert jobs.to_run(connection) == []
     with writing(other) as connection:
         jobs.add(connection, "ingest", "c", {})
     one.dispose()
@@ -135,7 +135,7 @@ def test_pool_recovers_from_server_restart(postgresql: str, postgresql_server: S
         jobs.add(connection, "ingest", "c", {})
     postgresql_server.restart()
     with reading(engine) as connection:
-        assert len(jobs.active(connection)) == 1
+        assert len(jobs.to_run(connection)) == 1
     postgresql_server.restart()
     with writing(engine) as connection:
         jobs.add(connection, "ingest", "c", {})
@@ -157,7 +157,7 @@ def test_server_stop_rolls_back_transaction(postgresql: str, postgresql_server: 
         with pytest.raises(Unavailable, match="try again"), reading(engine):
             pass
     with reading(engine) as connection:
-        assert jobs.active(connection) == []
+        assert jobs.to_run(connection) == []
     engine.dispose()
 
 

@@ -38,14 +38,15 @@ def test_lists_and_lookups_show_only_the_owners_rows(filled: Engine) -> None:
                 assert get(c, f"{owner}-{what}").owner == owner
                 with pytest.raises(NotFound):
                     get(c, f"{other}-{what}")
-            assert [row.id for row in jobs.active(c)] == [f"{owner}-job"]
+            assert jobs.active_job(c, capture=f"{owner}-capture") == f"{owner}-job"
+            assert jobs.active_job(c, capture=f"{other}-capture") is None
             found = uploads.by_key(c, "the-same-key")
             assert found is not None
             assert found.owner == owner
     with reading(filled) as c:
-        assert [row.owner for row in jobs.active(c)] == list(OWNERS)
+        assert [row.owner for row in jobs.to_run(c)] == list(OWNERS)
     with reading(for_owner(filled, NOBODY)) as c:
-        assert jobs.active(c) == []
+        assert jobs.active_job(c, capture="alice-capture") is None
 
 
 def test_dependent_rows_belong_to_the_owner(filled: Engine) -> None:

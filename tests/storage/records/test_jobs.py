@@ -130,11 +130,34 @@ def test_deleting_job_deletes_tiles_and_log(connection: Connection) -> None:
         assert connection.scalar(count.where(table.c.job == other))
 
 
-def test_active_jobs_are_oldest_first(connection: Connection) -> None:
+def test_jobs_to_run_are_oldest_first(connection: Connection) -> None:
     made = [planned(connection) for _ in range(4)]
     jobs.enter_stage(connection, made[2], "recovering")
     jobs.end(connection, made[1], "failed")
-    assert [row.id for row in jobs.active(connection)] == [made[0], made[2], made[3]]
+    assert [row.id for row in jobs.to_run(connection)] == [made[0], made[2], made[3]]
+
+
+def test_jobs_to_run_lack_what_waits_for_an_ingest(connection: Connection) -> None:
+    ingest = jobs.add(connection, "ingest", "new", {})
+    captures.add(connection, "new", ingest, name="", bytes=1, frames=1, program={})
+    recovery = jobs.add(connection, "recover", "new", {}, matte="m")
+    for state, expected in (
+        ("ingesting", [ingest]),
+        ("failed", [ingest, recovery]),
+        ("ready", [ingest, recovery]),
+    ):
+        captures.change(connection, "new", state=state)
+        assert [row.id for row in jobs.to_run(connection)] == expected
+
+
+def test_active_job_of_a_capture_or_a_matte(connection: Connection) -> None:
+    assert jobs.active_job(connection, capture="new") is None
+    first, second = (jobs.add(connection, "recover", "new", {}, matte=matte) for matte in ("a", "b"))
+    assert jobs.active_job(connection, capture="new") == first
+    assert jobs.active_job(connection, matte="b") == second
+    jobs.end(connection, first, "succeeded")
+    assert jobs.active_job(connection, capture="new") == second
+    assert jobs.active_job(connection, matte="a") is None
 
 
 def test_only_cancelled_job_has_leftovers(connection: Connection) -> None:

@@ -24,7 +24,7 @@ def create(connection: Connection) -> str:
 
 def count(engine: Engine) -> int:
     with reading(engine) as c:
-        return len(jobs.active(c))
+        return len(jobs.to_run(c))
 
 
 def test_repeat_with_key_answers_with_first(engine: Engine) -> None:
