@@ -61,6 +61,8 @@ def upgrade(connection: Connection, to: str = NEWEST) -> None:
     before = revision(connection)
     if before is not None:
         require_known(before, "the database")
+    if connection.dialect.name == "postgresql":  # it may take minutes, and would be cancelled at every start
+        connection.exec_driver_sql("SET LOCAL statement_timeout = 0")
     with _lock:
         _config.attributes["connection"] = connection
         try:

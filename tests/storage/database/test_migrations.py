@@ -19,7 +19,7 @@ from storage.database.engine import open_engine, reading, writing
 from storage.database.owners import DEFAULT, for_owner
 from storage.database.revision import NEWEST, revision
 from storage.database.tables import coordinator, metadata, tiles, totals
-from storage.errors import Conflict, NotFound
+from storage.errors import Conflict, NotFound, Unavailable
 from storage.layout.uploads import Part
 from storage.records import captures, idempotency, jobs, mattes, programs, uploads
 from storage.records import tiles as tile_records
@@ -182,6 +182,26 @@ def test_failed_upgrade_leaves_old_schema(bare: Engine) -> None:
         assert jobs.get(connection, "j").paced_done == 0
         assert differences(connection) == []
     engine.dispose()
+
+
+def test_upgrade_on_postgresql_may_take_long(
+    postgresql_server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(dialects.TIMEOUTS, "statement_timeout", "200ms")
+    with postgresql_server.database() as url:
+        bare = dialects.make_engine(url)
+        with writing(bare) as connection:
+            migrations.upgrade(connection, "0001")
+            connection.exec_driver_sql(
+                "CREATE FUNCTION wait() RETURNS event_trigger LANGUAGE plpgsql AS 'BEGIN PERFORM pg_sleep(0.4); END'"
+            )
+            connection.exec_driver_sql("CREATE EVENT TRIGGER slow ON ddl_command_end EXECUTE FUNCTION wait()")
+        with writing(bare) as connection:
+            migrations.upgrade(connection, "0002")
+            assert revision(connection) == "0002"
+        with pytest.raises(Unavailable), writing(bare) as connection:  # later statements are limited again
+            connection.exec_driver_sql("SELECT pg_sleep(1)")
+        bare.dispose()
 
 
 def test_newer_database_is_refused_and_unchanged(engine: Engine, url: str) -> None:
