@@ -31,6 +31,7 @@ from services.coordinator.retention import (
     sweep_uploads,
 )
 from services.runtime.logs import about
+from services.runtime.problems import problem_of
 from services.settings import CoordinatorSettings
 from storage.database.disk_reserve import keep_reserve
 from storage.database.engine import reading, writing
@@ -174,6 +175,7 @@ class Coordinator:
         for job in list(self._runs):
             self._drop(job)
         self._discards.clear()
+        self._troubles.clear()
 
     @contextmanager
     def _writing(self) -> Iterator[Connection]:
@@ -234,8 +236,8 @@ class Coordinator:
                 self._fail(
                     job,
                     GaveUp(
-                        f"the coordinator failed {self._troubles[job]} times on this job, last with {error!r}; retry "
-                        "it, or if that fails too, start a new one"
+                        f"the coordinator failed {self._troubles[job]} times on this job, last with: "
+                        f"{problem_of(error)['detail']}. Retry it, or if that fails too, start a new one"
                     ),
                 )
 
@@ -298,6 +300,7 @@ class Coordinator:
 
     def _tidy(self, job: str) -> None:
         """Remove what is of no use after the end of a job: its input, or everything if it can't be retried."""
+        self._troubles.pop(job, None)  # they are not those of a retry
         with reading(self._engine) as c:
             row = jobs.get(c, job)
         if row.state == "succeeded":

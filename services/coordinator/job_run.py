@@ -242,9 +242,12 @@ class JobRun:
         if isinstance(error, EnvmatteError) and not isinstance(error, Unavailable):
             raise error  # the next attempt would fail in the same way
         if error is not None:
-            if tile_records.record_failure(connection, self.job, tile, repr(error), attempts):
+            with about(self.job, tile):
+                logger.warning("failed: %r", error)
+            detail = problem_of(error)["detail"]  # the job shows no more of an unexpected error
+            if tile_records.record_failure(connection, self.job, tile, detail, attempts):
                 return True
-            raise GaveUp(f"{name} failed {attempts} times, last with {error!r}") from error
+            raise GaveUp(f"{name} failed {attempts} times, last with: {detail}") from error
         if outcome.starved:  # because of its tile, and it would be again
             if tile_records.record_failure(
                 connection, self.job, tile, f"its worker {outcome.died} ran out of memory", attempts

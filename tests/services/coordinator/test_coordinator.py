@@ -196,6 +196,35 @@ def test_what_cannot_expire_neither_costs_the_lease_nor_holds_up_jobs(
     assert last.seconds < 1.4
 
 
+def test_troubles_before_a_retry_do_not_count(
+    engine: Engine, objects: Objects, job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    troubles = 3
+
+    def confused(connection: Connection, row: Row[Any]) -> bool:
+        nonlocal troubles
+        if troubles:
+            troubles -= 1
+            raise KeyError("http://secret")
+        return True
+
+    monkeypatch.setattr(JOB_KINDS["ingest"], "is_due", confused)
+    dispatcher = Idle()
+    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, dispatcher):  # type: ignore[arg-type]
+
+        def row() -> Row[Any]:
+            with reading(engine) as c:
+                return jobs.get(c, job)
+
+        until(lambda: row().state == "failed")
+        assert "3 times on this job, last with: unexpected KeyError" in row().problem["detail"]
+        troubles = 2
+        with writing(engine) as c:
+            jobs.retry(c, job)
+        until(lambda: row().state != "queued")
+    assert dispatcher.submitted == [(job, PREPARE)]
+
+
 def test_recovery_takes_no_transaction_while_its_capture_is_ingested(
     engine: Engine, objects: Objects, job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

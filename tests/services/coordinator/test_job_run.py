@@ -128,15 +128,20 @@ def test_lost_tiles_are_repeated_without_counting_as_failures(connection: Connec
 
 
 @pytest.mark.parametrize("tile", [PREPARE, 1, FINISH])
-def test_a_step_is_tried_three_times(connection: Connection, job: str, tile: int) -> None:
+def test_a_step_is_tried_three_times(
+    connection: Connection, job: str, tile: int, caplog: pytest.LogCaptureFixture
+) -> None:
     run = start(connection, job) if tile == PREPARE else working(connection, job)
     if tile == FINISH:
         advance(connection, run, *(done(run, n) for n in range(3)))
-    error = Outcome(job, tile, error=ValueError("odd"))
+    error = Outcome(job, tile, error=ValueError("odd: http://secret"))
     assert [advance(connection, run, error) for _ in range(3)] == [True, True, False]
     row = jobs.get(connection, job)
     assert row.state == "failed"
-    assert "failed 3 times, last with ValueError('odd')" in row.problem["detail"]
+    hidden = "unexpected ValueError; the service's log has the details"
+    assert row.problem["detail"].endswith(f"failed 3 times, last with: {hidden}")
+    assert [line.partition(" of 3: ")[2] for line in lines(connection, job)[-4:-1]] == [hidden] * 3
+    assert caplog.text.count("odd: http://secret") == 3
     assert mattes.get(connection, "mat").state == "failed"
 
 
@@ -162,6 +167,7 @@ def test_outage_of_the_store_is_waited_for(
 def test_only_transient_errors_are_retried(connection: Connection, job: str) -> None:
     run = working(connection, job)
     assert advance(connection, run, Outcome(job, 0, error=Unavailable("its decoder has ended")))
+    assert lines(connection, job)[-1] == "tile 0, attempt 1 of 3: its decoder has ended"
     assert not advance(connection, run, Outcome(job, 0, error=Corrupt("it is damaged")))
     assert jobs.get(connection, job).problem["detail"] == "it is damaged"
 

@@ -297,7 +297,7 @@ export const de = {
 	"{mask} is {size}, the frames are {other}": "{mask} hat {size} Pixel, die Bilder haben {other}",
 	"{missing} of {all} patterns have no frame that can be used": "{missing} von {all} Mustern haben kein brauchbares Bild",
 	"{missing} of {all} patterns have no frame, the first of them pattern {first}": "{missing} von {all} Mustern haben kein Bild, das erste davon ist Muster {first}",
-	"{name} failed {n} times, last with {error}": "{name} ist {n}-mal gescheitert, zuletzt mit {error}",
+	"{name} failed {n} times, last with: {error}": "{name} ist {n}-mal gescheitert, zuletzt: {error}",
 	"{name} ran out of its worker's memory {n} times": "{name} hat {n}-mal den Speicher seines Workers überschritten",
 	"{remedy}: it is not corrected, because it is not certain, or no frame is black": "{remedy}: Es wird nicht ausgeglichen, weil es nicht sicher ist oder kein Bild schwarz ist",
 	"{remedy}: so large a change is followed only in part, and hides the camera's curve": "{remedy}: So großen Schwankungen folgt sie nur zum Teil, und sie verbergen die Kennlinie der Kamera",
