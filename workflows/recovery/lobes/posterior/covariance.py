@@ -272,7 +272,10 @@ def solve_covariance(
         add_products(A, np.float32(kappa), weight, p, Kp)
         for j in range(r.size):
             Kp[j] = Kp[j] if measured[j] else 0.0
-        length = left / inner(p, Kp)
+        curvature = inner(p, Kp)
+        if not curvature > 0:  # by rounding: measurements without noise are told apart no further
+            break
+        length = left / curvature
         subtract(x, -length, p)
         subtract(r, length, Kp)
         apply_inverse(rows, inverse, ones, r, z)

@@ -135,6 +135,16 @@ def test_identical_lobes_of_a_quiet_camera_leave_the_solver_stable():
     assert np.isfinite(x).all()
 
 
+def test_steps_end_where_rounding_leaves_nothing_of_the_covariance():
+    K, *_ = problem(1, 1)
+    K = K._replace(weight=np.zeros_like(K.weight), noise=np.zeros_like(K.noise))
+    approximate = empty(K, 0)
+    approximate.rows[:], approximate.inverse[:] = 0, 1
+    x, taken = solve(K, approximate, 9, np.resize([1.0, -1.0], K.noise.size))
+    assert taken == 0
+    assert (x == 0).all()
+
+
 def test_lobes_as_a_whole_save_steps():
     """Without them, the light that all nodes of a lobe have in common takes most steps."""
     left = np.zeros(2)
