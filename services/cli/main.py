@@ -1,5 +1,6 @@
 """The command `envmatte`: all of its commands, and what errors end it with."""
 
+import io
 import sys
 from typing import Any
 
@@ -15,6 +16,7 @@ from services.cli.remote.tether import tether
 from services.client import Busy, ServiceError, Unreachable
 from services.runtime.addresses import PortTaken
 from storage.errors import EnvmatteError
+from workflows.untrusted.control_characters import escape_controls
 
 
 class _PortTaken(click.ClickException):
@@ -86,12 +88,13 @@ def run() -> None:
     except OSError as error:
         _end(f"Error: {error}", 1)
     except click.ClickException as error:
-        error.show()
-        sys.exit(error.exit_code)
+        shown = io.StringIO()
+        error.show(shown)
+        _end(shown.getvalue().rstrip(), error.exit_code)
     except (click.Abort, KeyboardInterrupt):
         _end("Interrupted.", 130)
 
 
 def _end(message: str, code: int) -> None:
-    click.echo(message, err=True)
+    click.echo("\n".join(map(escape_controls, message.split("\n"))), err=True)
     sys.exit(code)

@@ -8,12 +8,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from types import TracebackType
+from typing import Any
 
 import dask
 from pythonjsonlogger.core import RESERVED_ATTRS
 from pythonjsonlogger.json import JsonFormatter
 
 from storage.steps import step_name
+from workflows.untrusted.control_characters import escape_controls
 
 logger = logging.getLogger(__name__)
 
@@ -56,7 +58,7 @@ def configure_logging(form: str, level: str, role: str) -> None:
     """
     handler = logging.StreamHandler()
     handler.addFilter(_add_about)
-    handler.setFormatter(_json(role) if form == "json" else logging.Formatter(TEXT))
+    handler.setFormatter(_json(role) if form == "json" else _TextFormatter(TEXT))
     # Libraries log from INFO at the lowest: numba alone has a hundred thousand debug lines about compiling a kernel.
     logging.basicConfig(level=max(logging.INFO, LEVELS[level]), handlers=[handler], force=True)
     for package in PACKAGES:
@@ -82,6 +84,16 @@ def configure_worker_logging() -> None:
     configure_logging(
         dask.config.get("envmatte.log", "text"), dask.config.get("envmatte.log-level", "INFO"), "worker"
     )
+
+
+class _TextFormatter(logging.Formatter):
+    """One line for a record, indented ones for its traceback: what others sent can't look like another record."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        return escape_controls(super().formatMessage(record))
+
+    def formatException(self, ei: Any) -> str:
+        return "\n".join(f"  {escape_controls(line)}" for line in super().formatException(ei).split("\n"))
 
 
 def _json(role: str) -> logging.Formatter:

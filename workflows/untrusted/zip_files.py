@@ -6,6 +6,7 @@ import zlib
 from typing import BinaryIO, cast
 
 from storage.errors import InvalidInput
+from workflows.untrusted.control_characters import CONTROL
 
 DIRECTORY_BYTES = 8 << 20
 """The largest central directory, which zipfile reads in one piece."""
@@ -74,6 +75,8 @@ def entries(
         name = info.filename
         if name.startswith(("/", "\\")) or ":" in name or ".." in name.replace("\\", "/").split("/"):
             raise refusal(f"{name!r} leaves the archive: use plain relative names", entry=name)
+        if CONTROL.search(name):
+            raise refusal(f"{name!r} has control characters: rename the file", entry=name)
         if stat.S_ISLNK(info.external_attr >> 16):
             raise refusal(f"{name!r} is a link: put the file itself in the archive", entry=name)
         if info.flag_bits & 1:

@@ -133,6 +133,16 @@ def test_exit_code_1_if_refused_failed_or_not_written(tmp_path: Path) -> None:
     assert "Traceback" not in found.stderr
 
 
+def test_errors_do_not_command_the_terminal() -> None:
+    with scripted_server(lambda n: refusal(422, "a\x1b[2J\x9b31m\x1b]0;title\x07.png")) as (url, _):
+        assert (
+            envmatte("status", "j", "--url", url).stderr == "Error: a\\x1b[2J\\x9b31m\\x1b]0;title\\x07.png\n"
+        )
+    wrong = envmatte("status", "j", "--url", "http://\x1b[2J")
+    assert wrong.returncode == 2
+    assert "\x1b" not in wrong.stderr
+
+
 @pytest.mark.parametrize(
     "arguments",
     [["fly"], ["status"], ["upload", "no-such-file"], ["status", "j", "--url", "localhost:8000"]],

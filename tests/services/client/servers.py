@@ -75,6 +75,6 @@ def ok(answer: dict[str, Any] = JOB) -> Answer:
     return 200, {"Content-Type": "application/json"}, json.dumps(answer).encode()
 
 
-def refusal(status: int, **headers: str) -> Answer:
-    problem = {"type": "urn:x", "title": "t", "status": status, "detail": "why, and what to do", "field": "f"}
+def refusal(status: int, detail: str = "why, and what to do", **headers: str) -> Answer:
+    problem = {"type": "urn:x", "title": "t", "status": status, "detail": detail, "field": "f"}
     return status, {"Content-Type": "application/problem+json"} | headers, json.dumps(problem).encode()

@@ -182,6 +182,13 @@ def test_entries_that_leave_the_archive_are_refused(make_zip: Zip, name: str) ->
     assert "leaves the archive" in error.detail
 
 
+@pytest.mark.parametrize("name", ["a\nb.png", "a\x1b[2J.png", "a\x7f", "a\x9b31m.png"])
+def test_entries_with_control_characters_are_refused(make_zip: Zip, name: str) -> None:
+    error = refused(make_zip(RECORD, FILES | {name: b"data"}))
+    assert error.fields == {"entry": name}
+    assert error.detail == f"{name!r} has control characters: rename the file"
+
+
 def test_links_are_refused(make_zip: Zip) -> None:
     target = io.BytesIO(make_zip(RECORD, FILES))
     with zipfile.ZipFile(target, "a") as archive:
