@@ -1,5 +1,6 @@
 """Media types of what is sent and of what is asked for: Content-Type and Accept."""
 
+import re
 from collections.abc import Sequence
 
 from fastapi import Request
@@ -8,6 +9,7 @@ from services.runtime.problems import WrongMediaType
 
 ZIP = "application/zip"
 JSON = "application/json"
+QUALITY = re.compile(r"0(\.[0-9]*)?|1(\.0*)?|\.[0-9]+")
 
 
 def media_type_of(request: Request) -> str:
@@ -35,22 +37,19 @@ def require_media_type(request: Request, media_type: str, what: str) -> None:
 def preferred(accept: str, offered: Sequence[str]) -> str | None:
     """Choose the media type that an Accept header likes best (RFC 9110, sect. 12.5.1); None if it takes none.
 
-    Of two with the same quality the first one named is chosen; a wildcard means the first one offered that it matches.
+    The most specific range that matches a type has its quality. Of two with the same quality, the one whose range comes
+    first is chosen, and of two with the same range the first one offered.
     """
-    ranges = []
-    for part in accept.split(","):
+    ranges: dict[str, tuple[float, int]] = {}
+    for place, part in enumerate(accept.split(",")):
         name, *parameters = (text.strip().lower() for text in part.split(";"))
         quality = next((text[2:] for text in parameters if text.startswith("q=")), "1")
-        try:
-            ranges.append((-float(quality), name))
-        except ValueError:
-            continue
-    for worth, name in sorted(ranges, key=lambda one: one[0]):
-        found = next((media_type for media_type in offered if _matches(name, media_type)), None)
-        if worth and found:
-            return found
-    return None
-
-
-def _matches(name: str, media_type: str) -> bool:
-    return name in ("*/*", media_type) or (name.endswith("/*") and media_type.startswith(name[:-1]))
+        if QUALITY.fullmatch(quality):
+            ranges.setdefault(name, (-float(quality), place))
+    found: list[tuple[tuple[float, int], str]] = []
+    for media_type in offered:
+        matching = (media_type, f"{media_type.partition('/')[0]}/*", "*/*")
+        rank = next((ranges[name] for name in matching if name in ranges), (0.0, 0))
+        if rank[0]:
+            found.append((rank, media_type))
+    return min(found, key=lambda one: one[0])[1] if found else None

@@ -73,5 +73,9 @@ def utc_time(seconds: float | None) -> datetime | None:
 
 
 def etag_matches(headers: Headers, tag: str) -> bool:
-    """Whether the caller already has the answer with an entity tag (If-None-Match, RFC 9110, sect. 13.1.2)."""
-    return tag in [text.strip() for text in headers.get("if-none-match", "").split(",")]
+    """Whether the caller already has the answer with an entity tag (If-None-Match, RFC 9110, sect. 13.1.2).
+
+    Tags are compared weakly, because a proxy that packs answers makes them weak; ``*`` is any answer.
+    """
+    known = [text.strip().removeprefix("W/") for text in headers.get("if-none-match", "").split(",")]
+    return tag.removeprefix("W/") in known or known == ["*"]
