@@ -39,7 +39,12 @@ def is_clip(request: Request) -> bool:
 
 
 async def composite_clip(
-    context: Context, request: Request, matte: str, options: dict[str, Any], webhook: str | None
+    context: Context,
+    request: Request,
+    matte: str,
+    options: dict[str, Any],
+    webhook: str | None,
+    key: str | None,
 ) -> Response:
     """Stream a clip, the body of a request, into the store, and queue the job that composites it.
 
@@ -49,6 +54,8 @@ async def composite_clip(
         ``transfer``, ``around``, and ``placement`` as `Placement` takes it.
     webhook : str, optional
         URL that is notified when the job has ended.
+    key : str, optional
+        The Idempotency-Key.
 
     Raises
     ------
@@ -65,7 +72,6 @@ async def composite_clip(
     check_webhook(webhook, context.settings)
     limit = upload_limit(context.settings, "a clip")
     length = limit.check_announced(request)
-    key = request.headers.get("idempotency-key", "")[:256]
     job = await context.call(find_earlier, context.engine, key, _call(matte), Job.read)
     if job is None:
         await context.call(_require_ready, context, matte)
@@ -131,7 +137,7 @@ def _queue(
     job: str,
     matte: str,
     options: dict[str, Any],
-    key: str,
+    key: str | None,
     size: int,
     webhook: str | None,
 ) -> Job:

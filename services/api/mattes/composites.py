@@ -1,10 +1,9 @@
 """Composites over HTTP: stills at once, clips as jobs."""
 
 import hashlib
-import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import IO, Annotated, Literal, TypeVar
+from typing import IO, Annotated, Literal
 
 import numpy as np
 from fastapi import Query, Request, Response
@@ -14,9 +13,11 @@ from starlette.datastructures import Headers
 from services.api.context import Context, OwnerContext
 from services.api.http.bodies import BodyLimit, spool_body
 from services.api.http.errors import answer as answer_problem
+from services.api.http.idempotency import IdempotencyKey
 from services.api.http.media_types import preferred
 from services.api.http.responses import MEMORY_BYTES, bytes_response, etag_matches, file_response
 from services.api.http.router import Router
+from services.api.http.server_timing import ServerTiming
 from services.api.jobs.jobs import Job
 from services.api.mattes import clips
 from services.api.mattes.composite_params import CompositeParams
@@ -40,7 +41,6 @@ from workflows.recovery.interval import Interval
 from workflows.threads import CORES
 
 router = Router(tags=["mattes"])
-R = TypeVar("R")
 Picture = NDArray[np.float32]
 """(height, width, 4): light and alpha."""
 BACKDROPS = (
@@ -98,7 +98,11 @@ INTERVAL_BYTES = 128
     },
 )
 async def post_composite(
-    context: OwnerContext, id: str, request: Request, params: Annotated[CompositeParams, Query()]
+    context: OwnerContext,
+    id: str,
+    request: Request,
+    params: Annotated[CompositeParams, Query()],
+    idempotency_key: IdempotencyKey = None,
 ) -> Response:
     """Put the glass in front of a backdrop: the body is an image, and the answer is one of the matte's size.
 
@@ -113,7 +117,8 @@ async def post_composite(
     If the body is a video, `Content-Type: video/*`, the answer is 202 and the job that composites its frames.
     """
     if clips.is_clip(request):
-        return await clips.composite_clip(context, request, id, params.clip_options(), params.webhook)
+        options = params.clip_options()
+        return await clips.composite_clip(context, request, id, options, params.webhook, idempotency_key)
     if params.webhook is not None:
         raise OptionError("webhook is for clips: a still is in the answer and has no job", field="webhook")
     accept = request.headers.get("accept", "*/*")
@@ -171,7 +176,7 @@ def _answer(
     params: CompositeParams,
     headers: Headers,
 ) -> Response:
-    times = _Times()
+    times = ServerTiming()
     body.seek(0)
     inputs = f"{progress.id} {sorted(progress.blocks or ())} {media_type} {params.model_dump_json()} "
     digest = hashlib.blake2b(inputs.encode(), digest_size=16)
@@ -203,29 +208,13 @@ def _answer(
     return answer
 
 
-class _Times(dict[str, float]):
-    """Milliseconds that the parts of an answer took."""
-
-    def take(self, name: str, function: Callable[[], R]) -> R:
-        """Call a function, and note how long it took."""
-        start = time.perf_counter()
-        result = function()
-        self[name] = self.get(name, 0) + (time.perf_counter() - start) * 1e3
-        return result
-
-    @property
-    def header(self) -> str:
-        """The value of the header Server-Timing (W3C Server Timing, section 3)."""
-        return ", ".join(f"{name};dur={milliseconds:.1f}" for name, milliseconds in self.items())
-
-
 def _codes(
     pictures: Iterator[Picture],
     rows: int | None,
     is_deep: bool,
     params: CompositeParams,
     media_type: str,
-    times: _Times,
+    times: ServerTiming,
 ) -> Codes:
     """The integers of an answer: of one picture, or of several bands with so many rows together.
 
@@ -268,7 +257,7 @@ def _pictures(
     backdrop: Backdrop,
     params: CompositeParams,
     bands: Sequence[Window],
-    times: _Times,
+    times: ServerTiming,
 ) -> Iterator[Picture]:
     """Light and alpha of an answer, by bands from top to bottom."""
     draw = _drawing(context, progress, matte, backdrop, params, times)
@@ -296,7 +285,7 @@ def _drawing(
     matte: Matte,
     backdrop: Backdrop,
     params: CompositeParams,
-    times: _Times,
+    times: ServerTiming,
 ) -> Callable[[Window], Picture]:
     """What draws a window before a backdrop, or how far the light of its pixels may be from that."""
 

@@ -1,4 +1,4 @@
-"""Backdrops that wait on disk, on a real port: an owner has a share of them, and broken uploads leave nothing."""
+"""Composites on a real port: an owner has a share of what waits on disk, and broken uploads leave nothing."""
 
 import socket
 import threading
@@ -36,10 +36,12 @@ class Api:
     url: str
     keys: dict[str, str]
 
-    def composite(self, owner: str, seconds: float = 120) -> httpx2.Response:
-        headers = {"Authorization": f"Bearer {self.keys[owner]}"}
+    def composite(
+        self, owner: str, seconds: float = 120, body: bytes = BACKDROP, **headers: str
+    ) -> httpx2.Response:
+        headers["Authorization"] = f"Bearer {self.keys[owner]}"
         url = f"{self.url}/v1/mattes/{owner}/composite"
-        return httpx2.post(url, content=BACKDROP, headers=headers, timeout=seconds)
+        return httpx2.post(url, content=body, headers=headers, timeout=seconds)
 
     def begin(self, owner: str) -> socket.socket:
         """Begin a composite with a backdrop of unknown length that does not end."""
@@ -96,3 +98,12 @@ def test_backdrops_of_one_owner_keep_no_other_waiting_and_leave_nothing(api: Api
         one.close()
     assert api.composite("alice").status_code == 200
     until(lambda: spooled() == before)
+
+
+def test_idempotency_key_that_is_too_long_is_refused(api: Api) -> None:
+    """And not cut: two clips whose keys begin alike would get one job."""
+    clip = {"body": b"any", "Content-Type": "video/mp4"}
+    answer = api.composite("alice", **clip, **{"Idempotency-Key": "k" * 257})
+    assert answer.status_code == 422
+    assert answer.json()["field"] == "Idempotency-Key"
+    assert api.composite("alice", **clip, **{"Idempotency-Key": "k" * 256}).status_code == 202
