@@ -1,6 +1,7 @@
 """PNG, JPEG, TIFF, HEIC and web formats of 8 to 16 bits to arrays, and PNG and JPEG back. Files are not trusted."""
 
 import io
+from contextlib import suppress
 from typing import IO, cast
 
 import imagecodecs
@@ -33,6 +34,7 @@ LOSSLESS = {
 """TIFF compressions that tifffile decodes within the size that the header states."""
 PLAIN = {tifffile.PHOTOMETRIC.MINISWHITE, tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB}
 """Photometric interpretations of a TIFF whose values are used as they are."""
+SAVE_IT = "save it as grey or RGB with 8 or 16 bits a channel"
 START_OF_SCAN = b"\xff\xda"
 SCANS = 100
 """Scans of a JPEG: each takes as long as a picture, but only a few bytes. Encoders write about ten."""
@@ -112,10 +114,7 @@ def decode(
     try:
         picture = Image.open(io.BytesIO(data), formats=formats)
     except Exception as error:  # damaged bytes raise many kinds of errors
-        raise ImageError(
-            f"this is not a {', '.join(formats)} or HEIC image, or it is cut off: copy it again from the camera, or "
-            "save it as PNG"
-        ) from error
+        raise ImageError(_not_opened(data, formats)) from error
     if picture.format == "PNG" and getattr(picture, "is_animated", False):
         raise ImageError("this PNG is animated: save a single picture")
     if picture.format in ("JPEG", "MPO") and data.count(START_OF_SCAN) > SCANS:
@@ -131,10 +130,21 @@ def decode(
         ) from error
     if pixels.dtype not in (np.uint8, np.uint16) or pixels.ndim != 3 or pixels.shape[2] not in (1, 2, 3, 4):
         raise ImageError(
-            f"this {picture.format} image has {pixels.dtype} values in the shape {pixels.shape}: "
-            "save it as grey or RGB with 8 or 16 bits a channel"
+            f"this {picture.format} has {pixels.shape[-1]} channels of type {pixels.dtype}: {SAVE_IT}"
         )
     return upright(_kept(pixels, alpha), own if turn is None else turn)
+
+
+def _not_opened(data: bytes, formats: tuple[str, ...]) -> str:
+    """Why Pillow does not open an image."""
+    with suppress(Exception), tifffile.TiffFile(io.BytesIO(data)) as file:
+        channels, bits = int(file.pages[0].samplesperpixel), int(file.pages[0].bitspersample)
+        if channels not in (1, 3):
+            return f"this TIFF has {channels} channels of {bits} bits, which is not supported: {SAVE_IT}"
+    return (
+        f"this is not a {', '.join(formats)} or HEIC image, or it is cut off: copy it again from the camera, or "
+        "save it as PNG"
+    )
 
 
 def _kept(pixels: NDArray[np.generic], alpha: bool) -> Codes:
@@ -177,8 +187,8 @@ def _tiff(data: bytes, picture: Image.Image, memory: int) -> NDArray[np.generic]
             or page.samplesperpixel > 4
         ):
             raise ImageError(
-                f"this TIFF has {page.samplesperpixel} channels of {page.bitspersample} bits and the axes {page.axes}: "
-                "save it as grey or RGB with 8 or 16 bits a channel"
+                f"this TIFF has {page.samplesperpixel} channels of {page.bitspersample} bits "
+                f"and the axes {page.axes}: {SAVE_IT}"
             )
         check_size(*picture.size, -(-page.nbytes // (picture.width * picture.height)), memory)
         tiff_lzw.check_lzw(data, page)

@@ -20,6 +20,7 @@ from services.api.http.router import Router
 from services.api.http.server_timing import ServerTiming
 from services.api.jobs.jobs import Job
 from services.api.mattes import clips
+from services.api.mattes.backdrops import decode_backdrop, refuse_form
 from services.api.mattes.composite_params import CompositeParams
 from services.api.mattes.progress import Progress, progress_of, while_there
 from services.runtime.problems import NotAcceptable, NotNeeded, problem_of
@@ -28,7 +29,7 @@ from storage.layout.mattes import Matte
 from storage.records import mattes
 from workflows.composite import composite, light_on
 from workflows.composite.backdrops.around import put_around
-from workflows.composite.backdrops.backdrop import Backdrop, backdrop_of
+from workflows.composite.backdrops.backdrop import Backdrop
 from workflows.composite.depth import Rays, from_one, from_two
 from workflows.composite.engine import Window, compose, double, shrink
 from workflows.composite.interval import contrast_on, half_widths
@@ -121,6 +122,7 @@ async def post_composite(
         return await clips.composite_clip(context, request, id, options, params.webhook, idempotency_key)
     if params.webhook is not None:
         raise OptionError("webhook is for clips: a still is in the answer and has no job", field="webhook")
+    refuse_form(request)
     accept = request.headers.get("accept", "*/*")
     media_type = preferred(accept, ANSWERS)
     if media_type is None:
@@ -188,9 +190,7 @@ def _answer(
         return answer_problem(
             problem_of(NotNeeded(f"the caller already has this composite: {tag}")), {"ETag": tag}
         )
-    backdrop = backdrop_of(
-        times.take("decode", lambda: context.decoders.decode(body, params.transfer)), params.transfer
-    )
+    backdrop = times.take("decode", lambda: decode_backdrop(context.decoders, body, params.transfer))
     is_deep = media_type == "image/png" and backdrop.pixels.dtype != np.uint8
     matte = times.take("open", lambda: context.cache.matte(progress.id))
     window = Window.of(matte, params.x, params.y, params.width, params.height)

@@ -10,11 +10,8 @@ from services.cli import options
 from services.cli.output import example, open_whole, print_result, write
 from services.cli.progress import Progress
 from services.client import Client
+from services.decoding.first_bytes import LENGTH, is_video
 
-STILLS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1", b"avif", b"crx ")
-"""What pictures call themselves that are kept as MP4 is."""
-SYNC = b"\x47"
-"""How each packet of a transport stream begins, every 188 bytes or every 192."""
 MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".exr": "image/x-exr"}
 """Of composites, by the ends of file names."""
 LAYERS = ("all.exr", "stmap.exr", "S.png", "rho.png", "alpha.png", "confidence.png")
@@ -83,18 +80,8 @@ def _composite_clip(client: Client, matte: str, clip: Path, output: Path, params
 
 
 def _is_clip(file: Path) -> bool:
-    """Whether a file's first bytes are those of MP4 or MOV, MKV or WebM, AVI, or a transport stream (MTS)."""
     with file.open("rb") as source:
-        start = source.read(197)
-    # HEIC and CR3 are stills in the boxes of MP4.
-    is_still = start[8:12] in STILLS
-    return (
-        (start[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free") and not is_still)
-        or start[:4] == b"\x1aE\xdf\xa3"
-        or (start[:4] == b"RIFF" and start[8:12] == b"AVI ")
-        or start[:1] == start[188:189] == SYNC
-        or start[4:5] == start[196:197] == SYNC  # camcorders put a time before each packet
-    )
+        return is_video(source.read(LENGTH))
 
 
 @click.command(

@@ -307,6 +307,7 @@ def test_listing_keys_imports_nothing_heavy(tmp_path: Path) -> None:
         (b"\0\0\0\x18ftypcrx ", "still"),
         (b"\x89PNG\r\n\x1a\n", "still"),
         (b"GIF89a", "still"),
+        (b"GIF89a" + bytes(182) + b"\x47", "still"),
         (b"RIFF\0\0\0\0WEBP", "still"),
         (b"", "still"),
     ],

@@ -238,6 +238,14 @@ def test_unsupported_variants_are_refused(data: bytes) -> None:
         decode(data, memory=MEMORY)
 
 
+@pytest.mark.parametrize("dtype", ["uint8", "uint16"])
+@pytest.mark.parametrize("extra", [["unassalpha", "unspecified"], ["unspecified", "unassalpha"]])
+def test_tiff_of_many_channels_is_refused_with_their_number(dtype: str, extra: list[str]) -> None:
+    data = tiff(noise((8, 8, 5), dtype), photometric="rgb", extrasamples=extra)
+    with pytest.raises(ImageError, match="this TIFF has 5 channels of"):
+        decode(data, memory=MEMORY)
+
+
 PIXELS = noise((40, 30, 3), "uint8")
 VALID = {
     "png": encode_png(PIXELS),

@@ -107,3 +107,20 @@ def test_idempotency_key_that_is_too_long_is_refused(api: Api) -> None:
     assert answer.status_code == 422
     assert answer.json()["field"] == "Idempotency-Key"
     assert api.composite("alice", **clip, **{"Idempotency-Key": "k" * 256}).status_code == 202
+
+
+def test_video_sent_as_a_picture_is_refused_with_its_media_type(api: Api) -> None:
+    clip = b"\0\0\0\x18ftypisom" + bytes(300)
+    for headers in ({}, {"Content-Type": "application/x-www-form-urlencoded"}):
+        answer = api.composite("alice", body=clip, **headers)
+        assert answer.status_code == 415
+        assert "`Content-Type: video/mp4`" in answer.json()["detail"]
+    assert api.composite("alice", body=b"neither").status_code == 422
+
+
+def test_picture_in_a_form_is_refused(api: Api) -> None:
+    headers = {"Authorization": f"Bearer {api.keys['alice']}"}
+    url = f"{api.url}/v1/mattes/alice/composite"
+    answer = httpx2.post(url, files={"file": BACKDROP}, headers=headers, timeout=120)
+    assert answer.status_code == 415
+    assert "not in a form" in answer.json()["detail"]
