@@ -63,7 +63,13 @@ def identify(settings: Settings, engine: Engine, key: str | None) -> Caller:
             return Caller(row.owner, row.scope, number=row.number)
         if not settings.keys and not api_keys.any_created(c):
             return ANYONE
-    raise Unauthorized("send a key of this service: `Authorization: Bearer KEY`")
+    if key is None:
+        raise Unauthorized(
+            "send a key of this service: `Authorization: Bearer KEY`; the command line takes `--key`"
+        )
+    raise Unauthorized(
+        "this service does not know the key, or it was revoked; `envmatte keys make NAME` makes one"
+    )
 
 
 def check_method(caller: Caller, request: Request) -> None:

@@ -18,20 +18,24 @@ if TYPE_CHECKING:
     from sqlalchemy import Engine
 
 SCOPES = ("read", "write", "admin")
+DEFAULT = "default"
+"""The owner of what is made without a key."""
 
 
 @contextmanager
-def _opened(given: dict[str, Any]) -> Iterator["Engine"]:
+def _opened(given: dict[str, Any], *, made: bool = False) -> Iterator["Engine"]:
+    """The service's database, which is made if there is none and it may be."""
     from services.runtime import environment
     from services.runtime.data_folder import make_data
     from storage.database.engine import open_engine
+    from storage.maintenance.row_dump import open_without_upgrade
 
     found = environment.read_environment(("data", "database")) | drop_unset(given)
     data, database = Path(found.get("data", environment.DATA)), found.get("database")
-    if database is None:
+    if made and database is None:
         make_data(data)
     try:
-        engine = open_engine(environment.database_url(data, database))
+        engine = (open_engine if made else open_without_upgrade)(environment.database_url(data, database))
     except InvalidInput as error:
         raise click.UsageError(error.detail) from error
     try:
@@ -50,7 +54,7 @@ def keys() -> None:
 
 @keys.command(epilog=example("envmatte keys make lab --owner alice"))
 @click.argument("name")
-@click.option("--owner", default="default", show_default=True, help="Owner of what is made with the key.")
+@click.option("--owner", default=DEFAULT, show_default=True, help="Owner of what is made with the key.")
 @click.option(
     "--scope",
     type=click.Choice(SCOPES),
@@ -64,11 +68,20 @@ def keys() -> None:
 @as_json
 def make(name: str, owner: str, scope: str, as_json: bool, **given: Any) -> None:
     """Make a key and print it. It is shown only once: the database keeps a hash of it."""
+    from storage.database.dialects import display_url
     from storage.database.engine import writing
     from storage.records import api_keys
 
-    with _opened(given) as engine, writing(engine) as connection:
-        key = api_keys.create(connection, name, owner, scope)
+    with _opened(given, made=True) as engine:
+        with writing(engine) as connection:
+            key = api_keys.create(connection, name, owner, scope)
+        click.echo(
+            f"made in {display_url(engine.url)}: every request to its service needs a key now", err=True
+        )
+    if owner != DEFAULT:
+        click.echo(
+            f"what was made without a key belongs to {DEFAULT!r}, and {owner!r} does not see it", err=True
+        )
     print_result({"name": name, "owner": owner, "scope": scope, "key": key}, as_json, "key")
 
 

@@ -262,7 +262,11 @@ def test_page_asks_for_a_key_where_needed(tab: Page, tmp_path_factory: pytest.Te
         program = posted(locked)
         tab.goto(f"{locked.url}/v1/programs/{program['id']}/play")
         key = tab.get_by_label("Key of the service")
-        for text, status in (("wrong", "send a key"), ("ключ", "send a key"), ("secret", "Ready.")):
+        for text, status in (
+            ("wrong", "not know the key"),
+            ("ключ", "not know the key"),
+            ("secret", "Ready."),
+        ):
             expect(key).to_be_visible()
             key.fill(text)
             key.press("Enter")

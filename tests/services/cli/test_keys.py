@@ -20,3 +20,24 @@ def test_names_that_cannot_be_made_or_revoked_are_reported(
     ):
         refused = CliRunner().invoke(main, ["keys", *words])
         assert (refused.exit_code, reason in refused.stderr) == (1, True), refused.stderr
+
+
+def test_a_key_says_which_database_has_it_and_who_does_not_see_what(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    made = CliRunner().invoke(main, ["keys", "make", "lab", "--owner", "alice"])
+    assert str(tmp_path / "envmatte-data" / "envmatte.db") in made.stderr
+    assert "belongs to 'default', and 'alice' does not see it" in made.stderr
+    assert made.stdout.count("\n") == 1
+    assert CliRunner().invoke(main, ["keys", "list"]).stdout.startswith("lab\talice")
+
+
+@pytest.mark.parametrize("words", [("list",), ("revoke", "lab")])
+def test_no_database_is_made_to_look_for_keys(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    refused = CliRunner().invoke(main, ["keys", *words])
+    assert (refused.exit_code, "there is no database" in refused.stderr) == (1, True), refused.stderr
+    assert list(tmp_path.iterdir()) == []
