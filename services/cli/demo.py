@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from services.cli.options import as_json, key
+from services.cli.options import OutputFile, as_json, key
 from services.cli.output import example, print_result, write
 
 
@@ -12,7 +12,7 @@ from services.cli.output import example, print_result, write
 @click.option(
     "-o",
     "--output",
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=OutputFile,
     default=Path("envmatte-demo.png"),
     show_default=True,
     help="PNG to write.",

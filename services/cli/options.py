@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import click
 
@@ -12,6 +12,21 @@ from services.runtime.environment import read_environment
 F = TypeVar("F", bound=Callable[..., Any])
 
 InputFile = click.Path(exists=True, dir_okay=False, path_type=Path)
+
+
+class _OutputFile(click.Path):
+    """A file to write, whose folder is looked at before anything is computed for it."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        file = cast(Path, super().convert(value, param, ctx))
+        if not file.parent.is_dir():
+            raise click.ClickException(
+                f"{file} can't be written: there is no folder {file.parent}; make it first"
+            )
+        return file
+
+
+OutputFile = _OutputFile(dir_okay=False, path_type=Path)
 as_json = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
 data = click.option("--data", type=click.Path(path_type=Path), help="Folder of the service's data.")
 database = click.option(

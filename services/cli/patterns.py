@@ -10,6 +10,9 @@ from services.cli.output import example, print_result
 from services.cli.progress import Progress
 from workflows.programs.preset_names import PRESETS
 
+OTHER_VIDEOS = {".webm", ".mov", ".avi", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".wmv", ".ogv", ".gif"}
+"""Ends of names of videos that are not written: a folder of such a name is not what was meant."""
+
 
 def _size(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[int, int] | None:
     if text is None:
@@ -63,6 +66,8 @@ def patterns(
     from workflows.programs.files import fit_to_screen, load_program, write_folder
     from workflows.programs.video import FORMATS, write_video
 
+    if out.suffix.lower() in OTHER_VIDEOS:
+        raise click.UsageError(f"{out}: a video is written as {' or '.join(FORMATS)}; pictures, to a folder")
     if grey and program not in PRESETS:
         raise click.UsageError("--grey is for presets: a program in a file has the colours that it names")
     video = out.suffix.lower() in FORMATS

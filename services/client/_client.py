@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, BinaryIO, Self, overload
+from urllib.parse import quote
 
 from services.client._errors import JobFailed, NotFound
 from services.client._records import Capture, Job, Layers, Matte, Record
@@ -358,7 +359,13 @@ def _region(region: tuple[int, int, int, int]) -> dict[str, int]:
 
 
 def _path(kind: type[Record], record: Record | str) -> str:
-    return f"{kind.path}/{_id(record)}"
+    """The path of a record; an id that would be another path is that of none."""
+    id = _id(record)
+    if id in ("", ".", ".."):
+        raise NotFound(
+            {"title": "Not found", "status": 404, "detail": f"{id!r} is not an id: give one of those listed"}
+        )
+    return f"{kind.path}/{quote(id, safe='')}"
 
 
 def _key() -> dict[str, str]:

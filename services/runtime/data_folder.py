@@ -15,7 +15,14 @@ def make_data(data: Path) -> None:
     """Make a data folder that no other user of the machine can enter.
 
     The rights to one that exists are left alone, because somebody may have given them on purpose; a warning says so.
+
+    Raises
+    ------
+    Conflict
+        If it is a file.
     """
+    if data.is_file():
+        raise Conflict(f"{data} is a file: name a folder with --data")
     if not data.exists():
         data.mkdir(mode=0o700, parents=True, exist_ok=True)
     elif data.stat().st_mode & 0o077:

@@ -21,7 +21,6 @@ NODES = {
     "glsl": ("matte.live", "envmatte.js", "glass.html"),
 }
 """Files that make a node of a tool."""
-OutputFile = click.Path(dir_okay=False, path_type=Path)
 
 
 @click.command(epilog=example("envmatte composite MATTE backdrop.png -o composite.png"))
@@ -30,7 +29,7 @@ OutputFile = click.Path(dir_okay=False, path_type=Path)
 @click.option(
     "-o",
     "--output",
-    type=OutputFile,
+    type=options.OutputFile,
     required=True,
     help="File to write: .png, .jpg or .exr; .mp4 for a clip.",
 )
@@ -88,7 +87,7 @@ def _is_clip(file: Path) -> bool:
     epilog=example("envmatte export MATTE -o matte.zip", "envmatte export MATTE --html -o glass.html")
 )
 @click.argument("matte")
-@click.option("-o", "--output", type=OutputFile, required=True, help="File to write.")
+@click.option("-o", "--output", type=options.OutputFile, required=True, help="File to write.")
 @click.option("--html", is_flag=True, help="Write a web page that draws the glass without a service.")
 @options.remote
 def export(matte: str, output: Path, html: bool, url: str, key: str | None, as_json: bool) -> None:

@@ -156,6 +156,7 @@ def test_patterns_need_a_new_or_empty_folder(tmp_path: Path) -> None:
         (["quick", "x", "--monitor", "2x2"], "too small"),
         (["quick", "x", "--monitor", "99999x960"], "must be at most 16384"),
         (["program.json", "x", "--grey"], "--grey is for presets"),
+        (["quick", "x.webm"], "a video is written as .mp4 or .mkv"),
     ],
 )
 def test_invalid_patterns_are_refused(

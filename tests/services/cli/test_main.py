@@ -125,12 +125,13 @@ def test_exit_code_1_if_refused_failed_or_not_written(tmp_path: Path) -> None:
     assert (found.returncode, found.stdout) == (1, "")
     assert "no light" in found.stderr
     (tmp_path / "backdrop.png").write_bytes(b"any")
-    with scripted_server(lambda n: ok()) as (url, _):
-        output = tmp_path / "no folder" / "out.png"
-        found = envmatte("composite", "m", str(tmp_path / "backdrop.png"), "-o", str(output), "--url", url)
-    assert found.returncode == 1
-    assert "no folder" in found.stderr
-    assert "Traceback" not in found.stderr
+    output = tmp_path / "nowhere" / "out.png"
+    with scripted_server(lambda n: ok()) as (url, calls):
+        for command in (["composite", "m", str(tmp_path / "backdrop.png")], ["export", "m"], ["demo"]):
+            found = envmatte(*command, "-o", str(output), "--url", url)
+            assert found.returncode == 1
+            assert f"there is no folder {output.parent}; make it first" in found.stderr
+        assert not calls
 
 
 def test_errors_do_not_command_the_terminal() -> None:

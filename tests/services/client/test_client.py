@@ -71,5 +71,16 @@ def test_retried_delete_succeeds_if_the_first_attempt_did() -> None:
     assert [call["call"] for call in calls[1:]] == ["DELETE /v1/jobs/j"] * 3
 
 
+def test_an_id_reaches_no_other_path() -> None:
+    with scripted_server(lambda n: ok()) as (url, calls), Client(url) as client:
+        for id in ("../captures", "a/b", "a b?c#d%2F"):
+            client.job(id)
+        for id in ("", ".", ".."):
+            with pytest.raises(NotFound, match="is not an id"):
+                client.cancel(id)
+    ids = ["..%2Fcaptures", "a%2Fb", "a%20b%3Fc%23d%252F"]
+    assert [call["call"] for call in calls] == [f"GET /v1/jobs/{id}" for id in ids]
+
+
 def test_package_is_marked_as_typed() -> None:
     assert Path(package.__file__).parents[1].joinpath("py.typed").is_file()
