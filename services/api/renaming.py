@@ -10,6 +10,7 @@ from sqlalchemy import Connection, Row
 from services.api.context import Context
 from services.api.http.bodies import read_json, schema_of
 from storage.database.engine import reading, writing
+from workflows.untrusted.validation import Name
 
 CHANGE_BYTES = 1 << 12
 
@@ -18,7 +19,7 @@ class Change(BaseModel):
     """What to change."""
 
     model_config = ConfigDict(extra="forbid", str_strip_whitespace=True)
-    name: str = Field(max_length=200, pattern=r"\S", description="A name for people.")
+    name: Name = Field(min_length=1, description="A name for people.")
 
 
 CHANGE: dict[str, Any] = {"requestBody": {"content": {"application/json": {"schema": schema_of(Change)}}}}

@@ -11,7 +11,7 @@ from storage.errors import CaptureError
 from workflows.images.tone_curves import Response
 from workflows.programs.border import Border
 from workflows.programs.program import Program
-from workflows.untrusted.validation import reason
+from workflows.untrusted.validation import Name, reason
 
 MANIFEST = "capture.json"
 MANIFEST_BYTES = 4 << 20
@@ -97,9 +97,7 @@ class Manifest(BaseModel):
         },
     )
     format: Literal["envmatte-capture/1"] = Field(description="Name and version of this format.")
-    name: str = Field(
-        default="", max_length=200, description="Name of the capture, for people.", examples=["glass ball"]
-    )
+    name: Name = Field(default="", description="Name of the capture, for people.", examples=["glass ball"])
     program: Program = Field(description="What the monitor showed: enough to make the patterns again.")
     response: Response = Field(
         default="unknown",

@@ -1,6 +1,11 @@
 """Why a value does not fit a model, in our words: pydantic's name types of Python, and stay English in the app."""
 
+from typing import Annotated
+
+from pydantic import AfterValidator, Field
 from pydantic_core import ErrorDetails
+
+from workflows.untrusted.control_characters import CONTROL
 
 REASONS = {
     "missing": "is required",
@@ -53,3 +58,14 @@ def reason(fault: ErrorDetails) -> str:
     if kind in REASONS:
         return REASONS[kind].format(**fault.get("ctx", {}))
     return TYPES.get(kind.partition("_")[0], fault["msg"])
+
+
+def _without_controls(name: str) -> str:
+    if CONTROL.search(name):
+        raise ValueError("must have no line breaks or other control characters")
+    return name
+
+
+# PostgreSQL stores no NUL, and the others command terminals.
+Name = Annotated[str, Field(max_length=200), AfterValidator(_without_controls)]
+"""A name for people."""

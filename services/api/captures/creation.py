@@ -29,6 +29,7 @@ from storage.layout.uploads import Part
 from storage.records import bodies, captures, jobs, uploads
 from workflows.ingest.archive import CaptureArchive
 from workflows.interruption import checkpoint
+from workflows.untrusted.validation import Name
 
 logger = logging.getLogger(__name__)
 router = Router(tags=["captures"])
@@ -43,7 +44,7 @@ class FromUpload(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
     upload: str
-    name: str = Field("", max_length=200)
+    name: Name = ""
     webhook: str | None = Field(
         None, description="URL, https, that is notified when the capture is ingested."
     )
@@ -65,7 +66,7 @@ class FromUpload(BaseModel):
 async def upload(
     context: OwnerContext,
     request: Request,
-    name: Annotated[str, Query(max_length=200, description="A name for people.")] = "",
+    name: Annotated[Name, Query(description="A name for people.")] = "",
     webhook: Annotated[
         str | None, Query(description="URL, https, that is notified when the capture is ingested.")
     ] = None,

@@ -10,6 +10,7 @@ from fastapi import Header, Request
 from starlette.datastructures import Headers, MutableHeaders
 
 from services.runtime.problems import BadHeader, ChecksumMismatch, WrongVersion
+from workflows.untrusted.control_characters import CONTROL
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -176,7 +177,7 @@ def file_name(metadata: str) -> str:
     """The ``filename`` in an ``Upload-Metadata`` that `metadata_of` has checked, without its extension, or nothing."""
     pairs = dict(pair.strip().partition(" ")[::2] for pair in metadata.split(","))
     name = base64.b64decode(pairs.get("filename", "")).decode(errors="replace")
-    return PurePath(name.replace("\0", "")).stem[:NAME_LENGTH]
+    return PurePath(CONTROL.sub("", name)).stem[:NAME_LENGTH]
 
 
 def _base64(text: str, name: str) -> bytes:

@@ -26,6 +26,7 @@ from storage.layout.matte_archive import Archive, is_entry, may_lack
 from storage.layout.uploads import Part
 from storage.records import bodies, mattes
 from workflows.mattes.imports.importing import bytes_of_import, take_in
+from workflows.untrusted.validation import Name
 
 router = Router(tags=["mattes"])
 CALL = "POST /v1/mattes"
@@ -109,7 +110,7 @@ async def post_archive(
     context: OwnerContext,
     request: Request,
     response: Response,
-    name: Annotated[str, Query(max_length=200, description="A name for people.")] = "",
+    name: Annotated[Name, Query(description="A name for people.")] = "",
     idempotency_key: IdempotencyKey = None,
 ) -> Matte:
     """Import a matte: the body is an archive from `GET /v1/mattes/{id}/archive`.

@@ -45,6 +45,20 @@ def test_invalid_changes_are_refused(http: TestClient, collection: str) -> None:
     path = f"/v1/{collection}/ball"
     for wrong in ({"name": ""}, {"name": " "}, {"name": "x" * 201}, {"state": "ready"}, {}):
         assert http.patch(path, json=wrong).status_code == 422
+    for name, why in {
+        "": "must have 1 or more characters",
+        " ": "must have 1 or more characters",
+        "a\0b": "must have no line breaks or other control characters",
+        "a\x1b[2Jb": "must have no line breaks or other control characters",
+    }.items():
+        assert http.patch(path, json={"name": name}).json()["detail"] == f"name: {why}"
+        if name.strip():
+            found = http.get(f"/v1/{collection}", params={"name": name})
+            assert (found.status_code, found.json()["detail"]) == (422, f"name: {why}")
+            created = http.post(
+                f"/v1/{collection}", params={"name": name}, headers={"Content-Type": "application/zip"}
+            )
+            assert (created.status_code, created.json()["detail"]) == (422, f"name: {why}")
     assert http.get(path).json()["name"] == "ball"
     assert http.patch(f"/v1/{collection}/none", json={"name": "x"}).status_code == 404
     assert http.patch(path, content=b" " * 5000).status_code == 413

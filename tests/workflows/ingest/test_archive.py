@@ -112,6 +112,8 @@ def test_archive_without_a_record_is_refused(make_zip: Zip) -> None:
         (lambda r: r.update(response={"gamma": 99}), "response", ""),
         (lambda r: r.update(response="kodak"), "response", "linear"),
         (lambda r: r.update(name="x" * 201), "name", "200"),
+        (lambda r: r.update(name="a\0b"), "name", "control characters"),
+        (lambda r: r.update(name="a\r\nb"), "name", "control characters"),
         (lambda r: r["program"]["monitor"].update(width=0), "program.monitor.width", "must be at least 1"),
         (
             lambda r: r["program"]["parts"][0].update(levels=[0.5, 0.5]),

@@ -153,6 +153,7 @@ export const de = {
 	"must be {expected}": "muss {expected} sein",
 	"must have at most {max_length} characters": "darf höchstens {max_length} Zeichen haben",
 	"must have at most {max_length} entries": "darf höchstens {max_length} Einträge haben",
+	"must have no line breaks or other control characters": "darf keine Zeilenumbrüche und keine anderen Steuerzeichen enthalten",
 	"must have one of these in {discriminator}: {expected_tags}": "muss in {discriminator} eines von diesen haben: {expected_tags}",
 	"must have the field {discriminator}": "muss das Feld {discriminator} haben",
 	"must have {min_length} or more characters": "muss mindestens {min_length} Zeichen haben",
