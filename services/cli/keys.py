@@ -27,15 +27,18 @@ def _opened(given: dict[str, Any], *, made: bool = False) -> Iterator["Engine"]:
     """The service's database, which is made if there is none and it may be."""
     from services.runtime import environment
     from services.runtime.data_folder import make_data
+    from storage.database.dialects import require_existing
     from storage.database.engine import open_engine
-    from storage.maintenance.row_dump import open_without_upgrade
 
     found = environment.read_environment(("data", "database")) | drop_unset(given)
     data, database = Path(found.get("data", environment.DATA)), found.get("database")
-    if made and database is None:
-        make_data(data)
+    url = environment.database_url(data, database)
     try:
-        engine = (open_engine if made else open_without_upgrade)(environment.database_url(data, database))
+        if not made:
+            require_existing(url)
+        elif database is None:
+            make_data(data)
+        engine = open_engine(url)
     except InvalidInput as error:
         raise click.UsageError(error.detail) from error
     try:

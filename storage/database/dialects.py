@@ -22,7 +22,7 @@ from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.compiler import SQLCompiler
 from sqlalchemy.sql.functions import FunctionElement
 
-from storage.errors import DISK_FULL, EnvmatteError, InvalidInput, NoRoom, Unavailable
+from storage.errors import DISK_FULL, Conflict, EnvmatteError, InvalidInput, NoRoom, Unavailable
 
 logger = logging.getLogger(__name__)
 
@@ -178,6 +178,22 @@ def reason(error: BaseException | None) -> str:
     """The first line of a driver's error message, which contains no password."""
     message = str(error.orig if isinstance(error, DBAPIError) else error)
     return message.partition("\n")[0]
+
+
+def require_existing(url: str) -> None:
+    """Check that a database is there, since to open one of SQLite creates it.
+
+    Raises
+    ------
+    Conflict
+        If it is of SQLite and has no file.
+    """
+    engine = make_engine(url)
+    file = engine.url.database
+    if engine.dialect.name == "sqlite" and not (file and Path(file).is_file()):
+        raise Conflict(
+            f"there is no database {display_url(engine.url)}; name the service's database with --data or --database"
+        )
 
 
 def display_url(url: URL) -> str:

@@ -9,7 +9,6 @@ import json
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import groupby, islice
-from pathlib import Path
 from typing import Any
 
 from sqlalchemy import (
@@ -64,11 +63,9 @@ def open_without_upgrade(url: str) -> Engine:
     InvalidInput, Unavailable
         As for `storage.database.engine.open_engine`.
     """
+    dialects.require_existing(url)
     engine = dialects.make_engine(url)
     where = dialects.display_url(engine.url)
-    file = engine.url.database
-    if engine.dialect.name == "sqlite" and not (file and Path(file).is_file()):  # opening would create it
-        raise Conflict(f"there is no database {where}; name the service's database with --data or --database")
     try:
         with reading(engine) as c:
             found = revision(c)

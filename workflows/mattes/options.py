@@ -28,8 +28,8 @@ class RecoveryOptions(BaseModel):
         None,
         ge=16,
         le=1024,
-        description="Edge of the square tiles that the frame is cut into, in pixels, rounded up to whole blocks of the "
-        "matte. Each tile is one task. The default is one block. The matte does not depend on it.",
+        description="Edge of the square tiles, in pixels, rounded up to whole blocks of the matte. Each tile is one "
+        "task; the default is one block. The matte does not depend on it.",
     )
 
     @property

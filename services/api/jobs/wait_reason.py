@@ -42,7 +42,7 @@ def reason(connection: Connection, row: Row[Any], sign: Heartbeat | None) -> str
     if trouble is not None:
         return trouble
     if sign is not None and row.id in sign.cluster.get("without_store", ()):
-        return "its tiles cannot reach the store, and try again every few seconds"
+        return "its tiles cannot reach the store"
     if row.kind == "recover":
         state = connection.scalar(select(captures.c.state).where(captures.c.id == row.capture))
         if state == "ingesting":

@@ -11,8 +11,8 @@ class Constants(NamedTuple):
     sparsity: Annotated[
         float,
         Range(0.01, 1),
-        "Most cells that T may have at the finest level, as a share of the measurements; a fifth in the paper. Coarser "
-        "levels may have as many cells as measurements: a cell that they miss is lost.",
+        "Most cells of T at the finest level, as a share of the measurements; a fifth in the paper. Coarser levels may "
+        "have as many as measurements.",
     ] = 0.2
     growth: Annotated[
         float,

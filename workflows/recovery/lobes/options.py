@@ -32,7 +32,7 @@ class LobesOptions(NamedTuple):
         float,
         Range(0, 1),
         "Lobes are fitted a second time, starting from their posterior mean, where they leave more than this variance "
-        "of a black-and-white pattern (-1 to 1) unexplained. 1 corresponds to a single ray that the lobes miss.",
+        "of a black-and-white pattern (-1 to 1) unexplained. 1: a single ray is missed.",
     ] = 0.01
     passes: Annotated[
         int,
