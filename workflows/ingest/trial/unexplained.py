@@ -16,7 +16,7 @@ from workflows.ingest.trial.trial_recovery import (
     recover_sample,
 )
 from workflows.programs.program import Program
-from workflows.recovery.camera.noise import Noise, fit_noise
+from workflows.recovery.camera.noise import LEAST_READ, Noise, fit_noise
 from workflows.recovery.glare import LEAST, Spread, centres, filter_patterns, fit_shares, spread_patterns
 from workflows.recovery.normalise import normalise
 from workflows.recovery.pyramid import Pyramid
@@ -217,14 +217,15 @@ class Rest:
                 self.level[flat].astype(np.float64),
                 (square * self.worth[flat]).astype(np.float64),
             )
-            found = fit_noise(level, square, noise.read / 100) or noise
+            floor = max(noise.read / 100, LEAST_READ)
+            found = fit_noise(level, square, floor) or noise
             if assumed or found.variance(_GREY)[0] > HIDDEN * noise.variance(_GREY)[0]:
                 noise = found
             elif self.filmed:
                 # Exposures and local tone mapping that are not quite right widen what a film shows beyond black and
                 # white, which its noise was measured by. All that is left is an upper limit.
                 square = (self.rest[flat] / 2 * self.rho[flat]) ** 2 * self.worth[flat]
-                limit = fit_noise(level, square.astype(np.float64), noise.read / 100)
+                limit = fit_noise(level, square.astype(np.float64), floor)
                 if limit and limit.variance(_GREY)[0] < noise.variance(_GREY)[0]:
                     noise = limit
         error = float(np.sqrt(max(common, 0.0)) / 2)

@@ -16,6 +16,7 @@ from workflows.ingest.trial import unexplained
 from workflows.ingest.trial.trial_recovery import take_sample
 from workflows.programs.program import Constant, Program
 from workflows.programs.pyramid_light import lay_out
+from workflows.recovery.camera.noise import LEAST_READ
 from workflows.recovery.glare import WIDTHS
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import Scene
@@ -111,6 +112,21 @@ def test_noise_that_constant_frames_hide_is_measured(
     assert not stack.attributes["assumed_noise"]
     assert stack.attributes["noise_of_patterns"] == (shown < 1)
     np.testing.assert_allclose(deviation(stack), NOISE, rtol=0.3)
+
+
+def test_channels_that_are_one_leave_the_noise_of_quantisation(
+    scene: Scene, program: Program, ingest: Ingest
+) -> None:
+    """They differ by nothing, and frames in the wrong order are explained by nothing."""
+    pictures, first = list(program.pictures(0, program.count)), int(program.measured[0])
+    order = [*range(first), *np.random.default_rng(1).permutation(program.measured)]
+
+    def see(n: int, _: NDArray[np.uint8]) -> NDArray[np.floating]:
+        return np.repeat(0.02 + 0.7 * scene.composite(pictures[order[n]])[..., :1], 3, axis=2)
+
+    stack = ingest("c", captured(program, see))
+    assert stack.attributes["noise"]["read"] >= LEAST_READ
+    assert error_of(stack.attributes) > 0.1
 
 
 def test_error_of_the_model_is_what_channels_have_in_common(
