@@ -106,6 +106,25 @@ def test_of_a_task_of_several_tiles_the_one_that_ended_it_is_blamed(
         assert found[6] == Outcome("a", 6)
 
 
+def test_no_tile_is_given_to_a_worker_that_ends_for_a_dropped_job(
+    cluster: LocalCluster, tmp_path: Path
+) -> None:
+    def work(objects: Objects, task: Task, tile: int) -> int:
+        time.sleep(60 if task.job == "dropped" else 0)
+        return 10
+
+    steps = replace(STEPS, work=work)
+    with Dispatcher(lambda: Client(cluster, set_as_default=False), tmp_path.as_uri()) as dispatcher:
+        until(lambda: dispatcher.free == 1)
+        dispatcher.submit(steps, task("dropped"), [[1]])
+        time.sleep(2)  # until it runs
+        dispatcher.drop("dropped")
+        until(lambda: dispatcher.free == 1)
+        dispatcher.submit(steps, task("next"), [[1]])
+        (outcome,) = outcomes(dispatcher, 1)
+        assert outcome.done is not None, outcome
+
+
 def test_a_missing_scheduler_is_reported_as_a_problem() -> None:
     def connect() -> Client:
         raise Unavailable("no scheduler answers at tcp://127.0.0.1:1")
