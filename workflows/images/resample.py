@@ -7,6 +7,9 @@ from numpy.typing import NDArray
 
 Value = TypeVar("Value", bound=np.generic)
 
+# Values in a strip of a stretched axis.
+_STRIP = 1 << 20
+
 
 def smallest_grid(image: NDArray[Value]) -> NDArray[Value]:
     """Reduce an image to the coarsest regular grid on which it loses nothing.
@@ -89,3 +92,39 @@ def area_mean(image: NDArray[np.float32], columns: int, rows: int) -> NDArray[np
         integral = whole[below] + part * moved[below]
         image = np.moveaxis(np.diff(integral, axis=0) * (cells / n), 0, axis).astype(np.float32)
     return np.ascontiguousarray(image)
+
+
+def stretched_mean(
+    values: NDArray[np.float32],
+    monitor: tuple[int, int],
+    columns: int,
+    rows: int,
+    offset: tuple[int, int] = (0, 0),
+) -> NDArray[np.float32]:
+    """The mean over each cell of a grid of values that are stretched over a monitor, and rolled.
+
+    Parameters
+    ----------
+    values : (height, width, channels) float32
+    monitor : (int, int)
+        Width and height in pixels.
+    columns, rows : int
+        The grid.
+    offset : (int, int)
+        Pixels x and y of the monitor that the stretched values are rolled back by.
+
+    Returns
+    -------
+    (rows, columns, channels) float32
+        As `area_mean` of the rolled result of `stretch`, but no array has all of the monitor's pixels: one axis after
+        the other is stretched and averaged, in strips.
+    """
+    for axis, cells in ((0, rows), (1, columns)):
+        pixels, n, across = monitor[1 - axis], values.shape[axis], values.shape[1 - axis]
+        at = (np.arange(pixels) + offset[1 - axis]) % pixels * n // pixels
+        means = []
+        for strip in np.array_split(values, -(-pixels * across // _STRIP), axis=1 - axis):
+            grid = (strip.shape[1], cells) if axis == 0 else (cells, strip.shape[0])
+            means.append(area_mean(strip.take(at, axis=axis), *grid))
+        values = np.concatenate(means, axis=1 - axis)
+    return values

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, FailFast, Field, model_validator
 
-from workflows.images.resample import area_mean, stretch
+from workflows.images.resample import stretched_mean
 from workflows.images.tone_curves import Response
 
 MAX_BLOCKS = 4096
@@ -153,11 +153,9 @@ class Bernoulli(Record):
 
     def means(self, monitor: Monitor, columns: int, rows: int) -> Iterator[NDArray[np.float32]]:
         """The mean of each pattern, offset applied, over the cells of a grid: (rows, columns, 1 or 3) float32 each."""
-        # One axis is averaged before the other is stretched, so that no array has all of the monitor's pixels.
-        for bits, (dx, dy) in zip(self.bits, self.offsets(monitor), strict=True):
-            tall = np.roll(stretch(bits.astype(np.float32), self.columns, monitor.height), -dy, axis=0)
-            wide = np.roll(stretch(area_mean(tall, self.columns, rows), monitor.width, rows), -dx, axis=1)
-            yield area_mean(wide, columns, rows)
+        size = monitor.width, monitor.height
+        for bits, (dx, dy) in zip(self.bits, self.offsets(monitor).tolist(), strict=True):
+            yield stretched_mean(bits.astype(np.float32), size, columns, rows, (dx, dy))
 
     @property
     def _words(self) -> int:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import FailFast, Field, model_validator
 
-from workflows.images.resample import stretch
+from workflows.images.resample import stretch, stretched_mean
 from workflows.images.tone_curves import Curve, to_light
 from workflows.programs.nested_grids import Shape, chain, fitting, nested, sense
 from workflows.programs.parts import (
@@ -173,6 +173,20 @@ class Program(Record):
                 yield self._placed(point(values), offset)
             else:
                 yield point(self._placed(values, offset))
+
+    def means(
+        self,
+        point: Callable[[NDArray[np.float32]], NDArray[np.float32]],
+        columns: int,
+        rows: int,
+        first: int,
+        last: int,
+        images: Sequence[NDArray[np.float32]] = (),
+    ) -> Iterator[NDArray[np.float32]]:
+        """The means of what `mapped` gives over the cells of a grid, (rows, columns, 1 or 3) float32 each."""
+        size = self.monitor.width, self.monitor.height
+        for values, offset in self._drawn(first, last, images):
+            yield stretched_mean(point(values), size, columns, rows, offset or (0, 0))
 
     def _values(
         self, first: int, last: int, images: Sequence[NDArray[np.float32]]

@@ -1,15 +1,14 @@
 """The light of a program's patterns on a pyramid of grids over the monitor."""
 
 from collections.abc import Iterator, Sequence
-from itertools import compress, islice
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
 
 from workflows.images.integer_formats import Codes, to_integers
-from workflows.images.resample import area_mean
 from workflows.images.tone_curves import Curve, to_light
-from workflows.programs.program import Program
+from workflows.programs.program import Constant, Halftone, Program
 from workflows.recovery.pyramid import Pyramid, halve_codes
 from workflows.recovery.sensing import Patterns
 
@@ -52,9 +51,7 @@ def lay_out(program: Program, curve: Curve, images: Sequence[NDArray[np.float32]
     columns, rows = pyramid.grids[0]
     m = program.measured.size
     code = np.empty((pyramid.nodes, channels * m), np.uint8)
-    measured = compress(
-        _codes(program, curve, images, columns, rows), np.isin(np.arange(program.count), program.measured)
-    )
+    measured = _codes(program, curve, images, columns, rows)
     planes = np.empty((channels, min(_BATCH, m), rows, columns), np.uint8)
     for first in range(0, m, _BATCH):
         batch = planes[:, : m - first]
@@ -73,11 +70,16 @@ def lay_out(program: Program, curve: Curve, images: Sequence[NDArray[np.float32]
 def _codes(
     program: Program, curve: Curve, images: Sequence[NDArray[np.float32]], columns: int, rows: int
 ) -> Iterator[Codes]:
-    """The light of a program's pictures on a grid, (rows, columns, 1 or 3) uint8 each."""
-    if (columns, rows) == (program.monitor.width, program.monitor.height):
-        return program.mapped(
-            lambda values: to_integers(to_light(values, curve), CODE), 0, program.count, images
-        )
-    # The light of a cell is the mean of its pixels: the curve is applied before, rounding after.
-    lights = program.mapped(lambda values: to_light(values, curve), 0, program.count, images)
-    return (to_integers(area_mean(light, columns, rows), CODE) for light in lights)
+    """The light of the pictures that tell T on a grid, (rows, columns, 1 or 3) uint8 each."""
+    at_pixels = (columns, rows) == (program.monitor.width, program.monitor.height)
+    for start, part in zip(program.starts, program.parts, strict=False):
+        if isinstance(part, Constant | Halftone):
+            continue
+        numbers = start, start + part.count
+        if at_pixels:
+            yield from program.mapped(
+                lambda values: to_integers(to_light(values, curve), CODE), *numbers, images
+            )
+        else:  # the light of a cell is the mean of its pixels: the curve is applied before, rounding after
+            lights = program.means(lambda values: to_light(values, curve), columns, rows, *numbers, images)
+            yield from (to_integers(light, CODE) for light in lights)

@@ -1,10 +1,12 @@
 """Images on grids: exact means against a plain integral, and the smallest grid that loses nothing."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from workflows.images.resample import area_mean, smallest_grid, stretch
+from workflows.images.resample import area_mean, smallest_grid, stretch, stretched_mean
 
 
 def test_smallest_grid_loses_no_detail() -> None:
@@ -68,3 +70,27 @@ def test_stretching_gives_each_pixel_its_block(columns: int, rows: int) -> None:
     for y in range(6):
         for x in range(8):
             np.testing.assert_array_equal(picture[y, x], values[y * rows // 6, x * columns // 8])
+
+
+@pytest.mark.parametrize("offset", [(0, 0), (5, 17)])
+@pytest.mark.parametrize(("columns", "rows"), [(20, 15), (10, 8), (7, 5), (40, 30)])
+@pytest.mark.parametrize("shape", [(6, 8, 3), (1, 16, 1), (30, 40, 1), (11, 13, 1)])
+def test_mean_of_what_is_stretched_and_rolled(
+    shape: tuple[int, int, int], columns: int, rows: int, offset: tuple[int, int]
+) -> None:
+    values = np.random.default_rng(0).integers(0, 2, shape).astype(np.float32)
+    rolled = np.roll(stretch(values, 40, 30), (-offset[1], -offset[0]), axis=(0, 1))
+    got = stretched_mean(values, (40, 30), columns, rows, offset)
+    np.testing.assert_array_equal(got, area_mean(rolled, columns, rows))
+
+
+def test_a_large_monitor_takes_little_memory() -> None:
+    values = np.random.default_rng(0).random((512, 700, 1), np.float32)
+    tracemalloc.start()
+    try:
+        got = stretched_mean(values, (16384, 16384), 1024, 1000, (3, 4))
+        assert tracemalloc.get_traced_memory()[1] < 100_000_000
+    finally:
+        tracemalloc.stop()
+    assert got.shape == (1000, 1024, 1)
+    np.testing.assert_allclose(got.mean(), values.mean(), atol=1e-5)

@@ -1,5 +1,7 @@
 """The patterns of a program on a pyramid: the pictures at its first grid, channel after channel, whatever the room."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -7,7 +9,7 @@ from numpy.typing import NDArray
 from workflows.images.resample import area_mean
 from workflows.images.tone_curves import Curve, Gamma, to_light
 from workflows.programs import pyramid_light
-from workflows.programs.program import Bernoulli, Constant, Images, Monitor, Program, Stripes
+from workflows.programs.program import Bernoulli, Constant, Halftone, Images, Monitor, Program, Stripes
 from workflows.programs.pyramid_light import lay_out, pyramid_of
 from workflows.recovery.sensing import Patterns
 
@@ -113,6 +115,19 @@ def test_with_little_room_cells_are_means_of_pixels(
     assert laid_out.pyramid.grids[0] == grid
     assert laid_out.code.nbytes <= room
     check(laid_out, light_of(program, "srgb", images))
+
+
+def test_a_large_monitor_takes_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its pixels would take 1 GB for each channel, those of constant patterns and half-tones too."""
+    monitor = Monitor(width=16384, height=16384)
+    parts = (CONSTANT, Halftone(kind="halftone", levels=(0.25,)), MANY)
+    monkeypatch.setattr(pyramid_light, "PATTERNS_BYTES", 1 << 23)
+    tracemalloc.start()
+    try:
+        lay_out(Program(monitor=monitor, parts=parts), "srgb")
+        assert tracemalloc.get_traced_memory()[1] < 100_000_000
+    finally:
+        tracemalloc.stop()
 
 
 def test_three_channels_take_three_times_the_room(monkeypatch: pytest.MonkeyPatch) -> None:
