@@ -26,8 +26,10 @@ RETRIES: "RetryConfig" = {
     "backoff": {"init_backoff": timedelta(seconds=0.1), "max_backoff": timedelta(seconds=5), "base": 4},
 }
 """For requests that a bucket does not answer, or answers with a server error: a minute in all."""
-UNREACHABLE = re.compile(r"HTTP error|status code: (429|5\d\d)|error sending request|response body")
-"""Messages of obstore for a bucket that does not answer, or answers with a server error; they have no own class."""
+UNREACHABLE = re.compile(
+    r"HTTP error(: [a-z ]+)?|status code: (429|5\d\d)|error sending request|response body"
+)
+"""In messages of obstore for a bucket that does not answer, or answers with a server error; they have no own class."""
 
 
 @contextmanager
@@ -51,8 +53,8 @@ def translate_errors() -> Iterator[None]:
             raise NoRoom(DISK_FULL) from error
         if f"(os error {errno.ENOENT})" in str(error):
             raise FileNotFoundError(errno.ENOENT, message) from error
-        if message.startswith(("Generic S3 error", "Generic HTTP error")) and UNREACHABLE.search(message):
-            raise StoreUnavailable(
-                f"the store cannot be reached; try again later ({message.rpartition(' - ')[2].strip(': ')})"
-            ) from error
+        found = [match[0] for match in UNREACHABLE.finditer(message)]
+        if message.startswith(("Generic S3 error", "Generic HTTP error")) and found:
+            # No more than that: the message goes on with the bucket's answer.
+            raise StoreUnavailable(f"the store cannot be reached; try again later ({found[-1]})") from error
         raise

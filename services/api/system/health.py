@@ -1,6 +1,7 @@
 """Health checks: whether the service is alive, and whether it can work. Both answer at once, whatever else goes on."""
 
 import asyncio
+import logging
 import time
 from collections.abc import Callable
 from typing import Literal
@@ -14,10 +15,12 @@ from services.api.jobs.wait_reason import trouble_of
 from storage.database.disk_reserve import file_of
 from storage.database.engine import reading
 from storage.disks import require_reserve
+from storage.errors import EnvmatteError
 from storage.objects.store import Objects
 from storage.records import leases
 from storage.records.leases import Heartbeat
 
+logger = logging.getLogger(__name__)
 router = APIRouter(tags=["system"])
 INTERVAL = 1.0
 """Seconds between two checks of the same thing, however often readiness is asked for."""
@@ -70,7 +73,12 @@ class Check:
         try:
             return self._check()
         except Exception as error:
-            return f"{type(error).__name__}: {error}"
+            # Anybody may ask. What libraries say may name servers, buckets, files and keys, and what a bucket answers.
+            unsaid = f"{type(error).__name__}; the log of the service has more"
+            found = error.detail if isinstance(error, EnvmatteError) else unsaid
+            if found != self._last:
+                logger.warning("not ready: %s", found, exc_info=True)
+            return found
 
 
 def checks(engine: Engine, objects: Objects) -> dict[str, Check]:

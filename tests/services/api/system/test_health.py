@@ -64,27 +64,41 @@ def test_checks_run_once_in_an_interval_however_often_they_are_asked_for() -> No
     assert 2 <= len(runs) <= 3
 
 
-def test_checks_write_nothing_and_name_what_fails(engine: Engine, objects: Objects, tmp_path: Path) -> None:
+async def _results(engine: Engine, objects: Objects) -> dict[str, str]:
+    async with asyncio.timeout(60):
+        made = checks(engine, objects)
+        found = {name: await check.result() for name, check in made.items()}
+        while any(text.startswith("no answer") for text in found.values()):
+            found = {name: await check.result() for name, check in made.items()}
+        return found
+
+
+def test_checks_write_nothing_and_name_what_fails(
+    engine: Engine, objects: Objects, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     executed: list[str] = []
 
     @event.listens_for(engine, "before_cursor_execute")
     def record(connection: Any, cursor: Any, statement: str, *_: Any) -> None:
         executed.append(statement)
 
-    async def ask() -> dict[str, str]:
-        async with asyncio.timeout(60):
-            made = checks(engine, objects)
-            found = {name: await check.result() for name, check in made.items()}
-            while any(text.startswith("no answer") for text in found.values()):
-                found = {name: await check.result() for name, check in made.items()}
-            return found
-
     before = sorted((tmp_path / "store").rglob("*"))
-    found = asyncio.run(ask())
+    found = asyncio.run(_results(engine, objects))
     assert (found["database"], found["store"]) == ("ok", "ok")
     assert "no coordinator has ever given a sign of life" in found["cluster"]
     assert {statement.split()[0] for statement in executed} == {"BEGIN", "SELECT"}
     assert sorted((tmp_path / "store").rglob("*")) == before
     engine.dispose()
     (tmp_path / "ledger.db").write_bytes(b"not a database, but long enough to be read as one" * 100)
-    assert "file is not a database" in asyncio.run(ask())["database"]
+    found = asyncio.run(_results(engine, objects))
+    assert found["database"] == found["cluster"] == "DatabaseError; the log of the service has more"
+    assert "file is not a database" in caplog.text
+
+
+def test_what_a_bucket_answers_is_in_the_log_only(
+    engine: Engine, s3: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    elsewhere = Objects(s3.replace("envmatte", "another"))
+    found = asyncio.run(_results(engine, elsewhere))
+    assert found["store"] == "GenericError; the log of the service has more"
+    assert "NoSuchBucket" in caplog.text
