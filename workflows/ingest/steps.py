@@ -52,19 +52,7 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
     with uploads.read(objects, task.capture) as file, Decoder(limits.image) as decoder:
         archive = CaptureArchive(file, limits)
         manifest = archive.manifest
-        names = [n for part in manifest.program.parts if isinstance(part, Images) for n in part.files]
-        patterns: list[NDArray[np.float32]] = []
-        for name in names:
-            patterns.append(
-                integer_formats.to_unit(smallest_grid(stills.read_integers(decoder, archive, name)))
-            )
-            if sum(pattern.nbytes for pattern in patterns) > limits.memory // 2:
-                raise CaptureError(
-                    f"the image files of patterns, up to {name}, take more than {limits.memory // 2} bytes together: "
-                    "use fewer, smaller or coarser ones",
-                    entry=name,
-                    limit=limits.memory // 2,
-                )
+        patterns = _decode_patterns(decoder, archive, limits)
         # One orientation for all frames: a camera that looks down detects its orientation at random.
         turn, half_colour = 1, False
         if manifest.video is None:
@@ -78,6 +66,12 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
                 raise CaptureError(
                     f"{manifest.mask} is {_size(mask)}, the frames are {shape[2]} x {shape[1]}"
                     + (", turned upright as the first of them says" if turn > 1 else ""),
+                    entry=manifest.mask,
+                )
+            if not mask.any():
+                raise CaptureError(
+                    f"{manifest.mask} is black everywhere, so nothing would be recovered: paint what is to be "
+                    "recovered white in it, for transparency is not read",
                     entry=manifest.mask,
                 )
     frames, height, width, _ = shape
@@ -123,6 +117,34 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
     notes = [] if filmed is None else filmed.notes
     size = {"width": width, "height": height, "frames": frames, "video": filmed is not None}
     return {"tiles": -(-frames // slab), "slab": slab, "memory": limits.memory, **size, "notes": notes}
+
+
+def _decode_patterns(decoder: Decoder, archive: CaptureArchive, limits: Limits) -> list[NDArray[np.float32]]:
+    """The patterns that are images, in order, each file decoded once however often the program shows it."""
+    names = [n for part in archive.manifest.program.parts if isinstance(part, Images) for n in part.files]
+    images: dict[str, NDArray[np.float32]] = {}
+    decoded = kept = 0
+    for name in names:
+        if name not in images:
+            pixels = stills.read_integers(decoder, archive, name)
+            decoded += pixels.nbytes
+            if decoded > limits.unpacked:
+                raise CaptureError(
+                    f"the image files of patterns, up to {name}, take {decoded} bytes, more than the "
+                    f"{limits.unpacked} allowed: use fewer or smaller ones",
+                    entry=name,
+                    limit=limits.unpacked,
+                )
+            images[name] = integer_formats.to_unit(smallest_grid(pixels))
+        kept += images[name].nbytes
+        if kept > limits.memory // 2:
+            raise CaptureError(
+                f"the image files of patterns, up to {name}, take more than {limits.memory // 2} bytes together: "
+                "use fewer, smaller or coarser ones",
+                entry=name,
+                limit=limits.memory // 2,
+            )
+    return [images[name] for name in names]
 
 
 def _examine(

@@ -15,7 +15,8 @@ class Limits:
     Attributes
     ----------
     unpacked : int
-        Bytes that all entries of an archive may unpack to together, and that all frames may take once decoded.
+        Bytes that all entries of an archive may unpack to together, that all frames may take once decoded, and that all
+        images of patterns may.
     memory : int
         Bytes that one reader may hold. An entry, or a decoded image, may take a quarter of it.
     frames, pixels : int, optional

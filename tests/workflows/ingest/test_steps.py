@@ -23,7 +23,7 @@ from tests.parts.captures import nested_program
 from tests.workflows.ingest.video.camera import Camera, Film, capture, film
 from tests.workflows.ingest.video.films import CAMERA, PROGRAM, IngestFilm, program_with
 from workflows.images.integer_formats import encode_png
-from workflows.ingest import steps
+from workflows.ingest import steps, stills
 from workflows.jobs import Task
 from workflows.recovery.camera.noise import Noise
 from workflows.simulation.glass_ball import glass_ball
@@ -128,6 +128,27 @@ def test_patterns_that_are_large_images_are_refused(make_zip: Zip, ingest: Inges
     assert caught.value.fields == {"entry": names[4], "limit": 200_000}
 
 
+def test_images_of_patterns_are_decoded_once_and_within_a_limit(
+    make_zip: Zip, ingest: Ingest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flat = encode_png(np.full((60, 60, 3), 9, np.uint8))
+    read, decoded = stills.read_integers, []
+    monkeypatch.setattr(stills, "read_integers", lambda *given: decoded.append(given[2]) or read(*given))
+    pictures = {f"{n}.png": encode_png(frame) for n, frame in enumerate(shots(12, 1, "uint8"))}
+
+    def given(names: list[str]) -> bytes:
+        made = record(list(range(12)))
+        made["program"]["parts"][1] = {"kind": "images", "files": names}
+        return make_zip(made, pictures | dict.fromkeys(names, flat), zipfile.ZIP_DEFLATED)
+
+    assert len(ingest("c", given(["a.png", "b.png", *["a.png"] * 7])).images()) == 9
+    assert decoded == ["a.png", "b.png"]
+    unpacked = 5 * 60 * 60 * 3
+    with pytest.raises(CaptureError, match="take 64800 bytes, more than the 54000") as caught:
+        ingest("c", given([f"{n}.jpg" for n in range(9)]), unpacked=unpacked)
+    assert caught.value.fields == {"entry": "5.jpg", "limit": unpacked}
+
+
 def test_slabs_in_any_order_and_again_are_the_same_bytes(
     make_zip: Zip, ingest: Ingest, digests: Digests
 ) -> None:
@@ -181,6 +202,20 @@ def test_a_mask_of_another_size_is_refused(make_zip: Zip, ingest: Ingest) -> Non
     files = {"mask.png": encode_png(np.zeros((WIDTH, HEIGHT, 1), np.uint8))}
     data = archive_of(make_zip, shots(6, 3, "uint8"), list(range(6)), mask="mask.png", files=files)
     with pytest.raises(CaptureError, match="the frames are 37 x 21") as caught:
+        ingest("c", data)
+    assert caught.value.fields == {"entry": "mask.png"}
+
+
+@pytest.mark.parametrize("channels", [1, 4])
+def test_a_mask_of_nothing_is_refused(make_zip: Zip, ingest: Ingest, channels: int) -> None:
+    """Also a black cut-out, whose shape is in its transparency."""
+    cut_out = np.zeros((HEIGHT, WIDTH, channels), np.uint8)
+    cut_out[5:, 5:, 3:] = 255
+    target = io.BytesIO()
+    Image.fromarray(cut_out.squeeze()).save(target, "PNG")
+    files = {"mask.png": target.getvalue()}
+    data = archive_of(make_zip, shots(6, 3, "uint8"), list(range(6)), mask="mask.png", files=files)
+    with pytest.raises(CaptureError, match="black everywhere") as caught:
         ingest("c", data)
     assert caught.value.fields == {"entry": "mask.png"}
 
