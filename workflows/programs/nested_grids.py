@@ -82,9 +82,11 @@ def sense(light: Iterable[NDArray[np.float32]], shapes: Sequence[Shape], grids: 
     shapes : sequence of Shape
         The shape of each pattern.
     grids : sequence of (int, int)
-        From coarse to fine, each a whole multiple of the one before.
+        From coarse to fine, each a whole multiple of the one before. Those coarser than every pattern are left out:
+        nothing could be solved on them.
     """
     first = np.array([_first_level(shape, grids) for shape in shapes])
+    grids, first = grids[first.min() :], first - first.min()
     channels = max(shape.channels for shape in shapes)
     levels = []
     for at, (columns, rows) in enumerate(grids):

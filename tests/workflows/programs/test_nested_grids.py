@@ -183,6 +183,14 @@ def test_stripes_alone_make_levels_that_hold_both_axes() -> None:
             np.testing.assert_array_equal(exact, pictures[n])
 
 
+def test_levels_coarser_than_every_pattern_are_left_out() -> None:
+    """Coloured stripes lie on the grid of the finest of three."""
+    levels = program(stripes("x", 2, 0, "rgb"), stripes("y", 1, 0, "rgb")).sensing("linear").levels
+    grids = [(level.columns, level.rows) for level in levels]
+    assert grids == [(8, 8), (16, 8), (32, 8), (64, 8)]
+    assert [level.patterns.tolist() for level in levels] == [[0, 2], [0, 2], [0, 2], [0, 1, 2]]
+
+
 def test_levels_that_are_too_large_are_left_out() -> None:
     parts = [grid(64, 64, 64), grid(256, 256, 64), grid(1024, 1024, 64)]
     levels = program(*parts, width=1024, height=1024).sensing("linear").levels
