@@ -3,6 +3,7 @@
 `Manifest.model_json_schema()` is published as the JSON Schema of the format, so every field has a description.
 """
 
+import codecs
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
@@ -138,8 +139,11 @@ def parse_manifest(text: bytes) -> Manifest:
             entry=MANIFEST,
             limit=MANIFEST_NODES,
         )
+    if text.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise CaptureError(f"{MANIFEST} is in UTF-16: save it in UTF-8", entry=MANIFEST)
     try:
-        return Manifest.model_validate_json(text)
+        # Editors and shells of Windows write the mark before UTF-8, which JSON does not have.
+        return Manifest.model_validate_json(text.removeprefix(codecs.BOM_UTF8))
     except ValidationError as error:
         # Each member of a union that was tried gives an error; the deepest one is the most specific.
         first = max(error.errors(include_url=False), key=lambda e: len(e["loc"]))

@@ -138,7 +138,7 @@ def storage_of(decoder: Decoder, archive: CaptureArchive, first: NDArray[np.gene
     Raises
     ------
     CaptureError
-        If float frames are said to have a tone curve, or the white frame has no light.
+        If float frames are said to have a tone curve, or the white frame has no light, or is clipped everywhere.
 
     Notes
     -----
@@ -163,6 +163,10 @@ def storage_of(decoder: Decoder, archive: CaptureArchive, first: NDArray[np.gene
         values = read(decoder, archive, entry)
         finite = values[np.isfinite(values)]
         full = 0.0
+        if not finite.size and np.isposinf(values).any():
+            raise CaptureError(
+                f"{entry}, the brightest constant frame, is clipped everywhere: expose shorter", entry=entry
+            )
         if finite.size:
             full = HEADROOM * min(float(finite.max()), HIGHLIGHT * float(np.percentile(finite, 99)))
     if full <= 0:

@@ -163,3 +163,12 @@ def test_example_in_the_schema_is_a_valid_manifest() -> None:
     Draft202012Validator(SCHEMA).validate(EXAMPLE)
     manifest = parse_manifest(json.dumps(EXAMPLE).encode())
     assert [frame.pattern for frame in manifest.frames] == list(range(manifest.program.count))
+
+
+def test_a_byte_order_mark_is_skipped_and_utf_16_is_named() -> None:
+    """As Notepad and PowerShell save it."""
+    text = json.dumps(EXAMPLE)
+    assert parse_manifest(text.encode("utf-8-sig")) == parse_manifest(text.encode())
+    for encoding in ("utf-16-le", "utf-16-be"):
+        error = refused(f"\ufeff{text}".encode(encoding))
+        assert error.detail == "capture.json is in UTF-16: save it in UTF-8"

@@ -123,6 +123,13 @@ def test_a_white_frame_without_light_is_refused(make_zip: Zip, ingest: Ingest) -
     assert caught.value.fields == {"entry": "2.exr"}
 
 
+def test_a_white_frame_of_infinite_light_is_called_clipped(make_zip: Zip, ingest: Ingest) -> None:
+    files = {f"{n}.exr": exr(np.full_like(f, np.inf) if n == 2 else f) for n, f in enumerate(light(1.0))}
+    with pytest.raises(CaptureError, match="is clipped everywhere: expose shorter") as caught:
+        ingest("c", make_zip(record("exr"), files))
+    assert caught.value.fields == {"entry": "2.exr"}
+
+
 def test_integers_among_floats_are_refused(make_zip: Zip, ingest: Ingest) -> None:
     files = {f"{n}.exr": exr(f) for n, f in enumerate(light(1.0))}
     files["4.exr"] = encode_png(np.ones((HEIGHT, WIDTH, 3), np.uint16))
