@@ -70,8 +70,8 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
                 )
             if not mask.any():
                 raise CaptureError(
-                    f"{manifest.mask} is black everywhere, so nothing would be recovered: paint what is to be "
-                    "recovered white in it, for transparency is not read",
+                    f"{manifest.mask} is black everywhere: paint white what is to be recovered; transparency is not "
+                    "read",
                     entry=manifest.mask,
                 )
     frames, height, width, _ = shape
@@ -129,22 +129,21 @@ def _decode_patterns(decoder: Decoder, archive: CaptureArchive, limits: Limits) 
             pixels = stills.read_integers(decoder, archive, name)
             decoded += pixels.nbytes
             if decoded > limits.unpacked:
-                raise CaptureError(
-                    f"the image files of patterns, up to {name}, take {decoded} bytes, more than the "
-                    f"{limits.unpacked} allowed: use fewer or smaller ones",
-                    entry=name,
-                    limit=limits.unpacked,
-                )
+                raise _too_large(name, limits.unpacked)
             images[name] = integer_formats.to_unit(smallest_grid(pixels))
         kept += images[name].nbytes
         if kept > limits.memory // 2:
-            raise CaptureError(
-                f"the image files of patterns, up to {name}, take more than {limits.memory // 2} bytes together: "
-                "use fewer, smaller or coarser ones",
-                entry=name,
-                limit=limits.memory // 2,
-            )
+            raise _too_large(name, limits.memory // 2)
     return [images[name] for name in names]
+
+
+def _too_large(name: str, limit: int) -> CaptureError:
+    return CaptureError(
+        f"the image files of patterns, up to {name}, take more than {limit} bytes together: use fewer, smaller or "
+        "coarser ones",
+        entry=name,
+        limit=limit,
+    )
 
 
 def _examine(

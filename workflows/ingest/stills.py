@@ -164,9 +164,7 @@ def storage_of(decoder: Decoder, archive: CaptureArchive, first: NDArray[np.gene
         finite = values[np.isfinite(values)]
         full = 0.0
         if not finite.size and np.isposinf(values).any():
-            raise CaptureError(
-                f"{entry}, the brightest constant frame, is clipped everywhere: expose shorter", entry=entry
-            )
+            raise CaptureError(f"{entry} is clipped everywhere: expose shorter", entry=entry)
         if finite.size:
             full = HEADROOM * min(float(finite.max()), HIGHLIGHT * float(np.percentile(finite, 99)))
     if full <= 0:

@@ -11,8 +11,7 @@ class Constants(NamedTuple):
     sparsity: Annotated[
         float,
         Range(0.01, 1),
-        "Most cells of T at the finest level, as a share of the measurements; a fifth in the paper. Coarser levels may "
-        "have as many as measurements.",
+        "Most cells of T at the finest level, as a share of the measurements; a fifth in the paper.",
     ] = 0.2
     growth: Annotated[
         float,

@@ -37,14 +37,14 @@ class LobesOptions(NamedTuple):
     passes: Annotated[
         int,
         Range(1, 20),
-        "How many times T is replaced by its posterior mean. Each pass starts from the result of the one before.",
+        "How many times T is replaced by its posterior mean.",
     ] = 4
     gradients: Annotated[int, Range(1, 1000), "Most conjugate gradient steps in a pass."] = 5
     disagreement: Annotated[
         float,
         Range(0, 1e6),
-        "One T serves all channels unless their chi-square per degree of freedom exceeds this; then each channel has "
-        "its own. For grey patterns; under coloured patterns the likelihood decides.",
+        "One T serves all channels unless their chi-square per degree of freedom exceeds this. For grey patterns; "
+        "under coloured ones the likelihood decides.",
     ] = 1.5
     least_weight: Annotated[float, Range(0, 0.1), "Entries of T below this are dropped."] = 1e-4
     least_contrast: Annotated[
