@@ -273,7 +273,7 @@ def solve_covariance(
         for j in range(r.size):
             Kp[j] = Kp[j] if measured[j] else 0.0
         curvature = inner(p, Kp)
-        if not curvature > 0:  # by rounding: measurements without noise are told apart no further
+        if not curvature > 0:  # by rounding, where measurements have almost no noise
             break
         length = left / curvature
         subtract(x, -length, p)
