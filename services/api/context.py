@@ -15,13 +15,14 @@ from sqlalchemy import Connection, Engine
 
 from services.api.auth import STRANGER, Caller, bearer, check_method, identify, require_scope
 from services.api.http.browser_security import require_own_site
+from services.api.http.responses import FileStreamResponse
 from services.api.http.together import Together
 from services.api.work import Shares, run
 from services.decoding.pool import Decoders
 from services.settings import Settings
 from storage.database.engine import reading
 from storage.database.owners import for_owner
-from storage.errors import Corrupt, Unavailable
+from storage.errors import Corrupt, TooMany, Unavailable
 from storage.objects.store import Objects
 from workflows.composite.cache import Cache
 from workflows.threads import CORES
@@ -66,6 +67,9 @@ class Context:
     """Archives of mattes unpacked at once."""
     layers: Shares = field(default_factory=lambda: Shares(2, 1))
     """Layers of mattes, and mattes for browsers, encoded at once."""
+    answers: Shares = field(default_factory=lambda: Shares(4 << 30, 2 << 30))
+    """Bytes of answers in temporary files until they are read. How many one has is known once it is computed: it begins
+    while its owner has less than their share, and may exceed it."""
     together: Together = field(default_factory=Together)
     """Reads what streams of events follow."""
     calls: Shares = field(default_factory=lambda: Shares(8, 4))
@@ -105,11 +109,28 @@ class Context:
             Bytes that it takes besides. More than an owner's share counts as all of it: it is done, one at a time.
         seconds : float, optional
             How long it may take; by default ENVMATTE_REQUEST_SECONDS.
+
+        Raises
+        ------
+        TooMany
+            If too many bytes of the owner's earlier answers have not been read, and as of `services.api.work.run`.
         """
-        needed = [(shares, amount)]
+        owner = self.caller.owner
+        needed = [(self.answers, 1), (shares, amount)]
         if memory:
             needed.append((self.memory, min(memory, self.memory.each)))
-        return await run(request, self.caller.owner, seconds or self.settings.request_seconds, needed, work)
+
+        def begin() -> T:
+            if self.answers.exceeded(owner):  # by answers that began before this one's turn
+                raise TooMany(
+                    "earlier answers have not been read yet; read those, or send this request again later"
+                )
+            return work()
+
+        result = await run(request, owner, seconds or self.settings.request_seconds, needed, begin)
+        if isinstance(result, FileStreamResponse):
+            result.release = self.answers.keep(owner, result.size)
+        return result
 
     @contextmanager
     def stored(self, get: Callable[[Connection, str], R], id: str) -> Iterator[R]:

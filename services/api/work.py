@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import count
 from typing import TypeVar
 
@@ -88,11 +89,25 @@ class Shares:
             yield
         finally:
             if turn.came.is_set():
-                self._free += amount
-                self._taken[owner] -= amount
+                self._give_back(owner, amount)
             else:
                 self._waiting.remove(turn)
-            self._admit()
+                self._admit()
+
+    def keep(self, owner: str, amount: int) -> Callable[[], None]:
+        """Have an amount at once, even if it is more than is free. The function that is returned gives it back."""
+        self._free -= amount
+        self._taken[owner] += amount
+        return partial(self._give_back, owner, amount)
+
+    def exceeded(self, owner: str) -> bool:
+        """Whether what an owner has, or all have, is more than they may take."""
+        return self._taken[owner] > self.each or self._free < 0
+
+    def _give_back(self, owner: str, amount: int) -> None:
+        self._free += amount
+        self._taken[owner] -= amount
+        self._admit()
 
     def _admit(self) -> None:
         waiting = {turn.owner for turn in self._waiting}

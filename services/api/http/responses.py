@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from functools import partial
+from pathlib import Path
 from typing import IO
 
 from fastapi import Response
@@ -13,6 +14,8 @@ from fastapi.responses import StreamingResponse
 from pydantic import BaseModel
 from starlette.datastructures import Headers
 from starlette.types import Receive, Scope, Send
+
+from storage.disks import require_reserve
 
 MEMORY_BYTES = 1 << 18
 """The largest answer kept in memory while it is sent, and the size of the pieces read from a file."""
@@ -31,7 +34,14 @@ def bytes_response(data: bytes, media_type: str, headers: dict[str, str] | None 
 def file_response(
     write: Callable[[IO[bytes]], object], media_type: str, headers: dict[str, str] | None = None
 ) -> Response:
-    """A response that a function writes to a temporary file. Don't call it in the event loop."""
+    """A response that a function writes to a temporary file. Don't call it in the event loop.
+
+    Raises
+    ------
+    NoRoom
+        If the disk of temporary files has no more than its reserve.
+    """
+    require_reserve(Path(tempfile.gettempdir()))
     with ExitStack() as stack:
         file = stack.enter_context(tempfile.TemporaryFile())
         write(file)
@@ -47,7 +57,17 @@ def json_response(model: BaseModel) -> Response:
 
 
 class FileStreamResponse(StreamingResponse):
-    """A response that streams a file and closes it, also when the connection breaks."""
+    """A response that streams a file and closes it, also when the connection breaks.
+
+    Attributes
+    ----------
+    size : int
+        Bytes of the file.
+    release : callable
+        Is called once it is closed.
+    """
+
+    release: Callable[[], None] | None = None
 
     def __init__(
         self, file: IO[bytes], size: int, media_type: str, headers: dict[str, str] | None = None
@@ -58,13 +78,15 @@ class FileStreamResponse(StreamingResponse):
             headers=(headers or {}) | length,
             media_type=media_type,
         )
-        self._file = file
+        self._file, self.size = file, size
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         try:
             await super().__call__(scope, receive, send)
         finally:
             self._file.close()
+            if self.release is not None:
+                self.release()
 
 
 def utc_time(seconds: float | None) -> datetime | None:

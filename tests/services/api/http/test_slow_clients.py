@@ -13,6 +13,7 @@ import httpx2
 import psutil
 import pytest
 import uvicorn
+from fastapi import FastAPI
 
 from services.api.app import build_app
 from services.api.http import slow_clients
@@ -34,6 +35,7 @@ SEND_BUFFER = 1 << 16
 class Served:
     """An API without a coordinator, served by this process."""
 
+    app: FastAPI
     server: uvicorn.Server
     port: int
     matte: str
@@ -79,7 +81,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
             timeout=60,
         )
         assert sent.status_code == 201, sent.text
-        yield Served(server, port, sent.json()["id"], folder)
+        yield Served(app, server, port, sent.json()["id"], folder)
         server.should_exit = True
         thread.join()
     app.state.context.decoders.close()
@@ -126,6 +128,26 @@ def test_answers_that_nobody_takes_are_held_on_disk_and_given_up(
         until(lambda: served.count == 1)
         until(lambda: served.count == 0)
         assert len(rest(one)) < len(whole.content) // 2
+
+
+def test_answers_that_nobody_takes_keep_their_owner_waiting(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = f"/v1/mattes/{served.matte}/layers/S.exr"
+    size = len(served.ask(path).content)
+    monkeypatch.setattr(served.app.state.context.answers, "each", 3 * size // 2)
+    monkeypatch.setattr(slow_clients, "CHECK_SECONDS", 30.0)
+    with contextlib.ExitStack() as stack, served.connected(b"") as last:
+        connections = [stack.enter_context(served.connected(get(path))) for _ in range(6)]
+        begun = sorted(one.recv(12) for one in connections)
+        assert begun == 2 * [b"HTTP/1.1 200"] + 4 * [b"HTTP/1.1 429"]
+        last.sendall(get(path))
+        last.settimeout(0.5)
+        with pytest.raises(TimeoutError):
+            last.recv(1)
+        stack.close()
+        last.settimeout(60)
+        assert last.recv(12) == b"HTTP/1.1 200"
 
 
 @pytest.mark.slow

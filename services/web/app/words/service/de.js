@@ -89,6 +89,7 @@ export const de = {
 	"decoding the image takes more than {seconds} s: send a smaller one, or {advice}": "das Lesen des Bildes dauert länger als {seconds} s: ein kleineres senden oder {advice}",
 	"decoding the image takes too much memory: send a smaller one, or {advice}": "das Lesen des Bildes braucht zu viel Speicher: ein kleineres senden oder {advice}",
 	"delete captures, mattes, videos, uploads, programs or ended jobs first": "erst Aufnahmen, Matten, Videos, Uploads, Programme oder beendete Aufträge löschen",
+	"earlier answers have not been read yet; read those, or send this request again later": "frühere Antworten sind noch nicht abgeholt; diese abholen oder später noch einmal senden",
 	"estimated from constant levels": "geschätzt an einfarbigen Bildern",
 	"estimated from constant levels and half-tones": "geschätzt an einfarbigen Bildern und Halbtönen",
 	"expect composites of about {low} dB ({worst}) to {high} dB ({best}), if nothing else is wrong": "Montagen erreichen etwa {low} dB ({worst}) bis {high} dB ({best}), wenn sonst alles stimmt",
