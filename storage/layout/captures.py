@@ -48,6 +48,8 @@ def create_stack(
 ) -> int:
     """Create the empty stack of a capture; a repeated call writes the same and leaves frames written since as they are.
 
+    If its grid of chunks is another than before, as with another memory, the frames written before are deleted.
+
     Parameters
     ----------
     shape : (frames, height, width, channels)
@@ -80,7 +82,7 @@ def create_stack(
         edge *= 2
     layout = MemoryStore()
     group = zarr.create_group(layout, attributes=attributes)
-    group.create_array(
+    stack = group.create_array(
         "frames",
         shape=shape,
         dtype=dtype,
@@ -104,8 +106,22 @@ def create_stack(
         group.create_array("shares", data=shares, dimension_names=("share", "column"), **whole)
     for n, image in enumerate(images):
         group.create_array(f"images/{n}", data=image, dimension_names=("row", "column", "channel"), **whole)
+    if _is_other_grid(objects, capture, stack):
+        # Some chunks would lie beyond the new grid, and others hide that a new one was lost. The metadata stays until
+        # it is replaced, so if this is interrupted, the next call deletes the rest.
+        for name in ("frames", "thumbnails"):
+            objects.delete(f"{path(capture)}/{name}/c")
     objects.put_tree(path(capture), layout)
     return slab
+
+
+def _is_other_grid(objects: Objects, capture: str, stack: zarr.Array[Any]) -> bool:
+    """Whether the stack that a capture has in the store has another shape or other chunks."""
+    try:
+        (before,) = gather(objects.array(f"{path(capture)}/frames"))
+    except (FileNotFoundError, Corrupt):  # what is damaged is written again
+        return False
+    return bool((before.shape, before.chunks) != (stack.shape, stack.chunks))
 
 
 def write_slab(objects: Objects, capture: str, first: int, frames: NDArray[np.unsignedinteger]) -> None:

@@ -127,6 +127,19 @@ def test_creating_stack_again_keeps_frames_and_measurements(
     assert again.attributes == {"patterns": [1, 0], "noise": 1}
 
 
+def test_creating_stack_with_other_slabs_deletes_frames(objects: Objects, values: NDArray[np.uint16]) -> None:
+    fill(objects, values)
+    assert create(objects, slab=3) == 3
+    stack = Stack(objects, "c")
+    assert stack.missing() == [0, 1, 2, 3]
+    for first in range(0, 11, 3):
+        write_slab(objects, "c", first, values[first : first + 3])
+    np.testing.assert_array_equal(stack.read(), values)
+    for name in ("frames", "thumbnails"):
+        chunks = zarr.open_array(objects.zarr, path=f"captures/c/{name}").nchunks
+        assert len(objects.paths_below(f"captures/c/{name}/c")) == chunks
+
+
 def test_measurements_are_saved(objects: Objects) -> None:
     create(objects)
     stack = Stack(objects, "c")
