@@ -15,7 +15,7 @@ from services.runtime.addresses import bind, url_of
 from services.runtime.data_folder import lock_data, make_data
 from services.runtime.logs import configure_logging
 from services.runtime.malloc import limit_arenas
-from services.runtime.signals import exit_on_sigterm
+from services.runtime.signals import exit_on_signal
 from services.settings import CoordinatorSettings, Settings
 from services.webhooks.sender import Sender
 from storage.database.disk_reserve import keep_reserve
@@ -94,7 +94,7 @@ def _run_jobs(stack: ExitStack, settings: CoordinatorSettings, engine: Engine, o
 def _opened(settings: CoordinatorSettings, role: str) -> Iterator[tuple[ExitStack, Engine, Objects]]:
     """Configure this process, and open the database and the store; the stack is closed before they are."""
     # uvicorn raises the signal that stopped it again when it ends: everything open here must be closed first.
-    exit_on_sigterm()
+    exit_on_signal()
     limit_arenas()
     configure_logging(settings.log, settings.log_level, role)
     configure_dask()

@@ -38,14 +38,17 @@ def _end(last: float) -> None:
     os._exit(0)
 
 
-def exit_on_sigterm() -> None:
-    """Raise SystemExit in the main thread at SIGTERM, so that everything open is closed, in time."""
+def exit_on_signal() -> None:
+    """Raise SystemExit in the main thread at SIGTERM, KeyboardInterrupt at SIGINT; what is open closes in time."""
 
     def end(number: int, frame: object) -> None:
         end_in_time()
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
         sys.exit(0)
 
-    signal.signal(signal.SIGTERM, end)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, end)
 
 
 def run_until_signal(service: AbstractAsyncContextManager[object]) -> None:

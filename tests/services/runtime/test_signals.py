@@ -20,7 +20,7 @@ child = subprocess.Popen(["sleep", "600"], stdout=subprocess.DEVNULL, stderr=sub
 """
 CODES = {
     "a process that runs until it exits": """
-signals.exit_on_sigterm()
+signals.exit_on_signal()
 try:
     print(child.pid, flush=True)
     while True:
@@ -39,13 +39,16 @@ signals.run_until_signal(service())
 }
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 @pytest.mark.parametrize("code", CODES.values(), ids=CODES)
-def test_process_ends_in_time_with_its_children_although_closing_hangs(code: str) -> None:
+def test_process_ends_in_time_with_its_children_although_closing_hangs(
+    code: str, number: signal.Signals
+) -> None:
     with running([sys.executable, "-c", START + code]) as process:
         assert process.stdout is not None
         child = psutil.Process(int(process.stdout.readline()))
         start = time.monotonic()
-        process.send_signal(signal.SIGTERM)
+        process.send_signal(number)
         assert process.wait(60) == 0
         until(lambda: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE)
         assert time.monotonic() - start < 5
