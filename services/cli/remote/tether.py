@@ -5,6 +5,7 @@ import tempfile
 import time
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -70,24 +71,33 @@ def tether(
     draft: Job | None = None
     last = False
     with options.client(url, key) as client:
-        while not last:
-            capture, over = _next_capture(client, takes, draft)
-            report = client.report(capture)
-            quality, missing = report["quality"], report["frames"]["missing"]
-            good = until is not None and quality is not None and quality["low"] >= until
-            last = over or good or shown.count - 1 not in missing
-            if last:
-                with Progress("recovery") as bar:
-                    job = client.wait(client.recover(capture, quality="fine"), progress=bar.job)
-            else:
-                job = _recover_draft(client, capture)
+        try:
+            while not last:
+                capture, over = _next_capture(client, takes, draft)
+                report = client.report(capture)
+                quality, missing = report["quality"], report["frames"]["missing"]
+                good = until is not None and quality is not None and quality["low"] >= until
+                last = over or good or shown.count - 1 not in missing
+                if last:
+                    with Progress("recovery") as bar:
+                        job = client.wait(client.recover(capture, quality="fine"), progress=bar.job)
+                else:
+                    job = _recover_draft(client, capture)
+                if draft is not None:
+                    _discard(client, draft)
+                draft = job
+                found = shown.count - len(missing)
+                expected = f"{quality['low']:.0f} to {quality['high']:.0f} dB" if quality else "not known yet"
+                place = f"{url.rstrip('/')}/#/mattes/{job.matte}"
+                click.echo(
+                    f"{found} of {shown.count} patterns, expected quality {expected}: {place}", err=True
+                )
+        except BaseException:
             if draft is not None:
-                _discard(client, draft)
-            draft = job
-            found = shown.count - len(missing)
-            expected = f"{quality['low']:.0f} to {quality['high']:.0f} dB" if quality else "not known yet"
-            place = f"{url.rstrip('/')}/#/mattes/{job.matte}"
-            click.echo(f"{found} of {shown.count} patterns, expected quality {expected}: {place}", err=True)
+                # A job that stays paused would count for ever, and keep its capture from expiring.
+                with suppress(ServiceError):
+                    client.resume(draft)
+            raise
     result = {"matte": job.matte, "capture": capture.id, "patterns": found, "quality": quality}
     print_result(result, as_json, "matte")
 

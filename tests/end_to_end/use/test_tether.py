@@ -11,10 +11,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import pytest
 
-from services.client import Matte, NotFound
+from services.cli.main import main
+from services.client import Capture, Client, Job, Matte, NotFound
 from tests.end_to_end.command_line import envmatte
 from tests.end_to_end.conftest import Service
 from tests.parts.processes import running
@@ -102,6 +104,29 @@ def test_there_is_a_draft_while_stills_come_and_at_last_the_matte_of_all(
     np.testing.assert_array_equal(
         service.client.composite(made, backdrop), service.client.composite(matte, backdrop)
     )
+
+
+def test_a_draft_that_paused_continues_after_an_interrupt(
+    service: Service, session: tuple[str, list[Path], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, stills, camera = session
+    module = sys.modules["services.cli.remote.tether"]
+    drafts: list[Job] = []
+
+    def unfinished(client: Client, capture: Capture) -> Job:
+        drafts.append(client.pause(client.recover(capture, quality="fast")))
+        monkeypatch.setattr(module, "ingest", interrupted)
+        shutil.copy(stills[FEW], camera)
+        return drafts[0]
+
+    def interrupted(*_: object) -> Capture:
+        assert service.client.job(drafts[0])["paused"]
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "_recover_draft", unfinished)
+    with pytest.raises(click.Abort):
+        main(["tether", file, str(camera), "--url", service.url], standalone_mode=False)
+    assert not service.client.job(drafts[0])["paused"]
 
 
 def test_it_stops_at_the_quality_that_was_asked_for(
