@@ -29,8 +29,6 @@ LOOK = 1.0
 """Seconds between two polls of the cluster."""
 ANSWER = 5.0
 """Seconds that the scheduler has to answer."""
-DYING = 2.0
-"""Seconds within which a worker ends itself once its task is dropped (`services.cluster.worker_preload`)."""
 LOOKING, SELDOM = 0.05, 5.0
 """The share of its time for which it looks at most, since a thousand workers take long, and yet after these seconds."""
 MEMORY = "worker-restart-memory"
@@ -112,8 +110,6 @@ class Dispatcher:
         self._client: Client | None = None
         self._flights: dict[str, Flight] = {}
         """By the keys of their dask tasks."""
-        self._dying: list[float] = []
-        """When each thread that works on a dropped task counts as free again."""
         self._number = count()
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="dispatcher")
@@ -146,11 +142,9 @@ class Dispatcher:
         No task waits there. So the next job is chosen when a thread is free, and a worker that dies had just the task
         that it worked on.
         """
-        if not self._usable():
-            return 0
-        now = time.monotonic()
-        self._dying = [end for end in self._dying if end > now]
-        return self.threads - len(self._dying) - sum(not flight.ended for flight in self._flights.values())
+        return (
+            self.threads - sum(not flight.ended for flight in self._flights.values()) if self._usable() else 0
+        )
 
     def submit(
         self, steps: Steps, task: Task, tiles: Sequence[Sequence[int]], trace: str | None = None
@@ -202,10 +196,7 @@ class Dispatcher:
     def drop(self, job: str) -> None:
         """Cancel the tasks of a job; workers end those that run (`services.cluster.worker_preload`)."""
         dropped = [key for key, flight in self._flights.items() if flight.job == job]
-        flights = [self._flights.pop(key) for key in dropped]
-        futures = [flight.future for flight in flights]
-        # A worker that still runs one ends itself, and the next task would die with it.
-        self._dying += [time.monotonic() + DYING for flight in flights if not flight.ended]
+        futures = [self._flights.pop(key).future for key in dropped]
         client = self._usable()
         if client is not None and futures:
             with suppress(Exception):  # if the client is being lost, they are released with it

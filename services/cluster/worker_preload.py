@@ -5,10 +5,11 @@ scheduler is gone, could run for long and write files that are never removed. So
 nanny starts another.
 """
 
+import asyncio
 import logging
 import os
 import time
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 
 from distributed import Worker
 from distributed.core import Status
@@ -31,6 +32,8 @@ LOOK = 0.2
 """Seconds between two checks of what runs."""
 PATIENCE = 0.5
 """Seconds that a task may continue after it was cancelled."""
+ANSWER = 0.5
+"""Seconds that the scheduler has to answer."""
 NICE = 10
 """Niceness of workers: a job takes minutes, while composites and other users of the machine should not wait."""
 
@@ -51,7 +54,7 @@ def dask_setup(worker: Worker) -> None:
         logger.warning("%s", lacking)
     since: dict[str, float] = {}
 
-    def end_strays() -> None:
+    async def end_strays() -> None:
         now = time.monotonic()
         ending = worker.status in (Status.closing, Status.closed)
         strays = {task.key for task in worker.state.executing if ending or task.state == "cancelled"}
@@ -62,7 +65,21 @@ def dask_setup(worker: Worker) -> None:
                 found = read_key(key)
                 with about(*found) if found else nullcontext():
                     logger.info("ending this process: its task was cancelled and still runs")
+                if not ending:
+                    await _leave(worker)
                 os._exit(1)
 
     # Not one of the worker's own callbacks, which stop when it begins to close.
     PeriodicCallback(end_strays, 1000 * LOOK).start()
+
+
+async def _leave(worker: Worker) -> None:
+    """Take a worker off its scheduler, which gives the tasks that it has to others and blames none of them.
+
+    A task of another job may have come since: for the scheduler a thread is free as soon as its task is cancelled.
+    """
+    leaving = worker.scheduler.unregister(
+        address=worker.address, expected=True, close=False, stimulus_id="ended-for-a-cancelled-task"
+    )
+    with suppress(OSError, TimeoutError):  # it ends all the same
+        await asyncio.wait_for(leaving, ANSWER)

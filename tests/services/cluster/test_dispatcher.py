@@ -106,23 +106,25 @@ def test_of_a_task_of_several_tiles_the_one_that_ended_it_is_blamed(
         assert found[6] == Outcome("a", 6)
 
 
-def test_no_tile_is_given_to_a_worker_that_ends_for_a_dropped_job(
+def test_tile_after_a_cancelled_one_does_not_die_with_its_worker(
     cluster: LocalCluster, tmp_path: Path
 ) -> None:
     def work(objects: Objects, task: Task, tile: int) -> int:
-        time.sleep(60 if task.job == "dropped" else 0)
+        (tmp_path / f"{task.job}{tile}").touch()
+        time.sleep(60 if task.job == "cancelled" else 0)
         return 10
 
     steps = replace(STEPS, work=work)
     with Dispatcher(lambda: Client(cluster, set_as_default=False), tmp_path.as_uri()) as dispatcher:
         until(lambda: dispatcher.free == 1)
-        dispatcher.submit(steps, task("dropped"), [[1]])
-        time.sleep(2)  # until it runs
-        dispatcher.drop("dropped")
-        until(lambda: dispatcher.free == 1)
-        dispatcher.submit(steps, task("next"), [[1]])
+        dispatcher.submit(steps, task("cancelled"), [[1]])
+        until((tmp_path / "cancelled1").exists)
+        dispatcher.drop("cancelled")
+        assert dispatcher.free == 1
+        dispatcher.submit(steps, task("a"), [[2]])
         (outcome,) = outcomes(dispatcher, 1)
-        assert outcome.done is not None, outcome
+        assert outcome.done is not None
+        assert outcome.died is None
 
 
 def test_a_missing_scheduler_is_reported_as_a_problem() -> None:
