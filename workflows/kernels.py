@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -115,15 +114,16 @@ def _compile(part: str) -> int:
     return sum(sum(kernel.stats.cache_misses.values()) for kernel in find_kernels())
 
 
-def _recover(method: str, objects: Objects) -> None:
-    """Ingest a capture of a glass ball and recover its matte."""
+def recover(objects: Objects) -> None:
+    """Ingest a capture of a glass ball, which recovers a sample of it, and recover its matte by each method."""
     file = io.BytesIO()
     scene = glass_ball(WIDTH, HEIGHT, monitor=MONITOR, rays=4)
     write_capture(scene, preset("sketch", *MONITOR), file)
     objects.put(uploads.part_path("c", "all"), file.getvalue())
     uploads.seal(objects, "c", [uploads.Part("all", len(file.getvalue()))])
     _run(INGEST, objects, Task("job", "c", "", {}, LIMITS))
-    _run(RECOVER, objects, Task("job", "c", "m", {"method": method}, LIMITS))
+    for method in ("lobes", "nn-dgsr"):
+        _run(RECOVER, objects, Task("job", "c", method, {"method": method}, LIMITS))
 
 
 def _run(steps: Steps, objects: Objects, task: Task) -> None:
@@ -179,8 +179,7 @@ def _matte(objects: Objects) -> Matte:
 
 
 PARTS: dict[str, Callable[[Objects], None]] = {
-    "the default recovery": partial(_recover, "lobes"),
+    "the recovery of mattes": recover,
     "composites, live view and depth": use_matte,
-    "the recovery of the paper": partial(_recover, "nn-dgsr"),
 }
 """What has kernels of its own, by what it is: compiled side by side, the longest first."""

@@ -12,9 +12,9 @@ from workflows.recovery.lobes.nodes import merge_nodes, node_responses, spread_l
 from workflows.recovery.normalise import Measurements
 from workflows.recovery.pyramid import Grids
 
-ALL, DISPERSED = 3, 4
+ALL, DISPERSED = np.int64(3), np.int64(4)
 """A pixel has up to five fits: 0 to 2 are those of its channels, these are of all channels together, the second with
-their lobes apart."""
+their lobes apart. For Python's own integers numba compiles each kernel once more for each constant that it is given."""
 
 
 class Pixels(NamedTuple):

@@ -201,7 +201,7 @@ def start_between(
     rest : float
         Mean squared residual of the neighbours.
     """
-    near, n = np.empty(neighbours.size, np.int64), 0
+    near, n = np.empty(neighbours.size, np.int64), np.int64(0)
     for q in neighbours:
         if q >= 0 and fits.k[q, c] > 0:
             near[n] = q

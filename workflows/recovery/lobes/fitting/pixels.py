@@ -33,7 +33,7 @@ from workflows.recovery.lobes.posterior.mean import update
 # alone makes it 1.
 _LEAST_STEP = 0.3
 # In place of a fit to start from.
-NONE = -1
+NONE = np.int64(-1)
 
 
 @njit(nogil=True, cache=True, inline="always")
@@ -110,7 +110,7 @@ def refit_from_posterior(
 
 
 @njit(nogil=True, cache=True, inline="always")
-def leading_channel(variance: NDArray[np.float32]) -> int:
+def leading_channel(variance: NDArray[np.float32]) -> np.int64:
     """The channel with the highest total precision, from the variances (3, m + 2) of a pixel."""
     lead, highest = ALL, -1.0
     for c in range(3):
@@ -118,7 +118,7 @@ def leading_channel(variance: NDArray[np.float32]) -> int:
         for j in range(variance.shape[1]):
             precision += 1 / variance[c, j]
         if precision > highest:
-            lead, highest = c, precision
+            lead, highest = np.int64(c), precision
     return lead
 
 
