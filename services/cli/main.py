@@ -11,7 +11,7 @@ from services.cli import maintenance, patterns, processes, setup
 from services.cli.demo import demo
 from services.cli.keys import keys
 from services.cli.output import example
-from services.cli.remote import jobs, mattes
+from services.cli.remote import jobs, mattes, records
 from services.cli.remote.tether import tether
 from services.client import Busy, ServiceError, Unreachable
 from services.runtime.addresses import PortTaken
@@ -72,6 +72,7 @@ for command in (
     *maintenance.COMMANDS,
     *jobs.COMMANDS,
     *mattes.COMMANDS,
+    *records.COMMANDS,
     demo,
     patterns.patterns,
     tether,

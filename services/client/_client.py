@@ -3,7 +3,7 @@
 import os
 import secrets
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, BinaryIO, Self, overload
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 PIECE = 8 << 20
 """Bytes of a video in one request."""
+_PAGE = 100
+"""Records that are read at a time."""
 SENT = 64 << 10
 """Bytes of an archive that are read and sent at a time."""
 
@@ -165,6 +167,31 @@ class Client:
         """Get the current state of a matte, or of the matte that a job makes."""
         which = (matte.matte or "") if isinstance(matte, Job) else matte
         return self._matte(self._http.json("GET", _path(Matte, which)))
+
+    def captures(self, **wanted: str) -> Iterator[Capture]:
+        """All captures, newest first: those of a ``state``, or whose name contains ``name``.
+
+        They are read page by page: make a list of them before you delete any.
+        """
+        return map(Capture.of, self._all(Capture, wanted))
+
+    def jobs(self, **wanted: str) -> Iterator[Job]:
+        """All jobs, newest first, or those of a ``state``."""
+        return map(Job.of, self._all(Job, wanted))
+
+    def mattes(self, **wanted: str) -> Iterator[Matte]:
+        """All mattes, newest first: those of a ``state``, of a ``capture``, or whose name contains ``name``."""
+        return map(self._matte, self._all(Matte, wanted))
+
+    def _all(self, kind: type[Record], wanted: Mapping[str, str]) -> Iterator[dict[str, Any]]:
+        """The answers of all pages of a collection."""
+        query = {**wanted, "limit": str(_PAGE)}
+        while True:
+            (page,) = self._http.json("GET", kind.path, params=query).values()
+            yield from page
+            if len(page) < _PAGE:
+                return
+            query["after"] = page[-1]["id"]
 
     def delete(self, record: Capture | Job | Matte) -> None:
         """Delete a capture, a matte, or a job that has ended; a retry of a delete that succeeded is no error."""

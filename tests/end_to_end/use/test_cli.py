@@ -44,6 +44,29 @@ def test_from_a_capture_to_a_composite(service: Service, capture_archive: Path, 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["backdrop.png", "composite.png"]
 
 
+def test_records_are_listed_and_deleted(
+    service: Service, capture_archive: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = [service.client.upload(capture_archive, name=f"listed {n}") for n in range(3)]
+    for one in made:
+        service.client.wait(one)
+    monkeypatch.setattr("services.client._client._PAGE", 2)
+    expected = [one.id for one in reversed(made)]
+    assert [one.id for one in service.client.captures(name="LISTED")] == expected
+    assert [one.id for one in service.client.jobs()][:3] == [one.job for one in reversed(made)]
+    listed = envmatte(service, "list", "captures", "--name", "listed", "--state", "ready")
+    rows = [line.split("\t") for line in listed.stdout.splitlines()]
+    assert [(id, state, name) for id, state, _, name in rows] == [
+        (id, "ready", f"listed {n}") for id, n in zip(expected, (2, 1, 0), strict=True)
+    ]
+    assert envmatte(service, "list", "captures", "--state", "failed", "--name", "listed").stdout == ""
+    assert envmatte(service, "delete", "captures", *expected[:2]).stdout == "2 deleted\n"
+    assert [one.id for one in service.client.captures(name="listed")] == expected[2:]
+    gone = envmatte(service, "delete", "captures", expected[0])
+    assert (gone.returncode, gone.stdout) == (1, "")
+    assert expected[0] in gone.stderr
+
+
 def test_refusal_has_exit_code_1(service: Service, tmp_path: Path) -> None:
     broken = tmp_path / "broken.zip"
     broken.write_bytes(b"no zip")
@@ -60,6 +83,7 @@ def test_refusal_has_exit_code_1(service: Service, tmp_path: Path) -> None:
 
 def test_wrong_command_line_has_exit_code_2(service: Service) -> None:
     for arguments in (
+        ["list", "jobs", "--name", "glass"],
         ["recover"],
         ["upload", "no-such-file.zip"],
         ["recover", "x", "--option", "tile"],

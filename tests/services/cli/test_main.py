@@ -65,6 +65,8 @@ REMOTE = {
     "share": ["m"],
     "import": ["matte.zip"],
     "layers": ["m", "layers"],
+    "list": ["mattes"],
+    "delete": ["mattes", "m"],
 }
 """Arguments of every command that does nothing but talk to a service."""
 
