@@ -11,6 +11,7 @@ from typing import Any
 from fastapi import APIRouter
 from fastapi.responses import FileResponse, HTMLResponse, Response
 from starlette.datastructures import Headers
+from starlette.middleware.gzip import DEFAULT_EXCLUDED_CONTENT_TYPES, GZipMiddleware
 from starlette.staticfiles import NotModifiedResponse, StaticFiles
 from starlette.types import Scope
 
@@ -35,6 +36,8 @@ POLICY = "; ".join(
 """Pages may load and fetch only from this service, and show pictures and videos that they make (`blob:`)."""
 # Browsers ask again each time, and get a 304: after an upgrade old files never mix with new ones.
 FRESH = {"Cache-Control": "no-cache"}
+COMPRESSED_TYPES = (*DEFAULT_EXCLUDED_CONTENT_TYPES, "text/plain")
+"""The media types of what is compressed already; the samples' mattes, whose suffix has none, count as text."""
 
 
 class Files(StaticFiles):
@@ -65,6 +68,11 @@ class MinifiedFiles(Files):
         if self.is_not_modified(answer.headers, Headers(scope=scope)):
             return NotModifiedResponse(answer.headers)
         return answer
+
+
+def compressed(files: StaticFiles) -> GZipMiddleware:
+    """Static files, compressed on their way: all of the app takes a third of its bytes then."""
+    return GZipMiddleware(files, compresslevel=6, exclude_content_types=COMPRESSED_TYPES)
 
 
 def _app() -> str:
