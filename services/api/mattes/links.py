@@ -2,19 +2,25 @@
 
 from dataclasses import replace
 from datetime import UTC, datetime
+from http import HTTPStatus
 from typing import Annotated, Any, Self
 
 from fastapi import APIRouter, Depends, Request, Response
+from fastapi.responses import HTMLResponse
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Row
 
 from services.api.auth import Caller
 from services.api.context import OwnerContext, PublicContext
 from services.api.http.bodies import has_body, read_json, schema_of
+from services.api.http.media_types import preferred
 from services.api.http.router import Router
 from services.api.mattes.live import live_page
+from services.api.mattes.live_page import PAGE
+from services.runtime.problems import MEDIA_TYPE
 from storage.database.engine import reading, writing
 from storage.database.owners import for_owner
+from storage.errors import NotFound
 from storage.records import links, mattes
 
 router = Router(tags=["mattes"])
@@ -24,6 +30,10 @@ DAY = 86_400
 """Seconds."""
 SANDBOX = "sandbox allow-scripts; frame-ancestors"
 """The page runs its own script, and nothing of it can reach the service: for the browser it is another site."""
+FRESH = {"Cache-Control": "private, no-store"}
+"""Asked for again each time, so that a deleted link shows nothing."""
+GONE = (PAGE / "gone.html").read_text(encoding="utf-8")
+"""What browsers show for a link that leads nowhere; other clients get the problem."""
 
 
 class Link(BaseModel):
@@ -117,8 +127,12 @@ async def _shown(context: PublicContext, token: str, request: Request, headers: 
         with reading(context.engine) as c:
             return links.find(c, token)
 
-    row = await context.call(find)
+    try:
+        row = await context.call(find)
+    except NotFound:
+        if preferred(request.headers.get("accept", "*/*"), (MEDIA_TYPE, "text/html")) != "text/html":
+            raise
+        return HTMLResponse(GONE, HTTPStatus.NOT_FOUND, headers | FRESH)
     # What it costs counts as its owner's.
     bound = replace(context, engine=for_owner(context.engine, row.owner), caller=Caller(row.owner, "read"))
-    # Asked for again each time, so that a deleted link shows nothing.
-    return await live_page(bound, row.matte, request, headers | {"Cache-Control": "private, no-store"})
+    return await live_page(bound, row.matte, request, headers | FRESH)

@@ -28,6 +28,9 @@ def test_link_shows_the_matte_and_nothing_else_until_it_is_deleted(service: Serv
     for gone in (link["path"], link["embed"]):
         problem = check_problem(service.http.get(gone), 404, "not-found")
         assert "expired or was deleted" in problem["detail"]
+        shown = service.http.get(gone, headers={"Accept": "text/html,*/*;q=0.8"})
+        assert (shown.status_code, shown.headers["cache-control"]) == (404, "private, no-store")
+        assert "it has expired or was deleted" in shown.text
     for wrong in (0, -1, 4000, "long"):
         check_problem(service.http.post(path, json={"days": wrong}), 422, "bad-request")
     check_problem(service.http.post("/v1/mattes/none/links", json={}), 404, "not-found")
