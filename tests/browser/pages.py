@@ -7,7 +7,7 @@ from urllib.parse import urlsplit
 
 from playwright.sync_api import Browser, Page
 
-ZIP = "Choose a capture archive or a film"
+ZIP = "Choose a film, stills or a capture archive"
 """The label of the field for capture archives and films."""
 MINUTE = 60_000
 """Milliseconds."""

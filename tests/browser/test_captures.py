@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from playwright.sync_api import Page, expect
 
 from tests.browser.pages import BY_HAND, MINUTE, ZIP
@@ -49,7 +50,7 @@ def test_film_with_its_record_becomes_a_capture(desk: Page, service: Service, cl
     desk.get_by_label(ZIP).set_input_files(clip)
     field = desk.get_by_label("Or the capture.json that came with the program")
     field.set_input_files({"name": "holiday.json", "mimeType": "application/json", "buffer": b"{}"})
-    expect(desk.get_by_text("Not the capture.json of a film")).to_be_visible()
+    expect(desk.get_by_text("Not the right capture.json: it describes no video")).to_be_visible()
     field.set_input_files(clip.with_suffix(".json"))
     expect(desk.get_by_role("heading", name="IMG 0001")).to_be_visible(timeout=MINUTE)
     expect(desk.get_by_role("region", name="Report")).to_be_visible(timeout=2 * MINUTE)
@@ -84,7 +85,7 @@ def test_film_without_record_asks_for_its_program(desk: Page, service: Service, 
     assert service.http.put(f"/v1/programs/{made['id']}/showing", json=showing).status_code == 204
     desk.goto(f"{service.url}/#/captures")
     desk.get_by_label(ZIP).set_input_files(clip)
-    expect(desk.get_by_text("Which program does this film show?")).to_be_visible()
+    expect(desk.get_by_text("Which program does this show?")).to_be_visible()
     desk.get_by_label("Program", exact=True).select_option("0")
     expect(desk.get_by_label("Patterns a second")).to_have_value("3.5")
     desk.get_by_role("button", name="Upload", exact=True).click()
@@ -93,11 +94,36 @@ def test_film_without_record_asks_for_its_program(desk: Page, service: Service, 
     assert Program.model_validate(found) == Program.model_validate(made["program"])
 
 
+def test_stills_become_a_capture(desk: Page, service: Service, ball: Path, tmp_path: Path) -> None:
+    with zipfile.ZipFile(ball) as archive:
+        record = archive.extract("capture.json", tmp_path)
+        frames = sorted(json.loads(Path(record).read_text())["frames"], key=lambda one: one["pattern"])
+        stills = [tmp_path / f"DSC_{9 + n}.PNG" for n in range(len(frames))]
+        for frame, still in zip(frames, stills, strict=True):
+            still.write_bytes(archive.read(frame["file"]))
+    desk.add_init_script(BY_HAND)
+    for taken in (stills[:-1], stills):
+        desk.goto(f"{service.url}/#/captures")
+        desk.reload()
+        desk.get_by_label(ZIP).set_input_files(taken)
+        desk.get_by_label("Or the capture.json that came with the program").set_input_files(record)
+        if taken != stills:
+            expect(desk.get_by_role("alert")).to_contain_text(
+                f"shows {len(stills)} pictures, and you chose {len(taken)} stills"
+            )
+    expect(desk.get_by_role("heading", name="a ball")).to_be_visible(timeout=MINUTE)
+    expect(desk.get_by_role("region", name="Report")).to_be_visible(timeout=2 * MINUTE)
+    found = service.client.capture(desk.url.rpartition("/")[2])
+    assert (found["state"], found["frames"]) == ("ready", len(stills))
+    first = service.http.get(f"/v1/captures/{found['id']}/frames/1.png").content
+    assert np.array_equal(Image.open(io.BytesIO(first)), Image.open(stills[1]))
+
+
 def test_film_and_record_are_zipped(desk: Page, service: Service) -> None:
     desk.goto(f"{service.url}/#/captures")
     text = desk.evaluate(
         """async () => {
-            const { filmArchive, recordOf } = await import("/web/app/upload/film_bundle.js");
+            const { filmArchive, recordOf } = await import("/web/app/upload/bundle.js");
             const showing = { border: { width: 641, height: 361 } };
             const record = recordOf({ program: { parts: [] }, display: { width: 640, height: 360 }, showing }, 3.5);
             const film = new File([new Uint8Array(9e6).map((_, i) => i % 251)], "Größe.WebM", { type: "video/webm" });

@@ -55,6 +55,7 @@ NAMES = {
         "#own input",
         "Bearer ",
         "Enter",
+        "Backspace",
     ),
     *("Deutsch", "English"),  # each language in its own words
 }

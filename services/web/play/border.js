@@ -43,7 +43,7 @@ export function schedule(count, rate) {
 	return [...lead, ...patterns, ...lead];
 }
 
-// Draws the border around a picture, or around the black or white of the lead-in.
+// Draws the border around a picture, or around the black or white of the lead-in; around a `plain` step it stays black.
 export function draw(context, border, step, picture) {
 	context.fillStyle = "#000";
 	context.fillRect(0, 0, border.width, border.height);
@@ -54,6 +54,7 @@ export function draw(context, border, step, picture) {
 	} else if (step.white) {
 		context.fillRect(...border.inner);
 	}
+	if (step.plain) return;
 	const number = code(step.number);
 	const ticks = tick(step.number);
 	for (const [boxes, lit] of [[border.top, number], [border.bottom, number], [border.left, ticks], [border.right, ticks]]) {

@@ -12,6 +12,8 @@ const COUNTDOWN = 5; // seconds
 const AHEAD = 8; // pictures decoded ahead: all of them would fill the memory
 const AT_ONCE = 4; // parallel requests
 const REPORT = 2000; // ms between two reports of progress
+const NEXT = [" ", "Enter", "ArrowRight", "ArrowDown", "PageDown"]; // keys, some of them those of a presenter
+const BACK = ["Backspace", "ArrowLeft", "ArrowUp", "PageUp"];
 
 // The pictures of a program: all are fetched before it starts, the next few are decoded.
 class Pictures {
@@ -178,12 +180,16 @@ async function open() {
 	setStatus(t("play.loading"));
 	await pictures.load(patterns, ask, (share) => ($("loaded").value = share));
 	setStatus(t("play.ready"));
-	$("start").disabled = $("aim").disabled = false;
+	disable(false);
 	$("settings").onsubmit = (event) => {
 		event.preventDefault();
-		play(program, pictures, Number($("rate").value), event.submitter === $("aim"));
+		play(program, pictures, Number($("rate").value), event.submitter.id);
 	};
 }
+
+const disable = (is) => {
+	for (const name of ["start", "aim", "stills"]) $(name).disabled = is;
+};
 
 async function refit(program, monitor) {
 	const body = JSON.stringify({ program, monitor, border: true });
@@ -205,18 +211,37 @@ async function aim(canvas, border, stopped, listen) {
 	});
 }
 
-async function play(program, pictures, rate, isAimed) {
+// Shows one picture after another for a still of each: the next at a click or a key, or the one before. There is no border,
+// whose light would be in the stills.
+async function step(context, border, count, pictures, stopped, listen) {
+	let pressed;
+	listen(document, "click", () => pressed?.(1));
+	listen(document, "keydown", ({ key, repeat }) => !repeat && pressed?.(NEXT.includes(key) - BACK.includes(key)));
+	for (let number = 0; number < count; ) {
+		await pictures.prepare(number);
+		draw(context, border, { number, plain: true }, pictures.at(number));
+		number = Math.max(0, number + await new Promise((resolve, reject) => {
+			pressed = resolve;
+			if (stopped.aborted) return reject(stopped.reason);
+			stopped.onabort = () => reject(stopped.reason);
+		}));
+	}
+}
+
+// Plays a program for a film, `how` is "start" or "aim", or for "stills".
+async function play(program, pictures, rate, how) {
+	const forStills = how === "stills";
 	const [stage, canvas] = [$("stage"), $("canvas")];
 	const stop = new AbortController();
 	const { signal } = stop;
 	const listen = (target, event, listener) => target.addEventListener(event, listener, { signal });
 	const end = (why) => stop.abort(new Error(why));
 	const progress = { playback: newKey(), phase: "countdown", patterns_per_second: rate, seconds: COUNTDOWN + LEAD_SECONDS.reduce((sum, one) => sum + one) };
-	const reportStop = () => report({ ...progress, phase: "stopped", seconds: 0 });
+	const reportStop = () => !forStills && report({ ...progress, phase: "stopped", seconds: 0 });
 	let lock;
 	let reportedAt = -REPORT;
 	$("record").hidden = true;
-	$("start").disabled = $("aim").disabled = true;
+	disable(true);
 	try {
 		stage.hidden = false;
 		// What stops it is heard from the start: full screen may take a while.
@@ -236,7 +261,7 @@ async function play(program, pictures, rate, isAimed) {
 		if (full && found.isExact) rememberScreen(found);
 		const isNew = sizeOf(found) !== sizeOf(surface);
 		if (!checkFit(program, found) && isNew) throw new Error(t("play.misfit"));
-		if (isAimed) {
+		if (how === "aim") {
 			const { width, height } = found;
 			[canvas.width, canvas.height] = [width, height];
 			const border = borderOn(width, height);
@@ -244,14 +269,18 @@ async function play(program, pictures, rate, isAimed) {
 			await aim(canvas, border, signal, listen);
 			canvas.width = canvas.height = 0;
 		}
-		report(progress);
-		const refresh = await countDown($("countdown"), signal);
+		if (!forStills) report(progress);
+		const refresh = forStills ? 0 : await countDown($("countdown"), signal);
 		const { width, height } = await measure(canvas);
 		[canvas.width, canvas.height] = [width, height];
 		listen(window, "resize", () => end(t("play.resized")));
 		const border = borderOn(canvas.width, canvas.height);
 		if (!border.fits) throw new Error(t("play.small"));
 		const context = canvas.getContext("2d", { alpha: false });
+		if (forStills) {
+			await step(context, border, program.patterns, pictures, signal, listen);
+			return setStatus(t("play.stills.done", { n: program.patterns }));
+		}
 		Object.assign(progress, { phase: "showing", seconds: 0, border: { width: border.width, height: border.height } });
 		const passed = (number) => {
 			if (number === LEAD || performance.now() < reportedAt + REPORT) return;
@@ -272,8 +301,8 @@ async function play(program, pictures, rate, isAimed) {
 		canvas.width = canvas.height = 0;
 		$("countdown").textContent = "";
 		stage.hidden = true;
-		$("start").disabled = $("aim").disabled = false;
-		$("start").focus();
+		disable(false);
+		$(how).focus();
 	}
 }
 

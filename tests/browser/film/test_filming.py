@@ -119,10 +119,14 @@ def test_followers_see_countdown_progress_and_stop(desk: Page, service: Service)
     for wrong, status in (({"phase": "dancing"}, 422), ({"phase": "shown", "patterns_per_second": -1}, 422)):
         assert service.http.put(f"/v1/programs/{made['id']}/showing", json=wrong).status_code == status
     assert service.http.put("/v1/programs/none/showing", json=body).status_code == 404
-    desk.get_by_label("Choose the film").set_input_files(
-        {"name": "holiday.txt", "mimeType": "text/plain", "buffer": b"twelve bytes"}
-    )
-    expect(desk.get_by_role("alert")).to_contain_text("Choose the video that the camera recorded")
+    text = {"name": "holiday.txt", "mimeType": "text/plain", "buffer": b"twelve bytes"}
+    still = {"name": "holiday.nef", "mimeType": "", "buffer": b"twelve bytes"}
+    for files, why in (
+        ([text], "Choose the video that the camera recorded, or all stills"),
+        ([still, still], "The program shows 12 pictures, and you chose 2 stills"),
+    ):
+        desk.get_by_label("Choose the film").set_input_files(files)
+        expect(desk.get_by_role("alert")).to_contain_text(why)
 
 
 def shown(service: Service, program: str, phase: str) -> None:

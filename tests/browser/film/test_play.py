@@ -30,6 +30,13 @@ from workflows.programs.program import Program
 pytestmark = pytest.mark.slow
 
 SCREEN = {"width": 640, "height": 360}
+SHORT = {
+    "monitor": SCREEN,
+    "parts": [
+        {"kind": "constant", "levels": [0, 1]},
+        {"kind": "bernoulli", "columns": 8, "rows": 6, "count": 2, "seed": 1, "colour": "grey"},
+    ],
+}
 DISPLAYS = [(640, 360), (1920, 1080), (1080, 1920), (3440, 1440), (161, 121), (90, 60), (200, 5000)]
 NUMBERS = [LEAD, 0, 1, 62, 63, 64, 1023, MAX_PATTERNS - 1]
 
@@ -195,6 +202,35 @@ def test_every_pattern_is_shown_in_order_for_its_time(tab: Page, service: Servic
     first, last = (times[next(i for i, (state, _) in enumerate(states) if state == n)] for n in (0, 36))
     assert record["video"]["patterns_per_second"] == pytest.approx(36 / (last - first) * 1000, rel=0.1)
     assert record["program"] == program["program"]
+
+
+def test_pictures_are_shown_one_by_one_for_stills(tab: Page, service: Service) -> None:
+    asked = {"program": SHORT, "monitor": SCREEN, "border": True}
+    program = service.http.post("/v1/programs", json=asked).json()
+    go(tab, service, program)
+    tab.get_by_role("button", name="Show for stills").press("Enter")
+    border = Border(**SCREEN)
+    every = [np.zeros((SCREEN["height"], SCREEN["width"], 3), np.uint8) for _ in range(4)]
+    x, y, width, height = border.inner
+    for screen, picture in zip(every, pictures(Program.model_validate(program["program"])), strict=True):
+        screen[y : y + height, x : x + width] = picture
+    presses = (None, 0), ("Space", 1), ("ArrowLeft", 0), ("PageDown", 1), ("x", 1), ("click", 2), ("Enter", 3)
+    for press, number in presses:
+        if press == "click":
+            tab.mouse.click(320, 180)
+        elif press:
+            tab.keyboard.press(press)
+        until(lambda number=number: np.array_equal(canvas(tab), every[number]))
+    assert phase(service, program) is None
+    tab.keyboard.press("ArrowRight")
+    expect(tab.get_by_role("status")).to_contain_text("All 4 pictures were shown")
+    expect(tab.get_by_role("button", name="Show for stills")).to_be_focused()
+
+
+def canvas(tab: Page) -> NDArray[np.uint8]:
+    """What the page shows, (height, width, 3)."""
+    url = tab.evaluate("document.getElementById('canvas').toDataURL()")
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))).convert("RGB"))
 
 
 def test_escape_stops_and_program_can_be_played_again(tab: Page, service: Service) -> None:

@@ -1,17 +1,18 @@
 // Filming: the choice of a program, and one program with its checklist, its progress on the monitor, and its film.
-import { getJson, newKey, post, putJson } from "../lib/api.js";
+import { elsewhere, getJson, newKey, post, putJson } from "../lib/api.js";
 import { camera, noCamera } from "./recorder.js";
 import { checks } from "./checklist.js";
 import { badge, duration, empty, facts, fileField, h, pause, problemBox, prose, size, when } from "../lib/dom.js";
 import { follow } from "../lib/events.js";
-import { isFilm, programName, recordOf } from "../upload/film_bundle.js";
+import { STILLS, isFilm, isStill, programName, recordOf, stillsRecordOf, together } from "../upload/bundle.js";
 import { list } from "../lib/list.js";
 import { FILM, steps } from "../lib/view.js";
-import { countScreen, onZoom } from "./screen.js";
+import { countScreen, isPhone, onZoom } from "./screen.js";
 import { begin, onDrop, running } from "../upload/upload.js";
 import { parts, said, t } from "../lib/words.js";
 import { placementDiagram } from "./placement_diagram.js";
 
+const USUAL = { width: 1920, height: 1080 }; // pixels of a monitor
 const COUNTDOWN = 8; // seconds, about
 const SILENT = 8; // seconds without a report after which the player page counts as gone; it reports every 2
 const isPlaying = ({ showing }) => ["countdown", "showing"].includes(showing?.phase) && showing.age_seconds < SILENT + showing.seconds;
@@ -21,7 +22,7 @@ export async function filming(main, signal) {
 	const problem = h("div");
 	const number = () => h("input", { type: "number", min: 1, max: 16384, step: 1, required: true });
 	const [width, height] = [number(), number()];
-	const fill = () => ({ width: width.value, height: height.value } = countScreen());
+	const fill = () => ({ width: width.value, height: height.value } = isPhone() ? USUAL : countScreen());
 	fill();
 	onZoom(fill, signal);
 	const choices = presets.map(({ name, description }, n) => {
@@ -31,7 +32,7 @@ export async function filming(main, signal) {
 	const form = h("form.panel", h("h2", t("film.choose")),
 		h("fieldset.stack", h("legend", t("film.shows")), choices),
 		h("div.row", h("label", t("film.width"), width), h("label", t("film.height"), height), h("span.unit", t("film.pixels"))),
-		h("p.hint", t("film.screen")),
+		h("p.hint", t(isPhone() ? "film.other" : "film.screen")),
 		problem, h("p.row", h("button.primary", t("continue"))));
 	form.onsubmit = async (event) => {
 		event.preventDefault();
@@ -58,8 +59,7 @@ export async function filming(main, signal) {
 
 // The address of a view for a phone, to be read off the screen.
 async function nearby(signal, view) {
-	const isOwn = /^(localhost|127\.|\[::1\]$)/.test(location.hostname);
-	const { url, problem } = isOwn ? await getJson("v1/network", signal) : { url: location.origin };
+	const { url, problem } = await elsewhere(signal);
 	if (!url) return h("section.panel", h("h2", t("phone")), h("p", prose(said(problem)), "."));
 	const address = `${url}/#/${view}`;
 	const code = h("img.code", { src: `v1/qr.svg?${new URLSearchParams({ text: address })}`, alt: t("phone.code"), width: 160, height: 160 });
@@ -81,15 +81,16 @@ export async function program(main, signal, id) {
 	const startPlayer = () => putJson(`v1/programs/${id}/showing`, { phase: "countdown", patterns_per_second: found.showing?.patterns_per_second ?? 2, seconds: COUNTDOWN });
 	const why = noCamera();
 	const recorder = why ? null : camera(signal, (file, whole) => film(file, { id: newKey(), warning: whole ? "" : t("film.cut") }), startPlayer);
-	const take = ([file]) => {
+	const take = ([file, ...more]) => {
 		problem.replaceChildren();
 		if (isFilm(file)) film(file);
+		else if (more.length && isStill(file)) begin(together([file, ...more]), stillsRecordOf(found));
 		else problem.replaceChildren(problemBox({ title: t("film.none"), detail: t("film.type", { name: file.name, type: file.type || t("film.unknown") }) }));
 	};
-	const choose = fileField({ accept: "video/*", id: "film" }, take);
+	const choose = fileField({ accept: `video/*,${STILLS}`, id: "film", multiple: true }, take);
 	const zone = h("div.drop.small", h("label", { for: "film" }, parts("film.drop", { choose: h("strong", t("film.file")) })), choose);
 	onDrop(zone, take);
-	const filmed = h("section.panel", h("h2", t("film.title")), recorder ? recorder.panel : h("p", why), zone, problem, running);
+	const filmed = h("section.panel", h("h2", t("film.taken")), recorder ? recorder.panel : h("p", why), zone, problem, running);
 	main.append(
 		steps(FILM),
 		h("p.crumb", h("a", { href: "#/film" }, t("filming"))),

@@ -2,6 +2,9 @@
 
 const key = () => `envmatte-screen-${screen.width}x${screen.height}`;
 
+// Whether the screen is too small to stand behind a glass: it shows the app while another shows the program.
+export const isPhone = () => matchMedia("(pointer: coarse)").matches && Math.min(screen.width, screen.height) < 600;
+
 // As the page counts: right at a zoom of 100 %, to within the rounding of CSS pixels.
 export const countScreen = () => ({
 	width: Math.round(screen.width * devicePixelRatio),

@@ -49,7 +49,7 @@ export async function home(main, signal) {
 		choice("sample", titleOf(sample), h("img", { src: still(sample), alt: "", width: 96, height: 72, draggable: "false" }), i === 0, () => show(sample)));
 
 	const take = (files) => {
-		if (!files[0].type.startsWith("image/")) return upload(files);
+		if (files.length > 1 || !files[0].type.startsWith("image/")) return upload(files);
 		for (const control of main.querySelectorAll("[name=backdrop]")) control.checked = false;
 		use(fromFile(files[0]).then((found) => found.picture ? found : Promise.reject(new Error(t("home.unreadable")))));
 	};

@@ -4,7 +4,6 @@ import { badge, h, newest } from "./dom.js";
 import { ACTIVE } from "./events.js";
 import { qualityOf } from "./view.js";
 import { known, said, t } from "./words.js";
-import { languageSwitch } from "./language.js";
 
 const REFRESH = 4000; // ms
 const SHOWN = 8;
@@ -37,8 +36,6 @@ export const refreshActivity = newest(async () => {
 });
 
 menu.addEventListener("toggle", ({ newState }) => {
-	if (newState !== "open") return;
-	menu.lastElementChild.replaceChildren(...languageSwitch());
-	refreshActivity();
+	if (newState === "open") refreshActivity();
 });
 addEventListener("hashchange", () => menu.hidePopover());

@@ -118,3 +118,9 @@ function saveAs(href, download) {
 	const link = Object.assign(document.createElement("a"), { href, download });
 	link.click();
 }
+
+// The `url` where other devices find this service, or the `problem` why they cannot, in words.
+export async function elsewhere(signal) {
+	const isHere = /^(localhost|127\.|\[::1\]$)/.test(location.hostname);
+	return isHere ? getJson("v1/network", signal) : { url: new URL(".", location.href.split("#")[0]).href.replace(/\/$/, "") };
+}

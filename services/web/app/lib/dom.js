@@ -5,7 +5,7 @@ import { known, locale, said, t } from "./words.js";
 export function h(name, ...children) {
 	const [tag, ...classes] = name.split(".");
 	const element = document.createElement(tag);
-	element.classList.add(...classes);
+	if (classes.length) element.className = classes.join(" ");
 	for (const [name, value] of Object.entries(children[0]?.constructor === Object ? children.shift() : {})) {
 		if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
 		else if (value !== false && value != null) element.setAttribute(name, value === true ? "" : value);
@@ -33,7 +33,7 @@ export const problemBox = (error) =>
 	h("div.problem", { role: "alert" }, h("strong", said(error.title ?? t("wrong"))),
 		h("p", prose(sentence(said(error.detail ?? error.message), error.entry))));
 
-export const empty = (title, text) => h("div.empty", h("strong", title), h("p", text));
+export const empty = (title, text) => h("div.empty", h("strong", title), h("p", text)); // a text, or its parts
 
 const LEVEL = {
 	good: "good", ready: "good", succeeded: "good",

@@ -14,10 +14,11 @@ export async function loadWords() {
 	speak(language, words);
 }
 
-export const languageSwitch = () => [t("language"), ...Object.entries(LANGUAGES).map(([language, name]) => h("button", {
-	type: "button", lang: language, "aria-pressed": String(locale().startsWith(language)),
+// A button for each other language.
+export const languageSwitch = () => Object.entries(LANGUAGES).filter(([language]) => !locale().startsWith(language)).map(([language, name]) => h("button", {
+	type: "button", lang: language,
 	onclick() {
 		localStorage.setItem(KEPT, language);
 		location.reload();
 	},
-}, name))];
+}, name));

@@ -37,6 +37,7 @@ async function read(file, { method, size, at }) {
 }
 
 const patterns = ({ levels, colours, files, count }) => (levels ?? colours ?? files)?.length ?? count;
+export const countPatterns = ({ parts }) => parts.reduce((sum, part) => sum + patterns(part), 0);
 
 // The size of a PNG or JPEG (ITU-T T.81, table B.1) from its first bytes.
 function sizeOf(head) {
@@ -54,7 +55,7 @@ export async function readArchiveInfo(file) {
 		const found = await entries(file);
 		if (found[RECORD].size > MOST) return info;
 		const record = JSON.parse(await (await read(file, found[RECORD])).text());
-		info.frames = record.frames?.length || record.program.parts.reduce((sum, part) => sum + patterns(part), 0);
+		info.frames = record.frames?.length || countPatterns(record.program);
 		if (record.frames?.length) {
 			const image = await read(file, found[record.frames[0].file]);
 			Object.assign(info, sizeOf(await view(image.slice(0, HEAD))));

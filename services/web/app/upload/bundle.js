@@ -1,11 +1,17 @@
-// Makes a capture archive of a film: asks which program it shows, and puts both into one ZIP.
-import { getJson } from "../lib/api.js";
+// Makes a capture archive of a film or of stills: asks which program they show, and puts all into one ZIP.
+import { Problem, getJson } from "../lib/api.js";
 import { h, size, when } from "../lib/dom.js";
+import { countPatterns } from "./archive_info.js";
 import { zip } from "./zip.js";
 import { parts, t } from "../lib/words.js";
 
 const ENDS = /\.(mp4|m4v|mov|mkv|webm|avi|3gp|mts|m2ts)$/i;
+// Browsers know no type of MKV, and give MTS that of something else.
 export const isFilm = (file) => file.type.startsWith("video/") || ENDS.test(file.name);
+export const RAW = ".dng,.nef,.cr2,.cr3,.arw,.raf,.orf,.rw2"; // the usual names of camera RAW
+export const STILLS = `image/*,.heic,.heif,.hif,.exr,.tif,.tiff,${RAW}`; // what a field for files takes
+const STILL_ENDS = new RegExp(`(${STILLS.split(",").slice(1).join("|").replaceAll(".", "\\.")})$`, "i");
+export const isStill = (file) => file.type.startsWith("image/") || STILL_ENDS.test(file.name);
 
 export const programName = (program) => t(program.display ? "program.screen" : "program.plain", { n: program.patterns, size: size(program.display ?? {}) });
 
@@ -13,8 +19,10 @@ export const programName = (program) => t(program.display ? "program.screen" : "
 export function recordOf(program, rate) {
 	const border = program.showing?.border ?? program.display;
 	const video = { patterns_per_second: rate, ...(border && { border }) };
-	return { format: "envmatte-capture/1", program: program.program, video };
+	return { ...stillsRecordOf(program), video };
 }
+
+export const stillsRecordOf = ({ program }) => ({ format: "envmatte-capture/1", program });
 
 export async function filmArchive(film, record, signal) {
 	const file = `film${ENDS.exec(film.name)?.[0].toLowerCase() ?? ".mp4"}`;
@@ -23,8 +31,23 @@ export async function filmArchive(film, record, signal) {
 	return zip([["capture.json", new Blob([text])], [file, film]], signal);
 }
 
-// Asks in `where` which program a film shows; resolves with its capture.json.
-export async function askForRecord(where, signal) {
+// Stills as one thing to upload: one of each pattern, in the order of their names.
+export function together(files) {
+	const stills = [...files].sort((a, b) => a.name.localeCompare(b.name, "en", { numeric: true }));
+	return { name: t("stills.name", { first: stills[0].name, n: stills.length }), type: "", stills, lastModified: stills[0].lastModified };
+}
+
+export async function stillsArchive({ stills }, { video, mask, ...record }, signal) {
+	const patterns = countPatterns(record.program);
+	if (stills.length !== patterns) throw new Problem({ status: 422, title: t("upload.none"), detail: t("stills.count", { n: stills.length, patterns }) });
+	const name = record.name || stills[0].name.replace(/\.\w+$/, "").slice(0, 200);
+	const frames = stills.map((still, pattern) => ({ file: `${String(pattern).padStart(5, "0")}${/\.\w+$/.exec(still.name)?.[0].toLowerCase() ?? ""}`, pattern }));
+	const text = JSON.stringify({ ...record, name, frames });
+	return zip([["capture.json", new Blob([text])], ...frames.map(({ file }, n) => [file, stills[n]])], signal);
+}
+
+// Asks in `where` which program a film or stills show; resolves with their capture.json.
+export async function askForRecord(where, isFilmed, signal) {
 	const { programs } = await getJson("v1/programs?limit=100", signal);
 	return new Promise((resolve, reject) => {
 		signal.addEventListener("abort", () => reject(signal.reason), { once: true });
@@ -38,7 +61,8 @@ export async function askForRecord(where, signal) {
 		own.onchange = async () => {
 			try {
 				const found = JSON.parse(await own.files[0].text());
-				if (!found.video?.patterns_per_second) throw new Error(t("record.novideo"));
+				if (isFilmed && !found.video?.patterns_per_second) throw new Error(t("record.novideo"));
+				if (!found.program?.parts) throw new Error(t("record.noprogram"));
 				resolve(found);
 			} catch (error) {
 				problem.textContent = t("record.wrong", { why: error.message });
@@ -48,12 +72,12 @@ export async function askForRecord(where, signal) {
 		const form = h("form.stack",
 			h("p", h("strong", t("program.which"))),
 			programs.length
-				? [h("label", t("program"), which), h("label", t("rate"), rate), h("p.row", h("button.primary", t("upload")))]
+				? [h("label", t("program"), which), isFilmed && h("label", t("rate"), rate), h("p.row", h("button.primary", t("upload")))]
 				: h("p", parts("program.none", { play: h("a", { href: "#/film" }, t("program.play")) })),
 			h("label", t("program.own"), own), problem);
 		form.onsubmit = (event) => {
 			event.preventDefault();
-			getJson(`v1/programs/${programs[which.value].id}`, signal).then((program) => resolve(recordOf(program, Number(rate.value))), reject);
+			getJson(`v1/programs/${programs[which.value].id}`, signal).then((program) => resolve(isFilmed ? recordOf(program, Number(rate.value)) : stillsRecordOf(program)), reject);
 		};
 		where.replaceChildren(form);
 		(programs.length ? which : own).focus();

@@ -2,7 +2,7 @@
 import { Problem, ask, newKey, post, saveBlob } from "../lib/api.js";
 import { recordings } from "../lib/recordings.js";
 import { bytes, confirmed, duration, fileField, h, problemBox, when } from "../lib/dom.js";
-import { askForRecord, filmArchive, isFilm } from "./film_bundle.js";
+import { STILLS, askForRecord, filmArchive, isFilm, isStill, stillsArchive, together } from "./bundle.js";
 import { forgetFilm, keepFilm, noteCapture, waitingFilms } from "./kept_films.js";
 import { send } from "./tus.js";
 import { crc32 } from "./zip.js";
@@ -16,8 +16,8 @@ export const running = h("div.uploads");
 const rows = new Set(); // of each upload, whether it is `busy`, and whether its film is `unsaved`: only in this page
 addEventListener("beforeunload", (event) => [...rows].some(({ busy, unsaved }) => busy || unsaved) && event.preventDefault());
 
-// Uploads a capture archive, or a film with its capture.json; without one, asks for its program. A film was filmed in the
-// view `again`. One that was recorded here has an `id`: it can be saved, is kept until its capture is ready, and is
+// Uploads a capture archive, or a film or stills with their capture.json; without one, asks for their program. A film was
+// filmed in the view `again`. One that was recorded here has an `id`: it can be saved, is kept until its capture is ready, and is
 // discarded only after a question. One with a `warning` waits for the user; one that is `stored` is kept already.
 export function begin(file, record, { again: view = "#/film", id, at = Date.now(), warning = "", stored = false } = {}) {
 	const film = { id, at, file, record, again: view, warning };
@@ -47,7 +47,7 @@ export function begin(file, record, { again: view = "#/film", id, at = Date.now(
 		h("p.row.spread", h("strong.name", file.name), h("span.row", again, save, cancel)), bar, status, asked, problem);
 	running.append(row);
 	rows.add(state);
-	let archive = isFilm(file) ? null : file;
+	let archive = isFilm(file) || file.stills ? null : file;
 	const once = newKey();
 	let remembered;
 
@@ -59,10 +59,10 @@ export function begin(file, record, { again: view = "#/film", id, at = Date.now(
 		state.busy = true;
 		try {
 			if (!archive) {
-				status.textContent = t("upload.film");
-				record ??= await askForRecord(asked, stop.signal);
+				status.textContent = t(file.stills ? "stills" : "upload.film");
+				record ??= await askForRecord(asked, isFilm(file), stop.signal);
 				status.textContent = t("upload.zipping");
-				archive = await filmArchive(file, record, stop.signal);
+				archive = await (file.stills ? stillsArchive : filmArchive)(file, record, stop.signal);
 			} else {
 				const head = await headOf(archive);
 				if (!/^PK[\x03\x05]/.test(head)) throw new Problem({ status: 422, title: t("upload.none"), detail: t("upload.neither", { name: file.name }) });
@@ -72,7 +72,7 @@ export function begin(file, record, { again: view = "#/film", id, at = Date.now(
 					return arrived(`#/mattes/${(await importMatte(file, once, stop.signal)).id}`);
 				}
 			}
-			// A film with another capture.json is another archive.
+			// A film or stills with another capture.json are another archive.
 			remembered ??= `envmatte-upload ${file.name} ${archive.size} ${file.lastModified} ${record ? await crc32(archive.slice(0, HEAD)) : ""}`;
 			const upload = await send(archive, remembered, {
 				filename: file.name,
@@ -129,11 +129,13 @@ async function importMatte(file, once, signal) {
 }
 
 export function upload(files) {
-	[...files].forEach((file) => begin(file));
+	const stills = [...files].filter(isStill);
+	for (const file of files) if (!isStill(file)) begin(file);
+	if (stills.length) begin(together(stills));
 	location.hash = "#/captures";
 }
 
-export const fileInput = (id) => fileField({ accept: ".zip,application/zip,video/*,.mkv,.mts,.m2ts", id, multiple: true }, upload);
+export const fileInput = (id) => fileField({ accept: `.zip,application/zip,video/*,.mkv,.mts,.m2ts,${STILLS}`, id, multiple: true }, upload);
 
 export function dropZone() {
 	const zone = h("div.drop",

@@ -2,9 +2,9 @@
 export const de = {
 	"140 frames, black and white: the best mattes, whatever the glass.": "140 Bilder, schwarz-weiß: die besten Matten, egal welches Glas.",
 	"282 frames: the program of the paper, for comparison.": "282 Bilder: das Programm aus der Veröffentlichung, zum Vergleich.",
-	"37 frames, in colour unless filmed: a first look at the set-up.": "37 Bilder, ungefilmt in Farbe: ein erster Blick auf den Aufbau.",
+	"37 frames: a first look at the set-up.": "37 Bilder: ein erster Blick auf den Aufbau.",
 	"432 frames: the longest program of the paper.": "432 Bilder: das längste Programm der Veröffentlichung.",
-	"61 frames, in colour unless filmed: clear glass, in half the time.": "61 Bilder, ungefilmt in Farbe: klares Glas, in der halben Zeit.",
+	"61 frames: clear glass, in half the time.": "61 Bilder: klares Glas, in der halben Zeit.",
 	"A cell is refined if its weight plus half of its eight neighbours' is more than this.": "Eine Zelle wird verfeinert, wenn ihr Gewicht plus die Hälfte dessen ihrer acht Nachbarn darüber liegt.",
 	"A channel whose rho is below this many standard deviations of a mid-grey value has an empty row in T.": "Ein Kanal, dessen rho unter so vielen Standardabweichungen eines mittelgrauen Werts liegt, hat eine leere Zeile in T.",
 	"A round ends when a step lowers chi-square by less than this.": "Eine Runde endet, wenn ein Schritt Chi-Quadrat um weniger als das senkt.",
