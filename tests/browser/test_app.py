@@ -67,7 +67,7 @@ def picture(seed: int, width: int, height: int) -> bytes:
 def test_upload_report_recovery_and_composite(tab: Page, service: Service, ball: Path) -> None:
     tab.add_init_script(BY_HAND)
     tab.goto(f"{service.url}/#/captures")
-    tab.get_by_label("Choose a capture archive or a film").set_input_files(ball)
+    tab.get_by_label("Choose a film, stills or a capture archive").set_input_files(ball)
     expect(tab).to_have_url(re.compile(r"#/captures/\w+"), timeout=MINUTE)
     expect(tab.get_by_role("heading", name="a ball")).to_be_visible()
     expect(tab.get_by_role("region", name="Report")).to_be_visible(

@@ -8,7 +8,7 @@ import { capture } from "./views/capture.js";
 import { filming, program } from "./film/program.js";
 import { job, jobs } from "./views/jobs.js";
 import { matte, mattes } from "./views/mattes.js";
-import { loadWords } from "./lib/language.js";
+import { languageSwitch, loadWords } from "./lib/language.js";
 import { t } from "./lib/words.js";
 import { offerFilms } from "./upload/upload.js";
 
@@ -86,6 +86,7 @@ for (const type of ["dragover", "drop"]) {
 }
 addEventListener("keydown", ({ key, target }) => key === "?" && !target.matches("input, select") && document.getElementById("keys").showModal());
 await loadWords();
+document.getElementById("languages").append(...languageSwitch());
 addEventListener("hashchange", () => route(true));
 route(false);
 offerFilms();

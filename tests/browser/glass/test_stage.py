@@ -3,6 +3,7 @@
 import base64
 import io
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -46,8 +47,8 @@ def pixels(page: Page, selector: str) -> NDArray[np.float64]:
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))).convert("RGBA"), float)
 
 
-def test_reload_and_link_show_the_same(desk: Page, service: Service, ready: tuple[str, str]) -> None:
-    opened(desk, service, ready[1])
+def test_reload_and_link_show_the_same(desk: Page, service: Service, masked: str) -> None:
+    opened(desk, service, masked)
     expect(desk).to_have_url(re.compile(r"#/mattes/\w+$"))
     desk.get_by_role("radio", name="Stripes").check()
     desk.get_by_role("slider", name="Turn").fill("30")
@@ -99,6 +100,37 @@ def test_what_the_mask_left_out_shows_the_backdrop_or_nothing(
     alone = pixels(desk, canvas)
     assert (alone[0, 5] == 0).all()
     assert 0.1 < np.mean(alone[..., 3] > 0) < 0.9
+
+
+def test_without_a_mask_nothing_can_be_transparent(
+    desk: Page, service: Service, ready: tuple[str, str]
+) -> None:
+    opened(desk, service, ready[1])
+    expect(desk.get_by_text("the capture had no mask")).to_be_visible()
+    expect(desk.get_by_label("Transparent around the glass")).to_be_disabled()
+
+
+def test_own_backdrop_stays_among_the_choices(
+    desk: Page, service: Service, ready: tuple[str, str], tmp_path: Path
+) -> None:
+    opened(desk, service, ready[1])
+    for name, colour in (("sea.png", "blue"), ("hill.png", "green")):
+        path = tmp_path / name
+        Image.new("RGB", (64, 48), colour).save(path)
+        desk.get_by_label("Your own picture or clip").set_input_files(path)
+        expect(desk.get_by_role("radio", name=name)).to_be_checked()
+        expect(desk.get_by_text(f"{name}: exact")).to_be_visible()
+        thumb = pixels(desk, ".thumb-choice:has(:checked) canvas")
+        np.testing.assert_array_equal(thumb[36, 48, :3], Image.new("RGB", (1, 1), colour).getpixel((0, 0)))
+    expect(desk.get_by_role("radio", name="sea.png")).to_have_count(0)  # the last one alone
+    desk.get_by_role("radio", name="Stripes").check()
+    expect(desk.get_by_text("Stripes: exact")).to_be_visible()
+    desk.get_by_role("radio", name="hill.png").check()
+    expect(desk.get_by_text("hill.png: exact")).to_be_visible()
+    damaged = {"name": "sky.exr", "mimeType": "", "buffer": b"no picture"}
+    desk.get_by_label("Your own picture or clip").set_input_files(damaged)
+    expect(desk.get_by_role("alert")).to_be_in_viewport()
+    expect(desk.locator(".thumb-choice:has(:checked)")).to_contain_text("exr")
 
 
 def test_phone_has_the_controls_in_a_sheet_of_the_full_screen(

@@ -179,17 +179,15 @@ def test_page_of_a_link_speaks_the_language_of_its_reader(
             expect(page.locator("html")).to_have_attribute("lang", locale[:2].replace("fr", "en"))
 
 
-def test_language_is_chosen_in_the_activity_menu_and_kept(desk: Page, service: Service) -> None:
+def test_language_is_chosen_at_the_top_and_kept(desk: Page, service: Service) -> None:
     desk.add_init_script(BY_HAND)
     desk.goto(f"{service.url}/#/captures")
     expect(desk.get_by_label(ZIP)).to_be_attached()
-    desk.get_by_role("button", name="Activity").click()
-    menu = desk.get_by_role("region", name="Activity")
-    expect(menu.get_by_role("button", name="English")).to_have_attribute("aria-pressed", "true")
-    menu.get_by_role("button", name="Deutsch").click()
+    header = desk.get_by_role("banner")
+    expect(header.get_by_role("button", name="English")).to_have_count(0)
+    header.get_by_role("button", name="Deutsch").click()
     expect(desk.get_by_role("heading", name="Aufnahmen")).to_be_visible()
     desk.reload()
     expect(desk.get_by_role("heading", name="Aufnahmen")).to_be_visible()
-    desk.get_by_role("button", name="Aktivität").click()
-    desk.get_by_role("region", name="Aktivität").get_by_role("button", name="English").click()
+    header.get_by_role("button", name="English").click()
     expect(desk.get_by_role("heading", name="Captures")).to_be_visible()

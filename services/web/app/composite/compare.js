@@ -8,9 +8,10 @@ export function comparison(stage, matte, others) {
 	const { width, height } = matte;
 	const aside = h("canvas.aside", { width, height, hidden: true, "aria-hidden": "true" });
 	const context = aside.getContext("2d");
+	const divider = h("span.divider", { hidden: true });
 	const slider = h("input", { type: "range", min: 0, max: 100, step: 1, value: 50, id: "divide" });
 	const row = h("div.row", { hidden: true }, h("label", { for: "divide" }, t("compare.divide")), slider);
-	const cut = () => (aside.style.clipPath = `inset(0 ${100 - slider.value}% 0 0)`);
+	const cut = () => stage.element.style.setProperty("--divide", `${slider.value}%`);
 	slider.oninput = cut;
 	cut();
 	const kinds = {
@@ -22,16 +23,17 @@ export function comparison(stage, matte, others) {
 		kinds[name] = async () => context.drawImage(await createImageBitmap(await stage.composite("image/jpeg", {}, stage.backdrop, other.id)), 0, 0, width, height);
 	}
 	let chosen = null;
+	const hide = (is) => (aside.hidden = divider.hidden = is);
 	const draw = newest(async () => {
 		row.hidden = !chosen;
-		aside.hidden = true;
+		hide(true);
 		if (!chosen || !stage.isExact) return;
 		const made = await Promise.resolve(chosen()).catch(stage.fail);
-		aside.hidden = made === false || !stage.isExact;
+		hide(made === false || !stage.isExact);
 	});
-	stage.element.append(aside);
+	stage.element.append(aside, divider);
 	stage.element.addEventListener("exact", draw);
-	stage.element.addEventListener("moved", () => (aside.hidden = true));
+	stage.element.addEventListener("moved", () => hide(true));
 	const choice = (name) => h("label.choice",
 		h("input", { type: "radio", name: "compare", checked: !kinds[name], onchange: () => ((chosen = kinds[name]), draw()) }), name);
 	return h("div.stack", h("fieldset.row", h("legend", t("compare.with")), Object.keys(kinds).map(choice)), row);

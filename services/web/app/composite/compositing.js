@@ -1,5 +1,6 @@
 // The stage of a matte, and its controls.
 import { fileField, h } from "../lib/dom.js";
+import { STILLS, isFilm } from "../upload/bundle.js";
 import { onDrop } from "../upload/upload.js";
 import { builtIn, fromFile } from "./backdrops/backdrops.js";
 import { clipJob } from "./clip_job.js";
@@ -9,14 +10,10 @@ import { explanation } from "./explain.js";
 import { handleGestures, placement } from "./placement.js";
 import { NAMES, scenery } from "./backdrops/scenery.js";
 import { Stage } from "./stage.js";
-import { cameraSymbol, choice, thumbs } from "./backdrops/thumb_choices.js";
+import { cameraSymbol, choice, thumbOf, thumbs } from "./backdrops/thumb_choices.js";
 import { camera, clip } from "./backdrops/video_backdrops.js";
 import { parts, t } from "../lib/words.js";
 import { recordButton } from "./recording.js";
-
-const RAW = ".dng,.nef,.cr2,.cr3,.arw,.raf,.orf,.rw2"; // the usual names of camera RAW
-// Browsers know no type of MKV, and give MTS that of something else.
-const isVideo = (file) => file.type.startsWith("video/") || /\.(mp4|mov|mkv|webm|avi|mts|m2ts)$/i.test(file.name);
 
 // The section, and its stage. `others` are mattes to compare with, by a name.
 export function compositing(matte, others, signal) {
@@ -34,7 +31,7 @@ export function compositing(matte, others, signal) {
 			play.textContent = t(stage.playing ? "pause" : "play");
 		},
 	}, t("pause"));
-	let used; // the control of the backdrop that is shown, if it has one
+	let used; // the control of the backdrop that is shown
 	async function use(promise, control) {
 		const backdrop = await stage.use(promise);
 		if (backdrop === false && used) used.checked = true;
@@ -43,9 +40,15 @@ export function compositing(matte, others, signal) {
 		video.choose(backdrop.clip);
 		play.hidden = !backdrop.moving;
 		play.textContent = t("pause");
+		return backdrop;
 	}
 	const transparent = h("input", { type: "checkbox", checked: given.around === "nothing" });
 	transparent.onchange = () => stage.putAround(!transparent.checked);
+	const unmasked = h("span.hint", { hidden: true }, t("transparent.none"));
+	stage.element.addEventListener("unmasked", () => {
+		transparent.disabled = true;
+		unmasked.hidden = false;
+	});
 	stage.around = !transparent.checked;
 	const first = NAMES.includes(given.backdrop) ? given.backdrop : NAMES[0];
 
@@ -73,7 +76,7 @@ export function compositing(matte, others, signal) {
 	const leave = h("button.leave", { type: "button", hidden: true, onclick: () => (document.fullscreenElement ? document.exitFullscreen() : filled(false)) }, t("full.leave"));
 	const folded = (title, ...about) => h("details", h("summary", title), about);
 	const sheet = h("details.panel.sheet", { open: true }, h("summary", t("controls")),
-		h("div.row", full, play, recordButton(stage, matte, signal), explained.button, placed.reset, h("label", transparent, " ", t("transparent"))),
+		h("div.row", full, play, recordButton(stage, matte, signal), explained.button, placed.reset, h("label", transparent, " ", t("transparent")), unmasked),
 		stage.status, explained.panel, choices,
 		folded(t("placement"), h("p.hint", t("placement.how")), placed.sliders),
 		folded(t("compare"), comparison(stage, matte, others)), folded(t("take"), taken.element), video.element, stage.renderer);
@@ -87,13 +90,22 @@ export function compositing(matte, others, signal) {
 function backdropChoices(matte, stage, use, all, first, signal) {
 	const builtIns = NAMES.map((name) => choice("backdrop", t(`scene.${name}`), scenery(name, 96, 72).picture, name === first, (control) => use(builtIn(name, matte.monitor), control)));
 	const choices = thumbs(t("backdrop"), [...builtIns, choice("backdrop", t("camera"), cameraSymbol(), false, (control) => use(camera(), control))]);
-	const take = (files) => {
+	let own; // the choice of the last file
+	const take = async (files) => {
 		if (files.length > 1) return all([...files]);
 		const [file] = files;
-		for (const input of choices.querySelectorAll("input")) input.checked = false;
-		use(isVideo(file) ? clip(file) : fromFile(file));
+		const open = () => (isFilm(file) ? clip(file) : fromFile(file));
+		const place = h("span");
+		const next = choice("backdrop", file.name || t("backdrop.pasted"), place, false, (control) => use(open(), control));
+		const control = next.querySelector("input");
+		const taken = await use(open(), control);
+		if (!taken) return;
+		own?.remove();
+		choices.lastChild.append((own = next));
+		place.replaceWith(thumbOf(taken));
+		control.checked = true;
 	};
-	const input = fileField({ id: "backdrop", multiple: true, accept: `image/*,.heic,.heif,.hif,.exr,.tif,.tiff,${RAW},video/*,.mts,.m2ts` }, take);
+	const input = fileField({ id: "backdrop", multiple: true, accept: `${STILLS},video/*,.mts,.m2ts` }, take);
 	onDrop(stage, take);
 	addEventListener("paste", ({ clipboardData }) => clipboardData?.files.length && take(clipboardData.files), { signal });
 	return [choices, h("div.drop.small", h("label", { for: "backdrop" }, parts("backdrop.drop", { own: h("strong", t("backdrop.own")) }),

@@ -8,7 +8,8 @@ import { t } from "../lib/words.js";
 
 const QUICK = 480; // pixels of the longer side of a preview
 
-// Its element sends `moved` before a change, and `exact` when the picture shows it at full size.
+// Its element sends `moved` before a change, `exact` when the picture shows it at full size, and `unmasked` if there is
+// nothing that a mask left out.
 export class Stage extends LiveGlass {
 	#matte;
 	#changes = 0;
@@ -32,7 +33,11 @@ export class Stage extends LiveGlass {
 		this.fetch();
 	}
 
-	fail = (error) => this.signal.aborted || this.problem.replaceChildren(problemBox(error));
+	fail = (error) => {
+		if (this.signal.aborted) return;
+		this.problem.replaceChildren(problemBox(error));
+		this.problem.scrollIntoView({ block: "nearest" });
+	};
 
 	// False if the backdrop cannot be used.
 	async use(promise) {
@@ -166,6 +171,7 @@ export class Stage extends LiveGlass {
 				if (this.gl) say(t("stage.toolarge"));
 				return;
 			}
+			if (!found.isMasked) this.element.dispatchEvent(new Event("unmasked"));
 			const step = found.step * (this.#matte.preview ?? 1);
 			say(t(step > 1 ? "stage.some" : "stage.all", { n: step ** 2 }));
 			if (!this.backdrop || this.isExact) return;

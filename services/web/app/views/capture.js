@@ -6,6 +6,7 @@ import { renamable } from "../lib/rename.js";
 import { CHECK, deletion, steps } from "../lib/view.js";
 import { matteCards } from "./mattes.js";
 import { recoveryForm } from "./recovery_form.js";
+import { verdictOf } from "./report.js";
 import { said, t } from "../lib/words.js";
 import { failedFilm } from "../film/failed_film.js";
 import { forgetFilmOf } from "../upload/kept_films.js";
@@ -49,19 +50,14 @@ async function mattesOf(id, signal) {
 		h("ul.list", mattes.map((one) => h("li", card(one)))));
 }
 
-const GRADES = [[40, "excellent"], [30, "good"], [22, "fair"], [-Infinity, "poor"]]; // from so many dB on
-
 // The report: a verdict, then what is wrong with its remedies; what is fine is folded.
-function verdict({ level, quality, findings }) {
-	// Random grids without offsets suit frosted glass, all others clear glass.
-	const clear = quality && (quality.blocks == null ? quality.high : quality.low);
-	const [, grade] = quality ? GRADES.find(([least]) => clear >= least) : [];
-	const text = t(`verdict.${level}`) + (grade ? t(`verdict.${level === "good" ? "expect" : "best"}`, { grade: t(`grade.${grade}`) }) : "");
+function verdict(report) {
+	const { level, findings } = report;
 	const rows = (some) => h("ul.findings", some.map((one) =>
 		h("li", badge(one.level), h("div", h("p", prose(sentence(said(one.message)))), one.remedy && h("p.remedy", prose(sentence(said(one.remedy))))))));
 	const fine = findings.filter((one) => one.level === "good");
 	const wrong = findings.filter((one) => one.level !== "good");
-	return h("section.panel", { "aria-label": t("report") }, h("div.row", h("h2", text), badge(level)),
+	return h("section.panel", { "aria-label": t("report") }, h("div.row", h("h2", verdictOf(report)), badge(level)),
 		wrong.length ? rows(wrong) : "", h("details", { hidden: !fine.length }, h("summary", t("report.fine", { n: fine.length })), rows(fine)));
 }
 

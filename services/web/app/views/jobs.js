@@ -9,6 +9,7 @@ import { list } from "../lib/list.js";
 import { followJob } from "../lib/job_progress.js";
 import { RECOVER, CHECK, deletion, qualityOf, steps } from "../lib/view.js";
 import { automatic } from "./recovery_form.js";
+import { reportLink } from "./report.js";
 import { t } from "../lib/words.js";
 
 const REFRESH = 2000; // ms between two pictures of what is recovered
@@ -43,6 +44,7 @@ export async function job(main, signal, id) {
 	const panel = h("section.panel", { "aria-label": t("progress"), "data-log": "" });
 	const preview = found.kind === "recover" ? await progressPicture(found, signal) : null;
 	const step = { ingest: CHECK, recover: RECOVER }[found.kind];
+	const report = found.kind === "recover" && (await reportLink(found.capture, signal));
 	main.append(
 		step ? steps(step, "#/captures", `#/captures/${found.capture}`) : "",
 		h("p.crumb", h("a", { href: "#/jobs" }, t("jobs"))),
@@ -50,7 +52,7 @@ export async function job(main, signal, id) {
 		problem,
 		facts({
 			[t("job.asked")]: when(found.created_at), [t("capture")]: found.capture && h("a", { href: `#/captures/${found.capture}` }, t("job.capture")),
-			[t("method")]: found.options.method, [t("quality")]: qualityOf(found),
+			[t("method")]: found.options.method, [t("quality")]: qualityOf(found), [t("report")]: report,
 		}),
 		links, h("div", { class: preview ? "columns" : "stack" }, preview?.panel, h("div.stack", panel, asked)),
 	);
@@ -98,13 +100,14 @@ async function progressPicture(found, signal) {
 	const frame = h("div.picture.filling", image);
 	if (width) frame.style.aspectRatio = `${width} / ${height}`;
 	const before = backdrop("Checker", 640, 480);
-	let done = -1;
+	let shown;
 	const look = newest(async (now) => {
-		if (now.tiles.done === done) return;
+		const next = `${now.state} ${now.tiles.done}`;
+		if (next === shown) return;
 		const size = Math.min(LONGER, Math.max(width ?? LONGER, height ?? LONGER));
 		try {
 			await show(image, await getComposite(now.matte, { size }, "image/png", await before, signal));
-			done = now.tiles.done;
+			shown = next;
 			if (now.state === "running") await pause(REFRESH, signal);
 		} catch {
 			await pause(REFRESH, signal).catch(() => {}); // nothing recovered yet, or the service is away, which the progress panel shows

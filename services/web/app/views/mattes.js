@@ -7,7 +7,8 @@ import { layers } from "../composite/layers.js";
 import { recovering } from "../composite/recovering.js";
 import { list } from "../lib/list.js";
 import { PLAY, deletion, matteName, qualityOf, steps, thumbnails } from "../lib/view.js";
-import { t } from "../lib/words.js";
+import { parts, t } from "../lib/words.js";
+import { reportLink } from "./report.js";
 import { sharing } from "./sharing.js";
 import { renamable } from "../lib/rename.js";
 
@@ -26,7 +27,7 @@ export async function mattes(main, signal) {
 	await list(main, signal, {
 		kind: "mattes", states: ["recovering", "ready", "failed"], named: true, text: matteName,
 		busy: (one) => one.state === "recovering",
-		none: () => empty(t("mattes.none"), t("mattes.first")),
+		none: () => empty(t("mattes.none"), parts("mattes.first", { captures: h("a", { href: "#/captures" }, t("nav.captures")) })),
 		item: matteCards(signal),
 	});
 }
@@ -50,6 +51,7 @@ export async function matte(main, signal, id) {
 		[t("frame")]: found.width && t("pixels", { size: size(found) }), [t("monitor")]: found.monitor && t("pixels", { size: found.monitor.join(" × ") }),
 		[t("made")]: when(found.created_at), [t("until")]: found.expires_at && when(found.expires_at),
 		[t("method")]: options.method, [t("quality")]: qualityOf(found),
+		[t("report")]: await reportLink(capture, signal),
 		[t("capture")]: capture && h("a", { href: `#/captures/${capture}` }, t("job.capture")),
 		[t("job")]: job && h("a", { href: `#/jobs/${job}` }, t("matte.job")),
 	}));

@@ -1,7 +1,7 @@
 // Links by which people without a key see a matte: made, copied, deleted.
-import { getJson, post, remove } from "../lib/api.js";
-import { button, h, problemBox, when } from "../lib/dom.js";
-import { parts, t } from "../lib/words.js";
+import { elsewhere, getJson, post, remove } from "../lib/api.js";
+import { button, h, problemBox, prose, when } from "../lib/dom.js";
+import { parts, said, t } from "../lib/words.js";
 
 const DAYS = [7, 30, 365];
 const USUAL = 30;
@@ -26,10 +26,11 @@ export function sharing(id, signal) {
 	const create = button(t("share.make"), problem, async () => {
 		const link = await post(path, { days: Number(days.value) });
 		made.dataset.link = link.id;
-		const to = (where) => new URL(where.slice(1), location.href.split("#")[0]).href;
-		made.replaceChildren(field(t("share.link"), to(link.path), problem),
+		const { url, problem: here } = await elsewhere(signal);
+		const to = (where) => new URL(where.slice(1), url ? `${url}/` : location.href.split("#")[0]).href;
+		made.replaceChildren(...[field(t("share.link"), to(link.path), problem),
 			field(t("share.embed"), h("iframe", { src: to(link.embed), width: 640, height: 560 }).outerHTML, problem),
-			h("p.hint", t("share.once")));
+			here && h("p", prose(said(here)), "."), h("p.hint", t("share.once"))].filter(Boolean));
 		links.prepend(row(link));
 	}, "primary");
 	const panel = h("details.panel", h("summary", h("h2", t("share"))),

@@ -36,7 +36,7 @@ export function decodeLive(buffer) {
 		return frame;
 	};
 	return {
-		...header, lookups, finest,
+		...header, lookups, finest, isMasked: plane(first + 6).some((alpha) => alpha < 255),
 		offset: together(plane(first), plane(first + 1), plane(first + 2), plane(first + 6)),
 		absorption: together(plane(first + 3), plane(first + 4), plane(first + 5)),
 	};
