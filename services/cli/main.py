@@ -7,7 +7,7 @@ from typing import Any
 import click
 from click.shell_completion import get_completion_class
 
-from services.cli import maintenance, patterns, processes, setup
+from services.cli import maintenance, processes, programs, setup
 from services.cli.demo import demo
 from services.cli.keys import keys
 from services.cli.output import example
@@ -74,7 +74,7 @@ for command in (
     *mattes.COMMANDS,
     *records.COMMANDS,
     demo,
-    patterns.patterns,
+    *programs.COMMANDS,
     tether,
 ):
     main.add_command(command)

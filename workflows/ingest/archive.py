@@ -19,6 +19,8 @@ MAX_ENTRIES = 2 * MAX_FRAMES + 2
 """A picture of each pattern besides, the mask, and capture.json."""
 NAME_LENGTH_AT = 26
 """Where a local file header has the lengths of the name and of the extra field (APPNOTE, sect. 4.3.7)."""
+MATTE = "zarr.json"
+"""An entry of the archives of mattes."""
 PIECE = 1 << 20
 """Bytes unpacked at a time."""
 
@@ -100,7 +102,15 @@ class CaptureArchive:
     def _read_manifest(self) -> Manifest:
         info = self._entries.get(MANIFEST)
         if info is None:
-            raise CaptureError(f"there is no {MANIFEST} at the root of the archive", entry=MANIFEST)
+            if (
+                folder := next((one for one in self._entries if one.endswith(f"/{MANIFEST}")), None)
+            ) is not None:
+                why = f"{folder} must be at the root of the archive: put in what is in that folder, and not the folder"
+            elif MATTE in self._entries:
+                why = "this is the archive of a matte: import it, with `envmatte import` or in the web app"
+            else:
+                why = f"there is no {MANIFEST} at the root of the archive"
+            raise CaptureError(why, entry=MANIFEST)
         if info.file_size > MANIFEST_BYTES:
             raise CaptureError(
                 f"{MANIFEST} is larger than {MANIFEST_BYTES} bytes", entry=MANIFEST, limit=MANIFEST_BYTES

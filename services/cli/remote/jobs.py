@@ -8,6 +8,7 @@ import click
 
 from services.cli import options
 from services.cli.output import example, print_result
+from services.cli.programs import is_film
 from services.cli.progress import Progress
 from services.client import Capture, Client
 
@@ -35,6 +36,10 @@ def upload(file: Path, name: str, webhook: str | None, url: str, key: str | None
 
     After an interrupt, the same command resumes the upload.
     """
+    if is_film(file):
+        raise click.UsageError(
+            f"{file} is a film: pack it with its program first, `envmatte pack PROGRAM {file} -o film.zip`"
+        )
     with options.client(url, key) as client:
         print_result(ingest(client, file, name, webhook).answer, as_json, "id")
 

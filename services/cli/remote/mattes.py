@@ -8,9 +8,9 @@ import click
 
 from services.cli import options
 from services.cli.output import example, open_whole, print_result, write
+from services.cli.programs import is_film
 from services.cli.progress import Progress
 from services.client import Client
-from services.decoding.first_bytes import LENGTH, is_video
 
 MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".exr": "image/x-exr"}
 """Of composites, by the ends of file names."""
@@ -54,11 +54,11 @@ def composite(
     A clip (a video file) is composited by a job, frame by frame. An interrupt cancels the job.
     """
     given = options.drop_unset(params)
-    ends = [".mp4"] if _is_clip(backdrop) else list(MEDIA_TYPES)
+    ends = [".mp4"] if is_film(backdrop) else list(MEDIA_TYPES)
     if output.suffix.lower() not in ends:
         raise click.BadParameter(f"{output}: the name must end in {', '.join(ends)}", param_hint="--output")
     with options.client(url, key) as client:
-        if _is_clip(backdrop):
+        if is_film(backdrop):
             _composite_clip(client, matte, backdrop, output, given)
         else:
             kind = MEDIA_TYPES[output.suffix.lower()]
@@ -78,11 +78,6 @@ def _composite_clip(client: Client, matte: str, clip: Path, output: Path, params
         client.video(job, file)
 
 
-def _is_clip(file: Path) -> bool:
-    with file.open("rb") as source:
-        return is_video(source.read(LENGTH))
-
-
 @click.command(
     epilog=example("envmatte export MATTE -o matte.zip", "envmatte export MATTE --html -o glass.html")
 )
@@ -92,6 +87,8 @@ def _is_clip(file: Path) -> bool:
 @options.remote
 def export(matte: str, output: Path, html: bool, url: str, key: str | None, as_json: bool) -> None:
     """Write a matte to a file, a ZIP for `envmatte import` elsewhere or any zarr reader."""
+    if output.suffix.lower() in (".html", ".htm") and not html:
+        raise click.UsageError(f"{output}: a web page is written with --html; without it this is a ZIP")
     with options.client(url, key) as client:
         if html:
             write(output, client.live_page(matte))

@@ -1,9 +1,7 @@
 """`envmatte tether`: recovers a matte while a camera takes the stills of a capture, or records its film."""
 
-import json
 import tempfile
 import time
-import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from http import HTTPStatus
@@ -14,6 +12,7 @@ import click
 
 from services.cli import options
 from services.cli.output import example, print_result
+from services.cli.programs import film_record, stills_in, stills_record, write_archive
 from services.cli.progress import Progress
 from services.cli.remote.jobs import ingest
 from services.client import Capture, Client, Job, JobFailed, ServiceError
@@ -104,20 +103,11 @@ def tether(
 
 def _stills(folder: Path, program: "Program", name: str) -> Iterator[Taken]:
     """All stills in the folder, each time that there are more of them."""
-    from workflows.programs.files import program_json
-
     stills: Sequence[Path] = ()
     while True:
         stills = _more(folder, len(stills), program)
-        files = {f"{pattern:05}{still.suffix}": still for pattern, still in enumerate(stills)}
-        manifest = {
-            "format": "envmatte-capture/1",
-            "name": name,
-            "program": program_json(program),
-            "frames": [{"file": file, "pattern": pattern} for pattern, file in enumerate(files)],
-            "unfinished": True,
-        }
-        yield Taken(manifest, files, len(stills) == program.count)
+        record, files = stills_record(program, stills)
+        yield Taken(record | {"name": name, "unfinished": True}, files, len(stills) == program.count)
 
 
 def _more(folder: Path, before: int, program: "Program") -> Sequence[Path]:
@@ -125,14 +115,7 @@ def _more(folder: Path, before: int, program: "Program") -> Sequence[Path]:
     sizes: dict[Path, int] = {}
     with Progress("stills") as bar:
         while True:
-            now = {path: path.stat().st_size for path in sorted(folder.glob("[!.]*")) if path.is_file()}
-            kinds = sorted({path.suffix.lower() for path in now})
-            if len(kinds) > 1:
-                raise click.UsageError(
-                    f"{folder} has files of the kinds {', '.join(kinds)}: leave stills of one kind"
-                )
-            if len(now) > program.count:
-                raise click.UsageError(f"{folder} has {len(now)} files, the program {program.count} patterns")
+            now = {path: path.stat().st_size for path in stills_in(folder, program)}
             complete = []
             for path, size in now.items():
                 if not size or sizes.get(path) != size:
@@ -149,14 +132,9 @@ def _more(folder: Path, before: int, program: "Program") -> Sequence[Path]:
 
 def _film(file: Path, record: Path, name: str) -> Iterator[Taken]:
     """The film each time that it has grown by some patterns, and once more when it has ended."""
-    manifest, entry = json.loads(record.read_bytes()), f"film{file.suffix}"
-    rate = (manifest.get("video") or {}).get("patterns_per_second")
-    if not rate:
-        raise click.UsageError(
-            f"{record} describes no film: name the .json that `envmatte patterns` wrote beside the video it made"
-        )
-    manifest |= {"name": name, "unfinished": True, "video": manifest["video"] | {"file": entry}}
-    pause = FEWEST / rate
+    manifest, files = film_record(record, file)
+    manifest |= {"name": name, "unfinished": True}
+    pause = FEWEST / manifest["video"]["patterns_per_second"]
     size, grew, taken, due = 0, time.monotonic(), 0, 0.0
     while True:
         now = file.stat().st_size
@@ -165,7 +143,7 @@ def _film(file: Path, record: Path, name: str) -> Iterator[Taken]:
         over = time.monotonic() - grew > OVER
         if over or (size > taken and time.monotonic() >= due):
             taken, due = size, time.monotonic() + pause
-            yield Taken(manifest, {entry: file}, over)
+            yield Taken(manifest, files, over)
         time.sleep(LOOK)
 
 
@@ -180,10 +158,7 @@ def _next_capture(client: Client, takes: Iterator[Taken], draft: Job | None) -> 
             _if_active(client.pause, draft)
         with tempfile.TemporaryDirectory(prefix="envmatte-tether-") as folder:
             archive = Path(folder, "capture.zip")
-            with zipfile.ZipFile(archive, "w") as target:
-                target.writestr("capture.json", json.dumps(taken.manifest))
-                for file, path in taken.files.items():
-                    target.write(path, file)
+            write_archive(archive, taken.manifest, taken.files)
             try:
                 return ingest(client, archive, taken.manifest["name"]), taken.last
             except JobFailed as error:

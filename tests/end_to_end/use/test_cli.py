@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 import time
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from tests.end_to_end.conftest import HEIGHT, WIDTH, Service, paused, png
 from tests.parts.processes import interrupt, running
 from workflows.images import integer_formats
 from workflows.programs import presets
+from workflows.programs.files import program_json
 from workflows.programs.preset_names import PRESETS
 from workflows.programs.program import Program
 
@@ -67,6 +69,56 @@ def test_records_are_listed_and_deleted(
     assert expected[0] in gone.stderr
 
 
+def test_films_and_stills_are_packed_with_their_program(tmp_path: Path) -> None:
+    shown = Program.model_validate(
+        {
+            "monitor": {"width": 64, "height": 48},
+            "parts": [{"kind": "constant", "levels": [0, 1]}, {"kind": "stripes", "axis": "x", "count": 2}],
+        }
+    )
+    record = tmp_path / "show.json"
+    record.write_text(
+        json.dumps(
+            {
+                "format": "envmatte-capture/1",
+                "program": program_json(shown),
+                "video": {"file": "show.mp4", "patterns_per_second": 2},
+            }
+        )
+    )
+    film, stills, archive = tmp_path / "IMG 1.MOV", tmp_path / "stills", tmp_path / "packed.zip"
+    film.write_bytes(b"\0\0\0\x14ftypqt  and more")
+    stills.mkdir()
+    for n in range(shown.count):
+        (stills / f"DSC_{n:04}.NEF").write_bytes(bytes([n]))
+
+    def pack(*arguments: Path | str) -> tuple[int, str]:
+        done = CliRunner().invoke(main, ["pack", *map(str, arguments)])
+        return done.exit_code, done.output
+
+    assert pack(record, film, "-o", archive) == (0, f"{archive}\n")
+    with zipfile.ZipFile(archive) as packed:
+        assert packed.namelist() == ["capture.json", "film.MOV"]
+        assert packed.read("film.MOV") == film.read_bytes()
+        found = json.loads(packed.read("capture.json"))
+        assert (found["name"], found["video"]) == ("IMG 1", {"file": "film.MOV", "patterns_per_second": 2})
+    assert pack(record, stills, "-o", archive) == (0, f"{archive}\n")
+    with zipfile.ZipFile(archive) as packed:
+        found = json.loads(packed.read("capture.json"))
+        for n, frame in enumerate(found["frames"]):
+            assert (frame["pattern"], packed.read(frame["file"])) == (n, bytes([n]))
+        assert Program.model_validate(found["program"]) == shown
+    (stills / "DSC_0001.NEF").unlink()
+    record.write_text(json.dumps(json.loads(record.read_text()) | {"video": None}))
+    for source, why in (
+        (stills, f"{shown.count - 1} files, the program {shown.count}"),
+        (film, "describes no film"),
+    ):
+        code, output = pack(record, source, "-o", archive)
+        assert code == 2
+        assert why in output
+
+
 def test_refusal_has_exit_code_1(service: Service, tmp_path: Path) -> None:
     broken = tmp_path / "broken.zip"
     broken.write_bytes(b"no zip")
@@ -81,9 +133,13 @@ def test_refusal_has_exit_code_1(service: Service, tmp_path: Path) -> None:
         assert "Traceback" not in refused.stderr
 
 
-def test_wrong_command_line_has_exit_code_2(service: Service) -> None:
+def test_wrong_command_line_has_exit_code_2(service: Service, tmp_path: Path) -> None:
+    film = tmp_path / "film.mov"
+    film.write_bytes(b"\0\0\0\x14ftypqt  ")
     for arguments in (
         ["list", "jobs", "--name", "glass"],
+        ["export", "m", "-o", "glass.html"],
+        ["upload", str(film)],
         ["recover"],
         ["upload", "no-such-file.zip"],
         ["recover", "x", "--option", "tile"],

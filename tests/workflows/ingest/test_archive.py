@@ -62,6 +62,21 @@ def refused(data: bytes, limits: Limits = LIMITS) -> CaptureError:
     return caught.value
 
 
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("my film/capture.json", "my film/capture.json must be at the root"),
+        ("zarr.json", "the archive of a matte"),
+        ("film.mp4", "there is no capture.json"),
+    ],
+)
+def test_what_is_there_in_place_of_a_capture_is_named(name: str, why: str) -> None:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr(name, "{}")
+    assert why in refused(file.getvalue()).detail
+
+
 @pytest.mark.parametrize("pack", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
 def test_archive_is_read(make_zip: Zip, pack: int) -> None:
     archive = open_archive(make_zip(RECORD, FILES, pack))

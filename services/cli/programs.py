@@ -1,0 +1,183 @@
+"""Commands for programs: write the patterns that a monitor shows, pack what a camera took of them."""
+
+import json
+import re
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import click
+
+from services.cli.options import InputFile, OutputFile, as_json
+from services.cli.output import example, open_whole, print_result
+from services.cli.progress import Progress
+from services.decoding.first_bytes import LENGTH, is_video
+from workflows.programs.preset_names import PRESETS
+
+if TYPE_CHECKING:
+    from workflows.programs.program import Program
+
+OTHER_VIDEOS = {".webm", ".mov", ".avi", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".wmv", ".ogv", ".gif"}
+"""Ends of names of videos that are not written: a folder of such a name is not what was meant."""
+
+
+def _size(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
+    if not found:
+        raise click.BadParameter("give it as WIDTHxHEIGHT in pixels, for example 1280x960")
+    return int(found[1]), int(found[2])
+
+
+@click.command(
+    epilog=example(
+        "envmatte patterns default patterns.mp4 --monitor 1920x1080",
+        more="\b\nPresets:\n" + "\n".join(f"  {name:<11}{text}" for name, text in PRESETS.items()),
+    )
+)
+@click.argument("program", metavar="PROGRAM")
+@click.argument("out", type=click.Path(path_type=Path), metavar="OUT")
+@click.option(
+    "--monitor",
+    metavar="WIDTHxHEIGHT",
+    callback=_size,
+    help="Size of the monitor in pixels; each must show one pixel of the picture. Default: 1280x960 "
+    "for a preset, the program's own size for a file.",
+)
+@click.option(
+    "--rate",
+    type=click.FloatRange(0.1, 30),
+    default=2.0,
+    show_default=True,
+    help="Patterns per second of a video.",
+)
+@click.option(
+    "--grey",
+    is_flag=True,
+    help="Pictures of `quick` and `sketch` in black and white, as in videos: for a camera that stores JPEG or HEIC, "
+    "which have colour at half the resolution.",
+)
+@as_json
+def patterns(
+    program: str, out: Path, monitor: tuple[int, int] | None, rate: float, grey: bool, as_json: bool
+) -> None:
+    """Write the patterns of PROGRAM, a preset or a JSON file with a program, to OUT.
+
+    If OUT ends in .mp4 or .mkv, it is a video, with a border and a lead-in by which a film of it can be read, and the
+    capture.json for that film is written beside it. Play it with software decoding, as VLC and mpv can.
+
+    Otherwise OUT is a new folder with a PNG of each pattern, and program.json for the capture.
+    """
+    from storage.errors import EnvmatteError
+    from workflows.programs.files import fit_to_screen, load_program, write_folder
+    from workflows.programs.video import FORMATS, write_video
+
+    if out.suffix.lower() in OTHER_VIDEOS:
+        raise click.UsageError(f"{out}: a video is written as {' or '.join(FORMATS)}; pictures, to a folder")
+    if grey and program not in PRESETS:
+        raise click.UsageError("--grey is for presets: a program in a file has the colours that it names")
+    video = out.suffix.lower() in FORMATS
+    try:
+        shown = fit_to_screen(load_program(program), monitor, bordered=video, grey=grey)
+        with Progress("patterns") as bar:
+
+            def progress(done: int, of: int) -> None:
+                bar.show(done / of, f"{done} of {of}")
+
+            if video:
+                write_video(shown, out, rate, progress)
+            else:
+                write_folder(shown, out, progress)
+    except EnvmatteError as error:
+        raise click.UsageError(error.detail) from error
+    except OSError as error:
+        raise click.ClickException(f"{out} can't be written: {error.strerror}") from error
+    kind, source = "video" if video else "folder", "preset" if program in PRESETS else "program"
+    size = [shown.monitor.width, shown.monitor.height]
+    print_result({kind: str(out), source: program, "monitor": size, "patterns": shown.count}, as_json, kind)
+
+
+@click.command(
+    epilog=example(
+        "envmatte pack patterns.json film.mkv -o film.zip", "envmatte pack program.json stills -o stills.zip"
+    )
+)
+@click.argument("program", type=InputFile, metavar="PROGRAM")
+@click.argument("source", type=click.Path(exists=True, path_type=Path), metavar="STILLS|FILM")
+@click.option("-o", "--output", type=OutputFile, required=True, help="Archive to write.")
+@as_json
+def pack(program: Path, source: Path, output: Path, as_json: bool) -> None:
+    """Pack what a camera took of PROGRAM into an archive for `envmatte upload`.
+
+    For a FILM, PROGRAM is the .json beside the video of the patterns. For a folder of STILLS it is the program.json
+    beside the pictures; there is one still of each, the first by name that of the first pattern.
+    """
+    if source.is_dir():
+        from workflows.programs.files import fit_to_screen, load_program
+
+        shown = fit_to_screen(load_program(str(program)), None, bordered=False)
+        stills = stills_in(source, shown)
+        if len(stills) < shown.count:
+            raise click.UsageError(f"{source} has {len(stills)} files, the program {shown.count} patterns")
+        record, files = stills_record(shown, stills)
+    else:
+        record, files = film_record(program, source)
+    with open_whole(output) as file:
+        write_archive(file, {**record, "name": source.stem}, files)
+    print_result({"output": str(output)}, as_json, "output")
+
+
+def stills_in(folder: Path, program: "Program") -> Sequence[Path]:
+    """The stills in a folder, by name; a usage error if they are of several kinds, or more than the patterns."""
+    stills = [path for path in sorted(folder.glob("[!.]*")) if path.is_file()]
+    kinds = sorted({path.suffix.lower() for path in stills})
+    if len(kinds) > 1:
+        raise click.UsageError(
+            f"{folder} has files of the kinds {', '.join(kinds)}: leave stills of one kind"
+        )
+    if len(stills) > program.count:
+        raise click.UsageError(f"{folder} has {len(stills)} files, the program {program.count} patterns")
+    return stills
+
+
+def stills_record(program: "Program", stills: Sequence[Path]) -> tuple[dict[str, Any], dict[str, Path]]:
+    """The capture.json of a program's first stills, and the files of its archive by name."""
+    from workflows.programs.files import program_json
+
+    files = {f"{pattern:05}{still.suffix}": still for pattern, still in enumerate(stills)}
+    record = {
+        "format": "envmatte-capture/1",
+        "program": program_json(program),
+        "frames": [{"file": file, "pattern": pattern} for pattern, file in enumerate(files)],
+    }
+    return record, files
+
+
+def film_record(record: Path, film: Path) -> tuple[dict[str, Any], dict[str, Path]]:
+    """The capture.json of a film of a program, and the files of its archive by name; a usage error if it is of none."""
+    found = json.loads(record.read_bytes())
+    if not (found.get("video") or {}).get("patterns_per_second"):
+        raise click.UsageError(
+            f"{record} describes no film: name the .json that `envmatte patterns` wrote beside the video it made"
+        )
+    entry = f"film{film.suffix}"
+    return found | {"video": found["video"] | {"file": entry}}, {entry: film}
+
+
+def write_archive(target: BinaryIO | Path, record: Mapping[str, Any], files: Mapping[str, Path]) -> None:
+    """Write a capture archive."""
+    with zipfile.ZipFile(target, "w") as archive:
+        archive.writestr("capture.json", json.dumps(record))
+        for name, path in files.items():
+            archive.write(path, name)
+
+
+def is_film(file: Path) -> bool:
+    """Whether a file begins as a video does."""
+    with file.open("rb") as source:
+        return is_video(source.read(LENGTH))
+
+
+COMMANDS = (patterns, pack)
