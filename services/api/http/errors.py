@@ -12,7 +12,7 @@ from starlette.requests import ClientDisconnect
 from starlette.routing import Match, Mount
 
 from services.runtime.problems import MEDIA_TYPE, Unauthorized, problem_detail, problem_of
-from storage.errors import EnvmatteError, InvalidInput, StoreUnavailable, TooMany, Unavailable
+from storage.errors import EnvmatteError, InvalidInput, TooMany, Unavailable
 from workflows.untrusted.validation import reason
 
 RESPONSES: dict[int | str, dict[str, Any]] = {
@@ -43,7 +43,6 @@ RESPONSES: dict[int | str, dict[str, Any]] = {
 HEADERS: dict[type[EnvmatteError], dict[str, str]] = {
     Unauthorized: {"WWW-Authenticate": "Bearer"},
     Unavailable: {"Retry-After": "2"},  # seconds
-    StoreUnavailable: {"Retry-After": "2"},
     TooMany: {"Retry-After": "10"},
 }
 METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
@@ -60,7 +59,8 @@ def register(app: FastAPI) -> None:
 
     @app.exception_handler(EnvmatteError)
     async def _ours(request: Request, error: EnvmatteError) -> JSONResponse:
-        return answer(problem_of(error), HEADERS.get(type(error)))
+        base = next((base for base in type(error).__mro__ if base in HEADERS), type(error))
+        return answer(problem_of(error), HEADERS.get(base))
 
     @app.exception_handler(HTTPException)
     async def _framework(request: Request, error: HTTPException) -> JSONResponse:
