@@ -157,18 +157,21 @@ def stills_record(program: "Program", stills: Sequence[Path]) -> tuple[dict[str,
 
 def film_record(record: Path, film: Path) -> tuple[dict[str, Any], dict[str, Path]]:
     """The capture.json of a film of a program, and the files of its archive by name; a usage error if it is of none."""
-    found = json.loads(record.read_bytes())
-    if not (found.get("video") or {}).get("patterns_per_second"):
+    entry = f"film{film.suffix}"
+    try:
+        found = json.loads(record.read_bytes())
+        video = found["video"] | {"file": entry}
+        float(video["patterns_per_second"])
+    except (ValueError, TypeError, KeyError) as error:
         raise click.UsageError(
             f"{record} describes no film: name the .json that `envmatte patterns` wrote beside the video it made"
-        )
-    entry = f"film{film.suffix}"
-    return found | {"video": found["video"] | {"file": entry}}, {entry: film}
+        ) from error
+    return found | {"video": video}, {entry: film}
 
 
 def write_archive(target: BinaryIO | Path, record: Mapping[str, Any], files: Mapping[str, Path]) -> None:
     """Write a capture archive."""
-    with zipfile.ZipFile(target, "w") as archive:
+    with zipfile.ZipFile(target, "w", strict_timestamps=False) as archive:
         archive.writestr("capture.json", json.dumps(record))
         for name, path in files.items():
             archive.write(path, name)

@@ -1,6 +1,7 @@
 """The command line against a real service."""
 
 import json
+import os
 import subprocess
 import sys
 import time
@@ -109,7 +110,8 @@ def test_films_and_stills_are_packed_with_their_program(tmp_path: Path) -> None:
             assert (frame["pattern"], packed.read(frame["file"])) == (n, bytes([n]))
         assert Program.model_validate(found["program"]) == shown
     (stills / "DSC_0001.NEF").unlink()
-    record.write_text(json.dumps(json.loads(record.read_text()) | {"video": None}))
+    whole = record.read_text()
+    record.write_text(json.dumps(json.loads(whole) | {"video": None}))
     for source, why in (
         (stills, f"{shown.count - 1} files, the program {shown.count}"),
         (film, "describes no film"),
@@ -117,6 +119,11 @@ def test_films_and_stills_are_packed_with_their_program(tmp_path: Path) -> None:
         code, output = pack(record, source, "-o", archive)
         assert code == 2
         assert why in output
+    record.write_text("no JSON")
+    assert pack(record, film, "-o", archive)[0] == 2
+    record.write_text(whole)
+    os.utime(film, (0, 0))  # before the times that a ZIP can hold
+    assert pack(record, film, "-o", archive)[0] == 0
 
 
 def test_refusal_has_exit_code_1(service: Service, tmp_path: Path) -> None:
