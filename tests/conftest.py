@@ -1,10 +1,12 @@
 """Options, markers and fixtures of all tests."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from xdist.remote import Producer
@@ -93,3 +95,26 @@ def postgresql(postgresql_server: postgres.Server) -> Iterator[str]:
     """The URL of a fresh database that has the tables."""
     with postgresql_server.database(like=postgres.TEMPLATE) as url:
         yield url
+
+
+@pytest.fixture(scope="session")
+def sqlite_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A SQLite database with the tables, from which new ones are copied."""
+    path = tmp_path_factory.mktemp("sqlite") / "with_tables.db"
+    open_engine(f"sqlite:///{path}").dispose()
+    return path
+
+
+@pytest.fixture
+def sqlite(tmp_path: Path, sqlite_template: Path) -> str:
+    """The URL of a new SQLite database with the tables."""
+    path = tmp_path / "ledger.db"
+    shutil.copyfile(sqlite_template, path)
+    return f"sqlite:///{path}"
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def database_url(request: pytest.FixtureRequest) -> str:
+    """The URL of a new database with the tables, of either kind."""
+    url: str = request.getfixturevalue(request.param)
+    return url

@@ -6,7 +6,6 @@ few objects.
 """
 
 import hashlib
-import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -50,32 +49,9 @@ def objects(store: str) -> Objects:
     return Objects(store)
 
 
-@pytest.fixture(scope="session")
-def sqlite_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A SQLite database with the tables, from which new ones are copied."""
-    path = tmp_path_factory.mktemp("sqlite") / "with_tables.db"
-    open_engine(f"sqlite:///{path}").dispose()
-    return path
-
-
 @pytest.fixture
-def sqlite(tmp_path: Path, sqlite_template: Path) -> str:
-    """The URL of a new SQLite database with the tables."""
-    path = tmp_path / "ledger.db"
-    shutil.copyfile(sqlite_template, path)
-    return f"sqlite:///{path}"
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def url(request: pytest.FixtureRequest) -> str:
-    """The URL of a new database with the tables, of either kind."""
-    url: str = request.getfixturevalue(request.param)
-    return url
-
-
-@pytest.fixture
-def engine(url: str) -> Iterator[Engine]:
-    engine = open_engine(url)
+def engine(database_url: str) -> Iterator[Engine]:
+    engine = open_engine(database_url)
     yield engine
     engine.dispose()
 

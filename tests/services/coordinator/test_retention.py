@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from sqlalchemy import Engine, select, update
@@ -23,10 +22,9 @@ from storage.objects.store import Objects
 from storage.records import bodies, captures, idempotency, jobs, mattes, tiles, uploads
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def engine(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Engine]:
-    sqlite = f"sqlite:///{tmp_path}/ledger.db"
-    engine = open_engine(sqlite if request.param == "sqlite" else request.getfixturevalue("postgresql"))
+@pytest.fixture
+def engine(database_url: str) -> Iterator[Engine]:
+    engine = open_engine(database_url)
     yield engine
     engine.dispose()
 

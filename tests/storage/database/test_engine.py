@@ -17,11 +17,11 @@ from storage.records import jobs, tiles
 from tests.parts.postgres import Server
 
 
-def test_rows_persist_after_reopening(engine: Engine, url: str) -> None:
+def test_rows_persist_after_reopening(engine: Engine, database_url: str) -> None:
     with writing(engine) as connection:
         job = jobs.add(connection, "ingest", "c", {})
     engine.dispose()
-    again = open_engine(url)
+    again = open_engine(database_url)
     with reading(again) as connection:
         assert jobs.get(connection, job).state == "queued"
     again.dispose()

@@ -204,11 +204,11 @@ def test_upgrade_on_postgresql_may_take_long(
         bare.dispose()
 
 
-def test_newer_database_is_refused_and_unchanged(engine: Engine, url: str) -> None:
+def test_newer_database_is_refused_and_unchanged(engine: Engine, database_url: str) -> None:
     with writing(engine) as connection:
         connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))
     with pytest.raises(Conflict, match=r"revision 9999, .* up to \d{4}; install the newer envmatte"):
-        open_engine(url)
+        open_engine(database_url)
     with reading(engine) as connection:
         assert revision(connection) == "9999"
         assert differences(connection) == []

@@ -67,7 +67,7 @@ def test_backup_while_items_are_deleted_and_finished(
 @pytest.mark.filterwarnings(  # SQLAlchemy can't close the cursor of a connection that broke
     "ignore:.*ServerCursor:pytest.PytestUnraisableExceptionWarning"
 )
-@pytest.mark.parametrize("url", ["postgresql"], indirect=True)
+@pytest.mark.parametrize("database_url", ["postgresql"], indirect=True)
 def test_restarted_database_fails_or_finishes_a_backup_and_a_restore(
     engine: Engine,
     filled: Objects,

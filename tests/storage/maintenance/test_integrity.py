@@ -13,7 +13,7 @@ from tests.storage.maintenance.test_verify import NOT_READ, found
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 def test_flipped_bit_of_any_object_is_found(engine: Engine, filled: Objects) -> None:
     paths = [path for path in contents(filled) if not NOT_READ.match(path)]
     kinds: dict[str, str] = {}
@@ -34,7 +34,7 @@ def test_flipped_bit_of_any_object_is_found(engine: Engine, filled: Objects) -> 
     assert verify(engine, filled).findings == []
 
 
-@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 @pytest.mark.parametrize(
     "path",
     [
@@ -53,7 +53,7 @@ def test_missing_object_is_found(engine: Engine, filled: Objects, folder: Path, 
     assert all(("again" in one.remedy) for one in report.findings)
 
 
-@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 def test_missing_item_is_found(engine: Engine, filled: Objects) -> None:
     for folder in ("captures/c", "mattes/m", "uploads/u", "composites/v"):
         filled.delete(folder)
@@ -62,7 +62,7 @@ def test_missing_item_is_found(engine: Engine, filled: Objects) -> None:
     assert "composites/v/video.mp4" in missing
 
 
-@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 def test_objects_without_checksum_are_counted(engine: Engine, filled: Objects) -> None:
     filled.delete("composites/v/video.mp4.crc32c")
     report = verify(engine, filled)

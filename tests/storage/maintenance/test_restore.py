@@ -74,7 +74,7 @@ def replace_rows(target: Objects, manifest: list[bytes], rows: list[bytes]) -> N
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 def test_from_sqlite_and_folder_to_postgresql_and_bucket_and_back(
     engine: Engine,
     objects: Objects,
@@ -186,7 +186,7 @@ INVALID_BUT_SEALED: dict[str, tuple[str, Callable[[list[bytes]], None]]] = {
 }
 
 
-@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 def test_invalid_backup_is_refused_and_leaves_nothing(
     engine: Engine, filled: Objects, folder: Path, target: Objects, elsewhere: tuple[Engine, Objects]
 ) -> None:
@@ -246,7 +246,7 @@ HOSTILE: tuple[tuple[str, str, Any], ...] = (
 )
 
 
-@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 @pytest.mark.parametrize(
     ("table", "column", "value"),
     [HOSTILE[0], *(pytest.param(*row, marks=pytest.mark.slow) for row in HOSTILE[1:])],
@@ -270,7 +270,7 @@ def test_row_that_the_service_would_stumble_over_is_refused(
     require_empty(*elsewhere)
 
 
-@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 @pytest.mark.slow
 def test_killed_restore_can_be_repeated(
     engine: Engine, filled: Objects, target: Objects, elsewhere: tuple[Engine, Objects]

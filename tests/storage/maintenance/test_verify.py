@@ -51,7 +51,7 @@ def test_data_deleted_meanwhile_is_not_reported(engine: Engine, filled: Objects)
     assert verify(engine, filled, meanwhile).findings == []
 
 
-@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 def test_items_that_change_meanwhile_are_not_reported(engine: Engine, filled: Objects) -> None:
     filled.delete("uploads/i")
 
@@ -63,7 +63,7 @@ def test_items_that_change_meanwhile_are_not_reported(engine: Engine, filled: Ob
     assert verify(engine, filled, meanwhile).findings == []
 
 
-@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 def test_old_objects_without_a_row_are_reported(engine: Engine, filled: Objects, folder: Path) -> None:
     filled.put("mattes/unknown/S/c/0", b"any")
     filled.put("uploads/unknown/all.part", b"any")

@@ -41,7 +41,7 @@ READS: dict[str, tuple[str, Callable[[Objects], Any]]] = {
 }
 
 
-@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 def test_flipped_bit_is_reported_by_path_wherever_read(filled: Objects) -> None:
     for path, read in READS.values():
         read(filled)
@@ -55,7 +55,7 @@ def test_flipped_bit_is_reported_by_path_wherever_read(filled: Objects) -> None:
         read(filled)
 
 
-@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 def test_damaged_cache_for_browsers_reads_as_none(filled: Objects) -> None:
     assert live.read(filled, "m", "live-1") is not None
     flip(filled, "mattes/m/live-1/c/0")

@@ -4,7 +4,6 @@ import sqlite3
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import pytest
 from sqlalchemy import Connection, Engine, PoolProxiedConnection
@@ -62,12 +61,8 @@ def test_repeat_after_deletion_is_not_found(engine: Engine) -> None:
     assert count(engine) == 0
 
 
-@pytest.mark.parametrize("database", ["sqlite", "postgresql"])
-def test_concurrent_repeats_create_once(
-    request: pytest.FixtureRequest, tmp_path: Path, database: str
-) -> None:
-    sqlite = f"sqlite:///{tmp_path}/ledger.db"
-    engine = open_engine(sqlite if database == "sqlite" else request.getfixturevalue("postgresql"))
+def test_concurrent_repeats_create_once(database_url: str) -> None:
+    engine = open_engine(database_url)
     begun = threading.Barrier(4)
 
     def create_slowly(connection: Connection) -> str:

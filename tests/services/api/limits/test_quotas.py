@@ -39,10 +39,9 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return path.read_bytes()
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def engine(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Engine]:
-    sqlite = f"sqlite:///{tmp_path / 'ledger.db'}"
-    opened = open_engine(sqlite if request.param == "sqlite" else request.getfixturevalue("postgresql"))
+@pytest.fixture
+def engine(database_url: str, tmp_path: Path) -> Iterator[Engine]:
+    opened = open_engine(database_url)
     with writing(opened) as c:
         tmp_path.joinpath("alice").write_text(api_keys.create(c, "alice", "alice", "write"))
         tmp_path.joinpath("bob").write_text(api_keys.create(c, "bob", "bob", "admin"))
