@@ -8,8 +8,8 @@ import { parts, t } from "../lib/words.js";
 const ENDS = /\.(mp4|m4v|mov|mkv|webm|avi|3gp|mts|m2ts)$/i;
 // Browsers know no type of MKV, and give MTS that of something else.
 export const isFilm = (file) => file.type.startsWith("video/") || ENDS.test(file.name);
-export const RAW = ".dng,.nef,.cr2,.cr3,.arw,.raf,.orf,.rw2"; // the usual names of camera RAW
-export const STILLS = `image/*,.heic,.heif,.hif,.exr,.tif,.tiff,${RAW}`; // what a field for files takes
+// What a field for files takes: the last are the usual names of camera RAW.
+export const STILLS = "image/*,.heic,.heif,.hif,.exr,.tif,.tiff,.dng,.nef,.cr2,.cr3,.arw,.raf,.orf,.rw2";
 const STILL_ENDS = new RegExp(`(${STILLS.split(",").slice(1).join("|").replaceAll(".", "\\.")})$`, "i");
 export const isStill = (file) => file.type.startsWith("image/") || STILL_ENDS.test(file.name);
 

@@ -17,8 +17,8 @@ const rows = new Set(); // of each upload, whether it is `busy`, and whether its
 addEventListener("beforeunload", (event) => [...rows].some(({ busy, unsaved }) => busy || unsaved) && event.preventDefault());
 
 // Uploads a capture archive, or a film or stills with their capture.json; without one, asks for their program. A film was
-// filmed in the view `again`. One that was recorded here has an `id`: it can be saved, is kept until its capture is ready, and is
-// discarded only after a question. One with a `warning` waits for the user; one that is `stored` is kept already.
+// filmed in the view `again`. One that was recorded here has an `id`: it can be saved, is kept until its capture is ready,
+// and is discarded only after a question. One with a `warning` waits for the user; one that is `stored` is kept already.
 export function begin(file, record, { again: view = "#/film", id, at = Date.now(), warning = "", stored = false } = {}) {
 	const film = { id, at, file, record, again: view, warning };
 	const state = { busy: false, unsaved: Boolean(id) && !stored };
