@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, BinaryIO, Self, overload
-from urllib.parse import quote
 
 from services.client._errors import JobFailed, NotFound
+from services.client._paths import id_of, path_of
 from services.client._records import Capture, Job, Layers, Matte, Record
 
 if TYPE_CHECKING:
@@ -102,13 +102,13 @@ class Client:
         **options
             As ``GET /v1/options`` lists them.
         """
-        body: dict[str, Any] = {"capture": _id(capture), "options": options}
+        body: dict[str, Any] = {"capture": id_of(capture), "options": options}
         body |= ({"webhook": webhook} if webhook else {}) | ({"region": _region(region)} if region else {})
         return Job.of(self._http.json("POST", Job.path, json=body, headers=_key()))
 
     def job(self, job: Job | str) -> Job:
         """Get the current state of a job."""
-        return Job.of(self._http.json("GET", _path(Job, job)))
+        return Job.of(self._http.json("GET", path_of(Job, job)))
 
     def pause(self, job: Job | str) -> Job:
         """Pause a job; what is under way is done."""
@@ -123,11 +123,11 @@ class Client:
         return self._change(job, region=_region(region))
 
     def _change(self, job: Job | str, **changes: Any) -> Job:
-        return Job.of(self._http.json("PATCH", _path(Job, job), json=changes, safe=True))
+        return Job.of(self._http.json("PATCH", path_of(Job, job), json=changes, safe=True))
 
     def cancel(self, job: Job | str) -> Job:
         """Cancel a job; cancelling it again changes nothing."""
-        return Job.of(self._http.json("POST", f"{_path(Job, job)}/cancel", safe=True))
+        return Job.of(self._http.json("POST", f"{path_of(Job, job)}/cancel", safe=True))
 
     def wait(
         self, job: Job | Capture | str, *, progress: Callable[[Job], None] | None = None, poll: float = 0.2
@@ -143,7 +143,7 @@ class Client:
         poll : float
             Seconds between polls at first; a long job is polled once a second.
         """
-        which = job.job if isinstance(job, Capture) else _id(job)
+        which = job.job if isinstance(job, Capture) else id_of(job)
         begun = time.monotonic()
         while True:
             found = self.job(which)
@@ -157,16 +157,16 @@ class Client:
 
     def capture(self, capture: Capture | str) -> Capture:
         """Get the current state of a capture."""
-        return Capture.of(self._http.json("GET", _path(Capture, capture)))
+        return Capture.of(self._http.json("GET", path_of(Capture, capture)))
 
     def report(self, capture: Capture | str) -> dict[str, Any]:
         """Get the report on a capture that is ready: its ``level``, its ``findings``, and the figures behind them."""
-        return self._http.json("GET", f"{_path(Capture, capture)}/report")
+        return self._http.json("GET", f"{path_of(Capture, capture)}/report")
 
     def matte(self, matte: Matte | Job | str) -> Matte:
         """Get the current state of a matte, or of the matte that a job makes."""
         which = (matte.matte or "") if isinstance(matte, Job) else matte
-        return self._matte(self._http.json("GET", _path(Matte, which)))
+        return self._matte(self._http.json("GET", path_of(Matte, which)))
 
     def captures(self, **wanted: str) -> Iterator[Capture]:
         """All captures, newest first: those of a ``state``, or whose name contains ``name``.
@@ -200,7 +200,7 @@ class Client:
         def delete() -> None:
             nonlocal tried
             tried += 1
-            self._http.once("DELETE", _path(type(record), record))
+            self._http.once("DELETE", path_of(type(record), record))
 
         try:
             self._http.patiently(delete)
@@ -261,7 +261,7 @@ class Client:
     ) -> bytes:
         return self._http.send(
             "POST",
-            f"{_path(Matte, matte)}/composite",
+            f"{path_of(Matte, matte)}/composite",
             safe=True,
             computing=True,
             params=wanted,
@@ -283,7 +283,7 @@ class Client:
         """
         wanted |= {"webhook": webhook} if webhook else {}
         headers = {"Content-Type": "video/*", "Content-Length": str(clip.stat().st_size)} | _key()
-        path = f"{_path(Matte, matte)}/composite"
+        path = f"{path_of(Matte, matte)}/composite"
         return Job.of(
             self._http.json("POST", path, params=wanted, headers=headers, content=lambda: _parts(clip))
         )
@@ -293,17 +293,17 @@ class Client:
         at, size = 0, 1
         while at < size:
             asked = {"Range": f"bytes={at}-{at + PIECE - 1}"}
-            answer = self._http.send("GET", f"{_path(Job, job)}/video.mp4", headers=asked)
+            answer = self._http.send("GET", f"{path_of(Job, job)}/video.mp4", headers=asked)
             at += target.write(answer.content)
             size = int(answer.headers.get("Content-Range", f"/{at}").rpartition("/")[2])
 
     def layer(self, matte: Matte | str, name: str) -> bytes:
         """Get a layer of a matte as a file, such as ``confidence.png``; ``Matte.layers`` has them as arrays."""
-        return self._http.send("GET", f"{_path(Matte, matte)}/layers/{name}", computing=True).content
+        return self._http.send("GET", f"{path_of(Matte, matte)}/layers/{name}", computing=True).content
 
     def live_page(self, matte: Matte | str) -> bytes:
         """Get a matte as a web page in one file, which draws the glass without a service."""
-        return self._http.send("GET", f"{_path(Matte, matte)}/live.html", computing=True).content
+        return self._http.send("GET", f"{path_of(Matte, matte)}/live.html", computing=True).content
 
     def share(self, matte: Matte | str, days: float = 30) -> str:
         """Make a link by which anyone can see a matte, live, without a key; returns its URL.
@@ -315,7 +315,7 @@ class Client:
         days : float
             Until the link expires, 3650 at most.
         """
-        made = self._http.json("POST", f"{_path(Matte, matte)}/links", json={"days": days})
+        made = self._http.json("POST", f"{path_of(Matte, matte)}/links", json={"days": days})
         return self._http.url_of(made["path"])
 
     def export(
@@ -331,7 +331,7 @@ class Client:
         part = file.with_name(file.name + ".part")
 
         def get() -> None:
-            with self._http.streamed("GET", f"{_path(Matte, matte)}/archive") as answer:
+            with self._http.streamed("GET", f"{path_of(Matte, matte)}/archive") as answer:
                 size = int(self._http.header(answer, "Content-Length"))
                 with part.open("wb") as out:
                     for data in answer.iter_bytes():
@@ -377,22 +377,8 @@ class Client:
         return Matte.of(answer, layers=Layers(lambda name: self.layer(answer["id"], name)))
 
 
-def _id(record: Record | str) -> str:
-    return record if isinstance(record, str) else record.id
-
-
 def _region(region: tuple[int, int, int, int]) -> dict[str, int]:
     return dict(zip(("x", "y", "width", "height"), region, strict=True))
-
-
-def _path(kind: type[Record], record: Record | str) -> str:
-    """The path of a record; an id that would be another path is that of none."""
-    id = _id(record)
-    if id in ("", ".", ".."):
-        raise NotFound(
-            {"title": "Not found", "status": 404, "detail": f"{id!r} is not an id: give one of those listed"}
-        )
-    return f"{kind.path}/{quote(id, safe='')}"
 
 
 def _key() -> dict[str, str]:

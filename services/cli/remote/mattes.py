@@ -54,11 +54,12 @@ def composite(
     A clip (a video file) is composited by a job, frame by frame. An interrupt cancels the job.
     """
     given = options.drop_unset(params)
-    ends = [".mp4"] if is_film(backdrop) else list(MEDIA_TYPES)
+    is_clip = is_film(backdrop)
+    ends = [".mp4"] if is_clip else list(MEDIA_TYPES)
     if output.suffix.lower() not in ends:
         raise click.BadParameter(f"{output}: the name must end in {', '.join(ends)}", param_hint="--output")
     with options.client(url, key) as client:
-        if is_film(backdrop):
+        if is_clip:
             _composite_clip(client, matte, backdrop, output, given)
         else:
             kind = MEDIA_TYPES[output.suffix.lower()]

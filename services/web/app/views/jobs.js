@@ -42,9 +42,8 @@ export async function job(main, signal, id) {
 	const asked = h("details.panel", { hidden: found.kind !== "recover" }, h("summary", t("options")), facts(found.options));
 	const links = h("p.row");
 	const panel = h("section.panel", { "aria-label": t("progress"), "data-log": "" });
-	const preview = found.kind === "recover" ? await progressPicture(found, signal) : null;
+	const [preview, report] = found.kind === "recover" ? await Promise.all([progressPicture(found, signal), reportLink(found.capture, signal)]) : [];
 	const step = { ingest: CHECK, recover: RECOVER }[found.kind];
-	const report = found.kind === "recover" && (await reportLink(found.capture, signal));
 	main.append(
 		step ? steps(step, "#/captures", `#/captures/${found.capture}`) : "",
 		h("p.crumb", h("a", { href: "#/jobs" }, t("jobs"))),

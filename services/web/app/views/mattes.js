@@ -47,18 +47,20 @@ export async function matte(main, signal, id) {
 		steps(PLAY, "#/captures", capture && `#/captures/${capture}`, job && `#/jobs/${job}`),
 		h("div.row.spread", renamable(matteName(found), t("matte.name"), rename), state),
 	);
-	const details = h("details.panel", { open: !isReady && !found.preview }, h("summary", h("h2", t("details"))), facts({
+	const isShown = isReady || found.preview;
+	const [report, others] = await Promise.all([reportLink(capture, signal), isShown && otherQualities(found, signal)]);
+	const details = h("details.panel", { open: !isShown }, h("summary", h("h2", t("details"))), facts({
 		[t("frame")]: found.width && t("pixels", { size: size(found) }), [t("monitor")]: found.monitor && t("pixels", { size: found.monitor.join(" × ") }),
 		[t("made")]: when(found.created_at), [t("until")]: found.expires_at && when(found.expires_at),
 		[t("method")]: options.method, [t("quality")]: qualityOf(found),
-		[t("report")]: await reportLink(capture, signal),
+		[t("report")]: report,
 		[t("capture")]: capture && h("a", { href: `#/captures/${capture}` }, t("job.capture")),
 		[t("job")]: job && h("a", { href: `#/jobs/${job}` }, t("matte.job")),
 	}));
 	const more = h("div.stack");
 	const complete = () => more.replaceChildren(layers(found, signal), sharing(id, signal));
-	if (isReady || found.preview) {
-		const { section, stage } = compositing(found, await otherQualities(found, signal), signal);
+	if (isShown) {
+		const { section, stage } = compositing(found, others, signal);
 		main.append(section, more);
 		if (isReady) complete();
 		else more.append(recovering(found, stage, signal, () => {
