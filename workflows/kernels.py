@@ -28,7 +28,7 @@ from storage.steps import FINISH, PREPARE
 from workflows.composite import composite
 from workflows.composite.backdrops.backdrop import backdrop_of
 from workflows.composite.backdrops.placement import Placement
-from workflows.composite.depth import from_two, places_of
+from workflows.composite.depth import from_two
 from workflows.composite.live.encode import encode_live
 from workflows.composite.quantise import encode
 from workflows.images import integer_formats
@@ -36,7 +36,9 @@ from workflows.images.decode import decode
 from workflows.images.tone_curves import from_light
 from workflows.ingest.steps import STEPS as INGEST
 from workflows.jobs import Steps, Task, run
+from workflows.mattes.cut_out import off_sight
 from workflows.mattes.lobes import rows_of
+from workflows.mattes.perspective import places_of
 from workflows.mattes.steps import STEPS as RECOVER
 from workflows.programs.presets import preset
 from workflows.programs.pyramid_light import lay_out
@@ -150,6 +152,7 @@ def use_matte(objects: Objects) -> None:
     add_glare(rows_of(matte, matte.read(0, 0)), shares)
     patterns = lay_out(preset("sketch", *MONITOR), "linear")
     filter_patterns(patterns, spread_patterns(patterns), shares)
+    off_sight(matte.read(0, 0), matte, np.zeros((HEIGHT, WIDTH, 2)), pitch=0.01, aspect=0.75)
     places = places_of(matte, threads=1)
     composite(matte, light, rays=from_two(places, places, (1.0, 2.0), 2.0))
     file = io.BytesIO()

@@ -6,8 +6,8 @@ from concurrent.futures import Future
 
 from storage.layout.mattes import Matte
 from storage.objects.store import Objects
-from workflows.composite.depth import Places, places_of
 from workflows.composite.strips import Blocks, Strip, columns_of, read_strip
+from workflows.mattes.perspective import Places, places_of
 
 Key = tuple[str, int, int, tuple[int, ...]]
 OPEN = 256

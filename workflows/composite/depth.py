@@ -7,31 +7,18 @@ for thin objects; for thick ones it is off by how far light moves sideways insid
 """
 
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from storage.errors import Conflict
-from storage.layout.mattes import Matte
 from workflows.interruption import checkpoint
-from workflows.mattes.lobes import block_lobes
+from workflows.mattes.perspective import Places, find_perspective, sights
 from workflows.recovery.pyramid import Grids
-from workflows.threads import in_parts
 
-LOBES = 3
-"""Lobes of a pixel that are fitted; the heaviest is used."""
-DIRECT = 0.9
-"""A pixel may see the monitor directly if its heaviest lobe has at least this share of its light."""
-NEAR = 0.004
-"""How far such a pixel may deviate from the common perspective, in widths of the monitor."""
 STRAY = 0.1
 """How far a ray may deviate from those around it in the object's plane, in widths of the monitor."""
-MIN_DIRECT = 0.02
-"""Share of the recovered pixels that must see the monitor directly to find the camera's perspective."""
-Places = NDArray[np.float32]
-"""(height, width, 4) float32: the heaviest lobe of every pixel, see `places_of`."""
 
 
 @dataclass(frozen=True)
@@ -51,36 +38,13 @@ class Rays:
     scale: float
 
 
-def places_of(matte: Matte, threads: int) -> Places:
-    """The heaviest lobe of every pixel.
-
-    Returns
-    -------
-    (height, width, 4) float32
-        Its centre, in widths and heights of the monitor from the top left; its mean standard deviation, in widths; and
-        its share of the light, which is 0 where nothing was recovered.
-    """
-    places = np.zeros((matte.height, matte.width, 4), np.float32)
-    blocks = list(product(range(matte.block_rows), range(matte.block_columns)))
-
-    def one(number: int) -> None:
-        lobe = block_lobes(matte, matte.read(*blocks[number]), LOBES)[:, :, 0]
-        at = places[matte.span(*blocks[number])]
-        at[..., 3] = lobe[..., 2:5].mean(axis=2)
-        at[..., 0], at[..., 1] = lobe[..., 0], np.where(at[..., 3] > 0, 1 - lobe[..., 1], 0)
-        at[..., 2] = np.sqrt(lobe[..., 5] * lobe[..., 6])
-
-    in_parts(one, range(len(blocks)), threads)
-    return places
-
-
 def from_two(first: Places, second: Places, distances: tuple[float, float], depth: float) -> Rays:
     """Rays through the positions that two mattes saw.
 
     Parameters
     ----------
     first, second : (height, width, 4) float32
-        See `places_of`; the first is the matte to composite.
+        See `workflows.mattes.perspective.places_of`; the first is the matte to composite.
     distances : (float, float)
         From the object to the monitor in each of them, in any unit.
     depth : float
@@ -119,7 +83,7 @@ def from_one(places: Places, aspect: float, distance: float, camera: float, dept
     Parameters
     ----------
     places : (height, width, 4) float32
-        See `places_of`.
+        See `workflows.mattes.perspective.places_of`.
     aspect : float
         Height of the monitor as a share of its width.
     distance, camera, depth : float
@@ -135,8 +99,16 @@ def from_one(places: Places, aspect: float, distance: float, camera: float, dept
     The camera's perspective is the homography between its pixels and the positions on the monitor that they see beside
     the object. The camera's axis is assumed to pass through the middle of the frame.
     """
-    sight = _perspective(places, aspect)
-    height, width = sight.shape[:2]
+    height, width, _ = places.shape
+    y, x = np.mgrid[:height, :width].astype(np.float64)
+    across, down = (2 * x + 1) / width - 1, (2 * y + 1) / height - 1
+    perspective = find_perspective(places, across, down, aspect)
+    if perspective is None:
+        raise Conflict(
+            "too little of the monitor is seen directly beside the object to find the camera's perspective: film it "
+            "with some of the bare monitor in the frame and no mask, or give a second matte at another distance"
+        )
+    sight = sights(perspective, across, down).astype(np.float32)
     foot = sight[(height - 1) // 2 : height // 2 + 1, (width - 1) // 2 : width // 2 + 1].mean(axis=(0, 1))
     through = foot + (sight - foot) * np.float32(camera / (camera + distance))
     return _through(through, depth / distance)
@@ -145,52 +117,6 @@ def from_one(places: Places, aspect: float, distance: float, camera: float, dept
 def _through(place: NDArray[np.floating], away: float) -> Rays:
     """Rays through positions ``place`` of the object's plane, to ``away`` times the monitor's distance."""
     return Rays((place * (1 - away)).astype(np.float32), away)
-
-
-def _perspective(places: Places, aspect: float) -> NDArray[np.float32]:
-    """Where on the monitor each pixel would look without the object, (height, width, 2)."""
-    height, width, _ = places.shape
-    y, x = np.mgrid[:height, :width].astype(np.float64)
-    across, down = (2 * x + 1) / width - 1, (2 * y + 1) / height - 1
-    seen = places[..., :2].astype(np.float64)
-    sharp = places[..., 3] > DIRECT
-    candidates = sharp & (places[..., 2] < 2 * np.median(places[..., 2][sharp])) if sharp.any() else sharp
-    # Start with the pixels at the edge of the frame, then add all that fit the same perspective.
-    fits = candidates & (np.maximum(np.abs(across), np.abs(down)) > 0.9)
-    least = max(MIN_DIRECT * np.count_nonzero(places[..., 3]), 16)
-    for _ in range(10):
-        checkpoint()
-        if np.count_nonzero(fits) < least:
-            raise Conflict(
-                "too little of the monitor is seen directly beside the object to find the camera's perspective: film "
-                "it with some of the bare monitor in the frame and no mask, or give a second matte at another distance"
-            )
-        h = _homography(across[fits], down[fits], seen[fits])
-        scale = h[2, 0] * across + h[2, 1] * down + h[2, 2]
-        sight = np.stack([h[k, 0] * across + h[k, 1] * down + h[k, 2] for k in (0, 1)], axis=2)
-        sight /= scale[..., np.newaxis]
-        off = np.hypot(*np.moveaxis((sight - seen) * (1, aspect), 2, 0))
-        now = candidates & (off < max(NEAR, float(np.median(off[fits]))))
-        if (now == fits).all():
-            break
-        fits = now
-    return np.asarray(sight, np.float32)
-
-
-def _homography(
-    x: NDArray[np.float64], y: NDArray[np.float64], seen: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """The (3, 3) homography from (x, y, 1) to ``seen`` (n, 2), by linear least squares; its last entry is 1."""
-    u, v = seen.T
-    one, zero = np.ones_like(x), np.zeros_like(x)
-    rows = np.concatenate(
-        [
-            np.stack([x, y, one, zero, zero, zero, -u * x, -u * y], axis=1),
-            np.stack([zero, zero, zero, x, y, one, -v * x, -v * y], axis=1),
-        ]
-    )
-    found, *_ = np.linalg.lstsq(rows, np.concatenate([u, v]), rcond=None)
-    return np.append(found, 1.0).reshape(3, 3)
 
 
 @njit(nogil=True, cache=True)

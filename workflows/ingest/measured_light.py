@@ -70,7 +70,11 @@ def exposures_of(attributes: dict[str, Any]) -> Floats:
 
 
 def read_light(
-    stack: Stack, span: tuple[slice, slice], program: Program, gain: Surroundings | None
+    stack: Stack,
+    span: tuple[slice, slice],
+    program: Program,
+    gain: Surroundings | None,
+    wanted: Bools | None = None,
 ) -> tuple[Light, Bools]:
     """The light of each pattern at the pixels of a rectangle that are to be recovered, and their (y, x) bool mask.
 
@@ -85,6 +89,8 @@ def read_light(
     program : Program
     gain : Surroundings or None
         As from `workflows.ingest.local_gain.local_gain`.
+    wanted : (y, x) bool, optional
+        Which pixels of the rectangle are wanted of those to be recovered; all by default.
 
     Raises
     ------
@@ -103,6 +109,7 @@ def read_light(
 
     if shifts is None or any(part.step for part in span):
         codes, recovered = stack.read_masked(*span) if shifts is None else _nearest(stack, span, shifts)
+        recovered = recovered if wanted is None else recovered & wanted
         codes = codes[:, recovered]
 
         def at_rest(frame: int) -> tuple[Floats, Bools]:
@@ -115,6 +122,7 @@ def read_light(
     else:
         margin = margin_of(shifts)
         around, recovered = _around(stack, span, margin), stack.mask(*span)
+        recovered = recovered if wanted is None else recovered & wanted
 
         def in_place(frame: int) -> tuple[Floats, Bools]:
             values, whole = unclipped_light(around[frame], shifts[frame], margin, look_up, top)

@@ -31,6 +31,11 @@ class RecoveryOptions(BaseModel):
         description="Edge of the square tiles, in pixels, rounded up to whole blocks of the matte. Each tile is one "
         "task; the default is one block. The matte does not depend on it.",
     )
+    cut_out: bool = Field(
+        False,
+        description="Recover the object alone, without the bare monitor and the room around it. Some bare monitor has "
+        "to be seen around the object. A capture with a mask is recovered within that, whatever this is.",
+    )
 
     @property
     def of_method(self) -> LobesOptions | DgsrOptions:

@@ -1,8 +1,12 @@
 """The preview of a matte: a matte of every k-th row and column of its frame, there before the rest is recovered."""
 
 import math
+from dataclasses import replace
 from itertools import product
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from storage.layout import mattes
 from storage.layout.captures import Stack
@@ -18,10 +22,10 @@ LEAST_SPACING = 4
 """A closer lattice would take too large a share of the whole recovery, which then is soon done."""
 
 
-def spacing_of(stack: Stack) -> int | None:
+def spacing_of(stack: Stack, least: int = LEAST_SPACING) -> int | None:
     """Of how many rows and columns of a capture a preview has one; None if it has no preview."""
     spacing = math.ceil(math.sqrt(int(stack.mask().sum()) / PIXELS))
-    return spacing if spacing >= LEAST_SPACING else None
+    return spacing if spacing >= least else None
 
 
 def recover_preview(objects: Objects, capture: str, matte: Matte, name: str, spacing: int) -> None:
@@ -73,3 +77,10 @@ def recover_preview(objects: Objects, capture: str, matte: Matte, name: str, spa
         preview.write(*blocks[number], tiles.recover_block(objects, stack, capture, (y, x), options))
 
     in_parts(recover, range(len(blocks)), CORES)
+
+
+def show_only(preview: Matte, shown: NDArray[np.bool_]) -> None:
+    """Show some pixels of a preview alone, (y, x) bool. The others' rows of T stay."""
+    for row, column in product(range(preview.block_rows), range(preview.block_columns)):
+        block = preview.read(row, column)
+        preview.write(row, column, replace(block, recovered=shown[preview.span(row, column)]))

@@ -1,9 +1,11 @@
 """The steps of a recovery: create the matte, recover its tiles, read its figures."""
 
 from collections.abc import Sequence
+from functools import lru_cache
 from itertools import product
 from typing import Any
 
+from storage.errors import Conflict
 from storage.layout import mattes
 from storage.layout.captures import Stack
 from storage.layout.mattes import Matte
@@ -12,6 +14,7 @@ from workflows.ingest.report.expected_psnr import exposure_error
 from workflows.ingest.trial.qualities import QUALITIES
 from workflows.jobs import Steps, Task
 from workflows.mattes import preview, tiles
+from workflows.mattes.cut_out import CutOut, find_object
 from workflows.mattes.options import RecoveryOptions, parse_options
 
 
@@ -22,7 +25,8 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
     -------
     dict
         ``tiles``: how many there are. ``figures``: of the matte, with ``preview``, of how many of its rows and columns
-        the preview has one, or None.
+        the preview has one, or None. ``is_cut_out``: whether only the object is recovered. ``notes``: lines for the
+        job's log.
     """
     stack = Stack(objects, task.capture)
     program, _ = tiles.program_of(objects, task.capture)
@@ -41,13 +45,31 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
         options=options.model_dump(mode="json", exclude={"tile"}),
         **_interval(stack, options),
     )
-    spacing = preview.spacing_of(stack)
+    is_cut_out, notes = options.cut_out and bool(stack.mask().all()), []
+    spacing = preview.spacing_of(stack, least=1) if is_cut_out else preview.spacing_of(stack)
     if spacing is not None:
         preview.recover_preview(objects, task.capture, matte, task.matte, spacing)
+    if is_cut_out:
+        try:
+            shown = _cut_out(objects, task.matte, spacing).object
+            preview.show_only(Matte(objects, mattes.preview_of(task.matte)), shown)
+        except Conflict as error:
+            is_cut_out = False
+            notes.append(f"the object could not be cut out, so the whole frame is recovered: {error}")
     return {
         "tiles": len(tiles.cut(matte, options.tile or matte.block)),
         "figures": matte.figures | {"preview": spacing},
+        "is_cut_out": is_cut_out,
+        "notes": notes,
     }
+
+
+@lru_cache(maxsize=1)
+def _cut_out(objects: Objects, matte: str, spacing: int | None) -> CutOut:
+    """Where the object of a matte stands, kept from tile to tile."""
+    whole = Matte(objects, matte)
+    assert spacing is not None  # a matte whose object is cut out has a preview
+    return find_object(Matte(objects, mattes.preview_of(matte)), spacing, whole.height, whole.width)
 
 
 def _interval(stack: Stack, options: RecoveryOptions) -> dict[str, Any]:
@@ -67,7 +89,9 @@ def _interval(stack: Stack, options: RecoveryOptions) -> dict[str, Any]:
 
 def work(objects: Objects, task: Task, tile: int) -> int:
     """Recover one tile; returns the number of pixels recovered."""
-    return tiles.recover_tile(objects, task.capture, task.matte, parse_options(task.options), tile)
+    plan, options = task.plan, parse_options(task.options)
+    cut_out = _cut_out(objects, task.matte, plan["figures"]["preview"]) if plan.get("is_cut_out") else None
+    return tiles.recover_tile(objects, task.capture, task.matte, options, tile, cut_out)
 
 
 def missing(objects: Objects, task: Task) -> list[int]:

@@ -15,6 +15,7 @@ from storage.objects.store import Objects
 from workflows.images.tone_curves import Curve, to_light
 from workflows.ingest.local_gain import Surroundings, local_gain
 from workflows.ingest.measured_light import conditions_of, constants_of, places_in, read_light
+from workflows.mattes.cut_out import CutOut
 from workflows.mattes.options import RecoveryOptions
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out, pyramid_of
@@ -80,10 +81,24 @@ def cut_inside(width: int, height: int, block: int, tile: int, region: Sequence[
     return {row * -(-width // edge) + column for row, column in product(rows, columns)}
 
 
-def recover_tile(objects: Objects, capture: str, matte: str, options: RecoveryOptions, index: int) -> int:
+def recover_tile(
+    objects: Objects,
+    capture: str,
+    matte: str,
+    options: RecoveryOptions,
+    index: int,
+    cut_out: CutOut | None = None,
+) -> int:
     """Recover the blocks of a matte that a tile consists of, one after another.
 
     What is held in memory is a block's, and what comes out is the same however blocks make up tiles.
+
+    Parameters
+    ----------
+    index : int
+        Of the tile.
+    cut_out : CutOut, optional
+        Where the object stands, if only it is to be recovered.
 
     Returns
     -------
@@ -100,17 +115,26 @@ def recover_tile(objects: Objects, capture: str, matte: str, options: RecoveryOp
     mask, pixels = mask_of(objects, capture), 0
     for row, column in product(rows, columns):
         span = target.span(row, column)
-        wanted = mask[span]
+        wanted = mask[span] if cut_out is None else mask[span] & cut_out.wanted(span)
         # Of most of a frame the mask leaves everything out: values need not be read.
-        found = recover_block(objects, stack, capture, span, options) if wanted.any() else None
-        block = found or empty_block(*wanted.shape)
+        if wanted.any():
+            block = recover_block(objects, stack, capture, span, options, wanted)
+            if cut_out is not None:
+                block = cut_out.cut(block, target, span)
+        else:
+            block = empty_block(*wanted.shape)
         target.write(row, column, block)
         pixels += int(block.recovered.sum())
     return pixels
 
 
 def recover_block(
-    objects: Objects, stack: Stack, capture: str, span: tuple[slice, slice], options: RecoveryOptions
+    objects: Objects,
+    stack: Stack,
+    capture: str,
+    span: tuple[slice, slice],
+    options: RecoveryOptions,
+    wanted: NDArray[np.bool_] | None = None,
 ) -> Block:
     """Recover a block of a matte.
 
@@ -118,11 +142,14 @@ def recover_block(
     ----------
     span : (slice, slice)
         Rows and columns of the frame. If they have a step, frames that drift are shifted by whole pixels only.
+    wanted : (h, w) bool, optional
+        Which pixels to recover of those within the capture's mask; all by default.
     """
     program, monitor = program_of(objects, capture)
     attributes = stack.attributes
     noise = Noise(**attributes["noise"])
-    (light, usable, worth), recovered = read_light(stack, span, program, gain_of(objects, capture))
+    gain = gain_of(objects, capture)
+    (light, usable, worth), recovered = read_light(stack, span, program, gain, wanted)
     crosstalk = np.array(attributes["crosstalk"])
     numbers, sent = constants_of(attributes, program)
     photometry = fit_photometry(

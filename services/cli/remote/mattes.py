@@ -39,6 +39,11 @@ NODES = {
 @click.option("--scale", type=float, help="Scale the backdrop by this factor.")
 @click.option("--angle", type=float, help="Rotate the backdrop clockwise, in degrees.")
 @click.option(
+    "--around",
+    type=click.Choice(["nothing", "backdrop"]),
+    help="What to show where the matte has no object: nothing, so that a PNG is transparent, or the backdrop.",
+)
+@click.option(
     "--interval",
     is_flag=True,
     default=None,

@@ -8,9 +8,10 @@ from storage.errors import Conflict
 from storage.layout.mattes import Block, Matte, create
 from storage.objects.store import Objects
 from workflows.composite import composite
-from workflows.composite.depth import MIN_DIRECT, Rays, from_one, from_two, places_of
+from workflows.composite.depth import Rays, from_one, from_two
 from workflows.composite.engine import Window
 from workflows.images.resample import area_mean
+from workflows.mattes.perspective import places_of
 from workflows.simulation import glass_ball
 from workflows.simulation.scene import Scene
 from workflows.threads import CORES
@@ -146,6 +147,5 @@ def test_without_a_bare_monitor_the_camera_is_not_known() -> None:
         from_one(places, 0.75, 3, 5, 4)
     rng = np.random.default_rng(0)
     places[..., :2], places[..., 2:] = rng.random((HEIGHT, WIDTH, 2)), (0.01, 1)
-    assert MIN_DIRECT < 0.1
     with pytest.raises(Conflict, match="bare monitor"):
         from_one(places, 0.75, 3, 5, 4)

@@ -133,7 +133,9 @@ def test_every_option_is_described_once_per_method_as_it_is_parsed() -> None:
         assert option["default"] == getattr(parse_options(base), name)
         for value in option["values"] or []:
             assert getattr(parse_options(base | {name: value}), name) == value
-        if option["values"] is None:
+        if option["type"] == "boolean":
+            assert getattr(parse_options(base | {name: not option["default"]}), name) is not option["default"]
+        elif option["values"] is None:
             for bound, beyond in (("minimum", -1), ("maximum", 1)):
                 assert getattr(parse_options(base | {name: option[bound]}), name) == option[bound]
                 with pytest.raises(OptionError):

@@ -49,7 +49,8 @@ export async function recoveryForm(capture, signal) {
 	const { options } = await getJson("v1/options", signal);
 	const isQuality = ({ name }) => name === "quality";
 	const qualities = cards(options.find(isQuality), capture.recovery_seconds);
-	const fields = options.filter((option) => !isQuality(option)).map(field);
+	const cutOut = h("input", { type: "checkbox", checked: true, "aria-describedby": "about-cut-out" });
+	const fields = options.filter((option) => !isQuality(option) && option.name !== "cut_out").map(field);
 	const method = fields.find(({ option }) => option.name === "method").input;
 	const problem = h("div");
 	const isWaiting = capture.state === "ingesting";
@@ -58,6 +59,7 @@ export async function recoveryForm(capture, signal) {
 	const form = h("form.panel", { id: "recovery" }, h("h2", t("recover.title")),
 		h("p", t("recover.about")),
 		qualities,
+		h("p", h("label", cutOut, " ", t("recover.cut")), " ", h("span.hint", { id: "about-cut-out" }, t("recover.cut.about"))),
 		isWaiting && h("label", itself, " ", t("recover.itself")),
 		h("details", h("summary", t("recover.expert")), h("p.hint", t("recover.defaults")),
 			h("div.options", fields.map(({ row }) => row))),
@@ -76,7 +78,7 @@ export async function recoveryForm(capture, signal) {
 		fields.forEach(({ input }) => input.removeAttribute("aria-invalid"));
 		try {
 			const quality = new FormData(form).get("quality");
-			const wanted = { ...chosen(fields, method.value), ...(quality === "fast" && { quality }) };
+			const wanted = { ...chosen(fields, method.value), ...(quality === "fast" && { quality }), ...(cutOut.checked && { cut_out: true }) };
 			const job = await post("v1/jobs", { capture: capture.id, options: wanted }, once);
 			if (once) automatic.add(job.id);
 			location.hash = `#/jobs/${job.id}`;

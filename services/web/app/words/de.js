@@ -335,6 +335,8 @@ export const de = {
 	"recording": "Film wird aufgenommen",
 	"recover": "Berechnen",
 	"recover.about": "Findet für jedes Pixel, woher auf dem Monitor sein Licht kommt.",
+	"recover.cut": "Objekt freistellen",
+	"recover.cut.about": "Lässt den bloßen Monitor und den Raum darum herum weg: So kann es vor allem stehen",
 	"recover.defaults": "Ein leeres Feld bekommt den grau gezeigten Wert oder den der Qualität.",
 	"recover.expert": "Für Fachleute",
 	"recover.itself": "Automatisch berechnen, sobald bereit",

@@ -335,6 +335,8 @@ export const en = {
 	"recording": "Recording a film",
 	"recover": "Recover",
 	"recover.about": "Finds, for each pixel, where on the monitor its light comes from.",
+	"recover.cut": "Cut the object out",
+	"recover.cut.about": "Leaves out the bare monitor and the room around it, so that it can stand before anything",
 	"recover.defaults": "An empty field takes the default shown in grey, or what the quality sets.",
 	"recover.expert": "Expert",
 	"recover.itself": "Recover automatically when ready",

@@ -39,6 +39,7 @@ export const de = {
 	"Not needed": "Nicht nötig",
 	"One T serves all channels unless their chi-square per degree of freedom exceeds this. For grey patterns; under coloured ones the likelihood decides.": "Ein T gilt für alle Kanäle, außer wenn ihr Chi-Quadrat je Freiheitsgrad darüber liegt. Für graue Muster; bei farbigen entscheidet die Likelihood.",
 	"RAW, EXR and float TIFF frames hold linear light: set \"response\": \"linear\"": "Bilder in RAW, EXR und Float-TIFF enthalten lineares Licht: \"response\": \"linear\" setzen",
+	"Recover the object alone, without the bare monitor and the room around it. Some bare monitor has to be seen around the object. A capture with a mask is recovered within that, whatever this is.": "Nur das Objekt berechnen, ohne den bloßen Monitor und den Raum darum herum. Um das Objekt muss etwas bloßer Monitor zu sehen sein. Eine Aufnahme mit Maske wird in jedem Fall innerhalb von dieser berechnet.",
 	"Refused to another website": "Einer anderen Website verweigert",
 	"Rounds, and fits of the Gaussians, end when one lowers the squared residual by less than this share.": "Runden und Anpassungen der Gauß-Keulen enden, wenn eine das quadrierte Residuum um weniger als diesen Anteil senkt.",
 	"Stored data is missing or damaged": "Gespeicherte Daten fehlen oder sind beschädigt",

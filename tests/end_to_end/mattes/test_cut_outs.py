@@ -1,0 +1,50 @@
+"""Glass without the monitor and the room around it, recovered from a capture without a mask, on a real server."""
+
+from pathlib import Path
+
+import numpy as np
+from scipy.ndimage import binary_dilation, binary_erosion
+
+from tests.end_to_end.conftest import Service
+from tests.end_to_end.mattes.test_composites import decoded, post_composite
+from workflows.images import integer_formats
+from workflows.programs.presets import preset
+from workflows.simulation.glass_ball import glass_ball
+from workflows.simulation.scene import write_capture
+
+MONITOR = 512, 384
+
+
+def test_the_object_is_cut_out(service: Service, tmp_path: Path) -> None:
+    scene = glass_ball(96, 72, monitor=MONITOR, rays=16, distance=8)
+    write_capture(scene, preset("sketch", *MONITOR), tmp_path / "ball.zip", noise=0.5, depth=16)
+    capture = service.client.upload(tmp_path / "ball.zip")
+    cut, whole = (
+        service.client.wait(service.client.recover(capture, quality="fast", cut_out=option)["id"])
+        for option in (True, False)
+    )
+    alpha = integer_formats.decode(
+        service.http.get(f"/v1/mattes/{cut['matte']}/layers/alpha.png").content, memory=1 << 24
+    )
+    shown, covered = alpha[:, :, 0] > 0, scene.coverage > 0.5
+    assert not (shown & ~binary_dilation(covered, iterations=2)).any()
+    assert not (binary_erosion(covered, iterations=2) & ~shown).any()
+    transparent = integer_formats.decode(
+        post_composite(service, cut["matte"]).content, memory=1 << 24, alpha=True
+    )
+    np.testing.assert_array_equal(transparent[:, :, 3] > 0, shown)
+    everything = integer_formats.decode(
+        post_composite(service, whole["matte"]).content, memory=1 << 24, alpha=True
+    )
+    assert everything.shape == (72, 96, 3)
+    around = decoded(post_composite(service, cut["matte"], around="backdrop"))
+    assert (around[~binary_dilation(shown, iterations=3)].max(axis=1) > 0).mean() > 0.9  # no dark room
+
+
+def test_the_log_says_why_an_object_is_not_cut_out(service: Service, tmp_path: Path) -> None:
+    scene = glass_ball(40, 30, monitor=MONITOR, rays=4, index=1.0, distance=8)  # which bends no light
+    write_capture(scene, preset("sketch", *MONITOR), tmp_path / "none.zip", noise=0.5, depth=16)
+    capture = service.client.upload(tmp_path / "none.zip")
+    job = service.client.wait(service.client.recover(capture, quality="fast", cut_out=True)["id"])
+    lines = [line["text"] for line in service.http.get(f"/v1/jobs/{job['id']}/log").json()["lines"]]
+    assert any("the whole frame is recovered: nothing stands before the monitor" in line for line in lines)

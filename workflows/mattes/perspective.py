@@ -1,0 +1,235 @@
+"""Where on the monitor a camera's pixels look beside the object: the perspective that bare pixels share."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion, label
+
+from storage.layout.mattes import Matte
+from workflows.interruption import checkpoint
+from workflows.mattes.lobes import block_lobes
+from workflows.threads import in_parts
+
+LOBES = 3
+"""Lobes of a pixel that are fitted; the heaviest is used."""
+DIRECT = 0.75
+"""A pixel may see the monitor directly if its heaviest lobe has at least this share of its light: the rest may be
+glare, or mirrored by a table."""
+NEAR = 0.004
+"""How far such a pixel may deviate from the common perspective, in widths of the monitor."""
+ROUGHLY = 0.012
+"""The same, where patterns without a fine grid tell places less well."""
+RIM = 0.05
+"""Width of the rim in which bare pixels are looked for, as a share of the frame's larger side."""
+LEAST_RIM = 0.3
+"""Share of the rim's pixels that must agree."""
+LEAST_PART = 0.02
+"""Groups of pixels that are smaller than this share of the largest are no part of the rim."""
+MOST_RIM = 4000
+"""Pixels of the rim that are tried, about."""
+LEAST = 16
+"""Pixels that must agree at least."""
+TRIALS = 300
+"""Perspectives that are tried, each through four pixels."""
+ROUNDS = 10
+"""In which the pixels that agree with a fit are chosen anew."""
+Places = NDArray[np.float32]
+"""(height, width, 4) float32: the heaviest lobe of every pixel, see `places_of`."""
+Bools = NDArray[np.bool_]
+Doubles = NDArray[np.float64]
+
+
+def places_of(matte: Matte, threads: int) -> Places:
+    """The heaviest lobe of every pixel.
+
+    Returns
+    -------
+    (height, width, 4) float32
+        Its centre, in widths and heights of the monitor from the top left; its mean standard deviation, in widths; and
+        its share of the light, which is 0 where nothing was recovered.
+    """
+    places = np.zeros((matte.height, matte.width, 4), np.float32)
+    blocks = list(product(range(matte.block_rows), range(matte.block_columns)))
+
+    def one(number: int) -> None:
+        lobe = block_lobes(matte, matte.read(*blocks[number]), LOBES)[:, :, 0]
+        at = places[matte.span(*blocks[number])]
+        at[..., 3] = lobe[..., 2:5].mean(axis=2)
+        at[..., 0], at[..., 1] = lobe[..., 0], np.where(at[..., 3] > 0, 1 - lobe[..., 1], 0)
+        at[..., 2] = np.sqrt(lobe[..., 5] * lobe[..., 6])
+
+    in_parts(one, range(len(blocks)), threads)
+    return places
+
+
+@dataclass(frozen=True)
+class Sight:
+    """Where on the monitor the pixels of a frame look beside the object, through a lens that bends straight lines.
+
+    Attributes
+    ----------
+    height, width : int
+        Of the frame.
+    perspective : (3, 3) float64
+        See `sights`.
+    bend : (10, 2) float64
+        What the lens adds, in widths and heights of the monitor: a polynomial of the third degree.
+    """
+
+    height: int
+    width: int
+    perspective: Doubles
+    bend: Doubles
+
+    def at(self, y: Doubles, x: Doubles) -> Doubles:
+        """The places that pixels with these rows and columns see, (..., 2), in widths and heights of the monitor."""
+        across, down = (2 * x + 1) / self.width - 1, (2 * y + 1) / self.height - 1
+        return sights(self.perspective, across, down) + _cubic(across, down) @ self.bend
+
+
+def find_sight(places: Places, y: Doubles, x: Doubles, frame: tuple[int, int], aspect: float) -> Sight | None:
+    """Where the pixels of a frame look, by what some of them see.
+
+    Parameters
+    ----------
+    places : (h, w, 4) float32
+        See `places_of`.
+    y, x : (h, w) float64
+        Their rows and columns in the frame.
+    frame : (int, int)
+        Height and width.
+    aspect : float
+        Height of the monitor as a share of its width.
+
+    Returns
+    -------
+    Sight
+        None if too few pixels see the monitor directly.
+    """
+    height, width = frame
+    across, down = (2 * x + 1) / width - 1, (2 * y + 1) / height - 1
+    perspective = find_perspective(places, across, down, aspect)
+    if perspective is None:
+        return None
+    terms, left = _cubic(across, down), places[..., :2] - sights(perspective, across, down)
+    sharp, bend = places[..., 3] > DIRECT, np.zeros((terms.shape[2], 2))
+    for _ in range(ROUNDS):
+        off = np.hypot(*np.moveaxis((left - terms @ bend) * (1, aspect), 2, 0))
+        fits = sharp & (off < NEAR)
+        bend = np.linalg.lstsq(terms[fits], left[fits], rcond=None)[0]
+    return Sight(height, width, perspective, bend)
+
+
+def _cubic(across: Doubles, down: Doubles) -> Doubles:
+    """The terms of a polynomial of the third degree, (..., 10)."""
+    return np.stack([across**i * down**j for i in range(4) for j in range(4 - i)], axis=-1)
+
+
+def find_perspective(places: Places, across: Doubles, down: Doubles, aspect: float) -> Doubles | None:
+    """The homography between pixels of a frame and the places on the monitor that they see beside the object.
+
+    Parameters
+    ----------
+    places : (height, width, 4) float32
+        See `places_of`.
+    across, down : (height, width) float64
+        Where the pixels are in the frame, from -1 to 1.
+    aspect : float
+        Height of the monitor as a share of its width.
+
+    Returns
+    -------
+    (3, 3) float64
+        See `sights`. None if too few pixels see the monitor directly.
+
+    Notes
+    -----
+    Bare pixels lie along the rim of what shows the monitor, which is that of the frame or of the monitor itself. Of the
+    homographies through four pixels of the rim (random sample consensus, Fischler and Bolles 1981) the one that most
+    of them agree with is fitted to all pixels that do.
+    """
+    sharp = places[..., 3] > DIRECT
+    if sharp.any():
+        sharp &= places[..., 2] < 2 * np.median(places[..., 2][sharp])
+    rim = np.flatnonzero(_rim(sharp))
+    rim = rim[:: 1 + rim.size // MOST_RIM]
+    if rim.size < LEAST:
+        return None
+    seen = places[..., :2].astype(np.float64)
+    x, y, at = across.ravel()[rim], down.ravel()[rim], seen.reshape(-1, 2)[rim]
+    tried = [_homography(x[four], y[four], at[four]) for four in _fours(rim.size)]
+    off = np.stack([_off(one, x, y, at, aspect) for one in tried])
+    for near in (NEAR, ROUGHLY):
+        agreed = np.count_nonzero(off < near, axis=1)
+        if agreed.max() >= max(LEAST, LEAST_RIM * rim.size):
+            break
+    else:
+        return None
+    best = tried[np.argmax(agreed)]
+    for _ in range(ROUNDS):
+        checkpoint()
+        fits = sharp & (_off(best, across, down, seen, aspect) < near)
+        best = _homography(across[fits], down[fits], seen[fits])
+    return best
+
+
+def _fours(count: int) -> Iterator[NDArray[np.intp]]:
+    """Four of some pixels, again and again; the same each time."""
+    random = np.random.default_rng(0)
+    for _ in range(TRIALS):
+        yield random.choice(count, 4, replace=False)
+
+
+def sights(perspective: Doubles, across: Doubles, down: Doubles) -> Doubles:
+    """Where on the monitor pixels look by a homography, (..., 2), in its widths and heights from the top left."""
+    scale = perspective[2, 0] * across + perspective[2, 1] * down + perspective[2, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):  # of four pixels that determine none
+        return np.stack(
+            [
+                (perspective[k, 0] * across + perspective[k, 1] * down + perspective[k, 2]) / scale
+                for k in (0, 1)
+            ],
+            axis=-1,
+        )
+
+
+def _off(perspective: Doubles, across: Doubles, down: Doubles, seen: Doubles, aspect: float) -> Doubles:
+    """How far from the places that pixels see those of a homography are, in widths of the monitor."""
+    off: Doubles = np.hypot(*np.moveaxis((sights(perspective, across, down) - seen) * (1, aspect), -1, 0))
+    return off
+
+
+def between(there: Bools) -> Bools:
+    """The pixels that are there, or between two of them in a row or a column."""
+    found = np.zeros_like(there)
+    for axis in (0, 1):
+        before = np.logical_or.accumulate(there, axis)
+        after = np.flip(np.logical_or.accumulate(np.flip(there, axis), axis), axis)
+        found |= before & after
+    return found
+
+
+def _rim(sharp: Bools) -> Bools:
+    """The outermost of some pixels, without small groups of them."""
+    parts, _ = label(sharp)
+    sizes = np.bincount(parts[sharp], minlength=1)
+    large = sharp & (sizes >= LEAST_PART * np.max(sizes))[parts]
+    width = max(1, round(RIM * max(sharp.shape)))
+    return np.asarray(large & ~binary_erosion(between(large), iterations=width))
+
+
+def _homography(x: Doubles, y: Doubles, seen: Doubles) -> Doubles:
+    """The (3, 3) homography from (x, y, 1) to ``seen`` (n, 2), by linear least squares; its last entry is 1."""
+    u, v = seen.T
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    rows = np.concatenate(
+        [
+            np.stack([x, y, one, zero, zero, zero, -u * x, -u * y], axis=1),
+            np.stack([zero, zero, zero, x, y, one, -v * x, -v * y], axis=1),
+        ]
+    )
+    found, *_ = np.linalg.lstsq(rows, np.concatenate([u, v]), rcond=None)
+    return np.append(found, 1.0).reshape(3, 3)
