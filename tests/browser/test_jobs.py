@@ -28,6 +28,24 @@ def test_invalid_option_is_explained(desk: Page, service: Service, ready: tuple[
     expect(desk.get_by_label("most lobes")).to_be_focused()
 
 
+def test_the_object_is_cut_out_unless_that_is_unticked(
+    desk: Page, service: Service, ready: tuple[str, str]
+) -> None:
+    def asked() -> bool | None:
+        desk.get_by_role("button", name="Recover", exact=True).click()
+        expect(desk).to_have_url(re.compile(r"#/jobs/\w+"))
+        job = desk.url.rpartition("/")[2]
+        service.client.wait(job)
+        options = service.http.get(f"/v1/jobs/{job}").json()["options"]
+        assert isinstance(options, dict)
+        return options.get("cut_out")
+
+    for is_cut in (True, False):
+        desk.goto(f"{service.url}/#/captures/{ready[0]}")
+        desk.get_by_label("Cut the object out").set_checked(is_cut)
+        assert bool(asked()) is is_cut
+
+
 def test_job_is_cancelled_and_deleted(desk: Page, service: Service, ready: tuple[str, str]) -> None:
     with paused(service):
         job = service.client.recover(ready[0])["id"]
@@ -158,6 +176,7 @@ def test_recovery_follows_the_ingest_by_itself(desk: Page, service: Service, bal
     expect(desk).to_have_url(re.compile("#/mattes/"), timeout=3 * MINUTE)
     matte = service.client.matte(desk.url.rpartition("/")[2])
     assert matte["options"]["quality"] == "fast"
+    service.client.wait(matte["job"])
     desk.get_by_role("list", name="Steps").get_by_role("link", name="Check").click()
     expect(desk.get_by_role("region", name="Mattes").get_by_role("link")).to_have_attribute(
         "href", f"#/mattes/{matte['id']}"

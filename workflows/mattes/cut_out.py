@@ -100,8 +100,7 @@ class CutOut:
         is_bare = (off < _tolerance(self.deviation, matte)) & _is_alike(rho, bare_rho)
         near = self._enlarged(binary_dilation(self.object, iterations=MARGIN), span)
         within = self._enlarged(binary_erosion(self.object, iterations=MARGIN, border_value=1), span)
-        is_lit = rho > LIT * np.median(self.bare_rho[self.bare_rho > 0])
-        seen_through = ~is_bare & (is_inside | (near & is_lit))
+        seen_through = ~is_bare & (is_inside | (near & _is_lit(rho, self.bare_rho)))
         kept = block.recovered & median_filter(block.recovered & (within | seen_through), 3)
         entries = np.repeat(kept.ravel(), block.count.sum(axis=2, dtype=np.intp).ravel())
         channels = kept[..., np.newaxis]
@@ -152,7 +151,7 @@ def find_object(preview: Matte, spacing: int, height: int, width: int) -> CutOut
     if sight is None:
         raise Conflict("too little of the monitor is seen directly beside it")
     seen = sight.at(y, x)
-    pitch = float(np.median(np.abs(np.diff(seen[..., 0], axis=1)))) / spacing
+    pitch = float(np.median(np.hypot(*np.moveaxis(np.diff(seen, axis=1) * (1, aspect), 2, 0)))) / spacing
     is_inside, rho = _is_inside(sight, seen, y, x, pitch), preview.layer("rho").mean(axis=2)
     off = np.empty((preview.height, preview.width), np.float32)
     for row, column in product(range(preview.block_rows), range(preview.block_columns)):
@@ -167,8 +166,7 @@ def find_object(preview: Matte, spacing: int, height: int, width: int) -> CutOut
     for _ in range(2):  # without what is brighter or darker than the others
         bare_rho = _around(rho, straight & _is_alike(rho, bare_rho))
     is_bare = straight & _is_alike(rho, bare_rho)
-    is_lit = rho > LIT * np.median(bare_rho[bare_rho > 0])
-    found = _largest_parts(~is_bare & (is_inside | is_lit), is_inside)
+    found = _largest_parts(~is_bare & (is_inside | _is_lit(rho, bare_rho)), is_inside)
     return CutOut(spacing, sight, aspect, pitch, deviation, bare_rho, found)
 
 
@@ -183,6 +181,11 @@ def _is_inside(sight: Sight, seen: Doubles, y: Doubles, x: Doubles, pitch: float
 def _is_alike(rho: Floats, bare_rho: Floats) -> Bools:
     """Whether rho is as that of bare pixels around."""
     return np.asarray(np.abs(rho - bare_rho) < ALIKE * bare_rho)
+
+
+def _is_lit(rho: Floats, bare_rho: Floats) -> Bools:
+    """Whether pixels show light of the monitor."""
+    return np.asarray(rho > LIT * np.median(bare_rho[bare_rho > 0]))
 
 
 def _around(rho: Floats, is_bare: Bools) -> Floats:

@@ -49,7 +49,7 @@ export async function recoveryForm(capture, signal) {
 	const { options } = await getJson("v1/options", signal);
 	const isQuality = ({ name }) => name === "quality";
 	const qualities = cards(options.find(isQuality), capture.recovery_seconds);
-	const cutOut = h("input", { type: "checkbox", checked: true, "aria-describedby": "about-cut-out" });
+	const cutOut = h("input", { type: "checkbox", name: "cut_out", checked: true, "aria-describedby": "about-cut-out" });
 	const fields = options.filter((option) => !isQuality(option) && option.name !== "cut_out").map(field);
 	const method = fields.find(({ option }) => option.name === "method").input;
 	const problem = h("div");

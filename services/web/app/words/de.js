@@ -432,7 +432,7 @@ export const de = {
 	"take.uncopied": "Das Bild lässt sich nicht kopieren",
 	"take.zip": "{n} von {all} Montagen sind in composites.zip.",
 	"transparent": "Rund um das Glas durchsichtig",
-	"transparent.none": "(die Aufnahme hatte keine Maske)",
+	"transparent.none": "(alles darum herum wurde mit berechnet: noch einmal berechnen und das Objekt freistellen)",
 	"undo": "Rückgängig",
 	"unlock.kept": "Dieser Browser behält ihn, bis der Tab geschlossen wird.",
 	"unlock.key": "Schlüssel des Dienstes",

@@ -432,7 +432,7 @@ export const en = {
 	"take.uncopied": "Cannot copy the picture",
 	"take.zip": "{n} of {all} composites are in composites.zip.",
 	"transparent": "Transparent around the glass",
-	"transparent.none": "(the capture had no mask)",
+	"transparent.none": "(all that is around it was recovered too: recover it again, and cut the object out)",
 	"undo": "Undo",
 	"unlock.kept": "This browser keeps it until you close this tab.",
 	"unlock.key": "Key of the service",
