@@ -10,7 +10,7 @@ was recovered with, and ``interval``, see `workflows.recovery.interval`, if that
 - ``shared`` (y, x) bool: whether a pixel's first row T holds for all of its channels, and the others are empty;
 - ``error`` (y, x) float32: expected root mean squared error of a composite at the pixel, in camera units; infinite
   where nothing could be recovered;
-- ``recovered`` (y, x) bool: false where the capture's mask excludes the pixel;
+- ``recovered`` (y, x) bool: false where the capture's mask excludes the pixel, or it is no part of the object;
 - ``T/R.C/cell`` and ``T/R.C/weight``, one-dimensional, for the block in block row R and block column C: the cells and
   weights of its rows T, concatenated in the order (y, x, channel).
 

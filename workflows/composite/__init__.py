@@ -46,7 +46,7 @@ def composite(
     Returns
     -------
     (height, width, 4) float32
-        Linear light and alpha: 1 where the pixel was recovered, 0 where the mask left it out.
+        Linear light and alpha: 1 where the pixel was recovered, 0 where it was left out.
 
     Raises
     ------

@@ -2,7 +2,7 @@
 
 =====================================  =================================================================
 ``S``, ``rho`` (y, x, channel)         Offset and factor of ``C = S + X (rho T L)``
-``alpha`` (y, x)                       1 where the pixel was recovered, 0 where the mask left it out
+``alpha`` (y, x)                       1 where the pixel was recovered, 0 where it was left out
 ``confidence`` (y, x)                  ``1 / (1 + e / 0.01)``, e the error to expect of a composite there
 ``u``, ``v`` (y, x, lobe)              Where a lobe lies on the monitor, 0 to 1 from its bottom left
 ``weight`` (y, x, lobe, channel)       Its share of a channel's light

@@ -7,7 +7,7 @@ Every layer has the frame's size. All values are linear light or plain numbers; 
 
 =================  ===========================================================================================
 ``S``, ``rho``     Offset and factor of ``C = S + X (rho T L)``: R, G and B
-``alpha``          1 where the pixel was recovered, 0 where the capture's mask left it out
+``alpha``          1 where the pixel was recovered, 0 where it was left out: by the mask, or as no part of the object
 ``confidence``     ``1 / (1 + e / 0.01)``, e the error to expect of a composite there
 ``stmap.exr``      R and G: where the pixel's heaviest lobe lies; B: 1 where there is one, else 0. 32 bits
 ``all.exr``        All of it, and the lobes of each pixel

@@ -176,7 +176,7 @@ def _caption(window: Window) -> str:
 
 def _lines(pixel: Pixel) -> list[str]:
     if not pixel.recovered:
-        return ["not recovered: the capture's mask left this pixel out"]
+        return ["not recovered: this pixel was left out"]
     if not len(pixel.lobes):
         return ["nothing could be recovered here: no cells, no lobes"]
     lines = [f"cells: {len(pixel.node)}; lobes, and the share of red, green and blue of each:"]

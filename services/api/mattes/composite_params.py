@@ -41,7 +41,7 @@ class CompositeParams(BaseModel):
 
     around: Literal["nothing", "backdrop"] = Field(
         "nothing",
-        description="What is shown where the mask left pixels out: nothing, so that a PNG is transparent and a JPEG "
+        description="What is shown where pixels were left out: nothing, so that a PNG is transparent and a JPEG "
         "or a video black there, or the backdrop, as if the frame saw the whole monitor.",
     )
     interval: bool = Field(
