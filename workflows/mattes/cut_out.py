@@ -99,7 +99,7 @@ class CutOut:
         bare_rho = map_coordinates(self.bare_rho, at, order=1, mode="nearest")
         is_bare = (off < _tolerance(self.deviation, matte)) & _is_alike(rho, bare_rho)
         near = self._enlarged(binary_dilation(self.object, iterations=MARGIN), span)
-        within = self._enlarged(binary_erosion(self.object, iterations=MARGIN, border_value=1), span)
+        within = self._enlarged(binary_erosion(self.object, border_value=1), span)
         seen_through = ~is_bare & (is_inside | (near & _is_lit(rho, self.bare_rho)))
         kept = block.recovered & median_filter(block.recovered & (within | seen_through), 3)
         entries = np.repeat(kept.ravel(), block.count.sum(axis=2, dtype=np.intp).ravel())
