@@ -48,6 +48,8 @@ def main() -> None:
                     [sys.executable, given.tool, *words, "--set", "mask=0"], check=True, capture_output=True
                 )
                 rows.append({"scene": scene.stem, "case": case} | measure(client, made, scene))
+                if len(rows) == 1:
+                    print("  ".join(f"{name:>8}" for name in rows[0]))
                 show(rows[-1])
     if given.json:
         given.json.write_text(json.dumps(rows, indent=1))
