@@ -17,6 +17,7 @@ workflows.composite.strips._empty_strip            8      strips in which nothin
 workflows.mattes.imports.reader._document_of_group 1      the zarr.json of a group
 workflows.mattes.imports.reader._document_of_one   1 each the zarr.json of an array of a dtype
 workflows.mattes.options._schemas                  2      the JSON schemas of a method's options
+workflows.mattes.steps._cut_out                        1      where the object of the last matte recovered stands
 workflows.mattes.tiles.gain_of                     1      the local tone mapping of the last capture recovered
 workflows.mattes.tiles.mask_of                     1      the mask of the last capture recovered
 workflows.mattes.tiles.patterns_of                 1      the patterns of the last capture recovered by lobes

@@ -76,6 +76,7 @@ def test_only_the_object_is_recovered(
     assert not (binary_erosion(covered, iterations=2) & ~kept).any()
 
 
+@pytest.mark.slow
 def test_what_is_kept_is_as_in_the_whole_frame(objects: Objects, capture: Stack) -> None:
     cut, _ = recover(objects, cut_out=True)
     whole, _ = recover(objects, "whole")
