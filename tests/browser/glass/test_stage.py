@@ -106,7 +106,7 @@ def test_without_a_mask_nothing_can_be_transparent(
     desk: Page, service: Service, ready: tuple[str, str]
 ) -> None:
     opened(desk, service, ready[1])
-    expect(desk.get_by_text("the capture had no mask")).to_be_visible()
+    expect(desk.get_by_text("all that is around it was recovered too")).to_be_visible()
     expect(desk.get_by_label("Transparent around the glass")).to_be_disabled()
 
 
