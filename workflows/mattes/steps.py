@@ -41,8 +41,8 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
         rows=rows,
         monitor=[program.monitor.width, program.monitor.height],
         crosstalk=stack.attributes["crosstalk"],
-        # Without the size of tiles, which changes nothing in the matte.
-        options=options.model_dump(mode="json", exclude={"tile"}),
+        # Without the size of tiles, which changes nothing in the matte; of whole frames as earlier versions wrote them.
+        options=options.model_dump(mode="json", exclude={"tile"} if options.cut_out else {"tile", "cut_out"}),
         **_interval(stack, options),
     )
     is_cut_out, notes = options.cut_out and bool(stack.mask().all()), []
