@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from storage.errors import Conflict
 from workflows.interruption import checkpoint
-from workflows.mattes.perspective import Places, find_perspective, sights
+from workflows.mattes.perspective import Places, find_perspective, in_frame, sights
 from workflows.recovery.pyramid import Grids
 
 STRAY = 0.1
@@ -101,7 +101,7 @@ def from_one(places: Places, aspect: float, distance: float, camera: float, dept
     """
     height, width, _ = places.shape
     y, x = np.mgrid[:height, :width].astype(np.float64)
-    across, down = (2 * x + 1) / width - 1, (2 * y + 1) / height - 1
+    across, down = in_frame(y, x, height, width)
     perspective = find_perspective(places, across, down, aspect)
     if perspective is None:
         raise Conflict(

@@ -6,6 +6,7 @@ recovered. Of each of these pixels its own T then says whether it is bare.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -24,7 +25,7 @@ from scipy.ndimage import (
 from storage.errors import Conflict
 from storage.layout.mattes import Block, Matte
 from workflows.mattes.lobes import Gridded, rows_of
-from workflows.mattes.perspective import DIRECT, LEAST, NEAR, Sight, between, find_sight, places_of
+from workflows.mattes.perspective import DIRECT, LEAST, NEAR, Sight, between, find_sight, lengths, places_of
 from workflows.recovery.pyramid import Grids, Pyramid
 from workflows.threads import CORES
 
@@ -86,7 +87,25 @@ class CutOut:
 
     def wanted(self, span: Span) -> Bools:
         """The pixels of a rectangle of the frame that are worth recovering: near the object, or between its parts."""
-        return self._enlarged(binary_dilation(between(self.object), iterations=MARGIN), span)
+        return self._enlarged(self._area, span)
+
+    # What follows holds for the frame: it is worked out once, not for each block.
+
+    @cached_property
+    def _area(self) -> Bools:
+        return np.asarray(binary_dilation(between(self.object), iterations=MARGIN))
+
+    @cached_property
+    def _near(self) -> Bools:
+        return np.asarray(binary_dilation(self.object, iterations=MARGIN))
+
+    @cached_property
+    def _within(self) -> Bools:
+        return np.asarray(binary_erosion(self.object, border_value=1))
+
+    @cached_property
+    def _lit(self) -> float:
+        return _least_lit(self.bare_rho)
 
     def cut(self, block: Block, matte: Gridded, span: Span) -> Block:
         """A block of a matte without the pixels that do not show the object."""
@@ -98,9 +117,8 @@ class CutOut:
         at = [(place - self.spacing // 2) / self.spacing for place in (y, x)]
         bare_rho = map_coordinates(self.bare_rho, at, order=1, mode="nearest")
         is_bare = (off < _tolerance(self.deviation, matte)) & _is_alike(rho, bare_rho)
-        near = self._enlarged(binary_dilation(self.object, iterations=MARGIN), span)
-        within = self._enlarged(binary_erosion(self.object, border_value=1), span)
-        seen_through = ~is_bare & (is_inside | (near & _is_lit(rho, self.bare_rho)))
+        near, within = self._enlarged(self._near, span), self._enlarged(self._within, span)
+        seen_through = ~is_bare & (is_inside | (near & (rho > self._lit)))
         kept = block.recovered & median_filter(block.recovered & (within | seen_through), 3)
         entries = np.repeat(kept.ravel(), block.count.sum(axis=2, dtype=np.intp).ravel())
         channels = kept[..., np.newaxis]
@@ -151,7 +169,7 @@ def find_object(preview: Matte, spacing: int, height: int, width: int) -> CutOut
     if sight is None:
         raise Conflict("too little of the monitor is seen directly beside it")
     seen = sight.at(y, x)
-    pitch = float(np.median(np.hypot(*np.moveaxis(np.diff(seen, axis=1) * (1, aspect), 2, 0)))) / spacing
+    pitch = float(np.median(lengths(np.diff(seen, axis=1), aspect))) / spacing
     is_inside, rho = _is_inside(sight, seen, y, x, pitch), preview.layer("rho").mean(axis=2)
     off = np.empty((preview.height, preview.width), np.float32)
     for row, column in product(range(preview.block_rows), range(preview.block_columns)):
@@ -166,7 +184,7 @@ def find_object(preview: Matte, spacing: int, height: int, width: int) -> CutOut
     for _ in range(2):  # without what is brighter or darker than the others
         bare_rho = _around(rho, straight & _is_alike(rho, bare_rho))
     is_bare = straight & _is_alike(rho, bare_rho)
-    found = _largest_parts(~is_bare & (is_inside | _is_lit(rho, bare_rho)), is_inside)
+    found = _largest_parts(~is_bare & (is_inside | (rho > _least_lit(bare_rho))), is_inside)
     return CutOut(spacing, sight, aspect, pitch, deviation, bare_rho, found)
 
 
@@ -183,9 +201,9 @@ def _is_alike(rho: Floats, bare_rho: Floats) -> Bools:
     return np.asarray(np.abs(rho - bare_rho) < ALIKE * bare_rho)
 
 
-def _is_lit(rho: Floats, bare_rho: Floats) -> Bools:
-    """Whether pixels show light of the monitor."""
-    return np.asarray(rho > LIT * np.median(bare_rho[bare_rho > 0]))
+def _least_lit(bare_rho: Floats) -> float:
+    """The rho from which on pixels show light of the monitor."""
+    return LIT * float(np.median(bare_rho[bare_rho > 0]))
 
 
 def _around(rho: Floats, is_bare: Bools) -> Floats:

@@ -35,7 +35,7 @@ LEAST = 16
 TRIALS = 300
 """Perspectives that are tried, each through four pixels."""
 ROUNDS = 10
-"""In which the pixels that agree with a fit are chosen anew."""
+"""Most times that the pixels which agree with a fit are chosen again."""
 Places = NDArray[np.float32]
 """(height, width, 4) float32: the heaviest lobe of every pixel, see `places_of`."""
 Bools = NDArray[np.bool_]
@@ -86,8 +86,18 @@ class Sight:
 
     def at(self, y: Doubles, x: Doubles) -> Doubles:
         """The places that pixels with these rows and columns see, (..., 2), in widths and heights of the monitor."""
-        across, down = (2 * x + 1) / self.width - 1, (2 * y + 1) / self.height - 1
+        across, down = in_frame(y, x, self.height, self.width)
         return sights(self.perspective, across, down) + _cubic(across, down) @ self.bend
+
+
+def in_frame(y: Doubles, x: Doubles, height: int, width: int) -> tuple[Doubles, Doubles]:
+    """How far across and down a frame pixels with some rows and columns are, from -1 to 1."""
+    return (2 * x + 1) / width - 1, (2 * y + 1) / height - 1
+
+
+def lengths(vectors: Doubles, aspect: float) -> Doubles:
+    """The lengths of vectors (..., 2) in widths and heights of the monitor, in its widths."""
+    return np.asarray(np.hypot(vectors[..., 0], vectors[..., 1] * aspect))
 
 
 def find_sight(places: Places, y: Doubles, x: Doubles, frame: tuple[int, int], aspect: float) -> Sight | None:
@@ -110,16 +120,19 @@ def find_sight(places: Places, y: Doubles, x: Doubles, frame: tuple[int, int], a
         None if too few pixels see the monitor directly.
     """
     height, width = frame
-    across, down = (2 * x + 1) / width - 1, (2 * y + 1) / height - 1
+    across, down = in_frame(y, x, height, width)
     perspective = find_perspective(places, across, down, aspect)
     if perspective is None:
         return None
     terms, left = _cubic(across, down), places[..., :2] - sights(perspective, across, down)
-    sharp, bend = places[..., 3] > DIRECT, np.zeros((terms.shape[2], 2))
+    sharp = places[..., 3] > DIRECT
+    bend: Doubles = np.zeros((terms.shape[2], 2))
+    fits = np.zeros_like(sharp)
     for _ in range(ROUNDS):
-        off = np.hypot(*np.moveaxis((left - terms @ bend) * (1, aspect), 2, 0))
-        fits = sharp & (off < NEAR)
-        bend = np.linalg.lstsq(terms[fits], left[fits], rcond=None)[0]
+        before, fits = fits, sharp & (lengths(left - terms @ bend, aspect) < NEAR)
+        if (fits == before).all():
+            break
+        bend = np.asarray(np.linalg.lstsq(terms[fits], left[fits], rcond=None)[0], np.float64)
     return Sight(height, width, perspective, bend)
 
 
@@ -161,7 +174,7 @@ def find_perspective(places: Places, across: Doubles, down: Doubles, aspect: flo
     seen = places[..., :2].astype(np.float64)
     x, y, at = across.ravel()[rim], down.ravel()[rim], seen.reshape(-1, 2)[rim]
     tried = [_homography(x[four], y[four], at[four]) for four in _fours(rim.size)]
-    off = np.stack([_off(one, x, y, at, aspect) for one in tried])
+    off = np.stack([lengths(sights(one, x, y) - at, aspect) for one in tried])
     for near in (NEAR, ROUGHLY):
         agreed = np.count_nonzero(off < near, axis=1)
         if agreed.max() >= max(LEAST, LEAST_RIM * rim.size):
@@ -169,9 +182,12 @@ def find_perspective(places: Places, across: Doubles, down: Doubles, aspect: flo
     else:
         return None
     best = tried[np.argmax(agreed)]
+    fits = np.zeros_like(sharp)
     for _ in range(ROUNDS):
         checkpoint()
-        fits = sharp & (_off(best, across, down, seen, aspect) < near)
+        before, fits = fits, sharp & (lengths(sights(best, across, down) - seen, aspect) < near)
+        if (fits == before).all():
+            break
         best = _homography(across[fits], down[fits], seen[fits])
     return best
 
@@ -194,12 +210,6 @@ def sights(perspective: Doubles, across: Doubles, down: Doubles) -> Doubles:
             ],
             axis=-1,
         )
-
-
-def _off(perspective: Doubles, across: Doubles, down: Doubles, seen: Doubles, aspect: float) -> Doubles:
-    """How far from the places that pixels see those of a homography are, in widths of the monitor."""
-    off: Doubles = np.hypot(*np.moveaxis((sights(perspective, across, down) - seen) * (1, aspect), -1, 0))
-    return off
 
 
 def between(there: Bools) -> Bools:
