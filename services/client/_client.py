@@ -279,7 +279,7 @@ class Client:
         webhook : str, optional
             URL to notify when the job has ended.
         **wanted
-            ``transfer``, ``around``, ``right``, ``down``, ``scale`` and ``angle``, as the call takes them.
+            ``transfer``, ``around``, ``fit``, ``right``, ``down``, ``scale`` and ``angle``, as the call takes them.
         """
         wanted |= {"webhook": webhook} if webhook else {}
         headers = {"Content-Type": "video/*", "Content-Length": str(clip.stat().st_size)} | _key()

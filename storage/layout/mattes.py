@@ -3,7 +3,9 @@
 ``mattes/ID`` is a zarr group with the attributes ``format``, ``width``, ``height``, ``monitor`` (its width and
 height), ``columns`` and ``rows`` (the first grid of T's cells), ``block``, ``crosstalk`` (X of
 ``C = S + X (rho T L)``: a row for each channel of the camera, a column for each of the monitor), the options that it
-was recovered with, and ``interval``, see `workflows.recovery.interval`, if that was measured. In it are
+was recovered with, and ``interval``, see `workflows.recovery.interval`, if that was measured. If the object was cut
+out, ``beside`` is what the frame sees beside it: ``sight``, the homography (three rows) to places on the monitor, both
+from 0 to 1 across and down; and ``rho`` of the bare monitor, by channel. In it are
 
 - ``S``, ``rho`` (y, x, channel) float32;
 - ``count`` (y, x, channel) uint32: the number of cells in the row T of a pixel and channel;

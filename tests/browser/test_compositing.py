@@ -241,7 +241,7 @@ def test_clip_is_composited_and_downloaded(
     assert job
     options = service.http.get(f"/v1/jobs/{job.rpartition('/')[2]}").json()["options"]
     assert options["placement"]["angle"] == 10
-    assert options["around"] == "backdrop"
+    assert (options["around"], options["fit"]) == ("backdrop", "frame")
 
 
 def test_pasted_picture_becomes_backdrop(context: BrowserContext, service: Service, ball: str) -> None:

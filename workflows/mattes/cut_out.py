@@ -73,6 +73,8 @@ class CutOut:
         See `DEVIATIONS`; in widths of the monitor.
     bare_rho : (h, w) float32
         Mean rho of the bare monitor around each pixel of the preview; 0 where there is none.
+    bare : (3,) float64
+        rho of the bare monitor around the object.
     object : (h, w) bool
         The pixels of the preview that show the object.
     """
@@ -83,6 +85,7 @@ class CutOut:
     pitch: float
     deviation: float
     bare_rho: Floats
+    bare: Doubles
     object: Bools
 
     def wanted(self, span: Span) -> Bools:
@@ -170,7 +173,8 @@ def find_object(preview: Matte, spacing: int, height: int, width: int) -> CutOut
         raise Conflict("too little of the monitor is seen directly beside it")
     seen = sight.at(y, x)
     pitch = float(np.median(lengths(np.diff(seen, axis=1), aspect))) / spacing
-    is_inside, rho = _is_inside(sight, seen, y, x, pitch), preview.layer("rho").mean(axis=2)
+    is_inside, colours = _is_inside(sight, seen, y, x, pitch), preview.layer("rho")
+    rho = colours.mean(axis=2)
     off = np.empty((preview.height, preview.width), np.float32)
     for row, column in product(range(preview.block_rows), range(preview.block_columns)):
         span = preview.span(row, column)
@@ -185,7 +189,10 @@ def find_object(preview: Matte, spacing: int, height: int, width: int) -> CutOut
         bare_rho = _around(rho, straight & _is_alike(rho, bare_rho))
     is_bare = straight & _is_alike(rho, bare_rho)
     found = _largest_parts(~is_bare & (is_inside | (rho > _least_lit(bare_rho))), is_inside)
-    return CutOut(spacing, sight, aspect, pitch, deviation, bare_rho, found)
+    # Of the bare pixels around the object alone: towards a frame's edges lenses darken.
+    near = is_bare & binary_dilation(found, iterations=round(2 * SPREAD * max(found.shape)))
+    bare = np.median(colours[near if near.any() else is_bare], axis=0).astype(np.float64)
+    return CutOut(spacing, sight, aspect, pitch, deviation, bare_rho, bare, found)
 
 
 def _is_inside(sight: Sight, seen: Doubles, y: Doubles, x: Doubles, pitch: float) -> Bools:

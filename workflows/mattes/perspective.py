@@ -34,6 +34,10 @@ LEAST = 16
 """Pixels that must agree at least."""
 TRIALS = 300
 """Perspectives that are tried, each through four pixels."""
+LEAST_DEPTH = 0.2
+"""How far a corner of the frame is from the camera at least, along its axis, in distances of the farthest."""
+FARTHEST = 20
+"""How far beyond the monitor the frame reaches at most, in its widths and heights."""
 ROUNDS = 10
 """Most times that the pixels which agree with a fit are chosen again."""
 Places = NDArray[np.float32]
@@ -84,10 +88,33 @@ class Sight:
     perspective: Doubles
     bend: Doubles
 
+    @property
+    def straight(self) -> Doubles:
+        """Without the bend, a homography (3, 3) from the frame, which is from 0 to 1 across and down."""
+        found = self.perspective @ ((2, 0, -1), (0, 2, -1), (0, 0, 1))
+        return np.asarray(found / found[2, 2])
+
     def at(self, y: Doubles, x: Doubles) -> Doubles:
         """The places that pixels with these rows and columns see, (..., 2), in widths and heights of the monitor."""
         across, down = in_frame(y, x, self.height, self.width)
         return sights(self.perspective, across, down) + _cubic(across, down) @ self.bend
+
+
+def corners(straight: Doubles) -> Doubles:
+    """Where on the monitor the corners of a frame look, (4, 2), by the homography of `Sight.straight`.
+
+    Raises
+    ------
+    ValueError
+        If the camera can't look so at the monitor: it is behind a corner, or far beyond it.
+    """
+    at = np.array([(x, y, 1.0) for y in (0, 1) for x in (0, 1)]) @ straight.T
+    if not (np.isfinite(at).all() and at[:, 2].min() > LEAST_DEPTH * at[:, 2].max() > 0):
+        raise ValueError("the frame does not face the monitor")
+    seen = at[:, :2] / at[:, 2:]
+    if np.abs(seen).max() > FARTHEST:
+        raise ValueError("the monitor is too small in the frame")
+    return np.asarray(seen)
 
 
 def in_frame(y: Doubles, x: Doubles, height: int, width: int) -> tuple[Doubles, Doubles]:
@@ -133,7 +160,12 @@ def find_sight(places: Places, y: Doubles, x: Doubles, frame: tuple[int, int], a
         if (fits == before).all():
             break
         bend = np.asarray(np.linalg.lstsq(terms[fits], left[fits], rcond=None)[0], np.float64)
-    return Sight(height, width, perspective, bend)
+    found = Sight(height, width, perspective, bend)
+    try:
+        corners(found.straight)
+    except ValueError:
+        return None
+    return found
 
 
 def _cubic(across: Doubles, down: Doubles) -> Doubles:

@@ -1,7 +1,7 @@
 """The steps of a recovery: create the matte, recover its tiles, read its figures."""
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import product
 from typing import Any
 
@@ -32,7 +32,8 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
     program, _ = tiles.program_of(objects, task.capture)
     options = parse_options(task.options)
     columns, rows = tiles.grid_of(objects, task.capture, options)
-    matte = mattes.create(
+    create = partial(
+        mattes.create,
         objects,
         task.matte,
         height=stack.height,
@@ -45,14 +46,16 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
         options=options.model_dump(mode="json", exclude={"tile"} if options.cut_out else {"tile", "cut_out"}),
         **_interval(stack, options),
     )
+    matte = create()
     is_cut_out, notes = options.cut_out and bool(stack.mask().all()), []
     spacing = preview.spacing_of(stack, least=1) if is_cut_out else preview.spacing_of(stack)
     if spacing is not None:
         preview.recover_preview(objects, task.capture, matte, task.matte, spacing)
     if is_cut_out:
         try:
-            shown = _cut_out(objects, task.matte, spacing).object
-            preview.show_only(Matte(objects, mattes.preview_of(task.matte)), shown)
+            found = _cut_out(objects, task.matte, spacing)
+            preview.show_only(Matte(objects, mattes.preview_of(task.matte)), found.object)
+            matte = create(beside={"sight": found.sight.straight.tolist(), "rho": found.bare.tolist()})
         except Conflict as error:
             is_cut_out = False
             notes.append(f"the object could not be cut out, so the whole frame is recovered: {error}")

@@ -51,7 +51,7 @@ async def composite_clip(
     Parameters
     ----------
     options : dict
-        ``transfer``, ``around``, and ``placement`` as `Placement` takes it.
+        ``transfer``, ``around``, ``fit``, and ``placement`` as `Placement` takes it.
     webhook : str, optional
         URL that is notified when the job has ended.
     key : str, optional

@@ -5,6 +5,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from storage.errors import OptionError
+from storage.layout.mattes import Matte
+from workflows.composite.backdrops.around import over_frame
 from workflows.composite.backdrops.placement import Placement
 
 Distance = Annotated[float, Field(ge=1e-6, le=1e6)]
@@ -42,7 +44,15 @@ class CompositeParams(BaseModel):
     around: Literal["nothing", "backdrop"] = Field(
         "nothing",
         description="What is shown where pixels were left out: nothing, so that a PNG is transparent and a JPEG "
-        "or a video black there, or the backdrop, as if the frame saw the whole monitor.",
+        "or a video black there, or the backdrop, as the camera would see it beside the object. If a mask left them "
+        "out, it is as if the frame saw the monitor and no more.",
+    )
+    fit: Literal["monitor", "frame"] | None = Field(
+        None,
+        description="`monitor`: the backdrop covers the monitor, as the patterns did, and the composite is what the "
+        "camera would take. `frame`: the backdrop is a picture that the object is put into. It covers all that the "
+        "frame sees, and clear glass shows it in its own colours. By default `frame` if the backdrop is shown "
+        "around the glass, else `monitor`. Only mattes of an object that recovery cut out tell them apart.",
     )
     interval: bool = Field(
         False,
@@ -82,9 +92,9 @@ class CompositeParams(BaseModel):
             )
         if self.around == "backdrop" and self.depth is not None:
             raise ValueError("a backdrop at another depth is not shown around the glass: omit around")
-        if self.interval and (self.depth is not None or self.around == "backdrop"):
+        if self.interval and (self.depth is not None or self.fits_frame):
             raise ValueError(
-                "intervals are those of the glass before a backdrop where the monitor was: omit depth and around"
+                "intervals are those of the glass before a backdrop where the monitor was: omit depth, around and fit"
             )
         if self.size is not None and self.enlarge > 1:
             raise ValueError("size makes a picture smaller, enlarge larger: omit one of them")
@@ -98,6 +108,15 @@ class CompositeParams(BaseModel):
         placement = Placement(self.right, self.down, self.scale, self.angle)
         return None if placement == Placement() else placement
 
+    @property
+    def fits_frame(self) -> bool:
+        """Whether the backdrop is fitted to the frame."""
+        return self.fit == "frame" or (self.fit is None and self.around == "backdrop")
+
+    def placement_behind(self, matte: Matte) -> Placement | None:
+        """Where the backdrop stands behind a matte; None if it is stretched over the monitor."""
+        return over_frame(matte, self.placement) if self.fits_frame else self.placement
+
     def clip_options(self) -> dict[str, Any]:
         """The options of a clip's job.
 
@@ -107,8 +126,10 @@ class CompositeParams(BaseModel):
             If a parameter is given that only stills have.
         """
         placement = {"right": self.right, "down": self.down, "scale": self.scale, "angle": self.angle}
-        for name in self.model_fields_set - placement.keys() - {"transfer", "around", "webhook"}:
+        for name in self.model_fields_set - placement.keys() - {"transfer", "around", "fit", "webhook"}:
             raise OptionError(
-                f"{name} is for stills: a clip takes transfer, around, {', '.join(placement)}", field=name
+                f"{name} is for stills: a clip takes transfer, around, fit, {', '.join(placement)}",
+                field=name,
             )
-        return {"transfer": self.transfer, "around": self.around, "placement": placement}
+        fit = "frame" if self.fits_frame else "monitor"
+        return {"transfer": self.transfer, "around": self.around, "fit": fit, "placement": placement}

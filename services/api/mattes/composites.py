@@ -28,8 +28,9 @@ from storage.errors import Conflict, OptionError
 from storage.layout.mattes import Matte
 from storage.records import mattes
 from workflows.composite import composite, light_on
-from workflows.composite.backdrops.around import put_around
+from workflows.composite.backdrops.around import expose, put_around
 from workflows.composite.backdrops.backdrop import Backdrop
+from workflows.composite.backdrops.placement import Placement
 from workflows.composite.depth import Rays, from_one, from_two
 from workflows.composite.engine import Window, compose, double, shrink
 from workflows.composite.interval import contrast_on, half_widths
@@ -260,12 +261,15 @@ def _pictures(
     times: ServerTiming,
 ) -> Iterator[Picture]:
     """Light and alpha of an answer, by bands from top to bottom."""
-    draw = _drawing(context, progress, matte, backdrop, params, times)
+    where = params.placement_behind(matte)
+    draw = _drawing(context, progress, matte, backdrop, where, params, times)
     steps: dict[str, Callable[[Picture, Window], Picture]] = {}
     if progress.preview is not None:
-        steps["preview"] = partial(_put_preview, context, progress, progress.preview, backdrop, params)
+        steps["preview"] = partial(_put_preview, context, progress, progress.preview, backdrop, where)
+    if params.fits_frame:
+        steps["expose"] = partial(expose, matte)
     if params.around == "backdrop":
-        steps["around"] = partial(_put_around, matte, backdrop, params)
+        steps["around"] = partial(put_around, matte, backdrop, where)
     if params.size is not None:
         size = params.size
         steps["shrink"] = lambda picture, _: shrink(picture, size)
@@ -284,6 +288,7 @@ def _drawing(
     progress: Progress,
     matte: Matte,
     backdrop: Backdrop,
+    where: Placement | None,
     params: CompositeParams,
     times: ServerTiming,
 ) -> Callable[[Window], Picture]:
@@ -293,11 +298,11 @@ def _drawing(
         return context.cache.strip(progress.id, row, number, progress.blocks)
 
     rays = times.take("rays", partial(_rays, context, progress, params)) if params.depth is not None else None
-    light = times.take("light", partial(light_on, matte, backdrop, params.placement, CORES))
+    light = times.take("light", partial(light_on, matte, backdrop, where, CORES))
     if not params.interval:
         return lambda band: compose(matte, light, band, read, CORES, rays)
     interval = _interval(progress, matte)
-    contrast = times.take("contrast", partial(contrast_on, matte, light, backdrop, params.placement, CORES))
+    contrast = times.take("contrast", partial(contrast_on, matte, light, backdrop, where, CORES))
     return lambda band: half_widths(matte, interval, light, contrast, band, read, CORES)
 
 
@@ -306,7 +311,7 @@ def _put_preview(
     progress: Progress,
     spacing: int,
     backdrop: Backdrop,
-    params: CompositeParams,
+    where: Placement | None,
     picture: Picture,
     window: Window,
 ) -> Picture:
@@ -317,19 +322,10 @@ def _put_preview(
     size = preview.width, preview.height
     part = window_of_preview(window, spacing, *size)
     read = partial(context.cache.strip, name)
-    small = composite(preview, backdrop, placement=params.placement, window=part, read=read)
+    small = composite(preview, backdrop, placement=where, window=part, read=read)
     block = context.cache.matte(progress.id).block
     put_behind(picture, enlarge(small, part, window, spacing, *size), window, progress.blocks, block)
     return picture
-
-
-def _put_around(
-    matte: Matte, backdrop: Backdrop, params: CompositeParams, picture: Picture, window: Window
-) -> Picture:
-    """Put the backdrop around the glass."""
-    wide, high = matte.attributes["monitor"]
-    frame = matte.width, matte.height
-    return put_around(picture, backdrop, window, frame, (wide, high), params.placement, CORES)
 
 
 def _interval(progress: Progress, matte: Matte) -> Interval:

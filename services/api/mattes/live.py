@@ -43,7 +43,9 @@ async def get_live(context: OwnerContext, id: str, request: Request) -> Response
         if now.blocks is None:
             encoded = _encoded(context, id, context.cache.matte(id))
         else:
-            encoded = encode.encode_live(context.cache.matte(now.whole_frame), CORES)
+            encoded = encode.encode_live(
+                context.cache.matte(now.whole_frame), CORES, whole=context.cache.matte(id)
+            )
         headers = _headers(now) | {"Content-Encoding": "gzip"}
         return bytes_response(encoded, "application/octet-stream", headers)
 

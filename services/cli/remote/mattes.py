@@ -44,6 +44,12 @@ NODES = {
     help="What to show where the matte has no object: nothing, so that a PNG is transparent, or the backdrop.",
 )
 @click.option(
+    "--fit",
+    type=click.Choice(["monitor", "frame"]),
+    help="Take the backdrop for what the monitor shows, or for all that the frame sees of the monitor's plane. "
+    "By default the frame with --around backdrop, else the monitor.",
+)
+@click.option(
     "--interval",
     is_flag=True,
     default=None,

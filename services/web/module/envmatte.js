@@ -30,9 +30,9 @@ export async function openGlass(canvas, url, monitor) {
 		height: matte.height,
 		// Takes a picture, or the current frame of a video or canvas. It is encoded in sRGB, as pictures of the web are.
 		setBackdrop: painter.setBackdrop,
-		// Draws the glass. The backdrop is moved by `right` and `down`, in widths and heights of the monitor; `scale` times as
-		// large; and turned clockwise by `angle` degrees. An `endless` one goes on beyond its edges; `around` shows it where the
-		// mask left pixels out. Only every 2 ** `coarser`-th row and column is drawn, for slow devices.
+		// Draws the glass. The backdrop is moved by `right` and `down`, in its widths and heights; `scale` times as large; and
+		// turned clockwise by `angle` degrees. An `endless` one goes on beyond its edges; `around` shows it where pixels were
+		// left out. Only every 2 ** `coarser`-th row and column is drawn, for slow devices.
 		draw({ right = 0, down = 0, scale = 1, angle = 0, endless = false, around = false, coarser = 0 } = {}) {
 			painter.draw({ right, down, scale, angle }, coarser, { endless, around });
 		},

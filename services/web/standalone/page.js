@@ -48,7 +48,7 @@ async function start() {
 	const found = await matte();
 	if (!glass.load(found, monitor)) return glass.gl && say(t("page.large"));
 	stage.style.setProperty("--aspect", found.width / found.height);
-	handleGestures(stage, placed);
+	handleGestures(stage, placed, glass);
 	const choice = (name, i) =>
 		h("label", h("input", { type: "radio", name: "backdrop", checked: i === 0, onchange: () => use(builtIn(name, monitor)) }), t(`scene.${name}`));
 	choices.prepend(h("fieldset", h("legend", t("backdrop")), NAMES.map(choice)));

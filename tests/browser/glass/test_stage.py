@@ -15,12 +15,19 @@ from playwright.sync_api import Page, expect
 from tests.browser.pages import PHONE, SIZE, is_fitting, unfold
 from tests.end_to_end.conftest import BANDS, Service
 from tests.parts.captures import nested_program
+from workflows.programs.presets import preset
 from workflows.simulation import glass_ball
 from workflows.simulation.scene import write_capture
 
 pytestmark = pytest.mark.slow
 
 CANVAS = "(canvas) => canvas.toDataURL('image/png')"
+COPY = """(image) => {
+	const canvas = document.createElement("canvas");
+	[canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
+	canvas.getContext("2d").drawImage(image, 0, 0);
+	return canvas.toDataURL("image/png");
+}"""
 
 
 @pytest.fixture(scope="module")
@@ -41,9 +48,9 @@ def opened(page: Page, service: Service, matte: str, query: str = "") -> None:
     unfold(page)
 
 
-def pixels(page: Page, selector: str) -> NDArray[np.float64]:
-    """What a canvas shows, (rows, columns, 4)."""
-    url = page.locator(selector).evaluate(CANVAS)
+def pixels(page: Page, selector: str, script: str = CANVAS) -> NDArray[np.float64]:
+    """What a canvas or, by ``COPY``, a picture shows, (rows, columns, 4)."""
+    url = page.locator(selector).evaluate(script)
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))).convert("RGBA"), float)
 
 
@@ -100,6 +107,37 @@ def test_what_the_mask_left_out_shows_the_backdrop_or_nothing(
     alone = pixels(desk, canvas)
     assert (alone[0, 5] == 0).all()
     assert 0.1 < np.mean(alone[..., 3] > 0) < 0.9
+
+
+def test_object_that_was_cut_out_stands_in_the_backdrop(desk: Page, service: Service, tmp_path: Path) -> None:
+    scene = glass_ball.glass_ball(
+        *SIZE, monitor=(512, 384), rays=9, distance=8
+    )  # the frame sees the room too
+    write_capture(scene, preset("sketch", *scene.monitor), tmp_path / "ball.zip")
+    job = service.client.recover(service.client.upload(tmp_path / "ball.zip"), quality="fast", cut_out=True)
+    opened(desk, service, str(service.client.wait(job["id"])["matte"]), "?backdrop=Dusk&right=0.1&scale=1.2")
+
+    def aside(name: str) -> NDArray[np.float64]:
+        desk.get_by_role("radio", name=name, exact=True).check()
+        expect(desk.locator("canvas.aside")).to_be_visible()
+        return pixels(desk, "canvas.aside")
+
+    live, bare = aside("Live"), aside("Backdrop")
+    exact = pixels(desk, ".picture.stage img", COPY)
+    assert np.sqrt(np.mean((live - exact) ** 2)) < 8
+    around = np.abs(exact - bare).max(axis=2) < 16  # what the service shows there, this browser does too
+    assert around[:, :16].all()
+    assert 0.05 < 1 - around.mean() < 0.5  # and the glass
+
+    box = desk.get_by_role("group", name="Composite.").bounding_box()
+    assert box
+    desk.mouse.move(box["x"] + 20, box["y"] + 20)
+    desk.mouse.down()
+    desk.mouse.move(box["x"] + 20 + box["width"] / 4, box["y"] + 20, steps=4)  # the backdrop follows the hand
+    desk.mouse.up()
+    expect(desk.get_by_text("exact")).to_be_visible()
+    moved = aside("Backdrop")
+    assert np.sqrt(np.mean((moved[:, 24:] - bare[:, :-24]) ** 2)) < 4
 
 
 def test_without_a_mask_nothing_can_be_transparent(

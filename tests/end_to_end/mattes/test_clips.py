@@ -23,6 +23,7 @@ VIDEO = {"Content-Type": "video/mp4"}
 OPTIONS = {
     "transfer": "srgb",
     "around": "nothing",
+    "fit": "monitor",
     "placement": {"right": 0, "down": 0, "scale": 1, "angle": 0},
 }
 

@@ -110,7 +110,7 @@ def test_intervals_hold_the_truth(service: Service, scene: Scene, tmp_path: Path
     assert np.corrcoef(error[seen].ravel(), half[seen].ravel())[0, 1] > 0.2
     shown = integer_formats.to_unit(decoded(post_composite(service, matte, transfer="linear", interval=True)))
     assert np.abs(shown - half).max() < 1 / 255
-    for query in ({"depth": 2, "distance": 1, "camera": 1}, {"around": "backdrop"}):
+    for query in ({"depth": 2, "distance": 1, "camera": 1}, {"around": "backdrop"}, {"fit": "frame"}):
         check_problem(post_composite(service, matte, interval=True, **query), 422, "bad-request")
 
 

@@ -32,6 +32,11 @@ def test_the_object_is_cut_out(service: Service, tmp_path: Path) -> None:
     np.testing.assert_array_equal(transparent[:, :, 3] > 0, shown)
     around = decoded(post_composite(service, job["matte"], around="backdrop"))
     assert (around[~binary_dilation(shown, iterations=3)].max(axis=1) > 0).mean() > 0.9  # no dark room
+    alone, camera = (decoded(post_composite(service, job["matte"], fit=fit)) for fit in ("frame", "monitor"))
+    within = binary_erosion(shown, iterations=2)
+    np.testing.assert_array_equal(around[within], alone[within])
+    assert not np.array_equal(camera[within], alone[within])
+    np.testing.assert_array_equal(camera, decoded(post_composite(service, job["matte"])))
 
 
 def test_the_log_says_why_an_object_is_not_cut_out(service: Service, tmp_path: Path) -> None:

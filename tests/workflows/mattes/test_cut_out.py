@@ -14,6 +14,10 @@ from storage.layout.captures import Stack
 from storage.layout.mattes import Matte
 from storage.objects.store import Objects
 from storage.steps import FINISH, PREPARE
+from workflows.composite import composite
+from workflows.composite.backdrops.around import expose, over_frame, put_around
+from workflows.composite.backdrops.backdrop import Backdrop
+from workflows.composite.engine import Window
 from workflows.jobs import Task, run
 from workflows.mattes.steps import STEPS
 from workflows.programs.presets import preset
@@ -94,6 +98,29 @@ def test_an_object_is_cut_out_the_same_whatever_the_tiles(
     recover(objects, cut_out=True)
     recover(objects, "others", cut_out=True, tile=64)
     assert digests(mattes.path("m")) == digests(mattes.path("others"))
+
+
+@pytest.mark.slow
+def test_around_the_object_the_backdrop_goes_on_as_through_bare_pixels(
+    objects: Objects, capture: Stack
+) -> None:
+    cut, _ = recover(objects, cut_out=True)
+    whole, _ = recover(objects, "whole")
+    y, x = np.mgrid[:48, :64] / 8
+    smooth = np.stack([0.5 + 0.4 * np.sin(x), 0.5 + 0.4 * np.cos(y), 0.5 + 0.2 * np.sin(x + y)], axis=2)
+    backdrop, window = Backdrop(smooth.astype(np.float32)), Window.of(cut)
+    where = over_frame(cut, None)
+    assert where is not None
+    assert where.scale > 1.05  # the frame sees the room too
+    taken, bare = (composite(matte, backdrop, placement=where) for matte in (cut, whole))
+    made = put_around(cut, backdrop, where, expose(cut, taken, window), window)
+    expected = expose(cut, bare, window)
+    rho = whole.layer("rho").min(axis=2)
+    around = ~binary_dilation(cut.layer("recovered"), iterations=2)
+    lit = around & (rho > 0.9 * np.median(rho[around]))  # within the monitor
+    assert lit.sum() > 1000
+    assert np.sqrt(np.mean((made - expected)[lit] ** 2)) < 0.03  # without what bare pixels reflect
+    assert (made[around] > 0.05).all()  # no room
 
 
 def test_a_mask_is_taken_as_it_is(objects: Objects, ball: Scene, ingest: Ingest) -> None:

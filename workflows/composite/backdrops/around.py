@@ -1,35 +1,87 @@
-"""The backdrop around the glass: what a mask left out shows it, as if the frame saw the whole monitor."""
+"""The backdrop around the glass: what was left out of a matte shows it, as the camera would see it there."""
 
 import numpy as np
 from numpy.typing import NDArray
 
+from storage.layout.mattes import Matte
 from workflows.composite.backdrops.backdrop import Backdrop, frame_light
 from workflows.composite.backdrops.placement import Placement
 from workflows.composite.engine import Window
+from workflows.mattes.perspective import corners
+from workflows.threads import CORES
+
+
+def over_frame(matte: Matte, placement: Placement | None) -> Placement | None:
+    """Where a backdrop stands that is placed over all that the frame sees, in place of the monitor.
+
+    Parameters
+    ----------
+    matte : Matte
+        If it does not know where the camera looks beside the object, the frame sees the monitor and no more.
+    placement : Placement, optional
+
+    Returns
+    -------
+    Placement
+        None if it is stretched over the monitor.
+
+    Notes
+    -----
+    It covers the monitor too, whose light the glass may bring from beyond the frame, and has the monitor's aspect.
+    """
+    beside = matte.attributes.get("beside")
+    if beside is None:
+        return placement
+    seen = np.concatenate([corners(np.array(beside["sight"])), [[0, 0], [1, 1]]])
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    right, down = (low + high - 1) / 2
+    covering = Placement(float(right), float(down), float((high - low).max()))
+    return (placement or Placement()).within(covering)
+
+
+def exposure(matte: Matte) -> NDArray[np.float64]:
+    """From the light that the camera takes to that of the monitor beside the object, by channel.
+
+    Returns
+    -------
+    (3, 3) float64
+        The identity if the matte does not know how bright the bare monitor was.
+
+    Notes
+    -----
+    The camera takes C = X (rho L) of the bare monitor, so this is the inverse of X diag(rho). Light that comes through
+    clear glass has the colours of the backdrop beside it then.
+    """
+    beside = matte.attributes.get("beside")
+    return np.linalg.inv(np.array(matte.attributes["crosstalk"]) * beside["rho"]) if beside else np.eye(3)
+
+
+def expose(matte: Matte, picture: NDArray[np.float32], _: Window) -> NDArray[np.float32]:
+    """Give a composite, (h, w, 4) float32, the colours and the brightness of the backdrop; changed in place."""
+    if "beside" in matte.attributes:
+        picture[..., :3] = picture[..., :3] @ exposure(matte).T.astype(np.float32)
+    return picture
 
 
 def put_around(
-    picture: NDArray[np.float32],
+    matte: Matte,
     backdrop: Backdrop,
-    window: Window,
-    frame: tuple[int, int],
-    monitor: tuple[int, int],
     placement: Placement | None,
-    threads: int,
+    picture: NDArray[np.float32],
+    window: Window,
+    threads: int = CORES,
 ) -> NDArray[np.float32]:
     """Put the backdrop where a composite is transparent.
 
     Parameters
     ----------
+    matte : Matte
+    backdrop : Backdrop
+    placement : Placement, optional
+        Where it stands, in the plane of the monitor.
     picture : (height, width, 4) float32
         Linear light and alpha of the window; changed in place.
-    backdrop : Backdrop
     window : Window
-    frame : (int, int)
-        Width and height of the matte. The backdrop is stretched over it.
-    monitor : (int, int)
-        Width and height of the monitor, for a backdrop with a placement.
-    placement : Placement, optional
     threads : int
 
     Returns
@@ -40,13 +92,22 @@ def put_around(
     alpha = picture[..., 3:]
     if (alpha == 1).all():
         return picture
-    behind = frame_light(backdrop, *frame, threads, placement, monitor)
+    behind = frame_light(backdrop, matte.width, matte.height, threads, _seen(matte, placement))
     behind = behind[window.y : window.y + window.height, window.x : window.x + window.width]
     alpha = alpha * _blurred(alpha)
     picture[..., :3] *= alpha
     picture[..., :3] += (1 - alpha) * behind
     picture[..., 3] = 1
     return picture
+
+
+def _seen(matte: Matte, placement: Placement | None) -> NDArray[np.float64] | None:
+    """The homography from the frame to the backdrop; None if the frame sees all of it."""
+    beside = matte.attributes.get("beside")
+    if beside is None and placement is None:
+        return None
+    placed = (placement or Placement()).matrix(matte.attributes["monitor"])
+    return placed if beside is None else placed @ beside["sight"]
 
 
 def _blurred(alpha: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -104,7 +104,7 @@ def node_light(
     if placement is None:
         _resample(backdrop, finest, threads, (rows, columns))
     else:
-        _place(backdrop, placement, monitor, finest, threads)
+        _place(backdrop, placement.matrix(monitor), finest, threads)
     for level in range(1, len(grids)):
         fine = light[starts[level - 1] : starts[level]].reshape(*grids[level - 1][::-1], 3)
         coarse = light[starts[level] : starts[level + 1]].reshape(*grids[level][::-1], 3)
@@ -121,15 +121,29 @@ def frame_light(
     width: int,
     height: int,
     threads: int,
-    placement: Placement | None = None,
-    monitor: tuple[int, int] = (1, 1),
+    seen: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float32]:
-    """The light of a backdrop at the pixels of a frame that sees the whole monitor, (height, width, 3) float32."""
+    """The light of a backdrop at the pixels of a frame.
+
+    Parameters
+    ----------
+    backdrop : Backdrop
+    width, height : int
+        Of the frame.
+    threads : int
+    seen : (3, 3) float64, optional
+        The homography from the frame to the backdrop, both from 0 to 1 across and down. By default the frame sees all
+        of the backdrop.
+
+    Returns
+    -------
+    (height, width, 3) float32
+    """
     light = np.empty((height, width, 3), np.float32)
-    if placement is None:
+    if seen is None:
         _resample(backdrop, light, threads, (height, width))
     else:
-        _place(backdrop, placement, monitor, light, threads)
+        _place(backdrop, seen, light, threads)
     return light
 
 
@@ -153,21 +167,16 @@ def _resample(
     )
 
 
-def _place(
-    backdrop: Backdrop,
-    placement: Placement,
-    monitor: tuple[int, int],
-    cells: NDArray[np.float32],
-    threads: int,
-) -> None:
-    """Compute cells (rows, columns, 3) of a backdrop with a placement."""
+def _place(backdrop: Backdrop, seen: NDArray[np.float64], cells: NDArray[np.float32], threads: int) -> None:
+    """Compute cells (rows, columns, 3) by a homography from their grid to the backdrop, both from 0 to 1."""
     rows, columns, _ = cells.shape
     height, width, _ = backdrop.pixels.shape
-    steps = np.hypot(*placement.matrix((columns, rows), monitor, (width, height))[:, :2].T)
+    seen = seen @ np.diag([1 / columns, 1 / rows, 1])
+    steps = np.hypot(*_slopes(seen, columns / 2, rows / 2)) * (width, height)
     wide, high = (math.ceil(size / max(step, 1.0)) for size, step in zip((width, height), steps, strict=True))
-    matrix = placement.matrix((columns, rows), monitor, (wide, high))
+    matrix = np.diag([wide, high, 1.0]) @ seen
     # Only the part that the cells see: an enlarged backdrop would have too many pixels.
-    across, down = _seen(matrix[0], columns, rows, wide), _seen(matrix[1], columns, rows, high)
+    across, down = _seen(matrix, 0, columns, rows, wide), _seen(matrix, 1, columns, rows, high)
     corner = (down.start, across.start)
     picture = np.empty((len(down), len(across), 3), np.float32)
     _resample(backdrop, picture, threads, (high, wide), corner)
@@ -178,19 +187,27 @@ def _place(
     )
 
 
-def _seen(line: NDArray[np.float64], columns: int, rows: int, size: int) -> range:
+def _slopes(matrix: NDArray[np.float64], x: float, y: float) -> NDArray[np.float64]:
+    """How fast what a homography maps to moves with x and with y, at a point: two rows (u, v)."""
+    u, v, depth = matrix @ (x, y, 1)
+    return np.asarray((matrix[:2, :2] - np.outer((u, v), matrix[2, :2]) / depth).T / depth)
+
+
+def _seen(matrix: NDArray[np.float64], axis: int, columns: int, rows: int, size: int) -> range:
     """The range of pixels along an axis of a picture that cells sample, with one more at each end for rounding.
 
     Parameters
     ----------
-    line : (3,) float64
-        The row of a placement's matrix for this axis.
+    matrix : (3, 3) float64
+        From cells to pixels.
+    axis : int
     columns, rows : int
         Size of the grid of cells.
     size : int
         Size of the picture along this axis.
     """
-    places = [line @ (x, y, 1) for x in (0, columns) for y in (0, rows)]
+    corners = [matrix @ (x, y, 1) for x in (0, columns) for y in (0, rows)]
+    places = [corner[axis] / corner[2] for corner in corners]
     first, end = (min(max(at, 0), size) for at in (math.floor(min(places)) - 2, math.floor(max(places)) + 3))
     return range(first, end)
 

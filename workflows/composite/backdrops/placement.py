@@ -27,31 +27,32 @@ class Placement:
     scale: float = 1.0
     angle: float = 0.0
 
-    def matrix(
-        self, cells: tuple[int, int], monitor: tuple[int, int], image: tuple[int, int]
-    ) -> NDArray[np.float64]:
-        """The affine map from the grid of cells to the backdrop.
+    def within(self, outer: "Placement") -> "Placement":
+        """Where a backdrop stands that has this placement over ``outer``, which is not turned, and not the monitor."""
+        return Placement(
+            outer.right + outer.scale * self.right,
+            outer.down + outer.scale * self.down,
+            outer.scale * self.scale,
+            self.angle,
+        )
+
+    def matrix(self, monitor: tuple[int, int]) -> NDArray[np.float64]:
+        """The map from the monitor to the backdrop, both from 0 to 1 across and down.
 
         Parameters
         ----------
-        cells : (int, int)
-            Columns and rows of the grid over the monitor.
         monitor : (int, int)
             Width and height in square pixels: a rotation keeps shapes.
-        image : (int, int)
-            Width and height of the backdrop.
 
         Returns
         -------
-        (2, 3) float64
-            Maps (x, y, 1) in cells from the top left of the grid to (x, y) in pixels from the top left of the backdrop.
+        (3, 3) float64
+            Of (x, y, 1).
         """
-        columns, rows = cells
         wide, high = monitor
-        width, height = image
         turn = math.radians(self.angle)
         cosine, sine = math.cos(turn) / self.scale, math.sin(turn) / self.scale
-        to_monitor = np.array([[wide / columns, 0, -wide / 2], [0, high / rows, -high / 2], [0, 0, 1]])
+        to_pixels = np.array([[wide, 0, -wide / 2], [0, high, -high / 2], [0, 0, 1]])
         back = np.array(
             [
                 [cosine, sine, -(cosine * self.right * wide + sine * self.down * high)],
@@ -59,8 +60,8 @@ class Placement:
                 [0, 0, 1],
             ]
         )
-        to_image = np.array([[width / wide, 0, width / 2], [0, height / high, height / 2]])
-        return np.asarray(to_image @ back @ to_monitor)
+        to_shares = np.array([[1 / wide, 0, 0.5], [0, 1 / high, 0.5], [0, 0, 1]])
+        return np.asarray(to_shares @ back @ to_pixels)
 
 
 @njit(nogil=True, cache=True)
@@ -83,8 +84,8 @@ def place(
         Height and width of the picture.
     corner : (int, int)
         Row and column of the picture at which the image begins.
-    matrix : (2, 3) float64
-        From cells to pixels of the picture.
+    matrix : (3, 3) float64
+        From cells to pixels of the picture: a homography.
     start, stop : int
         Rows of the grid to compute.
     cells : (rows, columns, 3) float32
@@ -97,8 +98,9 @@ def place(
             sums = np.zeros(3, np.float32)
             for place in range(4):
                 x, y = k + 0.25 + 0.5 * (place % 2), r + 0.25 + 0.5 * (place // 2)
-                u = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2]
-                v = matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2]
+                depth = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2]
+                u = (matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2]) / depth
+                v = (matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2]) / depth
                 if not (0 <= u < width and 0 <= v < height):
                     continue
                 u, v = max(u - 0.5, 0.0), max(v - 0.5, 0.0)

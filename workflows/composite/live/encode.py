@@ -14,6 +14,10 @@ The header's ``levels`` are the columns and rows of the texture's levels. The fi
 others accordingly, so that each level is exactly half as large as the one before; padding repeats the edge. The
 composite is ``S + crosstalk (rho * sum over lookups of share * texture)``.
 
+If the object was cut out, the header says how a backdrop is fitted to the frame, see
+`workflows.composite.backdrops.around`: by ``view`` it is placed over all that the frame sees, ``exposure`` is a matrix
+that the composite is multiplied by, and by ``sight`` it is seen around the glass.
+
 Only every ``step``-th row and column of a large matte is encoded.
 """
 
@@ -27,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.layout.mattes import Matte
+from workflows.composite.backdrops.around import exposure, over_frame
 from workflows.composite.live.lookups import block_lookups
 from workflows.recovery.pyramid import Pyramid
 from workflows.threads import in_parts
@@ -45,7 +50,7 @@ _GZIP_LEVEL = 6
 """Higher levels take twice as long for 1 % less."""
 
 
-def encode_live(matte: Matte, threads: int, lookups: int = LOOKUPS) -> bytes:
+def encode_live(matte: Matte, threads: int, lookups: int = LOOKUPS, whole: Matte | None = None) -> bytes:
     """Encode a matte for graphics hardware.
 
     Parameters
@@ -55,6 +60,8 @@ def encode_live(matte: Matte, threads: int, lookups: int = LOOKUPS) -> bytes:
         Number of threads; the bytes do not depend on it.
     lookups : int
         Lookups of a pixel.
+    whole : Matte, optional
+        Whose preview the matte is.
 
     Returns
     -------
@@ -96,7 +103,19 @@ def encode_live(matte: Matte, threads: int, lookups: int = LOOKUPS) -> bytes:
         "S": max(float(encoded.S.max()), 1e-6),
         "rho": max(float(encoded.rho.max()), 1e-6),
     }
-    return _pack(header, encoded)
+    return _pack(header | _fitted(whole or matte), encoded)
+
+
+def _fitted(matte: Matte) -> dict[str, Any]:
+    """What the header says of fitting a backdrop to the frame."""
+    view = over_frame(matte, None)
+    if view is None:
+        return {}
+    return {
+        "view": {"right": view.right, "down": view.down, "scale": view.scale},
+        "sight": matte.attributes["beside"]["sight"],
+        "exposure": exposure(matte).tolist(),
+    }
 
 
 def bytes_of_live(matte: Matte, lookups: int = LOOKUPS) -> int:

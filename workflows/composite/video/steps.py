@@ -22,7 +22,7 @@ from storage.layout.mattes import Matte
 from storage.objects.byte_objects import PART
 from storage.objects.store import Objects, gather
 from workflows.composite import composite
-from workflows.composite.backdrops.around import put_around
+from workflows.composite.backdrops.around import expose, over_frame, put_around
 from workflows.composite.backdrops.backdrop import Backdrop
 from workflows.composite.backdrops.placement import Placement
 from workflows.composite.cache import Cache
@@ -117,17 +117,20 @@ def work(objects: Objects, task: Task, tile: int) -> int:
     ticks = _ticks(objects, job)[tile * length : (tile + 1) * length]
     cache = Cache(objects, KEPT)
     put, light = cache.matte(matte), tone_curves.table(transfer, np.dtype(np.uint16))
-    has_around = task.options.get("around") == "backdrop"  # missing from jobs of earlier versions
+    # Jobs of earlier versions lack both.
+    has_around, fits_frame = task.options.get("around") == "backdrop", task.options.get("fit") == "frame"
+    where = None if placement == Placement() else placement
+    if fits_frame:
+        where = over_frame(put, where)
 
     def shown(frame: NDArray[np.uint16]) -> NDArray[np.uint8]:
         """An 8 bit picture; where the mask left the matte out, it is black or shows the backdrop."""
         backdrop = Backdrop(frame, light)
-        where = None if placement == Placement() else placement
         picture = composite(put, backdrop, placement=where, read=partial(cache.strip, matte), threads=1)
+        if fits_frame:
+            picture = expose(put, picture, Window.of(put))
         if has_around:
-            wide, high = put.attributes["monitor"]
-            size = put.width, put.height
-            picture = put_around(picture, backdrop, Window.of(put), size, (wide, high), where, threads=1)
+            picture = put_around(put, backdrop, where, picture, Window.of(put), threads=1)
         return encode(picture, transfer, np.dtype(np.uint8), 1, 3).astype(np.uint8, copy=False)
 
     with _reading(objects, task) as (decoder, file):

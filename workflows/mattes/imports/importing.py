@@ -66,9 +66,8 @@ def take_in(file: BinaryIO, objects: Objects, matte: str, limits: Limits) -> Mat
 def create_like(archive: Reader, objects: Objects, matte: str) -> Matte:
     """Create the matte of an archive without its blocks; raises `ArchiveError` if its arrays differ from ours."""
     given = archive.attributes
-    attributes = {
-        name: given[name] for name in ("monitor", "crosstalk", "options", "interval") if name in given
-    }
+    names = ("monitor", "crosstalk", "options", "interval", "beside")
+    attributes = {name: given[name] for name in names if name in given}
     layout = {name: given[name] for name in ("height", "width", "columns", "rows")}
     made = mattes.create(objects, matte, **layout, **attributes)
     for name in GROUPS:

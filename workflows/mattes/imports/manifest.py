@@ -2,15 +2,21 @@
 
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from storage.errors import ArchiveError
+from workflows.mattes.perspective import corners
 from workflows.untrusted.validation import reason
 
 Model = TypeVar("Model", bound=BaseModel)
 Side = Annotated[int, Field(ge=1, le=16384)]
 Share = Annotated[float, Field(ge=-100, le=100)]
+Coefficient = Annotated[float, Field(ge=-1e6, le=1e6)]
+BareRho = Annotated[float, Field(ge=1e-4, le=1e4)]
 Variance = Annotated[float, Field(ge=0, le=1e6)]
+MOST_CONDITION = 1e4
+"""Condition of the map from the monitor's colours to the camera's, at most."""
 Name = Annotated[str, Field(max_length=64)]
 Text = Annotated[str, Field(max_length=256)]
 
@@ -28,6 +34,22 @@ class IntervalGiven(_Strict):
     share: Variance
 
 
+class BesideGiven(_Strict):
+    """What the frame sees beside the object, see `storage.layout.mattes`."""
+
+    sight: Annotated[
+        list[Annotated[list[Coefficient], Field(min_length=3, max_length=3)]],
+        Field(min_length=3, max_length=3),
+    ]
+    rho: Annotated[list[BareRho], Field(min_length=3, max_length=3)]
+
+    @field_validator("sight")
+    @classmethod
+    def _faces_the_monitor(cls, sight: list[list[float]]) -> list[list[float]]:
+        corners(np.array(sight))
+        return sight
+
+
 class Attributes(_Strict):
     """The attributes of a matte's zarr group."""
 
@@ -42,7 +64,15 @@ class Attributes(_Strict):
         list[Annotated[list[Share], Field(min_length=3, max_length=3)]], Field(min_length=3, max_length=3)
     ]
     interval: IntervalGiven | None = None
+    beside: BesideGiven | None = None
     options: Annotated[dict[Name, bool | int | float | Text | None], Field(max_length=100)]
+
+    @model_validator(mode="after")
+    def _tells_colours_apart(self) -> "Attributes":
+        seen = np.array(self.crosstalk) * (self.beside.rho if self.beside else 1)
+        if self.beside and np.linalg.cond(seen) > MOST_CONDITION:
+            raise ValueError("the camera does not tell the colours of the bare monitor apart")
+        return self
 
 
 class Member(_Strict):

@@ -17,7 +17,10 @@ export function comparison(stage, matte, others) {
 	const kinds = {
 		[t("compare.nothing")]: null,
 		[t("compare.live")]: () => stage.isLive && context.drawImage(stage.drawn(), 0, 0, width, height),
-		[t("backdrop")]: () => stage.backdrop.picture && drawPlaced(context, stage.backdrop.picture, stage.place, matte.monitor),
+		[t("backdrop")]: () => {
+			if (stage.isLive) return context.drawImage(stage.drawn(true), 0, 0, width, height);
+			return stage.backdrop.picture && drawPlaced(context, stage.backdrop.picture, stage.place, matte.monitor);
+		},
 	};
 	for (const [name, other] of Object.entries(others)) {
 		kinds[name] = async () => context.drawImage(await createImageBitmap(await stage.composite("image/jpeg", {}, stage.backdrop, other.id)), 0, 0, width, height);

@@ -21,8 +21,8 @@ export function compositing(matte, others, signal) {
 	const placed = placement(() => stage.moved(), given);
 	const stage = new Stage(matte, placed.values, signal);
 	const explained = explanation(stage, matte, signal);
-	const video = clipJob(matte, () => ({ ...placed.values, around: stage.around ? "backdrop" : "nothing" }), signal);
-	handleGestures(stage.element, placed);
+	const video = clipJob(matte, () => ({ ...placed.values, around: stage.around ? "backdrop" : "nothing", fit: "frame" }), signal);
+	handleGestures(stage.element, placed, stage);
 
 	const play = h("button", {
 		type: "button", hidden: true,

@@ -46,7 +46,7 @@ export function explanation(stage, matte, signal) {
 		Object.assign(inset.style, { left: `${(100 * left) / width}%`, top: `${(100 * top) / height}%`, width: `${100 * INSET}%` });
 		Object.assign(words.style, { [left ? "left" : "right"]: 0, [top ? "bottom" : "top"]: 0, [left ? "right" : "left"]: "auto", [top ? "top" : "bottom"]: "auto" });
 		inset.hidden = !stage.backdrop?.picture;
-		if (!inset.hidden) drawPlaced(inset.getContext("2d"), stage.backdrop.picture, stage.place, matte.monitor);
+		if (!inset.hidden) drawPlaced(inset.getContext("2d"), stage.backdrop.picture, stage.placed, matte.monitor);
 		const heaviest = Math.max(...lobes.map(({ weight }) => mean(weight)));
 		const marks = lobes.map(({ u, v, weight, sigma_u: a, sigma_v: b, theta }) => {
 			const [cx, cy] = [left + u * across, top + (1 - v) * down];

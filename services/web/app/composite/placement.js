@@ -57,8 +57,8 @@ export function placement(changed, given = {}) {
 	};
 }
 
-// Lets keys, the wheel, the mouse and fingers set a placement. `monitor` is an element of the monitor's size.
-export function handleGestures(element, placed, monitor = element) {
+// Lets keys, the wheel, the mouse and fingers set a placement behind a glass.
+export function handleGestures(element, placed, glass) {
 	element.addEventListener("keydown", (event) => {
 		const [name, steps] = KEYS[event.key] ?? [];
 		if (!name || event.target !== element || event.ctrlKey || event.metaKey || event.altKey) return;
@@ -70,11 +70,11 @@ export function handleGestures(element, placed, monitor = element) {
 		event.preventDefault();
 		placed.set({ scale: placed.values.scale * Math.exp(-event.deltaY * (event.deltaMode ? 0.03 : 0.001)) });
 	}, { passive: false });
-	handlePointers(element, placed, monitor);
+	handlePointers(element, placed, glass);
 }
 
 // One finger or the mouse moves; two fingers scale and turn as well.
-function handlePointers(element, placed, monitor) {
+function handlePointers(element, placed, glass) {
 	const fingers = new Map();
 	const state = () => {
 		const [a, b = a] = [...fingers.values()];
@@ -91,7 +91,7 @@ function handlePointers(element, placed, monitor) {
 		const before = state();
 		fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
 		const now = state();
-		const { width, height } = monitor.getBoundingClientRect();
+		const { width, height } = glass.spread;
 		const { right, down, scale, angle } = placed.values;
 		const wanted = { right: right + (now.x - before.x) / width, down: down + (now.y - before.y) / height };
 		if (fingers.size === 2 && before.apart > 10) {

@@ -69,9 +69,11 @@ export class Stage extends LiveGlass {
 		this.moved();
 	}
 
-	// The live picture with all of its pixels, before what is shown.
-	drawn() {
+	// The live picture with all of its pixels, behind what is shown; `bare` is it without the glass.
+	drawn(bare = false) {
+		this.bare = bare;
 		super.draw(0);
+		this.bare = false;
 		return this.canvas;
 	}
 
@@ -94,7 +96,7 @@ export class Stage extends LiveGlass {
 
 	#request(body, wanted, type, signal = this.signal, matte = this.#matte.id) {
 		const around = this.around ? "backdrop" : "nothing";
-		return getComposite(matte, { ...this.place, around, ...wanted }, type, body, signal);
+		return getComposite(matte, { ...this.place, around, fit: "frame", ...wanted }, type, body, signal);
 	}
 
 	async #quick(backdrop) {

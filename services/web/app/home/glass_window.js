@@ -91,6 +91,10 @@ export class GlassWindow extends LiveGlass {
 		context.fillRect(0, 0, this.#surround.width, this.#surround.height);
 	}
 
+	get spread() {
+		return this.monitor.getBoundingClientRect();
+	}
+
 	lost() {
 		this.#stand(t("home.lost"));
 	}

@@ -20,7 +20,7 @@ export async function home(main, signal) {
 	await new Promise((next) => requestAnimationFrame(() => setTimeout(next))); // the header shows while WebGL2 starts
 	const placed = placement(() => glass.moved());
 	const glass = new GlassWindow(placed.values, signal);
-	handleGestures(glass.element, placed, glass.monitor);
+	handleGestures(glass.element, placed, glass);
 	const problem = h("div");
 	const fail = (error) => signal.aborted || problem.replaceChildren(problemBox(error));
 	const title = h("h1");

@@ -57,7 +57,7 @@ def test_captures_and_clips_take_a_webhook(engine: Engine, archive: bytes, tmp_p
         clip = http.post("/v1/mattes/m/composite", content=b"clip", headers=VIDEO, params=query)
         assert clip.status_code == 202
         assert webhook_of(engine, clip.json()["id"]) == query.get("webhook")
-        assert clip.json()["options"].keys() == {"transfer", "around", "placement"}
+        assert clip.json()["options"].keys() == {"transfer", "around", "fit", "placement"}
 
 
 def test_private_address_is_refused(engine: Engine, archive: bytes, tmp_path: Path) -> None:

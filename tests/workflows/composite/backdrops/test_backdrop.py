@@ -129,8 +129,8 @@ def test_visible_part_of_an_enlarged_backdrop_equals_that_of_the_whole(
     picture = np.random.default_rng(0).random((3000, 4000, 1), np.float32)
     found = cells(picture, **placement)[..., 0]
     # of pixels that are as large as cells, about, as it is made first
-    turned = Placement(**placement).matrix((COLUMNS, ROWS), MONITOR, (4000, 3000))
-    steps = np.hypot(*turned[:, :2].T)
+    turned = Placement(**placement).matrix(MONITOR)
+    steps = np.hypot(*(turned[:2, :2] / (COLUMNS, ROWS)).T) * (4000, 3000)
     assert (steps > 1).all()
     wide, high = (int(np.ceil(size / step)) for size, step in zip((4000, 3000), steps, strict=True))
     np.testing.assert_allclose(found, cells(area_mean(picture, wide, high), **placement)[..., 0], atol=1e-5)

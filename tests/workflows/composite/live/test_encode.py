@@ -95,6 +95,21 @@ def test_it_is_the_composite_where_lookups_suffice(matte: Matte) -> None:
     assert np.sqrt(np.mean((got - expected) ** 2)) < 0.005
 
 
+def test_header_fits_a_backdrop_to_the_frame(matte: Matte, objects: Objects) -> None:
+    assert (
+        not {"view", "sight", "exposure"}
+        & drawn(encode_live(matte, 1), np.zeros((ROWS, COLUMNS, 3)))[1].keys()
+    )
+    layout = {"height": HEIGHT, "width": WIDTH, "columns": COLUMNS, "rows": ROWS, "crosstalk": CROSSTALK}
+    sight = [[2.0, 0, -0.5], [0, 2.0, -0.5], [0, 0, 1]]
+    whole = mattes.create(objects, "whole", **layout, beside={"sight": sight, "rho": [0.5, 0.6, 0.7]})
+    _, header = drawn(encode_live(matte, 1, whole=whole), np.zeros((ROWS, COLUMNS, 3), np.float32))
+    assert header["view"] == {"right": 0, "down": 0, "scale": 2}
+    assert header["sight"] == sight
+    white = np.array(header["exposure"]) @ CROSSTALK @ [0.5, 0.6, 0.7]
+    np.testing.assert_allclose(white, 1)
+
+
 def test_the_bytes_are_the_same_by_any_threads(matte: Matte) -> None:
     assert encode_live(matte, 3) == encode_live(matte, 1)
 

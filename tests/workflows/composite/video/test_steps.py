@@ -22,7 +22,9 @@ from storage.objects.store import Objects
 from storage.steps import FINISH, PREPARE
 from tests.workflows.ingest.video.camera import interlaced
 from workflows.composite import composite
+from workflows.composite.backdrops.around import expose, over_frame, put_around
 from workflows.composite.backdrops.backdrop import Backdrop, frame_light
+from workflows.composite.engine import Window
 from workflows.composite.video import steps as video_steps
 from workflows.composite.video.steps import STEPS
 from workflows.images.tone_curves import from_light, to_light
@@ -212,6 +214,22 @@ def test_backdrop_is_around_the_glass(make: Make, matte: Matte, placement: dict[
         assert np.sqrt(np.mean((frame[:6, :6] / 255 - behind) ** 2)) < 0.05
         assert black[:6, :6].max() < 12
         assert np.sqrt(np.mean((frame[12:].astype(float) - black[12:]) ** 2)) < 4  # the glass is the same
+
+
+def test_backdrop_is_fitted_to_the_frame(make: Make, matte: Matte, objects: Objects) -> None:
+    names = ("height", "width", "columns", "rows", "crosstalk", "monitor")
+    beside = {"sight": [[1.5, 0, -0.25], [0, 1.5, -0.25], [0, 0, 1]], "rho": [0.8, 0.9, 0.7]}
+    cut = mattes.create(objects, "m", **{name: matte.attributes[name] for name in names}, beside=beside)
+    (shown,) = pictures(1)
+    (made,), *_ = frames_of(make(clip([shown], [0], crf="4"), around="backdrop", fit="frame"))
+    backdrop, where, window = (
+        Backdrop(to_light(shown / np.float32(255), "srgb")),
+        over_frame(cut, None),
+        Window.of(cut),
+    )
+    taken = expose(cut, composite(cut, backdrop, placement=where), window)
+    expected = from_light(put_around(cut, backdrop, where, taken, window)[..., :3], "srgb")
+    assert np.sqrt(np.mean((made[:HEIGHT, :WIDTH] / 255 - expected) ** 2)) < 0.05
 
 
 def test_linear_codes_are_light(make: Make, matte: Matte) -> None:

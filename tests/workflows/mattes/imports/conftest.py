@@ -64,6 +64,7 @@ def make_matte(objects: Objects) -> Matte:
         monitor=[80, 10],
         crosstalk=[[0.9, 0.1, 0], [0.05, 0.8, 0.15], [0.02, 0.18, 0.8]],
         options={"method": "lobes", "rounds": 1, "resolution": 1.0, "quality": None},
+        beside={"sight": [[1.4, 0.0, -0.2], [0.01, 1.3, -0.15], [0.001, 0.0, 1.0]], "rho": [0.8, 0.7, 0.75]},
     )
     for row in range(made.block_rows):
         for column in range(made.block_columns):

@@ -150,6 +150,10 @@ def attributes(**values: Any) -> Change:
     return documented("zarr.json", lambda d: d["attributes"].update(values))
 
 
+def beside(wide: float = 1.0, away: float = 0.0) -> dict[str, Any]:
+    return {"sight": [[wide, 0.0, 0.0], [0.0, 1.0, 0.0], [away, 0.0, 1.0]], "rho": [1.0, 1.0, 1.0]}
+
+
 def codec(document: dict[str, Any]) -> None:
     document["codecs"][1] = {"name": "gzip", "configuration": {"level": 5}}
 
@@ -205,6 +209,10 @@ WHOLE: dict[str, tuple[str, str, Change]] = {
     "block": ("zarr.json", "blocks of 64", attributes(block=64)),
     "crosstalk": ("zarr.json", "crosstalk", attributes(crosstalk=[[1, 0], [0, 1]])),
     "much crosstalk": ("zarr.json", "crosstalk", attributes(crosstalk=[[1e30, 0, 0]] * 3)),
+    "a frame that looks away": ("zarr.json", "does not face", attributes(beside=beside(away=-2))),
+    "a monitor far away": ("zarr.json", "too small", attributes(beside=beside(wide=100))),
+    "more beside": ("zarr.json", "beside", attributes(beside={**beside(), "more": 1})),
+    "grey light": ("zarr.json", "colours", attributes(crosstalk=[[1, 1, 1]] * 3)),
     "nested options": ("zarr.json", "options", attributes(options={"method": {"x": [1]}})),
     "many options": ("zarr.json", "options", attributes(options={str(n): n for n in range(1000)})),
     "another size": ("envmatte.json", "another matte", attributes(height=21)),

@@ -28,6 +28,18 @@ export class LiveGlass {
 		return Boolean(this.#painter && this.backdrop?.picture);
 	}
 
+	// Where the backdrop stands before the monitor.
+	get placed() {
+		return this.#painter?.placed(this.place) ?? this.place;
+	}
+
+	// The size on the page of a backdrop of scale 1.
+	get spread() {
+		const { width, height } = this.canvas.parentElement.getBoundingClientRect();
+		const [right, down] = this.#painter?.pace ?? [1, 1];
+		return { width: width / right, height: height / down };
+	}
+
 	get playing() {
 		return Boolean(this.backdrop?.moving && !this.backdrop.moving.paused);
 	}

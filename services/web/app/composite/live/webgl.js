@@ -14,22 +14,28 @@ void main() {
 	light = vec4(seen.a * seen.rgb, 1);
 }`;
 
-// Resamples the backdrop to the cells of the first level; beyond its edges is black, or its mirror image.
-const PLACE = `#version 300 es
-precision highp float;
+// The light of the backdrop at a point of a grid; beyond its edges is black, or its mirror image.
+const SAMPLE = `
 uniform sampler2D backdrop;
-uniform mat3 placing; // from cells to shares of the picture
-uniform vec2 most; // the last column and row
-uniform vec2 cells; // that are as wide, and as high, as the picture
-uniform float blur; // level of the picture that is as coarse as the cells
+uniform mat3 placing; // from the grid to shares of the picture: a homography
+uniform vec2 cells; // of the grid, that are as wide, and as high, as the picture
+uniform float blur; // level of the picture that is as coarse as the grid
 uniform bool endless;
-out vec4 light;
-void main() {
-	vec2 at = (placing * vec3(min(floor(gl_FragCoord.xy), most) + 0.5, 1)).xy;
+vec3 lightAt(vec2 point) {
+	vec3 placed = placing * vec3(point, 1);
+	vec2 at = placed.xy / placed.z;
 	if (endless) at = 1.0 - abs(mod(at, 2.0) - 1.0);
 	vec2 covered = endless ? vec2(1) : clamp(cells * min(at, 1.0 - at) + 0.5, 0.0, 1.0);
-	light = vec4(covered.x * covered.y * textureLod(backdrop, at, blur).rgb, 1);
+	return covered.x * covered.y * textureLod(backdrop, at, blur).rgb;
 }`;
+
+// Resamples the backdrop to the cells of the first level.
+const PLACE = `#version 300 es
+precision highp float;
+${SAMPLE}
+uniform vec2 most; // the last column and row
+out vec4 light;
+void main() { light = vec4(lightAt(min(floor(gl_FragCoord.xy), most) + 0.5), 1); }`;
 
 // Halves a level, with the weights [1, 3, 3, 1] / 8 along each axis, by sampling between pairs of nodes.
 const HALVE = `#version 300 es
@@ -53,13 +59,14 @@ uniform usampler2DArray lookups; // x, y, level and red, green and blue; the hea
 uniform sampler2D offset; // roots of S, and alpha
 uniform sampler2D absorption; // roots of rho
 uniform vec2 tops; // of S and of rho
+uniform mat3 exposure;
 uniform mat3 crosstalk;
 uniform float finest; // level of the light that is there
 uniform int height;
 uniform int every; // pixel that is drawn, along each axis
-uniform bool around; // whether what a mask left out shows the light behind it
-uniform vec2 whole; // share of the texture of the light that the monitor takes
-uniform float coarse; // level of the light that is as coarse as the pixels
+uniform bool around; // whether what was left out shows the backdrop
+uniform bool bare; // whether all of the glass is left out
+${SAMPLE}
 out vec4 colour;
 void main() {
 	ivec2 pixel = min(every * ivec2(gl_FragCoord.x, float(height) - gl_FragCoord.y) + every / 2, textureSize(offset, 0) - 1);
@@ -73,31 +80,45 @@ void main() {
 	}
 	vec4 root = texelFetch(offset, pixel, 0);
 	vec3 rho = texelFetch(absorption, pixel, 0).rgb;
-	vec3 seen = tops.x * root.rgb * root.rgb + crosstalk * (tops.y * rho * rho * sum);
-	float alpha = root.a;
+	vec3 seen = exposure * (tops.x * root.rgb * root.rgb + crosstalk * (tops.y * rho * rho * sum));
+	float alpha = bare ? 0.0 : root.a;
 	if (around) {
 		ivec2 size = textureSize(offset, 0);
 		float near = 0.0; // the mean of the pixel and its neighbours: no steps at the edge
 		for (int k = 0; k < 9; k++) near += texelFetch(offset, clamp(pixel + ivec2(k % 3, k / 3) - 1, ivec2(0), size - 1), 0).a / 9.0;
-		vec3 behind = textureLod(light, whole * (vec2(pixel) + 0.5) / vec2(size), max(coarse - finest, 0.0)).rgb;
-		seen = mix(behind, seen, alpha * near);
+		seen = mix(lightAt(vec2(pixel) + 0.5), seen, alpha * near);
 		alpha = 1.0;
 	}
 	seen = clamp(alpha * seen, 0.0, 1.0);
 	colour = vec4(mix(12.92 * seen, 1.055 * pow(seen, vec3(1.0 / 2.4)) - 0.055, greaterThan(seen, vec3(0.0031308))), alpha);
 }`;
 
-// The matrix of a placement, as `Placement.matrix` computes it: from cells to shares of the picture.
-function placing({ right, down, scale, angle }, [columns, rows], [wide, high]) {
+// The matrix of a placement, as `Placement.matrix` computes it: three rows, from shares of the monitor to shares of the picture.
+function placing({ right, down, scale, angle }, [wide, high]) {
 	const turn = (angle * Math.PI) / 180;
 	const [cosine, sine] = [Math.cos(turn) / scale, Math.sin(turn) / scale];
 	const [x, y] = [-wide / 2 - right * wide, -high / 2 - down * high];
 	return [
-		(cosine * wide) / columns / wide, (-sine * wide) / columns / high, 0,
-		(sine * high) / rows / wide, (cosine * high) / rows / high, 0,
-		(cosine * x + sine * y) / wide + 0.5, (-sine * x + cosine * y) / high + 0.5, 1,
+		[cosine, (sine * high) / wide, (cosine * x + sine * y) / wide + 0.5],
+		[(-sine * wide) / high, cosine, (-sine * x + cosine * y) / high + 0.5],
+		[0, 0, 1],
 	];
 }
+
+const SAME = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
+
+const times = (a, b) => a.map((row) => b[0].map((_, k) => row.reduce((sum, one, i) => sum + one * b[i][k], 0)));
+
+const project = (matrix, x, y) => {
+	const [u, v, w] = matrix.map(([a, b, c]) => a * x + b * y + c);
+	return [u / w, v / w];
+};
+
+// How far the place of a point moves from the middle of a grid to the next cell, along x and along y.
+const steps = (matrix, [columns, rows]) => {
+	const [[x, y], [u, v], [p, q]] = [[0, 0], [1, 0], [0, 1]].map(([i, j]) => project(matrix, columns / 2 + i, rows / 2 + j));
+	return [[u - x, v - y], [p - x, q - y]];
+};
 
 // A WebGL2 context; null where the browser has none, or cannot render to floating-point textures.
 export function webglContext(canvas) {
@@ -108,6 +129,8 @@ export function webglContext(canvas) {
 // A painter of a matte that `decodeLive` has decoded.
 export function createPainter(gl, matte, monitor) {
 	const { width, height, levels, texture, finest } = matte;
+	// Unless the object was cut out, the frame sees the monitor and no more.
+	const { view = { right: 0, down: 0, scale: 1 }, sight = SAME, exposure = SAME } = matte;
 	const made = [];
 	const keep = (kind, thing) => (made.push([kind, thing]), thing);
 
@@ -168,8 +191,8 @@ export function createPainter(gl, matte, monitor) {
 	gl.uniform1i(seen.at("offset"), OFFSET);
 	gl.uniform1i(seen.at("absorption"), ABSORPTION);
 	gl.uniform2f(seen.at("tops"), matte.S, matte.rho);
-	gl.uniform2f(seen.at("whole"), levels[0][0] / texture[0], levels[0][1] / texture[1]);
-	gl.uniform1f(seen.at("coarse"), Math.log2(levels[0][0] / width));
+	gl.uniformMatrix3fv(seen.at("exposure"), true, exposure.flat());
+	gl.uniform1i(seen.at("backdrop"), BACKDROP);
 	gl.uniformMatrix3fv(seen.at("crosstalk"), true, matte.crosstalk.flat());
 	halve.use();
 	gl.uniform1i(halve.at("fine"), LIGHT);
@@ -177,7 +200,23 @@ export function createPainter(gl, matte, monitor) {
 	gl.uniform1i(decode.at("picture"), PICTURE);
 	place.use();
 	gl.uniform1i(place.at("backdrop"), BACKDROP);
+	// Sets how a grid sees the picture, by a matrix from shares of the grid.
+	function look(program, matrix, size, endless, blurred) {
+		const seen = times(matrix, [[1 / size[0], 0, 0], [0, 1 / size[1], 0], [0, 0, 1]]);
+		const [[a, b], [c, d]] = steps(seen, size);
+		gl.uniformMatrix3fv(program.at("placing"), true, seen.flat());
+		gl.uniform2f(program.at("cells"), 1 / Math.hypot(a, c), 1 / Math.hypot(b, d));
+		const blur = Math.log2(blurred * Math.sqrt(Math.abs(a * d - b * c) * shown[0] * shown[1]));
+		gl.uniform1f(program.at("blur"), blur > 0.25 ? blur : 0); // sampling between two levels takes twice as long
+		gl.uniform1i(program.at("endless"), endless);
+	}
+	const [[right], [, down]] = steps(sight, [1, 1]);
 	return {
+		// How much farther than across a monitor a backdrop moves across the frame, and down.
+		pace: [right / view.scale, down / view.scale],
+		// Where a backdrop stands before the monitor that is placed over all that the frame sees.
+		placed: ({ right, down, scale, angle }) =>
+			({ right: view.right + view.scale * right, down: view.down + view.scale * down, scale: view.scale * scale, angle }),
 		// Sets the backdrop: a picture, or the current frame of a video.
 		setBackdrop(picture) {
 			gl.activeTexture(gl.TEXTURE0 + PICTURE);
@@ -195,26 +234,22 @@ export function createPainter(gl, matte, monitor) {
 			gl.generateMipmap(gl.TEXTURE_2D);
 		},
 		// Draws one of 4 ** coarser pixels, from light that is as much coarser. An `endless` backdrop goes on beyond its edges;
-		// what a mask left out shows it, or is transparent.
-		draw(at, coarser = 0, { endless = false, around = false } = {}) {
+		// what was left out shows it, or is transparent, which `bare` does without the glass.
+		draw(at, coarser = 0, { endless = false, around = false, bare = false } = {}) {
 			if (!shown[0]) return;
 			const first = Math.min(finest + coarser, levels.length - 1);
 			const every = 2 ** coarser;
 			const size = { width: Math.ceil(width / every), height: Math.ceil(height / every) };
 			if (gl.canvas.width !== size.width || gl.canvas.height !== size.height) Object.assign(gl.canvas, size);
 			const cells = levels[0].map((one) => one / 2 ** first);
-			const matrix = placing(at, cells, monitor);
-			const pixels = Math.sqrt(Math.abs(matrix[0] * matrix[4] - matrix[1] * matrix[3]) * shown[0] * shown[1]);
+			const stands = this.placed(at);
+			const matrix = placing(stands, monitor);
 			// The service samples a picture that is moved at four places in each cell: that blurs as a pixel an eighth larger.
-			const moved = at.right || at.down || at.angle || at.scale !== 1;
+			const blurred = stands.right || stands.down || stands.angle || stands.scale !== 1 ? 1.125 : 1;
 			gl.activeTexture(gl.TEXTURE0 + LIGHT);
 			place.use();
-			gl.uniformMatrix3fv(place.at("placing"), false, matrix);
+			look(place, matrix, cells, endless, blurred);
 			gl.uniform2f(place.at("most"), levels[first][0] - 1, levels[first][1] - 1);
-			gl.uniform2f(place.at("cells"), 1 / Math.hypot(matrix[0], matrix[3]), 1 / Math.hypot(matrix[1], matrix[4]));
-			const blur = Math.log2(pixels * (moved ? 1.125 : 1));
-			gl.uniform1f(place.at("blur"), blur > 0.25 ? blur : 0); // sampling between two levels takes twice as long
-			gl.uniform1i(place.at("endless"), endless);
 			for (let level = first; level < levels.length; level++) {
 				gl.bindFramebuffer(gl.FRAMEBUFFER, targets[level]);
 				gl.viewport(0, 0, texture[0] >> level, texture[1] >> level);
@@ -236,7 +271,9 @@ export function createPainter(gl, matte, monitor) {
 			gl.uniform1f(seen.at("finest"), first);
 			gl.uniform1i(seen.at("height"), size.height);
 			gl.uniform1i(seen.at("every"), every);
-			gl.uniform1i(seen.at("around"), around);
+			gl.uniform1i(seen.at("around"), around || bare);
+			gl.uniform1i(seen.at("bare"), bare);
+			look(seen, times(matrix, sight), [width, height], endless, every * blurred);
 			gl.drawArrays(gl.TRIANGLES, 0, 3);
 		},
 		// Frees everything on the graphics card.
