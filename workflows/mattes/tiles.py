@@ -19,6 +19,7 @@ from workflows.mattes.cut_out import CutOut
 from workflows.mattes.options import RecoveryOptions
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out, pyramid_of
+from workflows.recovery.camera.clipped import bound_clipped
 from workflows.recovery.camera.noise import Noise
 from workflows.recovery.camera.photometry import fit_photometry
 from workflows.recovery.dgsr import recover as dgsr
@@ -156,8 +157,11 @@ def recover_block(
         light[:, numbers], to_light(sent, monitor), usable[:, numbers], noise, worth[:, numbers]
     )
     shown = program.measured
-    measurements = np.ascontiguousarray(light[:, shown])
-    given = (noise, usable[:, shown], worth[:, shown])
+    filmed = np.isin(shown, attributes["patterns"])
+    measurements, usable, worth = bound_clipped(
+        light[:, shown], usable[:, shown], worth[:, shown], filmed, photometry, noise
+    )
+    given = (noise, usable, worth)
     places = places_in(span, recovered)
     method, conditions = options.of_method, conditions_of(stack, program)
     patterns = patterns_of(objects, capture)

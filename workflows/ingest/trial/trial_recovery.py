@@ -24,6 +24,7 @@ from workflows.ingest.measured_light import (
     unclipped_light,
 )
 from workflows.programs.program import Program
+from workflows.recovery.camera.clipped import bound_clipped
 from workflows.recovery.camera.noise import Noise
 from workflows.recovery.camera.photometry import Photometry, fit_photometry
 from workflows.recovery.lobes.options import FINE, LobesOptions
@@ -240,15 +241,18 @@ def recover_seen(
     if np.count_nonzero(alive.any(axis=1)) < MIN_PIXELS:
         return None
     shown, conditions = program.measured, conditions_of(stack, program)
-    used = usable[:, shown]
+    filmed = np.isin(shown, attributes["patterns"])
+    measurements, used, worth = bound_clipped(
+        light[:, shown], usable[:, shown], worth[:, shown], filmed, photometry, noise
+    )
     used[:, held_out] = False
     transport, photometry, _, stray = recover(
-        np.ascontiguousarray(light[:, shown]),
+        measurements,
         photometry,
         patterns,
         noise,
         used,
-        worth[:, shown],
+        worth,
         options,
         conditions,
         places,

@@ -137,7 +137,7 @@ def recover(
         usable[:, :, 1:] = False
     stray: NDArray[np.float32] | None = None
     if len(strays) > 1:
-        stray, photometry = find_strong_strays(measurements, photometry, strays, usable)
+        stray, photometry = find_strong_strays(measurements, photometry, strays, usable, frames)
         measurements = measurements - stray
     measured = normalise(measurements, photometry, noise, options.least_contrast, usable, frames)
     counts = np.zeros((n, 3), np.int64)

@@ -20,6 +20,7 @@ def find_strong_strays(
     photometry: Photometry,
     strays: NDArray[np.float32],
     usable: NDArray[np.bool_] | None,
+    worth: NDArray[np.number] | None,
 ) -> tuple[NDArray[np.float32], Photometry]:
     """Find the stray light of pixels that see more of it than of the patterns, as those that see a film's border.
 
@@ -33,6 +34,8 @@ def find_strong_strays(
         As in :class:`~workflows.recovery.normalise.Conditions`; the first is constant.
     usable : (n, m, 3) bool or None
         False where a value must be ignored.
+    worth : (m,) or (n, m, 3) number, or None
+        How many frames a value is worth.
 
     Returns
     -------
@@ -58,6 +61,9 @@ def find_strong_strays(
     design = np.concatenate([strays[:1], half[np.newaxis], strays[1:]]).T.astype(np.float64)
     weight = known.astype(np.float64)
     weight[:, :, m:] = 0
+    if worth is not None and worth.ndim == 3:
+        # Of values that are bounds little is known: they must not look like the border's light.
+        weight[:, :, :m] *= (worth / worth.max(axis=1, keepdims=True)).transpose(0, 2, 1)
     count = np.maximum(weight.sum(axis=2, keepdims=True), 1)
     before = (weight * (values - (weight * values).sum(axis=2, keepdims=True) / count) ** 2).sum(axis=2)
     alone = np.delete(design, 1, axis=1)

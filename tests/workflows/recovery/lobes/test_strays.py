@@ -92,7 +92,7 @@ def test_a_pixel_that_sees_the_border_keeps_its_mean_light() -> None:
         )
     )
     values = (light[:, :m, np.newaxis] * three).astype(np.float32)
-    stray, found = find_strong_strays(values, given, rows.astype(np.float32), None)
+    stray, found = find_strong_strays(values, given, rows.astype(np.float32), None, None)
     left = values - stray
     np.testing.assert_allclose(found.S[:, 0], S, atol=0.01)
     np.testing.assert_allclose(found.rho[:, 0], rho, atol=0.01)
@@ -113,9 +113,9 @@ def test_what_explains_a_pixel_by_chance_is_left_to_its_lobes(m: int) -> None:
     usable = np.ones(values.shape, bool)
     usable[: n // 2, m // 2 :] = False
     S, rho, variance = (np.full((n, 3), value, np.float32) for value in (0.1, 0.5, 1e-6))
-    stray, _ = find_strong_strays(values, Photometry(S, rho, variance, variance), rows, usable)
+    stray, _ = find_strong_strays(values, Photometry(S, rho, variance, variance), rows, usable, None)
     assert stray[: n // 2].any(axis=(1, 2)).mean() < 0.02
     assert stray[n // 2 :].any(axis=(1, 2)).mean() < 0.02
     half = Photometry(*(part[: n // 2] for part in (S, rho, variance, variance)))
-    alone, _ = find_strong_strays(values[: n // 2], half, rows, usable[: n // 2])
+    alone, _ = find_strong_strays(values[: n // 2], half, rows, usable[: n // 2], None)
     np.testing.assert_array_equal(alone, stray[: n // 2])

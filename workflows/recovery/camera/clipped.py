@@ -1,0 +1,58 @@
+"""What values that the camera has clipped still say: the light was at least, or at most, so bright."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.photometry import Photometry
+
+NARROWEST = 0.1
+"""How much brighter than its clipped value a pixel may have been at least, as a share of rho."""
+DEVIATION = 2.0
+"""Standard deviation of such a value, in widths of what it may have been: exposures and white are not exact either."""
+Floats = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+
+def bound_clipped(
+    measurements: Floats, usable: Bools, worth: Floats, filmed: Bools, photometry: Photometry, noise: Noise
+) -> tuple[Floats, Bools, Floats]:
+    """Replace clipped values by what the light can have been, to be used with less weight.
+
+    Parameters
+    ----------
+    measurements, worth : (n, m, 3) float32
+        See `workflows.ingest.measured_light.Light`.
+    usable : (n, m, 3) bool
+        False where a value, or with crosstalk that of another channel, is clipped.
+    filmed : (m,) bool
+        False where there is no frame of a pattern.
+    photometry : Photometry
+        S and rho of the n pixels.
+    noise : Noise
+
+    Returns
+    -------
+    measurements : (n, m, 3) float32
+    usable : (n, m, 3) bool
+        False only where there is no frame.
+    worth : (n, m, 3) float32
+
+    Notes
+    -----
+    No pattern is brighter than white or darker than black: a pixel that is clipped at white saw between the clipped
+    value and S + rho, one that is clipped at black between S and the value. It counts as the middle of that. Where
+    bright patterns clip, this is most of what a film says of T, for else little is left but what is black.
+    """
+    S, rho = photometry.S[:, np.newaxis], photometry.rho[:, np.newaxis]
+    bright = measurements > S + rho / 2
+    over, under = np.maximum(S + rho - measurements, NARROWEST * rho), np.maximum(measurements - S, 0)
+    width = np.where(bright, over, under)
+    middle = measurements + np.where(bright, width, -width) / 2
+    before = noise.variance(middle)
+    bounded = worth * before / (before + worth * (DEVIATION * width) ** 2)
+    return (
+        np.ascontiguousarray(np.where(usable, measurements, middle), np.float32),
+        usable | filmed[:, np.newaxis],
+        np.where(usable, worth, bounded).astype(np.float32),
+    )
