@@ -43,6 +43,8 @@ ALIKE = 0.06
 """How far rho of a bare pixel may be from that of the bare pixels around it, as a share."""
 SPREAD = 1 / 32
 """Standard deviation with which rho of bare pixels is averaged, in lengths of the frame's larger side."""
+FAINTEST = 0.02
+"""Least rho of a channel of the bare monitor, as a share of that of the brightest: a camera may not see one at all."""
 LIT = 0.1
 """Beyond the monitor's edges the object has at least this share of the bare monitor's rho. A table mirrors less."""
 LEAST_PART = 0.02
@@ -192,6 +194,7 @@ def find_object(preview: Matte, spacing: int, height: int, width: int) -> CutOut
     # Of the bare pixels around the object alone: towards a frame's edges lenses darken.
     near = is_bare & binary_dilation(found, iterations=round(2 * SPREAD * max(found.shape)))
     bare = np.median(colours[near if near.any() else is_bare], axis=0).astype(np.float64)
+    bare = np.maximum(bare, FAINTEST * bare.max())
     return CutOut(spacing, sight, aspect, pitch, deviation, bare_rho, bare, found)
 
 

@@ -110,9 +110,8 @@ def test_what_the_mask_left_out_shows_the_backdrop_or_nothing(
 
 
 def test_object_that_was_cut_out_stands_in_the_backdrop(desk: Page, service: Service, tmp_path: Path) -> None:
-    scene = glass_ball.glass_ball(
-        *SIZE, monitor=(512, 384), rays=9, distance=8
-    )  # the frame sees the room too
+    # The frame sees the room too.
+    scene = glass_ball.glass_ball(*SIZE, monitor=(512, 384), rays=9, distance=8)
     write_capture(scene, preset("sketch", *scene.monitor), tmp_path / "ball.zip")
     job = service.client.recover(service.client.upload(tmp_path / "ball.zip"), quality="fast", cut_out=True)
     opened(desk, service, str(service.client.wait(job["id"])["matte"]), "?backdrop=Dusk&right=0.1&scale=1.2")

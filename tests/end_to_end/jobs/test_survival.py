@@ -73,7 +73,7 @@ def test_ingest_continues_after_the_server_is_killed(
         assert files_of(second, job["matte"]) == files_of(service, matte)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_matte_bytes_do_not_depend_on_tiles_or_workers(
     service: Service, matte: str, capture_archive: Path, tmp_path: Path
 ) -> None:

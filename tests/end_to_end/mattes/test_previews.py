@@ -37,6 +37,7 @@ def live_header(content: bytes) -> dict[str, int]:
     return found
 
 
+@pytest.mark.exhaustive
 def test_whole_frame_is_served_while_it_is_recovered(service: Service, large: str) -> None:
     job = service.client.recover(large, quality="fast")
     matte = job["matte"]

@@ -130,6 +130,7 @@ def test_a_mask_is_taken_as_it_is(objects: Objects, ball: Scene, ingest: Ingest)
     np.testing.assert_array_equal(matte.layer("recovered"), stack.mask())
 
 
+@pytest.mark.slow
 def test_without_an_object_the_whole_frame_is_recovered(objects: Objects, ingest: Ingest) -> None:
     ingest("c", archive(before_monitor(1.0)))
     matte, notes = recover(objects, cut_out=True)
