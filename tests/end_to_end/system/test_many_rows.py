@@ -8,6 +8,7 @@ from storage.database.engine import open_engine, writing
 from storage.records import captures, jobs, mattes, tiles
 from tests.benchmarks.service.many_rows import calls, fill
 from tests.end_to_end.conftest import serving
+from tests.parts.waiting import until
 
 JOBS = 10_000
 SECONDS = 0.5
@@ -31,6 +32,7 @@ def test_calls_read_few_of_many_rows(tmp_path: Path) -> None:
     fill(engine, JOBS)
     engine.dispose()
     with serving(data, "--workers", "1") as service:
+        until(lambda: service.http.get("/readyz").is_success)
         assert f'envmatte_captures{{state="ready"}} {JOBS // 10 + 1}' in service.http.get("/metrics").text
         took = dict(calls(service.http))
     assert not {call: seconds for call, seconds in took.items() if min(seconds) > SECONDS}
