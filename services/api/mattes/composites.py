@@ -267,7 +267,7 @@ def _pictures(
     if progress.preview is not None:
         steps["preview"] = partial(_put_preview, context, progress, progress.preview, backdrop, where)
     if params.fits_frame:
-        steps["expose"] = partial(expose, matte)
+        steps["expose"] = lambda picture, _: expose(matte, picture)
     if params.around == "backdrop":
         steps["around"] = partial(put_around, matte, backdrop, where)
     if params.size is not None:

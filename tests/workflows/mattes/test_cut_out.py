@@ -113,8 +113,8 @@ def test_around_the_object_the_backdrop_goes_on_as_through_bare_pixels(
     assert where is not None
     assert where.scale > 1.05  # the frame sees the room too
     taken, bare = (composite(matte, backdrop, placement=where) for matte in (cut, whole))
-    made = put_around(cut, backdrop, where, expose(cut, taken, window), window)
-    expected = expose(cut, bare, window)
+    made = put_around(cut, backdrop, where, expose(cut, taken), window)
+    expected = expose(cut, bare)
     rho = whole.layer("rho").min(axis=2)
     around = ~binary_dilation(cut.layer("recovered"), iterations=2)
     lit = around & (rho > 0.9 * np.median(rho[around]))  # within the monitor

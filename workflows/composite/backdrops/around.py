@@ -56,7 +56,7 @@ def exposure(matte: Matte) -> NDArray[np.float64]:
     return np.linalg.inv(np.array(matte.attributes["crosstalk"]) * beside["rho"]) if beside else np.eye(3)
 
 
-def expose(matte: Matte, picture: NDArray[np.float32], _: Window) -> NDArray[np.float32]:
+def expose(matte: Matte, picture: NDArray[np.float32]) -> NDArray[np.float32]:
     """Give a composite, (h, w, 4) float32, the colours and the brightness of the backdrop; changed in place."""
     if "beside" in matte.attributes:
         picture[..., :3] = picture[..., :3] @ exposure(matte).T.astype(np.float32)

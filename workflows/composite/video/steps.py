@@ -128,7 +128,7 @@ def work(objects: Objects, task: Task, tile: int) -> int:
         backdrop = Backdrop(frame, light)
         picture = composite(put, backdrop, placement=where, read=partial(cache.strip, matte), threads=1)
         if fits_frame:
-            picture = expose(put, picture, Window.of(put))
+            picture = expose(put, picture)
         if has_around:
             picture = put_around(put, backdrop, where, picture, Window.of(put), threads=1)
         return encode(picture, transfer, np.dtype(np.uint8), 1, 3).astype(np.uint8, copy=False)

@@ -10,6 +10,8 @@ from workflows.mattes.perspective import corners
 from workflows.untrusted.validation import reason
 
 Model = TypeVar("Model", bound=BaseModel)
+Item = TypeVar("Item")
+Three = Annotated[list[Item], Field(min_length=3, max_length=3)]
 Side = Annotated[int, Field(ge=1, le=16384)]
 Share = Annotated[float, Field(ge=-100, le=100)]
 Coefficient = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -37,11 +39,8 @@ class IntervalGiven(_Strict):
 class BesideGiven(_Strict):
     """What the frame sees beside the object, see `storage.layout.mattes`."""
 
-    sight: Annotated[
-        list[Annotated[list[Coefficient], Field(min_length=3, max_length=3)]],
-        Field(min_length=3, max_length=3),
-    ]
-    rho: Annotated[list[BareRho], Field(min_length=3, max_length=3)]
+    sight: Three[Three[Coefficient]]
+    rho: Three[BareRho]
 
     @field_validator("sight")
     @classmethod
@@ -60,9 +59,7 @@ class Attributes(_Strict):
     rows: Side
     block: int
     monitor: Annotated[list[Side], Field(min_length=2, max_length=2)]
-    crosstalk: Annotated[
-        list[Annotated[list[Share], Field(min_length=3, max_length=3)]], Field(min_length=3, max_length=3)
-    ]
+    crosstalk: Three[Three[Share]]
     interval: IntervalGiven | None = None
     beside: BesideGiven | None = None
     options: Annotated[dict[Name, bool | int | float | Text | None], Field(max_length=100)]

@@ -44,6 +44,8 @@ def bound_clipped(
     value and S + rho, one that is clipped at black between S and the value. It counts as the middle of that. Where
     bright patterns clip, this is most of what a film says of T, for else little is left but what is black.
     """
+    if usable.all():
+        return np.ascontiguousarray(measurements), usable, worth
     S, rho = photometry.S[:, np.newaxis], photometry.rho[:, np.newaxis]
     bright = measurements > S + rho / 2
     over, under = np.maximum(S + rho - measurements, NARROWEST * rho), np.maximum(measurements - S, 0)

@@ -98,13 +98,13 @@ def test_clear_glass_shows_the_backdrop_in_its_own_colours(objects: Objects) -> 
     matte = make(objects, crosstalk=crosstalk.tolist(), beside=beside)
     light, alpha = np.random.default_rng(0).random((2, HEIGHT, WIDTH, 3), np.float32)
     taken = np.concatenate([(light * rho) @ crosstalk.T, alpha[..., :1]], axis=2).astype(np.float32)
-    found = expose(matte, taken.copy(), WHOLE)
+    found = expose(matte, taken.copy())
     np.testing.assert_allclose(found[..., :3], light, atol=1e-5)
     np.testing.assert_array_equal(found[..., 3], alpha[..., 0])
 
 
 def test_without_a_bare_monitor_a_picture_is_exposed_as_the_camera_did(matte: Matte) -> None:
-    np.testing.assert_array_equal(expose(matte, glass(), WHOLE), glass())
+    np.testing.assert_array_equal(expose(matte, glass()), glass())
 
 
 @pytest.mark.parametrize("attributes", [{}, {"beside": {"sight": LARGER}}])

@@ -227,7 +227,7 @@ def test_backdrop_is_fitted_to_the_frame(make: Make, matte: Matte, objects: Obje
         over_frame(cut, None),
         Window.of(cut),
     )
-    taken = expose(cut, composite(cut, backdrop, placement=where), window)
+    taken = expose(cut, composite(cut, backdrop, placement=where))
     expected = from_light(put_around(cut, backdrop, where, taken, window)[..., :3], "srgb")
     assert np.sqrt(np.mean((made[:HEIGHT, :WIDTH] / 255 - expected) ** 2)) < 0.05
 
