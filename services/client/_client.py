@@ -297,9 +297,17 @@ class Client:
             at += target.write(answer.content)
             size = int(answer.headers.get("Content-Range", f"/{at}").rpartition("/")[2])
 
-    def layer(self, matte: Matte | str, name: str) -> bytes:
-        """Get a layer of a matte as a file, such as ``confidence.png``; ``Matte.layers`` has them as arrays."""
-        return self._http.send("GET", f"{path_of(Matte, matte)}/layers/{name}", computing=True).content
+    def layer(self, matte: Matte | str, name: str, *, plate: bool = False) -> bytes:
+        """Get a layer of a matte as a file, such as ``confidence.png``; ``Matte.layers`` has them as arrays.
+
+        Parameters
+        ----------
+        plate : bool
+            For ``stmap.exr`` and the nodes of Blender and Nuke: they take a plate of the frame, which the glass goes
+            over, in place of a picture that is stretched over the monitor.
+        """
+        path, params = f"{path_of(Matte, matte)}/layers/{name}", {"plate": "true"} if plate else {}
+        return self._http.send("GET", path, params=params, computing=True).content
 
     def live_page(self, matte: Matte | str) -> bytes:
         """Get a matte as a web page in one file, which draws the glass without a service."""

@@ -137,8 +137,9 @@ class Matte:
 
     @property
     def figures(self) -> dict[str, Any]:
-        """The attributes that describe a matte in lists."""
-        return {name: self.attributes[name] for name in FIGURES}
+        """What describes a matte in lists: some attributes, and whether it knows what is beside the object."""
+        described = {name: self.attributes[name] for name in FIGURES}
+        return described | {"cut_out": "beside" in self.attributes}
 
     @property
     def block_rows(self) -> int:

@@ -9,7 +9,8 @@ Every layer has the frame's size. All values are linear light or plain numbers; 
 ``S``, ``rho``     Offset and factor of ``C = S + X (rho T L)``: R, G and B
 ``alpha``          1 where the pixel was recovered, 0 where it was left out: by the mask, or as no part of the object
 ``confidence``     ``1 / (1 + e / 0.01)``, e the error to expect of a composite there
-``stmap.exr``      R and G: where the pixel's heaviest lobe lies; B: 1 where there is one, else 0. 32 bits
+``stmap.exr``      R and G: where the pixel's heaviest lobe lies, on the monitor or, if so asked, on a plate of the
+                   frame; B: 1 where there is one, else 0. 32 bits
 ``all.exr``        All of it, and the lobes of each pixel
 =================  ===========================================================================================
 
@@ -123,19 +124,36 @@ def exr(matte: Matte, name: str, file: IO[bytes]) -> None:
     _write(file, matte, dict.fromkeys(names, np.float32), bands)
 
 
-def stmap(matte: Matte, file: IO[bytes]) -> None:
-    """Write where the heaviest lobe of each pixel lies as an EXR of 32 bits: u, v, and whether there is one."""
+def stmap(matte: Matte, file: IO[bytes], place: NDArray[np.float64] | None = None) -> None:
+    """Write where the heaviest lobe of each pixel lies as an EXR of 32 bits: u, v, and whether there is one.
+
+    Parameters
+    ----------
+    matte : Matte
+    file : IO[bytes]
+    place : (3, 3) float64, optional
+        The homography from the monitor to what is looked up in its place, both from 0 to 1 across and down.
+    """
 
     def bands() -> Iterator[Planes]:
         for row, rows in enumerate(_bands(matte)):
             planes = {name: np.zeros((rows.stop - rows.start, matte.width), np.float32) for name in "RGB"}
             for block, columns in _blocks(matte, row):
                 lobes = block_lobes(matte, block, LOBES)[..., 0, :]
-                planes["R"][:, columns], planes["G"][:, columns] = lobes[..., 0], lobes[..., 1]
-                planes["B"][:, columns] = lobes[..., 2:5].any(axis=-1)
+                there = lobes[..., 2:5].any(axis=-1)
+                seen = lobes[..., :2] if place is None else _moved(lobes[..., :2], place)
+                planes["R"][:, columns], planes["G"][:, columns] = np.moveaxis(seen, -1, 0) * there
+                planes["B"][:, columns] = there
             yield planes
 
     _write(file, matte, dict.fromkeys("RGB", np.float32), bands())
+
+
+def _moved(places: NDArray[np.float32], place: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Places u, v (..., 2) by a homography of x and y, where y goes down."""
+    seen = np.stack([places[..., 0], 1 - places[..., 1], np.ones(places.shape[:-1])], axis=-1) @ place.T
+    x, y = np.moveaxis(seen[..., :2] / seen[..., 2:], -1, 0)
+    return np.stack([x, 1 - y], axis=-1)
 
 
 def everything(matte: Matte, file: IO[bytes], lobes: int = LOBES) -> None:

@@ -18,6 +18,7 @@ from services.api.mattes.progress import Progress, open_whole_frame, while_there
 from storage.errors import InvalidInput, NotFound
 from storage.layout import mattes as stored_mattes
 from storage.records import mattes
+from workflows.composite.backdrops.around import plate_of
 from workflows.composite.live import nodes
 from workflows.composite.live.encode import bytes_of_live
 from workflows.composite.live.nodes.exr import LOOKUPS, bytes_of_lookups
@@ -38,13 +39,15 @@ MEDIA_TYPES = {
     "js": "text/javascript",
     "live": "application/octet-stream",
 }
-FILES: dict[str, Callable[[stored_mattes.Matte, IO[bytes]], None]] = {
+FILES: dict[str, Callable[..., None]] = {
     f"{name}.{kind}": lambda matte, file, name=name, write=write: write(matte, name, file)
     for name in layers.NAMES
     for kind, write in (("png", layers.png), ("exr", layers.exr))
 } | {"stmap.exr": layers.stmap}
 ALL = "all.exr"
 NODES = nodes.FILES | live_module.FILES
+OF_PLATE = ("stmap.exr", "blender.py", "nuke.nk", "nuke_stmap.nk")
+"""The files that can take a plate of the frame."""
 Lobes = Annotated[
     int,
     Query(
@@ -59,6 +62,13 @@ Lookups = Annotated[
         ge=1,
         le=LOOKUPS,
         description="The most look-ups of a pixel in the files of a node; further cells are merged into these.",
+    ),
+]
+OverPlate = Annotated[
+    bool,
+    Query(
+        description=f"Make {', '.join(OF_PLATE[:-1])} or {OF_PLATE[-1]} for a plate of the frame, which the glass goes "
+        "over, in place of a picture that is stretched over the monitor. For mattes that were recovered with `cut_out`."
     ),
 ]
 MOST_CELLS = 10_000
@@ -122,6 +132,7 @@ async def get_layer(
     request: Request,
     lobes: Lobes = layers.LOBES,
     lookups: Lookups = LOOKUPS,
+    plate: OverPlate = False,
 ) -> Response:
     """A layer: `S`, `rho`, `alpha` or `confidence`, as `.png` (16 bits, linear, clipped to 0 to 1) or `.exr`;
     `stmap.exr`; `all.exr`, all layers with the lobes of each pixel; or `lookups.exr`, for a node that draws the glass,
@@ -132,10 +143,12 @@ async def get_layer(
     """
     if file not in (known := [*FILES, ALL, *NODES]):
         raise NotFound(f"there is no layer {file}; the layers are {', '.join(known)}")
+    if plate and file not in OF_PLATE:
+        raise InvalidInput(f"{file} takes no plate: only {', '.join(OF_PLATE)} do", field="plate")
 
     def headers_of(progress: Progress) -> dict[str, str]:
         # Neither a matte that is ready nor a preview ever changes.
-        headers = progress.headers | {"ETag": f'"{progress.whole_frame}-{file}-{lobes}-{lookups}"'}
+        headers = progress.headers | {"ETag": f'"{progress.whole_frame}-{file}-{lobes}-{lookups}-{plate}"'}
         # Saved and not shown: here it would be a page of the service.
         return headers | ({"Content-Disposition": "attachment"} if file.endswith(".html") else {})
 
@@ -155,17 +168,21 @@ async def get_layer(
         )
     kind = file.rpartition(".")[2]
 
-    def write(found: stored_mattes.Matte, target: IO[bytes]) -> None:
+    def write(found: stored_mattes.Matte, given: dict[str, Any], target: IO[bytes]) -> None:
         if file in NODES:
-            NODES[file](found, target, lookups)
+            NODES[file](found, target, lookups, **given)
         elif file == ALL:
             layers.everything(found, target, lobes)
         else:
-            FILES[file](found, target)
+            FILES[file](found, target, **given)
 
     def encode(now: Progress) -> Response:
         found = context.cache.matte(now.whole_frame)
-        return file_response(partial(write, found), MEDIA_TYPES[kind], headers_of(now))
+        given: dict[str, Any] = {}
+        if plate:
+            over = plate_of(context.cache.matte(id))
+            given = {"plate": over} if file in NODES else {"place": over.place}
+        return file_response(partial(write, found, given), MEDIA_TYPES[kind], headers_of(now))
 
     work = partial(while_there, context, progress, encode)
     memory = LOOK_BYTES + layers.bytes_of_band(matte, lobes)

@@ -36,6 +36,11 @@ class Matte(BaseModel):
     monitor: Pair | None = None
     columns: int | None = None
     rows: int | None = None
+    cut_out: bool | None = Field(
+        None,
+        description="Whether the object was cut out of what the frame sees, so that `fit` and `plate` know where the "
+        "monitor is in it.",
+    )
     preview: int | None = Field(
         None,
         description="While it is recovered: composites show every so many-th row and column of what is not done yet, "

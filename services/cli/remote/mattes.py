@@ -21,6 +21,8 @@ NODES = {
     "glsl": ("matte.live", "envmatte.js", "glass.html"),
 }
 """Files that make a node of a tool."""
+OF_PLATE = ("stmap.exr", "blender.py", "nuke.nk", "nuke_stmap.nk")
+"""Those that can take a plate of the frame."""
 
 
 @click.command(epilog=example("envmatte composite MATTE backdrop.png -o composite.png"))
@@ -131,14 +133,24 @@ def import_(file: Path, name: str, url: str, key: str | None, as_json: bool) -> 
     print_result(matte.answer, as_json, "id")
 
 
-@click.command(epilog=example("envmatte layers MATTE layers", "envmatte layers MATTE glass --for blender"))
+@click.command(
+    epilog=example("envmatte layers MATTE layers", "envmatte layers MATTE glass --for blender --plate")
+)
 @click.argument("matte")
 @click.argument("folder", type=click.Path(file_okay=False, path_type=Path))
 @click.option(
     "--for", "tool", type=click.Choice(list(NODES)), help="Write what makes a node of this tool instead."
 )
+@click.option(
+    "--plate",
+    is_flag=True,
+    help="Make stmap.exr, or the node, for a plate of the frame that the glass goes over, in place of a picture that "
+    "is stretched over the monitor.",
+)
 @options.remote
-def layers(matte: str, folder: Path, tool: str | None, url: str, key: str | None, as_json: bool) -> None:
+def layers(
+    matte: str, folder: Path, tool: str | None, plate: bool, url: str, key: str | None, as_json: bool
+) -> None:
     """Write the layers of a matte for other tools to FOLDER: all.exr, stmap.exr, and 16-bit PNGs.
 
     With --for they are a node that draws the glass in front of any backdrop. The files appear once all of them are
@@ -147,12 +159,14 @@ def layers(matte: str, folder: Path, tool: str | None, url: str, key: str | None
     import tempfile
 
     names = NODES[tool] if tool else LAYERS
+    if plate and not set(names) & set(OF_PLATE):
+        raise click.UsageError("--plate: web pages fit every backdrop to the frame already")
     with options.client(url, key) as client:
         client.matte(matte)  # fails before a folder is made
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as part:
             for name in names:
-                Path(part, name).write_bytes(client.layer(matte, name))
+                Path(part, name).write_bytes(client.layer(matte, name, plate=plate and name in OF_PLATE))
             folder.mkdir(exist_ok=True)
             for name in names:
                 os.replace(Path(part, name), folder / name)

@@ -114,7 +114,8 @@ def test_object_that_was_cut_out_stands_in_the_backdrop(desk: Page, service: Ser
     scene = glass_ball.glass_ball(*SIZE, monitor=(512, 384), rays=9, distance=8)
     write_capture(scene, preset("sketch", *scene.monitor), tmp_path / "ball.zip")
     job = service.client.recover(service.client.upload(tmp_path / "ball.zip"), quality="fast", cut_out=True)
-    opened(desk, service, str(service.client.wait(job["id"])["matte"]), "?backdrop=Dusk&right=0.1&scale=1.2")
+    matte = str(service.client.wait(job["id"])["matte"])
+    opened(desk, service, matte, "?backdrop=Dusk&right=0.1&scale=1.2")
 
     def aside(name: str) -> NDArray[np.float64]:
         desk.get_by_role("radio", name=name, exact=True).check()
@@ -137,6 +138,13 @@ def test_object_that_was_cut_out_stands_in_the_backdrop(desk: Page, service: Ser
     expect(desk.get_by_text("exact")).to_be_visible()
     moved = aside("Backdrop")
     assert np.sqrt(np.mean((moved[:, 24:] - bare[:, :-24]) ** 2)) < 4
+
+    desk.get_by_role("heading", name="Layers").click()
+    for plate in (True, False):
+        desk.get_by_label("for a plate of the frame").set_checked(plate)
+        with desk.expect_download() as download:
+            desk.get_by_role("button", name="nuke.nk").click()
+        assert download.value.path().read_bytes() == service.client.layer(matte, "nuke.nk", plate=plate)
 
 
 def test_without_a_mask_nothing_can_be_transparent(

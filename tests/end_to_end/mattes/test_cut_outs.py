@@ -3,11 +3,14 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
+from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion
 
+from services.client import ServiceError
 from tests.end_to_end.conftest import Service
 from tests.end_to_end.mattes.test_composites import decoded, post_composite
-from workflows.images import integer_formats
+from workflows.images import float_formats, integer_formats
 from workflows.programs.presets import preset
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import write_capture
@@ -37,6 +40,22 @@ def test_the_object_is_cut_out(service: Service, tmp_path: Path) -> None:
     np.testing.assert_array_equal(around[within], alone[within])
     assert not np.array_equal(camera[within], alone[within])
     np.testing.assert_array_equal(camera, decoded(post_composite(service, job["matte"])))
+    assert_files_take_a_plate(service, job["matte"], within)
+
+
+def assert_files_take_a_plate(service: Service, matte: str, within: NDArray[np.bool_]) -> None:
+    assert service.client.matte(matte).answer["cut_out"]
+    for name in ("blender.py", "nuke.nk", "nuke_stmap.nk"):
+        assert service.client.layer(matte, name) != service.client.layer(matte, name, plate=True)
+    monitor, plate = (
+        float_formats.decode(service.client.layer(matte, "stmap.exr", plate=plate), memory=1 << 24)
+        for plate in (False, True)
+    )
+    lit = within & (monitor[..., 2] > 0)
+    # The frame sees the monitor smaller than itself, so what lies on it is nearer together there.
+    assert (np.ptp(plate[lit, :2], axis=0) < 0.95 * np.ptp(monitor[lit, :2], axis=0)).all()
+    with pytest.raises(ServiceError, match=r"S\.png takes no plate: only stmap\.exr, blender\.py"):
+        service.client.layer(matte, "S.png", plate=True)
 
 
 def test_the_log_says_why_an_object_is_not_cut_out(service: Service, tmp_path: Path) -> None:
@@ -44,5 +63,7 @@ def test_the_log_says_why_an_object_is_not_cut_out(service: Service, tmp_path: P
     write_capture(scene, preset("sketch", *MONITOR), tmp_path / "none.zip", noise=0.5, depth=16)
     capture = service.client.upload(tmp_path / "none.zip")
     job = service.client.wait(service.client.recover(capture, quality="fast", cut_out=True)["id"])
+    with pytest.raises(ServiceError, match="recover it with cut_out"):
+        service.client.layer(job["matte"], "nuke.nk", plate=True)
     lines = [line["text"] for line in service.http.get(f"/v1/jobs/{job['id']}/log").json()["lines"]]
     assert any("the whole frame is recovered: nothing stands before the monitor" in line for line in lines)

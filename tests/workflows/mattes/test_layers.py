@@ -90,6 +90,21 @@ def test_an_identity_is_an_stmap_of_pixel_centres_from_the_bottom_left(identity:
     np.testing.assert_array_equal(channels["B"], seen)
 
 
+def test_an_stmap_of_a_plate_points_at_the_frame(identity: Matte) -> None:
+    sight = np.array([[1.6, 0.1, -0.3], [0.06, 1.7, -0.4], [0.08, -0.05, 1]])
+    channels, _ = read(lambda file: layers.stmap(identity, file, np.linalg.inv(sight)))
+    seen = channels["B"] > 0
+    y, x = np.mgrid[:30, :50]
+    frame = np.stack([channels["R"], 1 - channels["G"], np.ones_like(channels["R"])], axis=-1)
+    monitor = frame @ sight.T
+    monitor /= monitor[..., 2:]
+    np.testing.assert_allclose(monitor[seen, 0], (x[seen] + 0.5) / 50, atol=1e-6)
+    np.testing.assert_allclose(monitor[seen, 1], (y[seen] + 0.5) / 30, atol=1e-6)
+    np.testing.assert_array_equal(seen, identity.layer("count").any(axis=2))
+    assert not channels["R"][~seen].any()
+    assert not channels["G"][~seen].any()
+
+
 @pytest.mark.parametrize("name", layers.NAMES)
 def test_single_layers_equal_the_data_of_the_matte(identity: Matte, name: str) -> None:
     held = {

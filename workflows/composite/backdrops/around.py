@@ -1,8 +1,11 @@
 """The backdrop around the glass: what was left out of a matte shows it, as the camera would see it there."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
+from storage.errors import Conflict
 from storage.layout.mattes import Matte
 from workflows.composite.backdrops.backdrop import Backdrop, frame_light
 from workflows.composite.backdrops.placement import Placement
@@ -54,6 +57,45 @@ def exposure(matte: Matte) -> NDArray[np.float64]:
     """
     beside = matte.attributes.get("beside")
     return np.linalg.inv(np.array(matte.attributes["crosstalk"]) * beside["rho"]) if beside else np.eye(3)
+
+
+class Plate(NamedTuple):
+    """How a plate of the frame, what the camera would see without the glass, stands for the backdrop.
+
+    Attributes
+    ----------
+    place : (3, 3) float64
+        The homography from the monitor to the frame, both from 0 to 1 across and down.
+    exposure : (3, 3) float64
+        See `exposure`.
+    """
+
+    place: NDArray[np.float64]
+    exposure: NDArray[np.float64]
+
+
+def plate_of(matte: Matte) -> Plate:
+    """How a plate of a matte's frame stands for the backdrop.
+
+    Raises
+    ------
+    Conflict
+        If it is not known where the frame's pixels look beside the object, or the frame sees too little of the monitor.
+    """
+    if "beside" not in matte.attributes:
+        raise Conflict(
+            "where this matte's camera looks beside the object is not known, so it can't take a plate of the frame: "
+            "recover it with cut_out from a capture without a mask, with some of the bare monitor in the frame"
+        )
+    place = np.linalg.inv(np.array(matte.attributes["beside"]["sight"]))
+    try:
+        corners(place)
+    except ValueError:
+        raise Conflict(
+            "the frame sees too little of the monitor, or too much from the side, to show it a plate: film it with "
+            "more of the monitor in the frame"
+        ) from None
+    return Plate(place, exposure(matte))
 
 
 def expose(matte: Matte, picture: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -5,6 +5,7 @@ import { t } from "../lib/words.js";
 
 const FIRST = "rho";
 const LAYERS = ["S", "rho", "alpha", "confidence"];
+const OF_PLATE = ["stmap.exr", "blender.py", "nuke.nk", "nuke_stmap.nk"];
 
 const altOf = (name) => t("layer.name", { name: t(`layer.label.${name}`) });
 
@@ -28,11 +29,16 @@ export function layers(matte, signal) {
 	});
 	const names = h("fieldset.row", h("legend", t("layer")), LAYERS.map((name) =>
 		h("label.choice", h("input", { type: "radio", name: "layer", checked: name === FIRST, onchange: () => choose(name) }), t(`layer.label.${name}`))));
-	const file = (name) => button(name, problem, () => save(`v1/mattes/${matte.id}/layers/${name}`, name));
+	const plate = h("input", { type: "checkbox", checked: true });
+	const file = (name) => button(name, problem, () => {
+		const query = matte.cut_out && plate.checked && OF_PLATE.includes(name) ? "?plate=true" : "";
+		return save(`v1/mattes/${matte.id}/layers/${name}${query}`, name);
+	});
 	const files = ["all.exr", "stmap.exr"].map(file);
 	const nodes = ["lookups.exr", "blender.py", "nuke.nk", "nuke_stmap.nk"].map(file);
 	const panel = h("details.panel", h("summary", h("h2", t("layers"))),
-		h("div.stack", names, frame, about, h("p.row", t("layers.tools"), files), h("p.row", t("layers.nodes"), nodes), problem));
+		h("div.stack", names, frame, about, h("p.row", t("layers.tools"), files), h("p.row", t("layers.nodes"), nodes),
+			matte.cut_out && h("label.choice", plate, t("layers.plate")), problem));
 	panel.addEventListener("toggle", () => image.hidden && choose(FIRST), { once: true });
 	return panel;
 }

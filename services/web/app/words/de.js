@@ -185,6 +185,7 @@ export const de = {
 	"layer.rho": "Durchlässigkeit: wie viel vom Licht des Monitors durchkommt, für jede Farbe.",
 	"layers": "Ebenen",
 	"layers.nodes": "Als Knoten für Blender oder Nuke, neben lookups.exr:",
+	"layers.plate": "Knoten und stmap.exr für ein Bild des ganzen Ausschnitts, über das das Glas kommt, nicht für eines anstelle des Monitors",
 	"layers.tools": "Für andere Programme:",
 	"list.all": "Alle Zustände",
 	"list.choose": "{name} auswählen",

@@ -185,6 +185,7 @@ export const en = {
 	"layer.rho": "Transparency: how much of the monitor’s light comes through, for each colour.",
 	"layers": "Layers",
 	"layers.nodes": "As a node of Blender or Nuke, beside lookups.exr:",
+	"layers.plate": "Make nodes and stmap.exr for a plate of the frame, which the glass goes over, not for a picture in the monitor’s place",
 	"layers.tools": "For other tools:",
 	"list.all": "All states",
 	"list.choose": "Choose {name}",

@@ -5,10 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from storage.errors import Conflict
 from storage.layout import mattes
 from storage.layout.mattes import Matte
 from storage.objects.store import Objects
-from workflows.composite.backdrops.around import expose, over_frame, put_around
+from workflows.composite.backdrops.around import expose, over_frame, plate_of, put_around
 from workflows.composite.backdrops.backdrop import Backdrop
 from workflows.composite.backdrops.placement import Placement
 from workflows.composite.engine import Window
@@ -120,3 +121,15 @@ def test_whole_glass_is_left_as_it_is(matte: Matte) -> None:
     picture = np.ones((HEIGHT, WIDTH, 4), np.float32)
     nothing = Backdrop(np.zeros((2, 2, 3), np.float32))
     assert put_around(matte, nothing, None, picture, WHOLE) is picture
+
+
+def test_a_plate_needs_to_know_where_the_frame_sees_the_monitor(matte: Matte, objects: Objects) -> None:
+    with pytest.raises(Conflict, match="recover it with cut_out"):
+        plate_of(matte)
+    beside = {"sight": LARGER, "rho": [0.5, 0.5, 0.5]}
+    plate = plate_of(make(objects, crosstalk=np.eye(3).tolist(), beside=beside))
+    np.testing.assert_allclose(plate.place @ LARGER, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(plate.exposure, 2 * np.eye(3))
+    tiny = [[1 / 30, 0, 0], [0, 1 / 30, 0], [0, 0, 1]]
+    with pytest.raises(Conflict, match="too little of the monitor"):
+        plate_of(make(objects, beside={"sight": tiny, "rho": [1, 1, 1]}))

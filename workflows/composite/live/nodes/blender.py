@@ -5,6 +5,7 @@ from pprint import pformat
 from typing import IO
 
 from storage.layout.mattes import Matte
+from workflows.composite.backdrops.around import Plate
 from workflows.recovery.pyramid import Pyramid
 
 NAME = "envmatte glass"
@@ -13,7 +14,7 @@ _SCRIPT = Path(__file__).with_name("files") / "blender.py"
 _PLACE = "MATTE: dict[str, Any] = {}\n"
 
 
-def write_blender(matte: Matte, file: IO[bytes], lookups: int) -> None:
+def write_blender(matte: Matte, file: IO[bytes], lookups: int, plate: Plate | None = None) -> None:
     """Write the script.
 
     Parameters
@@ -22,6 +23,8 @@ def write_blender(matte: Matte, file: IO[bytes], lookups: int) -> None:
     file : IO[bytes]
     lookups : int
         Of a pixel, in the EXR that lies beside it.
+    plate : Plate, optional
+        Makes nodes that take a plate of the frame.
     """
     figures = {
         "name": NAME,
@@ -29,6 +32,7 @@ def write_blender(matte: Matte, file: IO[bytes], lookups: int) -> None:
         "levels": Pyramid.over(matte.columns, matte.rows).grids,
         "lookups": lookups,
         "crosstalk": matte.attributes["crosstalk"],
+        "plate": plate and {name: value.tolist() for name, value in plate._asdict().items()},
     }
     before, _, after = _SCRIPT.read_text().partition(_PLACE)
     file.write(f"{before}MATTE: dict[str, Any] = {pformat(figures, width=100)}\n{after}".encode())

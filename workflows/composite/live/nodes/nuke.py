@@ -5,7 +5,11 @@ from pathlib import Path
 from string import Template
 from typing import IO, Any
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from storage.layout.mattes import Matte
+from workflows.composite.backdrops.around import Plate
 from workflows.recovery.pyramid import Pyramid
 
 NAME = "envmatte_glass"
@@ -15,7 +19,7 @@ _ESCAPED = str.maketrans({c: f"\\{c}" for c in '\\"{}[]$'} | {"\n": "\\n", "\t":
 Level = dict[str, int]
 
 
-def write_nuke(matte: Matte, file: IO[bytes], lookups: int) -> None:
+def write_nuke(matte: Matte, file: IO[bytes], lookups: int, plate: Plate | None = None) -> None:
     """Write the group.
 
     Parameters
@@ -24,6 +28,8 @@ def write_nuke(matte: Matte, file: IO[bytes], lookups: int) -> None:
     file : IO[bytes]
     lookups : int
         Of a pixel, in the EXR that lies beside it.
+    plate : Plate, optional
+        Makes nodes that take a plate of the frame.
     """
     levels = _levels(matte)
     first = levels[0]
@@ -32,7 +38,7 @@ def write_nuke(matte: Matte, file: IO[bytes], lookups: int) -> None:
         max(one["bottom"] + one["rows"] for one in levels),
     )
     nodes = Nodes()
-    backdrop, held = nodes.sources()
+    backdrop, held = nodes.sources(matte, plate)
     light = nodes.add("Constant", name="canvas", format=_format(canvas))
     light = nodes.blink("cells", "cells", (light, backdrop), columns=first["columns"], rows=first["rows"])
     for n, (fine, coarse) in enumerate(pairwise(levels), start=1):
@@ -43,7 +49,7 @@ def write_nuke(matte: Matte, file: IO[bytes], lookups: int) -> None:
         of_lookup = (nodes.layer(held, f"lookup{k}"), nodes.layer(held, f"weight{k}"), arrived, light)
         sizes = {"columns": first["columns"], "rows": first["rows"], "levels": len(levels)}
         arrived = nodes.blink(f"add{k}", "lookup", of_lookup, **sizes)
-    nodes.finish(matte, held, arrived)
+    nodes.finish(matte, held, arrived, plate)
     file.write(nodes.text(NAME).encode())
 
 
@@ -61,6 +67,12 @@ def _levels(matte: Matte) -> list[Level]:
 def _format(size: tuple[int, int]) -> str:
     width, height = size
     return f'"{width} {height} 0 0 {width} {height} 1 envmatte_{width}x{height}"'
+
+
+def _matrix(rows: ArrayLike) -> str:
+    """A matrix as the value of a knob."""
+    written = " ".join("{" + " ".join(f"{value:.9g}" for value in row) + "}" for row in np.asarray(rows))
+    return f"{{{written}}}"
 
 
 def _quoted(text: str) -> str:
@@ -95,22 +107,36 @@ class Nodes:
         """Add the sum of two nodes, the first of which may be missing."""
         return self.add("Merge2", (one, other), name=name, operation="plus") if one else other
 
-    def sources(self) -> tuple[str, str]:
+    def sources(self, matte: Matte, plate: Plate | None) -> tuple[str, str]:
         """Add the backdrop, up to the edges of its format and repeated beyond them, and the EXR."""
         backdrop = self.add("Input", name="backdrop")
         box = "{0 0 {input.width} {input.height}}"
         backdrop = self.add("Crop", (backdrop,), name="whole", box=box, crop="false")
+        if plate:
+            backdrop = self._shown(backdrop, matte.attributes["monitor"], plate)
         exr = _quoted("[file dirname [value root.name]]/lookups.exr")
         return backdrop, self.add("Read", name="lookups", file=exr, raw="true")
 
-    def finish(self, matte: Matte, held: str, arrived: str) -> None:
+    def _shown(self, backdrop: str, monitor: tuple[int, int], plate: Plate) -> str:
+        """Add what shows the monitor a plate of the frame, by the perspective of the camera."""
+        wide, high = monitor
+        to_shares = [[1 / wide, 0, 0.5 / wide], [0, -1 / high, 1 - 0.5 / high], [0, 0, 1]]
+        across, down, depth = (
+            f"({a:.9g}*x+{b:.9g}*y+{c:.9g})" for a, b, c in plate.place @ np.array(to_shares)
+        )
+        u, v = f'"clamp({across}/{depth},0,1)"', f'"clamp(1-{down}/{depth},0,1)"'
+        canvas = self.add("Constant", name="monitor", format=_format((wide, high)))
+        place = self.add("Expression", (canvas,), name="where", expr0=u, expr1=v)
+        return self.add("STMap", (backdrop, place), name="shown", channels="rgb", uv="rgb", filter="Cubic")
+
+    def finish(self, matte: Matte, held: str, arrived: str, plate: Plate | None) -> None:
         """Add what makes the glass of the light that arrives, and the group's output."""
         through = self.add("Merge2", (arrived, self.layer(held, "rho")), name="through", operation="multiply")
-        matrix = " ".join(
-            "{" + " ".join(f"{value:.9g}" for value in row) + "}" for row in matte.attributes["crosstalk"]
-        )
-        mixed = self.add("ColorMatrix", (through,), name="crosstalk", matrix=f"{{{matrix}}}")
+        matrix = _matrix(matte.attributes["crosstalk"])
+        mixed = self.add("ColorMatrix", (through,), name="crosstalk", matrix=matrix)
         seen = self.add("Merge2", (mixed, self.layer(held, "S")), name="glass", operation="plus")
+        if plate:
+            seen = self.add("ColorMatrix", (seen,), name="exposed", matrix=_matrix(plate.exposure))
         whole = self.add("Copy", (seen, held), name="alpha", from0="rgba.alpha", to0="rgba.alpha")
         size = f"{{0 0 {matte.width} {matte.height}}}"
         self.add("Output", (self.add("Crop", (whole,), name="frame", box=size),), name="image")

@@ -7,6 +7,7 @@ levels are, so it is an approximation of it.
 from typing import IO
 
 from storage.layout.mattes import Matte
+from workflows.composite.backdrops.around import Plate
 from workflows.composite.live.nodes.nuke import Nodes
 from workflows.recovery.pyramid import Pyramid
 
@@ -16,7 +17,7 @@ SIZE = 2.4
 """The size of a Gaussian of Blur, in its standard deviations."""
 
 
-def write_nuke_stmap(matte: Matte, file: IO[bytes], lookups: int) -> None:
+def write_nuke_stmap(matte: Matte, file: IO[bytes], lookups: int, plate: Plate | None = None) -> None:
     """Write the group.
 
     Parameters
@@ -25,9 +26,11 @@ def write_nuke_stmap(matte: Matte, file: IO[bytes], lookups: int) -> None:
     file : IO[bytes]
     lookups : int
         Of a pixel, in the EXR that lies beside it.
+    plate : Plate, optional
+        Makes nodes that take a plate of the frame.
     """
     nodes = Nodes()
-    backdrop, held = nodes.sources()
+    backdrop, held = nodes.sources(matte, plate)
     levels = []
     for n in range(len(Pyramid.over(matte.columns, matte.rows).grids)):
         sides = _size(n, "width", matte.columns), _size(n, "height", matte.rows)
@@ -49,7 +52,7 @@ def write_nuke_stmap(matte: Matte, file: IO[bytes], lookups: int) -> None:
         lit = nodes.add("Merge2", (weight, seen), name=f"lit{k}", operation="multiply")
         arrived = nodes.plus(f"add{k}", arrived, lit)
     assert arrived is not None
-    nodes.finish(matte, held, arrived)
+    nodes.finish(matte, held, arrived, plate)
     file.write(nodes.text(NAME).encode())
 
 

@@ -3,6 +3,7 @@
 import io
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
@@ -31,13 +32,17 @@ SIZE = 96, 72
 Image = NDArray[np.float32]
 
 
-def few_nodes(objects: Objects, most: int) -> Matte:
+BESIDE = {"sight": [[1.6, 0.1, -0.3], [0.06, 1.7, -0.4], [0.08, -0.05, 1]], "rho": [0.8, 0.7, 0.6]}
+"""A camera that sees more than the monitor, a little from the side."""
+
+
+def few_nodes(objects: Objects, most: int, **attributes: Any) -> Matte:
     """A matte with a few nodes of T in each pixel, which lookups hold exactly."""
     height, width, columns, rows = 20, 35, 75, 37
     rng = np.random.default_rng(0)
     nodes = Pyramid.over(columns, rows).nodes
     sizes = {"height": height, "width": width, "columns": columns, "rows": rows}
-    made = mattes.create(objects, "few", **sizes, monitor=[150, 74], crosstalk=CROSSTALK)
+    made = mattes.create(objects, "few", **sizes, monitor=[150, 74], crosstalk=CROSSTALK, **attributes)
     for at in np.ndindex(made.block_rows, made.block_columns):
         shape = tuple(part.stop - part.start for part in made.span(*at))
         recovered = rng.random(shape) < 0.8
@@ -83,6 +88,22 @@ def backdrops() -> dict[str, Image]:
         "checker": np.repeat(((x // 20 + y // 20) % 2)[..., np.newaxis], 3, axis=-1),
     }
     return {name: np.ascontiguousarray(picture, np.float32) for name, picture in pictures.items()}
+
+
+def plate_and_backdrop(matte: Matte) -> tuple[Image, Image]:
+    """What the frame would see without the glass, four times as fine as the matte, and what the monitor would show."""
+
+    def light(places: NDArray[np.float64]) -> Image:
+        x, y = np.moveaxis(places, -1, 0)
+        bands = [0.5 + 0.3 * np.sin(5 * x + k) + 0.15 * np.cos(4 * y - 2 * k) for k in range(3)]
+        return np.stack(bands, axis=-1).astype(np.float32)
+
+    def pixels(width: int, height: int) -> NDArray[np.float64]:
+        return np.stack(np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height), -1)
+
+    frame = pixels(4 * matte.width, 4 * matte.height)
+    seen = np.concatenate([frame, np.ones_like(frame[..., :1])], axis=-1) @ np.transpose(BESIDE["sight"])
+    return light(seen[..., :2] / seen[..., 2:]), light(pixels(*matte.attributes["monitor"]))
 
 
 def _photo(width: int, height: int, rng: np.random.Generator) -> NDArray[np.float64]:

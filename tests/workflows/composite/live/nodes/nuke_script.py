@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 Image = NDArray[np.float32]
 CLASSES = {
@@ -20,6 +20,7 @@ CLASSES = {
     "Shuffle": 1,
     "BlinkScript": None,
     "Blur": 1,
+    "Expression": 1,
     "STMap": 2,
     "Merge2": 2,
     "MergeExpression": 2,
@@ -123,9 +124,20 @@ def _run(
             return np.asarray(gaussian_filter(image, (down, across, 0), mode="nearest"))
         case "STMap":
             source, places = (np.asarray(one) for one in of)
-            assert (node.knobs["uv"], node.knobs["filter"]) == ("rgb", "Impulse")
-            u, v = np.clip(places[..., 0], 0, 1 - 1e-7), np.clip(places[..., 1], 0, 1 - 1e-7)
-            return source[(v * source.shape[0]).astype(int), (u * source.shape[1]).astype(int)]
+            assert node.knobs["uv"] == "rgb"
+            v, u = (places[..., c] * source.shape[1 - c] - 0.5 for c in (1, 0))
+            order = {"Impulse": 0, "Cubic": 3}[node.knobs["filter"]]
+            planes = [
+                map_coordinates(plane, (v, u), order=order, mode="nearest")
+                for plane in np.moveaxis(source, -1, 0)
+            ]
+            return np.stack(planes, axis=-1)
+        case "Expression":
+            (image,) = (np.array(one) for one in of)
+            y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+            for c in range(2):
+                image[..., c] = _value(node.knobs[f"expr{c}"].strip('"'), {"x": x, "y": y})
+            return image
         case "MergeExpression":
             below, above = (np.asarray(one) for one in of)
             known = {f"B{c}": below[..., n] for n, c in enumerate("rgb")}
@@ -152,7 +164,7 @@ def _run(
 
 def _value(expression: str, known: dict[str, Any]) -> Any:
     """The value of an expression of Nuke's; these are also Python."""
-    functions = {"abs": np.abs, "max": np.maximum, "sqrt": np.sqrt, "pow": np.power}
+    functions = {"abs": np.abs, "max": np.maximum, "sqrt": np.sqrt, "pow": np.power, "clamp": np.clip}
     return eval(expression, {"__builtins__": {}}, functions | known)
 
 

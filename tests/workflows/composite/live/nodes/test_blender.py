@@ -11,16 +11,19 @@ import pytest
 from storage.layout.mattes import Matte
 from storage.objects.store import Objects
 from tests.workflows.composite.live.nodes.drawing import (
+    BESIDE,
     Image,
     backdrops,
     draw,
     few_nodes,
+    plate_and_backdrop,
     psnr,
     read_channels,
     recovered,
     write_picture,
 )
 from workflows.composite import composite
+from workflows.composite.backdrops.around import Plate, expose, plate_of
 from workflows.composite.live.nodes.blender import write_blender
 from workflows.composite.live.nodes.exr import LOOKUPS, write_lookups
 
@@ -32,10 +35,11 @@ BARS = {"photo": 45, "strokes": 45, "ramp": 45, "checker": 40, "tiles": 40}
 """PSNR of the nodes against the service's composite, at least."""
 
 
-def write_nodes(matte: Matte, folder: Path, lookups: int) -> None:
-    for name, write in (("lookups.exr", write_lookups), ("blender.py", write_blender)):
-        with (folder / name).open("wb") as file:
-            write(matte, file, lookups)
+def write_nodes(matte: Matte, folder: Path, lookups: int, plate: Plate | None = None) -> None:
+    with (folder / "lookups.exr").open("wb") as file:
+        write_lookups(matte, file, lookups)
+    with (folder / "blender.py").open("wb") as file:
+        write_blender(matte, file, lookups, plate)
 
 
 def render(folder: Path, backdrop: Image, *more: str) -> Image:
@@ -76,6 +80,21 @@ def test_backdrop_of_any_size_is_averaged_over_the_cells(objects: Objects, tmp_p
     backdrop = np.stack([x / 200, y / 90, 0.5 + 0.4 * np.sin(x / 20)], axis=-1).astype(np.float32)
     expected = composite(matte, backdrop)
     assert psnr(render(tmp_path, backdrop), expected, expected[..., 3] > 0) > 50
+
+
+@needs_blender
+@pytest.mark.parametrize("material", [False, True])
+def test_a_plate_of_the_frame_is_what_the_monitor_shows(
+    objects: Objects, tmp_path: Path, material: bool
+) -> None:
+    matte = few_nodes(objects, 3, beside=BESIDE)
+    write_nodes(matte, tmp_path, 3, plate_of(matte))
+    plate, backdrop = plate_and_backdrop(matte)
+    size = matte.width, matte.height
+    seen = render_material(tmp_path, size, plate) if material else render(tmp_path, plate)
+    expected = expose(matte, composite(matte, backdrop))
+    np.testing.assert_array_equal(seen[..., 3], expected[..., 3])
+    assert psnr(seen, expected, expected[..., 3] > 0) > 50
 
 
 TEXT_EDITOR = """

@@ -9,27 +9,31 @@ import pytest
 from storage.layout.mattes import Matte
 from storage.objects.store import Objects
 from tests.workflows.composite.live.nodes.drawing import (
+    BESIDE,
     backdrops,
     draw,
     few_nodes,
+    plate_and_backdrop,
     psnr,
     read_channels,
     recovered,
 )
 from tests.workflows.composite.live.nodes.nuke_script import CLASSES, Node, parse, run
 from workflows.composite import composite
+from workflows.composite.backdrops.around import Plate, expose, plate_of
 from workflows.composite.live.nodes import FILES
-from workflows.composite.live.nodes.exr import LOOKUPS
+from workflows.composite.live.nodes.exr import LOOKUPS, write_lookups
 
 needs_compiler = pytest.mark.skipif(
     shutil.which("g++") is None, reason="g++, which runs the kernels, is not installed"
 )
 
 
-def written(matte: Matte, folder: Path, lookups: int, script: str = "nuke.nk") -> str:
-    for name in ("lookups.exr", script):
-        with (folder / name).open("wb") as file:
-            FILES[name](matte, file, lookups)
+def written(matte: Matte, folder: Path, lookups: int, script: str = "nuke.nk", **plate: Plate) -> str:
+    with (folder / "lookups.exr").open("wb") as file:
+        write_lookups(matte, file, lookups)
+    with (folder / script).open("wb") as file:
+        FILES[script](matte, file, lookups, **plate)
     return (folder / script).read_text()
 
 
@@ -80,6 +84,22 @@ def test_kernels_draw_the_composite_where_lookups_suffice(objects: Objects, tmp_
     seen = run(nodes, backdrop, channels, tmp_path)
     np.testing.assert_allclose(seen, composite(matte, backdrop), atol=1e-3)  # half floats
     np.testing.assert_allclose(seen[..., :3], draw(tmp_path / "lookups.exr", backdrop), atol=2e-5)
+
+
+@needs_compiler
+@pytest.mark.parametrize(("script", "least"), [("nuke.nk", 50), ("nuke_stmap.nk", 38)])
+def test_a_plate_of_the_frame_is_what_the_monitor_shows(
+    objects: Objects, tmp_path: Path, script: str, least: float
+) -> None:
+    matte = few_nodes(objects, 3, beside=BESIDE)
+    _, nodes = parse(written(matte, tmp_path, 3, script, plate=plate_of(matte)))
+    channels, _ = read_channels(tmp_path / "lookups.exr")
+    plate, backdrop = plate_and_backdrop(matte)
+    opaque = np.concatenate([plate, np.ones_like(plate[..., :1])], axis=-1)
+    expected = expose(matte, composite(matte, backdrop))
+    seen = run(nodes, opaque, channels, tmp_path)
+    np.testing.assert_array_equal(seen[..., 3], expected[..., 3])
+    assert psnr(seen, expected, expected[..., 3] > 0) > least
 
 
 def test_nodes_without_kernels(objects: Objects, tmp_path: Path) -> None:

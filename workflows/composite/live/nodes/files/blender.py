@@ -2,7 +2,8 @@
 
 Keep this file beside `lookups.exr`. In Blender, open it in the text editor and run it: the compositor gets a group of
 nodes. Connect any linear picture, clip or render to its input, and the output to what it leads to. The backdrop
-stretches over the monitor that the glass was filmed before. Or without a window::
+stretches over the monitor that the glass was filmed before, unless the node was made for a plate of the frame: that is
+what the glass goes over. Or without a window::
 
     blender -b -P blender.py -- --backdrop sky.exr --output glass.exr --save glass.blend
 
@@ -86,6 +87,16 @@ class Nodes:
         return self.tree
 
 
+def grid(nodes: Nodes, size: tuple[int, int]) -> tuple[Value, Value]:
+    """u and v of the pixels of a picture of a size."""
+    name = f"envmatte {size[0]} x {size[1]}"
+    picture = bpy.data.images.get(name) or bpy.data.images.new(name, *size)
+    picture.use_fake_user = True
+    normalised = nodes.add("ImageCoordinates", nodes.add("Image", image=picture)[0])[1]
+    u, v, _ = nodes.add("SeparateXYZ", normalised)
+    return u, v
+
+
 def resampled(
     nodes: Nodes, light: Value, size: tuple[int, int], axis: int, places: list[tuple[Any, float]]
 ) -> Value:
@@ -93,11 +104,7 @@ def resampled(
 
     A place is a function of the column or row, counted from the top left: it returns the coordinate from 0 to 1.
     """
-    name = f"envmatte {size[0]} x {size[1]}"
-    grid = bpy.data.images.get(name) or bpy.data.images.new(name, *size)
-    grid.use_fake_user = True
-    normalised = nodes.add("ImageCoordinates", nodes.add("Image", image=grid)[0])[1]
-    u, v, _ = nodes.add("SeparateXYZ", normalised)
+    u, v = grid(nodes, size)
     along = u if axis == 0 else nodes.math("SUBTRACT", 1.0, v)
     number = nodes.math("FLOOR", nodes.math("MULTIPLY", along, float(size[axis])))
     total = None
@@ -149,25 +156,60 @@ def next_level(fine: tuple[int, int], coarse: tuple[int, int]) -> Any:
     return nodes.finish(resampled(nodes, light, coarse, 1, places(fine[1])))
 
 
-def bilinear(level: int, size: tuple[int, int]) -> Any:
-    """A group that looks up places in a level: x and y, in cells of the first one, from its top left."""
-    nodes = Nodes(f"envmatte look-up in level {level}", [("Image", "Color"), ("x", "Float"), ("y", "Float")])
-    light = nodes.inputs[0]
+def between_pixels(nodes: Nodes, light: Value, places: Sequence[Value], counts: Sequence[Value]) -> Value:
+    """What `light` shows at places across and down, in pixels from the centre of its top left one; bilinear."""
     coordinates, shares = [], []
-    for place, count in zip((nodes.inputs[1], nodes.inputs[2]), size, strict=True):
-        at = nodes.between(nodes.math("MULTIPLY_ADD", place, 0.5**level, -0.5), 0.0, count - 1.0)
+    for place, count in zip(places, counts, strict=True):
+        last = nodes.math("SUBTRACT", count, 1.0)
+        at = nodes.between(place, 0.0, last)
         first = nodes.math("FLOOR", at)
-        second = nodes.math("MINIMUM", nodes.math("ADD", first, 1.0), count - 1.0)
+        second = nodes.math("MINIMUM", nodes.math("ADD", first, 1.0), last)
         shares.append(nodes.math("SUBTRACT", at, first))
-        coordinates.append(
-            [nodes.math("DIVIDE", nodes.math("ADD", n, 0.5), float(count)) for n in (first, second)]
-        )
+        coordinates.append([nodes.math("DIVIDE", nodes.math("ADD", n, 0.5), count) for n in (first, second)])
     up = [nodes.math("SUBTRACT", 1.0, down) for down in coordinates[1]]
     rows = [
         nodes.mix("MIX", shares[0], *(nodes.look_up(light, across, v) for across in coordinates[0]))
         for v in up
     ]
-    return nodes.finish(nodes.mix("MIX", shares[1], *rows))
+    return nodes.mix("MIX", shares[1], *rows)
+
+
+def bilinear(level: int, size: tuple[int, int]) -> Any:
+    """A group that looks up places in a level: x and y, in cells of the first one, from its top left."""
+    nodes = Nodes(f"envmatte look-up in level {level}", [("Image", "Color"), ("x", "Float"), ("y", "Float")])
+    light, x, y = nodes.inputs[0], nodes.inputs[1], nodes.inputs[2]
+    places = [nodes.math("MULTIPLY_ADD", place, 0.5**level, -0.5) for place in (x, y)]
+    return nodes.finish(between_pixels(nodes, light, places, [float(count) for count in size]))
+
+
+def levels_of(taps: int) -> list[Any]:
+    """Groups that make the levels of the backdrop, each of the one before, the first of the backdrop."""
+    sizes = MATTE["levels"]
+    first = first_level(sizes[0], taps)
+    if MATTE["plate"]:
+        first = of_plate(first, (sizes[0][0] * taps, sizes[0][1] * taps))
+    return [first, *(next_level(*pair) for pair in pairwise(sizes))]
+
+
+def of_plate(first: Any, size: tuple[int, int]) -> Any:
+    """A group that shows the monitor a plate of the frame, by the perspective of the camera, and makes its first level.
+
+    Beyond the plate's edges it goes on as there.
+    """
+    nodes = Nodes("envmatte plate", [("Image", "Color")])
+    light = nodes.inputs[0]
+    u, v = grid(nodes, size)
+    y = nodes.math("SUBTRACT", 1.0, v)
+    across, down, depth = (
+        nodes.math("ADD", nodes.math("MULTIPLY_ADD", u, of_x, one), nodes.math("MULTIPLY", y, of_y))
+        for of_x, of_y, one in MATTE["plate"]["place"]
+    )
+    counts = nodes.add("SeparateXYZ", nodes.add("ImageInfo", light)["Dimensions"])
+    places = [
+        nodes.math("MULTIPLY_ADD", nodes.math("DIVIDE", value, depth), count, -0.5)
+        for value, count in zip((across, down), counts, strict=False)
+    ]
+    return nodes.finish(nodes.group(first, between_pixels(nodes, light, places, list(counts)[:2])))
 
 
 def glass(exr: Path, taps: int) -> Any:
@@ -177,9 +219,10 @@ def glass(exr: Path, taps: int) -> Any:
     nodes = Nodes(MATTE["name"], [("Backdrop", "Color")])
     held = bpy.data.images.load(str(exr), check_existing=True)
     layers = nodes.add("Image", image=held)
-    pyramid = [nodes.group(first_level(levels[0], taps), nodes.inputs[0])]
-    for fine, coarse in pairwise(levels):
-        pyramid.append(nodes.group(next_level(fine, coarse), pyramid[-1]))
+    light, pyramid = nodes.inputs[0], []
+    for level_group in levels_of(taps):
+        light = nodes.group(level_group, light)
+        pyramid.append(light)
     samplers = [bilinear(level, size) for level, size in enumerate(levels)]
     arrived = (0.0, 0.0, 0.0, 1.0)
     for k in range(MATTE["lookups"]):
@@ -192,17 +235,26 @@ def glass(exr: Path, taps: int) -> Any:
             weight = nodes.mix("MULTIPLY", 1.0, layers[f"weight{k}"], share)
             seen = nodes.mix("MULTIPLY", 1.0, weight, nodes.group(samplers[n], light, x, y))
             arrived = nodes.mix("ADD", 1.0, arrived, seen)
-    result = crossed(nodes, nodes.mix("MULTIPLY", 1.0, layers["rho"], arrived), layers["S"])
+    result = seen_by_camera(nodes, nodes.mix("MULTIPLY", 1.0, layers["rho"], arrived), layers["S"])
     return nodes.finish(nodes.add("SetAlpha", result, layers["Alpha"], mode="REPLACE_ALPHA")[0])
 
 
-def crossed(nodes: Nodes, through: Value, result: Value) -> Value:
-    """What comes through, as the camera tells its colours apart, on top of the light that the glass adds."""
-    channels = nodes.add("SeparateColor", through)
-    for channel, column in enumerate(zip(*MATTE["crosstalk"], strict=True)):
-        lit = nodes.mix("MULTIPLY", 1.0, channels[channel], (*column, 1.0))
-        result = nodes.mix("ADD", 1.0, result, lit)
-    return result
+def seen_by_camera(nodes: Nodes, through: Value, added: Value) -> Value:
+    """What comes through, as the camera tells its colours apart, with the light that the glass adds."""
+    seen = nodes.mix("ADD", 1.0, added, turned(nodes, through, MATTE["crosstalk"]))
+    return turned(nodes, seen, MATTE["plate"]["exposure"]) if MATTE["plate"] else seen
+
+
+def turned(nodes: Nodes, colour: Value, matrix: Sequence[Sequence[float]]) -> Value:
+    """The product of a matrix and a colour; by numbers, for a colour that is set has no negative ones."""
+    red, green, blue, *_ = nodes.add("SeparateColor", colour)
+    rows = [
+        nodes.math(
+            "MULTIPLY_ADD", red, a, nodes.math("MULTIPLY_ADD", green, b, nodes.math("MULTIPLY", blue, c))
+        )
+        for a, b, c in matrix
+    ]
+    return nodes.add("CombineColor", *rows)[0]
 
 
 def baked(exr: Path, backdrop: Any, taps: int) -> dict[str, Any]:
@@ -223,11 +275,7 @@ def baked(exr: Path, backdrop: Any, taps: int) -> dict[str, Any]:
     sockets = {name: layers[name] for k in numbers for name in (f"lookup{k}", f"weight{k}")}
     sockets |= {name: layers[name] for name in ("S", "rho", "Alpha")}
     light = shown("Image", image=backdrop).outputs[0]
-    trees = [
-        first_level(MATTE["levels"][0], taps),
-        *(next_level(*sizes) for sizes in pairwise(MATTE["levels"])),
-    ]
-    for n, tree in enumerate(trees):
+    for n, tree in enumerate(levels_of(taps)):
         level = shown("Group", node_tree=tree)
         links.new(light, level.inputs[0])
         sockets[f"level{n}"] = light = level.outputs[0]
@@ -279,7 +327,7 @@ def glass_shader(images: dict[str, Any]) -> Any:
         lit = nodes.mix("MULTIPLY", 1.0, nodes.texture(images[f"weight{k}"], place), seen)
         arrived = nodes.mix("ADD", 1.0, arrived, lit)
     through = nodes.mix("MULTIPLY", 1.0, nodes.texture(images["rho"], place), arrived)
-    result = crossed(nodes, through, nodes.texture(images["S"], place))
+    result = seen_by_camera(nodes, through, nodes.texture(images["S"], place))
     return nodes.finish(result, nodes.texture(images["Alpha"], place))
 
 
