@@ -9,9 +9,9 @@ import tifffile
 from numpy.typing import NDArray
 
 from storage.errors import ImageError
-from workflows.images.exr_writer import write_exr
 from workflows.images.integer_formats import LOSSLESS, PLAIN, check_tiles, orientation
 from workflows.images.orientation import upright
+from workflows.images.writers.exr import write_exr
 from workflows.untrusted import tiff_lzw
 from workflows.untrusted.limits import check_size
 

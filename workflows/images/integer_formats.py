@@ -13,7 +13,7 @@ from PIL import Image, JpegImagePlugin
 from storage.errors import ImageError
 from workflows.images import heif, web_formats
 from workflows.images.orientation import ORIENTATION, inverse, upright
-from workflows.images.png_writer import write_png
+from workflows.images.writers.png import write_png
 from workflows.untrusted import tiff_lzw
 from workflows.untrusted.limits import check_size
 

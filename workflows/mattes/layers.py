@@ -51,10 +51,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.layout.mattes import Block, Matte
-from workflows.images.exr_writer import Types, write_exr
 from workflows.images.float_formats import REC_709
 from workflows.images.integer_formats import to_integers
-from workflows.images.png_writer import write_png
+from workflows.images.writers.exr import Types, write_exr
+from workflows.images.writers.png import write_png
 from workflows.interruption import checkpoint
 from workflows.mattes.lobes import block_lobes
 from workflows.recovery.clusters.lobe_table import FIELDS

@@ -91,9 +91,13 @@ def recover(
 @click.argument("job")
 @options.remote
 def status(job: str, url: str, key: str | None, as_json: bool) -> None:
-    """Show a job: its state, stage and progress."""
+    """Show a job: its state and, until it has ended, its stage and progress."""
     with options.client(url, key) as client:
-        print_result(client.job(job).answer, as_json, "state", "stage", "progress")
+        answer = client.job(job).answer
+    if as_json or answer["stage"] == answer["state"]:
+        print_result(answer, as_json, "state")
+    else:
+        click.echo(f"{answer['state']} {answer['stage']} {answer['progress']:.0%}")
 
 
 @click.command(epilog=example("envmatte wait JOB"))

@@ -330,6 +330,8 @@ def test_requests_leak_nothing(service: Service, matte: str, requests: int) -> N
     )  # other decoders may have been started
     print(f"bytes, open files and threads, every {requests // 3} requests: {sums.tolist()}")
     memory, files, threads = sums[2:].min(axis=0) - sums[:2].min(axis=0)  # what leaks does not come back
-    assert memory < 64 << 20  # blocks of 19 MB come and go with the moment of looking; backdrops would be 500 MB
+    assert (
+        memory < 64 << 20
+    )  # blocks of 19 MB come and go with the moment of looking; backdrops would be 500 MB
     assert files < 5
     assert threads < 5

@@ -113,8 +113,10 @@ def test_exit_codes_agree_between_readme_docstring_and_help() -> None:
 def test_exit_code_0_after_success() -> None:
     with scripted_server(lambda n: ok()) as (url, _):
         done = envmatte("status", "j", "--url", url)
-        assert (done.returncode, done.stdout) == (0, "running recovering 0.5\n")
+        assert (done.returncode, done.stdout) == (0, "running recovering 50%\n")
         assert json.loads(envmatte("status", "j", "--url", url, "--json").stdout) == JOB
+    with scripted_server(lambda n: ok(JOB | {"state": "failed", "stage": "failed"})) as (url, _):
+        assert envmatte("status", "j", "--url", url).stdout == "failed\n"
 
 
 def test_exit_code_1_if_refused_failed_or_not_written(tmp_path: Path) -> None:

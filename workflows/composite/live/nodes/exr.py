@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 
 from storage.layout.mattes import Block, Matte
 from workflows.composite.live.lookups import block_lookups
-from workflows.images.exr_writer import Types, write_exr
 from workflows.images.float_formats import REC_709
+from workflows.images.writers.exr import Types, write_exr
 from workflows.threads import CORES, in_parts
 
 LOOKUPS = 16

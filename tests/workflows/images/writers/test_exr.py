@@ -6,7 +6,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from workflows.images.exr_writer import LINES, write_exr
+from workflows.images.writers.exr import LINES, write_exr
 from workflows.interruption import interruptible
 
 RNG = np.random.default_rng(0)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from workflows.images.integer_formats import encode_png
-from workflows.images.png_writer import STRIP_BYTES, write_png
+from workflows.images.writers.png import STRIP_BYTES, write_png
 from workflows.interruption import interruptible
 
 RNG = np.random.default_rng(0)

@@ -1,0 +1,1 @@
+"""Pictures written band by band, so that a large one takes little memory."""
