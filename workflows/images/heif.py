@@ -10,14 +10,13 @@ import pillow_heif
 from numpy.typing import NDArray
 
 from storage.errors import ImageError
+from workflows.images.hdr import is_hdr, to_srgb
 from workflows.images.orientation import inverse, upright
 from workflows.images.tone_curves import to_light
 from workflows.untrusted.limits import check_size
 
 BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"hevm", b"hevs", b"mif1", b"msf1"})
 """What such a file calls itself in its first box (ISO/IEC 23008-12, sect. 10). The last two may hold other codecs."""
-HDR = {16: "PQ", 18: "HLG"}
-"""Transfer characteristics (ITU-T H.273, table 3) that are no tone curve of a camera."""
 NOT_WIDE = (1, 2)
 """Colour primaries (table 2 there) that are sRGB's, or not stated."""
 PROPERTIES = 10_000
@@ -56,22 +55,16 @@ def decode(data: bytes, *, memory: int, turn: int | None = None) -> NDArray[np.u
     -------
     (height, width, 1, 3 or 4) uint8 or uint16
         Upright, grey or RGB, with alpha if there is one. 10 and 12 bits are stretched to 16: their largest code becomes
-        65535.
+        65535. Codes for HDR displays are converted to sRGB.
 
     Raises
     ------
     ImageError
-        If it is damaged, too large, of another codec than HEVC, or coded for HDR displays.
+        If it is damaged, too large, or of another codec than HEVC.
     """
     picture = _opened(data)
-    curve = HDR.get(_info(picture).get("nclx_profile", {}).get("transfer_characteristics", 0))
-    if curve is not None:
-        raise ImageError(
-            f"this HEIF is coded for HDR displays ({curve}): switch HDR off in the camera, or convert it to TIFF of 16 "
-            "bits with the curve of sRGB"
-        )
     name, _, depth = picture.mode.partition(";")
-    deep = bool(depth)
+    deep, stated = bool(depth), _info(picture).get("nclx_profile") or {}
     check_size(*picture.size, (2 if deep else 1) * (1 if name in ("L", "I") else len(name)), memory)
     try:
         pixels = np.asarray(picture)
@@ -84,6 +77,9 @@ def decode(data: bytes, *, memory: int, turn: int | None = None) -> NDArray[np.u
     if deep:
         bits = int(_info(picture)["bit_depth"])
         pixels = (pixels << (16 - bits)) | (pixels >> (2 * bits - 16))
+    if is_hdr(stated.get("transfer_characteristics", 0)) and pixels.shape[2] == 3:
+        codes = (pixels if deep else pixels * np.uint16(257)).astype(np.uint16, copy=False)
+        pixels = to_srgb(codes, stated["transfer_characteristics"], stated["color_primaries"])
     # The library has turned it by the file's own orientation.
     if turn is not None and (own := orientation(data)) != turn:
         pixels = upright(upright(pixels, inverse(own)), turn)
@@ -91,7 +87,7 @@ def decode(data: bytes, *, memory: int, turn: int | None = None) -> NDArray[np.u
 
 
 def profile(data: bytes) -> bytes | None:
-    """The ICC profile of a HEIF, or one made of the primaries that it states; None if its colours are sRGB's.
+    """The ICC profile of what is decoded, or one made of the primaries that are stated; None if its colours are sRGB's.
 
     Raises
     ------
@@ -99,6 +95,8 @@ def profile(data: bytes) -> bytes | None:
     """
     info = _info(_opened(data))
     stated = info.get("nclx_profile")
+    if stated and is_hdr(stated["transfer_characteristics"]):
+        return None  # `decode` has converted them
     if info.get("icc_profile") or not stated or stated["color_primaries"] in NOT_WIDE:
         return info.get("icc_profile")
     primaries = [stated[f"color_primary_{name}_{axis}"] for name in ("red", "green", "blue") for axis in "xy"]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from storage.errors import ImageError
 from tests.parts.inputs.heics import heic
 from workflows.images import decode as any_format
-from workflows.images import heif, integer_formats
+from workflows.images import hdr, heif, integer_formats
 from workflows.images.orientation import upright
 from workflows.images.tone_curves import to_light
 
@@ -76,11 +76,17 @@ def test_colours_of_a_wide_gamut_become_srgb_however_they_are_stated() -> None:
     np.testing.assert_array_equal(any_format.decode(srgb, "srgb", memory=MEMORY), PIXELS)
 
 
-@pytest.mark.parametrize(("transfer", "curve"), [(16, "PQ"), (18, "HLG")])
-def test_hdr_is_refused_by_name(transfer: int, curve: str) -> None:
-    data = heic(bits_of(10), color_primaries=9, transfer_characteristics=transfer)
-    with pytest.raises(ImageError, match=rf"HDR displays \({curve}\): switch HDR off in the camera"):
-        heif.decode(data, memory=MEMORY)
+@pytest.mark.parametrize("transfer", [hdr.PQ, hdr.HLG])
+@pytest.mark.parametrize("bits", [8, 10])
+def test_hdr_becomes_srgb(transfer: int, bits: int) -> None:
+    pixels = PIXELS if bits == 8 else bits_of(bits)
+    stated = {"color_primaries": hdr.BT_2020, "transfer_characteristics": transfer}
+    plain = heif.decode(heic(pixels), memory=MEMORY)
+    full = (plain * np.uint16(257) if bits == 8 else plain).astype(np.uint16)
+    expected = hdr.to_srgb(full, transfer, hdr.BT_2020)
+    data = heic(pixels, **stated)
+    np.testing.assert_array_equal(heif.decode(data, memory=MEMORY), expected)
+    np.testing.assert_array_equal(any_format.decode(data, "srgb", memory=MEMORY), expected)
 
 
 @pytest.mark.parametrize("pixels", [PIXELS, bits_of(10)])

@@ -10,6 +10,7 @@ from av.video.reformatter import ColorRange, Colorspace, Interpolation
 from numpy.typing import NDArray
 
 from storage.errors import CaptureError
+from workflows.images.hdr import is_hdr, to_srgb
 from workflows.ingest.video.decoder import Clip, tick_of
 
 PLANAR = {
@@ -39,7 +40,7 @@ class Share(NamedTuple):
 
 
 def mean_frames(clip: Clip, plan: Sequence[Sequence[Share]]) -> Iterator[NDArray[np.uint16]]:
-    """Weighted means of frames, averaged in the colour system of the video and then converted to RGB.
+    """Weighted means of frames, averaged in the colour system of the video and then converted to RGB, from HDR to sRGB.
 
     Parameters
     ----------
@@ -78,7 +79,10 @@ def mean_frames(clip: Clip, plan: Sequence[Sequence[Share]]) -> Iterator[NDArray
                 sums = [np.zeros(plane.shape, kind) for plane in planes]
             for total, plane in zip(sums, planes, strict=True):
                 total += np.multiply(plane, weight, dtype=total.dtype)
-        yield np.ascontiguousarray(np.rot90(_to_rgb(sums, seen), clip.quarter_turns))
+        rgb = _to_rgb(sums, seen)
+        if is_hdr(seen.color_trc):
+            rgb = to_srgb(rgb, seen.color_trc, seen.color_primaries)
+        yield np.ascontiguousarray(np.rot90(rgb, clip.quarter_turns))
 
 
 def _planar(frame: VideoFrame) -> VideoFrame:

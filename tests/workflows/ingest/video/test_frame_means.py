@@ -2,6 +2,7 @@
 
 import io
 from contextlib import closing
+from typing import Any
 
 import av
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from av.video.reformatter import Colorspace
 
 from tests.workflows.ingest.video.camera import interlaced
+from workflows.images import hdr
 from workflows.ingest.video.decoder import Clip
 from workflows.ingest.video.frame_means import ACCURATE, TOTAL_WEIGHT, Share, mean_frames
 from workflows.ingest.video.signatures import take_signatures
@@ -63,6 +65,25 @@ def test_fields_of_an_interlaced_film_keep_their_own_colours() -> None:
         (mean,) = mean_frames(film, [[Share(int(ticks[1]), TOTAL_WEIGHT)]])
     assert np.abs(mean[::2] / 257 - red).max() < 3
     assert np.abs(mean[1::2] / 257 - blue).max() < 3
+
+
+@pytest.mark.parametrize("transfer", [hdr.PQ, hdr.HLG])
+def test_a_film_for_hdr_displays_becomes_srgb(transfer: int) -> None:
+    random = np.random.default_rng(0)
+    grey, colour = random.integers(200, 560, (48, 64, 1)), random.integers(-40, 40, (48, 64, 3))
+    codes = (grey + colour).astype(np.uint16)
+    target = io.BytesIO()
+    with av.open(target, "w", format="matroska") as box:
+        stream = box.add_stream("ffv1", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "gbrp10le"
+        coded: Any = stream.codec_context
+        coded.color_trc, coded.color_primaries = transfer, hdr.BT_2020
+        box.mux(stream.encode(av.VideoFrame.from_ndarray(codes, "gbrp10le")))
+        box.mux(stream.encode())
+    with closing(Clip(io.BytesIO(target.getvalue()), "clip", 1 << 24)) as film:
+        (mean,) = mean_frames(film, [[Share(0, TOTAL_WEIGHT)]])
+    expected = hdr.to_srgb(np.rint(codes * (65535 / 1023)).astype(np.uint16), transfer, hdr.BT_2020)
+    assert np.abs(mean.astype(int) - expected).max() < 3 * 257
 
 
 @pytest.mark.parametrize(("height", "system"), [(96, Colorspace.ITU601), (640, Colorspace.ITU709)])

@@ -1,0 +1,82 @@
+"""Codes for HDR displays (ITU-R BT.2100) as those of sRGB: phones film so by default.
+
+Light is that of the scene, without a display's system gamma: light of several sources adds up. The white of pages and
+skies in HDR, 203 cd/m2 or 75 % of HLG (ITU-R BT.2408, sect. 3), becomes white; what is brighter is clipped.
+"""
+
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workflows.images.tone_curves import from_light
+
+PQ, HLG = 16, 18
+"""Transfer characteristics (ITU-T H.273, table 3)."""
+BT_2020 = 9
+"""Colour primaries (table 2 there)."""
+WHITE = 203.0
+"""Of PQ, in cd/m2."""
+TO_SRGB = np.array(
+    [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]], np.float32
+)
+"""From the primaries of BT.2020 to those of sRGB (ITU-R BT.2407, sect. 2.2)."""
+BAND = 1 << 18
+"""Pixels that are converted at a time."""
+TOP = 65535
+
+
+def is_hdr(transfer: int) -> bool:
+    """Whether these transfer characteristics are for HDR displays."""
+    return transfer in (PQ, HLG)
+
+
+def to_srgb(codes: NDArray[np.uint16], transfer: int, primaries: int) -> NDArray[np.uint16]:
+    """Convert RGB for HDR displays to sRGB.
+
+    Parameters
+    ----------
+    codes : (height, width, 3) uint16
+        Full range.
+    transfer : int
+        `PQ` or `HLG`.
+    primaries : int
+        Those other than `BT_2020` are left alone.
+
+    Returns
+    -------
+    (height, width, 3) uint16
+    """
+    light_of, code_of = _light(transfer), _codes()
+    found = np.empty_like(codes)
+    rows = max(1, BAND // codes.shape[1])
+    for first in range(0, len(codes), rows):
+        at = slice(first, first + rows)
+        light = light_of[codes[at]]
+        if primaries == BT_2020:
+            light = light @ TO_SRGB.T
+        found[at] = code_of[np.rint(np.clip(light, 0, 1) * np.float32(TOP)).astype(np.uint16)]
+    return found
+
+
+@cache
+def _light(transfer: int) -> NDArray[np.float32]:
+    """The light of every code, 1 for white (BT.2100, tables 4 and 5)."""
+    code = np.arange(TOP + 1) / TOP
+    if transfer == PQ:
+        root = code ** (32 / 2523)
+        light = (np.maximum(root - 107 / 128, 0) / (2413 / 128 - 2392 / 128 * root)) ** (8192 / 1305)
+        return (light * 10_000 / WHITE).astype(np.float32)
+    a, b, c = 0.17883277, 0.28466892, 0.55991073
+
+    def of(code: NDArray[np.float64] | float) -> NDArray[np.float64]:
+        return np.where(np.asarray(code) <= 0.5, np.square(code) / 3, (np.exp((code - c) / a) + b) / 12)
+
+    return (of(code) / of(0.75)).astype(np.float32)
+
+
+@cache
+def _codes() -> NDArray[np.uint16]:
+    """The code of sRGB for every light in 65535ths."""
+    light = np.arange(TOP + 1, dtype=np.float32) / np.float32(TOP)
+    return np.rint(from_light(light, "srgb") * TOP).astype(np.uint16)
