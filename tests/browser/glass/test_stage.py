@@ -69,6 +69,18 @@ def test_reload_and_link_show_the_same(desk: Page, service: Service, masked: str
     expect(desk.get_by_label("Transparent around the glass")).to_be_checked()
 
 
+def test_view_that_was_chosen_meanwhile_stays_chosen(
+    desk: Page, service: Service, ready: tuple[str, str]
+) -> None:
+    opened(desk, service, ready[1])
+    # The picture becomes exact after the link was followed, and before the app hears of that.
+    desk.locator(".stage").first.evaluate(
+        "stage => { location.hash = '#/captures'; stage.dispatchEvent(new Event('exact', { bubbles: true })); }"
+    )
+    expect(desk).to_have_url(re.compile(r"#/captures$"))
+    expect(desk.get_by_role("heading", name="Captures")).to_be_visible()
+
+
 def test_picture_is_divided_between_backdrop_and_glass(
     desk: Page, service: Service, ready: tuple[str, str]
 ) -> None:
@@ -139,7 +151,7 @@ def test_object_that_was_cut_out_stands_in_the_backdrop(desk: Page, service: Ser
     moved = aside("Backdrop")
     assert np.sqrt(np.mean((moved[:, 24:] - bare[:, :-24]) ** 2)) < 4
 
-    desk.get_by_role("heading", name="Layers").click()
+    unfold(desk)
     for plate in (True, False):
         desk.get_by_label("for a plate of the frame").set_checked(plate)
         with desk.expect_download() as download:

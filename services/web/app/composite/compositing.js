@@ -53,13 +53,15 @@ export function compositing(matte, others, signal) {
 	const first = NAMES.includes(given.backdrop) ? given.backdrop : NAMES[0];
 
 	// A reload and a link show the same, as far as the backdrop is a built-in one.
+	const view = `#/mattes/${matte.id}`;
 	stage.element.addEventListener("exact", () => {
-		if (signal.aborted) return;
+		// Another view may be in the URL already, whose event is still to come: it must not be replaced.
+		if (signal.aborted || location.hash.split("?")[0] !== view) return;
 		const state = new URLSearchParams(placed.moved);
 		const { name } = stage.backdrop;
 		if (NAMES.includes(name) && name !== NAMES[0]) state.set("backdrop", name);
 		if (!stage.around) state.set("around", "nothing");
-		history.replaceState(history.state, "", `#/mattes/${matte.id}${state.size ? `?${state}` : ""}`);
+		history.replaceState(history.state, "", `${view}${state.size ? `?${state}` : ""}`);
 	});
 	const taken = downloads(stage, signal);
 	const choices = backdropChoices(matte, stage.element, use, taken.all, first, signal);
