@@ -104,7 +104,7 @@ def test_backdrop_around_the_glass_joins_what_is_seen_through_it(desk: Page, ser
     assert np.median(np.abs(difference)) < 25
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive  # as on the page of a matte, which a slow test covers
 def test_camera_is_a_backdrop(desk: Page, service: Service) -> None:
     desk.goto(service.url)
     settled(desk)
