@@ -117,7 +117,7 @@ def _compile(part: str) -> int:
 
 
 def recover(objects: Objects) -> None:
-    """Ingest a capture of a glass ball, which recovers a sample of it, and recover its matte by each method."""
+    """Ingest a capture of a glass ball, and recover its matte by each method."""
     file = io.BytesIO()
     scene = glass_ball(WIDTH, HEIGHT, monitor=MONITOR, rays=4)
     write_capture(scene, preset("sketch", *MONITOR), file)
