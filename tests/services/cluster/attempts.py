@@ -19,9 +19,11 @@ async def gets_in(at: str, security: Security) -> bool:
     try:
         opening = open_comm(at, timeout=2, **security.get_connection_args("client"))
         comm = await asyncio.wait_for(opening, 5)
-        await comm.write({"op": "identity", "reply": True})
-        reply = await asyncio.wait_for(comm.read(), 5)
-        comm.abort()
+        try:
+            await comm.write({"op": "identity", "reply": True})
+            reply = await asyncio.wait_for(comm.read(), 5)
+        finally:
+            comm.abort()
     except (OSError, TimeoutError, ValueError):  # of tornado, if the connection ends before TLS begins
         return False
     return bool(reply["id"])
@@ -33,8 +35,10 @@ async def answers_without_certificate(port: int) -> bool:
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     try:
         reader, writer = await asyncio.wait_for(asyncio.open_connection("127.0.0.1", port, ssl=context), 5)
-        answer = await asyncio.wait_for(reader.read(1), 5)
-        writer.close()
+        try:
+            answer = await asyncio.wait_for(reader.read(1), 5)
+        finally:
+            writer.transport.abort()
     except (OSError, TimeoutError):
         return False
     return bool(answer)
