@@ -10,10 +10,13 @@ from pydantic import TypeAdapter
 
 from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
-from workflows.images.tone_curves import CameraCurve, light_of_codes, table
+from workflows.images.tone_curves import CameraCurve, Curve, light_of_codes, table, to_light
 from workflows.ingest.local_gain import Surroundings
 from workflows.programs.border import border_light
 from workflows.programs.program import Program
+from workflows.recovery.camera.clipped import bound_clipped
+from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.photometry import Photometry, fit_photometry
 from workflows.recovery.normalise import Conditions
 
 LOBES = 3
@@ -40,6 +43,23 @@ class Light(NamedTuple):
         The number of frames of the shortest exposure that carry as much information.
     """
 
+    values: Floats
+    usable: Bools
+    worth: Floats
+
+
+class Measured(NamedTuple):
+    """What T is recovered from.
+
+    Attributes
+    ----------
+    photometry : Photometry
+        S and rho of the n pixels.
+    values, usable, worth : (n, m, 3)
+        Those of `Light`, of the m patterns that are measured; clipped values are bounds.
+    """
+
+    photometry: Photometry
     values: Floats
     usable: Bools
     worth: Floats
@@ -266,6 +286,19 @@ def constants_of(attributes: dict[str, Any], program: Program) -> tuple[NDArray[
     if attributes.get("border") and np.ptp(sent[grey, :1]) > 0:
         return numbers[grey], sent[grey]
     return numbers, sent
+
+
+def measure(light: Light, attributes: dict[str, Any], program: Program, monitor: Curve) -> Measured:
+    """Fit S and rho to what pixels saw of constant patterns, and bound what is clipped of the others."""
+    noise, (values, usable, worth) = Noise(**attributes["noise"]), light
+    numbers, sent = constants_of(attributes, program)
+    photometry = fit_photometry(
+        values[:, numbers], to_light(sent, monitor), usable[:, numbers], noise, worth[:, numbers]
+    )
+    shown = program.measured
+    filmed = np.isin(shown, attributes["patterns"])
+    bounded = bound_clipped(values[:, shown], usable[:, shown], worth[:, shown], filmed, photometry, noise)
+    return Measured(photometry, *bounded)
 
 
 def black_patterns(program: Program) -> NDArray[np.intp]:

@@ -12,16 +12,14 @@ from pydantic import TypeAdapter
 from storage.layout.captures import Stack
 from storage.layout.mattes import Block, Matte, empty_block
 from storage.objects.store import Objects
-from workflows.images.tone_curves import Curve, to_light
+from workflows.images.tone_curves import Curve
 from workflows.ingest.local_gain import Surroundings, local_gain
-from workflows.ingest.measured_light import conditions_of, constants_of, places_in, read_light
+from workflows.ingest.measured_light import conditions_of, measure, places_in, read_light
 from workflows.mattes.cut_out import CutOut
 from workflows.mattes.options import RecoveryOptions
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out, pyramid_of
-from workflows.recovery.camera.clipped import bound_clipped
 from workflows.recovery.camera.noise import Noise
-from workflows.recovery.camera.photometry import fit_photometry
 from workflows.recovery.dgsr import recover as dgsr
 from workflows.recovery.dgsr.glare import filter_sensing
 from workflows.recovery.dgsr.options import DgsrOptions
@@ -150,17 +148,9 @@ def recover_block(
     attributes = stack.attributes
     noise = Noise(**attributes["noise"])
     gain = gain_of(objects, capture)
-    (light, usable, worth), recovered = read_light(stack, span, program, gain, wanted)
+    light, recovered = read_light(stack, span, program, gain, wanted)
     crosstalk = np.array(attributes["crosstalk"])
-    numbers, sent = constants_of(attributes, program)
-    photometry = fit_photometry(
-        light[:, numbers], to_light(sent, monitor), usable[:, numbers], noise, worth[:, numbers]
-    )
-    shown = program.measured
-    filmed = np.isin(shown, attributes["patterns"])
-    measurements, usable, worth = bound_clipped(
-        light[:, shown], usable[:, shown], worth[:, shown], filmed, photometry, noise
-    )
+    photometry, measurements, usable, worth = measure(light, attributes, program, monitor)
     given = (noise, usable, worth)
     places = places_in(span, recovered)
     method, conditions = options.of_method, conditions_of(stack, program)

@@ -16,17 +16,16 @@ from workflows.ingest.measured_light import (
     Light,
     clipped_from,
     conditions_of,
-    constants_of,
     even_out,
     exposures_of,
     light_of,
     look_up_of,
+    measure,
     unclipped_light,
 )
 from workflows.programs.program import Program
-from workflows.recovery.camera.clipped import bound_clipped
 from workflows.recovery.camera.noise import Noise
-from workflows.recovery.camera.photometry import Photometry, fit_photometry
+from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.lobes.options import FINE, LobesOptions
 from workflows.recovery.lobes.recover import recover
 from workflows.recovery.sensing import Patterns
@@ -233,18 +232,11 @@ def recover_seen(
     attributes = stack.attributes | {"gains": np.exp(gains).tolist() if gains.any() else None}
     noise = Noise(**attributes["noise"])
     found = light_of(lambda n: (seen.values[n], seen.whole[n]), attributes, program, seen.values.shape[1])
-    light, usable, worth = found
-    numbers, sent = constants_of(attributes, program)
-    levels = to_light(sent, monitor)
-    photometry = fit_photometry(light[:, numbers], levels, usable[:, numbers], noise, worth[:, numbers])
+    photometry, measurements, used, worth = measure(found, attributes, program, monitor)
     alive = photometry.rho**2 > CONTRAST**2 * noise.variance(photometry.S + photometry.rho / 2)
     if np.count_nonzero(alive.any(axis=1)) < MIN_PIXELS:
         return None
-    shown, conditions = program.measured, conditions_of(stack, program)
-    filmed = np.isin(shown, attributes["patterns"])
-    measurements, used, worth = bound_clipped(
-        light[:, shown], usable[:, shown], worth[:, shown], filmed, photometry, noise
-    )
+    conditions = conditions_of(stack, program)
     used[:, held_out] = False
     transport, photometry, _, stray = recover(
         measurements,
