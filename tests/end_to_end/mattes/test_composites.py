@@ -320,18 +320,18 @@ def test_requests_leak_nothing(service: Service, matte: str, requests: int) -> N
 
     ask(requests // 3)  # until every thread has filled its caches
     looks = [held()]
-    for _ in range(3):
-        ask(requests // 3)
+    for _ in range(6):
+        ask(requests // 6)
         looks.append(held())
     assert set(looks[0]) <= set(looks[-1]), "a decoder is gone"
     assert 1 < len(looks[-1]) <= 1 + askers
     sums = np.array(
         [sum(look[pid] for pid in looks[0]) for look in looks]
     )  # other decoders may have been started
-    print(f"bytes, open files and threads, every {requests // 3} requests: {sums.tolist()}")
-    memory, files, threads = sums[2:].min(axis=0) - sums[:2].min(axis=0)  # what leaks does not come back
-    assert (
-        memory < 64 << 20
-    )  # blocks of 19 MB come and go with the moment of looking; backdrops would be 500 MB
+    print(f"bytes, open files and threads, every {requests // 6} requests: {sums.tolist()}")
+    _, files, threads = sums[4:].min(axis=0) - sums[:3].min(axis=0)  # what leaks does not come back
+    # Under load blocks of 19 MB come, and stay: what leaks grows from look to look.
+    growth = np.median(np.diff(sums[:, 0]))
+    assert 6 * growth < 24 << 20
     assert files < 5
     assert threads < 5
