@@ -300,11 +300,8 @@ class Client:
     def layer(self, matte: Matte | str, name: str, *, plate: bool = False) -> bytes:
         """Get a layer of a matte as a file, such as ``confidence.png``; ``Matte.layers`` has them as arrays.
 
-        Parameters
-        ----------
-        plate : bool
-            For ``stmap.exr`` and the nodes of Blender and Nuke: they take a plate of the frame, which the glass goes
-            over, in place of a picture that is stretched over the monitor.
+        With ``plate``, ``stmap.exr`` and the nodes of Blender and Nuke take a plate of the frame, which the glass goes
+        over, in place of a picture that is stretched over the monitor.
         """
         path, params = f"{path_of(Matte, matte)}/layers/{name}", {"plate": "true"} if plate else {}
         return self._http.send("GET", path, params=params, computing=True).content

@@ -65,7 +65,10 @@ def decode(data: bytes, *, memory: int, turn: int | None = None) -> NDArray[np.u
     picture = _opened(data)
     name, _, depth = picture.mode.partition(";")
     deep, stated = bool(depth), _info(picture).get("nclx_profile") or {}
-    check_size(*picture.size, (2 if deep else 1) * (1 if name in ("L", "I") else len(name)), memory)
+    is_for_hdr = is_hdr(stated.get("transfer_characteristics", 0))
+    check_size(
+        *picture.size, (2 if deep or is_for_hdr else 1) * (1 if name in ("L", "I") else len(name)), memory
+    )
     try:
         pixels = np.asarray(picture)
     except Exception as error:
@@ -77,7 +80,7 @@ def decode(data: bytes, *, memory: int, turn: int | None = None) -> NDArray[np.u
     if deep:
         bits = int(_info(picture)["bit_depth"])
         pixels = (pixels << (16 - bits)) | (pixels >> (2 * bits - 16))
-    if is_hdr(stated.get("transfer_characteristics", 0)) and pixels.shape[2] == 3:
+    if is_for_hdr and pixels.shape[2] == 3:
         codes = (pixels if deep else pixels * np.uint16(257)).astype(np.uint16, copy=False)
         pixels = to_srgb(codes, stated["transfer_characteristics"], stated["color_primaries"])
     # The library has turned it by the file's own orientation.

@@ -18,7 +18,7 @@ from services.api.mattes.progress import Progress, open_whole_frame, while_there
 from storage.errors import InvalidInput, NotFound
 from storage.layout import mattes as stored_mattes
 from storage.records import mattes
-from workflows.composite.backdrops.around import plate_of
+from workflows.composite.backdrops.around import Plate, plate_of
 from workflows.composite.live import nodes
 from workflows.composite.live.encode import bytes_of_live
 from workflows.composite.live.nodes.exr import LOOKUPS, bytes_of_lookups
@@ -39,11 +39,17 @@ MEDIA_TYPES = {
     "js": "text/javascript",
     "live": "application/octet-stream",
 }
+
+
+def _stmap(matte: stored_mattes.Matte, file: IO[bytes], plate: Plate | None = None) -> None:
+    layers.stmap(matte, file, plate and plate.place)
+
+
 FILES: dict[str, Callable[..., None]] = {
     f"{name}.{kind}": lambda matte, file, name=name, write=write: write(matte, name, file)
     for name in layers.NAMES
     for kind, write in (("png", layers.png), ("exr", layers.exr))
-} | {"stmap.exr": layers.stmap}
+} | {"stmap.exr": _stmap}
 ALL = "all.exr"
 NODES = nodes.FILES | live_module.FILES
 OF_PLATE = ("stmap.exr", "blender.py", "nuke.nk", "nuke_stmap.nk")
@@ -178,10 +184,7 @@ async def get_layer(
 
     def encode(now: Progress) -> Response:
         found = context.cache.matte(now.whole_frame)
-        given: dict[str, Any] = {}
-        if plate:
-            over = plate_of(context.cache.matte(id))
-            given = {"plate": over} if file in NODES else {"place": over.place}
+        given = {"plate": plate_of(context.cache.matte(id))} if plate else {}
         return file_response(partial(write, found, given), MEDIA_TYPES[kind], headers_of(now))
 
     work = partial(while_there, context, progress, encode)

@@ -4,9 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner, Result
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion
 
+from services.cli.main import main
 from services.client import ServiceError
 from tests.end_to_end.conftest import Service
 from tests.end_to_end.mattes.test_composites import decoded, post_composite
@@ -41,6 +43,7 @@ def test_the_object_is_cut_out(service: Service, tmp_path: Path) -> None:
     assert not np.array_equal(camera[within], alone[within])
     np.testing.assert_array_equal(camera, decoded(post_composite(service, job["matte"])))
     assert_files_take_a_plate(service, job["matte"], within)
+    assert_command_writes_them(service, job["matte"], tmp_path / "glass")
 
 
 def assert_files_take_a_plate(service: Service, matte: str, within: NDArray[np.bool_]) -> None:
@@ -56,6 +59,18 @@ def assert_files_take_a_plate(service: Service, matte: str, within: NDArray[np.b
     assert (np.ptp(plate[lit, :2], axis=0) < 0.95 * np.ptp(monitor[lit, :2], axis=0)).all()
     with pytest.raises(ServiceError, match=r"S\.png takes no plate: only stmap\.exr, blender\.py"):
         service.client.layer(matte, "S.png", plate=True)
+
+
+def assert_command_writes_them(service: Service, matte: str, folder: Path) -> None:
+    def layers(tool: str) -> Result:
+        command = ["layers", matte, str(folder), "--for", tool, "--plate", "--url", service.url]
+        return CliRunner().invoke(main, command)
+
+    assert layers("nuke").exit_code == 0
+    for name, plate in (("lookups.exr", False), ("nuke.nk", True), ("nuke_stmap.nk", True)):
+        assert (folder / name).read_bytes() == service.client.layer(matte, name, plate=plate)
+    refused = layers("glsl")
+    assert (refused.exit_code, "already" in refused.stderr) == (2, True)
 
 
 def test_the_log_says_why_an_object_is_not_cut_out(service: Service, tmp_path: Path) -> None:

@@ -204,12 +204,12 @@ def of_plate(first: Any, size: tuple[int, int]) -> Any:
         nodes.math("ADD", nodes.math("MULTIPLY_ADD", u, of_x, one), nodes.math("MULTIPLY", y, of_y))
         for of_x, of_y, one in MATTE["plate"]["place"]
     )
-    counts = nodes.add("SeparateXYZ", nodes.add("ImageInfo", light)["Dimensions"])
+    wide, high, _ = nodes.add("SeparateXYZ", nodes.add("ImageInfo", light)["Dimensions"])
     places = [
         nodes.math("MULTIPLY_ADD", nodes.math("DIVIDE", value, depth), count, -0.5)
-        for value, count in zip((across, down), counts, strict=False)
+        for value, count in ((across, wide), (down, high))
     ]
-    return nodes.finish(nodes.group(first, between_pixels(nodes, light, places, list(counts)[:2])))
+    return nodes.finish(nodes.group(first, between_pixels(nodes, light, places, (wide, high))))
 
 
 def glass(exr: Path, taps: int) -> Any:
